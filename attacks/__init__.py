@@ -1,0 +1,1 @@
+"""What an adversary can do: the audit's attacks."""

@@ -1,0 +1,1 @@
+"""Enrollment: photos or a client's template become one private template of a subject."""

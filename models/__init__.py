@@ -1,0 +1,1 @@
+"""From bytes to embedding: decoding, packs, detection, alignment, embedding."""

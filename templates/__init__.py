@@ -1,0 +1,1 @@
+"""The private template: subspaces, lifting, decoys, distances, contract, storage."""

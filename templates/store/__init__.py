@@ -1,0 +1,1 @@
+"""The template store: SQLAlchemy tables, migrations and repository."""

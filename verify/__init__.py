@@ -1,0 +1,1 @@
+"""Verification: a probe against a subject becomes a decision; metrics and calibration."""
