@@ -1,0 +1,47 @@
+"""Fixtures shared by all rooms: the real models and faces, where they are present."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+DEFAULT_SHARED_DATA = Path(__file__).resolve().parent.parent.parent / "shared" / "data"
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Folder with real packs and real faces (``VEILFACE_TEST_DATA`` overrides where)."""
+    root = Path(os.environ.get("VEILFACE_TEST_DATA", DEFAULT_SHARED_DATA))
+    if not (root / "README.md").exists():
+        pytest.skip(f"real models and faces are absent: {root} does not exist")
+    return root
+
+
+@pytest.fixture(scope="session")
+def mbf_pack_dir(shared_data: Path) -> Path:
+    """SCRFD-500M and the 512-d ArcFace MobileFaceNet."""
+    return shared_data / "packs" / "w600k_mbf"
+
+
+@pytest.fixture(scope="session")
+def yunet_pack_dir(shared_data: Path) -> Path:
+    """YuNet and the 128-d MobileFaceNet."""
+    return shared_data / "packs" / "yunet_mobilefacenet128"
+
+
+@pytest.fixture(scope="session")
+def lfw_photos(shared_data: Path) -> Path:
+    """80 people with 5 unaligned LFW photos each."""
+    return shared_data / "lfw" / "photos"
+
+
+@pytest.fixture(scope="session")
+def lfw_aligned(shared_data: Path) -> Path:
+    """The aligned crops of LFW view 2, with ``pairs.txt``."""
+    return shared_data / "lfw" / "aligned112"
+
+
+@pytest.fixture(scope="session")
+def fairface(shared_data: Path) -> Path:
+    """FairFace subset: 5,000 training and 1,500 validation faces with labels."""
+    return shared_data / "fairface"
