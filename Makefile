@@ -9,7 +9,7 @@ demo: .venv/core
 	$(VENV)/veilface demo
 
 test: .venv/dev
-	$(VENV)/pytest
+	$(VENV)/pytest $(PYTEST_ARGS)
 
 lint: .venv/dev
 	$(VENV)/ruff check .
