@@ -13,7 +13,10 @@ def shared_data() -> Path:
     """Folder with real packs and real faces (``VEILFACE_TEST_DATA`` overrides where)."""
     root = Path(os.environ.get("VEILFACE_TEST_DATA", DEFAULT_SHARED_DATA))
     if not (root / "README.md").exists():
-        pytest.skip(f"real models and faces are absent: {root} does not exist")
+        reason = f"real models and faces are absent: {root} does not exist"
+        if os.environ.get("VEILFACE_REQUIRE_DATA") == "1":
+            pytest.fail(reason)
+        pytest.skip(reason)
     return root
 
 
