@@ -1,0 +1,194 @@
+"""Random samples from a ChaCha20 keystream.
+
+METHOD §2 asks for a cryptographic generator: who sees a template (which is public to whoever
+steals it) must not be able to predict the randomness of the next one, as they could with PCG64 or
+the Mersenne Twister.
+"""
+
+import hashlib
+import json
+import os
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+from cryptography.exceptions import AlreadyFinalized
+from cryptography.hazmat.primitives.ciphers import Cipher
+from cryptography.hazmat.primitives.ciphers.algorithms import ChaCha20
+from numpy.typing import NDArray
+from scipy.special import ndtri
+
+KEY_BYTES = 32
+_SEED_DOMAIN = b"veilface seeded keystream 1\x00"
+# Samples are made in tiles that stay in the processor's cache; also bounds temporary memory.
+_TILE = 1 << 16
+_ZEROS = bytes(8 * _TILE)
+
+Shape = int | tuple[int, ...]
+
+
+class Keystream:
+    """ChaCha20 keystream turned into samples; the only source of randomness of ``templates``.
+
+    In production every template gets a stream of its own from :meth:`fresh`, which is destroyed
+    when the template is made (use it as a context manager). Experiments share one
+    :meth:`seeded` stream.
+
+    Examples
+    --------
+    >>> with Keystream.seeded("example", 1) as stream:
+    ...     stream.choose(5, rows=1, k=2).shape
+    (1, 2)
+    """
+
+    __slots__ = ("_cipher",)
+
+    def __init__(self, key: bytes | bytearray) -> None:
+        if len(key) != KEY_BYTES:
+            raise ValueError(f"a keystream key has {KEY_BYTES} bytes, not {len(key)}")
+        # The nonce may be constant, because a key is used for one stream only.
+        self._cipher = Cipher(ChaCha20(bytes(key), bytes(16)), mode=None).encryptor()
+
+    @classmethod
+    def fresh(cls) -> Self:
+        """Return a stream under a new key from the operating system."""
+        return cls(os.urandom(KEY_BYTES))
+
+    @classmethod
+    def seeded(cls, *parts: str | int) -> Self:
+        """Return the stream that belongs to ``parts``. For experiments, never for production.
+
+        ``1`` and ``"1"`` are different parts, and ``("ab",)`` differs from ``("a", "b")``.
+        """
+        if not parts:
+            raise ValueError("a seeded keystream needs at least one part")
+        canonical = json.dumps(parts, ensure_ascii=True, separators=(",", ":")).encode()
+        return cls(hashlib.sha256(_SEED_DOMAIN + canonical).digest())
+
+    def __repr__(self) -> str:
+        return "Keystream()"
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.destroy()
+
+    def __reduce__(self) -> str | tuple[object, ...]:
+        raise TypeError("a keystream is not copied or stored: two copies would repeat each other")
+
+    def destroy(self) -> None:
+        """Free the cipher state, which OpenSSL overwrites; later draws raise ``ValueError``."""
+        try:
+            self._cipher.finalize()
+        except AlreadyFinalized:
+            return
+
+    def token(self, nbytes: int) -> bytes:
+        """Return ``nbytes`` bytes of the stream."""
+        try:
+            return self._cipher.update(bytes(nbytes))
+        except AlreadyFinalized:
+            raise ValueError("this keystream was destroyed: make a fresh one") from None
+
+    def _words(self, out: NDArray[np.uint64]) -> NDArray[np.uint64]:
+        """Fill a contiguous array of at most ``_TILE`` words."""
+        try:
+            self._cipher.update_into(memoryview(_ZEROS)[: out.nbytes], out.view(np.uint8).data)
+        except AlreadyFinalized:
+            raise ValueError("this keystream was destroyed: make a fresh one") from None
+        return out
+
+    def uniform(self, shape: Shape, low: float = 0.0, high: float = 1.0) -> NDArray[np.float64]:
+        """Sample U([low, high)) with 53 random bits each.
+
+        Returns
+        -------
+        ndarray of float64, of ``shape``
+        """
+        out = np.empty(shape, dtype=np.float64)
+        flat = out.reshape(-1)
+        words = np.empty(min(_TILE, flat.size), dtype=np.uint64)
+        for start in range(0, flat.size, _TILE):
+            tile = flat[start : start + _TILE]
+            drawn = self._words(words[: tile.size])
+            np.right_shift(drawn, np.uint64(11), out=drawn)
+            np.multiply(drawn, (high - low) * 2.0**-53, out=tile, casting="unsafe")
+            if low:
+                tile += low
+        return out
+
+    def normal(self, shape: Shape) -> NDArray[np.float64]:
+        """Sample N(0, 1) by the inverse distribution function.
+
+        The uniforms are odd multiples of 2⁻⁵³, so 0 and 1 (infinite normals) never occur, and a
+        sample costs one word of the stream whatever its value.
+
+        Returns
+        -------
+        ndarray of float64, of ``shape``
+        """
+        out = np.empty(shape, dtype=np.float64)
+        flat = out.reshape(-1)
+        words = np.empty(min(_TILE, flat.size), dtype=np.uint64)
+        for start in range(0, flat.size, _TILE):
+            tile = flat[start : start + _TILE]
+            drawn = self._words(words[: tile.size])
+            np.right_shift(drawn, np.uint64(12), out=drawn)
+            np.add(drawn, 0.5, out=tile, casting="unsafe")
+            tile *= 2.0**-52
+            ndtri(tile, out=tile)
+        return out
+
+    def integers(self, bound: int, size: int) -> NDArray[np.int64]:
+        """Sample ``size`` integers of 0 … ``bound`` − 1, exactly uniform (by rejection).
+
+        Returns
+        -------
+        ndarray of int64, shape (size,)
+        """
+        if not 1 <= bound <= 2**62:
+            raise ValueError(f"the bound must lie between 1 and 2**62, not {bound}")
+        # Words of the last, incomplete run of `bound` values would favour the small integers.
+        surplus = 2**64 % bound
+        words = np.empty(size, dtype=np.uint64)
+        pending = np.arange(size)
+        while pending.size:
+            drawn = np.frombuffer(self.token(8 * pending.size), dtype=np.uint64)
+            words[pending] = drawn
+            pending = pending[drawn >= np.uint64(2**64 - surplus)] if surplus else pending[:0]
+        return (words % np.uint64(bound)).astype(np.int64)
+
+    def choose(self, population: int, rows: int, k: int) -> NDArray[np.int64]:
+        """Sample ``k`` different integers of 0 … ``population`` − 1 in every row.
+
+        Every ordered selection has the same probability. Rows are independent.
+
+        Returns
+        -------
+        ndarray of int64, shape (rows, k)
+
+        Notes
+        -----
+        Floyd's algorithm (Bentley & Floyd, CACM 1987), a column at a time for all rows, then
+        Fisher–Yates for the order: O(rows · k²) whatever the population.
+        """
+        if not 0 <= k <= population:
+            raise ValueError(f"cannot choose {k} different integers out of {population}")
+        chosen = np.full((rows, k), -1, dtype=np.int64)
+        for column, last in enumerate(range(population - k, population)):
+            drawn = self.integers(last + 1, rows)
+            taken = (chosen[:, :column] == drawn[:, None]).any(axis=1)
+            chosen[:, column] = np.where(taken, last, drawn)
+        every = np.arange(rows)
+        for column in range(k - 1, 0, -1):
+            other = self.integers(column + 1, rows)
+            swapped = chosen[every, other]
+            chosen[every, other] = chosen[:, column]
+            chosen[:, column] = swapped
+        return chosen
