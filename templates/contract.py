@@ -1,0 +1,391 @@
+"""The contract: what a template and a threshold belong to, and the file that carries it.
+
+``contract_id`` is the SHA-256 of the canonical JSON of the binding. Every stored template carries
+it, and a template of another contract is refused (PRODUCT "Contract"). Recalibrating changes the
+calibrations, their ids and perhaps the cohort, never the ``contract_id``.
+
+The file is JSON. The cohort is a secret: who has it can search for a probe that passes the cohort
+test. It is sealed inside the file, and the seal's context holds the digest of everything else in
+the file, so that an edited threshold is refused as well.
+"""
+
+import base64
+import binascii
+import hashlib
+import json
+import os
+import secrets
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import safetensors
+import safetensors.numpy
+
+from templates.canonical import Fields, Json, digest, free_object, parse_object
+from templates.distances import Metric
+from templates.errors import ContractError, SealError, Uncalibrated
+from templates.levels import (
+    LEVEL_NAME,
+    SHA256_HEX,
+    Calibration,
+    Level,
+    Mode,
+    Rate,
+    check_norm_range,
+    norm_range,
+)
+from templates.lifting import Strategy
+from templates.sealing import Sealer
+from templates.subspace import SubspaceBatch
+
+__all__ = ["Binding", "Calibration", "Contract", "Level", "Mode", "Rate"]
+
+FORMAT = "veilface-contract"
+VERSION = 1
+MAX_FILE_BYTES = 256 * 2**20
+MAX_CALIBRATIONS = 64
+MAX_N = 4096
+MAX_M = 128
+COHORT_SIZES = (2, 4096)
+BASIS_TOLERANCE = 1e-4
+
+
+@dataclass(frozen=True)
+class Binding:
+    """What makes two templates comparable; its hash is the ``contract_id``.
+
+    Parameters
+    ----------
+    embedder_sha256
+        SHA-256 of the embedder's ONNX file, 64 hexadecimal digits.
+    preprocessing
+        Alignment template, size, channel order, mean, scale and flip.
+    n
+        Descriptor dimension.
+    strategy, m
+        Lifting strategy and subspace dimension of stored templates.
+    decoy_source_id
+        SHA-256 of the decoy source's canonical content.
+    rotation_version
+        Version of the tenant-rotation derivation.
+    """
+
+    embedder_sha256: str
+    preprocessing: Mapping[str, Json]
+    n: int
+    strategy: Strategy
+    m: int
+    decoy_source_id: str
+    rotation_version: str
+
+    def __post_init__(self) -> None:
+        if not SHA256_HEX.fullmatch(self.embedder_sha256):
+            raise ContractError("the embedder's hash must be 64 lower-case hexadecimal digits")
+        if not SHA256_HEX.fullmatch(self.decoy_source_id):
+            raise ContractError("the decoy source's id must be 64 lower-case hexadecimal digits")
+        if not 2 <= self.n <= MAX_N:
+            raise ContractError(f"the descriptor dimension must lie in 2 to {MAX_N}")
+        if not 1 <= self.m <= min(MAX_M, self.n - 1):
+            raise ContractError(f"the subspace dimension must lie in 1 to min({MAX_M}, n - 1)")
+        if not 1 <= len(self.rotation_version) <= 64:
+            raise ContractError("the rotation version must be a text of 1 to 64 characters")
+        preprocessing = free_object(self.preprocessing, what="the preprocessing")
+        object.__setattr__(self, "preprocessing", preprocessing)
+        object.__setattr__(self, "strategy", Strategy(self.strategy))
+
+    @property
+    def contract_id(self) -> str:
+        """SHA-256 of the canonical JSON, 64 hexadecimal digits."""
+        return digest(self.to_json())
+
+    def to_json(self) -> dict[str, Json]:
+        """JSON form: exactly what is hashed."""
+        return {
+            "embedder_sha256": self.embedder_sha256,
+            "preprocessing": dict(self.preprocessing),
+            "n": self.n,
+            "strategy": str(self.strategy),
+            "m": self.m,
+            "decoy_source_id": self.decoy_source_id,
+            "rotation_version": self.rotation_version,
+        }
+
+    @classmethod
+    def from_json(cls, value: object) -> "Binding":
+        """Parse hostile JSON."""
+        fields = Fields(value, what="the binding")
+        strategy = fields.text("strategy")
+        if strategy not in list(Strategy):
+            raise ContractError(f"the strategy must be one of {[*map(str, Strategy)]}")
+        binding = cls(
+            embedder_sha256=fields.text("embedder_sha256"),
+            preprocessing=fields.free("preprocessing"),
+            n=fields.integer("n"),
+            strategy=Strategy(strategy),
+            m=fields.integer("m"),
+            decoy_source_id=fields.text("decoy_source_id"),
+            rotation_version=fields.text("rotation_version"),
+        )
+        fields.done()
+        return binding
+
+
+@dataclass(frozen=True, eq=False)
+class Contract:
+    """A binding with its calibrations, its cohort and its enrollment limits.
+
+    Parameters
+    ----------
+    binding
+        What the ``contract_id`` hashes.
+    recorded
+        Facts that are recorded but not bound: pack name, detector and its input size, dates.
+    calibrations
+        One per (mode, metric, probe m); ids are computed here where they are empty, and checked
+        where they are not.
+    default_level
+        Level of a request that names none.
+    photo_consistency
+        Least raw cosine between any two photos of one enrollment.
+    template_foot_point_norm
+        Range of ‖p‖ that an honest template of this contract has.
+    cohort
+        Templates that belong to nobody, un-rotated; (C, n) feet and (C, m, n) bases. Secret.
+
+    Raises
+    ------
+    ContractError
+        Where a part contradicts another one.
+    """
+
+    binding: Binding
+    recorded: Mapping[str, Json]
+    calibrations: tuple[Calibration, ...]
+    default_level: str
+    photo_consistency: float
+    template_foot_point_norm: tuple[float, float]
+    cohort: SubspaceBatch = field(repr=False)
+
+    def __post_init__(self) -> None:
+        recorded = free_object(self.recorded, what="the record")
+        object.__setattr__(self, "recorded", recorded)
+        if not -1.0 <= self.photo_consistency <= 1.0:
+            raise ContractError("photo_consistency is a cosine and must lie in [-1, 1]")
+        if not LEVEL_NAME.fullmatch(self.default_level):
+            raise ContractError("the default level's name must match " + LEVEL_NAME.pattern)
+        check_norm_range(self.template_foot_point_norm)
+        self._check_cohort()
+        self._check_calibrations()
+
+    def _check_cohort(self) -> None:
+        feet, bases = self.cohort.feet, self.cohort.bases
+        least, most = COHORT_SIZES
+        if not least <= len(self.cohort) <= most:
+            raise ContractError(f"the cohort must have {least} to {most} templates")
+        if (self.cohort.n, self.cohort.m) != (self.binding.n, self.binding.m):
+            raise ContractError("the cohort's dimensions differ from the binding's")
+        if not (np.isfinite(feet).all() and np.isfinite(bases).all()):
+            raise ContractError("the cohort holds a number that is not finite")
+        gram = np.matmul(bases, bases.transpose(0, 2, 1)) - np.eye(self.binding.m, dtype=np.float32)
+        dots = np.matmul(bases, feet[:, :, None])
+        if max(np.abs(gram).max(), np.abs(dots).max()) > BASIS_TOLERANCE:
+            raise ContractError("a cohort template is not in canonical, orthonormal form")
+
+    def _check_calibrations(self) -> None:
+        if not 1 <= len(self.calibrations) <= MAX_CALIBRATIONS:
+            raise ContractError(f"a contract needs 1 to {MAX_CALIBRATIONS} calibrations")
+        keys = {(entry.mode, entry.metric, entry.probe_m) for entry in self.calibrations}
+        if len(keys) != len(self.calibrations):
+            raise ContractError("two calibrations share mode, metric and probe m")
+        if any(entry.probe_m >= self.binding.n for entry in self.calibrations):
+            raise ContractError("a calibration's probe m is not below the descriptor dimension")
+        names = {level.name for entry in self.calibrations for level in entry.levels}
+        if self.default_level not in names:
+            raise ContractError("no calibration has the default level")
+        contract_id, cohort_id = self.contract_id, self.cohort_id
+        identified = tuple(
+            entry.identified(contract_id=contract_id, cohort_id=cohort_id)
+            for entry in self.calibrations
+        )
+        for given, computed in zip(self.calibrations, identified, strict=True):
+            if given.calibration_id not in ("", computed.calibration_id):
+                raise ContractError("a calibration_id is not the hash of its calibration")
+        object.__setattr__(self, "calibrations", identified)
+
+    @property
+    def contract_id(self) -> str:
+        """SHA-256 of the binding's canonical JSON."""
+        return self.binding.contract_id
+
+    @property
+    def cohort_id(self) -> str:
+        """SHA-256 over the cohort's float32 numbers, feet then bases, little-endian."""
+        digester = hashlib.sha256(str(self.cohort.bases.shape).encode())
+        digester.update(self.cohort.feet.astype("<f4", copy=False).tobytes())
+        digester.update(self.cohort.bases.astype("<f4", copy=False).tobytes())
+        return digester.hexdigest()
+
+    def calibration(
+        self, mode: Mode, metric: Metric | None = None, probe_m: int = 0
+    ) -> Calibration:
+        """Find the calibration of one mode, metric and probe dimension.
+
+        ``metric`` None takes the first that the contract lists for the mode and dimension.
+
+        Raises
+        ------
+        Uncalibrated
+            Where there is none; the message names those there are.
+        """
+        for entry in self.calibrations:
+            if (entry.mode, entry.probe_m) == (mode, probe_m) and metric in (None, entry.metric):
+                return entry
+        have = [f"{entry.mode} {entry.metric} m={entry.probe_m}" for entry in self.calibrations]
+        wanted = f"{mode} {metric or 'any metric'} with probe m = {probe_m}"
+        raise Uncalibrated(f"no calibration for {wanted}; calibrated are: {', '.join(have)}")
+
+    def public(self) -> dict[str, Json]:
+        """Everything but the cohort, as JSON values."""
+        return {
+            "contract_id": self.contract_id,
+            "binding": self.binding.to_json(),
+            "recorded": dict(self.recorded),
+            "calibrations": [entry.to_json() for entry in self.calibrations],
+            "default_level": self.default_level,
+            "photo_consistency": self.photo_consistency,
+            "template_foot_point_norm": list(self.template_foot_point_norm),
+            "cohort_size": len(self.cohort),
+            "cohort_id": self.cohort_id,
+        }
+
+    def save(self, path: Path | str, sealer: Sealer) -> None:
+        """Write the contract file atomically, readable by its owner only (mode 0600).
+
+        ``public()`` returns the same facts for readers who may not know the cohort.
+        """
+        document: dict[str, Json] = {"format": FORMAT, "version": VERSION, **self.public()}
+        tensors = {
+            "feet": np.ascontiguousarray(self.cohort.feet, dtype=np.float32),
+            "bases": np.ascontiguousarray(self.cohort.bases, dtype=np.float32),
+        }
+        sealed = sealer.seal(safetensors.numpy.save(tensors), context=_seal_context(document))
+        document["cohort"] = base64.b64encode(sealed).decode("ascii")
+        _write_private(Path(path), _render(document))
+
+    @classmethod
+    def load(cls, path: Path | str, sealer: Sealer) -> "Contract":
+        """Read a contract file, treating it as hostile.
+
+        Raises
+        ------
+        ContractError
+            Where the file is absent, too large, of another version, or breaks any rule.
+        SealError
+            Where the cohort does not open: another master key, or an edited file.
+        """
+        fields = Fields(
+            parse_object(_read_bounded(Path(path)), what="the contract file"), what="it"
+        )
+        if fields.text("format") != FORMAT or fields.integer("version") != VERSION:
+            raise ContractError(f"the file is not a {FORMAT} of version {VERSION}; recalibrate")
+        cohort_text = fields.take("cohort")
+        if not isinstance(cohort_text, str):
+            raise ContractError("the contract file's cohort is not base64 text")
+        document = {"format": FORMAT, "version": VERSION, **fields.remaining()}
+        binding = Binding.from_json(fields.take("binding"))
+        if fields.text("contract_id") != binding.contract_id:
+            raise ContractError("the contract_id is not the hash of the binding")
+        calibrations = tuple(
+            map(Calibration.from_json, fields.items("calibrations", most=MAX_CALIBRATIONS))
+        )
+        if not all(entry.calibration_id for entry in calibrations):
+            raise ContractError("a calibration has no calibration_id")
+        cohort = _open_cohort(cohort_text, sealer, document, binding)
+        contract = cls(
+            binding=binding,
+            recorded=fields.free("recorded"),
+            calibrations=calibrations,
+            default_level=fields.text("default_level"),
+            photo_consistency=fields.number("photo_consistency"),
+            template_foot_point_norm=norm_range(fields.take("template_foot_point_norm")),
+            cohort=cohort,
+        )
+        if fields.integer("cohort_size") != len(cohort):
+            raise ContractError("cohort_size is not the size of the cohort")
+        if fields.text("cohort_id") != contract.cohort_id:
+            raise ContractError("the cohort_id is not the hash of the cohort")
+        fields.done()
+        return contract
+
+
+def _seal_context(document: Mapping[str, object]) -> str:
+    """Context of the cohort's seal: the contract id and the digest of all that is not sealed."""
+    return f"contract-cohort:{document['contract_id']}:{digest(document)}"
+
+
+def _open_cohort(
+    text: str, sealer: Sealer, document: Mapping[str, object], binding: Binding
+) -> SubspaceBatch:
+    try:
+        sealed = base64.b64decode(text, validate=True)
+    except (binascii.Error, ValueError):
+        raise ContractError("the contract file's cohort is not base64 text") from None
+    try:
+        plain = sealer.open(sealed, context=_seal_context(document))
+    except SealError as error:
+        raise SealError(
+            "the contract's cohort does not open: the master key is not the one that sealed it, "
+            "or the file was edited; use the right key file, or run the calibration again"
+        ) from error
+    try:
+        tensors = safetensors.numpy.load(plain)
+    except (safetensors.SafetensorError, ValueError, KeyError):
+        raise ContractError("the contract's cohort is not a safetensors container") from None
+    if sorted(tensors) != ["bases", "feet"]:
+        raise ContractError("the contract's cohort does not hold exactly feet and bases")
+    feet, bases = tensors["feet"], tensors["bases"]
+    count = len(feet) if feet.ndim else 0
+    if feet.shape != (count, binding.n) or bases.shape != (count, binding.m, binding.n):
+        raise ContractError("the contract's cohort has shapes other than the binding's")
+    if feet.dtype != np.float32 or bases.dtype != np.float32:
+        raise ContractError("the contract's cohort is not float32")
+    return SubspaceBatch(feet=np.ascontiguousarray(feet), bases=np.ascontiguousarray(bases))
+
+
+def _read_bounded(path: Path) -> bytes:
+    try:
+        with path.open("rb") as file:
+            data = file.read(MAX_FILE_BYTES + 1)
+    except OSError as error:
+        raise ContractError(
+            f"the contract file cannot be read ({error.strerror}); `veilface calibrate` writes one"
+        ) from None
+    if len(data) > MAX_FILE_BYTES:
+        raise ContractError(f"the contract file is larger than {MAX_FILE_BYTES} bytes")
+    return data
+
+
+def _render(document: Mapping[str, Json]) -> bytes:
+    return json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False).encode("utf-8")
+
+
+def _write_private(path: Path, data: bytes) -> None:
+    """Write beside the target, flush to disk, then replace: a reader sees the old or the new."""
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}.part")
+    descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    try:
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
