@@ -1,0 +1,119 @@
+"""The byte form of decoy sources: safetensors with one canonical encoding, decoded strictly.
+
+A safetensors file may order its tensors, pad its header and carry foreign metadata as it likes.
+Here one content has one encoding, so that its hash can name it: the decoder re-encodes what it
+read and refuses anything that does not come out byte for byte the same.
+"""
+
+import json
+from collections.abc import Mapping
+
+import numpy as np
+import safetensors
+from numpy.typing import NDArray
+from safetensors.numpy import save
+
+from templates.errors import DecoyError
+
+METADATA_KEY = "veilface"
+# The writer keeps metadata in an unordered map: a second key would make the bytes vary by run.
+
+MAX_HEADER = 64 * 1024
+_LENGTH_BYTES = 8
+_DTYPES: Mapping[str, np.dtype] = {"F32": np.dtype("<f4"), "U8": np.dtype("u1")}
+_MAX_RANK = 3
+
+Fields = Mapping[str, str | int | list[str]]
+
+
+def encode(fields: Fields, tensors: Mapping[str, NDArray[np.generic]]) -> bytes:
+    """Encode named arrays and a few plain fields.
+
+    Parameters
+    ----------
+    fields
+        Plain values; ``fields["format"]`` names what the bytes are.
+    tensors
+        float32 or uint8 arrays of rank 1 to 3.
+
+    Returns
+    -------
+    bytes
+        A safetensors file; equal input gives equal bytes.
+    """
+    text = json.dumps(fields, sort_keys=True, separators=(",", ":"), ensure_ascii=True)
+    arrays = {name: np.ascontiguousarray(array) for name, array in tensors.items()}
+    return bytes(save(arrays, metadata={METADATA_KEY: text}))
+
+
+def decode(
+    data: bytes, *, what: str, max_bytes: int
+) -> tuple[dict[str, object], dict[str, NDArray[np.generic]]]:
+    """Decode bytes that may be hostile.
+
+    Parameters
+    ----------
+    data
+        The whole file.
+    what
+        Name of the thing for error messages, such as ``"decoy generator"``.
+    max_bytes
+        Largest accepted size.
+
+    Returns
+    -------
+    tuple
+        The fields and the arrays (read-only views of `data`), exactly as `encode` was given them.
+        The caller checks names, shapes and values.
+
+    Raises
+    ------
+    DecoyError
+        The bytes are not what `encode` writes.
+    """
+    if len(data) > max_bytes:
+        raise DecoyError(f"the {what} has {len(data)} bytes; at most {max_bytes} are accepted")
+    if len(data) < _LENGTH_BYTES:
+        raise DecoyError(f"the {what} is truncated: it has {len(data)} bytes")
+    header_size = int.from_bytes(data[:_LENGTH_BYTES], "little")
+    if header_size > min(MAX_HEADER, len(data) - _LENGTH_BYTES):
+        raise DecoyError(f"the {what} declares a header of {header_size} bytes, which cannot be")
+    try:
+        header = json.loads(data[_LENGTH_BYTES : _LENGTH_BYTES + header_size])
+        fields = json.loads(header.pop("__metadata__")[METADATA_KEY])
+        body = memoryview(data)[_LENGTH_BYTES + header_size :]
+        arrays = {str(name): _array(entry, body) for name, entry in header.items()}
+        canonical = isinstance(fields, dict) and encode(fields, arrays) == data
+    except (
+        ValueError,
+        KeyError,
+        TypeError,
+        AttributeError,
+        RecursionError,
+        OverflowError,
+        safetensors.SafetensorError,
+    ) as error:
+        # The parser's own words may quote the input, which may be a descriptor.
+        raise DecoyError(f"the {what} is not a valid safetensors file of this kind") from error
+    if not canonical:
+        raise DecoyError(f"the {what} is not in its canonical encoding; write it again")
+    return fields, arrays
+
+
+def _array(entry: dict[str, object], body: memoryview) -> NDArray[np.generic]:
+    """One tensor as a view of `body`; raises ValueError or KeyError when the entry is wrong."""
+    shape, offsets = entry["shape"], entry["data_offsets"]
+    dtype = _DTYPES[str(entry["dtype"])]
+    if not isinstance(shape, list) or not isinstance(offsets, list):
+        raise ValueError("lists expected")
+    if not 1 <= len(shape) <= _MAX_RANK or not all(
+        type(x) is int and 0 <= x <= len(body) for x in (*shape, *offsets)
+    ):
+        raise ValueError("plain non-negative integers within the file expected")
+    start, stop = offsets
+    count = 1
+    for size in shape:
+        count *= size
+    if stop - start != count * dtype.itemsize:
+        raise ValueError("offsets do not fit the shape")
+    return np.frombuffer(body[start:stop], dtype=dtype).reshape(shape)

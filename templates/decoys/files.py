@@ -1,0 +1,51 @@
+"""Reading and writing the files of decoy sources."""
+
+import os
+import tempfile
+from pathlib import Path
+
+from templates.errors import DecoyError
+
+
+def write_private(path: Path, data: bytes) -> None:
+    """Replace `path` at once by a file of mode 0600, so that a crash leaves the old or the new.
+
+    Raises
+    ------
+    DecoyError
+        The file cannot be written.
+    """
+    try:
+        handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            Path(temporary).replace(path)
+        except BaseException:
+            Path(temporary).unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        raise DecoyError(f"cannot write {path.name}: {error.strerror}") from error
+
+
+def read_bounded(path: Path, limit: int) -> bytes:
+    """Read a file of at most `limit` bytes.
+
+    Raises
+    ------
+    DecoyError
+        The file cannot be read or is larger.
+    """
+    try:
+        with path.open("rb") as file:
+            size = os.fstat(file.fileno()).st_size
+            if size > limit:
+                raise DecoyError(f"{path.name} has {size} bytes; at most {limit} are accepted")
+            data = file.read(limit + 1)
+    except OSError as error:
+        raise DecoyError(f"cannot read {path.name}: {error.strerror}") from error
+    if len(data) > limit:
+        raise DecoyError(f"{path.name} is larger than {limit} bytes")
+    return data

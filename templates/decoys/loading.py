@@ -1,0 +1,29 @@
+"""Opening a decoy file without being told what it holds."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from templates.decoys.generator import DecoyGenerator
+from templates.decoys.pool import POOL_MAGIC, DecoyPool
+from templates.errors import DecoyError
+
+if TYPE_CHECKING:
+    from templates.sealing import Sealer
+
+
+def load_source(path: Path, sealer: "Sealer") -> DecoyPool | DecoyGenerator:
+    """Load a sealed pool or a plain generator, told apart by the first bytes of the file.
+
+    Raises
+    ------
+    DecoyError
+        The file cannot be read, or is neither.
+    SealError
+        It is a pool that the sealer's key does not open.
+    """
+    try:
+        with path.open("rb") as file:
+            start = file.read(len(POOL_MAGIC))
+    except OSError as error:
+        raise DecoyError(f"cannot read {path.name}: {error.strerror}") from error
+    return DecoyPool.load(path, sealer) if start == POOL_MAGIC else DecoyGenerator.load(path)

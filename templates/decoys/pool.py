@@ -1,0 +1,267 @@
+"""Real descriptors as decoys: a secret of the deployment, kept sealed.
+
+Who holds the pool can strip its decoys from a template (METHOD §4.2), and the people in it are
+accepted by every template that uses them (METHOD §4.3). `DecoyGenerator` has neither fault; the
+pool exists for the paper's strategies, hybrid+ and sub-databases among them.
+"""
+
+import hashlib
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from templates.decoys import container
+from templates.decoys.files import read_bounded, write_private
+from templates.decoys.source import MAX_DIMENSION, Attributes
+from templates.errors import DecoyError
+from templates.randomness import Keystream
+
+if TYPE_CHECKING:
+    from templates.sealing import Sealer
+
+POOL_MAGIC = b"VEILFACE DECOY POOL 1\n"
+POOL_CONTEXT = "veilface decoy pool 1"
+MAX_POOL_BYTES = 2 * 1024**3
+MAX_ENTRIES = 1_000_000
+UNIT_TOLERANCE = 1e-3
+_FORMAT = "veilface decoy pool"
+_VERSION = 1
+_UNKNOWN = 255
+_MAX_LABEL = 64
+
+
+class DecoyPool:
+    """A database W of real descriptors, optionally labelled.
+
+    Parameters
+    ----------
+    descriptors
+        float32, shape (N, n), unit rows (tolerance 1e-3).
+    labels
+        One `Attributes` per row, or None. Needed for ``unlike``.
+
+    Raises
+    ------
+    DecoyError
+        Wrong shape, a row that is not a finite unit vector, or labels that do not fit.
+    """
+
+    def __init__(
+        self, descriptors: NDArray[np.floating], *, labels: Sequence[Attributes] | None = None
+    ) -> None:
+        array = np.array(descriptors, dtype="<f4", order="C", copy=True)
+        if array.ndim != 2 or not 1 <= array.shape[0] <= MAX_ENTRIES:
+            raise DecoyError(
+                f"a decoy pool needs descriptors of shape (N, n) with 1 ≤ N ≤ {MAX_ENTRIES}; "
+                f"seen {array.shape}"
+            )
+        if not 2 <= array.shape[1] <= MAX_DIMENSION:
+            raise DecoyError(f"descriptors must have 2 to {MAX_DIMENSION} numbers each")
+        norms = np.sqrt(np.einsum("ij,ij->i", array, array, dtype=np.float64))
+        wrong = int(np.count_nonzero(~(np.abs(norms - 1.0) <= UNIT_TOLERANCE)))
+        if wrong:
+            raise DecoyError(f"{wrong} of {len(array)} descriptors are not finite unit vectors")
+        if labels is not None and len(labels) != len(array):
+            raise DecoyError(f"{len(labels)} labels for {len(array)} descriptors")
+        array.flags.writeable = False
+        self._descriptors = array
+        self._labels = None if labels is None else tuple(labels)
+        self.n: int = array.shape[1]
+        self.source_id: str = hashlib.sha256(self._encode()).hexdigest()
+
+    def __len__(self) -> int:
+        return len(self._descriptors)
+
+    def __repr__(self) -> str:
+        labelled = "unlabelled" if self._labels is None else "labelled"
+        return f"DecoyPool({len(self)} {labelled} entries, n={self.n}, id {self.source_id[:12]})"
+
+    @property
+    def labelled(self) -> bool:
+        """Whether the entries have labels, as hybrid+ needs."""
+        return self._labels is not None
+
+    def draw(
+        self,
+        rows: int,
+        k: int,
+        *,
+        stream: Keystream,
+        unlike: Sequence[Attributes] | None = None,
+        sub_databases: int | None = None,
+    ) -> NDArray[np.float32]:
+        """Draw entries; see `DecoySource.draw`.
+
+        Raises
+        ------
+        DecoyError
+            Fewer than `k` entries qualify, the pool has no labels, or `unlike` and
+            `sub_databases` are asked for together (no strategy of METHOD §2 does).
+        """
+        if rows < 0 or k < 0:
+            raise DecoyError(f"rows and k must not be negative; seen {rows} and {k}")
+        if unlike is not None and sub_databases is not None:
+            raise DecoyError("choose either decoys unlike the subject or sub-databases, not both")
+        if unlike is not None:
+            chosen = self._choose_unlike(rows, k, unlike, stream)
+        elif sub_databases is not None:
+            chosen = self._choose_in_parts(rows, k, sub_databases, stream)
+        else:
+            self._require(len(self), k, "in the pool")
+            chosen = stream.choose(len(self), rows, k)
+        return self._descriptors[chosen].reshape(rows, k, self.n)
+
+    def parts(self, sub_databases: int) -> list[NDArray[np.int64]]:
+        """Split the pool into `sub_databases` disjoint parts whose sizes differ by one at most.
+
+        The split looks random, and is a function of the pool alone: entries are ordered by a
+        hash of the pool's id and their position, so two processes agree without a stored seed.
+
+        Returns
+        -------
+        list of int64 arrays
+            Entry numbers of each part; together every entry once.
+        """
+        if not 1 <= sub_databases <= len(self):
+            raise DecoyError(
+                f"a pool of {len(self)} entries cannot be split into {sub_databases} parts"
+            )
+        prefix = f"{self.source_id}|sub-databases|".encode()
+        keys = [hashlib.sha256(prefix + str(i).encode()).digest() for i in range(len(self))]
+        order = np.array(sorted(range(len(self)), key=keys.__getitem__), dtype=np.int64)
+        return list(np.array_split(order, sub_databases))
+
+    def _choose_in_parts(
+        self, rows: int, k: int, sub_databases: int, stream: Keystream
+    ) -> NDArray[np.int64]:
+        parts = self.parts(sub_databases)
+        self._require(min(map(len, parts)), k, f"in each of {sub_databases} sub-databases")
+        part_of_row = stream.choose(sub_databases, rows, 1).reshape(rows)
+        chosen = np.empty((rows, k), dtype=np.int64)
+        for number, part in enumerate(parts):
+            mine = np.flatnonzero(part_of_row == number)
+            if len(mine):
+                chosen[mine] = part[stream.choose(len(part), len(mine), k)]
+        return chosen
+
+    def _choose_unlike(
+        self, rows: int, k: int, unlike: Sequence[Attributes], stream: Keystream
+    ) -> NDArray[np.int64]:
+        if self._labels is None:
+            raise DecoyError(
+                "hybrid+ needs a decoy pool with gender and race labels; build the pool from a "
+                "folder with FairFace labels"
+            )
+        if len(unlike) != rows:
+            raise DecoyError(f"{len(unlike)} attributes for {rows} rows")
+        rows_of: defaultdict[Attributes, list[int]] = defaultdict(list)
+        for row, attributes in enumerate(unlike):
+            rows_of[attributes].append(row)
+        chosen = np.empty((rows, k), dtype=np.int64)
+        for attributes, mine in rows_of.items():
+            allowed = np.array(
+                [i for i, label in enumerate(self._labels) if _differs(label, attributes)],
+                dtype=np.int64,
+            )
+            self._require(len(allowed), k, "of another gender and race in the pool")
+            chosen[mine] = allowed[stream.choose(len(allowed), len(mine), k)]
+        return chosen
+
+    @staticmethod
+    def _require(available: int, k: int, where: str) -> None:
+        if available < k:
+            raise DecoyError(f"{k} decoys are needed, but only {available} entries are {where}")
+
+    def _encode(self) -> bytes:
+        labels = self._labels
+        if labels is None:
+            fields: container.Fields = {"format": _FORMAT, "version": _VERSION}
+            return container.encode(fields, {"descriptors": self._descriptors})
+        genders, gender_codes = _coded([label.gender for label in labels])
+        races, race_codes = _coded([label.race for label in labels])
+        return container.encode(
+            {"format": _FORMAT, "version": _VERSION, "genders": genders, "races": races},
+            {"descriptors": self._descriptors, "gender": gender_codes, "race": race_codes},
+        )
+
+    def save(self, path: Path, sealer: "Sealer") -> None:
+        """Write the pool, sealed, to a file that only its owner may read.
+
+        Raises
+        ------
+        DecoyError
+            The file cannot be written.
+        """
+        write_private(path, POOL_MAGIC + sealer.seal(self._encode(), context=POOL_CONTEXT))
+
+    @classmethod
+    def load(cls, path: Path, sealer: "Sealer") -> Self:
+        """Read what `save` wrote.
+
+        Raises
+        ------
+        DecoyError
+            The file cannot be read or is no decoy pool.
+        SealError
+            The sealer's key does not open it.
+        """
+        data = read_bounded(path, MAX_POOL_BYTES)
+        if not data.startswith(POOL_MAGIC):
+            raise DecoyError(f"{path.name} is not a decoy pool")
+        return cls._decode(sealer.open(data[len(POOL_MAGIC) :], context=POOL_CONTEXT))
+
+    @classmethod
+    def _decode(cls, data: bytes) -> Self:
+        fields, arrays = container.decode(data, what="decoy pool", max_bytes=MAX_POOL_BYTES)
+        if fields.get("format") != _FORMAT or fields.get("version") != _VERSION:
+            raise DecoyError(f"this is not a decoy pool of version {_VERSION}")
+        names = set(arrays)
+        if names == {"descriptors"} and set(fields) == {"format", "version"}:
+            return cls(arrays["descriptors"].astype(np.float32))
+        if names != {"descriptors", "gender", "race"} or set(fields) != {
+            "format",
+            "version",
+            "genders",
+            "races",
+        }:
+            raise DecoyError("the decoy pool has missing or unknown parts")
+        genders = _decoded(fields["genders"], arrays["gender"])
+        races = _decoded(fields["races"], arrays["race"])
+        if len(genders) != len(races):
+            raise DecoyError("the decoy pool has labels of different lengths")
+        labels = [Attributes(g, r) for g, r in zip(genders, races, strict=True)]
+        return cls(arrays["descriptors"].astype(np.float32), labels=labels)
+
+
+def _differs(label: Attributes, subject: Attributes) -> bool:
+    """Whether an entry is surely of another gender and race; an unlabelled entry is not."""
+    pairs = ((label.gender, subject.gender), (label.race, subject.race))
+    return all(theirs is None or (mine is not None and mine != theirs) for mine, theirs in pairs)
+
+
+def _coded(values: list[str | None]) -> tuple[list[str], NDArray[np.uint8]]:
+    """Distinct names in order, and per value its place among them (255 for None)."""
+    names = sorted({value for value in values if value is not None})
+    if len(names) >= _UNKNOWN or any(not 1 <= len(name) <= _MAX_LABEL for name in names):
+        raise DecoyError(
+            f"labels must be at most {_UNKNOWN - 1} distinct names of 1 to {_MAX_LABEL} letters"
+        )
+    place: dict[str | None, int] = {name: i for i, name in enumerate(names)}
+    place[None] = _UNKNOWN
+    return names, np.array([place[value] for value in values], dtype=np.uint8)
+
+
+def _decoded(names: object, codes: NDArray[np.generic]) -> list[str | None]:
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise DecoyError("the decoy pool has label names that are not text")
+    if codes.dtype != np.uint8 or codes.ndim != 1:
+        raise DecoyError("the decoy pool has labels of the wrong shape")
+    table: dict[int, str | None] = {**dict(enumerate(names[:_UNKNOWN])), _UNKNOWN: None}
+    try:
+        return [table[code] for code in codes.tolist()]
+    except KeyError:
+        raise DecoyError("the decoy pool has a label without a name") from None

@@ -1,0 +1,77 @@
+"""What lifting asks of a decoy source, whichever kind it is."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from templates.randomness import Keystream
+
+MAX_DIMENSION = 4096
+"""Largest descriptor dimension a source may have; the same bound as the wire format's."""
+
+
+@dataclass(frozen=True)
+class Attributes:
+    """Labels of a person or of a pool entry, as FairFace names them.
+
+    Attributes
+    ----------
+    gender, race
+        The label, or None where it is not known or must not matter.
+    """
+
+    gender: str | None = None
+    race: str | None = None
+
+
+@runtime_checkable
+class DecoySource(Protocol):
+    """Where the decoys of a template come from.
+
+    Attributes
+    ----------
+    source_id
+        SHA-256, in hex, of the canonical content. Part of the contract.
+    n
+        Dimension of the descriptors.
+    """
+
+    source_id: str
+    n: int
+
+    def draw(
+        self,
+        rows: int,
+        k: int,
+        *,
+        stream: Keystream,
+        unlike: Sequence[Attributes] | None = None,
+        sub_databases: int | None = None,
+    ) -> NDArray[np.float32]:
+        """Draw ``k`` decoys for each of ``rows`` templates.
+
+        Parameters
+        ----------
+        rows, k
+            Number of templates, and of decoys in each.
+        stream
+            The only source of randomness.
+        unlike
+            One entry per row: that row's decoys differ from it in gender and in race (hybrid+).
+        sub_databases
+            Number S of disjoint parts; all decoys of a row come from one part, chosen at random.
+
+        Returns
+        -------
+        float32, shape (rows, k, n)
+            Unit rows, C-contiguous; no decoy twice inside one row.
+
+        Raises
+        ------
+        DecoyError
+            The source cannot meet the request.
+        """
+        ...
