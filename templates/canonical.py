@@ -13,7 +13,7 @@ from typing import TypeAlias
 
 from templates.errors import ContractError
 
-Json: TypeAlias = "None | bool | int | float | str | list[Json] | dict[str, Json]"
+Json: TypeAlias = "bool | int | float | str | list[Json] | dict[str, Json] | None"
 
 MAX_DEPTH = 12
 FREE_DEPTH = 4  # of an object of free content, which sits some levels down in its document

@@ -1,4 +1,4 @@
-"""What a calibration found: rates with their counts, security levels, and the calibration itself."""
+"""What a calibration found: rates with their counts, levels, and the calibration itself."""
 
 import re
 from collections.abc import Mapping
@@ -210,7 +210,7 @@ class Calibration:
         )
 
     def identified(self, *, contract_id: str, cohort_id: str) -> "Calibration":
-        """Same calibration with its id computed for one contract and one cohort."""
+        """Compute the id for one contract and one cohort."""
         body: dict[str, Json] = self.to_json()
         del body["calibration_id"]
         bound = {"calibration": body, "contract_id": contract_id, "cohort_id": cohort_id}

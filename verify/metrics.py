@@ -1,0 +1,218 @@
+"""Error rates on similarities, with counts and intervals (terms of ISO/IEC 19795-1).
+
+A comparison is a match where its similarity is at or above the threshold. All thresholds and
+comparisons are float64: a Python float against a float32 array would be rounded first, and the
+rounding can move a score across its own threshold.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import ndtri
+
+from templates.contract import Rate
+
+FloatArray = NDArray[np.float64]
+
+RULE_OF_THREE = 3.0
+"""With no error in N independent trials, the 95 % upper bound of the rate is 3 / N."""
+
+
+def wilson(errors: int, trials: int, *, confidence: float = 0.95) -> tuple[float, float]:
+    """Wilson score interval of a proportion.
+
+    Returns
+    -------
+    tuple of float
+        Lower and upper bound; (0, 1) where there are no trials.
+
+    References
+    ----------
+    E. B. Wilson, "Probable inference, the law of succession, and statistical inference",
+    JASA 22 (1927).
+    """
+    if trials == 0:
+        return 0.0, 1.0
+    z = float(ndtri(0.5 + confidence / 2))
+    p = errors / trials
+    centre = p + z * z / (2 * trials)
+    spread = z * math.sqrt(p * (1 - p) / trials + (z / (2 * trials)) ** 2)
+    scale = 1 + z * z / trials
+    # At 0 and at all errors the bound is exactly the rate; rounding must not cross it.
+    low = 0.0 if errors == 0 else max(0.0, (centre - spread) / scale)
+    high = 1.0 if errors == trials else min(1.0, (centre + spread) / scale)
+    return low, high
+
+
+def rate(errors: int, trials: int) -> Rate:
+    """Rate with its Wilson interval, for trials that are independent."""
+    low, high = wilson(errors, trials)
+    return Rate(errors=errors, trials=trials, ci_low=low, ci_high=high)
+
+
+def false_match_rate(impostor: ArrayLike, threshold: float) -> Rate:
+    """Share of impostor similarities at or above the threshold."""
+    scores = np.asarray(impostor, dtype=np.float64)
+    return rate(int(np.count_nonzero(scores >= threshold)), scores.size)
+
+
+def false_non_match_rate(genuine: ArrayLike, threshold: float) -> Rate:
+    """Share of genuine similarities below the threshold."""
+    scores = np.asarray(genuine, dtype=np.float64)
+    return rate(int(np.count_nonzero(scores < threshold)), scores.size)
+
+
+def most_errors(target: float, trials: int) -> int:
+    """Largest count whose rate is at most the target, free of rounding in ``target * trials``."""
+    count = math.floor(target * trials)
+    while (count + 1) / trials <= target:
+        count += 1
+    while count > 0 and count / trials > target:
+        count -= 1
+    return count
+
+
+def threshold_at_fmr(impostor: ArrayLike, target: float) -> float:
+    """Lowest threshold whose FMR on these impostors is at most the target, never the nearest.
+
+    The threshold lies halfway between the last similarity that it accepts and the first that it
+    rejects; above all of them where the target allows no error.
+
+    Raises
+    ------
+    ValueError
+        Without impostors, or with a target outside [0, 1].
+    """
+    scores = np.sort(np.asarray(impostor, dtype=np.float64).ravel())[::-1]
+    if scores.size == 0 or not 0.0 <= target <= 1.0:
+        raise ValueError("a threshold needs impostor trials and a target in [0, 1]")
+    allowed = most_errors(target, scores.size)
+    if allowed == scores.size:
+        return float(scores[-1])
+    first_rejected = scores[allowed]
+    above = scores[scores > first_rejected]
+    if above.size == 0:
+        return float(np.nextafter(first_rejected, np.inf))
+    return between(first_rejected, above[-1])
+
+
+def between(rejected: float, accepted: float) -> float:
+    """Threshold halfway between two similarities, which rejects the lower and accepts the upper."""
+    middle = float(rejected) + (float(accepted) - float(rejected)) / 2
+    return middle if middle > rejected else float(accepted)
+
+
+def fnmr_at_fmr(genuine: ArrayLike, impostor: ArrayLike, target: float) -> tuple[float, Rate]:
+    """Threshold at FMR ≤ target, and the FNMR there.
+
+    Raises
+    ------
+    ValueError
+        Where the impostor trials cannot resolve the target (``resolvable``).
+    """
+    trials = np.asarray(impostor).size
+    if not resolvable(target, trials):
+        raise ValueError(
+            f"{trials} impostor trials cannot resolve FMR {target:g}: with no error at all their "
+            f"95 % upper bound is {RULE_OF_THREE / max(trials, 1):.2g}; add trials"
+        )
+    threshold = threshold_at_fmr(impostor, target)
+    return threshold, false_non_match_rate(genuine, threshold)
+
+
+def resolvable(target: float, trials: int, *, expected_errors: float = RULE_OF_THREE) -> bool:
+    """Whether ``trials`` can speak about a rate of ``target``: at least 3 errors expected.
+
+    Ask for more expected errors where a threshold is *set* on the data: at k errors the relative
+    standard error of the rate beyond the threshold is about 1/√k.
+    """
+    # The tolerance keeps 3,000 trials able to resolve 1e-3, as 1e-3 * 3000 rounds below 3.
+    return target * trials >= expected_errors * (1 - 1e-9)
+
+
+@dataclass(frozen=True)
+class ErrorCurve:
+    """FMR and FNMR at every threshold that changes either (the DET curve's points).
+
+    Parameters
+    ----------
+    thresholds, fmr, fnmr
+        Float64 arrays of equal length; thresholds ascend, FMR falls, FNMR rises.
+    """
+
+    thresholds: FloatArray
+    fmr: FloatArray
+    fnmr: FloatArray
+
+
+def error_curve(genuine: ArrayLike, impostor: ArrayLike) -> ErrorCurve:
+    """Count both errors at every observed similarity and above the largest."""
+    mated = np.sort(np.asarray(genuine, dtype=np.float64).ravel())
+    non_mated = np.sort(np.asarray(impostor, dtype=np.float64).ravel())
+    if mated.size == 0 or non_mated.size == 0:
+        raise ValueError("an error curve needs genuine and impostor trials")
+    observed = np.unique(np.concatenate([mated, non_mated]))
+    thresholds = np.append(observed, np.nextafter(observed[-1], np.inf))
+    fmr = 1.0 - np.searchsorted(non_mated, thresholds, side="left") / non_mated.size
+    fnmr = np.searchsorted(mated, thresholds, side="left") / mated.size
+    return ErrorCurve(thresholds=thresholds, fmr=fmr, fnmr=fnmr)
+
+
+def equal_error_rate(genuine: ArrayLike, impostor: ArrayLike) -> tuple[float, float]:
+    """EER and its threshold: the mean of FMR and FNMR where they are nearest to each other."""
+    curve = error_curve(genuine, impostor)
+    nearest = int(np.argmin(np.abs(curve.fmr - curve.fnmr)))
+    return float(curve.fmr[nearest] + curve.fnmr[nearest]) / 2, float(curve.thresholds[nearest])
+
+
+def subject_bootstrap(
+    errors: NDArray[np.integer],
+    *,
+    people: int,
+    trials: int,
+    weighted_trials: Callable[[FloatArray], float],
+    replicates: int = 1000,
+    seed: int = 0,
+) -> Rate:
+    """Rate with an interval that resamples people, since trials share them.
+
+    A replicate draws ``people`` people with replacement; a person drawn w times weighs w. A trial
+    between people a ≠ b weighs w_a w_b, a trial within one person w_a. The percentile interval
+    of the replicates is widened to the Wilson interval where it is narrower: with few errors, or
+    none, resampling what was seen knows nothing of what was not.
+
+    Parameters
+    ----------
+    errors : (E, 2) integers
+        The two people of every trial that went wrong.
+    people
+        Number of people; the indices in ``errors`` are below it.
+    trials
+        Number of trials.
+    weighted_trials
+        Total weight of all trials under the (people,) weights of one replicate.
+    """
+    count = len(errors)
+    low, high = wilson(count, trials)
+    if count:
+        keys, repeats = np.unique(
+            errors[:, 0].astype(np.int64) * people + errors[:, 1], return_counts=True
+        )
+        first, second = np.divmod(keys, people)
+        within = first == second
+        generator = np.random.default_rng(seed)
+        rates = []
+        for _ in range(replicates):
+            drawn = generator.integers(people, size=people)
+            weights = np.bincount(drawn, minlength=people).astype(np.float64)
+            total = weighted_trials(weights)
+            if total > 0:
+                other = np.where(within, 1.0, weights[second])
+                rates.append(float(np.sum(repeats * weights[first] * other)) / total)
+        if rates:
+            lower, upper = np.percentile(np.clip(rates, 0.0, 1.0), [2.5, 97.5])
+            low, high = min(low, float(lower)), max(high, float(upper))
+    return Rate(errors=count, trials=trials, ci_low=low, ci_high=high, interval="subject-bootstrap")
