@@ -1,0 +1,103 @@
+"""Limits before allocation: how much of a body is read, for how long, and what waits for a turn."""
+
+from collections.abc import AsyncGenerator, AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from typing import TypeVar
+
+import anyio
+import anyio.to_thread
+from starlette.requests import Request
+
+from api.errors import ApiError
+
+MAX_JSON_BYTES = 4 * 1024 * 1024
+"""Largest JSON body. The largest template that the wire format admits, in base64, fits."""
+
+RETRY_AFTER_S = 1
+
+T = TypeVar("T")
+
+
+async def stream_limited(request: Request, limit: int) -> AsyncGenerator[bytes, None]:
+    """Yield the body, and stop as soon as it is known to be larger than ``limit`` bytes.
+
+    Both the declared and the real length count: a chunked body declares none, and a declared one
+    may lie.
+
+    Raises
+    ------
+    ApiError
+        ``request_too_large``.
+    """
+    too_large = ApiError(
+        "request_too_large",
+        f"the request body is larger than {limit} bytes",
+        {"limit_bytes": limit},
+        {"Connection": "close"},
+    )
+    declared = request.headers.get("content-length")
+    # A length of twenty digits is refused without converting it.
+    if declared is not None and (len(declared) > 18 or int(declared) > limit):
+        raise too_large
+    seen = 0
+    async for chunk in request.stream():
+        seen += len(chunk)
+        if seen > limit:
+            raise too_large
+        yield chunk
+
+
+async def read_limited(request: Request, limit: int) -> bytes:
+    """Read the whole body into memory, at most ``limit`` bytes of it."""
+    body = bytearray()
+    async for chunk in stream_limited(request, limit):
+        body += chunk
+    return bytes(body)
+
+
+class Gate:
+    """Lets a bounded number of requests into one worker, and fewer of them compute at a time.
+
+    Parameters
+    ----------
+    slots : int
+        Requests that may compute at the same time.
+    waiting : int
+        Requests that may be inside and not compute: they send their body, or wait for a slot.
+        Their bodies are what bounds the worker's memory.
+    """
+
+    def __init__(self, *, slots: int, waiting: int) -> None:
+        self._slots = anyio.CapacityLimiter(slots)
+        self._queries = anyio.CapacityLimiter(max(4, 2 * slots))
+        self._room = slots + waiting
+
+    @asynccontextmanager
+    async def admitted(self) -> AsyncIterator[None]:
+        """Hold a place from before the body is read until the answer is known.
+
+        Raises
+        ------
+        ApiError
+            ``overloaded``, with ``Retry-After``.
+        """
+        if self._room <= 0:
+            raise ApiError(
+                "overloaded",
+                "too many requests wait already; try again shortly",
+                {},
+                {"Retry-After": str(RETRY_AFTER_S)},
+            )
+        self._room -= 1
+        try:
+            yield
+        finally:
+            self._room += 1
+
+    async def compute(self, work: Callable[[], T]) -> T:
+        """Run ``work`` in a thread, once a slot is free."""
+        return await anyio.to_thread.run_sync(work, limiter=self._slots)
+
+    async def query(self, work: Callable[[], T]) -> T:
+        """Run ``work``, which asks the database and computes little, in a thread."""
+        return await anyio.to_thread.run_sync(work, limiter=self._queries)
