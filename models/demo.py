@@ -1,0 +1,208 @@
+"""The demo model: a face descriptor without training, built here as an ONNX graph.
+
+It lets ``veilface demo`` and the tests run the whole service on a clone that has no weights. It
+looks at the direction of edges around each place of the picture (a histogram of oriented
+gradients, made independent of the light by the contrast around the place), takes off what a drawn
+face has on average, and projects the rest with fixed random signs to 256 numbers. No weight is
+learnt, and nothing has seen a real face.
+
+**Demo model: not for authentication.** On photos of real people it is little more than a
+comparison of pictures.
+"""
+
+import hashlib
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime as ort
+from numpy.typing import NDArray
+from onnx import ModelProto, NodeProto, TensorProto, helper, numpy_helper
+
+from models.synthetic import draw_people
+
+DEMO_NOTICE = "demo model: not for authentication"
+DEMO_DIMENSION = 256
+DEMO_FILE = "demo.onnx"
+
+_SIDE = 112
+_DIRECTIONS = 8
+_SIGMA = 1.2  # width of the edge filters in pixels
+_REACH = 4
+_CELL = 8  # an edge counts for all cells of 8 x 8 pixels that hold it; cells start every 4 pixels
+_STRIDE = 4
+_CELLS = (_SIDE - _CELL) // _STRIDE + 1
+_FLAT = 9e-4  # squared contrast below which a cell is sensor noise: (0.03)^2 on a scale of -1 to 1
+_CENTRE = (56.0, 62.0)  # of the window that keeps background and most hair out
+_WINDOW = (30.0, 42.0)
+_AVERAGED = range(10_000_000, 10_000_096)  # people whom no demo and no test enrolls
+_GRID = 1 / 4096  # constants are rounded to it, so that no bit depends on a machine's libm
+_OPSET = 17
+_IR_VERSION = 8
+
+
+def build_demo_pack(folder: Path) -> Path:
+    """Write the demo model into ``folder`` as a pack without a detector.
+
+    The pack takes aligned 112 x 112 faces (:func:`models.synthetic.draw_face` draws them) with
+    the usual ArcFace preprocessing.
+
+    Parameters
+    ----------
+    folder : Path
+        Made when it is missing. ``demo.onnx`` in it is replaced.
+
+    Returns
+    -------
+    Path
+        ``folder``, to be given to ``ModelPack.load``.
+
+    Raises
+    ------
+    OSError
+        The folder cannot be written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / DEMO_FILE).write_bytes(demo_model_bytes())
+    return folder
+
+
+@cache
+def demo_model_bytes() -> bytes:
+    """Build the ONNX file: the same bytes each time, since its SHA-256 stands in contracts."""
+    model = _model(_features(), "features", dimension=None, constants=_feature_constants())
+    mean = _average_features(model.SerializeToString())
+    constants = {
+        **_feature_constants(),
+        "average": np.asarray(-mean, np.float32),
+        "window": _window(),
+        "signs": _signs(_DIRECTIONS * _CELLS * _CELLS, DEMO_DIMENSION),
+        "scale": np.asarray(1 / 64, np.float32),
+    }
+    final = _model(
+        [*_features(), *_projection()], "embedding", dimension=DEMO_DIMENSION, constants=constants
+    )
+    onnx.checker.check_model(final, full_check=True)
+    return bytes(final.SerializeToString())
+
+
+@cache
+def demo_model_sha256() -> str:
+    """SHA-256 of :func:`demo_model_bytes` in hexadecimal."""
+    return hashlib.sha256(demo_model_bytes()).hexdigest()
+
+
+def is_demo_model(sha256: str) -> bool:
+    """Whether an embedder's fingerprint is the demo model's: then show ``DEMO_NOTICE``."""
+    return sha256.lower() == demo_model_sha256()
+
+
+def _features() -> list[NodeProto]:
+    """Edges by direction and cell, relative to the contrast around: (N, 8, 27, 27).
+
+    The first eight nodes hold no subtraction: a pack loader must not take the division by the
+    contrast for an input normalisation inside the graph.
+    """
+    make = helper.make_node
+    return [
+        make("Conv", ["image", "edges"], ["slopes"], pads=[_REACH] * 4),
+        make("Relu", ["slopes"], ["rising"]),
+        make("AveragePool", ["rising"], ["cells"], kernel_shape=[_CELL] * 2, strides=[_STRIDE] * 2),
+        make("ReduceSumSquare", ["cells"], ["energy"], axes=[1], keepdims=1),
+        make("AveragePool", ["energy"], ["around"], kernel_shape=[3, 3], pads=[1] * 4),
+        make("Add", ["around", "flat"], ["floored"]),
+        make("Sqrt", ["floored"], ["contrast"]),
+        make("Div", ["cells", "contrast"], ["features"]),
+    ]
+
+
+def _projection() -> list[NodeProto]:
+    """Damp what differs from the average face, weigh it by the window and project it."""
+    make = helper.make_node
+    return [
+        make("Add", ["features", "average"], ["difference"]),
+        make("Abs", ["difference"], ["size"]),
+        make("Sqrt", ["size"], ["root"]),
+        make("Sign", ["difference"], ["sign"]),
+        make("Mul", ["root", "sign"], ["damped"]),
+        make("Mul", ["damped", "window"], ["seen"]),
+        make("Flatten", ["seen"], ["flattened"], axis=1),
+        make("Cast", ["signs"], ["directions"], to=TensorProto.FLOAT),
+        make("MatMul", ["flattened", "directions"], ["projected"]),
+        make("Mul", ["projected", "scale"], ["embedding"]),
+    ]
+
+
+def _feature_constants() -> dict[str, NDArray[np.generic]]:
+    reach = np.arange(-_REACH, _REACH + 1, dtype=np.float64)
+    y, x = np.meshgrid(reach, reach, indexing="ij")
+    bell = np.exp(-(x**2 + y**2) / (2 * _SIGMA**2))
+    angles = 2 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
+    slopes = (np.cos(angles)[:, None, None] * x + np.sin(angles)[:, None, None] * y) * bell
+    slopes /= np.abs(slopes).sum(axis=(1, 2), keepdims=True)
+    luminance = np.array([0.299, 0.587, 0.114])
+    edges = slopes[:, None] * luminance[None, :, None, None]
+    return {"edges": _rounded(edges), "flat": np.asarray([_FLAT], np.float32)}
+
+
+def _average_features(model: bytes) -> NDArray[np.float64]:
+    """Mean features of drawn people: (8, 27, 27), rounded so that its last bits are stable."""
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = 1  # the order of a sum must not depend on the number of cores
+    session = ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+    faces = draw_people(_AVERAGED, range(1), size=_SIDE)
+    total = np.zeros((_DIRECTIONS, _CELLS, _CELLS))
+    for face in faces:
+        image = ((face.astype(np.float32) - 127.5) / 127.5).transpose(2, 0, 1)[None]
+        total += session.run(None, {"image": np.ascontiguousarray(image)})[0][0]
+    return np.asarray(np.round(total / len(faces) * 64) / 64)
+
+
+def _window() -> NDArray[np.float32]:
+    """Weight of each cell, (27, 27): 1 on the face, falling fast beyond it."""
+    middle = _CELL / 2 + _STRIDE * np.arange(_CELLS)
+    across = np.abs((middle - _CENTRE[0]) / _WINDOW[0]) ** 4
+    down = np.abs((middle - _CENTRE[1]) / _WINDOW[1]) ** 4
+    return _rounded(np.sqrt(np.exp(-(across[None, :] + down[:, None]))))
+
+
+def _signs(rows: int, columns: int) -> NDArray[np.int8]:
+    """Signs from SHAKE-256: an almost orthogonal projection that anyone can recompute."""
+    stream = hashlib.shake_256(b"veilface demo projection 1").digest((rows * columns + 7) // 8)
+    bits = np.unpackbits(np.frombuffer(stream, np.uint8))[: rows * columns]
+    return (bits.reshape(rows, columns).astype(np.int8) * 2 - 1).astype(np.int8)
+
+
+def _rounded(values: NDArray[np.float64]) -> NDArray[np.float32]:
+    return np.asarray(np.round(values / _GRID) * _GRID, np.float32)
+
+
+def _model(
+    nodes: list[NodeProto],
+    output: str,
+    *,
+    dimension: int | None,
+    constants: Mapping[str, NDArray[np.generic]],
+) -> ModelProto:
+    shape: list[str | int | None] = (
+        ["N", _DIRECTIONS, _CELLS, _CELLS] if dimension is None else ["N", dimension]
+    )
+    graph = helper.make_graph(
+        nodes,
+        "veilface-demo",
+        [helper.make_tensor_value_info("image", TensorProto.FLOAT, ["N", 3, _SIDE, _SIDE])],
+        [helper.make_tensor_value_info(output, TensorProto.FLOAT, shape)],
+        [numpy_helper.from_array(np.ascontiguousarray(a), name) for name, a in constants.items()],
+    )
+    model = helper.make_model(
+        graph,
+        ir_version=_IR_VERSION,
+        opset_imports=[helper.make_opsetid("", _OPSET)],
+        producer_name="veilface",
+        producer_version="1",
+        doc_string=DEMO_NOTICE,
+    )
+    helper.set_model_props(model, {"notice": DEMO_NOTICE})
+    return model

@@ -1,0 +1,137 @@
+import hashlib
+import subprocess
+import sys
+
+import numpy as np
+import onnx
+import onnxruntime as ort
+import pytest
+from scipy.ndimage import correlate
+
+from models.demo import (
+    DEMO_DIMENSION,
+    DEMO_NOTICE,
+    build_demo_pack,
+    demo_model_bytes,
+    demo_model_sha256,
+    is_demo_model,
+)
+from models.synthetic import draw_face, draw_people
+
+PEOPLE, PHOTOS = 200, 4
+
+
+def normalised(faces: np.ndarray) -> np.ndarray:
+    values = (faces.astype(np.float32) - 127.5) / 127.5
+    return np.ascontiguousarray(values.transpose(0, 3, 1, 2))
+
+
+@pytest.fixture(scope="module")
+def session() -> ort.InferenceSession:
+    return ort.InferenceSession(demo_model_bytes(), providers=["CPUExecutionProvider"])
+
+
+@pytest.fixture(scope="module")
+def descriptors(session) -> np.ndarray:
+    faces = draw_people(range(PEOPLE), range(PHOTOS))
+    raw = session.run(None, {"image": normalised(faces)})[0]
+    return (raw / np.linalg.norm(raw, axis=1, keepdims=True)).reshape(PEOPLE, PHOTOS, -1)
+
+
+def scores(descriptors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    genuine, impostor = [], []
+    for i in range(PEOPLE):
+        for a in range(PHOTOS):
+            genuine += [descriptors[i, a] @ descriptors[i, b] for b in range(a)]
+        impostor.append((descriptors[i] @ descriptors[:i].reshape(-1, DEMO_DIMENSION).T).ravel())
+    return np.asarray(genuine), np.concatenate(impostor)
+
+
+def test_the_signature_routes_as_an_embedder():
+    graph = onnx.load_from_string(demo_model_bytes()).graph
+    (given,) = graph.input
+    (made,) = graph.output
+    assert [d.dim_value for d in given.type.tensor_type.shape.dim][1:] == [3, 112, 112]
+    assert [d.dim_value for d in made.type.tensor_type.shape.dim][1:] == [DEMO_DIMENSION]
+    # FORMATS: subtraction and scaling together in the first eight nodes would mean 0..255 input.
+    assert "Sub" not in [node.op_type for node in graph.node[:8]]
+
+
+def test_the_file_is_the_same_in_another_process():
+    program = "from models.demo import demo_model_sha256; print(demo_model_sha256())"
+    seen = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    ).stdout.strip()
+    assert seen == hashlib.sha256(demo_model_bytes()).hexdigest() == demo_model_sha256()
+
+
+def test_the_pack_says_what_it_is(tmp_path):
+    folder = build_demo_pack(tmp_path / "new" / "pack")
+    assert [f.name for f in folder.iterdir()] == ["demo.onnx"]
+    written = (folder / "demo.onnx").read_bytes()
+    assert onnx.load_from_string(written).doc_string == DEMO_NOTICE
+    assert is_demo_model(hashlib.sha256(written).hexdigest())
+    assert not is_demo_model(hashlib.sha256(b"another model").hexdigest())
+
+
+def test_features_agree_with_scipy(session):
+    """The edge features before the projection, recomputed in float64 for one cell."""
+    model = onnx.load_from_string(demo_model_bytes())
+    model.graph.output.append(
+        onnx.helper.make_tensor_value_info("features", onnx.TensorProto.FLOAT, None)
+    )
+    both = ort.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+    image = normalised(draw_face(1, 1)[None])
+    features = both.run(["features"], {"image": image})[0][0]
+
+    luminance = np.tensordot([0.299, 0.587, 0.114], image[0].astype(np.float64), axes=1)
+    y, x = np.mgrid[-4:5, -4:5].astype(np.float64)
+    cells = np.zeros((8, 27, 27))
+    for k in range(8):
+        angle = 2 * np.pi * k / 8
+        kernel = (np.cos(angle) * x + np.sin(angle) * y) * np.exp(-(x**2 + y**2) / (2 * 1.2**2))
+        rising = np.maximum(correlate(luminance, kernel / np.abs(kernel).sum(), mode="constant"), 0)
+        for i in range(27):
+            for j in range(27):
+                cells[k, i, j] = rising[4 * i : 4 * i + 8, 4 * j : 4 * j + 8].mean()
+    energy = (cells**2).sum(axis=0)
+    around = energy[12:15, 12:15].mean()
+    expected = cells[:, 13, 13] / np.sqrt(around + 0.03**2)
+    assert np.allclose(features[:, 13, 13], expected, atol=5e-3)
+
+
+def test_raw_descriptors_separate_synthetic_people(descriptors):
+    genuine, impostor = scores(descriptors)
+    for target, worst in ((1e-2, 0.02), (1e-3, 0.05)):
+        threshold = np.quantile(impostor, 1 - target)
+        assert (genuine < threshold).mean() <= worst
+    assert abs(impostor.mean()) < 0.1
+
+
+def test_adversarially_lifted_descriptors_still_separate(descriptors):
+    """METHOD §3 spherical point-to-subspace, m = 8, decoys from people who take no other part."""
+    m = 8
+    decoys, people = descriptors[:100, 0], descriptors[100:]
+    rng = np.random.default_rng(5)
+    genuine, impostor = [], []
+    for i, person in enumerate(people):
+        enrolled = person[:3].mean(axis=0)
+        enrolled = enrolled / np.linalg.norm(enrolled)
+        chosen = decoys[rng.choice(len(decoys), m, replace=False)]
+        basis = np.linalg.qr((chosen - enrolled).T)[0].T
+        foot = enrolled - basis.T @ (basis @ enrolled)
+        radius = np.sqrt(1 - foot @ foot)
+        probes = people[:, 3]
+        similarity = probes @ foot + radius * np.linalg.norm(probes @ basis.T, axis=1)
+        genuine.append(similarity[i])
+        impostor += list(np.delete(similarity, i))
+    threshold = np.quantile(impostor, 0.99)
+    assert np.mean(np.asarray(genuine) < threshold) <= 0.05
+
+
+def test_the_descriptor_ignores_the_light(session):
+    face = draw_face(8, 0).astype(np.float32)
+    darker = np.clip(face * 0.7 + 10, 0, 255)
+    pair = session.run(None, {"image": normalised(np.stack([face, darker]))})[0]
+    cosine = pair[0] @ pair[1] / np.linalg.norm(pair[0]) / np.linalg.norm(pair[1])
+    assert cosine > 0.9
