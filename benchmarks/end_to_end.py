@@ -1,0 +1,457 @@
+"""FNMR and FMR of the running service on real photos, beside raw embeddings on the same attempts.
+
+Builds the decoys and the contract with the command line, starts ``veilface serve`` with two
+workers, enrolls photos 1-3 of every person over HTTP, then verifies photos 4-5 against the person
+(genuine) and against other people (impostor). An enrollment that is refused counts as failed
+genuine attempts. Every answer that is not a decision is counted by its status.
+
+Example
+-------
+::
+
+    python -m benchmarks.end_to_end --data ../shared/data --dim 16 --database sqlite
+"""
+
+import argparse
+import base64
+import csv
+import json
+import os
+import secrets
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import httpx
+import numpy as np
+import numpy.typing as npt
+from sqlalchemy import create_engine, text
+from sqlalchemy.engine import make_url
+
+from models.extraction import Extractor
+from models.pack import FacePolicy, ModelPack
+from templates.decoys import DecoyGenerator
+from templates.lifting import Strategy, lift
+from templates.wire import encode
+from verify.datasets import labelled_folder
+from verify.metrics import wilson
+
+VEILFACE = Path(sys.executable).with_name("veilface")
+PHOTOS_ENROLLED = 3
+DEFAULT_POSTGRES = "postgresql://postgres@127.0.0.1:5432/postgres"
+
+
+@dataclass(frozen=True)
+class Person:
+    """A person of the folder, with the photos of enrollment and the probes."""
+
+    name: str
+    enroll: list[Path]
+    probes: list[Path]
+
+
+@dataclass
+class Outcome:
+    """Counts of one run; rates come with 95 % Wilson intervals."""
+
+    genuine_rejected: int = 0
+    genuine: int = 0
+    impostor_accepted: int = 0
+    impostor: int = 0
+    refused_enrollments: dict[str, str] = field(default_factory=dict)
+    other_answers: Counter[str] = field(default_factory=Counter)
+
+    def summary(self) -> dict[str, object]:
+        """Counts, rates and intervals, as they are reported."""
+        return {
+            "fnmr": rate(self.genuine_rejected, self.genuine),
+            "fmr": rate(self.impostor_accepted, self.impostor),
+            "refused_enrollments": self.refused_enrollments,
+            "answers_that_are_no_decision": dict(self.other_answers),
+        }
+
+
+def rate(errors: int, trials: int) -> dict[str, object]:
+    """``errors / trials`` with its counts and 95 % Wilson interval."""
+    low, high = wilson(errors, trials)
+    return {
+        "errors": errors,
+        "trials": trials,
+        "percent": round(100 * errors / trials, 3),
+        "ci95_percent": [round(100 * low, 3), round(100 * high, 3)],
+    }
+
+
+def people_of(folder: Path) -> list[Person]:
+    """People of ``folder/Name/*.jpg`` with at least one photo beyond those enrolled."""
+    found = []
+    for person in sorted(p for p in folder.iterdir() if p.is_dir()):
+        photos = sorted(person.glob("*.jpg"))
+        if len(photos) > PHOTOS_ENROLLED:
+            found.append(Person(person.name, photos[:PHOTOS_ENROLLED], photos[PHOTOS_ENROLLED:]))
+    return found
+
+
+def impostor_attempts(people: Sequence[Person], each: int) -> Iterator[tuple[Person, Path]]:
+    """``each`` other people, evenly spread over the list, for every probe photo."""
+    count = len(people)
+    steps = np.unique(np.linspace(1, count - 1, each).astype(int))
+    for position, person in enumerate(people):
+        for probe in person.probes:
+            for step in steps:
+                yield people[(position + int(step)) % count], probe
+
+
+def veilface(*arguments: str | Path, env: dict[str, str]) -> str:
+    """Run the installed command; its standard output. A failure ends the benchmark."""
+    done = subprocess.run(
+        [str(VEILFACE), *map(str, arguments)], env=env, text=True, capture_output=True, check=False
+    )
+    if done.returncode:
+        raise SystemExit(f"veilface {arguments[0]} failed: {done.stderr.strip()}")
+    return done.stdout
+
+
+def free_port() -> int:
+    """A local port that nobody listens on now."""
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        port: int = listener.getsockname()[1]
+        return port
+
+
+@contextmanager
+def database(kind: str, work: Path) -> Iterator[str]:
+    """A fresh SQLite file, or a fresh PostgreSQL database that is dropped afterwards."""
+    if kind == "sqlite":
+        yield f"sqlite:///{work / 'veilface.db'}"
+        return
+    server = make_url(os.environ.get("VEILFACE_TEST_POSTGRES_URL", DEFAULT_POSTGRES)).set(
+        drivername="postgresql+psycopg"
+    )
+    admin = create_engine(server, isolation_level="AUTOCOMMIT")
+    name = f"veilface_bench_{secrets.token_hex(4)}"
+    with admin.connect() as connection:
+        connection.execute(text(f'CREATE DATABASE "{name}"'))
+    try:
+        yield server.set(database=name).render_as_string(hide_password=False)
+    finally:
+        with admin.connect() as connection:
+            connection.execute(text(f'DROP DATABASE "{name}" WITH (FORCE)'))
+        admin.dispose()
+
+
+@contextmanager
+def service(env: dict[str, str], *, workers: int, log: Path) -> Iterator[str]:
+    """``veilface serve`` on a free port; yields its base URL once it is ready."""
+    port = free_port()
+    with log.open("wb") as sink:
+        process = subprocess.Popen(
+            [str(VEILFACE), "serve", "--port", str(port), "--workers", str(workers)],
+            env=env,
+            stdout=sink,
+            stderr=sink,
+        )
+        url = f"http://127.0.0.1:{port}"
+        try:
+            for _ in range(240):
+                if process.poll() is not None:
+                    raise SystemExit(f"veilface serve ended: {log.read_text()[-2000:]}")
+                try:
+                    if httpx.get(f"{url}/health/ready", timeout=5).status_code == 200:
+                        break
+                except httpx.TransportError:
+                    pass
+                time.sleep(0.25)
+            else:
+                raise SystemExit(f"the service did not become ready: {log.read_text()[-2000:]}")
+            yield url
+        finally:
+            process.terminate()
+            process.wait(timeout=30)
+
+
+def enroll_photos(
+    client: httpx.Client, person: Person, attributes: dict[str, str] | None
+) -> httpx.Response:
+    """PUT the person's enrollment photos."""
+    return client.put(
+        f"/v1/subjects/{person.name}/enrollment",
+        files=[("images", (p.name, p.read_bytes(), "image/jpeg")) for p in person.enroll],
+        data={"face": "largest"} | ({"attributes": json.dumps(attributes)} if attributes else {}),
+    )
+
+
+def verify_photo(client: httpx.Client, subject: str, photo: Path, level: str) -> httpx.Response:
+    """POST one probe photo; the most central face is taken, as LFW's protocol does."""
+    return client.post(
+        f"/v1/subjects/{subject}/verify",
+        files={"image": (photo.name, photo.read_bytes(), "image/jpeg")},
+        data={"level": level, "face": "largest"},
+    )
+
+
+@dataclass(frozen=True)
+class LiftingClient:
+    """A device that embeds and lifts by itself and sends only private templates."""
+
+    pack: ModelPack
+    generator: DecoyGenerator
+    contract_id: str
+    strategy: Strategy
+    m: int
+
+    @classmethod
+    def connect(cls, client: httpx.Client, pack: ModelPack) -> "LiftingClient":
+        """Fetch what lifting needs: the contract and the decoy generator, never a pool."""
+        binding = client.get("/v1/contract").raise_for_status().json()
+        generator = client.get("/v1/contract/generator").raise_for_status()
+        return cls(
+            pack=pack,
+            generator=DecoyGenerator.from_bytes(generator.content),
+            contract_id=binding["contract_id"],
+            strategy=Strategy(binding["binding"]["strategy"]),
+            m=binding["binding"]["m"],
+        )
+
+    def template(self, photos: Sequence[Path], m: int) -> str:
+        """Base64 of the wire bytes: the photos' mean descriptor, lifted once to dimension m."""
+        samples = [
+            self.pack.embed_photo(p.read_bytes(), policy=FacePolicy.LARGEST).embedding
+            for p in photos
+        ]
+        mean = np.mean(samples, axis=0)
+        lifted = lift(
+            (mean / np.linalg.norm(mean))[None], strategy=self.strategy, m=m, source=self.generator
+        )
+        return base64.b64encode(encode(lifted[0], contract_id=self.contract_id)).decode()
+
+
+def decide(outcome: Outcome, answer: httpx.Response, *, genuine: bool) -> None:
+    """Count one answer; a genuine attempt that gets no decision is a rejection."""
+    accepted = answer.status_code == 200 and answer.json()["decision"] == "accept"
+    if answer.status_code != 200:
+        code = answer.json()["error"]["code"]
+        outcome.other_answers[f"{answer.status_code} {code}"] += 1
+    if genuine:
+        outcome.genuine += 1
+        outcome.genuine_rejected += not accepted
+    else:
+        outcome.impostor += 1
+        outcome.impostor_accepted += accepted
+
+
+def attempt_all(
+    client: httpx.Client,
+    people: Sequence[Person],
+    *,
+    level: str,
+    impostors: int,
+    attributes: dict[str, dict[str, str]] | None,
+    lifting: LiftingClient | None,
+    probe_dim: int,
+    clients: int,
+) -> Outcome:
+    """Enroll everybody, then verify every genuine and impostor attempt."""
+    outcome = Outcome()
+    probes: dict[Path, str] = {}
+    if lifting:
+        probes = {p: lifting.template([p], probe_dim) for person in people for p in person.probes}
+
+    def enroll(person: Person) -> httpx.Response:
+        if lifting:
+            return client.put(
+                f"/v1/subjects/{person.name}/enrollment",
+                json={"template": lifting.template(person.enroll, lifting.m)},
+            )
+        return enroll_photos(client, person, attributes and attributes[person.name])
+
+    def verify(attempt: tuple[str, Path]) -> httpx.Response:
+        subject, photo = attempt
+        if lifting:
+            return client.post(
+                f"/v1/subjects/{subject}/verify", json={"template": probes[photo], "level": level}
+            )
+        return verify_photo(client, subject, photo, level)
+
+    with ThreadPoolExecutor(clients) as pool:
+        for person, answer in zip(people, pool.map(enroll, people), strict=True):
+            if answer.status_code not in (200, 201):
+                outcome.refused_enrollments[person.name] = answer.json()["error"]["code"]
+        genuine = [(person.name, photo) for person in people for photo in person.probes]
+        for answer in pool.map(verify, genuine):
+            decide(outcome, answer, genuine=True)
+        enrolled = [p for p in people if p.name not in outcome.refused_enrollments]
+        others = [(person.name, photo) for person, photo in impostor_attempts(enrolled, impostors)]
+        for answer in pool.map(verify, others):
+            decide(outcome, answer, genuine=False)
+    return outcome
+
+
+def raw_outcome(
+    pack: ModelPack, people: Sequence[Person], calibration: Path, *, fmr: float, impostors: int
+) -> dict[str, object]:
+    """The same attempts with raw descriptors and a cosine threshold at the same FMR target.
+
+    The threshold comes from all cross-identity pairs of the calibration faces, people of the
+    attempts left out, as the service's own does.
+    """
+    names = {person.name for person in people}
+    faces = labelled_folder(calibration)
+    keep = [i for i, name in enumerate(faces.identities) if name not in names]
+    crops = Extractor(pack).extract([faces.paths[i] for i in keep], aligned=True)
+    identity = np.unique([faces.identities[i] for i in keep], return_inverse=True)[1]
+    cosines = crops.descriptors @ crops.descriptors.T
+    impostor = cosines[np.triu(identity[:, None] != identity[None, :], k=1)]
+    allowed = int(fmr * impostor.size)
+    threshold = float(np.partition(impostor, impostor.size - allowed - 1)[-allowed - 1])
+
+    def embed(photo: Path) -> npt.NDArray[np.float32]:
+        return pack.embed_photo(photo.read_bytes(), policy=FacePolicy.LARGEST).embedding
+
+    means = {p.name: np.mean([embed(photo) for photo in p.enroll], axis=0) for p in people}
+    probes = {photo: embed(photo) for p in people for photo in p.probes}
+
+    def accepted(person: Person, photo: Path) -> bool:
+        mean = means[person.name]
+        return bool(probes[photo] @ (mean / np.linalg.norm(mean)) > threshold)
+
+    outcome = Outcome()
+    for person in people:
+        for photo in person.probes:
+            outcome.genuine += 1
+            outcome.genuine_rejected += not accepted(person, photo)
+    for person, photo in impostor_attempts(people, impostors):
+        outcome.impostor += 1
+        outcome.impostor_accepted += accepted(person, photo)
+    return {"cosine_threshold": round(threshold, 4)} | outcome.summary()
+
+
+def predicted_attributes(
+    pack: ModelPack, people: Sequence[Person], fairface: Path, neighbours: int = 10
+) -> dict[str, dict[str, str]]:
+    """Gender and race of every person by K-NN of their enrollment photos on FairFace labels."""
+    with (fairface / "fairface_label_train.csv").open(newline="") as table:
+        labels = {row["file"]: row for row in csv.DictReader(table)}
+    gallery = Extractor(pack).extract([fairface / name for name in labels])
+    rows = [labels[str(path.relative_to(fairface))] for path in gallery.paths]
+    predicted: dict[str, dict[str, str]] = {}
+    for person in people:
+        votes: dict[str, Counter[str]] = {"gender": Counter(), "race": Counter()}
+        for photo in person.enroll:
+            sample = pack.embed_photo(photo.read_bytes(), policy=FacePolicy.LARGEST)
+            for index in np.argsort(gallery.descriptors @ sample.embedding)[-neighbours:]:
+                for attribute, count in votes.items():
+                    count[rows[int(index)][attribute]] += 1
+        predicted[person.name] = {a: count.most_common(1)[0][0] for a, count in votes.items()}
+    return predicted
+
+
+def prepare(args: argparse.Namespace, work: Path, env: dict[str, str], probe_dims: str) -> None:
+    """Decoys and contract by the command line, people of the attempts left out."""
+    data = args.data
+    kind = "pool" if args.pool else "generator"
+    veilface(
+        "decoys", "build", data / "fairface", "--split", "train", "--pack", args.pack,
+        "--kind", kind, "--out", work / "decoys.veil", env=env,
+    )  # fmt: skip
+    veilface(
+        "calibrate", data / "lfw" / "aligned112", "--aligned", "--pack", args.pack,
+        "--decoys", work / "decoys.veil", "--strategy", args.strategy, "--dim", str(args.dim),
+        "--probe-dims", probe_dims, "--exclude-people", data / "lfw" / "photos",
+        "--out", work / "contract.json", env=env,
+    )  # fmt: skip
+
+
+def main() -> None:
+    """Run one configuration and print its figures as JSON."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
+    parser.add_argument("--pack", type=Path, help="default: DATA/packs/w600k_mbf")
+    parser.add_argument("--strategy", default="adversarial")
+    parser.add_argument("--dim", type=int, default=16)
+    parser.add_argument("--pool", action="store_true", help="real decoys, not generated ones")
+    parser.add_argument("--probe-dim", type=int, default=0, help="0: photos; else lifted probes")
+    parser.add_argument("--database", choices=["sqlite", "postgresql"], default="sqlite")
+    parser.add_argument("--level", default="fmr-1e-3")
+    parser.add_argument("--impostors", type=int, default=20, help="other people for each probe")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--clients", type=int, default=4)
+    parser.add_argument("--work", type=Path, help="keep decoys, contract, database and log here")
+    args = parser.parse_args()
+    args.pack = args.pack or args.data / "packs" / "w600k_mbf"
+
+    with ExitStack() as stack:
+        work = args.work or Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        work.mkdir(parents=True, exist_ok=True)
+        url = stack.enter_context(database(args.database, work))
+        env = os.environ | {
+            "VEILFACE_DATA_DIR": str(work),
+            "VEILFACE_DATABASE_URL": url,
+            "VEILFACE_PACK": str(args.pack),
+            "VEILFACE_DECOYS_FILE": str(work / "decoys.veil"),
+            "VEILFACE_CONTRACT_FILE": str(work / "contract.json"),
+        }
+        started = time.perf_counter()
+        prepare(args, work, env, str(args.probe_dim or 4))
+        prepared = time.perf_counter()
+        token = json.loads(
+            veilface("keys", "create", "--json", "--rights", "enroll,verify,embeddings", env=env)
+        )["token"]
+        pack = ModelPack.load(args.pack)
+        people = people_of(args.data / "lfw" / "photos")
+        attributes = (
+            predicted_attributes(pack, people, args.data / "fairface")
+            if args.strategy == "hybrid+"
+            else None
+        )
+        address = stack.enter_context(service(env, workers=args.workers, log=work / "serve.log"))
+        client = stack.enter_context(
+            httpx.Client(
+                base_url=address, headers={"Authorization": f"Bearer {token}"}, timeout=120
+            )
+        )
+        attempted = time.perf_counter()
+        outcome = attempt_all(
+            client,
+            people,
+            level=args.level,
+            impostors=args.impostors,
+            attributes=attributes,
+            lifting=LiftingClient.connect(client, pack) if args.probe_dim else None,
+            probe_dim=args.probe_dim,
+            clients=args.clients,
+        )
+        finished = time.perf_counter()
+        target = float(args.level.removeprefix("fmr-"))
+        report = {
+            "pack": args.pack.name,
+            "strategy": args.strategy,
+            "decoys": "pool" if args.pool else "generator",
+            "m": args.dim,
+            "probe_m": args.probe_dim,
+            "database": args.database,
+            "level": args.level,
+            "workers": args.workers,
+            "service": outcome.summary(),
+            "raw": raw_outcome(
+                pack, people, args.data / "lfw" / "aligned112", fmr=target, impostors=args.impostors
+            ),
+            "seconds": {
+                "decoys_and_calibration": round(prepared - started, 1),
+                "attempts": round(finished - attempted, 1),
+            },
+        }
+    print(json.dumps(report, indent=2))
+
+
+if __name__ == "__main__":
+    main()
