@@ -1,1 +1,16 @@
-"""Enrollment: photos or a client's template become one private template of a subject."""
+"""From photos, or a client's template, to the one private template of a subject.
+
+Imports the floor below only: ``templates`` and ``models``.
+"""
+
+from enroll.enroller import Enroller, Enrollment, PhotoResult
+from enroll.errors import EnrollmentError, InconsistentImages, PhotoRejected
+
+__all__ = [
+    "Enroller",
+    "Enrollment",
+    "EnrollmentError",
+    "InconsistentImages",
+    "PhotoRejected",
+    "PhotoResult",
+]

@@ -23,12 +23,12 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
+from templates.binding import Binding
 from templates.canonical import Fields, Json, digest, free_object, parse_object
 from templates.distances import Metric
 from templates.errors import ContractError, SealError, Uncalibrated
 from templates.levels import (
     LEVEL_NAME,
-    SHA256_HEX,
     Calibration,
     Level,
     Mode,
@@ -36,7 +36,6 @@ from templates.levels import (
     check_norm_range,
     norm_range,
 )
-from templates.lifting import Strategy
 from templates.sealing import Sealer
 from templates.subspace import SubspaceBatch
 
@@ -46,90 +45,8 @@ FORMAT = "veilface-contract"
 VERSION = 1
 MAX_FILE_BYTES = 256 * 2**20
 MAX_CALIBRATIONS = 64
-MAX_N = 4096
-MAX_M = 128
 COHORT_SIZES = (2, 4096)
 BASIS_TOLERANCE = 1e-4
-
-
-@dataclass(frozen=True)
-class Binding:
-    """What makes two templates comparable; its hash is the ``contract_id``.
-
-    Parameters
-    ----------
-    embedder_sha256
-        SHA-256 of the embedder's ONNX file, 64 hexadecimal digits.
-    preprocessing
-        Alignment template, size, channel order, mean, scale and flip.
-    n
-        Descriptor dimension.
-    strategy, m
-        Lifting strategy and subspace dimension of stored templates.
-    decoy_source_id
-        SHA-256 of the decoy source's canonical content.
-    rotation_version
-        Version of the tenant-rotation derivation.
-    """
-
-    embedder_sha256: str
-    preprocessing: Mapping[str, Json]
-    n: int
-    strategy: Strategy
-    m: int
-    decoy_source_id: str
-    rotation_version: str
-
-    def __post_init__(self) -> None:
-        if not SHA256_HEX.fullmatch(self.embedder_sha256):
-            raise ContractError("the embedder's hash must be 64 lower-case hexadecimal digits")
-        if not SHA256_HEX.fullmatch(self.decoy_source_id):
-            raise ContractError("the decoy source's id must be 64 lower-case hexadecimal digits")
-        if not 2 <= self.n <= MAX_N:
-            raise ContractError(f"the descriptor dimension must lie in 2 to {MAX_N}")
-        if not 1 <= self.m <= min(MAX_M, self.n - 1):
-            raise ContractError(f"the subspace dimension must lie in 1 to min({MAX_M}, n - 1)")
-        if not 1 <= len(self.rotation_version) <= 64:
-            raise ContractError("the rotation version must be a text of 1 to 64 characters")
-        preprocessing = free_object(self.preprocessing, what="the preprocessing")
-        object.__setattr__(self, "preprocessing", preprocessing)
-        object.__setattr__(self, "strategy", Strategy(self.strategy))
-
-    @property
-    def contract_id(self) -> str:
-        """SHA-256 of the canonical JSON, 64 hexadecimal digits."""
-        return digest(self.to_json())
-
-    def to_json(self) -> dict[str, Json]:
-        """JSON form: exactly what is hashed."""
-        return {
-            "embedder_sha256": self.embedder_sha256,
-            "preprocessing": dict(self.preprocessing),
-            "n": self.n,
-            "strategy": str(self.strategy),
-            "m": self.m,
-            "decoy_source_id": self.decoy_source_id,
-            "rotation_version": self.rotation_version,
-        }
-
-    @classmethod
-    def from_json(cls, value: object) -> "Binding":
-        """Parse hostile JSON."""
-        fields = Fields(value, what="the binding")
-        strategy = fields.text("strategy")
-        if strategy not in list(Strategy):
-            raise ContractError(f"the strategy must be one of {[*map(str, Strategy)]}")
-        binding = cls(
-            embedder_sha256=fields.text("embedder_sha256"),
-            preprocessing=fields.free("preprocessing"),
-            n=fields.integer("n"),
-            strategy=Strategy(strategy),
-            m=fields.integer("m"),
-            decoy_source_id=fields.text("decoy_source_id"),
-            rotation_version=fields.text("rotation_version"),
-        )
-        fields.done()
-        return binding
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,150 @@
+"""What makes two templates comparable: the part of a contract that its id hashes."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from templates.canonical import Fields, Json, digest, free_object
+from templates.errors import ContractError, ContractMismatch
+from templates.levels import SHA256_HEX
+from templates.lifting import Strategy
+
+MAX_N = 4096
+MAX_M = 128
+
+
+@dataclass(frozen=True)
+class Binding:
+    """What makes two templates comparable; its hash is the ``contract_id``.
+
+    Parameters
+    ----------
+    embedder_sha256
+        SHA-256 of the embedder's ONNX file, 64 hexadecimal digits.
+    preprocessing
+        Alignment template, size, channel order, mean, scale and flip.
+    n
+        Descriptor dimension.
+    strategy, m
+        Lifting strategy and subspace dimension of stored templates.
+    decoy_source_id
+        SHA-256 of the decoy source's canonical content.
+    rotation_version
+        Version of the tenant-rotation derivation.
+    """
+
+    embedder_sha256: str
+    preprocessing: Mapping[str, Json]
+    n: int
+    strategy: Strategy
+    m: int
+    decoy_source_id: str
+    rotation_version: str
+
+    def __post_init__(self) -> None:
+        if not SHA256_HEX.fullmatch(self.embedder_sha256):
+            raise ContractError("the embedder's hash must be 64 lower-case hexadecimal digits")
+        if not SHA256_HEX.fullmatch(self.decoy_source_id):
+            raise ContractError("the decoy source's id must be 64 lower-case hexadecimal digits")
+        if not 2 <= self.n <= MAX_N:
+            raise ContractError(f"the descriptor dimension must lie in 2 to {MAX_N}")
+        if not 1 <= self.m <= min(MAX_M, self.n - 1):
+            raise ContractError(f"the subspace dimension must lie in 1 to min({MAX_M}, n - 1)")
+        if not 1 <= len(self.rotation_version) <= 64:
+            raise ContractError("the rotation version must be a text of 1 to 64 characters")
+        preprocessing = free_object(self.preprocessing, what="the preprocessing")
+        object.__setattr__(self, "preprocessing", preprocessing)
+        object.__setattr__(self, "strategy", Strategy(self.strategy))
+
+    @property
+    def contract_id(self) -> str:
+        """SHA-256 of the canonical JSON, 64 hexadecimal digits."""
+        return digest(self.to_json())
+
+    def to_json(self) -> dict[str, Json]:
+        """JSON form: exactly what is hashed."""
+        return {
+            "embedder_sha256": self.embedder_sha256,
+            "preprocessing": dict(self.preprocessing),
+            "n": self.n,
+            "strategy": str(self.strategy),
+            "m": self.m,
+            "decoy_source_id": self.decoy_source_id,
+            "rotation_version": self.rotation_version,
+        }
+
+    def require_embedder(
+        self, *, embedder_sha256: str, preprocessing: Mapping[str, object], n: int
+    ) -> None:
+        """Refuse a pack whose embeddings this contract does not describe.
+
+        Raises
+        ------
+        ContractMismatch
+            Naming both sides.
+        """
+        if n != self.n:
+            raise ContractMismatch(
+                f"the contract is for descriptors of {self.n} numbers, the pack gives {n}; "
+                "use the pack that the contract was calibrated with"
+            )
+        if embedder_sha256 != self.embedder_sha256:
+            raise ContractMismatch(
+                f"the contract is bound to the embedder {self.embedder_sha256[:16]}…, the pack's is "
+                f"{embedder_sha256[:16]}…; use the pack that the contract was calibrated with"
+            )
+        theirs = free_object(preprocessing, what="the pack's preprocessing")
+        if theirs != self.preprocessing:
+            keys = sorted(theirs.keys() | self.preprocessing.keys())
+            differing = [key for key in keys if theirs.get(key) != self.preprocessing.get(key)]
+            sides = "; ".join(
+                f"{key}: contract {self.preprocessing.get(key)}, pack {theirs.get(key)}"
+                for key in differing
+            )
+            raise ContractMismatch(f"the pack preprocesses otherwise than the contract: {sides}")
+
+    def require_source(self, *, source_id: str) -> None:
+        """Refuse a decoy source other than the contract's.
+
+        Raises
+        ------
+        ContractMismatch
+            Naming both sides.
+        """
+        if source_id != self.decoy_source_id:
+            raise ContractMismatch(
+                f"the contract is bound to the decoy source {self.decoy_source_id[:16]}…, this one "
+                f"is {source_id[:16]}…; use the file that the contract was calibrated with"
+            )
+
+    def require_contract(self, contract_id: str, *, what: str) -> None:
+        """Refuse a template of another contract.
+
+        Raises
+        ------
+        ContractMismatch
+            Naming both sides.
+        """
+        if contract_id != self.contract_id:
+            raise ContractMismatch(
+                f"{what} belongs to the contract {contract_id[:16]}…, the service runs "
+                f"{self.contract_id[:16]}…; enroll or lift again under the service's contract"
+            )
+
+    @classmethod
+    def from_json(cls, value: object) -> "Binding":
+        """Parse hostile JSON."""
+        fields = Fields(value, what="the binding")
+        strategy = fields.text("strategy")
+        if strategy not in list(Strategy):
+            raise ContractError(f"the strategy must be one of {[*map(str, Strategy)]}")
+        binding = cls(
+            embedder_sha256=fields.text("embedder_sha256"),
+            preprocessing=fields.free("preprocessing"),
+            n=fields.integer("n"),
+            strategy=Strategy(strategy),
+            m=fields.integer("m"),
+            decoy_source_id=fields.text("decoy_source_id"),
+            rotation_version=fields.text("rotation_version"),
+        )
+        fields.done()
+        return binding

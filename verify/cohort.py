@@ -1,0 +1,75 @@
+"""The cohort: templates that belong to nobody, against which every probe is normalised.
+
+A *wolf* probe lies near everybody's template, and so near the cohort's as well. Its similarity to
+one subject must therefore exceed its mean similarity to the cohort by a calibrated number of the
+cohort's standard deviations (T-norm, METHOD §4.7).
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from templates.decoys import DecoyGenerator, DecoyPool, DecoySource
+from templates.distances import Metric, pairwise_distances, similarity
+from templates.lifting import Strategy, lift
+from templates.randomness import Keystream
+from templates.subspace import SubspaceBatch
+
+COHORT_SIZE = 150
+LEAST_SPREAD = 1e-6
+"""Floor of the cohort's standard deviation: keeps the score finite for a probe that is equally
+far from the whole cohort."""
+
+Probes = NDArray[np.float32] | SubspaceBatch
+
+# A pool may own a real person whom the cohort must not hold, so the cohort is lifted from
+# generated descriptors with generated decoys; these strategies are then their plain forms.
+_PLAIN = {
+    Strategy.HYBRID_PLUS: Strategy.HYBRID,
+    Strategy.SUB_HYBRID: Strategy.HYBRID,
+    Strategy.SUB_ADVERSARIAL: Strategy.ADVERSARIAL,
+}
+
+
+def make_cohort(
+    source: DecoySource,
+    *,
+    strategy: Strategy,
+    m: int,
+    stream: Keystream,
+    size: int = COHORT_SIZE,
+) -> SubspaceBatch:
+    """Lift ``size`` descriptors of nobody, with decoys of nobody.
+
+    Parameters
+    ----------
+    source
+        The contract's decoy source. A generator is drawn from; to a pool of real descriptors a
+        generator is fitted first.
+    strategy, m
+        The contract's.
+    stream
+        Fresh for a service; seeded for experiments only, since the cohort is a secret.
+
+    Returns
+    -------
+    SubspaceBatch
+        ``size`` templates, un-rotated.
+    """
+    nobody: DecoySource = source
+    if isinstance(source, DecoyPool):
+        entries = source.draw(1, len(source), stream=stream)[0]
+        nobody = DecoyGenerator.fit(entries)
+    descriptors = nobody.draw(size, 1, stream=stream)[:, 0, :]
+    return lift(
+        descriptors, strategy=_PLAIN.get(strategy, strategy), m=m, source=nobody, stream=stream
+    )
+
+
+def cohort_statistics(
+    probes: Probes, cohort: SubspaceBatch, *, metric: Metric, steps: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Mean and standard deviation of every probe's similarities to the cohort, each (P,)."""
+    distances = pairwise_distances(probes, cohort, metric=metric, steps=steps)
+    similarities = np.asarray(similarity(distances), dtype=np.float64)
+    spread = np.maximum(similarities.std(axis=1, ddof=1), LEAST_SPREAD)
+    return similarities.mean(axis=1), spread

@@ -1,0 +1,210 @@
+"""A probe against a stored template becomes a decision."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.pack import FacePolicy, ModelPack
+from models.quality import QualityLimits
+from templates import wire
+from templates.contract import Calibration, Contract, Level
+from templates.distances import Metric, paired_distances, similarity
+from templates.embedding import unit_rows
+from templates.errors import ContractMismatch, InvalidTemplate
+from templates.subspace import AffineSubspace, SubspaceBatch
+from verify.cohort import Probes, cohort_statistics
+from verify.decision import Decision
+
+MAX_PROBE_M = 128
+
+
+@dataclass(frozen=True)
+class _Rule:
+    """The calibration and level that one decision is taken by."""
+
+    calibration: Calibration
+    level: Level
+
+
+class Verifier:
+    """Decides for one contract and one tenant. Holds no state between calls; threads may share it.
+
+    Every decision needs both the similarity threshold and the cohort test of its level
+    (METHOD §4.7). Stored templates are rotated, the cohort is not, so the probe is turned for the
+    template only.
+
+    Parameters
+    ----------
+    contract
+        Whose calibrations and cohort decide.
+    rotation : (n, n) float64
+        The tenant's orthogonal rotation.
+
+    Raises
+    ------
+    ContractMismatch
+        Where the rotation is of another dimension.
+    """
+
+    def __init__(self, contract: Contract, *, rotation: NDArray[np.float64]) -> None:
+        n = contract.binding.n
+        if rotation.shape != (n, n):
+            raise ContractMismatch(
+                f"the contract is for descriptors of {n} numbers, the rotation turns "
+                f"{rotation.shape[0]}"
+            )
+        self._contract = contract
+        self._rotation = rotation
+        self._stand_in = wire.encode(
+            contract.cohort[0].rotated(rotation), contract_id=contract.contract_id, dtype="float16"
+        )
+
+    @property
+    def stand_in(self) -> bytes:
+        """Wire bytes of a template of nobody, of the size that every stored template has.
+
+        Deciding against it, for a subject that does not exist, costs what a real one costs.
+        """
+        return self._stand_in
+
+    def decide_photo(
+        self,
+        pack: ModelPack,
+        photo: bytes,
+        stored: bytes | None,
+        *,
+        level: str | None = None,
+        policy: FacePolicy = FacePolicy.SINGLE,
+        quality: QualityLimits | None = None,
+    ) -> Decision:
+        """Decide for a photo file; see ``decide_embedding``.
+
+        Raises
+        ------
+        ContractMismatch
+            Where the pack is not the contract's.
+        ModelError
+            Where the photo has no usable face.
+        """
+        info = pack.info
+        self._contract.binding.require_embedder(
+            embedder_sha256=info.embedder_sha256, preprocessing=info.preprocessing, n=info.n
+        )
+        sample = pack.embed_photo(photo, policy=policy, quality=quality or QualityLimits())
+        return self.decide_embedding(sample.embedding, stored, level=level)
+
+    def decide_embedding(
+        self,
+        embedding: NDArray[np.floating],
+        stored: bytes | None,
+        *,
+        level: str | None = None,
+        metric: Metric | None = None,
+    ) -> Decision:
+        """Decide for a unit-norm embedding, (n,).
+
+        Parameters
+        ----------
+        stored
+            Wire bytes of the subject's template; None where the subject does not exist. The same
+            work is then done on a template of nobody, and the answer is a rejection.
+        level
+            Name of a level; the contract's default where None.
+        metric
+            The contract's first p-to-s calibration decides where None.
+
+        Raises
+        ------
+        InvalidEmbedding
+            Where the probe is not a finite unit vector of n numbers.
+        Uncalibrated
+            Where the contract has no such level or metric.
+        ContractMismatch, InvalidTemplate
+            Where the stored bytes are not a template of this contract.
+        """
+        calibration = self._contract.calibration("p2s", metric)
+        rule = _Rule(calibration, calibration.level(level or self._contract.default_level))
+        probe = unit_rows(embedding, n=self._contract.binding.n, most=1)
+        turned = (probe.astype(np.float64) @ self._rotation.T).astype(np.float32)
+        return self._decide(rule, probe, turned, stored)
+
+    def decide_template(
+        self,
+        probe: bytes,
+        stored: bytes | None,
+        *,
+        level: str | None = None,
+        metric: Metric | None = None,
+    ) -> Decision:
+        """Decide for a probe that the client lifted, in the wire format, un-rotated.
+
+        Parameters as in ``decide_embedding``.
+
+        Raises
+        ------
+        InvalidTemplate
+            Where the probe's bytes break the format, or its foot point cannot be an honest lift's.
+        Uncalibrated
+            Where the contract has no calibration for the probe's dimension.
+        ContractMismatch
+            Where the probe belongs to another contract.
+        """
+        binding = self._contract.binding
+        received = wire.decode(probe, max_n=binding.n, max_m=min(MAX_PROBE_M, binding.n - 1))
+        binding.require_contract(received.contract_id, what="the lifted probe")
+        subspace = received.subspace
+        if subspace.n != binding.n:
+            raise InvalidTemplate(f"a lifted probe must have n = {binding.n}, not {subspace.n}")
+        calibration = self._contract.calibration("s2s", metric, subspace.m)
+        rule = _Rule(calibration, calibration.level(level or self._contract.default_level))
+        self._require_honest_foot(subspace, calibration)
+        turned = SubspaceBatch.of([subspace.rotated(self._rotation)])
+        return self._decide(rule, SubspaceBatch.of([subspace]), turned, stored)
+
+    def _require_honest_foot(self, subspace: AffineSubspace, calibration: Calibration) -> None:
+        if calibration.foot_point_norm is None:
+            raise InvalidTemplate("this calibration takes no lifted probes")
+        low, high = calibration.foot_point_norm
+        if not low <= subspace.foot_norm <= high:
+            raise InvalidTemplate(
+                "the probe's foot point is outside the range that the calibration recorded: "
+                "lift a unit-norm descriptor with the contract's decoys"
+            )
+
+    def _template(self, stored: bytes | None) -> SubspaceBatch:
+        binding = self._contract.binding
+        data = self._stand_in if stored is None else stored
+        received = wire.decode(data, max_n=binding.n, max_m=binding.m)
+        binding.require_contract(received.contract_id, what="the stored template")
+        subspace = received.subspace
+        if (subspace.n, subspace.m) != (binding.n, binding.m):
+            raise InvalidTemplate("the stored template has dimensions other than the contract's")
+        return SubspaceBatch.of([subspace])
+
+    def _decide(self, rule: _Rule, probe: Probes, turned: Probes, stored: bytes | None) -> Decision:
+        calibration, level = rule.calibration, rule.level
+        distances = paired_distances(
+            turned, self._template(stored), metric=calibration.metric, steps=calibration.steps
+        )
+        distance = float(distances[0])
+        score = float(np.asarray(similarity(distances), dtype=np.float64)[0])
+        means, spreads = cohort_statistics(
+            probe, self._contract.cohort, metric=calibration.metric, steps=calibration.steps
+        )
+        cohort_score = (score - float(means[0])) / float(spreads[0])
+        # Both tests are evaluated, and NaN fails either, so no input is accepted by an exception.
+        similar = score >= level.similarity_threshold
+        singular = cohort_score >= level.cohort_threshold
+        accepted = bool(similar and singular and stored is not None)
+        return Decision(
+            accepted=accepted,
+            reason="match" if accepted else "no_match",
+            level=level.name,
+            fmr=level.fmr.value if level.target_fmr is None else level.target_fmr,
+            contract_id=self._contract.contract_id,
+            calibration_id=calibration.calibration_id,
+            similarity=score,
+            distance=distance,
+            cohort_score=cohort_score,
+        )
