@@ -1,0 +1,109 @@
+"""Warp a face onto the common five-point template of ArcFace."""
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from models.errors import PackError
+
+# Left eye, right eye, nose, left and right mouth corner as the viewer sees them, for 112 x 112
+# (FORMATS, "Alignment").
+TEMPLATE_112 = np.array(
+    [
+        [38.2946, 51.6963],
+        [73.5318, 51.5014],
+        [56.0252, 71.7366],
+        [41.5493, 92.3655],
+        [70.7299, 92.2041],
+    ],
+    dtype=np.float64,
+)
+TEMPLATE_NAME = "arcface-112"
+
+
+def template(size: int) -> NDArray[np.float64]:
+    """Five points of the template, in pixels of a ``size`` x ``size`` crop.
+
+    Parameters
+    ----------
+    size
+        A multiple of 112, or of 128 (then x moves by ``8 * ratio``).
+
+    Returns
+    -------
+    ndarray of float64, shape (5, 2)
+
+    Raises
+    ------
+    PackError
+        For any other size, for which there is no common template.
+    """
+    if size > 0 and size % 112 == 0:
+        return TEMPLATE_112 * (size / 112)
+    if size > 0 and size % 128 == 0:
+        ratio = size / 128
+        return TEMPLATE_112 * ratio + np.array([8 * ratio, 0.0])
+    raise PackError(
+        f"There is no common alignment template for a {size} x {size} embedder; sizes are"
+        " multiples of 112 or of 128."
+    )
+
+
+def similarity_transform(source: ArrayLike, target: ArrayLike) -> NDArray[np.float64]:
+    """Least-squares similarity (rotation, uniform scale, translation; no shear, no mirror).
+
+    In the plane Umeyama's problem has a closed form: with points as complex numbers it is the
+    regression ``w = a z + b`` with one complex slope, whose modulus is the scale and whose
+    argument the rotation.
+
+    Parameters
+    ----------
+    source, target
+        Corresponding points, shape (k, 2), k of at least 2, not all equal.
+
+    Returns
+    -------
+    ndarray of float64, shape (2, 3)
+        ``target ≈ M[:, :2] @ source + M[:, 2]``.
+
+    References
+    ----------
+    S. Umeyama, Least-squares estimation of transformation parameters between two point patterns,
+    IEEE TPAMI 13(4), 1991.
+    """
+    z = np.asarray(source, dtype=np.float64) @ np.array([1, 1j])
+    w = np.asarray(target, dtype=np.float64) @ np.array([1, 1j])
+    z_mean, w_mean = z.mean(), w.mean()
+    z_centred = z - z_mean
+    power = float(np.vdot(z_centred, z_centred).real)
+    if not np.isfinite(power) or power <= 0.0:
+        raise ValueError("the source points must be finite and not all equal")
+    a = complex(np.vdot(z_centred, w - w_mean)) / power
+    b = complex(w_mean - a * z_mean)
+    return np.array([[a.real, -a.imag, b.real], [a.imag, a.real, b.imag]])
+
+
+def align(
+    image: NDArray[np.uint8], keypoints: NDArray[np.floating], *, size: int
+) -> NDArray[np.uint8]:
+    """Crop a face so that its five points lie on the template.
+
+    Parameters
+    ----------
+    image
+        uint8, shape (h, w, 3).
+    keypoints
+        Shape (5, 2), pixels of ``image``, in the order of the template.
+    size
+        Side of the crop in pixels.
+
+    Returns
+    -------
+    ndarray of uint8, shape (size, size, 3)
+        Bilinear warp, 0 outside of the image.
+    """
+    matrix = similarity_transform(keypoints, template(size))
+    crop = cv2.warpAffine(
+        image, matrix, (size, size), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT
+    )
+    return np.ascontiguousarray(crop, dtype=np.uint8)

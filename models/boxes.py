@@ -1,0 +1,102 @@
+"""Faces as boxes with five points: the value, its rank, and non-maximum suppression."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+# A detector has up to 16,800 cells at 640 x 640. Greedy suppression is quadratic in what is kept,
+# and no photo of a face needs more candidates than this.
+MAX_CANDIDATES = 1000
+
+
+@dataclass(frozen=True, eq=False)
+class Face:
+    """One detected face, in pixels of the upright image.
+
+    Attributes
+    ----------
+    box
+        float32, shape (4,): x1, y1, x2, y2. May reach over the image's border.
+    score
+        Confidence of the detector, 0...1; detectors differ in what a value means.
+    keypoints
+        float32, shape (5, 2): left eye, right eye, nose, left and right mouth corner as the viewer
+        sees them.
+    """
+
+    box: NDArray[np.float32]
+    score: float
+    keypoints: NDArray[np.float32]
+
+    @property
+    def width(self) -> float:
+        """Width of the box in pixels."""
+        return float(self.box[2] - self.box[0])
+
+    @property
+    def height(self) -> float:
+        """Height of the box in pixels."""
+        return float(self.box[3] - self.box[1])
+
+    @property
+    def area(self) -> float:
+        """Area of the box in pixels."""
+        return max(self.width, 0.0) * max(self.height, 0.0)
+
+
+def centre_rank(face: Face, image_shape: tuple[int, ...]) -> float:
+    """Rank of a face as the one that is meant: ``area - 2 * ‖box centre - image centre‖²``.
+
+    Parameters
+    ----------
+    image_shape
+        Height and width first, as of a NumPy image.
+    """
+    height, width = image_shape[:2]
+    dx = float(face.box[0] + face.box[2]) / 2 - width / 2
+    dy = float(face.box[1] + face.box[3]) / 2 - height / 2
+    return face.area - 2 * (dx * dx + dy * dy)
+
+
+def ranked(faces: Sequence[Face], image_shape: tuple[int, ...]) -> list[Face]:
+    """Faces, the one that is most likely meant first."""
+    return sorted(faces, key=lambda face: centre_rank(face, image_shape), reverse=True)
+
+
+def non_maximum_suppression(
+    boxes: NDArray[np.float32], scores: NDArray[np.float32], *, threshold: float
+) -> NDArray[np.intp]:
+    """Greedy suppression of boxes that overlap a better one.
+
+    Parameters
+    ----------
+    boxes
+        Shape (k, 4), x1 y1 x2 y2.
+    scores
+        Shape (k,).
+    threshold
+        Boxes with an intersection over union above it are dropped.
+
+    Returns
+    -------
+    ndarray of intp
+        Indices that are kept, best score first; at most `MAX_CANDIDATES` are considered.
+    """
+    order = np.argsort(-scores, kind="stable")[:MAX_CANDIDATES]
+    x1, y1, x2, y2 = boxes[order].astype(np.float64).T
+    areas = np.maximum(x2 - x1, 0) * np.maximum(y2 - y1, 0)
+    alive = np.ones(len(order), dtype=bool)
+    kept = []
+    for i in range(len(order)):
+        if not alive[i]:
+            continue
+        kept.append(i)
+        rest = slice(i + 1, None)
+        overlap_x = np.minimum(x2[i], x2[rest]) - np.maximum(x1[i], x1[rest])
+        overlap_y = np.minimum(y2[i], y2[rest]) - np.maximum(y1[i], y1[rest])
+        intersection = np.maximum(overlap_x, 0) * np.maximum(overlap_y, 0)
+        union = areas[i] + areas[rest] - intersection
+        alive[rest] &= intersection <= threshold * union
+    return order[np.asarray(kept, dtype=np.intp)]

@@ -1,0 +1,100 @@
+"""The exceptions of decoding, model packs and faces.
+
+::
+
+    ModelError
+    ├── ImageError(code)         bytes that are not a picture Veilface reads
+    ├── PackError                a model pack that is broken, unknown or ambiguous
+    ├── ProviderUnavailable      an accelerator was asked for and is not there
+    ├── CacheError               an embedding cache that is not one
+    └── FaceError(code)          a picture that was read, with no usable face in it
+        ├── NoFace
+        ├── MultipleFaces
+        ├── FaceTooSmall
+        └── LowQuality(details)
+
+Messages name the cause and the remedy. They never hold a pixel or a number of a descriptor.
+"""
+
+from collections.abc import Mapping
+from typing import Literal
+
+ImageCode = Literal["unsupported_image", "image_too_large"]
+
+
+class ModelError(Exception):
+    """Base of all errors that the models room raises on purpose."""
+
+
+class ImageError(ModelError):
+    """Bytes that are no picture Veilface reads, or a picture over a limit.
+
+    Parameters
+    ----------
+    code
+        ``unsupported_image`` or ``image_too_large``.
+    message
+        A sentence for the person who sent the picture.
+    """
+
+    def __init__(self, code: ImageCode, message: str) -> None:
+        super().__init__(message)
+        self.code: ImageCode = code
+
+
+class PackError(ModelError):
+    """A model pack that is broken, unknown or ambiguous; the message names the file."""
+
+
+class ProviderUnavailable(ModelError):
+    """The requested accelerator is absent; the message names those that are there."""
+
+
+class CacheError(ModelError):
+    """An embedding cache whose opened content breaks its format."""
+
+
+class FaceError(ModelError):
+    """A picture that was decoded, in which no usable face was found.
+
+    Attributes
+    ----------
+    code
+        Machine-readable name, the same as in the REST contract.
+    details
+        Measured values and limits, keyed by what was measured.
+    """
+
+    code = "no_face"
+
+    def __init__(self, message: str, *, details: Mapping[str, object] | None = None) -> None:
+        super().__init__(message)
+        self.details: dict[str, object] = dict(details or {})
+
+
+class NoFace(FaceError):
+    """No face was found."""
+
+    code = "no_face"
+
+
+class MultipleFaces(FaceError):
+    """More than one face that could be meant was found."""
+
+    code = "multiple_faces"
+
+
+class FaceTooSmall(FaceError):
+    """The face has too few pixels."""
+
+    code = "face_too_small"
+
+
+class LowQuality(FaceError):
+    """The face was found and failed at least one quality limit.
+
+    ``details`` maps each failed measure (``score``, ``blur``, ``darkness``, ``brightness``,
+    ``pose``) to ``{"value": measured, "limit": limit}``.
+    """
+
+    code = "low_quality"

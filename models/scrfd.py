@@ -1,0 +1,100 @@
+"""SCRFD, the detector of the InsightFace packs (J. Guo et al., ICLR 2022)."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.boxes import Face
+from models.detection import (
+    DEFAULT_SIZE,
+    Size,
+    canvas_sizes,
+    cell_centres,
+    faces_from_candidates,
+    letterbox,
+)
+from models.errors import ModelError
+from models.sessions import Session
+
+STRIDES = (8, 16, 32)
+SCORE_THRESHOLD = 0.5
+OVERLAP = 0.4
+
+
+class Scrfd:
+    """SCRFD with keypoints.
+
+    Parameters
+    ----------
+    session
+        A graph with one image input and nine outputs: scores, boxes and points at strides 8, 16
+        and 32, boxes and points as distances from the cell in units of the stride.
+    input_name
+        Name of the image input.
+    size
+        Side of the canvas, a multiple of 32.
+    fixed
+        Height and width where the graph accepts no other.
+    """
+
+    kind = "scrfd"
+    score_threshold = SCORE_THRESHOLD
+
+    def __init__(
+        self,
+        session: Session,
+        *,
+        input_name: str,
+        size: int = DEFAULT_SIZE,
+        fixed: Size | None = None,
+    ) -> None:
+        self._session = session
+        self._input_name = input_name
+        self.sizes = canvas_sizes(size, fixed)
+
+    def detect_once(self, image: NDArray[np.uint8], size: Size) -> list[Face]:
+        """Faces found in one pass on a canvas of ``size``, in pixels of ``image``."""
+        canvas, scale = letterbox(image, size, enlarge=True)
+        blob = (canvas.astype(np.float32) - np.float32(127.5)) * np.float32(1 / 128)
+        outputs = self._session.run({self._input_name: _nchw(blob)})
+        boxes, scores, keypoints = [], [], []
+        for stride, (score, distance, point) in zip(STRIDES, _by_stride(outputs), strict=True):
+            rows, columns = size[0] // stride, size[1] // stride
+            per_cell, rest = divmod(len(score), rows * columns)
+            if rest or per_cell == 0 or len(distance) != len(score) or len(point) != len(score):
+                raise ModelError(
+                    f"{self._session.name}: the outputs at stride {stride} do not fit a"
+                    f" {size[1]} x {size[0]} canvas."
+                )
+            found = np.flatnonzero(score >= self.score_threshold)
+            centres = cell_centres(rows, columns, stride=stride, per_cell=per_cell)[found]
+            reach = distance[found] * stride
+            boxes.append(np.concatenate([centres - reach[:, :2], centres + reach[:, 2:]], axis=1))
+            scores.append(score[found])
+            keypoints.append(centres[:, None, :] + point[found].reshape(-1, 5, 2) * stride)
+        return faces_from_candidates(boxes, scores, keypoints, overlap=OVERLAP, scale=scale)
+
+
+def _nchw(blob: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.ascontiguousarray(blob.transpose(2, 0, 1)[None])
+
+
+def _by_stride(
+    outputs: list[NDArray[np.float32]],
+) -> list[tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]]:
+    """Scores (k,), distances (k, 4) and points (k, 10) per stride, the finest first.
+
+    Exports differ in the order of the outputs and in a leading batch axis, so the role is told by
+    the last axis and the stride by the length.
+    """
+    groups: dict[int, list[NDArray[np.float32]]] = {1: [], 4: [], 10: []}
+    for output in outputs:
+        width = output.shape[-1]
+        if width not in groups:
+            raise ModelError(f"A detector output has {width} values per cell, not 1, 4 or 10.")
+        groups[width].append(output.reshape(-1, width))
+    for group in groups.values():
+        group.sort(key=len, reverse=True)
+    return [
+        (score[:, 0], distance, point)
+        for score, distance, point in zip(groups[1], groups[4], groups[10], strict=True)
+    ]

@@ -1,0 +1,95 @@
+"""YuNet, the detector of the OpenCV Zoo (W. Wu, H. Peng, S. Yu, 2023)."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.boxes import Face
+from models.detection import (
+    DEFAULT_SIZE,
+    Size,
+    canvas_sizes,
+    cell_centres,
+    faces_from_candidates,
+    letterbox,
+)
+from models.errors import ModelError
+from models.sessions import Session
+
+STRIDES = (8, 16, 32)
+SCORE_THRESHOLD = 0.6
+OVERLAP = 0.3
+OUTPUTS = tuple(f"{role}_{stride}" for role in ("cls", "obj", "bbox", "kps") for stride in STRIDES)
+# exp of a wild regression must not overflow; 2**10 strides exceed any canvas.
+_MAX_LOG_SIDE = 7.0
+
+
+class YuNet:
+    """YuNet with five points.
+
+    Parameters
+    ----------
+    session
+        A graph with one image input and the outputs ``cls_8`` ... ``kps_32``.
+    input_name
+        Name of the image input.
+    size
+        Side of the canvas, a multiple of 32.
+    fixed
+        Height and width where the graph accepts no other.
+    """
+
+    kind = "yunet"
+    score_threshold = SCORE_THRESHOLD
+
+    def __init__(
+        self,
+        session: Session,
+        *,
+        input_name: str,
+        size: int = DEFAULT_SIZE,
+        fixed: Size | None = None,
+    ) -> None:
+        self._session = session
+        self._input_name = input_name
+        self._fixed = fixed is not None
+        self.sizes = canvas_sizes(size, fixed)
+
+    def detect_once(self, image: NDArray[np.uint8], size: Size) -> list[Face]:
+        """Faces found in one pass on a canvas of ``size``, in pixels of ``image``."""
+        if not self._fixed:
+            size = _trimmed(image, size)
+        canvas, scale = letterbox(image, size, enlarge=False)
+        blob = np.ascontiguousarray(canvas[:, :, ::-1].transpose(2, 0, 1)[None], dtype=np.float32)
+        named = dict(
+            zip(OUTPUTS, self._session.run({self._input_name: blob}, OUTPUTS), strict=True)
+        )
+        boxes, scores, keypoints = [], [], []
+        for stride in STRIDES:
+            rows, columns = size[0] // stride, size[1] // stride
+            cls = named[f"cls_{stride}"].reshape(-1)
+            if len(cls) != rows * columns:
+                raise ModelError(
+                    f"{self._session.name}: the outputs at stride {stride} do not fit a"
+                    f" {size[1]} x {size[0]} canvas."
+                )
+            obj = named[f"obj_{stride}"].reshape(-1)
+            score = np.sqrt(np.clip(cls, 0, 1) * np.clip(obj, 0, 1))
+            found = np.flatnonzero(score >= self.score_threshold)
+            corner = cell_centres(rows, columns, stride=stride, per_cell=1)[found]
+            box = named[f"bbox_{stride}"].reshape(-1, 4)[found]
+            centre = corner + box[:, :2] * stride
+            half = np.exp(np.minimum(box[:, 2:], _MAX_LOG_SIDE)) * (stride / 2)
+            boxes.append(np.concatenate([centre - half, centre + half], axis=1))
+            scores.append(score[found])
+            points = named[f"kps_{stride}"].reshape(-1, 5, 2)[found]
+            keypoints.append(corner[:, None, :] + points * stride)
+        return faces_from_candidates(boxes, scores, keypoints, overlap=OVERLAP, scale=scale)
+
+
+def _trimmed(image: NDArray[np.uint8], size: Size) -> Size:
+    """Smallest canvas of whole 32-pixel blocks that holds the picture, at most ``size``."""
+    scale = min(size[0] / image.shape[0], size[1] / image.shape[1], 1.0)
+    return (
+        min(size[0], max(32, -(-round(image.shape[0] * scale) // 32) * 32)),
+        min(size[1], max(32, -(-round(image.shape[1] * scale) // 32) * 32)),
+    )
