@@ -1,0 +1,413 @@
+"""Encryption at rest: the master keys, and what is sealed directly under them.
+
+A master key never encrypts anything itself. HKDF-SHA256 derives one AES-256-GCM key per purpose
+from it, so that a blob of one purpose cannot stand in for a blob of another. A sealed blob is::
+
+    version (1 byte) | key id (8) | nonce (12) | ciphertext and tag (len(plaintext) + 16)
+
+Nonces are random; a purpose key may seal 2**32 blobs (NIST SP 800-38D §8.3), which no deployment
+of this size reaches. The associated data holds the header and the parts that the caller binds the
+blob to, each with its length in front, so that no two lists of parts have the same encoding.
+"""
+
+import base64
+import binascii
+import contextlib
+import hashlib
+import itertools
+import os
+import stat
+import threading
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import NoReturn, Protocol, Self
+
+from cryptography.exceptions import InvalidTag
+from cryptography.hazmat.primitives.ciphers.aead import AESGCM
+from cryptography.hazmat.primitives.hashes import SHA256
+from cryptography.hazmat.primitives.kdf.hkdf import HKDF
+
+from templates.errors import SealError
+
+KEY_BYTES = 32
+KEY_ID_BYTES = 8
+NONCE_BYTES = 12
+TAG_BYTES = 16
+OVERHEAD_BYTES = 1 + KEY_ID_BYTES + NONCE_BYTES + TAG_BYTES
+
+_VERSION = 1
+_MAX_FILE_BYTES = 64 * 1024
+_MAX_PLAINTEXT_BYTES = 2**31 - 1 - OVERHEAD_BYTES  # the limit of one call of the AES-GCM library
+_MIN_DISTINCT_BYTES = 16  # 32 random bytes have fewer with a probability of about 1e-15
+
+
+class Sealer(Protocol):
+    """Turns bytes into sealed bytes and back; whoever lacks the key learns only the length."""
+
+    def seal(self, plaintext: bytes, *, context: str) -> bytes:
+        """Encrypt `plaintext` so that it opens only with the same `context`."""
+        ...
+
+    def open(self, sealed: bytes, *, context: str) -> bytes:
+        """Decrypt; raise :class:`SealError` for another key, context or any altered byte."""
+        ...
+
+
+def encode_parts(*parts: str | bytes | int) -> bytes:
+    """Encode parts as associated data, injectively: count, then type, length and bytes of each.
+
+    Parameters
+    ----------
+    *parts
+        Text is taken as UTF-8, a whole number in decimal. The type is part of the encoding.
+    """
+    encoded = [len(parts).to_bytes(4, "big")]
+    for part in parts:
+        match part:
+            case str():
+                kind, body = b"t", part.encode()
+            case bytes():
+                kind, body = b"b", part
+            case int():
+                kind, body = b"i", str(part).encode()
+        encoded += [kind, len(body).to_bytes(8, "big"), body]
+    return b"".join(encoded)
+
+
+def derive_key(key: bytes, label: str) -> bytes:
+    """Derive 32 bytes for one purpose from a uniformly random key (HKDF-SHA256, RFC 5869)."""
+    return HKDF(SHA256(), KEY_BYTES, salt=None, info=b"veilface/1/" + label.encode()).derive(key)
+
+
+class MasterKeyring:
+    """The master keys of a deployment; the first seals, all of them open.
+
+    Use :meth:`load`, :meth:`create` or :meth:`from_text`. A keyring that came from a file follows
+    the file: when it changes, the keys are read again at the next seal, or when a blob names a key
+    that is not in memory. So a running service picks up a rotation without a restart.
+
+    Parameters
+    ----------
+    keys
+        32 random bytes each, the current one first.
+    source
+        What to call the place they came from in error texts.
+
+    Raises
+    ------
+    SealError
+        For no key, a repeated key, a key of another length, or one that is visibly not random.
+    """
+
+    def __init__(self, keys: Sequence[bytes], *, source: str = "the master keyring") -> None:
+        self._source = source
+        self._path: Path | None = None
+        self._stamp: tuple[int, int, int] | None = None
+        self._lock = threading.Lock()
+        self._keys = _Keys(keys, source=source)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read a key file: one base64 key of 32 bytes on a line, the current one first.
+
+        Raises
+        ------
+        SealError
+            If the file is absent, readable by group or others, or holds anything else.
+        """
+        path = Path(path)
+        keys, stamp = _read_key_file(path)
+        keyring = cls(keys, source=f"the key file {path}")
+        keyring._path, keyring._stamp = path, stamp
+        return keyring
+
+    @classmethod
+    def create(cls, path: str | Path) -> Self:
+        """Write a new key file with one random key, mode 0600, and load it.
+
+        The file appears whole or not at all, and an existing one is never touched, so of several
+        processes that try at once exactly one succeeds.
+
+        Raises
+        ------
+        SealError
+            If the file exists already or cannot be written.
+        """
+        path = Path(path)
+        _write_key_file(path, [os.urandom(KEY_BYTES)], replace=False)
+        return cls.load(path)
+
+    @classmethod
+    def from_text(cls, text: str, *, source: str = "the environment variable") -> Self:
+        """Read keys from a setting: base64, separated by white space or commas."""
+        return cls(_parse_keys(text.replace(",", " ").split(), source=source), source=source)
+
+    @staticmethod
+    def add_current(path: str | Path) -> str:
+        """Put a new random key in front of a key file's keys; returns its key id.
+
+        The file is replaced in one step. Afterwards re-wrap the store, then :meth:`drop_retired`.
+        """
+        path = Path(path)
+        keys, _ = _read_key_file(path)
+        fresh = os.urandom(KEY_BYTES)
+        _write_key_file(path, [fresh, *keys], replace=True)
+        return _key_id(fresh).hex()
+
+    @staticmethod
+    def drop_retired(path: str | Path) -> int:
+        """Keep only the first key of a key file; returns how many were dropped.
+
+        Whatever is still sealed under a dropped key is lost: ask
+        ``TemplateStore.wrapping_keys()`` first.
+        """
+        path = Path(path)
+        keys, _ = _read_key_file(path)
+        _write_key_file(path, keys[:1], replace=True)
+        return len(keys) - 1
+
+    @property
+    def current(self) -> str:
+        """Key id, 16 hexadecimal digits, of the key that seals."""
+        self._follow_file()
+        return self._keys.ids[0].hex()
+
+    @property
+    def key_ids(self) -> tuple[str, ...]:
+        """Ids of all keys, the current one first."""
+        self._follow_file()
+        return tuple(key_id.hex() for key_id in self._keys.ids)
+
+    def seal(
+        self, plaintext: bytes, *, purpose: str, bound_to: Sequence[str | bytes | int]
+    ) -> bytes:
+        """Encrypt under the current key.
+
+        Parameters
+        ----------
+        plaintext
+            At most 2 GiB.
+        purpose
+            Label of the derived key, for instance ``"subject-key"``.
+        bound_to
+            What the blob belongs to; it opens only with the same parts.
+        """
+        if len(plaintext) > _MAX_PLAINTEXT_BYTES:
+            raise SealError(f"{len(plaintext)} bytes are too many to seal at once (2 GiB at most)")
+        self._follow_file()
+        keys = self._keys
+        header = bytes([_VERSION]) + keys.ids[0]
+        nonce = os.urandom(NONCE_BYTES)
+        cipher = AESGCM(keys.derived(keys.ids[0], purpose))
+        return header + nonce + cipher.encrypt(nonce, plaintext, _bind(header, purpose, bound_to))
+
+    def open(self, sealed: bytes, *, purpose: str, bound_to: Sequence[str | bytes | int]) -> bytes:
+        """Decrypt what :meth:`seal` made with the same purpose and parts.
+
+        Raises
+        ------
+        SealError
+            If the blob names an unknown key, belongs to something else, or was altered.
+        """
+        key_id = sealed_key_id(sealed)
+        raw_id = bytes.fromhex(key_id)
+        if raw_id not in self._keys.ids:
+            self._follow_file()
+        keys = self._keys
+        if raw_id not in keys.ids:
+            known = ", ".join(each.hex() for each in keys.ids)
+            raise SealError(
+                f"sealed under master key {key_id}, but {self._source} has only {known}: "
+                "put the missing key back as a further line"
+            )
+        header, nonce = sealed[: 1 + KEY_ID_BYTES], sealed[1 + KEY_ID_BYTES :][:NONCE_BYTES]
+        cipher = AESGCM(keys.derived(raw_id, purpose))
+        try:
+            return cipher.decrypt(
+                nonce,
+                sealed[1 + KEY_ID_BYTES + NONCE_BYTES :],
+                _bind(header, purpose, bound_to),
+            )
+        except InvalidTag:
+            raise SealError(
+                f"sealed data ({purpose}) does not open: it was altered, or belongs elsewhere"
+            ) from None
+
+    def rewrap(
+        self, sealed: bytes, *, purpose: str, bound_to: Sequence[str | bytes | int]
+    ) -> bytes:
+        """Open a blob and seal it again under the current key."""
+        plaintext = self.open(sealed, purpose=purpose, bound_to=bound_to)
+        return self.seal(plaintext, purpose=purpose, bound_to=bound_to)
+
+    def _follow_file(self) -> None:
+        if self._path is None:
+            return
+        try:
+            if _stamp(self._path.stat()) == self._stamp:
+                return
+        except OSError:
+            return  # the keys in memory stay good while the file is away
+        # A file that is broken at this moment must not stop a service that has its keys: a blob
+        # under a key that is not in memory still fails, with the id of that key.
+        with self._lock, contextlib.suppress(SealError):
+            keys, stamp = _read_key_file(self._path)
+            self._keys, self._stamp = _Keys(keys, source=self._source), stamp
+
+    def __repr__(self) -> str:
+        return f"MasterKeyring({', '.join(each.hex() for each in self._keys.ids)})"
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError("a master keyring is not serialised: load it where it is needed")
+
+
+class KeyringSealer:
+    """A :class:`Sealer` under a master keyring, for files: decoy pools, cohorts, caches.
+
+    Parameters
+    ----------
+    keyring
+        The master keys.
+    purpose
+        Label of the derived key. Readers and writers of one file must agree on it.
+    """
+
+    def __init__(self, keyring: MasterKeyring, *, purpose: str = "file") -> None:
+        self._keyring = keyring
+        self._purpose = f"sealer/{purpose}"
+
+    def seal(self, plaintext: bytes, *, context: str) -> bytes:
+        """Encrypt `plaintext`, bound to `context`."""
+        return self._keyring.seal(plaintext, purpose=self._purpose, bound_to=[context])
+
+    def open(self, sealed: bytes, *, context: str) -> bytes:
+        """Decrypt; :class:`SealError` for another key or context, or an altered byte."""
+        return self._keyring.open(sealed, purpose=self._purpose, bound_to=[context])
+
+    def __repr__(self) -> str:
+        return f"KeyringSealer({self._keyring!r}, purpose={self._purpose!r})"
+
+
+def sealed_key_id(sealed: bytes) -> str:
+    """Id, 16 hexadecimal digits, of the master key that a blob was sealed under."""
+    if len(sealed) < OVERHEAD_BYTES:
+        raise SealError(f"sealed data has at least {OVERHEAD_BYTES} bytes, this has {len(sealed)}")
+    if sealed[0] != _VERSION:
+        raise SealError(f"sealed data of version {sealed[0]}, this program reads {_VERSION}")
+    return sealed[1 : 1 + KEY_ID_BYTES].hex()
+
+
+class _Keys:
+    """An immutable set of checked keys, and the keys derived from them so far."""
+
+    def __init__(self, keys: Sequence[bytes], *, source: str) -> None:
+        if not keys:
+            raise SealError(f"{source} holds no key")
+        for number, key in enumerate(keys, start=1):
+            if fault := _weakness(key):
+                raise SealError(f"key {number} of {source} {fault}")
+        if len(set(keys)) != len(keys):
+            raise SealError(f"{source} holds the same key twice")
+        self._masters = {_key_id(key): key for key in keys}
+        self._derived: dict[tuple[bytes, str], bytes] = {}
+        self.ids = tuple(self._masters)
+
+    def derived(self, key_id: bytes, purpose: str) -> bytes:
+        found = self._derived.get((key_id, purpose))
+        if found is None:
+            found = derive_key(self._masters[key_id], f"seal/{purpose}")
+            self._derived[key_id, purpose] = found
+        return found
+
+
+def _bind(header: bytes, purpose: str, bound_to: Sequence[str | bytes | int]) -> bytes:
+    return header + encode_parts(purpose, *bound_to)
+
+
+def _key_id(key: bytes) -> bytes:
+    return hashlib.sha256(derive_key(key, "key-id")).digest()[:KEY_ID_BYTES]
+
+
+def _weakness(key: bytes) -> str | None:
+    """Say what is wrong with a key, for keys that nobody drew at random."""
+    advice = "make one with `veilface keys master`"
+    if len(key) != KEY_BYTES:
+        return f"has {len(key)} bytes, not {KEY_BYTES}: {advice}"
+    steps = {(b - a) % 256 for a, b in itertools.pairwise(key)}
+    if len(set(key)) < _MIN_DISTINCT_BYTES or len(steps) == 1 or key[:16] == key[16:]:
+        return f"is a pattern, not random bytes: {advice}"
+    if all(0x20 <= byte < 0x7F for byte in key):
+        return f"is readable text, not random bytes: {advice}"
+    return None
+
+
+def _parse_keys(encoded: Iterable[str], *, source: str) -> list[bytes]:
+    keys = []
+    for number, line in enumerate(encoded, start=1):
+        try:
+            keys.append(base64.b64decode(line, validate=True))
+        except (binascii.Error, ValueError):
+            raise SealError(f"key {number} of {source} is not base64") from None
+    return keys
+
+
+def _stamp(status: os.stat_result) -> tuple[int, int, int]:
+    return status.st_ino, status.st_mtime_ns, status.st_size
+
+
+def _read_key_file(path: Path) -> tuple[list[bytes], tuple[int, int, int]]:
+    source = f"the key file {path}"
+    try:
+        # Not blocking: a named pipe in the place of the file would hold the start for ever.
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+    except FileNotFoundError:
+        raise SealError(f"{source} does not exist: make it with `veilface keys master`") from None
+    except OSError as error:
+        raise SealError(f"{source} cannot be opened: {error.strerror}") from None
+    with os.fdopen(descriptor, "rb") as file:
+        status = os.fstat(descriptor)
+        if not stat.S_ISREG(status.st_mode):
+            raise SealError(f"{source} is not a regular file")
+        if status.st_mode & 0o077:
+            raise SealError(
+                f"{source} may be read by others (mode {stat.S_IMODE(status.st_mode):04o}): "
+                "`chmod 600` it, and replace the keys if others could have read them"
+            )
+        if status.st_size > _MAX_FILE_BYTES:
+            raise SealError(f"{source} has {status.st_size} bytes, more than {_MAX_FILE_BYTES}")
+        data = file.read(_MAX_FILE_BYTES + 1)
+    try:
+        text = data.decode("ascii")
+    except UnicodeDecodeError:
+        raise SealError(f"{source} is not text: it holds one base64 key on each line") from None
+    keys = _parse_keys((line.strip() for line in text.splitlines() if line.strip()), source=source)
+    _Keys(keys, source=source)
+    return keys, _stamp(status)
+
+
+def _write_key_file(path: Path, keys: Sequence[bytes], *, replace: bool) -> None:
+    """Write beside the place, then link or rename into it: nobody ever sees half a file."""
+    text = b"".join(base64.b64encode(key) + b"\n" for key in keys)
+    draft = path.with_name(f".{path.name}.{os.urandom(8).hex()}")
+    try:
+        descriptor = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+        try:
+            with os.fdopen(descriptor, "wb") as file:
+                file.write(text)
+                file.flush()
+                os.fsync(file.fileno())
+            if replace:
+                draft.replace(path)
+            else:
+                path.hardlink_to(draft)
+        finally:
+            draft.unlink(missing_ok=True)
+        directory = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(directory)
+        finally:
+            os.close(directory)
+    except FileExistsError:
+        raise SealError(f"the key file {path} exists already and is not overwritten") from None
+    except OSError as error:
+        raise SealError(f"the key file {path} cannot be written: {error.strerror}") from None

@@ -1,0 +1,284 @@
+"""The connection to SQLite or PostgreSQL: transactions, retries, and errors in our own words.
+
+One :class:`Database` may be used by many threads, and survives a fork: each process makes its own
+connections. A write runs as one function inside one transaction; it may be run again when the
+database asks for that (a deadlock, a serialisation failure), so it must do nothing but database
+work.
+"""
+
+import os
+import random
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import sqlalchemy as sa
+from sqlalchemy import event
+from sqlalchemy.engine import URL, Connection, Engine, make_url
+from sqlalchemy.exc import ArgumentError, DBAPIError, SQLAlchemyError
+from sqlalchemy.exc import TimeoutError as PoolTimeout
+
+from templates.errors import StoreError, StoreUnavailable
+
+T = TypeVar("T")
+
+_ATTEMPTS = 5
+_RETRIED_STATES = {"40001", "40P01"}  # serialisation failure, deadlock
+_UNAVAILABLE_CLASSES = {"08", "53", "57", "58"}  # connection, resources, operator, system
+
+
+class Database:
+    """An engine for each process, and the two ways to use it: :meth:`read` and :meth:`write`.
+
+    Parameters
+    ----------
+    url
+        ``sqlite:///path`` or ``postgresql://user@host/name``. The path of SQLite is a file on a
+        local disk; it is created with mode 0600.
+    pool_size, max_overflow
+        Connections kept, and further ones under load, in each process.
+    timeout
+        Seconds to wait for a connection, or for another writer (SQLite).
+
+    Raises
+    ------
+    StoreError
+        If the URL names neither database.
+    """
+
+    def __init__(
+        self, url: str, *, pool_size: int = 5, max_overflow: int = 10, timeout: float = 10.0
+    ) -> None:
+        self.url = _checked_url(url)
+        self.is_sqlite = self.url.get_backend_name() == "sqlite"
+        self._pool_size = pool_size
+        self._max_overflow = max_overflow
+        self._timeout = timeout
+        self._lock = threading.Lock()
+        self._process = _Process(self._make_engine())
+
+    @property
+    def engine(self) -> Engine:
+        """The engine of this process."""
+        return self._here().engine
+
+    def read(self, work: Callable[[Connection], T]) -> T:
+        """Run `work` on a connection; what it sees is committed."""
+        here = self._here()
+        try:
+            with here.readers.connect() as connection:
+                return work(connection)
+        except (SQLAlchemyError, OSError) as error:
+            raise _translated(error) from None
+
+    def write(self, work: Callable[[Connection], T], *, lock: str | None = None) -> T:
+        """Run `work` in one transaction and commit it; all or nothing.
+
+        Parameters
+        ----------
+        work
+            May run several times; only its last run counts.
+        lock
+            Writes with the same lock name run one after the other, over all processes. (On SQLite
+            all writes do.)
+        """
+        here = self._here()
+        for attempt in range(1, _ATTEMPTS + 1):
+            try:
+                if self.is_sqlite:
+                    # Threads queue here in turn; SQLite's own lock is polled and knows no order.
+                    with here.writing, here.writers.begin() as connection:
+                        return work(connection)
+                with here.writers.begin() as connection:
+                    if lock is not None:
+                        number = _lock_number(lock)
+                        connection.execute(sa.select(sa.func.pg_advisory_xact_lock(number)))
+                    return work(connection)
+            except DBAPIError as error:
+                if attempt < _ATTEMPTS and _state(error) in _RETRIED_STATES:
+                    time.sleep(random.uniform(0, 0.02 * 2**attempt))
+                    continue
+                raise _translated(error) from None
+            except (SQLAlchemyError, OSError) as error:
+                raise _translated(error) from None
+        raise AssertionError("the last attempt returns or raises")
+
+    def purge_log(self) -> bool:
+        """Move SQLite's write-ahead log into the database file and empty it.
+
+        What a transaction removed may still stand in the log until then. Waits for readers up to
+        the timeout; False if one outlasted it. Nothing to do on PostgreSQL.
+        """
+        if not self.is_sqlite:
+            return True
+        here = self._here()
+        try:
+            with here.writing, here.engine.connect() as connection:
+                driver: Any = connection.connection.driver_connection
+                busy, _, _ = driver.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()
+        except SQLAlchemyError as error:
+            raise _translated(error) from None
+        except Exception as error:
+            if type(error).__module__ == "sqlite3":
+                return False
+            raise
+        return not busy
+
+    def close(self) -> None:
+        """Close the connections of this process that are idle."""
+        self._here().engine.dispose()
+
+    def _here(self) -> "_Process":
+        if self._process.pid != os.getpid():
+            # The sockets and file locks of the parent are not ours: forget them, unclosed.
+            self._lock = threading.Lock()
+            self._process.engine.dispose(close=False)
+            self._process = _Process(self._make_engine())
+        return self._process
+
+    def _make_engine(self) -> Engine:
+        common: dict[str, Any] = {
+            "pool_size": self._pool_size,
+            "max_overflow": self._max_overflow,
+            "pool_timeout": self._timeout,
+            "hide_parameters": True,  # an error text must never quote a row
+        }
+        if not self.is_sqlite:
+            return sa.create_engine(
+                self.url,
+                pool_pre_ping=True,
+                connect_args={
+                    "connect_timeout": max(2, round(self._timeout)),
+                    "application_name": "veilface",
+                    "keepalives_idle": 30,
+                    "keepalives_interval": 10,
+                    "keepalives_count": 3,
+                    "tcp_user_timeout": 30_000,
+                },
+                **common,
+            )
+        _create_private_file(Path(str(self.url.database)))
+        engine = sa.create_engine(
+            self.url,
+            poolclass=sa.pool.QueuePool,
+            connect_args={"timeout": self._timeout, "check_same_thread": False},
+            **common,
+        )
+        event.listen(engine, "connect", _prepare_sqlite)
+        event.listen(engine, "begin", _begin_sqlite)
+        return engine
+
+    def __repr__(self) -> str:
+        return f"Database({self.url.render_as_string(hide_password=True)!r})"
+
+
+class _Process:
+    """What belongs to one process: its engine, seen as readers' and as writers'."""
+
+    def __init__(self, engine: Engine) -> None:
+        self.pid = os.getpid()
+        self.engine = engine
+        self.writing = threading.Lock()
+        self.writers = engine.execution_options(veilface_write=True)
+        self.readers = (
+            engine
+            if engine.dialect.name == "sqlite"
+            else engine.execution_options(isolation_level="AUTOCOMMIT")
+        )
+
+
+def _checked_url(text: str) -> URL:
+    try:
+        url = make_url(text)
+    except ArgumentError:
+        raise StoreError(
+            "the database URL cannot be read: write sqlite:///path or postgresql://user@host/name"
+        ) from None
+    if url.drivername in ("postgresql", "postgres", "postgresql+psycopg"):
+        return url.set(drivername="postgresql+psycopg")
+    if url.drivername in ("sqlite", "sqlite+pysqlite"):
+        if not url.database or url.database == ":memory:" or url.database.startswith("file:"):
+            raise StoreError("SQLite needs a file: write sqlite:///path")
+        return url.set(drivername="sqlite+pysqlite")
+    raise StoreError(
+        f"a database of kind {url.drivername!r} is not supported: use sqlite:// or postgresql://"
+    )
+
+
+def _create_private_file(path: Path) -> None:
+    try:
+        os.close(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
+    except OSError as error:
+        raise StoreError(f"the database file {path} cannot be used: {error.strerror}") from None
+
+
+def _prepare_sqlite(connection: Any, _record: object) -> None:
+    connection.isolation_level = None  # transactions begin where _begin_sqlite says so
+    cursor = connection.cursor()
+    try:
+        # Waiting first: the switch to WAL below needs the file for itself for a moment.
+        _set_wal(cursor)
+        cursor.execute("PRAGMA synchronous = FULL")
+        cursor.execute("PRAGMA foreign_keys = ON")
+        cursor.execute("PRAGMA secure_delete = ON")
+        cursor.execute("PRAGMA temp_store = MEMORY")
+    finally:
+        cursor.close()
+
+
+def _set_wal(cursor: Any) -> None:
+    # SQLite answers "locked" at once here, without its busy handler, when two processes switch.
+    for pause in (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, None):
+        try:
+            (mode,) = cursor.execute("PRAGMA journal_mode = WAL").fetchone()
+        except Exception as error:
+            if pause is None or "locked" not in str(error):
+                raise
+            time.sleep(pause)
+            continue
+        if mode != "wal":
+            raise StoreError(
+                f"SQLite keeps its journal as {mode!r} here, not as a write-ahead log: "
+                "put the database file on a local disk"
+            )
+        return
+
+
+def _begin_sqlite(connection: Connection) -> None:
+    writing = connection.get_execution_options().get("veilface_write", False)
+    connection.exec_driver_sql("BEGIN IMMEDIATE" if writing else "BEGIN")
+
+
+def _lock_number(name: str) -> int:
+    import hashlib
+
+    return int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big", signed=True)
+
+
+def _state(error: DBAPIError) -> str:
+    return getattr(error.orig, "sqlstate", None) or ""
+
+
+def _translated(error: Exception) -> StoreError:
+    """Say what went wrong without the statement, its parameters or any row."""
+    if isinstance(error, PoolTimeout):
+        return StoreUnavailable("all connections to the database are busy")
+    if not isinstance(error, DBAPIError):
+        return StoreError(f"the database cannot be used ({type(error).__name__})")
+    cause, state = type(error.orig).__name__, _state(error)
+    if type(error.orig).__module__ == "sqlite3":
+        text = str(error.orig)
+        if cause == "OperationalError" and "no such" not in text:
+            return StoreUnavailable(f"the SQLite database does not answer: {text}")
+        if cause == "DatabaseError":
+            return StoreUnavailable("the SQLite file is damaged, or is not a database")
+        return StoreError(f"SQLite refused the statement ({cause})")
+    if (
+        error.connection_invalidated
+        or state[:2] in _UNAVAILABLE_CLASSES
+        or (cause in ("OperationalError", "InterfaceError", "ConnectionTimeout") and not state)
+    ):
+        return StoreUnavailable(f"the PostgreSQL server does not answer ({cause} {state})".strip())
+    return StoreError(f"PostgreSQL refused the statement ({cause} {state})")

@@ -1,0 +1,115 @@
+"""Secrets of the whole deployment, made once, and the check of the master key."""
+
+import os
+import threading
+
+import sqlalchemy as sa
+from sqlalchemy.dialects.postgresql import insert as postgresql_insert
+from sqlalchemy.dialects.sqlite import insert as sqlite_insert
+from sqlalchemy.engine import Connection
+
+from templates.errors import SealError, StoreError
+from templates.sealing import MasterKeyring, sealed_key_id
+from templates.store.database import Database
+from templates.store.identifiers import Clock, checked_opaque_id
+from templates.store.schema import Base, MasterKeyCheckRow, SecretRow
+
+SECRET_PURPOSE = "store-secret"  # noqa: S105 - a label, not a secret
+CHECK_PURPOSE = "master-key-check"
+_CHECK_TEXT = b"veilface"
+
+
+class Secrets:
+    """Named random values: the same for every process, and wrapped by the master key.
+
+    Parameters
+    ----------
+    database, keyring, clock
+        Where they are kept, what wraps them, and what time it is.
+    """
+
+    def __init__(self, database: Database, keyring: MasterKeyring, clock: Clock) -> None:
+        self._database = database
+        self._keyring = keyring
+        self._clock = clock
+        self._known: dict[str, bytes] = {}
+        self._lock = threading.Lock()
+
+    def get(self, name: str) -> bytes:
+        """Return 32 random bytes of this name; the first call of any process makes them.
+
+        Raises
+        ------
+        SealError
+            If the master key that wrapped it is missing.
+        """
+        checked_opaque_id(name, what="secret's name")
+        with self._lock:
+            if name not in self._known:
+                self._known[name] = self._database.write(lambda each: self._obtain(each, name))
+            return self._known[name]
+
+    def _obtain(self, connection: Connection, name: str) -> bytes:
+        fresh = self._keyring.seal(os.urandom(32), purpose=SECRET_PURPOSE, bound_to=[name])
+        insert_once(
+            connection,
+            SecretRow,
+            name=name,
+            wrapped_value=fresh,
+            wrapping_key=sealed_key_id(fresh),
+            created_at=self._clock(),
+        )
+        wrapped = connection.execute(
+            sa.select(SecretRow.wrapped_value).where(SecretRow.name == name)
+        ).scalar_one()
+        return self._keyring.open(wrapped, purpose=SECRET_PURPOSE, bound_to=[name])
+
+    def __repr__(self) -> str:
+        return "Secrets()"
+
+
+def insert_once(connection: Connection, table: type[Base], **values: object) -> bool:
+    """Insert a row unless its key is taken; True if it was inserted."""
+    insert = sqlite_insert if connection.dialect.name == "sqlite" else postgresql_insert
+    statement = insert(table).values(**values).on_conflict_do_nothing()
+    return connection.execute(statement).rowcount == 1
+
+
+def mark_master_key(database: Database, keyring: MasterKeyring, clock: Clock) -> None:
+    """Leave a mark under the current master key in a database that has none yet."""
+    sealed = keyring.seal(_CHECK_TEXT, purpose=CHECK_PURPOSE, bound_to=[])
+    database.write(
+        lambda each: insert_once(
+            each,
+            MasterKeyCheckRow,
+            id=1,
+            wrapped_value=sealed,
+            wrapping_key=sealed_key_id(sealed),
+            created_at=clock(),
+        )
+    )
+
+
+def check_master_key(database: Database, keyring: MasterKeyring) -> None:
+    """Raise unless the keyring opens the mark that :func:`mark_master_key` left.
+
+    Raises
+    ------
+    StoreError
+        If the database carries no mark.
+    SealError
+        If it was made with another master key.
+    """
+    row = database.read(
+        lambda each: each.execute(
+            sa.select(MasterKeyCheckRow.wrapped_value, MasterKeyCheckRow.wrapping_key)
+        ).one_or_none()
+    )
+    if row is None:
+        raise StoreError("the database has no master key yet: run `veilface db upgrade`")
+    try:
+        opened = keyring.open(row.wrapped_value, purpose=CHECK_PURPOSE, bound_to=[])
+    except SealError as error:
+        raise SealError(f"this is not the master key of this database: {error}") from None
+    if opened != _CHECK_TEXT:
+        raise SealError("the database's mark of its master key is not ours: it was altered")

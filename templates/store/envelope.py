@@ -1,0 +1,100 @@
+"""Envelope encryption of one template.
+
+A subject's data key, 32 random bytes, is made anew with every enrollment and encrypts exactly one
+template, so that a nonce cannot repeat under it. It is stored wrapped by the master key, bound to
+the tenant and to the random row id of the subject. The template's ciphertext is bound to tenant,
+row id, subject id, contract id, template id and rotation epoch: a row that is moved or relabelled
+does not open.
+"""
+
+import os
+from dataclasses import dataclass, field
+
+from cryptography.exceptions import InvalidTag
+from cryptography.hazmat.primitives.ciphers.aead import AESGCM
+
+from templates.errors import SealError
+from templates.sealing import NONCE_BYTES, TAG_BYTES, MasterKeyring, encode_parts
+
+_VERSION = b"\x01"
+_DATA_KEY_PURPOSE = "subject-data-key"
+
+
+@dataclass(frozen=True)
+class Owner:
+    """What a template's ciphertext belongs to."""
+
+    tenant_id: str
+    subject_pk: str
+    subject_id: str
+    contract_id: str
+    template_id: str
+    rotation_epoch: int
+
+    @property
+    def bound_to(self) -> bytes:
+        """Associated data of the ciphertext."""
+        return encode_parts(
+            "template",
+            self.tenant_id,
+            self.subject_pk,
+            self.subject_id,
+            self.contract_id,
+            self.template_id,
+            self.rotation_epoch,
+        )
+
+
+@dataclass(frozen=True)
+class Envelope:
+    """A template as it is stored."""
+
+    wrapped_key: bytes = field(repr=False)
+    ciphertext: bytes = field(repr=False)
+
+
+def close_envelope(wire: bytes, owner: Owner, keyring: MasterKeyring) -> Envelope:
+    """Encrypt a template under a fresh data key, and wrap that key."""
+    data_key, nonce = os.urandom(32), os.urandom(NONCE_BYTES)
+    body = AESGCM(data_key).encrypt(nonce, wire, owner.bound_to)
+    return Envelope(
+        wrapped_key=keyring.seal(
+            data_key,
+            purpose=_DATA_KEY_PURPOSE,
+            bound_to=[owner.tenant_id, owner.subject_pk],
+        ),
+        ciphertext=_VERSION + nonce + body,
+    )
+
+
+def open_envelope(envelope: Envelope, owner: Owner, keyring: MasterKeyring) -> bytes:
+    """Decrypt a template.
+
+    Raises
+    ------
+    SealError
+        If the row was altered, belongs to another owner, or its master key is missing.
+    """
+    data_key = keyring.open(
+        envelope.wrapped_key,
+        purpose=_DATA_KEY_PURPOSE,
+        bound_to=[owner.tenant_id, owner.subject_pk],
+    )
+    stored = envelope.ciphertext
+    if len(stored) < 1 + NONCE_BYTES + TAG_BYTES or stored[:1] != _VERSION:
+        raise SealError("a stored template is cut short, or of a version this program cannot read")
+    try:
+        return AESGCM(data_key).decrypt(
+            stored[1 : 1 + NONCE_BYTES], stored[1 + NONCE_BYTES :], owner.bound_to
+        )
+    except InvalidTag:
+        raise SealError(
+            "a stored template does not open: its row was altered, or belongs to another subject"
+        ) from None
+
+
+def rewrap_data_key(
+    wrapped: bytes, *, tenant_id: str, subject_pk: str, keyring: MasterKeyring
+) -> bytes:
+    """Wrap a data key again, under the keyring's current key."""
+    return keyring.rewrap(wrapped, purpose=_DATA_KEY_PURPOSE, bound_to=[tenant_id, subject_pk])

@@ -1,0 +1,51 @@
+"""The names that come from outside, and the rules they keep."""
+
+import re
+from collections.abc import Callable
+from datetime import UTC, datetime
+
+from templates.errors import StoreError
+
+SUBJECT_ID_RULE = "1 to 128 characters out of A-Z a-z 0-9 . _ @ : -"
+TENANT_NAME_RULE = "1 to 64 characters out of A-Z a-z 0-9 . _ -"
+OPAQUE_ID_RULE = "1 to 64 characters out of A-Z a-z 0-9 _ -"
+
+_SUBJECT_ID = re.compile(r"[A-Za-z0-9._@:-]{1,128}")
+_TENANT_NAME = re.compile(r"[A-Za-z0-9._-]{1,64}")
+_OPAQUE_ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
+
+Clock = Callable[[], datetime]
+
+
+class InvalidIdentifier(StoreError):
+    """A subject id, tenant name or page cursor that breaks the rules."""
+
+
+class UnknownTenant(StoreError):
+    """No tenant of this name."""
+
+
+def utc_now() -> datetime:
+    """Time of now, aware, in UTC."""
+    return datetime.now(UTC)
+
+
+def checked_subject_id(text: str) -> str:
+    """Return `text`, or raise :class:`InvalidIdentifier` with the rule."""
+    return _checked(text, _SUBJECT_ID, f"a subject id has {SUBJECT_ID_RULE}")
+
+
+def checked_tenant_name(text: str) -> str:
+    """Return `text`, or raise :class:`InvalidIdentifier` with the rule."""
+    return _checked(text, _TENANT_NAME, f"a tenant name has {TENANT_NAME_RULE}")
+
+
+def checked_opaque_id(text: str, *, what: str) -> str:
+    """Return `text` (a template, contract or key id), or raise :class:`InvalidIdentifier`."""
+    return _checked(text, _OPAQUE_ID, f"a {what} has {OPAQUE_ID_RULE}")
+
+
+def _checked(text: str, pattern: re.Pattern[str], message: str) -> str:
+    if not isinstance(text, str) or pattern.fullmatch(text) is None:
+        raise InvalidIdentifier(message)
+    return text

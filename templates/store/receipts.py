@@ -1,0 +1,142 @@
+"""Signed erasure receipts.
+
+A receipt is a canonical JSON text and its Ed25519 signature (RFC 8032). It names the subject by a
+pseudonym, HMAC-SHA256 of tenant and subject id under a key of the deployment: whoever holds the
+subject id and asks the deployment can find the receipt, nobody else learns whom it is about.
+"""
+
+import base64
+import binascii
+import hashlib
+import hmac
+import json
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any
+
+from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
+
+from templates.errors import StoreError
+from templates.sealing import encode_parts
+from templates.store.deployment import Secrets
+
+PSEUDONYM_SECRET = "pseudonym"  # noqa: S105 - a name, not a secret
+RECEIPT_SECRET = "receipt-signing"  # noqa: S105
+
+_KIND = "veilface-erasure-receipt"
+_VERSION = 1
+
+
+@dataclass(frozen=True)
+class Receipt:
+    """Proof that a subject's data was erased, or that none was held.
+
+    Attributes
+    ----------
+    body
+        Canonical JSON: kind, version, tenant, subject (pseudonym), held, erased_at, signing_key.
+    signature
+        64 bytes, Ed25519 over the UTF-8 bytes of `body`.
+    """
+
+    body: str
+    signature: bytes
+
+    @property
+    def claims(self) -> dict[str, Any]:
+        """The body, read."""
+        claims: dict[str, Any] = json.loads(self.body)
+        return claims
+
+    @property
+    def held(self) -> bool:
+        """Whether there was a template to erase."""
+        return bool(self.claims["held"])
+
+    def to_json(self) -> dict[str, Any]:
+        """The form that a client keeps and :func:`verify_receipt` takes."""
+        return {"body": self.body, "signature": base64.b64encode(self.signature).decode()}
+
+    @classmethod
+    def from_json(cls, value: object) -> "Receipt":
+        """Read :meth:`to_json`'s form; :class:`StoreError` for anything else."""
+        if not isinstance(value, dict) or set(value) != {"body", "signature"}:
+            raise StoreError("a receipt is an object with a body and a signature")
+        body, signature = value["body"], value["signature"]
+        if not isinstance(body, str) or not isinstance(signature, str) or len(body) > 4096:
+            raise StoreError("the body and the signature of a receipt are short texts")
+        try:
+            return cls(body, base64.b64decode(signature, validate=True))
+        except (binascii.Error, ValueError):
+            raise StoreError("the signature of a receipt is base64") from None
+
+
+class ReceiptSigner:
+    """Makes pseudonyms and receipts with the deployment's keys."""
+
+    def __init__(self, secrets: Secrets) -> None:
+        self._secrets = secrets
+
+    def pseudonym(self, tenant: str, subject_id: str) -> str:
+        """Keyed pseudonym, 64 hexadecimal digits, of one subject of one tenant."""
+        key = self._secrets.get(PSEUDONYM_SECRET)
+        return hmac.new(key, encode_parts(tenant, subject_id), hashlib.sha256).hexdigest()
+
+    def public_key(self) -> bytes:
+        """The 32 bytes that verify this deployment's receipts."""
+        return self._private().public_key().public_bytes_raw()
+
+    def sign(self, *, tenant: str, pseudonym: str, held: bool, erased_at: datetime) -> Receipt:
+        """Write and sign a receipt."""
+        private = self._private()
+        body = json.dumps(
+            {
+                "kind": _KIND,
+                "version": _VERSION,
+                "tenant": tenant,
+                "subject": pseudonym,
+                "held": held,
+                "erased_at": erased_at.isoformat(),
+                "signing_key": key_fingerprint(private.public_key().public_bytes_raw()),
+            },
+            sort_keys=True,
+            separators=(",", ":"),
+        )
+        return Receipt(body, private.sign(body.encode()))
+
+    def _private(self) -> Ed25519PrivateKey:
+        return Ed25519PrivateKey.from_private_bytes(self._secrets.get(RECEIPT_SECRET))
+
+
+def key_fingerprint(public_key: bytes) -> str:
+    """First 16 hexadecimal digits of a public key's SHA-256, to tell keys apart."""
+    return hashlib.sha256(public_key).hexdigest()[:16]
+
+
+def verify_receipt(receipt: Receipt, public_key: bytes) -> dict[str, Any]:
+    """Check a receipt's signature and form, and return its claims.
+
+    Raises
+    ------
+    StoreError
+        If it was not signed with this key, was altered, or is no erasure receipt.
+    """
+    try:
+        key = Ed25519PublicKey.from_public_bytes(public_key)
+    except ValueError:
+        raise StoreError("the public key of a deployment has 32 bytes") from None
+    try:
+        key.verify(receipt.signature, receipt.body.encode())
+    except InvalidSignature:
+        raise StoreError(
+            "the receipt does not carry this deployment's signature: "
+            "it was altered, or another deployment signed it"
+        ) from None
+    try:
+        claims = receipt.claims
+    except (ValueError, RecursionError):
+        raise StoreError("the receipt's body is not JSON") from None
+    if not isinstance(claims, dict) or claims.get("kind") != _KIND or claims.get("version") != 1:
+        raise StoreError("the signed text is not an erasure receipt of version 1")
+    return claims

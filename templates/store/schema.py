@@ -1,0 +1,262 @@
+"""The tables of the store.
+
+Whatever is a secret is a sealed blob, and beside each blob that a master key sealed stands the id
+of that key (``wrapping_key``), so that a rotation finds the rows it still has to re-wrap. Rows
+that must outlive a subject (receipts, audit lines) name it by a keyed pseudonym only.
+
+Some columns have their place here and their writer in the service's abuse and retention work:
+``failed_attempts``, ``used_nonces``, ``audit_log`` and ``subjects.last_used_at``.
+"""
+
+from datetime import UTC, datetime
+
+from sqlalchemy import (
+    BigInteger,
+    DateTime,
+    Dialect,
+    ForeignKey,
+    Index,
+    Integer,
+    LargeBinary,
+    MetaData,
+    String,
+    Text,
+    TypeDecorator,
+    UniqueConstraint,
+)
+from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
+
+KEY_ID = String(16)
+PSEUDONYM = String(64)
+UUID_HEX = String(32)
+
+# Ordered by code point on every database, so that a page cursor means the same on each of them.
+SUBJECT_ID = String(128).with_variant(String(128, collation="C"), "postgresql")
+SERIAL = BigInteger().with_variant(Integer, "sqlite")
+
+
+class UtcDateTime(TypeDecorator[datetime]):
+    """An aware time, in UTC on both sides; SQLite would otherwise hand back a naive one."""
+
+    impl = DateTime(timezone=True)
+    cache_ok = True
+
+    def process_bind_param(
+        self,
+        value: datetime | None,
+        dialect: Dialect,  # noqa: ARG002 - SQLAlchemy's signature
+    ) -> datetime | None:
+        """Convert to UTC; a naive time has no meaning here."""
+        if value is None:
+            return None
+        if value.tzinfo is None:
+            raise ValueError("times in the store carry a time zone")
+        return value.astimezone(UTC)
+
+    def process_result_value(
+        self,
+        value: datetime | None,
+        dialect: Dialect,  # noqa: ARG002
+    ) -> datetime | None:
+        """Attach UTC where the database dropped the zone."""
+        if value is None:
+            return None
+        return value.replace(tzinfo=UTC) if value.tzinfo is None else value.astimezone(UTC)
+
+
+class Base(DeclarativeBase):
+    """Base of the mapped tables; constraint names are fixed so that migrations can name them."""
+
+    metadata = MetaData(
+        naming_convention={
+            "ix": "ix_%(table_name)s_%(column_0_N_name)s",
+            "uq": "uq_%(table_name)s_%(column_0_N_name)s",
+            "fk": "fk_%(table_name)s_%(column_0_name)s_%(referred_table_name)s",
+            "pk": "pk_%(table_name)s",
+        }
+    )
+
+
+class TenantRow(Base):
+    """A tenant: one rotation, one set of subjects, its own API keys."""
+
+    __tablename__ = "tenants"
+
+    id: Mapped[str] = mapped_column(UUID_HEX, primary_key=True)
+    name: Mapped[str] = mapped_column(String(64), unique=True)
+    rotation_epoch: Mapped[int] = mapped_column(Integer)
+    created_at: Mapped[datetime] = mapped_column(UtcDateTime)
+
+
+class RotationKeyRow(Base):
+    """The key of a tenant's rotation, one row for each epoch that templates still belong to."""
+
+    __tablename__ = "rotation_keys"
+
+    tenant_id: Mapped[str] = mapped_column(
+        UUID_HEX, ForeignKey("tenants.id", ondelete="CASCADE"), primary_key=True
+    )
+    epoch: Mapped[int] = mapped_column(Integer, primary_key=True)
+    wrapped_key: Mapped[bytes] = mapped_column(LargeBinary)
+    wrapping_key: Mapped[str] = mapped_column(KEY_ID)
+    created_at: Mapped[datetime] = mapped_column(UtcDateTime)
+
+
+class ApiKeyRow(Base):
+    """An API key: the hash of its token, and the sealed key that its probes are signed with."""
+
+    __tablename__ = "api_keys"
+
+    id: Mapped[str] = mapped_column(UUID_HEX, primary_key=True)
+    tenant_id: Mapped[str] = mapped_column(
+        UUID_HEX, ForeignKey("tenants.id", ondelete="CASCADE"), index=True
+    )
+    prefix: Mapped[str] = mapped_column(String(16), unique=True)
+    token_hash: Mapped[bytes] = mapped_column(LargeBinary(32))
+    rights: Mapped[str] = mapped_column(String(128))
+    label: Mapped[str] = mapped_column(String(128))
+    wrapped_probe_key: Mapped[bytes] = mapped_column(LargeBinary)
+    wrapping_key: Mapped[str] = mapped_column(KEY_ID)
+    created_at: Mapped[datetime] = mapped_column(UtcDateTime)
+    expires_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
+    revoked_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
+    last_used_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
+
+
+class SubjectRow(Base):
+    """A subject, with the data key of its template, wrapped by a master key."""
+
+    __tablename__ = "subjects"
+    __table_args__ = (
+        UniqueConstraint("tenant_id", "subject_id"),
+        Index("ix_subjects_wrapping_key", "wrapping_key"),
+    )
+
+    id: Mapped[str] = mapped_column(UUID_HEX, primary_key=True)
+    tenant_id: Mapped[str] = mapped_column(UUID_HEX, ForeignKey("tenants.id", ondelete="CASCADE"))
+    subject_id: Mapped[str] = mapped_column(SUBJECT_ID)
+    wrapped_key: Mapped[bytes] = mapped_column(LargeBinary)
+    wrapping_key: Mapped[str] = mapped_column(KEY_ID)
+    created_at: Mapped[datetime] = mapped_column(UtcDateTime)
+    updated_at: Mapped[datetime] = mapped_column(UtcDateTime)
+    last_used_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
+
+
+class TemplateRow(Base):
+    """The one template of a subject, encrypted under the subject's data key."""
+
+    __tablename__ = "templates"
+
+    subject_pk: Mapped[str] = mapped_column(
+        UUID_HEX, ForeignKey("subjects.id", ondelete="CASCADE"), primary_key=True
+    )
+    template_id: Mapped[str] = mapped_column(String(64))
+    contract_id: Mapped[str] = mapped_column(String(64), index=True)
+    rotation_epoch: Mapped[int] = mapped_column(Integer)
+    ciphertext: Mapped[bytes] = mapped_column(LargeBinary)
+    n: Mapped[int] = mapped_column(Integer)
+    m: Mapped[int] = mapped_column(Integer)
+    dtype: Mapped[str] = mapped_column(String(16))
+    source: Mapped[str] = mapped_column(String(16))
+    photos: Mapped[int] = mapped_column(Integer)
+    created_at: Mapped[datetime] = mapped_column(UtcDateTime)
+
+
+class FailedAttemptsRow(Base):
+    """Failed verifications of a subject, enrolled or not, and until when it is locked."""
+
+    __tablename__ = "failed_attempts"
+
+    tenant_id: Mapped[str] = mapped_column(
+        UUID_HEX, ForeignKey("tenants.id", ondelete="CASCADE"), primary_key=True
+    )
+    pseudonym: Mapped[str] = mapped_column(PSEUDONYM, primary_key=True)
+    consecutive: Mapped[int] = mapped_column(Integer)
+    total: Mapped[int] = mapped_column(Integer)
+    last_failed_at: Mapped[datetime] = mapped_column(UtcDateTime)
+    locked_until: Mapped[datetime | None] = mapped_column(UtcDateTime)
+    disabled_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
+
+
+class UsedNonceRow(Base):
+    """A nonce of a signed probe, kept until its time stamp alone would refuse it."""
+
+    __tablename__ = "used_nonces"
+
+    api_key_id: Mapped[str] = mapped_column(
+        UUID_HEX, ForeignKey("api_keys.id", ondelete="CASCADE"), primary_key=True
+    )
+    nonce_hash: Mapped[bytes] = mapped_column(LargeBinary(32), primary_key=True)
+    expires_at: Mapped[datetime] = mapped_column(UtcDateTime, index=True)
+
+
+class ReceiptRow(Base):
+    """A signed erasure receipt. No foreign key: it outlives the subject and the tenant."""
+
+    __tablename__ = "receipts"
+    __table_args__ = (Index("ix_receipts_pseudonym_sequence", "pseudonym", "sequence"),)
+
+    sequence: Mapped[int] = mapped_column(SERIAL, primary_key=True, autoincrement=True)
+    pseudonym: Mapped[str] = mapped_column(PSEUDONYM)
+    body: Mapped[str] = mapped_column(Text)
+    signature: Mapped[bytes] = mapped_column(LargeBinary(64))
+    created_at: Mapped[datetime] = mapped_column(UtcDateTime)
+
+
+class IdempotencyRow(Base):
+    """A write that carried an idempotency key: what was asked (keyed hashes) and answered."""
+
+    __tablename__ = "idempotency"
+
+    tenant_id: Mapped[str] = mapped_column(
+        UUID_HEX, ForeignKey("tenants.id", ondelete="CASCADE"), primary_key=True
+    )
+    actor: Mapped[str] = mapped_column(String(64), primary_key=True)
+    key_hash: Mapped[bytes] = mapped_column(LargeBinary(32), primary_key=True)
+    request_hash: Mapped[bytes] = mapped_column(LargeBinary(32))
+    pseudonym: Mapped[str | None] = mapped_column(PSEUDONYM, index=True)
+    claim: Mapped[str] = mapped_column(UUID_HEX)
+    claimed_until: Mapped[datetime] = mapped_column(UtcDateTime)
+    status: Mapped[int | None] = mapped_column(Integer)
+    body: Mapped[bytes | None] = mapped_column(LargeBinary)
+    created_at: Mapped[datetime] = mapped_column(UtcDateTime)
+    expires_at: Mapped[datetime] = mapped_column(UtcDateTime, index=True)
+
+
+class AuditRow(Base):
+    """One line of the audit log, chained to the one before by its hash."""
+
+    __tablename__ = "audit_log"
+
+    sequence: Mapped[int] = mapped_column(SERIAL, primary_key=True, autoincrement=False)
+    at: Mapped[datetime] = mapped_column(UtcDateTime, index=True)
+    tenant: Mapped[str | None] = mapped_column(String(64))
+    actor: Mapped[str | None] = mapped_column(String(64))
+    action: Mapped[str] = mapped_column(String(64))
+    pseudonym: Mapped[str | None] = mapped_column(PSEUDONYM, index=True)
+    outcome: Mapped[str] = mapped_column(String(64))
+    request_id: Mapped[str | None] = mapped_column(String(64))
+    previous_hash: Mapped[bytes] = mapped_column(LargeBinary(32))
+    hash: Mapped[bytes] = mapped_column(LargeBinary(32))
+
+
+class SecretRow(Base):
+    """A secret of the deployment, made once and wrapped by a master key."""
+
+    __tablename__ = "secrets"
+
+    name: Mapped[str] = mapped_column(String(64), primary_key=True)
+    wrapped_value: Mapped[bytes] = mapped_column(LargeBinary)
+    wrapping_key: Mapped[str] = mapped_column(KEY_ID)
+    created_at: Mapped[datetime] = mapped_column(UtcDateTime)
+
+
+class MasterKeyCheckRow(Base):
+    """One row, sealed under the master key: a start with another key file fails on it."""
+
+    __tablename__ = "master_key_check"
+
+    id: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=False)
+    wrapped_value: Mapped[bytes] = mapped_column(LargeBinary)
+    wrapping_key: Mapped[str] = mapped_column(KEY_ID)
+    created_at: Mapped[datetime] = mapped_column(UtcDateTime)

@@ -1,0 +1,424 @@
+"""Subjects and their templates: put, get, describe, list, erase."""
+
+import base64
+import binascii
+import uuid
+from dataclasses import dataclass, field
+from datetime import datetime
+from enum import StrEnum
+from typing import Any
+
+import sqlalchemy as sa
+from sqlalchemy.engine import Connection
+
+from templates.errors import SealError, StoreError
+from templates.sealing import MasterKeyring, sealed_key_id
+from templates.store.database import Database
+from templates.store.envelope import Envelope, Owner, close_envelope, open_envelope
+from templates.store.identifiers import (
+    Clock,
+    InvalidIdentifier,
+    UnknownTenant,
+    checked_opaque_id,
+    checked_subject_id,
+)
+from templates.store.receipts import Receipt, ReceiptSigner
+from templates.store.schema import (
+    FailedAttemptsRow,
+    IdempotencyRow,
+    ReceiptRow,
+    SubjectRow,
+    TemplateRow,
+    TenantRow,
+)
+
+MAX_WIRE_BYTES = 4 * 1024 * 1024  # a float32 template of n = 4096, m = 128 has 2.1 MB
+MAX_PAGE = 1000
+
+_CURSOR_PURPOSE = "list-cursor"
+
+
+class Source(StrEnum):
+    """What a template was made from."""
+
+    PHOTOS = "photos"
+    TEMPLATE = "template"
+
+
+@dataclass(frozen=True)
+class StoredTemplate:
+    """What :meth:`Subjects.put` did."""
+
+    template_id: str
+    created: bool
+
+
+@dataclass(frozen=True)
+class SubjectRecord:
+    """What is known of a subject without opening its template."""
+
+    subject_id: str
+    template_id: str
+    contract_id: str
+    rotation_epoch: int
+    n: int
+    m: int
+    dtype: str
+    source: Source
+    photos: int
+    created_at: datetime
+    updated_at: datetime
+
+
+@dataclass(frozen=True)
+class SubjectTemplate:
+    """A subject with its decrypted template; the wire bytes stay out of its repr."""
+
+    record: SubjectRecord
+    wire: bytes = field(repr=False)
+
+
+@dataclass(frozen=True)
+class SubjectPage:
+    """One page of subjects; `next_cursor` is None on the last one."""
+
+    records: tuple[SubjectRecord, ...]
+    next_cursor: str | None
+
+
+@dataclass(frozen=True)
+class Erasure:
+    """What :meth:`Subjects.erase` did.
+
+    Attributes
+    ----------
+    receipt
+        The signed receipt.
+    erased
+        Whether this call removed a template; False when there was none (any more).
+    log_purged
+        False if a long reader kept SQLite from emptying its write-ahead log just now; the next
+        erasure or ``purge_log`` does it.
+    """
+
+    receipt: Receipt
+    erased: bool
+    log_purged: bool
+
+
+class Subjects:
+    """Repository of subjects."""
+
+    def __init__(
+        self, database: Database, keyring: MasterKeyring, signer: ReceiptSigner, clock: Clock
+    ) -> None:
+        self._database = database
+        self._keyring = keyring
+        self._signer = signer
+        self._clock = clock
+
+    def put(
+        self,
+        tenant: str,
+        subject_id: str,
+        wire: bytes,
+        *,
+        contract_id: str,
+        n: int,
+        m: int,
+        dtype: str,
+        source: Source,
+        photos: int,
+        template_id: str | None = None,
+        rotation_epoch: int | None = None,
+    ) -> StoredTemplate:
+        """Store a template, or replace the one there is, in one transaction.
+
+        Parameters
+        ----------
+        tenant, subject_id
+            Whose it is.
+        wire
+            The template's wire bytes, 4 MiB at most.
+        contract_id, n, m, dtype, source, photos
+            Metadata that stays readable without a key.
+        template_id
+            Made here when not given.
+        rotation_epoch
+            Epoch of the tenant's rotation that the template is in; the current one by default.
+
+        Raises
+        ------
+        InvalidIdentifier, UnknownTenant, StoreError, StoreUnavailable
+
+        Notes
+        -----
+        A replacement gets a fresh data key, and the old key and ciphertext are removed with it:
+        an old backup of one of the two rows does not help to read the other.
+        """
+        checked_subject_id(subject_id)
+        checked_opaque_id(contract_id, what="contract id")
+        template_id = checked_opaque_id(template_id or uuid.uuid4().hex, what="template id")
+        if not 0 < len(wire) <= MAX_WIRE_BYTES:
+            raise StoreError(
+                f"a template has 1 to {MAX_WIRE_BYTES} wire bytes, this has {len(wire)}"
+            )
+
+        def work(connection: Connection) -> bool:
+            tenant_id, current_epoch = _tenant(connection, tenant)
+            epoch = current_epoch if rotation_epoch is None else rotation_epoch
+            now = self._clock()
+            known = _subject_pk(connection, tenant_id, subject_id)
+            subject_pk = known or uuid.uuid4().hex
+            owner = Owner(tenant_id, subject_pk, subject_id, contract_id, template_id, epoch)
+            envelope = close_envelope(wire, owner, self._keyring)
+            key_columns = {
+                "wrapped_key": envelope.wrapped_key,
+                "wrapping_key": sealed_key_id(envelope.wrapped_key),
+                "updated_at": now,
+            }
+            if known is None:
+                connection.execute(
+                    sa.insert(SubjectRow).values(
+                        id=subject_pk,
+                        tenant_id=tenant_id,
+                        subject_id=subject_id,
+                        created_at=now,
+                        **key_columns,
+                    )
+                )
+            else:
+                connection.execute(
+                    sa.update(SubjectRow).where(SubjectRow.id == known).values(**key_columns)
+                )
+                connection.execute(sa.delete(TemplateRow).where(TemplateRow.subject_pk == known))
+            connection.execute(
+                sa.insert(TemplateRow).values(
+                    subject_pk=subject_pk,
+                    template_id=template_id,
+                    contract_id=contract_id,
+                    rotation_epoch=epoch,
+                    ciphertext=envelope.ciphertext,
+                    n=n,
+                    m=m,
+                    dtype=dtype,
+                    source=Source(source).value,
+                    photos=photos,
+                    created_at=now,
+                )
+            )
+            return known is None
+
+        created = self._database.write(work, lock=_lock(tenant, subject_id))
+        if not created:
+            self._database.purge_log()
+        return StoredTemplate(template_id=template_id, created=created)
+
+    def get(self, tenant: str, subject_id: str) -> SubjectTemplate | None:
+        """Return a subject with its decrypted template, or None.
+
+        Raises
+        ------
+        SealError
+            If the row was altered or moved, or its master key is missing.
+        """
+        checked_subject_id(subject_id)
+        query = (
+            sa.select(
+                *_RECORD_COLUMNS,
+                SubjectRow.id,
+                SubjectRow.tenant_id,
+                SubjectRow.wrapped_key,
+                TemplateRow.ciphertext,
+            )
+            .join(TemplateRow, TemplateRow.subject_pk == SubjectRow.id)
+            .join(TenantRow, TenantRow.id == SubjectRow.tenant_id)
+            .where(TenantRow.name == tenant, SubjectRow.subject_id == subject_id)
+        )
+        row = self._database.read(lambda each: each.execute(query).one_or_none())
+        if row is None:
+            return None
+        *columns, subject_pk, tenant_id, wrapped_key, ciphertext = row
+        record = _record(columns)
+        owner = Owner(
+            tenant_id,
+            subject_pk,
+            subject_id,
+            record.contract_id,
+            record.template_id,
+            record.rotation_epoch,
+        )
+        wire = open_envelope(Envelope(wrapped_key, ciphertext), owner, self._keyring)
+        return SubjectTemplate(record=record, wire=wire)
+
+    def describe(self, tenant: str, subject_id: str) -> SubjectRecord | None:
+        """Return a subject's metadata, or None; nothing is decrypted."""
+        checked_subject_id(subject_id)
+        query = _records(tenant).where(SubjectRow.subject_id == subject_id)
+        row = self._database.read(lambda each: each.execute(query).one_or_none())
+        return None if row is None else _record(row)
+
+    def list(self, tenant: str, *, limit: int = 100, cursor: str | None = None) -> SubjectPage:
+        """Return a page of a tenant's subjects, in the order of their ids.
+
+        A subject that stays enrolled while the pages are read appears exactly once, whatever is
+        enrolled or erased meanwhile.
+
+        Parameters
+        ----------
+        tenant
+            Whose subjects.
+        limit
+            1 to 1000.
+        cursor
+            `next_cursor` of the page before; it is sealed, so it shows no subject id.
+
+        Raises
+        ------
+        InvalidIdentifier
+            For a limit out of range, or a cursor that this store did not give for this tenant.
+        """
+        if not 1 <= limit <= MAX_PAGE:
+            raise InvalidIdentifier(f"the limit of a page is 1 to {MAX_PAGE}")
+        query = _records(tenant).order_by(SubjectRow.subject_id).limit(limit + 1)
+        if cursor is not None:
+            query = query.where(SubjectRow.subject_id > self._after(tenant, cursor))
+        rows = self._database.read(lambda each: each.execute(query).all())
+        records = tuple(_record(row) for row in rows[:limit])
+        return SubjectPage(
+            records=records,
+            next_cursor=self._cursor(tenant, records[-1]) if len(rows) > limit else None,
+        )
+
+    def erase(self, tenant: str, subject_id: str) -> Erasure:
+        """Remove all that is held of a subject, its data key included; leave a signed receipt.
+
+        In one transaction: template, metadata, data key, failed attempts and idempotency records
+        go, the receipt comes. Erasing again returns the receipt of the first time; erasing who
+        was never enrolled leaves a receipt that says nothing was held.
+        """
+        checked_subject_id(subject_id)
+        pseudonym = self._signer.pseudonym(tenant, subject_id)
+        self._signer.public_key()  # obtains the signing key before the transaction needs it
+
+        def work(connection: Connection) -> tuple[Receipt, bool]:
+            tenant_id, _ = _tenant(connection, tenant)
+            for table in (FailedAttemptsRow, IdempotencyRow):
+                connection.execute(
+                    sa.delete(table).where(
+                        table.tenant_id == tenant_id, table.pseudonym == pseudonym
+                    )
+                )
+            subject_pk = _subject_pk(connection, tenant_id, subject_id)
+            if subject_pk is None:
+                earlier = connection.execute(
+                    sa.select(ReceiptRow.body, ReceiptRow.signature)
+                    .where(ReceiptRow.pseudonym == pseudonym)
+                    .order_by(ReceiptRow.sequence.desc())
+                    .limit(1)
+                ).one_or_none()
+                if earlier is not None:
+                    return Receipt(earlier.body, earlier.signature), False
+            else:
+                connection.execute(
+                    sa.delete(TemplateRow).where(TemplateRow.subject_pk == subject_pk)
+                )
+                connection.execute(sa.delete(SubjectRow).where(SubjectRow.id == subject_pk))
+            now = self._clock()
+            held = subject_pk is not None
+            receipt = self._signer.sign(
+                tenant=tenant, pseudonym=pseudonym, held=held, erased_at=now
+            )
+            connection.execute(
+                sa.insert(ReceiptRow).values(
+                    pseudonym=pseudonym,
+                    body=receipt.body,
+                    signature=receipt.signature,
+                    created_at=now,
+                )
+            )
+            return receipt, held
+
+        receipt, erased = self._database.write(work, lock=_lock(tenant, subject_id))
+        return Erasure(receipt=receipt, erased=erased, log_purged=self._database.purge_log())
+
+    def receipt(self, tenant: str, subject_id: str) -> Receipt | None:
+        """Return the latest erasure receipt of a subject, or None."""
+        pseudonym = self._signer.pseudonym(tenant, checked_subject_id(subject_id))
+        row = self._database.read(
+            lambda each: each.execute(
+                sa.select(ReceiptRow.body, ReceiptRow.signature)
+                .where(ReceiptRow.pseudonym == pseudonym)
+                .order_by(ReceiptRow.sequence.desc())
+                .limit(1)
+            ).one_or_none()
+        )
+        return None if row is None else Receipt(row.body, row.signature)
+
+    def _cursor(self, tenant: str, last: SubjectRecord) -> str:
+        sealed = self._keyring.seal(
+            last.subject_id.encode(), purpose=_CURSOR_PURPOSE, bound_to=[tenant]
+        )
+        return base64.urlsafe_b64encode(sealed).decode().rstrip("=")
+
+    def _after(self, tenant: str, cursor: str) -> str:
+        if len(cursor) > 512:
+            raise InvalidIdentifier("this cursor is too long to be one of ours")
+        try:
+            sealed = base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4))
+            opened = self._keyring.open(sealed, purpose=_CURSOR_PURPOSE, bound_to=[tenant])
+        except (SealError, binascii.Error, ValueError):
+            raise InvalidIdentifier(
+                "this cursor was not given for this list: start again without one"
+            ) from None
+        return opened.decode()
+
+
+_RECORD_COLUMNS = (
+    SubjectRow.subject_id,
+    TemplateRow.template_id,
+    TemplateRow.contract_id,
+    TemplateRow.rotation_epoch,
+    TemplateRow.n,
+    TemplateRow.m,
+    TemplateRow.dtype,
+    TemplateRow.source,
+    TemplateRow.photos,
+    SubjectRow.created_at,
+    SubjectRow.updated_at,
+)
+
+
+def _records(tenant: str) -> sa.Select[*tuple[Any, ...]]:
+    return (
+        sa.select(*_RECORD_COLUMNS)
+        .join(TemplateRow, TemplateRow.subject_pk == SubjectRow.id)
+        .join(TenantRow, TenantRow.id == SubjectRow.tenant_id)
+        .where(TenantRow.name == tenant)
+    )
+
+
+def _record(columns: Any) -> SubjectRecord:
+    values = dict(zip(SubjectRecord.__dataclass_fields__, columns, strict=True))
+    return SubjectRecord(**{**values, "source": Source(values["source"])})
+
+
+def _tenant(connection: Connection, name: str) -> tuple[str, int]:
+    row = connection.execute(
+        sa.select(TenantRow.id, TenantRow.rotation_epoch).where(TenantRow.name == name)
+    ).one_or_none()
+    if row is None:
+        raise UnknownTenant(f"there is no tenant {name!r}")
+    return row.id, row.rotation_epoch
+
+
+def _subject_pk(connection: Connection, tenant_id: str, subject_id: str) -> str | None:
+    return connection.execute(
+        sa.select(SubjectRow.id).where(
+            SubjectRow.tenant_id == tenant_id, SubjectRow.subject_id == subject_id
+        )
+    ).scalar_one_or_none()
+
+
+def _lock(tenant: str, subject_id: str) -> str:
+    return f"subject {tenant} {subject_id}"
