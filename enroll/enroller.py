@@ -22,7 +22,6 @@ from templates.decoys import Attributes, DecoySource
 from templates.embedding import unit_rows
 from templates.errors import ContractMismatch, InvalidTemplate
 from templates.lifting import Strategy, lift
-from templates.randomness import Keystream
 from templates.subspace import AffineSubspace
 
 MAX_PHOTOS = 10
@@ -157,15 +156,14 @@ class Enroller:
         descriptor = mean_descriptor(rows, consistency=self._contract.photo_consistency)
         binding = self._contract.binding
         named = [attributes or Attributes()] if binding.strategy is Strategy.HYBRID_PLUS else None
-        with Keystream.fresh() as stream:
-            lifted = lift(
-                descriptor[None],
-                strategy=binding.strategy,
-                m=binding.m,
-                source=self._source,
-                stream=stream,
-                attributes=named,
-            )
+        # Without a stream, lift draws from a fresh one and destroys it.
+        lifted = lift(
+            descriptor[None],
+            strategy=binding.strategy,
+            m=binding.m,
+            source=self._source,
+            attributes=named,
+        )
         records = qualities if qualities is not None else [None] * len(rows)
         results = [PhotoResult(index, entry) for index, entry in enumerate(records)]
         return self._finish(lifted[0], per_photo=tuple(results))

@@ -89,7 +89,7 @@ class Binding:
             )
         if embedder_sha256 != self.embedder_sha256:
             raise ContractMismatch(
-                f"the contract is bound to the embedder {self.embedder_sha256[:16]}…, the pack's is "
+                f"the contract is bound to embedder {self.embedder_sha256[:16]}…, the pack's is "
                 f"{embedder_sha256[:16]}…; use the pack that the contract was calibrated with"
             )
         theirs = free_object(preprocessing, what="the pack's preprocessing")

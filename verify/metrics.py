@@ -75,10 +75,11 @@ def most_errors(target: float, trials: int) -> int:
     return count
 
 
-def threshold_at_fmr(impostor: ArrayLike, target: float) -> float:
+def threshold_at_fmr(impostor: ArrayLike, target: float, *, trials: int | None = None) -> float:
     """Lowest threshold whose FMR on these impostors is at most the target, never the nearest.
 
-    The threshold lies halfway between the last similarity that it accepts and the first that it
+    ``trials`` is their number where ``impostor`` holds only the highest similarities of them, more
+    than the target allows errors. The threshold lies halfway between the last similarity that it accepts and the first that it
     rejects; above all of them where the target allows no error.
 
     Raises
@@ -89,9 +90,12 @@ def threshold_at_fmr(impostor: ArrayLike, target: float) -> float:
     scores = np.sort(np.asarray(impostor, dtype=np.float64).ravel())[::-1]
     if scores.size == 0 or not 0.0 <= target <= 1.0:
         raise ValueError("a threshold needs impostor trials and a target in [0, 1]")
-    allowed = most_errors(target, scores.size)
-    if allowed == scores.size:
+    total = scores.size if trials is None else trials
+    allowed = most_errors(target, total)
+    if allowed == total:
         return float(scores[-1])
+    if allowed >= scores.size:
+        raise ValueError("the highest similarities must outnumber the errors that are allowed")
     first_rejected = scores[allowed]
     above = scores[scores > first_rejected]
     if above.size == 0:

@@ -1,0 +1,174 @@
+"""Readers of labelled face folders: ``root/Person/photo.jpg``, as LFW is laid out."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from templates.errors import VeilfaceError
+from verify.tenfold import FOLDS, Pair
+
+SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp"})
+MAX_PAIRS_BYTES = 16 * 2**20
+
+
+class DatasetError(VeilfaceError):
+    """A data set that is not laid out as its reader expects; the message lists what is wrong."""
+
+
+@dataclass(frozen=True)
+class LabelledFolder:
+    """Photos with the names of the people on them.
+
+    Parameters
+    ----------
+    root
+        The folder that was read.
+    paths, identities
+        Equal lengths, sorted by person and file name.
+    ignored
+        What lay beside and was no photo, relative to ``root``.
+    """
+
+    root: Path
+    paths: tuple[Path, ...]
+    identities: tuple[str, ...]
+    ignored: tuple[str, ...]
+
+    @classmethod
+    def read(cls, root: Path | str) -> "LabelledFolder":
+        """List ``root/Person/photo.jpg``; photos are not opened here.
+
+        Hidden entries are skipped silently. Other files, such as ``pairs.txt``, are listed in
+        ``ignored``.
+
+        Raises
+        ------
+        DatasetError
+            Listing every fault: no folder, photos beside the people's folders, empty people.
+        """
+        folder = Path(root)
+        if not folder.is_dir():
+            raise DatasetError(f"{folder} is not a folder; expected root/Person/photo.jpg")
+        paths: list[Path] = []
+        identities: list[str] = []
+        ignored: list[str] = []
+        faults: list[str] = []
+        for entry in sorted(folder.iterdir()):
+            if entry.name.startswith("."):
+                continue
+            if not entry.is_dir():
+                if entry.suffix.lower() in SUFFIXES:
+                    faults.append(f"photo {entry.name} lies beside the people's folders")
+                else:
+                    ignored.append(entry.name)
+                continue
+            photos = []
+            for file in sorted(entry.iterdir()):
+                if file.name.startswith("."):
+                    continue
+                if file.is_file() and file.suffix.lower() in SUFFIXES:
+                    photos.append(file)
+                elif file.is_dir():
+                    faults.append(f"{entry.name}/{file.name} is a folder inside a person's folder")
+                else:
+                    ignored.append(f"{entry.name}/{file.name}")
+            if not photos:
+                faults.append(f"{entry.name} holds no photo ({', '.join(sorted(SUFFIXES))})")
+            paths += photos
+            identities += [entry.name] * len(photos)
+        if not paths and not faults:
+            faults.append("there is no person's folder in it")
+        if faults:
+            raise DatasetError(_listing(folder, "expected root/Person/photo.jpg", faults))
+        return cls(folder, tuple(paths), tuple(identities), tuple(ignored))
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    @property
+    def people(self) -> int:
+        """Number of different names."""
+        return len(set(self.identities))
+
+
+def read_lfw_pairs(
+    file: Path | str, folder: LabelledFolder, *, missing: Mapping[Path, str] | None = None
+) -> list[Pair]:
+    """Read LFW's ``pairs.txt`` into indices of the folder's photos.
+
+    The header is ``folds<TAB>pairs per class and fold``; every fold then has that many lines
+    ``Name i j`` of one person and as many lines ``NameA i NameB j`` of two (FORMATS).
+
+    Parameters
+    ----------
+    missing
+        Photos without a descriptor, with the reason; pairs that need one are left out. The caller
+        reports them as failures to acquire.
+
+    Raises
+    ------
+    DatasetError
+        Listing every faulty line.
+    """
+    path = Path(file)
+    try:
+        if path.stat().st_size > MAX_PAIRS_BYTES:
+            raise DatasetError(f"{path.name} is larger than {MAX_PAIRS_BYTES} bytes")
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError):
+        raise DatasetError(f"{path.name} cannot be read as UTF-8 text") from None
+    index = {(entry.parent.name, entry.stem): number for number, entry in enumerate(folder.paths)}
+    gone = {(entry.parent.name, entry.stem) for entry in (missing or {})}
+    folds, per_class = _header(path, lines)
+    body = lines[1 : 1 + 2 * folds * per_class]
+    if len(body) < 2 * folds * per_class:
+        raise DatasetError(
+            f"{path.name} promises {2 * folds * per_class} pairs and holds {len(body)}"
+        )
+    pairs: list[Pair] = []
+    faults: list[str] = []
+    for number, line in enumerate(body):
+        fold, place = divmod(number, 2 * per_class)
+        same = place < per_class
+        keys = _photo_keys(line, same=same)
+        if keys is None:
+            form = "Name i j" if same else "NameA i NameB j"
+            faults.append(f"line {number + 2} is not of the form {form}")
+        elif any(key in gone for key in keys):
+            continue
+        elif any(key not in index for key in keys):
+            absent = next(key for key in keys if key not in index)
+            faults.append(f"line {number + 2} names {absent[0]}/{absent[1]}, which is not there")
+        else:
+            pairs.append(Pair(index[keys[0]], index[keys[1]], same, fold))
+    if faults:
+        raise DatasetError(_listing(path, "expected LFW's pairs format", faults))
+    return pairs
+
+
+def _header(path: Path, lines: Sequence[str]) -> tuple[int, int]:
+    numbers = lines[0].split() if lines else []
+    if len(numbers) != 2 or not all(number.isdecimal() and len(number) < 7 for number in numbers):
+        raise DatasetError(f"{path.name} does not begin with: folds, pairs per class and fold")
+    folds, per_class = map(int, numbers)
+    if folds != FOLDS or per_class < 1:
+        raise DatasetError(f"{path.name} has {folds} folds; the protocol has {FOLDS}")
+    return folds, per_class
+
+
+def _photo_keys(line: str, *, same: bool) -> tuple[tuple[str, str], tuple[str, str]] | None:
+    """Person and file stem of both photos, or None where the line has another form."""
+    parts = line.split("\t") if "\t" in line else line.split()
+    if len(parts) != (3 if same else 4):
+        return None
+    first, i, *rest = parts
+    second, j = (first, rest[0]) if same else (rest[0], rest[1])
+    if not all(number.isdecimal() and len(number) < 7 for number in (i, j)):
+        return None
+    return (first, f"{first}_{int(i):04d}"), (second, f"{second}_{int(j):04d}")
+
+
+def _listing(where: Path, expected: str, faults: Sequence[str], *, most: int = 20) -> str:
+    shown = "; ".join(faults[:most])
+    more = f"; and {len(faults) - most} more" if len(faults) > most else ""
+    return f"{where} has {len(faults)} fault(s), {expected}: {shown}{more}"
