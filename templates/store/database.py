@@ -6,14 +6,17 @@ database asks for that (a deadlock, a serialisation failure), so it must do noth
 work.
 """
 
+import hashlib
 import os
 import random
+import sqlite3
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+import psycopg
 import sqlalchemy as sa
 from sqlalchemy import event
 from sqlalchemy.engine import URL, Connection, Engine, make_url
@@ -26,6 +29,8 @@ T = TypeVar("T")
 
 _ATTEMPTS = 5
 _RETRIED_STATES = {"40001", "40P01"}  # serialisation failure, deadlock
+_DATABASE_ERRORS = (SQLAlchemyError, sqlite3.Error, psycopg.Error, OSError)
+_EMPTY_LOG = "PRAGMA wal_checkpoint(TRUNCATE)"
 _UNAVAILABLE_CLASSES = {"08", "53", "57", "58"}  # connection, resources, operator, system
 
 
@@ -70,7 +75,7 @@ class Database:
         try:
             with here.readers.connect() as connection:
                 return work(connection)
-        except (SQLAlchemyError, OSError) as error:
+        except _DATABASE_ERRORS as error:
             raise _translated(error) from None
 
     def write(self, work: Callable[[Connection], T], *, lock: str | None = None) -> T:
@@ -97,11 +102,11 @@ class Database:
                         connection.execute(sa.select(sa.func.pg_advisory_xact_lock(number)))
                     return work(connection)
             except DBAPIError as error:
-                if attempt < _ATTEMPTS and _state(error) in _RETRIED_STATES:
+                if attempt < _ATTEMPTS and _state(error.orig) in _RETRIED_STATES:
                     time.sleep(random.uniform(0, 0.02 * 2**attempt))
                     continue
                 raise _translated(error) from None
-            except (SQLAlchemyError, OSError) as error:
+            except _DATABASE_ERRORS as error:
                 raise _translated(error) from None
         raise AssertionError("the last attempt returns or raises")
 
@@ -116,15 +121,28 @@ class Database:
         here = self._here()
         try:
             with here.writing, here.engine.connect() as connection:
-                driver: Any = connection.connection.driver_connection
-                busy, _, _ = driver.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()
-        except SQLAlchemyError as error:
+                # On the driver's connection: SQLAlchemy would begin a transaction around it.
+                busy, _, _ = _driver(connection).execute(_EMPTY_LOG).fetchone()
+        except sqlite3.OperationalError:
+            return False
+        except _DATABASE_ERRORS as error:
             raise _translated(error) from None
-        except Exception as error:
-            if type(error).__module__ == "sqlite3":
-                return False
-            raise
         return not busy
+
+    def compact(self, tables: Sequence[str]) -> None:
+        """Rewrite tables (PostgreSQL) or the file (SQLite) without what was removed from them."""
+        here = self._here()
+        try:
+            autocommit = here.engine.execution_options(isolation_level="AUTOCOMMIT")
+            with here.writing, autocommit.connect() as connection:
+                if self.is_sqlite:
+                    _driver(connection).execute("VACUUM")
+                for table in () if self.is_sqlite else tables:
+                    name = connection.dialect.identifier_preparer.quote(table)
+                    connection.exec_driver_sql(f"VACUUM (FULL) {name}")
+        except _DATABASE_ERRORS as error:
+            raise _translated(error) from None
+        self.purge_log()
 
     def close(self) -> None:
         """Close the connections of this process that are idle."""
@@ -246,39 +264,58 @@ def _set_wal(cursor: Any) -> None:
         return
 
 
+def _driver(connection: Connection) -> Any:
+    return connection.connection.driver_connection
+
+
 def _begin_sqlite(connection: Connection) -> None:
     writing = connection.get_execution_options().get("veilface_write", False)
     connection.exec_driver_sql("BEGIN IMMEDIATE" if writing else "BEGIN")
 
 
 def _lock_number(name: str) -> int:
-    import hashlib
-
     return int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big", signed=True)
 
 
-def _state(error: DBAPIError) -> str:
-    return getattr(error.orig, "sqlstate", None) or ""
+def _state(error: BaseException | None) -> str:
+    return getattr(error, "sqlstate", None) or ""
 
 
 def _translated(error: Exception) -> StoreError:
     """Say what went wrong without the statement, its parameters or any row."""
     if isinstance(error, PoolTimeout):
         return StoreUnavailable("all connections to the database are busy")
-    if not isinstance(error, DBAPIError):
-        return StoreError(f"the database cannot be used ({type(error).__name__})")
-    cause, state = type(error.orig).__name__, _state(error)
-    if type(error.orig).__module__ == "sqlite3":
-        text = str(error.orig)
-        if cause == "OperationalError" and "no such" not in text:
-            return StoreUnavailable(f"the SQLite database does not answer: {text}")
-        if cause == "DatabaseError":
-            return StoreUnavailable("the SQLite file is damaged, or is not a database")
-        return StoreError(f"SQLite refused the statement ({cause})")
-    if (
-        error.connection_invalidated
-        or state[:2] in _UNAVAILABLE_CLASSES
-        or (cause in ("OperationalError", "InterfaceError", "ConnectionTimeout") and not state)
-    ):
-        return StoreUnavailable(f"the PostgreSQL server does not answer ({cause} {state})".strip())
-    return StoreError(f"PostgreSQL refused the statement ({cause} {state})")
+    lost = isinstance(error, DBAPIError) and error.connection_invalidated
+    cause = error.orig if isinstance(error, DBAPIError) else error
+    name = type(cause).__name__
+    if isinstance(cause, sqlite3.Error):
+        return _sqlite_error(cause)
+    if isinstance(cause, psycopg.Error):
+        state = _state(cause)
+        if state == "42P01":
+            return StoreError("a table is missing: run `veilface db upgrade`")
+        if lost or state[:2] in _UNAVAILABLE_CLASSES or _without_answer(cause):
+            return StoreUnavailable(f"the PostgreSQL server does not answer ({name} {state})")
+        return StoreError(f"PostgreSQL refused the statement ({name} {state})")
+    if isinstance(cause, OSError):
+        return StoreUnavailable(f"the database cannot be reached: {cause.strerror}")
+    return StoreError(f"the database cannot be used ({name})")
+
+
+def _without_answer(cause: psycopg.Error) -> bool:
+    # The server answers with a state; without one the connection failed.
+    return not _state(cause) and isinstance(
+        cause, psycopg.OperationalError | psycopg.InterfaceError
+    )
+
+
+def _sqlite_error(cause: sqlite3.Error) -> StoreError:
+    code = getattr(cause, "sqlite_errorname", "")
+    if "no such table" in str(cause):
+        return StoreError("a table is missing: run `veilface db upgrade`")
+    if code.startswith(("SQLITE_CORRUPT", "SQLITE_NOTADB")):
+        return StoreUnavailable("the SQLite file is damaged, or is not a database")
+    if isinstance(cause, sqlite3.OperationalError):
+        # SQLite's own words for a full disk, a lock that was not freed and the like.
+        return StoreUnavailable(f"the SQLite database does not answer: {cause}")
+    return StoreError(f"SQLite refused the statement ({type(cause).__name__} {code})")

@@ -17,7 +17,7 @@ from templates.errors import SealError
 from templates.sealing import NONCE_BYTES, TAG_BYTES, MasterKeyring, encode_parts
 
 _VERSION = b"\x01"
-_DATA_KEY_PURPOSE = "subject-data-key"
+DATA_KEY_PURPOSE = "subject-data-key"
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ def close_envelope(wire: bytes, owner: Owner, keyring: MasterKeyring) -> Envelop
     return Envelope(
         wrapped_key=keyring.seal(
             data_key,
-            purpose=_DATA_KEY_PURPOSE,
+            purpose=DATA_KEY_PURPOSE,
             bound_to=[owner.tenant_id, owner.subject_pk],
         ),
         ciphertext=_VERSION + nonce + body,
@@ -77,7 +77,7 @@ def open_envelope(envelope: Envelope, owner: Owner, keyring: MasterKeyring) -> b
     """
     data_key = keyring.open(
         envelope.wrapped_key,
-        purpose=_DATA_KEY_PURPOSE,
+        purpose=DATA_KEY_PURPOSE,
         bound_to=[owner.tenant_id, owner.subject_pk],
     )
     stored = envelope.ciphertext
@@ -91,10 +91,3 @@ def open_envelope(envelope: Envelope, owner: Owner, keyring: MasterKeyring) -> b
         raise SealError(
             "a stored template does not open: its row was altered, or belongs to another subject"
         ) from None
-
-
-def rewrap_data_key(
-    wrapped: bytes, *, tenant_id: str, subject_pk: str, keyring: MasterKeyring
-) -> bytes:
-    """Wrap a data key again, under the keyring's current key."""
-    return keyring.rewrap(wrapped, purpose=_DATA_KEY_PURPOSE, bound_to=[tenant_id, subject_pk])

@@ -1,11 +1,18 @@
 """The store of a deployment, opened from a URL and a keyring."""
 
+from collections.abc import Callable
+
+import sqlalchemy as sa
+
 from templates.sealing import MasterKeyring
-from templates.store import deployment, migrate
+from templates.store import deployment, migrate, rewrap
+from templates.store.api_keys import ApiKeys
 from templates.store.database import Database
 from templates.store.deployment import Secrets
+from templates.store.idempotency import Idempotency
 from templates.store.identifiers import Clock, utc_now
 from templates.store.receipts import ReceiptSigner
+from templates.store.schema import FailedAttemptsRow, IdempotencyRow, SubjectRow, TemplateRow
 from templates.store.subjects import Subjects
 from templates.store.tenants import Tenants
 
@@ -32,6 +39,8 @@ class TemplateStore(Subjects):
         signer = ReceiptSigner(self.secrets)
         super().__init__(database, keyring, signer, clock)
         self.tenants = Tenants(database, keyring, clock)
+        self.api_keys = ApiKeys(database, keyring, self.tenants, clock)
+        self.idempotency = Idempotency(database, self.secrets, signer, clock)
 
     def upgrade(self) -> None:
         """Bring the schema to this program's version; safe when several workers start at once."""
@@ -47,3 +56,42 @@ class TemplateStore(Subjects):
     def close(self) -> None:
         """Close the idle connections of this process."""
         self._database.close()
+
+    def ping(self) -> None:
+        """Raise :class:`StoreUnavailable` unless the database answers a query."""
+        self._database.read(lambda connection: connection.execute(sa.select(1)).one())
+
+    def pseudonym(self, tenant: str, subject_id: str) -> str:
+        """Name of a subject in receipts, logs and the audit log."""
+        return self._signer.pseudonym(tenant, subject_id)
+
+    def receipt_public_key(self) -> bytes:
+        """The 32 bytes that :func:`verify_receipt` checks this deployment's receipts with."""
+        return self._signer.public_key()
+
+    def rewrap(self, *, batch: int = 200, progress: Callable[[int], None] | None = None) -> int:
+        """Bring all wrapped keys and secrets under the current key; see ``rewrap.rewrap``."""
+        count = rewrap.rewrap(self._database, self._keyring, batch=batch, progress=progress)
+        self._database.purge_log()
+        return count
+
+    def wrapping_keys(self) -> dict[str, int]:
+        """Count what each master key still wraps; an absent key may be dropped from the file."""
+        return rewrap.wrapping_keys(self._database)
+
+    def purge(self) -> bool:
+        """Remove expired records, and on SQLite empty the write-ahead log."""
+        self.idempotency.expire()
+        return self._database.purge_log()
+
+    def compact(self) -> None:
+        """Rewrite the tables of subjects, so that no page keeps what was erased.
+
+        PostgreSQL keeps a removed row in its page until it vacuums; ``VACUUM FULL`` writes new
+        files and locks each table meanwhile. SQLite overwrites as it deletes; there this gives
+        the free pages back to the file system.
+        """
+        self._database.compact([table.__tablename__ for table in _HOLD_SUBJECT_DATA])
+
+
+_HOLD_SUBJECT_DATA = (SubjectRow, TemplateRow, FailedAttemptsRow, IdempotencyRow)

@@ -389,7 +389,9 @@ _RECORD_COLUMNS = (
 )
 
 
-def _records(tenant: str) -> sa.Select[*tuple[Any, ...]]:
+def _records(
+    tenant: str,
+) -> "sa.Select[*tuple[Any, ...]]":  # quoted: variadic from SQLAlchemy 2.1 on
     return (
         sa.select(*_RECORD_COLUMNS)
         .join(TemplateRow, TemplateRow.subject_pk == SubjectRow.id)

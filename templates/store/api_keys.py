@@ -1,0 +1,285 @@
+"""API keys: tokens that are shown once, and the rights they carry.
+
+A token is ``vf_<prefix>_<secret>``, 48 and 256 random bits in hexadecimal. The store keeps the
+prefix, to find the row, and the SHA-256 of the whole token: a secret of 256 random bits cannot be
+guessed from a fast hash. The key that signs probes is derived from the token, so that a client
+needs nothing else; the server keeps it sealed, because the hash must not double as a credential.
+"""
+
+import contextlib
+import hashlib
+import hmac
+import os
+import re
+import uuid
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from datetime import datetime, timedelta
+from enum import StrEnum
+from typing import Any
+
+import sqlalchemy as sa
+from sqlalchemy.engine import Connection
+
+from templates.errors import StoreError, StoreUnavailable
+from templates.sealing import MasterKeyring, derive_key, sealed_key_id
+from templates.store.database import Database
+from templates.store.identifiers import Clock, UnknownTenant
+from templates.store.schema import ApiKeyRow, TenantRow
+from templates.store.tenants import Tenants
+
+PROBE_KEY_PURPOSE = "api-key-probe-key"
+MAX_LABEL = 128
+
+_TOKEN = re.compile(r"vf_([0-9a-f]{12})_([0-9a-f]{64})")
+_NOBODYS_HASH = os.urandom(32)
+_USE_IS_NOTED_EVERY = timedelta(minutes=1)
+
+
+class Right(StrEnum):
+    """What a key may do."""
+
+    ENROLL = "enroll"
+    VERIFY = "verify"
+    ERASE = "erase"
+    EXPORT = "export"
+    SCORES = "scores"
+    EMBEDDINGS = "embeddings"
+    ADMIN = "admin"
+
+
+@dataclass(frozen=True)
+class ApiKey:
+    """An API key without its secret."""
+
+    id: str
+    prefix: str
+    tenant: str
+    rights: frozenset[Right]
+    label: str
+    created_at: datetime
+    expires_at: datetime | None
+    revoked_at: datetime | None
+    last_used_at: datetime | None
+
+    def is_valid_at(self, time: datetime) -> bool:
+        """Whether the key is neither revoked nor expired."""
+        return self.revoked_at is None and (self.expires_at is None or time < self.expires_at)
+
+
+@dataclass(frozen=True)
+class NewApiKey:
+    """A key that was just made; the only moment at which its token exists."""
+
+    key: ApiKey
+    token: str = field(repr=False)
+
+
+class ApiKeys:
+    """Repository of API keys."""
+
+    def __init__(
+        self, database: Database, keyring: MasterKeyring, tenants: Tenants, clock: Clock
+    ) -> None:
+        self._database = database
+        self._keyring = keyring
+        self._tenants = tenants
+        self._clock = clock
+
+    def create(
+        self,
+        tenant: str,
+        rights: Iterable[Right | str],
+        *,
+        label: str = "",
+        expires_at: datetime | None = None,
+    ) -> NewApiKey:
+        """Make a key of an existing tenant.
+
+        Raises
+        ------
+        UnknownTenant, StoreError
+            For no right at all, an unknown one, or a label that is too long.
+        """
+        granted = _rights(rights)
+        if len(label) > MAX_LABEL or not label.isprintable():
+            raise StoreError(f"a label has at most {MAX_LABEL} printable characters")
+        return self._database.write(
+            lambda each: self._insert(each, tenant, granted, label=label, expires_at=expires_at)
+        )
+
+    def bootstrap(
+        self, *, tenant: str = "default", rights: Iterable[Right] = tuple(Right)
+    ) -> NewApiKey | None:
+        """Make the first tenant and the first key, once in the life of a store.
+
+        Of any number of processes that call this at once, one gets the key and the others None.
+        """
+        granted = _rights(rights)
+
+        def work(connection: Connection) -> NewApiKey | None:
+            if connection.execute(sa.select(ApiKeyRow.id).limit(1)).first() is not None:
+                return None
+            self._tenants.ensure(connection, tenant)
+            return self._insert(connection, tenant, granted, label="bootstrap", expires_at=None)
+
+        return self._database.write(work, lock="bootstrap")
+
+    def verify(self, token: str) -> ApiKey | None:
+        """Return the key of a token, or None if it is unknown, wrong, expired or revoked.
+
+        The comparison takes the same time wherever the tokens differ, and an unknown prefix is
+        compared too.
+        """
+        match = _TOKEN.fullmatch(token) if len(token) <= 128 else None
+        prefix = match[1] if match else ""
+        row = self._database.read(
+            lambda each: each.execute(
+                _KEYS.add_columns(ApiKeyRow.token_hash).where(ApiKeyRow.prefix == prefix)
+            ).one_or_none()
+        )
+        expected = _NOBODYS_HASH if row is None else row.token_hash
+        same = hmac.compare_digest(_token_hash(token), expected)
+        if row is None or not same:
+            return None
+        key, now = _api_key(row[:-1]), self._clock()
+        if not key.is_valid_at(now):
+            return None
+        self._note_use(key, now)
+        return key
+
+    def get(self, prefix: str) -> ApiKey | None:
+        """Return a key by its prefix, or None."""
+        row = self._database.read(
+            lambda each: each.execute(_KEYS.where(ApiKeyRow.prefix == prefix)).one_or_none()
+        )
+        return None if row is None else _api_key(row)
+
+    def all(self, *, tenant: str | None = None) -> tuple[ApiKey, ...]:
+        """Every key, or every key of a tenant, the oldest first."""
+        query = _KEYS.order_by(ApiKeyRow.created_at, ApiKeyRow.prefix)
+        if tenant is not None:
+            query = query.where(TenantRow.name == tenant)
+        rows = self._database.read(lambda each: each.execute(query).all())
+        return tuple(_api_key(row) for row in rows)
+
+    def revoke(self, prefix: str) -> bool:
+        """Revoke a key for good; True unless it was unknown or revoked before."""
+        statement = (
+            sa.update(ApiKeyRow)
+            .where(ApiKeyRow.prefix == prefix, ApiKeyRow.revoked_at.is_(None))
+            .values(revoked_at=self._clock())
+        )
+        return self._database.write(lambda each: each.execute(statement).rowcount == 1)
+
+    def probe_key(self, prefix: str) -> bytes:
+        """Open the key that probes of this API key are signed with; see :func:`probe_key`."""
+        row = self._database.read(
+            lambda each: each.execute(
+                sa.select(ApiKeyRow.id, ApiKeyRow.wrapped_probe_key).where(
+                    ApiKeyRow.prefix == prefix
+                )
+            ).one_or_none()
+        )
+        if row is None:
+            raise StoreError("there is no API key of this prefix")
+        return self._keyring.open(
+            row.wrapped_probe_key, purpose=PROBE_KEY_PURPOSE, bound_to=[row.id]
+        )
+
+    def _insert(
+        self,
+        connection: Connection,
+        tenant: str,
+        rights: frozenset[Right],
+        *,
+        label: str,
+        expires_at: datetime | None,
+    ) -> NewApiKey:
+        tenant_id = connection.execute(
+            sa.select(TenantRow.id).where(TenantRow.name == tenant)
+        ).scalar_one_or_none()
+        if tenant_id is None:
+            raise UnknownTenant(f"there is no tenant {tenant!r}")
+        key_id, prefix, now = uuid.uuid4().hex, os.urandom(6).hex(), self._clock()
+        token = f"vf_{prefix}_{os.urandom(32).hex()}"
+        wrapped = self._keyring.seal(probe_key(token), purpose=PROBE_KEY_PURPOSE, bound_to=[key_id])
+        connection.execute(
+            sa.insert(ApiKeyRow).values(
+                id=key_id,
+                tenant_id=tenant_id,
+                prefix=prefix,
+                token_hash=_token_hash(token),
+                rights=",".join(sorted(rights)),
+                label=label,
+                wrapped_probe_key=wrapped,
+                wrapping_key=sealed_key_id(wrapped),
+                created_at=now,
+                expires_at=expires_at,
+            )
+        )
+        key = ApiKey(key_id, prefix, tenant, rights, label, now, expires_at, None, None)
+        return NewApiKey(key=key, token=token)
+
+    def _note_use(self, key: ApiKey, now: datetime) -> None:
+        # To the minute, so that verifying does not turn every request into a write.
+        noted, due = key.last_used_at, now - _USE_IS_NOTED_EVERY
+        if noted is not None and noted > due:
+            return
+        statement = (
+            sa.update(ApiKeyRow)
+            .where(
+                ApiKeyRow.id == key.id,
+                sa.or_(ApiKeyRow.last_used_at.is_(None), ApiKeyRow.last_used_at <= due),
+            )
+            .values(last_used_at=now)
+        )
+        # A full or busy disk must not refuse a good key.
+        with contextlib.suppress(StoreUnavailable):
+            self._database.write(lambda each: each.execute(statement))
+
+
+def probe_key(token: str) -> bytes:
+    """Derive the 32-byte key that a client signs its probes with from its API token.
+
+    Raises
+    ------
+    StoreError
+        If the text is not a token.
+    """
+    match = _TOKEN.fullmatch(token)
+    if match is None:
+        raise StoreError("this is not an API token: one looks like vf_<prefix>_<secret>")
+    return derive_key(bytes.fromhex(match[2]), "probe-key")
+
+
+_KEYS = sa.select(
+    ApiKeyRow.id,
+    ApiKeyRow.prefix,
+    TenantRow.name,
+    ApiKeyRow.rights,
+    ApiKeyRow.label,
+    ApiKeyRow.created_at,
+    ApiKeyRow.expires_at,
+    ApiKeyRow.revoked_at,
+    ApiKeyRow.last_used_at,
+).join(TenantRow, TenantRow.id == ApiKeyRow.tenant_id)
+
+
+def _api_key(columns: Any) -> ApiKey:
+    key_id, prefix, tenant, rights, *rest = columns
+    return ApiKey(key_id, prefix, tenant, frozenset(map(Right, rights.split(","))), *rest)
+
+
+def _rights(rights: Iterable[Right | str]) -> frozenset[Right]:
+    try:
+        granted = frozenset(Right(each) for each in rights)
+    except ValueError:
+        raise StoreError(f"the rights of a key are among {', '.join(Right)}") from None
+    if not granted:
+        raise StoreError("a key needs at least one right")
+    return granted
+
+
+def _token_hash(token: str) -> bytes:
+    return hashlib.sha256(token.encode("utf-8", "surrogatepass")).digest()

@@ -1,0 +1,170 @@
+"""Idempotency records: a repeated write with the same key is answered, not done again.
+
+A write first claims its key, then runs, then leaves its answer. A claim that its worker did not
+finish (it was killed) lapses after a minute, so that the client's next try may run. Keys and
+requests are kept as HMAC-SHA256 under a secret of the deployment: a record does not tell whose
+photo was sent to somebody who holds the photo. Answers must hold no biometric data.
+"""
+
+import hashlib
+import hmac
+import uuid
+from dataclasses import dataclass, field
+from datetime import timedelta
+
+import sqlalchemy as sa
+from sqlalchemy.engine import Connection
+
+from templates.errors import StoreError
+from templates.sealing import encode_parts
+from templates.store.database import Database
+from templates.store.deployment import Secrets, insert_once
+from templates.store.identifiers import Clock, UnknownTenant
+from templates.store.receipts import ReceiptSigner
+from templates.store.schema import IdempotencyRow, TenantRow
+
+RETENTION = timedelta(hours=24)
+CLAIM = timedelta(minutes=1)
+MAX_KEY = 255
+MAX_BODY_BYTES = 64 * 1024
+
+_SECRET = "idempotency"  # noqa: S105 - a name, not a secret
+
+
+class IdempotencyConflict(StoreError):
+    """The key was used for another request, or its first request is still running."""
+
+
+@dataclass(frozen=True)
+class Claim:
+    """The right to run a write; hand it back by ``finish`` or ``release``."""
+
+    tenant_id: str
+    actor: str
+    key_hash: bytes = field(repr=False)
+    token: str = field(repr=False)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What the first run of the write answered."""
+
+    status: int
+    body: bytes = field(repr=False)
+
+
+class Idempotency:
+    """Repository of idempotency records."""
+
+    def __init__(
+        self, database: Database, secrets: Secrets, signer: ReceiptSigner, clock: Clock
+    ) -> None:
+        self._database = database
+        self._secrets = secrets
+        self._signer = signer
+        self._clock = clock
+
+    def claim(
+        self, tenant: str, *, actor: str, key: str, request: bytes, subject_id: str | None = None
+    ) -> Claim | Answer:
+        """Claim a key for a write, or return what the write answered before.
+
+        Parameters
+        ----------
+        tenant, actor
+            Whose key it is; `actor` is the prefix of the API key.
+        key
+            The client's ``Idempotency-Key``, 1 to 255 characters.
+        request
+            Whatever makes the request the same (method, path, digest of the body).
+        subject_id
+            The subject that the write concerns; erasing it removes the record.
+
+        Raises
+        ------
+        IdempotencyConflict
+            If the key belongs to another request, or to one that is still running.
+        """
+        if not 1 <= len(key) <= MAX_KEY:
+            raise StoreError(f"an idempotency key has 1 to {MAX_KEY} characters")
+        secret = self._secrets.get(_SECRET)
+        key_hash = hmac.digest(secret, encode_parts("key", key), hashlib.sha256)
+        request_hash = hmac.digest(secret, encode_parts("request", request), hashlib.sha256)
+        pseudonym = None if subject_id is None else self._signer.pseudonym(tenant, subject_id)
+
+        def work(connection: Connection) -> Claim | Answer:
+            tenant_id = connection.execute(
+                sa.select(TenantRow.id).where(TenantRow.name == tenant)
+            ).scalar_one_or_none()
+            if tenant_id is None:
+                raise UnknownTenant(f"there is no tenant {tenant!r}")
+            now = self._clock()
+            claim = Claim(tenant_id, actor, key_hash, uuid.uuid4().hex)
+            connection.execute(
+                sa.delete(IdempotencyRow).where(
+                    *_is(claim),
+                    sa.or_(
+                        IdempotencyRow.expires_at <= now,
+                        sa.and_(
+                            IdempotencyRow.status.is_(None), IdempotencyRow.claimed_until <= now
+                        ),
+                    ),
+                )
+            )
+            if insert_once(
+                connection,
+                IdempotencyRow,
+                tenant_id=tenant_id,
+                actor=actor,
+                key_hash=key_hash,
+                request_hash=request_hash,
+                pseudonym=pseudonym,
+                claim=claim.token,
+                claimed_until=now + CLAIM,
+                created_at=now,
+                expires_at=now + RETENTION,
+            ):
+                return claim
+            row = connection.execute(
+                sa.select(
+                    IdempotencyRow.request_hash, IdempotencyRow.status, IdempotencyRow.body
+                ).where(*_is(claim))
+            ).one()
+            if not hmac.compare_digest(row.request_hash, request_hash):
+                raise IdempotencyConflict("this idempotency key was used for another request")
+            if row.status is None or row.body is None:
+                raise IdempotencyConflict("the first request with this key is still running")
+            return Answer(row.status, row.body)
+
+        return self._database.write(work, lock=f"idempotency {tenant} {actor} {key_hash.hex()}")
+
+    def finish(self, claim: Claim, *, status: int, body: bytes) -> bool:
+        """Leave the answer; False if the claim is gone (lapsed, or the subject was erased)."""
+        if len(body) > MAX_BODY_BYTES:
+            raise StoreError(f"an answer of more than {MAX_BODY_BYTES} bytes is not kept")
+        statement = (
+            sa.update(IdempotencyRow)
+            .where(*_is(claim), IdempotencyRow.claim == claim.token)
+            .values(status=status, body=body)
+        )
+        return self._database.write(lambda each: each.execute(statement).rowcount == 1)
+
+    def release(self, claim: Claim) -> None:
+        """Give the key back, because the write failed and may be tried again."""
+        statement = sa.delete(IdempotencyRow).where(
+            *_is(claim), IdempotencyRow.claim == claim.token, IdempotencyRow.status.is_(None)
+        )
+        self._database.write(lambda each: each.execute(statement))
+
+    def expire(self) -> int:
+        """Remove records that are older than a day; returns how many."""
+        statement = sa.delete(IdempotencyRow).where(IdempotencyRow.expires_at <= self._clock())
+        return self._database.write(lambda each: each.execute(statement).rowcount)
+
+
+def _is(claim: Claim) -> tuple[sa.ColumnElement[bool], ...]:
+    return (
+        IdempotencyRow.tenant_id == claim.tenant_id,
+        IdempotencyRow.actor == claim.actor,
+        IdempotencyRow.key_hash == claim.key_hash,
+    )
