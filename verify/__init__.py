@@ -1,1 +1,22 @@
-"""Verification: a probe against a subject becomes a decision; metrics and calibration."""
+"""Verification: a probe against a subject becomes a decision; metrics and calibration.
+
+Imports the floor below only: ``templates`` and ``models``.
+"""
+
+from verify.calibration import Calibrated, CalibrationReport, calibrate
+from verify.calibration_mode import CalibrationOptions
+from verify.datasets import DatasetError, LabelledFolder, read_lfw_pairs
+from verify.decision import Decision
+from verify.verifier import Verifier
+
+__all__ = [
+    "Calibrated",
+    "CalibrationOptions",
+    "CalibrationReport",
+    "DatasetError",
+    "Decision",
+    "LabelledFolder",
+    "Verifier",
+    "calibrate",
+    "read_lfw_pairs",
+]

@@ -30,6 +30,23 @@ _PLAIN = {
 }
 
 
+def plain_strategy(strategy: Strategy) -> Strategy:
+    """Return the form of a strategy that needs no labels and no sub-databases."""
+    return _PLAIN.get(strategy, strategy)
+
+
+def client_source(source: DecoySource) -> DecoySource:
+    """Return the generator that lifting clients receive, never a pool.
+
+    A generator is returned as it is; to a pool one is fitted, always the same for the same pool.
+    """
+    if not isinstance(source, DecoyPool):
+        return source
+    with Keystream.seeded("pool entries", source.source_id) as stream:
+        entries = source.draw(1, len(source), stream=stream)[0]
+    return DecoyGenerator.fit(entries[np.lexsort(entries.T)])
+
+
 def make_cohort(
     source: DecoySource,
     *,
@@ -55,14 +72,9 @@ def make_cohort(
     SubspaceBatch
         ``size`` templates, un-rotated.
     """
-    nobody: DecoySource = source
-    if isinstance(source, DecoyPool):
-        entries = source.draw(1, len(source), stream=stream)[0]
-        nobody = DecoyGenerator.fit(entries)
+    nobody = client_source(source)
     descriptors = nobody.draw(size, 1, stream=stream)[:, 0, :]
-    return lift(
-        descriptors, strategy=_PLAIN.get(strategy, strategy), m=m, source=nobody, stream=stream
-    )
+    return lift(descriptors, strategy=plain_strategy(strategy), m=m, source=nobody, stream=stream)
 
 
 def cohort_statistics(

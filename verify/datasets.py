@@ -1,6 +1,6 @@
 """Readers of labelled face folders: ``root/Person/photo.jpg``, as LFW is laid out."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -92,18 +92,20 @@ class LabelledFolder:
 
 
 def read_lfw_pairs(
-    file: Path | str, folder: LabelledFolder, *, missing: Mapping[Path, str] | None = None
+    file: Path | str, paths: Sequence[Path], *, missing: Collection[Path] = ()
 ) -> list[Pair]:
-    """Read LFW's ``pairs.txt`` into indices of the folder's photos.
+    """Read LFW's ``pairs.txt`` into positions in ``paths``.
 
     The header is ``folds<TAB>pairs per class and fold``; every fold then has that many lines
     ``Name i j`` of one person and as many lines ``NameA i NameB j`` of two (FORMATS).
 
     Parameters
     ----------
+    paths
+        Photos with a descriptor, in its order; ``Name/Name_0001.jpg``.
     missing
-        Photos without a descriptor, with the reason; pairs that need one are left out. The caller
-        reports them as failures to acquire.
+        Photos of the same folder without a descriptor; pairs that need one are left out. The
+        caller reports them as failures to acquire.
 
     Raises
     ------
@@ -117,8 +119,8 @@ def read_lfw_pairs(
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError):
         raise DatasetError(f"{path.name} cannot be read as UTF-8 text") from None
-    index = {(entry.parent.name, entry.stem): number for number, entry in enumerate(folder.paths)}
-    gone = {(entry.parent.name, entry.stem) for entry in (missing or {})}
+    index = {(entry.parent.name, entry.stem): number for number, entry in enumerate(paths)}
+    gone = {(entry.parent.name, entry.stem) for entry in missing}
     folds, per_class = _header(path, lines)
     body = lines[1 : 1 + 2 * folds * per_class]
     if len(body) < 2 * folds * per_class:

@@ -78,9 +78,18 @@ def most_errors(target: float, trials: int) -> int:
 def threshold_at_fmr(impostor: ArrayLike, target: float, *, trials: int | None = None) -> float:
     """Lowest threshold whose FMR on these impostors is at most the target, never the nearest.
 
-    ``trials`` is their number where ``impostor`` holds only the highest similarities of them, more
-    than the target allows errors. The threshold lies halfway between the last similarity that it accepts and the first that it
+    The threshold lies halfway between the last similarity that it accepts and the first that it
     rejects; above all of them where the target allows no error.
+
+    Parameters
+    ----------
+    impostor
+        Similarities of the impostor trials.
+    target
+        False match rate.
+    trials
+        Number of trials, where ``impostor`` holds only their highest similarities, more of them
+        than the target allows errors.
 
     Raises
     ------

@@ -1,0 +1,267 @@
+"""From labelled descriptors to a contract: thresholds for stated false match rates."""
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from templates.canonical import Json
+from templates.contract import Binding, Calibration, Contract
+from templates.decoys import Attributes, DecoySource
+from templates.errors import ContractError
+from templates.lifting import unit_descriptors
+from templates.randomness import Keystream
+from templates.subspace import SubspaceBatch
+from verify.calibration_mode import Bench, CalibrationOptions, calibrate_mode
+from verify.cohort import COHORT_SIZE, client_source, make_cohort, plain_strategy
+from verify.comparisons import Lifter, Progress, honest_norms
+from verify.raw_pairs import SuspiciousPair, consistency_threshold, suspicious_pairs
+from verify.tenfold import Pair, TenFold, random_pairs
+from verify.trials import Plan, chosen_photos, enrolled_means, plan_trials
+
+DEFAULT_LEVEL = "fmr-1e-3"
+
+
+@dataclass(frozen=True)
+class CalibrationReport:
+    """What an operator should read beside the contract.
+
+    Parameters
+    ----------
+    consistency_pairs
+        Raw photo pairs that ``photo_consistency`` was set on.
+    unresolved
+        Sentences about the FMR targets that the data cannot resolve.
+    suspicious
+        People who may be one person under two names: look at them before believing a threshold
+        at FMR 1e-4 or below, then name them in ``aliases`` (METHOD §3).
+    suspicious_above
+        Raw cosine that makes a pair suspicious.
+    ten_folds
+        Results of the ten-fold protocol, one per calibration in the contract's order; empty
+        under protocol ``fmr``.
+    """
+
+    consistency_pairs: int
+    unresolved: tuple[str, ...]
+    suspicious: tuple[SuspiciousPair, ...]
+    suspicious_above: float
+    ten_folds: tuple[TenFold, ...]
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """A contract, and the report of its calibration."""
+
+    contract: Contract
+    report: CalibrationReport
+
+
+def _silent(_what: str, _share: float) -> None:
+    """Show no progress."""
+
+
+def calibrate(
+    descriptors: NDArray[np.floating],
+    identities: Sequence[str],
+    *,
+    binding: Binding,
+    source: DecoySource,
+    options: CalibrationOptions | None = None,
+    exclude: Collection[str] = (),
+    aliases: Mapping[str, str] | None = None,
+    attributes: Sequence[Attributes] | None = None,
+    pairs: Sequence[Pair] | None = None,
+    cohort: SubspaceBatch | None = None,
+    recorded: Mapping[str, Json] | None = None,
+    dataset: str = "labelled folder",
+    progress: Callable[[str, float], None] = _silent,
+) -> Calibrated:
+    """Calibrate a contract on the private templates of labelled people.
+
+    Every person is enrolled once, on up to ``photos_per_enrollment`` averaged photos, lifted and
+    passed through the wire format as in the service. Genuine probes are the photos that were left
+    out. Impostor trials are all cross-identity pairs in p-to-s, and a stated random subset of
+    them in s-to-s. A level's two thresholds stand at one marginal quantile, chosen so that the
+    joint FMR is at most the target (METHOD §4.7).
+
+    Parameters
+    ----------
+    descriptors : (N, n) floating
+        Unit rows.
+    identities
+        N names.
+    binding, source
+        What the contract binds to, and the decoy source it names.
+    exclude
+        People to leave out, such as those of a test.
+    aliases
+        Second names of one person, mapped to the first.
+    attributes
+        One per descriptor, for hybrid+; without them hybrid+ is calibrated on decoys of any label.
+    pairs
+        Pairs of the ten-fold protocol, as positions in ``descriptors``; balanced random pairs
+        where None. Pairs of excluded people are left out.
+    cohort
+        A contract's cohort, to keep it; by default a new one is drawn from fresh randomness.
+    recorded
+        Facts for the contract file, such as the pack's name and detector.
+    dataset
+        What the descriptors came from, for the contract file.
+    progress
+        Called with what is being done and a share in [0, 1].
+
+    Returns
+    -------
+    Calibrated
+        Contract and report.
+
+    Raises
+    ------
+    ContractError
+        Where the data are too few for a single level, or do not fit the binding.
+    ContractMismatch
+        Where ``source`` is not the binding's.
+    """
+    chosen_options = options or CalibrationOptions()
+    binding.require_source(source_id=source.source_id)
+    unit = unit_descriptors(descriptors)
+    if unit.shape != (len(identities), binding.n):
+        raise ContractError(
+            f"{len(identities)} identities and a binding of n = {binding.n} need descriptors of "
+            f"shape ({len(identities)}, {binding.n}), not {unit.shape}"
+        )
+    kept, names = chosen_photos(identities, exclude=exclude, aliases=aliases or {})
+    if len(set(names)) < 2 or len(set(names)) == len(names):
+        raise ContractError(
+            "a calibration needs at least two people, and one with at least two photos"
+        )
+    data = np.ascontiguousarray(unit[kept], dtype=np.float32)
+    rng = np.random.default_rng(chosen_options.seed)
+    plan = plan_trials(names, photos_per_enrollment=chosen_options.photos_per_enrollment, rng=rng)
+    bench = _lay_out(
+        data,
+        plan,
+        binding=binding,
+        source=source,
+        options=chosen_options,
+        cohort=cohort,
+        attributes=None if attributes is None else [attributes[index] for index in kept],
+        pairs=_protocol_pairs(chosen_options, pairs, kept, plan, rng),
+        facts={
+            "dataset": dataset,
+            "photos": len(data),
+            "people": len(plan.people),
+            "excluded_photos": len(identities) - len(data),
+            "photos_per_enrollment": chosen_options.photos_per_enrollment,
+            "protocol": chosen_options.protocol,
+            "seed": chosen_options.seed,
+        },
+        progress=progress,
+    )
+    consistency, consistency_pairs = consistency_threshold(
+        data, plan.person_of, fmr=chosen_options.consistency_fmr, rng=rng
+    )
+    calibrations: list[Calibration] = []
+    unresolved: list[str] = []
+    ten_folds: list[TenFold] = []
+    for probe_m in chosen_options.probe_dims:
+        entry, missing, folds = calibrate_mode(bench, probe_m, rng)
+        calibrations.append(entry)
+        unresolved += missing
+        ten_folds += [folds] if folds else []
+    contract = Contract(
+        binding=binding,
+        recorded={**(recorded or {}), "photo_consistency_fmr": chosen_options.consistency_fmr},
+        calibrations=tuple(calibrations),
+        default_level=_default_level(calibrations),
+        photo_consistency=consistency,
+        template_foot_point_norm=honest_norms(bench.templates.foot_norms),
+        cohort=bench.cohort,
+    )
+    return Calibrated(
+        contract,
+        CalibrationReport(
+            consistency_pairs=consistency_pairs,
+            unresolved=tuple(unresolved),
+            suspicious=tuple(
+                suspicious_pairs(
+                    data, plan.person_of, plan.people, above=chosen_options.suspicious_above
+                )
+            ),
+            suspicious_above=chosen_options.suspicious_above,
+            ten_folds=tuple(ten_folds),
+        ),
+    )
+
+
+def _lay_out(
+    data: NDArray[np.float32],
+    plan: Plan,
+    *,
+    binding: Binding,
+    source: DecoySource,
+    options: CalibrationOptions,
+    cohort: SubspaceBatch | None,
+    attributes: Sequence[Attributes] | None,
+    pairs: tuple[Pair, ...],
+    facts: Mapping[str, Json],
+    progress: Progress,
+) -> Bench:
+    """Enroll everybody, and draw the cohort where none is given."""
+    service = Lifter(binding.strategy, source, binding.contract_id)
+    client = Lifter(plain_strategy(binding.strategy), client_source(source), binding.contract_id)
+    progress("enrolling people", 0.0)
+    with Keystream.seeded("calibration templates", options.seed) as stream:
+        templates = service.lift(
+            enrolled_means(data, plan),
+            m=binding.m,
+            stream=stream,
+            attributes=attributes and [attributes[photos[0]] for photos in plan.enrolled],
+        )
+    if cohort is None:
+        with Keystream.fresh() as stream:
+            cohort = make_cohort(
+                source, strategy=binding.strategy, m=binding.m, stream=stream, size=COHORT_SIZE
+            )
+    return Bench(
+        descriptors=data,
+        plan=plan,
+        templates=templates,
+        cohort=cohort,
+        service=service,
+        client=client,
+        pairs=pairs,
+        options=options,
+        facts=facts,
+        progress=progress,
+    )
+
+
+def _protocol_pairs(
+    options: CalibrationOptions,
+    pairs: Sequence[Pair] | None,
+    kept: NDArray[np.int64],
+    plan: Plan,
+    rng: np.random.Generator,
+) -> tuple[Pair, ...]:
+    if options.protocol == "fmr":
+        return ()
+    if pairs is None:
+        return tuple(random_pairs(plan.person_of, rng=rng))
+    place = {int(photo): position for position, photo in enumerate(kept)}
+    return tuple(
+        Pair(place[pair.first], place[pair.second], pair.same, pair.fold)
+        for pair in pairs
+        if pair.first in place and pair.second in place
+    )
+
+
+def _default_level(calibrations: Sequence[Calibration]) -> str:
+    """FMR 1e-3 where the first calibration resolves it, else its strictest level by target."""
+    levels = calibrations[0].levels
+    if any(level.name == DEFAULT_LEVEL for level in levels):
+        return DEFAULT_LEVEL
+    targeted = [level for level in levels if level.target_fmr is not None]
+    return (targeted or list(levels))[-1].name

@@ -1,0 +1,270 @@
+"""Genuine and impostor scores of private templates, as a service would compute them.
+
+Templates pass through the wire format on the way, so that calibration sees the same float16
+numbers as the service. They are not rotated: a rotation leaves every distance as it was.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from templates import wire
+from templates.decoys import Attributes, DecoySource
+from templates.distances import Metric, paired_distances, pairwise_distances, similarity
+from templates.lifting import Strategy, lift
+from templates.randomness import Keystream
+from templates.subspace import SubspaceBatch
+from verify.cohort import Probes, cohort_statistics
+from verify.thresholds import Genuine, Impostors
+from verify.trials import Indices, Plan, impostor_sample
+
+WIRE_DTYPE = "float16"
+PROBE_TILE = 256
+PAIR_TILE_BYTES = 128 * 2**20
+
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class Lifter:
+    """Lifts as a service or a client of one contract does, through the wire format.
+
+    Parameters
+    ----------
+    strategy, source
+        How to lift, and with whose decoys.
+    contract_id
+        Written into the wire bytes.
+    """
+
+    strategy: Strategy
+    source: DecoySource
+    contract_id: str
+
+    def lift(
+        self,
+        descriptors: NDArray[np.float32],
+        *,
+        m: int,
+        stream: Keystream,
+        attributes: Sequence[Attributes] | None = None,
+    ) -> SubspaceBatch:
+        """Lift, encode and decode; hybrid+ without attributes takes any decoys."""
+        named = None
+        if self.strategy is Strategy.HYBRID_PLUS:
+            named = attributes or [Attributes()] * len(descriptors)
+        lifted = lift(
+            descriptors,
+            strategy=self.strategy,
+            m=m,
+            source=self.source,
+            stream=stream,
+            attributes=named,
+        )
+        return through_wire(lifted, contract_id=self.contract_id)
+
+
+def through_wire(batch: SubspaceBatch, *, contract_id: str) -> SubspaceBatch:
+    """Encode and decode every template, as storing and reading it does."""
+    feet, bases = np.empty_like(batch.feet), np.empty_like(batch.bases)
+    for row, template in enumerate(batch):
+        data = wire.encode(template, contract_id=contract_id, dtype=WIRE_DTYPE)
+        back = wire.decode(data, max_n=batch.n, max_m=batch.m).subspace
+        feet[row], bases[row] = back.foot, back.basis
+    return SubspaceBatch(feet, bases)
+
+
+def point_trials(
+    descriptors: NDArray[np.float32],
+    plan: Plan,
+    templates: SubspaceBatch,
+    cohort: SubspaceBatch,
+    *,
+    metric: Metric,
+    steps: int,
+    most_cells: int,
+    rng: np.random.Generator,
+    progress: Progress,
+) -> tuple[Impostors, Genuine]:
+    """Compare raw probes with everybody's template: all cross-identity pairs.
+
+    Where photos × people exceeds ``most_cells``, impostor probes are a random subset of the
+    photos, so that memory stays bounded; all genuine probes are kept.
+    """
+    people = len(plan.people)
+    limit = max(1, most_cells // people)
+    extra = np.setdiff1d(np.arange(len(plan.person_of)), plan.genuine)
+    if len(plan.genuine) >= limit:
+        chosen = np.sort(rng.choice(plan.genuine, limit, replace=False))
+    else:
+        room = min(len(extra), limit - len(plan.genuine))
+        chosen = np.sort(np.concatenate([plan.genuine, rng.choice(extra, room, replace=False)]))
+    owners = plan.person_of[chosen]
+    similarities = np.empty((len(chosen), people), dtype=np.float32)
+    scores = np.empty_like(similarities)
+    for start in range(0, len(chosen), PROBE_TILE):
+        rows = slice(start, start + PROBE_TILE)
+        probes = descriptors[chosen[rows]]
+        distances = pairwise_distances(probes, templates, metric=metric, steps=steps)
+        similarities[rows] = similarity(distances)
+        means, spreads = cohort_statistics(probes, cohort, metric=metric, steps=steps)
+        scores[rows] = (similarities[rows] - means[:, None]) / spreads[:, None]
+        progress("comparing photos with templates", min(1.0, (start + PROBE_TILE) / len(chosen)))
+    position = np.searchsorted(chosen, plan.genuine)
+    kept = position < len(chosen)
+    kept[kept] = chosen[position[kept]] == plan.genuine[kept]
+    own, position = plan.person_of[plan.genuine[kept]], position[kept]
+    genuine = Genuine(similarities[position, own], scores[position, own], own)
+    rows_index = np.arange(len(chosen))
+    similarities[rows_index, owners] = -np.inf
+    scores[rows_index, owners] = -np.inf
+    probes_of = np.bincount(owners, minlength=people).astype(np.float64)
+
+    def people_of(flat: Indices) -> Indices:
+        return np.stack([owners[flat // people], flat % people], axis=1)
+
+    def weighted_trials(weights: NDArray[np.float64]) -> float:
+        mine = probes_of * weights
+        return float(mine.sum() * weights.sum() - mine @ weights)
+
+    probing = int(np.count_nonzero(probes_of))
+    return Impostors(
+        similarities=similarities.reshape(-1),
+        cohort_scores=scores.reshape(-1),
+        trials=len(chosen) * (people - 1),
+        people=people,
+        person_pairs=probing * (people - 1) - probing * (probing - 1) // 2,
+        people_of=people_of,
+        weighted_trials=weighted_trials,
+    ), genuine
+
+
+@dataclass(frozen=True, eq=False)
+class LiftedTrials:
+    """Scores of lifted probes, and the foot-point norms that honest lifts have."""
+
+    impostors: Impostors
+    genuine: Genuine
+    foot_norms: NDArray[np.float64]
+
+
+def lifted_trials(
+    descriptors: NDArray[np.float32],
+    plan: Plan,
+    templates: SubspaceBatch,
+    cohort: SubspaceBatch,
+    lifter: Lifter,
+    *,
+    probe_m: int,
+    metric: Metric,
+    steps: int,
+    most_probes: int,
+    impostor_pairs: int,
+    rng: np.random.Generator,
+    stream: Keystream,
+    progress: Progress,
+) -> LiftedTrials:
+    """Compare lifted probes with their person's template, and with a random subset of others.
+
+    Probes are at most ``most_probes`` photos, genuine ones first; each meets the same number of
+    other people's templates, ``impostor_pairs`` in all.
+    """
+    what = f"comparing lifted probes, m = {probe_m}"
+    genuine_photos = plan.genuine
+    if len(genuine_photos) > most_probes:
+        genuine_photos = rng.choice(genuine_photos, most_probes, replace=False)
+    extra = np.setdiff1d(np.arange(len(plan.person_of)), plan.genuine)
+    room = min(len(extra), most_probes - len(genuine_photos))
+    chosen = np.concatenate([genuine_photos, rng.choice(extra, room, replace=False)])
+    owners = plan.person_of[chosen]
+    probes = lifter.lift(descriptors[chosen], m=probe_m, stream=stream)
+    means, spreads = np.empty(len(chosen)), np.empty(len(chosen))
+    for start in range(0, len(chosen), PROBE_TILE):
+        rows = slice(start, start + PROBE_TILE)
+        means[rows], spreads[rows] = cohort_statistics(
+            probes[rows], cohort, metric=metric, steps=steps
+        )
+        progress(what, 0.5 * min(1.0, (start + PROBE_TILE) / len(chosen)))
+
+    def compare(positions: Indices, people: Indices) -> NDArray[np.float32]:
+        return _paired(probes, positions, templates, people, metric, steps, progress, what)
+
+    own_positions = np.arange(len(genuine_photos), dtype=np.int64)
+    own = owners[: len(genuine_photos)]
+    mated = compare(own_positions, own) if len(own) else np.empty(0, dtype=np.float32)
+    positions, people = impostor_sample(plan, chosen, pairs=impostor_pairs, rng=rng)
+    non_mated = compare(positions, people)
+    pair_people = np.stack([owners[positions], people], axis=1)
+    keys, repeats = np.unique(pair_people, axis=0, return_counts=True)
+    unordered = np.unique(np.sort(keys, axis=1), axis=0)
+
+    def weighted_trials(weights: NDArray[np.float64]) -> float:
+        return float(np.sum(repeats * weights[keys[:, 0]] * weights[keys[:, 1]]))
+
+    def z(scores: NDArray[np.float32], rows: Indices) -> NDArray[np.float32]:
+        return ((scores - means[rows]) / spreads[rows]).astype(np.float32)
+
+    impostors = Impostors(
+        similarities=non_mated,
+        cohort_scores=z(non_mated, positions),
+        trials=len(positions),
+        people=len(plan.people),
+        person_pairs=len(unordered),
+        people_of=lambda flat: pair_people[flat],
+        weighted_trials=weighted_trials,
+    )
+    genuine = Genuine(mated, z(mated, own_positions), own)
+    return LiftedTrials(impostors, genuine, probes.foot_norms)
+
+
+def pair_similarities(
+    probes: Probes,
+    templates: SubspaceBatch,
+    positions: Indices,
+    numbers: Indices,
+    *,
+    metric: Metric,
+    steps: int,
+) -> NDArray[np.float32]:
+    """Similarities of the pairs (probes[positions[i]], templates[numbers[i]]), by tiles."""
+    return _paired(
+        probes, positions, templates, numbers, metric, steps, lambda _what, _share: None, ""
+    )
+
+
+def _paired(
+    probes: Probes,
+    positions: Indices,
+    templates: SubspaceBatch,
+    numbers: Indices,
+    metric: Metric,
+    steps: int,
+    progress: Progress,
+    what: str,
+) -> NDArray[np.float32]:
+    dimension = templates.m + 2 + (probes.m if isinstance(probes, SubspaceBatch) else 0)
+    tile = max(1, PAIR_TILE_BYTES // (4 * templates.n * dimension))
+    out = np.empty(len(positions), dtype=np.float32)
+    for start in range(0, len(positions), tile):
+        rows = slice(start, start + tile)
+        distances = paired_distances(
+            probes[positions[rows]], templates[numbers[rows]], metric=metric, steps=steps
+        )
+        out[rows] = similarity(distances)
+        progress(what, 0.5 + 0.5 * min(1.0, (start + tile) / len(positions)))
+    return out
+
+
+def honest_norms(norms: NDArray[np.float64]) -> tuple[float, float]:
+    """Range of ‖p‖ that honest lifts have: what was observed, widened by half its width each way.
+
+    ‖p‖ of honest lifts is unimodal with thin tails (a sum over many decoys). The extremes of 1,000
+    or more observations lie some 3 standard deviations out, so the widened range reaches about 6,
+    and an honest client is refused less than once in a million. The lower bound stays positive:
+    a set through the coordinate origin is no lift of a unit vector (METHOD §4.7).
+    """
+    low, high = float(norms.min()), float(norms.max())
+    margin = max((high - low) / 2, 1e-3)
+    return max(low - margin, low / 2), min(high + margin, 1.0)
