@@ -152,7 +152,7 @@ async def read_json(request: Request, *, max_bytes: int, timeout_s: float) -> di
     return value
 
 
-class _arrives_within:  # noqa: N801 - reads as a clause
+class _arrives_within:
     """Bounds the time that a body may take to arrive."""
 
     def __init__(self, seconds: float) -> None:

@@ -5,11 +5,27 @@ An error body has one shape, framework errors included::
     {"error": {"code": "no_face", "message": "…", "details": {…}}, "request_id": "…"}
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from templates.errors import VeilfaceError
+from enroll.errors import InconsistentImages, PhotoRejected
+from models.errors import FaceError, ImageError, ModelError
+from templates.errors import (
+    ContractMismatch,
+    DecoyError,
+    InvalidEmbedding,
+    InvalidTemplate,
+    LiftingError,
+    NotEnrolled,
+    SealError,
+    StoreError,
+    Uncalibrated,
+    VeilfaceError,
+)
+from templates.store.idempotency import IdempotencyConflict
+from templates.store.identifiers import InvalidIdentifier
 
 
 class StartError(VeilfaceError):
@@ -85,3 +101,74 @@ class ApiError(Exception):
     def status(self) -> int:
         """HTTP status of the code."""
         return ERROR_CODES[self.code].status
+
+
+UNAVAILABLE_HEADERS = {"Retry-After": "5"}
+
+
+def api_error(error: Exception) -> ApiError | None:
+    """Give an exception of the rooms below its code; None for one that is not expected.
+
+    The text of a client's mistake is passed on: the rooms below hold no number of a descriptor or
+    template and no key in their messages. The text of a failure of the service is not, because
+    it may name a file or a host.
+    """
+    if isinstance(error, ApiError):
+        return error
+    if isinstance(error, PhotoRejected):
+        known = api_error(error.cause)
+        if known is None:
+            return None
+        details = {"image": error.index, **known.details}
+        return ApiError(known.code, f"photo {error.index}: {known.message}", details, known.headers)
+    if isinstance(error, InconsistentImages):
+        pairs = [list(pair) for pair in error.pairs]
+        return ApiError("inconsistent_images", str(error), {"pairs": pairs})
+    if isinstance(error, ImageError | FaceError):
+        details = plain_details(getattr(error, "details", {}))
+        return ApiError(error.code, str(error), details)
+    for kind, code, public in _TABLE:
+        if isinstance(error, kind):
+            status = ERROR_CODES[code].status
+            return ApiError(
+                code,
+                str(error) if public is None else public,
+                {},
+                UNAVAILABLE_HEADERS if status == 503 else {},
+            )
+    return None
+
+
+_TABLE: tuple[tuple[type[Exception], str, str | None], ...] = (
+    (ModelError, "model_unavailable", "the model failed on this request"),
+    (InvalidTemplate, "invalid_template", None),
+    (InvalidEmbedding, "invalid_embedding", None),
+    (LiftingError, "validation_failed", None),
+    (DecoyError, "validation_failed", None),
+    (ContractMismatch, "contract_mismatch", None),
+    (Uncalibrated, "uncalibrated", None),
+    (NotEnrolled, "not_enrolled", "the tenant has no such subject"),
+    (SealError, "store_unavailable", "what is stored cannot be opened with the master key"),
+    (InvalidIdentifier, "validation_failed", None),
+    (IdempotencyConflict, "idempotency_conflict", None),
+    (StoreError, "store_unavailable", "the database does not answer"),
+)
+
+
+def plain_details(details: Mapping[str, Any]) -> dict[str, Any]:
+    """Return details as JSON values: numbers of NumPy become Python's, the rest becomes text."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return {str(key): plain(entry) for key, entry in value.items()}
+        if isinstance(value, list | tuple):
+            return [plain(entry) for entry in value]
+        if value is None or isinstance(value, bool | int | str):
+            return value
+        try:
+            number = float(value)
+        except (TypeError, ValueError):
+            return str(value)
+        return number if math.isfinite(number) else None
+
+    return {str(key): plain(value) for key, value in details.items()}

@@ -97,17 +97,21 @@ class Settings(BaseSettings):
         "wait. 0: one for each processor.",
     )
     queue_limit: int = Field(
-        64,
+        32,
         ge=1,
         le=100_000,
-        description="Requests that may wait for a compute slot in one worker; further ones "
-        "are answered `overloaded`.",
+        description="Requests with a body that may send it or wait for a compute slot in one "
+        "worker; further ones are answered `overloaded`. With `max_request_bytes` it bounds a "
+        "worker's memory.",
     )
     workers: int = Field(1, ge=1, le=256, description="Server processes.")
     host: str = Field("127.0.0.1", description="Address to listen on.")
     port: int = Field(8421, ge=0, le=65535, description="Port to listen on; 0 takes a free one.")
     max_request_bytes: int = Field(
-        64 * MIB, ge=1024, le=1024 * MIB, description="Largest request body, in bytes."
+        32 * MIB, ge=1024, le=1024 * MIB, description="Largest request body, in bytes."
+    )
+    body_timeout_s: float = Field(
+        60.0, gt=0, le=3600, description="Seconds that a request body may take to arrive."
     )
     max_image_bytes: int = Field(
         10 * MIB, ge=1024, le=256 * MIB, description="Largest photo, in bytes as sent."
@@ -153,10 +157,10 @@ class Settings(BaseSettings):
         settings_cls: type[BaseSettings],
         init_settings: PydanticBaseSettingsSource,
         env_settings: PydanticBaseSettingsSource,
-        dotenv_settings: PydanticBaseSettingsSource,
-        file_secret_settings: PydanticBaseSettingsSource,
+        dotenv_settings: PydanticBaseSettingsSource,  # noqa: ARG003 - the base's signature
+        file_secret_settings: PydanticBaseSettingsSource,  # noqa: ARG003
     ) -> tuple[PydanticBaseSettingsSource, ...]:
-        """Flags, then the environment, then the TOML file."""
+        """Order the sources: flags, then the environment, then the TOML file."""
         return (
             init_settings,
             env_settings,

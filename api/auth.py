@@ -1,0 +1,96 @@
+"""Who calls, and what they may do: API keys with a tenant and rights."""
+
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from typing import Annotated
+
+from fastapi import Depends, Request, Security
+from fastapi.security import APIKeyHeader, HTTPAuthorizationCredentials, HTTPBearer
+
+from api.errors import ApiError
+from api.limits import Gate
+from api.runtime import Runtime
+
+MAX_TOKEN = 256
+
+_bearer = HTTPBearer(
+    auto_error=False, scheme_name="bearer", description="`Authorization: Bearer vf_…`"
+)
+_header = APIKeyHeader(
+    name="X-API-Key", auto_error=False, scheme_name="apiKey", description="`X-API-Key: vf_…`"
+)
+
+
+@dataclass(frozen=True)
+class Caller:
+    """An API key that was recognised."""
+
+    prefix: str
+    tenant: str
+    rights: frozenset[str]
+
+    def require(self, *rights: str) -> None:
+        """Refuse unless the key has all of these rights.
+
+        Raises
+        ------
+        ApiError
+            ``forbidden``; it names the right that is missing.
+        """
+        missing = [right for right in rights if right not in self.rights]
+        if missing:
+            raise ApiError(
+                "forbidden",
+                f"this API key lacks the right {missing[0]}",
+                {"missing": missing},
+            )
+
+    @property
+    def sees_enrollment(self) -> bool:
+        """Whether the key may learn that a subject does not exist."""
+        return bool(self.rights & {"enroll", "admin"})
+
+
+async def caller(
+    request: Request,
+    bearer: Annotated[HTTPAuthorizationCredentials | None, Security(_bearer)] = None,
+    header: Annotated[str | None, Security(_header)] = None,
+) -> Caller:
+    """Recognise the API key of a request.
+
+    Raises
+    ------
+    ApiError
+        ``unauthorized``, in the same words for an absent, an unknown and a revoked key.
+    """
+    runtime: Runtime = request.app.state.runtime
+    gate: Gate = request.app.state.gate
+    token = bearer.credentials if bearer is not None else header
+    refused = ApiError(
+        "unauthorized",
+        "send a valid API key: Authorization: Bearer vf_… or X-API-Key",
+        {},
+        {"WWW-Authenticate": "Bearer"},
+    )
+    if token is None or len(token) > MAX_TOKEN or not token.isascii():
+        raise refused
+    found = await gate.query(lambda: runtime.store.api_keys.verify(token))
+    if found is None:
+        raise refused
+    request.state.log.update(tenant=found.tenant, key_id=found.prefix)
+    return Caller(
+        prefix=found.prefix, tenant=found.tenant, rights=frozenset(map(str, found.rights))
+    )
+
+
+CallerDep = Annotated[Caller, Depends(caller)]
+
+
+def holding(*rights: str) -> Callable[[Caller], Awaitable[Caller]]:
+    """Make a dependency that demands rights before anything of the body is read."""
+
+    async def holder(caller: CallerDep) -> Caller:
+        caller.require(*rights)
+        return caller
+
+    return holder

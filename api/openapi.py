@@ -1,0 +1,113 @@
+"""What OpenAPI says of errors and request bodies, derived from the one table of codes."""
+
+from typing import Any
+
+from api.errors import ERROR_CODES
+from api.schemas import REQUEST_ID, ErrorAnswer, TemplateRequest, VerifyRequest
+
+DESCRIPTION = """\
+Face authentication that never stores a face descriptor. Every error has one shape; the codes are
+listed with every call. `X-Request-ID` is accepted, and returned in the header and in the body.
+"""
+
+EVERY_CALL = ("unauthorized", "store_unavailable", "internal_error")
+BODY = ("malformed_request", "request_too_large", "validation_failed", "overloaded")
+IDEMPOTENT = ("idempotency_conflict",)
+PHOTO = (
+    "unsupported_image",
+    "image_too_large",
+    "too_many_images",
+    "no_face",
+    "multiple_faces",
+    "face_too_small",
+    "low_quality",
+    "model_unavailable",
+)
+
+
+def error_responses(*codes: str) -> dict[int | str, dict[str, Any]]:
+    """Document the codes of one call, grouped by status, each with an example."""
+    grouped: dict[int | str, dict[str, Any]] = {}
+    for code in sorted(set(codes), key=list(ERROR_CODES).index):
+        entry = ERROR_CODES[code]
+        response = grouped.setdefault(
+            entry.status,
+            {
+                "model": ErrorAnswer,
+                "description": "",
+                "content": {"application/json": {"examples": {}}},
+            },
+        )
+        shown = f"`{code}`: {entry.meaning}"
+        response["description"] = "\n\n".join(filter(None, (response["description"], shown)))
+        response["content"]["application/json"]["examples"][code] = {
+            "value": {
+                "error": {"code": code, "message": entry.meaning, "details": {}},
+                "request_id": REQUEST_ID,
+            }
+        }
+    return grouped
+
+
+def _text(description: str, **extra: Any) -> dict[str, Any]:
+    return {"type": "string", "description": description, **extra}
+
+
+LEVEL = _text("Security level; default from the contract.", examples=["fmr-1e-3"])
+FACE = _text(
+    "Which face counts when a photo shows several: none (`single`, the default), or the largest.",
+    enum=["single", "largest"],
+)
+FILE = {"type": "string", "format": "binary"}
+
+
+def _body(multipart: dict[str, Any] | None, json_body: dict[str, Any]) -> dict[str, Any]:
+    content: dict[str, Any] = {"application/json": json_body}
+    if multipart is not None:
+        content = {"multipart/form-data": {"schema": multipart}, **content}
+    return {"requestBody": {"required": True, "content": content}}
+
+
+ENROLLMENT_BODY = _body(
+    {
+        "type": "object",
+        "required": ["images"],
+        "properties": {
+            "images": {"type": "array", "items": FILE, "minItems": 1, "maxItems": 10},
+            "attributes": _text(
+                "JSON object with `gender` and `race`; used for lifting only, never stored.",
+                examples=['{"gender": "Female", "race": "Indian"}'],
+            ),
+            "face": FACE,
+        },
+    },
+    {
+        "schema": TemplateRequest.model_json_schema(),
+        "examples": {"template": {"value": {"template": "kAAAAAAAAAB7Li4u"}}},
+    },
+)
+VERIFY_BODY = _body(
+    {
+        "type": "object",
+        "required": ["image"],
+        "properties": {"image": FILE, "level": LEVEL, "face": FACE},
+    },
+    {
+        "schema": VerifyRequest.model_json_schema(),
+        "examples": {
+            "embedding": {"value": {"embedding": [0.6, -0.8], "level": "fmr-1e-3"}},
+            "template": {"value": {"template": "kAAAAAAAAAB7Li4u"}},
+        },
+    },
+)
+IMPORT_BODY = _body(
+    None,
+    {
+        "schema": {
+            "type": "object",
+            "required": ["export"],
+            "properties": {"export": _text("`export` of an export call.")},
+        },
+        "examples": {"import": {"value": {"export": "VkZYMS4uLg=="}}},
+    },
+)

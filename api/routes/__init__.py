@@ -1,0 +1,1 @@
+"""The REST calls, one module for each thing that a client does."""

@@ -1,0 +1,200 @@
+"""Enrollment: photos, or a client's template."""
+
+import json
+from typing import Any
+
+from fastapi import APIRouter, Request
+from starlette.responses import Response
+
+from api.auth import Caller
+from api.bodies import Form, base64_field, content_type, read_form, read_json, reject_unknown
+from api.deps import (
+    Enrolls,
+    GateDep,
+    IdempotencyDep,
+    RuntimeDep,
+    SubjectDep,
+    query_of,
+)
+from api.errors import ApiError
+from api.idempotency import Outcome, once
+from api.openapi import BODY, ENROLLMENT_BODY, EVERY_CALL, IDEMPOTENT, PHOTO, error_responses
+from api.runtime import Runtime
+from api.schemas import EnrollmentAnswer
+from api.values import face_policy, one_of
+from enroll import Enrollment
+from models.quality import Quality
+from templates.decoys import Attributes
+from templates.store.subjects import Source
+
+router = APIRouter(prefix="/v1/subjects", tags=["subjects"])
+
+CODES = (
+    *EVERY_CALL,
+    *BODY,
+    *PHOTO,
+    *IDEMPOTENT,
+    "too_many_images",
+    "forbidden",
+    "invalid_template",
+    "contract_mismatch",
+    "inconsistent_images",
+)
+
+
+@router.put(
+    "/{subject_id}/enrollment",
+    response_model=EnrollmentAnswer,
+    responses={
+        200: {"description": "An earlier enrollment was replaced."},
+        201: {"model": EnrollmentAnswer, "description": "The subject is new."},
+        **error_responses(*CODES),
+    },
+    openapi_extra=ENROLLMENT_BODY,
+    summary="Enroll a subject, or replace its enrollment",
+)
+async def enroll(
+    request: Request,
+    caller: Enrolls,
+    subject: SubjectDep,
+    runtime: RuntimeDep,
+    gate: GateDep,
+    idempotency_key: IdempotencyDep,
+) -> Response:
+    """Rights: `enroll`, and `embeddings` for a template.
+
+    Either 1 to 10 photos, which must show one and the same person, or a private template that the
+    client lifted. All or nothing: a rejected set leaves the old enrollment untouched.
+    """
+    settings = runtime.settings
+    query = query_of(request, ("face",))
+    async with gate.admitted():
+        if content_type(request) == "multipart/form-data":
+            runtime.require_photos(lifting=True)
+            form = await read_form(
+                request,
+                max_bytes=settings.max_request_bytes,
+                max_images=settings.max_images,
+                max_image_bytes=settings.max_image_bytes,
+                timeout_s=settings.body_timeout_s,
+            )
+            return await _enroll_photos(request, caller, subject, form, query, idempotency_key)
+        body = await read_json(
+            request, max_bytes=settings.max_request_bytes, timeout_s=settings.body_timeout_s
+        )
+        caller.require("embeddings")
+        reject_unknown([*body, *query], ("template",))
+        template = base64_field(body.get("template"), "template", code="invalid_template")
+
+        def work() -> Outcome:
+            epoch = runtime.epoch(caller.tenant)
+            enrollment = runtime.enroller(caller.tenant, epoch).from_template(template)
+            return _stored(runtime, caller.tenant, subject, epoch, enrollment, Source.TEMPLATE)
+
+        return await once(
+            request,
+            caller,
+            idempotency_key,
+            operation="enroll-template",
+            asked=[subject, template],
+            subject=subject,
+            work=work,
+            run=gate.compute,
+        )
+
+
+async def _enroll_photos(
+    request: Request,
+    caller: Caller,
+    subject: str,
+    form: Form,
+    query: dict[str, str],
+    idempotency_key: str | None,
+) -> Response:
+    runtime: Runtime = request.app.state.runtime
+    photos = form.images("images")
+    reject_unknown(form.fields, ("attributes", "face"))
+    policy = face_policy(one_of(form.fields, query, "face"))
+    attributes = parse_attributes(form.fields.get("attributes"))
+
+    def work() -> Outcome:
+        epoch = runtime.epoch(caller.tenant)
+        enrollment = runtime.enroll_photos(
+            caller.tenant, epoch, photos, policy=policy, attributes=attributes
+        )
+        return _stored(runtime, caller.tenant, subject, epoch, enrollment, Source.PHOTOS)
+
+    return await once(
+        request,
+        caller,
+        idempotency_key,
+        operation="enroll-photos",
+        asked=[
+            subject,
+            str(policy),
+            attributes.gender or "",
+            attributes.race or "",
+            *photos,
+        ],
+        subject=subject,
+        work=work,
+        run=request.app.state.gate.compute,
+    )
+
+
+def parse_attributes(text: str | None) -> Attributes:
+    """Read the form field ``attributes``; it is used for lifting and then forgotten.
+
+    Raises
+    ------
+    ApiError
+        ``validation_failed``; the message never repeats the input.
+    """
+    if text is None:
+        return Attributes()
+    try:
+        value = json.loads(text)
+    except (ValueError, RecursionError):
+        value = None
+    if (
+        not isinstance(value, dict)
+        or not set(value) <= {"gender", "race"}
+        or not all(isinstance(label, str) and 0 < len(label) <= 64 for label in value.values())
+    ):
+        raise ApiError(
+            "validation_failed",
+            "attributes must be a JSON object with texts for gender and race, or one of them",
+            {"field": "attributes"},
+        )
+    return Attributes(gender=value.get("gender"), race=value.get("race"))
+
+
+def _quality(quality: object) -> dict[str, Any]:
+    return quality.as_dict() if isinstance(quality, Quality) else {}
+
+
+def _stored(
+    runtime: Runtime,
+    tenant: str,
+    subject: str,
+    epoch: int,
+    enrollment: Enrollment,
+    source: Source,
+) -> Outcome:
+    stored = runtime.put(
+        tenant, subject, epoch, enrollment, source=source, photos=len(enrollment.per_photo)
+    )
+    body: dict[str, Any] = {
+        "template_id": stored.template_id,
+        "contract_id": enrollment.contract_id,
+        "replaced": not stored.created,
+        "images": [
+            {
+                "index": result.index,
+                "status": "used",
+                "quality": _quality(result.quality),
+            }
+            for result in enrollment.per_photo
+        ],
+    }
+    return Outcome(201 if stored.created else 200, body)

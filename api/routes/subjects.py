@@ -1,0 +1,123 @@
+"""Subjects: list, describe, erase."""
+
+import datetime
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query, Request
+from starlette.responses import Response
+
+from api.answers import answer
+from api.deps import Enrolls, Erases, GateDep, IdempotencyDep, RuntimeDep, SubjectDep
+from api.errors import ApiError
+from api.idempotency import Outcome, once
+from api.openapi import EVERY_CALL, IDEMPOTENT, error_responses
+from api.receipts import receipt_json
+from api.schemas import ReceiptAnswer, SubjectAnswer, SubjectsAnswer
+from templates.store.subjects import SubjectRecord
+
+router = APIRouter(prefix="/v1/subjects", tags=["subjects"])
+
+
+@router.get(
+    "",
+    response_model=SubjectsAnswer,
+    responses=error_responses(*EVERY_CALL, "forbidden", "validation_failed"),
+    summary="The tenant's subjects, page by page",
+)
+async def list_subjects(
+    request: Request,
+    caller: Enrolls,
+    runtime: RuntimeDep,
+    gate: GateDep,
+    limit: Annotated[int, Query(ge=1, le=1000, description="Subjects on one page.")] = 100,
+    cursor: Annotated[str | None, Query(description="`next_cursor` of the page before.")] = None,
+) -> Response:
+    """Right: `enroll`. Metadata only, in the order of the subject ids."""
+    page = await gate.query(lambda: runtime.store.list(caller.tenant, limit=limit, cursor=cursor))
+    return answer(
+        request,
+        {
+            "subjects": [
+                _described(record, runtime.contract.contract_id) for record in page.records
+            ],
+            "next_cursor": page.next_cursor,
+        },
+    )
+
+
+@router.get(
+    "/{subject_id}",
+    response_model=SubjectAnswer,
+    responses=error_responses(*EVERY_CALL, "forbidden", "not_enrolled", "validation_failed"),
+    summary="One subject",
+)
+async def get_subject(
+    request: Request, caller: Enrolls, subject: SubjectDep, runtime: RuntimeDep, gate: GateDep
+) -> Response:
+    """Right: `enroll`. Metadata only, never template bytes."""
+    record = await gate.query(lambda: runtime.store.describe(caller.tenant, subject))
+    if record is None:
+        raise ApiError("not_enrolled", "the tenant has no such subject")
+    return answer(request, _described(record, runtime.contract.contract_id))
+
+
+@router.delete(
+    "/{subject_id}",
+    response_model=ReceiptAnswer,
+    responses=error_responses(
+        *EVERY_CALL, *IDEMPOTENT, "forbidden", "not_enrolled", "validation_failed"
+    ),
+    summary="Erase a subject",
+)
+async def erase_subject(
+    request: Request,
+    caller: Erases,
+    subject: SubjectDep,
+    runtime: RuntimeDep,
+    gate: GateDep,
+    idempotency_key: IdempotencyDep,
+) -> Response:
+    """Right: `erase`. Erases template, metadata and data key; answers with a signed receipt.
+
+    Erasing again returns the same receipt. A key that also has `enroll` or `admin` is told of a
+    subject that never was there; another one gets a receipt that says nothing was held.
+    """
+
+    def work() -> Outcome:
+        store = runtime.store
+        if (
+            caller.sees_enrollment
+            and store.describe(caller.tenant, subject) is None
+            and store.receipt(caller.tenant, subject) is None
+        ):
+            raise ApiError("not_enrolled", "the tenant never had such a subject")
+        return Outcome(200, receipt_json(store.erase(caller.tenant, subject).receipt))
+
+    # The subject's records of idempotency are erased with it, so this one is not filed under it.
+    return await once(
+        request,
+        caller,
+        idempotency_key,
+        operation="erase",
+        asked=[subject],
+        subject=None,
+        work=work,
+        run=gate.query,
+    )
+
+
+def _described(record: SubjectRecord, contract_id: str) -> dict[str, Any]:
+    return {
+        "subject_id": record.subject_id,
+        "template_id": record.template_id,
+        "contract_id": record.contract_id,
+        "current": record.contract_id == contract_id,
+        "enrolled_by": str(record.source),
+        "photos": record.photos,
+        "created_at": _time(record.created_at),
+        "updated_at": _time(record.updated_at),
+    }
+
+
+def _time(value: datetime.datetime) -> str:
+    return value.astimezone(datetime.UTC).isoformat(timespec="seconds").replace("+00:00", "Z")

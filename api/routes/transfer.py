@@ -1,0 +1,115 @@
+"""Export and import of one subject, encrypted."""
+
+import base64
+
+from fastapi import APIRouter, Request
+from starlette.responses import Response
+
+from api.answers import answer
+from api.bodies import base64_field, read_json, reject_unknown
+from api.deps import Exports, GateDep, IdempotencyDep, RuntimeDep, SubjectDep
+from api.errors import ApiError
+from api.idempotency import Outcome, once
+from api.openapi import BODY, EVERY_CALL, IDEMPOTENT, IMPORT_BODY, error_responses
+from api.schemas import ExportAnswer, ImportAnswer
+from api.transfer import open_export
+from templates.store.identifiers import checked_subject_id
+from templates.store.subjects import Source
+
+router = APIRouter(prefix="/v1/subjects", tags=["transfer"])
+
+
+@router.get(
+    "/{subject_id}/export",
+    response_model=ExportAnswer,
+    responses=error_responses(
+        *EVERY_CALL, "forbidden", "not_enrolled", "validation_failed", "contract_mismatch"
+    ),
+    summary="Export a subject, encrypted",
+)
+async def export_subject(
+    request: Request, caller: Exports, subject: SubjectDep, runtime: RuntimeDep, gate: GateDep
+) -> Response:
+    """Right: `export`. The template is un-rotated inside the encryption."""
+    exported = await gate.compute(lambda: runtime.export(caller.tenant, subject))
+    if exported is None:
+        raise ApiError("not_enrolled", "the tenant has no such subject")
+    return answer(
+        request,
+        {
+            "export": base64.b64encode(exported).decode("ascii"),
+            "contract_id": runtime.contract.contract_id,
+            "key_id": runtime.export_key.key_id,
+        },
+    )
+
+
+@router.post(
+    "/import",
+    response_model=ImportAnswer,
+    responses={
+        200: {"description": "An earlier enrollment was replaced."},
+        201: {"model": ImportAnswer, "description": "The subject is new."},
+        **error_responses(
+            *EVERY_CALL, *BODY, *IDEMPOTENT, "forbidden", "invalid_template", "contract_mismatch"
+        ),
+    },
+    openapi_extra=IMPORT_BODY,
+    summary="Import a subject that was exported",
+)
+async def import_subject(
+    request: Request,
+    caller: Exports,
+    runtime: RuntimeDep,
+    gate: GateDep,
+    idempotency_key: IdempotencyDep,
+) -> Response:
+    """Right: `export`. The tenant's own rotation is put on the template."""
+    settings = runtime.settings
+    async with gate.admitted():
+        body = await read_json(
+            request, max_bytes=settings.max_request_bytes, timeout_s=settings.body_timeout_s
+        )
+        reject_unknown(body, ("export",))
+        data = base64_field(body.get("export"), "export", code="invalid_template")
+        exported = await gate.query(
+            lambda: open_export(
+                data,
+                key=runtime.export_key,
+                tenant=caller.tenant,
+                contract_id=runtime.contract.contract_id,
+            )
+        )
+        checked_subject_id(exported.subject_id)
+
+        def work() -> Outcome:
+            epoch = runtime.epoch(caller.tenant)
+            enrollment = runtime.enroller(caller.tenant, epoch).from_template(exported.wire)
+            stored = runtime.put(
+                caller.tenant,
+                exported.subject_id,
+                epoch,
+                enrollment,
+                source=Source(exported.source),
+                photos=exported.photos,
+            )
+            return Outcome(
+                201 if stored.created else 200,
+                {
+                    "template_id": stored.template_id,
+                    "contract_id": enrollment.contract_id,
+                    "replaced": not stored.created,
+                },
+            )
+
+        return await once(
+            request,
+            caller,
+            idempotency_key,
+            operation="import",
+            asked=[data],
+            subject=exported.subject_id,
+            work=work,
+            run=gate.compute,
+            add={"subject_id": exported.subject_id},
+        )
