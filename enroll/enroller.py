@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from enroll.errors import InconsistentImages, PhotoRejected
+from models.decoding import DEFAULT_LIMITS, ImageLimits
 from models.errors import ModelError
 from models.pack import FacePolicy, ModelPack
-from models.quality import QualityLimits
+from models.quality import DEFAULT_QUALITY, QualityLimits
 from templates import wire
 from templates.contract import Contract
 from templates.decoys import Attributes, DecoySource
@@ -97,9 +98,15 @@ class Enroller:
         *,
         attributes: Attributes | None = None,
         policy: FacePolicy = FacePolicy.SINGLE,
-        quality: QualityLimits | None = None,
+        quality: QualityLimits | None = DEFAULT_QUALITY,
+        limits: ImageLimits = DEFAULT_LIMITS,
     ) -> Enrollment:
         """Enroll from 1 to 10 photo files.
+
+        Parameters
+        ----------
+        policy, quality, limits
+            See ``ModelPack.embed_photo``; ``attributes`` see ``from_embeddings``.
 
         Raises
         ------
@@ -116,13 +123,13 @@ class Enroller:
         )
         if not 1 <= len(photos) <= MAX_PHOTOS:
             raise ValueError(f"an enrollment has 1 to {MAX_PHOTOS} photos, not {len(photos)}")
-        limits = quality or QualityLimits()
         samples = []
         for index, photo in enumerate(photos):
             try:
-                samples.append(pack.embed_photo(photo, policy=policy, quality=limits))
+                sample = pack.embed_photo(photo, policy=policy, quality=quality, limits=limits)
             except ModelError as error:
                 raise PhotoRejected(index, error) from error
+            samples.append(sample)
         return self.from_embeddings(
             np.stack([sample.embedding for sample in samples]),
             attributes=attributes,
@@ -179,7 +186,7 @@ class Enroller:
             Where the template belongs to another contract.
         """
         binding = self._contract.binding
-        received = wire.decode(data, max_n=binding.n, max_m=binding.m)
+        received = wire.decode(data)
         binding.require_contract(received.contract_id, what="the template")
         subspace = received.subspace
         if (subspace.n, subspace.m) != (binding.n, binding.m):
@@ -226,4 +233,4 @@ def mean_descriptor(rows: NDArray[np.float32], *, consistency: float) -> NDArray
         chosen = differing if differing.any() else np.ones_like(differing)
         pairs = zip(first[chosen].tolist(), second[chosen].tolist(), strict=True)
         raise InconsistentImages(list(pairs))
-    return (mean / norm).astype(np.float32)
+    return np.asarray(mean / norm, dtype=np.float32)

@@ -5,7 +5,7 @@ Imports the floor below only: ``templates`` and ``models``.
 
 from verify.calibration import Calibrated, CalibrationReport, calibrate
 from verify.calibration_mode import CalibrationOptions
-from verify.datasets import DatasetError, LabelledFolder, read_lfw_pairs
+from verify.datasets import DatasetError, LabelledFolder, labelled_folder, read_lfw_pairs
 from verify.decision import Decision
 from verify.verifier import Verifier
 
@@ -18,5 +18,6 @@ __all__ = [
     "LabelledFolder",
     "Verifier",
     "calibrate",
+    "labelled_folder",
     "read_lfw_pairs",
 ]

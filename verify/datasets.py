@@ -34,54 +34,6 @@ class LabelledFolder:
     identities: tuple[str, ...]
     ignored: tuple[str, ...]
 
-    @classmethod
-    def read(cls, root: Path | str) -> "LabelledFolder":
-        """List ``root/Person/photo.jpg``; photos are not opened here.
-
-        Hidden entries are skipped silently. Other files, such as ``pairs.txt``, are listed in
-        ``ignored``.
-
-        Raises
-        ------
-        DatasetError
-            Listing every fault: no folder, photos beside the people's folders, empty people.
-        """
-        folder = Path(root)
-        if not folder.is_dir():
-            raise DatasetError(f"{folder} is not a folder; expected root/Person/photo.jpg")
-        paths: list[Path] = []
-        identities: list[str] = []
-        ignored: list[str] = []
-        faults: list[str] = []
-        for entry in sorted(folder.iterdir()):
-            if entry.name.startswith("."):
-                continue
-            if not entry.is_dir():
-                if entry.suffix.lower() in SUFFIXES:
-                    faults.append(f"photo {entry.name} lies beside the people's folders")
-                else:
-                    ignored.append(entry.name)
-                continue
-            photos = []
-            for file in sorted(entry.iterdir()):
-                if file.name.startswith("."):
-                    continue
-                if file.is_file() and file.suffix.lower() in SUFFIXES:
-                    photos.append(file)
-                elif file.is_dir():
-                    faults.append(f"{entry.name}/{file.name} is a folder inside a person's folder")
-                else:
-                    ignored.append(f"{entry.name}/{file.name}")
-            if not photos:
-                faults.append(f"{entry.name} holds no photo ({', '.join(sorted(SUFFIXES))})")
-            paths += photos
-            identities += [entry.name] * len(photos)
-        if not paths and not faults:
-            faults.append("there is no person's folder in it")
-        if faults:
-            raise DatasetError(_listing(folder, "expected root/Person/photo.jpg", faults))
-        return cls(folder, tuple(paths), tuple(identities), tuple(ignored))
-
     def __len__(self) -> int:
         return len(self.paths)
 
@@ -89,6 +41,54 @@ class LabelledFolder:
     def people(self) -> int:
         """Number of different names."""
         return len(set(self.identities))
+
+
+def labelled_folder(root: Path | str) -> LabelledFolder:
+    """List ``root/Person/photo.jpg``; photos are not opened here.
+
+    Hidden entries are skipped silently. Other files, such as ``pairs.txt``, are listed in
+    ``ignored``.
+
+    Raises
+    ------
+    DatasetError
+        Listing every fault: no folder, photos beside the people's folders, empty people.
+    """
+    folder = Path(root)
+    if not folder.is_dir():
+        raise DatasetError(f"{folder} is not a folder; expected root/Person/photo.jpg")
+    paths: list[Path] = []
+    identities: list[str] = []
+    ignored: list[str] = []
+    faults: list[str] = []
+    for entry in sorted(folder.iterdir()):
+        if entry.name.startswith("."):
+            continue
+        if not entry.is_dir():
+            if entry.suffix.lower() in SUFFIXES:
+                faults.append(f"photo {entry.name} lies beside the people's folders")
+            else:
+                ignored.append(entry.name)
+            continue
+        photos = []
+        for file in sorted(entry.iterdir()):
+            if file.name.startswith("."):
+                continue
+            if file.is_file() and file.suffix.lower() in SUFFIXES:
+                photos.append(file)
+            elif file.is_dir():
+                faults.append(f"{entry.name}/{file.name} is a folder inside a person's folder")
+            else:
+                ignored.append(f"{entry.name}/{file.name}")
+        if not photos:
+            faults.append(f"{entry.name} holds no photo ({', '.join(sorted(SUFFIXES))})")
+        paths += photos
+        identities += [entry.name] * len(photos)
+    if not paths and not faults:
+        faults.append("there is no person's folder in it")
+    if faults:
+        raise DatasetError(_listing(folder, "expected root/Person/photo.jpg", faults))
+    return LabelledFolder(folder, tuple(paths), tuple(identities), tuple(ignored))
 
 
 def read_lfw_pairs(

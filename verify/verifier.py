@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from models.decoding import DEFAULT_LIMITS, ImageLimits
 from models.pack import FacePolicy, ModelPack
-from models.quality import QualityLimits
+from models.quality import DEFAULT_QUALITY, QualityLimits
 from templates import wire
 from templates.contract import Calibration, Contract, Level
 from templates.distances import Metric, paired_distances, similarity
@@ -15,8 +16,6 @@ from templates.errors import ContractMismatch, InvalidTemplate
 from templates.subspace import AffineSubspace, SubspaceBatch
 from verify.cohort import Probes, cohort_statistics
 from verify.decision import Decision
-
-MAX_PROBE_M = 128
 
 
 @dataclass(frozen=True)
@@ -76,7 +75,8 @@ class Verifier:
         *,
         level: str | None = None,
         policy: FacePolicy = FacePolicy.SINGLE,
-        quality: QualityLimits | None = None,
+        quality: QualityLimits | None = DEFAULT_QUALITY,
+        limits: ImageLimits = DEFAULT_LIMITS,
     ) -> Decision:
         """Decide for a photo file; see ``decide_embedding``.
 
@@ -91,7 +91,7 @@ class Verifier:
         self._contract.binding.require_embedder(
             embedder_sha256=info.embedder_sha256, preprocessing=info.preprocessing, n=info.n
         )
-        sample = pack.embed_photo(photo, policy=policy, quality=quality or QualityLimits())
+        sample = pack.embed_photo(photo, policy=policy, quality=quality, limits=limits)
         return self.decide_embedding(sample.embedding, stored, level=level)
 
     def decide_embedding(
@@ -151,7 +151,7 @@ class Verifier:
             Where the probe belongs to another contract.
         """
         binding = self._contract.binding
-        received = wire.decode(probe, max_n=binding.n, max_m=min(MAX_PROBE_M, binding.n - 1))
+        received = wire.decode(probe)
         binding.require_contract(received.contract_id, what="the lifted probe")
         subspace = received.subspace
         if subspace.n != binding.n:
