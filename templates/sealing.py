@@ -364,7 +364,7 @@ def _read_key_file(path: Path) -> tuple[list[bytes], tuple[int, int, int]]:
         raise SealError(f"{source} does not exist: make it with `veilface keys master`") from None
     except OSError as error:
         raise SealError(f"{source} cannot be opened: {error.strerror}") from None
-    with os.fdopen(descriptor, "rb") as file:
+    try:
         status = os.fstat(descriptor)
         if not stat.S_ISREG(status.st_mode):
             raise SealError(f"{source} is not a regular file")
@@ -375,7 +375,11 @@ def _read_key_file(path: Path) -> tuple[list[bytes], tuple[int, int, int]]:
             )
         if status.st_size > _MAX_FILE_BYTES:
             raise SealError(f"{source} has {status.st_size} bytes, more than {_MAX_FILE_BYTES}")
-        data = file.read(_MAX_FILE_BYTES + 1)
+        data = os.read(descriptor, _MAX_FILE_BYTES)
+    except OSError as error:
+        raise SealError(f"{source} cannot be read: {error.strerror}") from None
+    finally:
+        os.close(descriptor)
     try:
         text = data.decode("ascii")
     except UnicodeDecodeError:

@@ -1,0 +1,64 @@
+"""Fixtures for the databases that tests run on: SQLite in a folder, and a real PostgreSQL server.
+
+``VEILFACE_TEST_POSTGRES_URL`` names the server; without it, a server on this machine is tried.
+Tests make a database of a random name there and drop it. Where no server answers they skip, unless
+``VEILFACE_REQUIRE_POSTGRES=1`` says that this is a failure.
+
+A ``conftest.py`` imports the fixtures it needs::
+
+    from tests.databases import database_url, postgres_database, postgres_url  # noqa: F401
+"""
+
+import os
+import secrets
+from collections.abc import Iterator
+from pathlib import Path
+
+import psycopg
+import pytest
+from sqlalchemy.engine import make_url
+
+DEFAULT_SERVER = "postgresql://postgres@127.0.0.1:5432/postgres"
+
+
+@pytest.fixture(scope="session")
+def postgres_database() -> Iterator[str]:
+    """URL of an empty database of this test run's own."""
+    server = os.environ.get("VEILFACE_TEST_POSTGRES_URL", DEFAULT_SERVER)
+    server = server.replace("postgresql+psycopg://", "postgresql://")
+    try:
+        connection = psycopg.connect(server, autocommit=True, connect_timeout=3)
+    except psycopg.OperationalError as error:
+        reason = f"no PostgreSQL server answers ({type(error).__name__})"
+        if os.environ.get("VEILFACE_REQUIRE_POSTGRES") == "1":
+            pytest.fail(f"{reason}, and VEILFACE_REQUIRE_POSTGRES=1 asks for one")
+        pytest.skip(reason)
+    name = f"veilface_test_{secrets.token_hex(6)}"
+    with connection:
+        connection.execute(f'CREATE DATABASE "{name}"')
+        # Tests kill clients, never the server: no need to wait for its disk.
+        connection.execute(f'ALTER DATABASE "{name}" SET synchronous_commit TO off')
+        yield make_url(server).set(database=name).render_as_string(hide_password=False)
+        connection.execute(f'DROP DATABASE "{name}" WITH (FORCE)')
+
+
+@pytest.fixture
+def postgres_url(postgres_database: str) -> Iterator[str]:
+    """URL of an empty schema of this test's own."""
+    schema = f"test_{secrets.token_hex(6)}"
+    with psycopg.connect(postgres_database, autocommit=True) as connection:
+        connection.execute(f'CREATE SCHEMA "{schema}"')
+    url = make_url(postgres_database).update_query_dict({"options": f"-csearch_path={schema}"})
+    yield url.render_as_string(hide_password=False)
+    with psycopg.connect(postgres_database, autocommit=True) as connection:
+        connection.execute("SET client_min_messages = warning")
+        connection.execute(f'DROP SCHEMA "{schema}" CASCADE')
+
+
+@pytest.fixture(params=["sqlite", "postgres"])
+def database_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """URL of an empty database: each test runs on SQLite and again on PostgreSQL."""
+    if request.param == "sqlite":
+        return f"sqlite:///{tmp_path / 'veilface.db'}"
+    url: str = request.getfixturevalue("postgres_url")
+    return url

@@ -1,0 +1,70 @@
+"""A store on each database, with a clock that the test sets."""
+
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+from templates.sealing import MasterKeyring
+from templates.store import Source, StoredTemplate, TemplateStore
+from tests.databases import database_url, postgres_database, postgres_url  # noqa: F401
+
+CONTRACT = "c" * 64
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.time = datetime(2026, 3, 1, 12, 0, 0, 123456, tzinfo=UTC)
+
+    def __call__(self) -> datetime:
+        return self.time
+
+    def pass_by(self, **amount: float) -> None:
+        self.time += timedelta(**amount)
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def key_file(tmp_path: Path) -> Path:
+    path = tmp_path / "master.key"
+    MasterKeyring.create(path)
+    return path
+
+
+@pytest.fixture
+def keyring(key_file: Path) -> MasterKeyring:
+    return MasterKeyring.load(key_file)
+
+
+@pytest.fixture
+def store(database_url: str, keyring: MasterKeyring, clock: Clock) -> Iterator[TemplateStore]:  # noqa: F811
+    """An empty store with the tenants "default" and "other"."""
+    store = TemplateStore(database_url, keyring, clock=clock)
+    store.upgrade()
+    store.tenants.create("default")
+    store.tenants.create("other")
+    yield store
+    store.close()
+
+
+def put(
+    store: TemplateStore, subject_id: str, wire: bytes, *, tenant: str = "default", **changes: str
+) -> StoredTemplate:
+    """Store a template with ordinary metadata."""
+    return store.put(
+        tenant,
+        subject_id,
+        wire,
+        contract_id=changes.pop("contract_id", CONTRACT),
+        n=512,
+        m=16,
+        dtype="float16",
+        source=Source.PHOTOS,
+        photos=3,
+        **changes,
+    )

@@ -1,0 +1,258 @@
+import os
+import socket
+import sqlite3
+import stat
+import threading
+from pathlib import Path
+
+import psycopg
+import pytest
+import sqlalchemy as sa
+
+from templates.errors import StoreError, StoreUnavailable
+from templates.sealing import MasterKeyring
+from templates.store import TemplateStore
+from templates.store.database import Database
+from templates.store.schema import TenantRow
+from tests.templates.store.conftest import put
+
+
+@pytest.mark.parametrize(
+    ("url", "message"),
+    [
+        ("mysql://host/name", "not supported"),
+        ("nonsense", "cannot be read"),
+        ("", "cannot be read"),
+        ("sqlite://", "needs a file"),
+        ("sqlite:///:memory:", "needs a file"),
+        ("sqlite:////no/such/folder/x.db", "No such file"),
+    ],
+)
+def test_a_url_that_cannot_work_is_refused(url: str, message: str) -> None:
+    with pytest.raises(StoreError, match=message):
+        Database(url)
+
+
+@pytest.mark.parametrize("driver", ["postgres", "postgresql", "postgresql+psycopg"])
+def test_all_spellings_of_postgresql_mean_psycopg(driver: str) -> None:
+    database = Database(f"{driver}://somebody:password@127.0.0.1/name")
+    assert database.engine.dialect.driver == "psycopg"
+    assert "password" not in repr(database)
+
+
+def test_sqlite_is_private_durable_and_forgets(tmp_path: Path) -> None:
+    path = tmp_path / "veilface.db"
+    database = Database(f"sqlite:///{path}")
+
+    def pragmas(connection: sa.Connection) -> dict[str, object]:
+        names = ("journal_mode", "synchronous", "foreign_keys", "secure_delete", "temp_store")
+        return {n: connection.exec_driver_sql(f"PRAGMA {n}").scalar() for n in names}
+
+    assert database.read(pragmas) == {
+        "journal_mode": "wal",
+        "synchronous": 2,  # FULL
+        "foreign_keys": 1,
+        "secure_delete": 1,
+        "temp_store": 2,  # MEMORY
+    }
+    database.write(lambda each: each.exec_driver_sql("CREATE TABLE t (x)"))
+    for file in tmp_path.iterdir():
+        assert stat.S_IMODE(file.stat().st_mode) == 0o600, file
+    database.close()
+
+
+def test_a_failed_write_leaves_nothing(store: TemplateStore, database_url: str) -> None:
+    database = Database(database_url)
+
+    def work(connection: sa.Connection) -> None:
+        connection.execute(sa.delete(TenantRow))
+        raise RuntimeError("half way")
+
+    with pytest.raises(RuntimeError, match="half way"):
+        database.write(work)
+    assert [tenant.name for tenant in store.tenants.all()] == ["default", "other"]
+    database.close()
+
+
+def test_errors_never_quote_a_row(store: TemplateStore, database_url: str) -> None:
+    database = Database(database_url)
+    tenant = store.tenants.get("default")
+
+    def twice(connection: sa.Connection) -> None:
+        connection.execute(
+            sa.insert(TenantRow).values(
+                id=tenant.id, name="secret-name", rotation_epoch=1, created_at=tenant.created_at
+            )
+        )
+
+    with pytest.raises(StoreError) as caught:
+        database.write(twice)
+    assert not isinstance(caught.value, StoreUnavailable)
+    for part in ("secret-name", tenant.id, "INSERT"):
+        assert part not in str(caught.value)
+    assert caught.value.__suppress_context__
+    database.close()
+
+
+def test_no_server_is_store_unavailable() -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    database = Database(f"postgresql://postgres@127.0.0.1:{port}/postgres", timeout=2)
+    for call in (database.read, database.write):
+        with pytest.raises(StoreUnavailable, match="does not answer"):
+            call(lambda connection: connection.execute(sa.select(1)))
+
+
+def test_a_lost_connection_is_replaced(
+    postgres_url: str, postgres_database: str, keyring: MasterKeyring
+) -> None:
+    store = TemplateStore(postgres_url, keyring, pool_size=2)
+    store.upgrade()
+    store.ping()
+    with psycopg.connect(postgres_database, autocommit=True) as connection:
+        killed = connection.execute(
+            "SELECT pg_terminate_backend(pid) FROM pg_stat_activity "
+            "WHERE application_name = 'veilface' AND datname = current_database()"
+        ).fetchall()
+    assert killed
+    store.ping()
+    store.tenants.create("after")
+    store.close()
+
+
+def test_a_connection_lost_inside_a_write_is_store_unavailable(
+    postgres_url: str, keyring: MasterKeyring
+) -> None:
+    store = TemplateStore(postgres_url, keyring)
+    store.upgrade()
+    database = Database(postgres_url)
+
+    def cut(connection: sa.Connection) -> None:
+        connection.execute(sa.delete(TenantRow))
+        connection.exec_driver_sql("SELECT pg_terminate_backend(pg_backend_pid())")
+
+    store.tenants.create("kept")
+    with pytest.raises(StoreUnavailable, match="does not answer"):
+        database.write(cut)
+    assert [tenant.name for tenant in store.tenants.all()] == ["kept"]
+    database.close()
+    store.close()
+
+
+def test_a_busy_sqlite_file_is_store_unavailable(tmp_path: Path, keyring: MasterKeyring) -> None:
+    path = tmp_path / "veilface.db"
+    store = TemplateStore(f"sqlite:///{path}", keyring, timeout=0.2)
+    store.upgrade()
+    holder = sqlite3.connect(path, isolation_level=None)
+    holder.execute("BEGIN IMMEDIATE")
+    with pytest.raises(StoreUnavailable, match="locked"):
+        store.tenants.create("default")
+    assert store.tenants.all() == ()  # readers are not held up
+    holder.execute("ROLLBACK")
+    holder.close()
+    store.tenants.create("default")
+    store.close()
+
+
+def test_a_full_disk_is_said_and_harms_nothing(tmp_path: Path, keyring: MasterKeyring) -> None:
+    """SQLite's page limit gives the same error as a full disk (SQLITE_FULL)."""
+    store = TemplateStore(f"sqlite:///{tmp_path / 'veilface.db'}", keyring, pool_size=1)
+    store.upgrade()
+    store.tenants.create("default")
+    put(store, "first", b"1" * 5000)
+    pages = store._database.read(lambda each: each.exec_driver_sql("PRAGMA page_count").scalar())
+
+    def limit(connection: sa.Connection) -> None:
+        connection.exec_driver_sql(f"PRAGMA max_page_count = {pages}")
+
+    store._database.read(limit)
+    with pytest.raises(StoreUnavailable, match="full"):
+        put(store, "second", b"2" * 500_000)
+    assert store.get("default", "second") is None
+    first = store.get("default", "first")
+    assert first is not None
+    assert first.wire == b"1" * 5000
+    store.close()
+    with sqlite3.connect(tmp_path / "veilface.db") as raw:
+        assert raw.execute("PRAGMA integrity_check").fetchone() == ("ok",)
+    raw.close()
+
+
+def test_a_file_that_is_no_database_is_said(tmp_path: Path, keyring: MasterKeyring) -> None:
+    path = tmp_path / "veilface.db"
+    path.write_bytes(b"This is a letter, not a database. " * 200)
+    store = TemplateStore(f"sqlite:///{path}", keyring)
+    with pytest.raises(StoreUnavailable, match="not a database"):
+        store.check()
+    store.close()
+
+
+def test_all_connections_busy_is_store_unavailable(database_url: str) -> None:
+    database = Database(database_url, pool_size=1, max_overflow=0, timeout=0.2)
+    entered, leave = threading.Event(), threading.Event()
+
+    def hold(connection: sa.Connection) -> None:
+        entered.set()
+        leave.wait(10)
+
+    thread = threading.Thread(target=lambda: database.read(hold))
+    thread.start()
+    entered.wait(10)
+    try:
+        with pytest.raises(StoreUnavailable, match="busy"):
+            database.read(lambda connection: connection.execute(sa.select(1)))
+    finally:
+        leave.set()
+        thread.join()
+        database.close()
+
+
+@pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork:DeprecationWarning")
+def test_a_forked_child_makes_its_own_connections(store: TemplateStore) -> None:
+    put(store, "parent", b"p")
+    child = os.fork()
+    if child == 0:
+        try:
+            found = store.get("default", "parent")
+            put(store, "child", b"c")
+            os._exit(0 if found is not None and found.wire == b"p" else 1)
+        except BaseException:
+            os._exit(2)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    for subject, wire in (("parent", b"p"), ("child", b"c")):
+        found = store.get("default", subject)
+        assert found is not None
+        assert found.wire == wire
+
+
+def test_a_deadlock_is_tried_again(postgres_url: str, keyring: MasterKeyring) -> None:
+    """Two writes that take the same two rows in opposite order both end, and both count."""
+    store = TemplateStore(postgres_url, keyring)
+    store.upgrade()
+    for name in ("a", "b"):
+        store.tenants.create(name)
+    database = Database(postgres_url)
+    both_hold_one = threading.Barrier(2, timeout=10)
+    runs: list[str] = []
+
+    def bump(connection: sa.Connection, first: str, second: str) -> None:
+        runs.append(first)
+        add = sa.update(TenantRow).values(rotation_epoch=TenantRow.rotation_epoch + 1)
+        connection.execute(add.where(TenantRow.name == first))
+        if len(runs) <= 2:
+            both_hold_one.wait()
+        connection.execute(add.where(TenantRow.name == second))
+
+    threads = [
+        threading.Thread(target=lambda pair=pair: database.write(lambda each: bump(each, *pair)))
+        for pair in (("a", "b"), ("b", "a"))
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(runs) == 3  # one of them was the victim, and ran again
+    assert {tenant.rotation_epoch for tenant in store.tenants.all()} == {3}
+    database.close()
+    store.close()

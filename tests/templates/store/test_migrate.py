@@ -1,0 +1,129 @@
+import logging
+import threading
+from pathlib import Path
+
+import pytest
+import sqlalchemy as sa
+
+from templates.errors import SealError, StoreError
+from templates.sealing import MasterKeyring
+from templates.store import TemplateStore, migrate
+from templates.store.database import Database
+from templates.store.schema import Base
+from tests.templates.store.conftest import put
+
+
+def tables(database: Database) -> set[str]:
+    return set(sa.inspect(database.engine).get_table_names())
+
+
+def test_upgrade_from_empty_gives_what_the_mapped_classes_say(database_url: str) -> None:
+    database = Database(database_url)
+    assert tables(database) == set()
+    migrate.upgrade(database)
+    assert migrate.differences(database) == []
+    assert tables(database) == {*Base.metadata.tables, "alembic_version"}
+    assert migrate.current_revision(database) == migrate.head_revision()
+    database.close()
+
+
+def test_a_difference_would_be_seen(database_url: str) -> None:
+    database = Database(database_url)
+    migrate.upgrade(database)
+    database.write(lambda each: each.exec_driver_sql("DROP TABLE audit_log"))
+    database.write(lambda each: each.exec_driver_sql("ALTER TABLE receipts ADD COLUMN more TEXT"))
+    kinds = {difference[0] for difference in migrate.differences(database)}
+    assert {"add_table", "remove_column"} <= kinds
+    database.close()
+
+
+def test_each_migration_can_be_taken_back(database_url: str) -> None:
+    database = Database(database_url)
+    migrate.upgrade(database)
+    migrate.downgrade(database, "base")
+    assert tables(database) == {"alembic_version"}
+    migrate.upgrade(database)
+    assert migrate.differences(database) == []
+    database.close()
+
+
+def test_upgrading_twice_keeps_the_data(store: TemplateStore) -> None:
+    put(store, "ada", b"wire")
+    store.upgrade()
+    found = store.get("default", "ada")
+    assert found is not None
+    assert found.wire == b"wire"
+
+
+def test_workers_that_start_at_once_agree(database_url: str, keyring: MasterKeyring) -> None:
+    errors: list[Exception] = []
+    tokens: list[str] = []
+    secrets: list[bytes] = []
+    start = threading.Barrier(6)
+
+    def worker() -> None:
+        store = TemplateStore(database_url, keyring)
+        start.wait()
+        try:
+            store.upgrade()
+            if new := store.api_keys.bootstrap():
+                tokens.append(new.token)
+            secrets.append(store.secrets.get("pseudonym"))
+        except Exception as error:
+            errors.append(error)
+        finally:
+            store.close()
+
+    threads = [threading.Thread(target=worker) for _ in range(6)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert errors == []
+    assert len(tokens) == 1
+    assert len(secrets) == 6
+    assert len(set(secrets)) == 1
+
+
+def test_check_names_the_remedy(database_url: str, keyring: MasterKeyring) -> None:
+    store = TemplateStore(database_url, keyring)
+    with pytest.raises(StoreError, match="veilface db upgrade"):
+        store.check()
+    store.upgrade()
+    store.check()
+    database = Database(database_url)
+    database.write(lambda each: each.exec_driver_sql("UPDATE alembic_version SET version_num='9'"))
+    with pytest.raises(StoreError, match="newer version"):
+        store.check()
+    database.close()
+    store.close()
+
+
+def test_a_query_before_the_upgrade_names_the_remedy(
+    database_url: str, keyring: MasterKeyring
+) -> None:
+    store = TemplateStore(database_url, keyring)
+    with pytest.raises(StoreError, match="veilface db upgrade"):
+        store.get("default", "ada")
+    store.close()
+
+
+def test_another_master_key_is_refused_at_the_start(
+    store: TemplateStore, database_url: str, tmp_path: Path
+) -> None:
+    stranger = TemplateStore(database_url, MasterKeyring.create(tmp_path / "other.key"))
+    with pytest.raises(SealError, match="not the master key of this database"):
+        stranger.check()
+    with pytest.raises(SealError, match="not the master key of this database"):
+        stranger.upgrade()
+    stranger.close()
+    store.check()
+
+
+def test_migrating_leaves_logging_alone(database_url: str) -> None:
+    level, handlers = logging.root.level, list(logging.root.handlers)
+    database = Database(database_url)
+    migrate.upgrade(database)
+    assert (logging.root.level, logging.root.handlers) == (level, handlers)
+    assert not logging.getLogger("templates").disabled
+    database.close()

@@ -1,0 +1,313 @@
+import base64
+import random
+
+import pytest
+import sqlalchemy as sa
+from hypothesis import given
+from hypothesis import strategies as st
+
+from templates.errors import SealError, StoreError
+from templates.store import InvalidIdentifier, Source, TemplateStore, UnknownTenant
+from templates.store.database import Database
+from templates.store.identifiers import checked_subject_id
+from templates.store.schema import SubjectRow, TemplateRow
+from tests.templates.store.conftest import CONTRACT, Clock, put
+
+
+def wire_of(store: TemplateStore, subject_id: str, *, tenant: str = "default") -> bytes | None:
+    found = store.get(tenant, subject_id)
+    return None if found is None else found.wire
+
+
+def test_put_then_get(store: TemplateStore, clock: Clock) -> None:
+    stored = store.put(
+        "default",
+        "ada@example.org",
+        b"wire bytes",
+        contract_id=CONTRACT,
+        n=512,
+        m=16,
+        dtype="float16",
+        source=Source.TEMPLATE,
+        photos=0,
+        template_id="t-1",
+    )
+    assert (stored.template_id, stored.created) == ("t-1", True)
+    found = store.get("default", "ada@example.org")
+    assert found is not None
+    assert found.wire == b"wire bytes"
+    record = found.record
+    assert record == store.describe("default", "ada@example.org")
+    assert (record.subject_id, record.template_id, record.contract_id) == (
+        "ada@example.org",
+        "t-1",
+        CONTRACT,
+    )
+    assert (record.n, record.m, record.dtype) == (512, 16, "float16")
+    assert (record.source, record.photos, record.rotation_epoch) == (Source.TEMPLATE, 0, 1)
+    assert record.created_at == record.updated_at == clock.time
+
+
+def test_an_unknown_subject_is_none(store: TemplateStore) -> None:
+    assert store.get("default", "nobody") is None
+    assert store.describe("default", "nobody") is None
+    assert store.get("no-such-tenant", "nobody") is None
+
+
+def test_replacing_keeps_the_first_date_and_forgets_the_rest(
+    store: TemplateStore, database_url: str, clock: Clock
+) -> None:
+    first = put(store, "ada", b"old", contract_id="a" * 64)
+    before = rows(database_url)
+    clock.pass_by(days=3)
+    second = put(store, "ada", b"new")
+    assert first.created
+    assert not second.created
+    assert first.template_id != second.template_id
+    assert wire_of(store, "ada") == b"new"
+    record = store.describe("default", "ada")
+    assert record is not None
+    assert record.contract_id == CONTRACT
+    assert (record.updated_at - record.created_at).days == 3
+    after = rows(database_url)
+    assert len(before) == len(after) == 1
+    assert before[0].wrapped_key != after[0].wrapped_key
+    assert before[0].ciphertext != after[0].ciphertext
+
+
+def test_tenants_do_not_see_each_other(store: TemplateStore) -> None:
+    put(store, "ada", b"mine")
+    put(store, "ada", b"theirs", tenant="other")
+    assert wire_of(store, "ada") == b"mine"
+    assert wire_of(store, "ada", tenant="other") == b"theirs"
+    store.erase("other", "ada")
+    assert wire_of(store, "ada") == b"mine"
+    assert [record.subject_id for record in store.list("other").records] == []
+
+
+def test_an_unknown_tenant_is_refused(store: TemplateStore) -> None:
+    with pytest.raises(UnknownTenant):
+        put(store, "ada", b"wire", tenant="nobody")
+    with pytest.raises(UnknownTenant):
+        store.erase("nobody", "ada")
+
+
+@given(st.text(max_size=6))
+def test_subject_ids_keep_to_the_rule(text: str) -> None:
+    allowed = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789._@:-"
+    if text and all(character in allowed for character in text):
+        assert checked_subject_id(text) == text
+    else:
+        with pytest.raises(InvalidIdentifier, match="1 to 128 characters"):
+            checked_subject_id(text)
+
+
+@pytest.mark.parametrize("bad", ["", "x" * 129, "a b", "a/b", "ä", "a\n", "a\x00", "%", "..\\"])
+def test_a_bad_subject_id_is_refused_everywhere(store: TemplateStore, bad: str) -> None:
+    calls = (
+        lambda: put(store, bad, b"wire"),
+        lambda: store.get("default", bad),
+        lambda: store.describe("default", bad),
+        lambda: store.erase("default", bad),
+        lambda: store.receipt("default", bad),
+    )
+    for call in calls:
+        with pytest.raises(InvalidIdentifier):
+            call()
+
+
+def test_the_longest_subject_id_is_taken(store: TemplateStore) -> None:
+    put(store, "x" * 128, b"wire")
+    assert wire_of(store, "x" * 128) == b"wire"
+
+
+@pytest.mark.parametrize("size", [0, 4 * 1024 * 1024 + 1])
+def test_a_template_of_an_absurd_size_is_refused(store: TemplateStore, size: int) -> None:
+    with pytest.raises(StoreError, match="wire bytes"):
+        put(store, "ada", bytes(size))
+    assert store.get("default", "ada") is None
+
+
+def test_a_template_of_four_megabytes_is_kept(store: TemplateStore) -> None:
+    wire = random.Random(0).randbytes(4 * 1024 * 1024)
+    put(store, "ada", wire)
+    assert wire_of(store, "ada") == wire
+
+
+def test_the_wire_does_not_show(store: TemplateStore) -> None:
+    put(store, "ada", b"wire bytes")
+    assert "wire bytes" not in repr(store.get("default", "ada"))
+
+
+def rows(database_url: str) -> list[sa.Row]:
+    """What stands in the database, read past the store."""
+    database = Database(database_url)
+    query = sa.select(SubjectRow, TemplateRow.ciphertext, TemplateRow.template_id).join(
+        TemplateRow, TemplateRow.subject_pk == SubjectRow.id
+    )
+    found = database.read(lambda each: list(each.execute(query.order_by(SubjectRow.subject_id))))
+    database.close()
+    return found
+
+
+def test_the_database_holds_no_plaintext(store: TemplateStore, database_url: str) -> None:
+    wire = random.Random(1).randbytes(9000)
+    put(store, "ada", wire)
+    (row,) = rows(database_url)
+    for stored in (row.ciphertext, row.wrapped_key):
+        assert not any(wire[i : i + 8] in stored for i in range(0, len(wire), 8))
+
+
+SWAPS = {
+    "template of another subject": ("default", "eve", "ciphertext"),
+    "data key of another subject": ("default", "eve", "wrapped_key"),
+    "both of another subject": ("default", "eve", "ciphertext wrapped_key"),
+    "template of another tenant": ("other", "ada", "ciphertext"),
+    "both of another tenant": ("other", "ada", "ciphertext wrapped_key"),
+}
+
+
+@pytest.mark.parametrize("swap", SWAPS)
+def test_a_row_moved_in_the_database_does_not_open(
+    store: TemplateStore, database_url: str, swap: str
+) -> None:
+    put(store, "ada", b"wire of ada", template_id="same")
+    tenant, subject, columns = SWAPS[swap]
+    put(store, subject, b"another wire", tenant=tenant, template_id="same")
+    source = next(
+        row
+        for row in rows(database_url)
+        if (row.subject_id, row.tenant_id) == (subject, store.tenants.get(tenant).id)
+    )
+    change(
+        store,
+        database_url,
+        "ada",
+        **{column: getattr(source, column) for column in columns.split()},
+    )
+    with pytest.raises(SealError, match="does not open"):
+        store.get("default", "ada")
+    # The control: nothing else was wrong.
+    assert wire_of(store, subject, tenant=tenant) == b"another wire"
+
+
+@pytest.mark.parametrize(
+    ("column", "value"),
+    [
+        ("contract_id", "d" * 64),
+        ("template_id", "t-2"),
+        ("rotation_epoch", 2),
+        ("tenant_id", "other"),
+        ("subject_id", "eve"),
+        ("ciphertext", b""),
+        ("ciphertext", b"\x02" * 60),
+        ("wrapped_key", b""),
+    ],
+)
+def test_a_row_relabelled_in_the_database_does_not_open(
+    store: TemplateStore, database_url: str, column: str, value: str | int | bytes
+) -> None:
+    put(store, "ada", b"wire", template_id="t-1")
+    tenant, subject = "default", "ada"
+    if column == "tenant_id":
+        tenant, value = "other", store.tenants.get("other").id
+    if column == "subject_id":
+        subject = "eve"
+    change(store, database_url, "ada", **{column: value})
+    with pytest.raises(SealError):
+        store.get(tenant, subject)
+
+
+def test_a_subject_under_another_row_id_does_not_open(
+    store: TemplateStore, database_url: str
+) -> None:
+    """An old row put back after an erasure opens no more under the subject's new row."""
+    put(store, "ada", b"first")
+    (old,) = rows(database_url)
+    store.erase("default", "ada")
+    put(store, "ada", b"second")
+    change(store, database_url, "ada", wrapped_key=old.wrapped_key, ciphertext=old.ciphertext)
+    with pytest.raises(SealError):
+        store.get("default", "ada")
+
+
+def change(store: TemplateStore, database_url: str, who: str, **values: object) -> None:
+    """Alter columns of a subject of the default tenant, as a thief in the database would."""
+    database = Database(database_url)
+    tenant_id = store.tenants.get("default").id
+    pk = sa.select(SubjectRow.id).where(
+        SubjectRow.tenant_id == tenant_id, SubjectRow.subject_id == who
+    )
+
+    def work(connection: sa.Connection) -> None:
+        subject_pk = connection.execute(pk).scalar_one()
+        for name, value in values.items():
+            table = TemplateRow if name in TemplateRow.__table__.columns else SubjectRow
+            key = table.subject_pk if table is TemplateRow else table.id
+            connection.execute(sa.update(table).where(key == subject_pk).values({name: value}))
+
+    database.write(work)
+    database.close()
+
+
+def test_pages_hold_every_subject_once_in_order(store: TemplateStore) -> None:
+    names = ["b", "B", "a", "Z", "z9", "z10", "a.b", "a-b", "a_b", "a:b", "a@b", "0"]
+    for name in names:
+        put(store, name, b"wire")
+    seen, cursor, pages = [], None, 0
+    while True:
+        page = store.list("default", limit=5, cursor=cursor)
+        seen += [record.subject_id for record in page.records]
+        pages += 1
+        if (cursor := page.next_cursor) is None:
+            break
+    assert seen == sorted(names)  # by code point, whatever the database's language
+    assert pages == 3
+
+
+def test_a_page_that_ends_with_the_last_subject_is_the_last(store: TemplateStore) -> None:
+    for name in ("a", "b"):
+        put(store, name, b"wire")
+    assert store.list("default", limit=2).next_cursor is None
+    assert store.list("default", limit=1).next_cursor is not None
+    assert store.list("other").records == ()
+
+
+def test_pages_are_stable_while_others_write(store: TemplateStore) -> None:
+    stay = [f"s{number:02d}" for number in range(0, 40, 2)]
+    for name in stay:
+        put(store, name, b"wire")
+    generator, seen, cursor = random.Random(2), [], None
+    while True:
+        page = store.list("default", limit=3, cursor=cursor)
+        seen += [record.subject_id for record in page.records]
+        for _ in range(3):
+            name = f"s{generator.randrange(1, 40, 2):02d}"
+            if generator.random() < 0.5:
+                put(store, name, b"wire")
+            else:
+                store.erase("default", name)
+        if page.next_cursor is None:
+            break
+        cursor = page.next_cursor
+    assert [name for name in seen if name in stay] == stay
+    assert len(seen) == len(set(seen))
+
+
+def test_a_cursor_shows_nothing_and_cannot_be_made(store: TemplateStore) -> None:
+    for name in ("ada", "eve"):
+        put(store, name, b"wire")
+        put(store, name, b"wire", tenant="other")
+    cursor = store.list("default", limit=1).next_cursor
+    assert cursor is not None
+    raw = base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4))
+    assert b"ada" not in raw
+    altered = cursor[:-2] + ("AA" if cursor[-2:] != "AA" else "BB")
+    for bad in (altered, cursor[:10], "", "ada", "ä", "x" * 1000):
+        with pytest.raises(InvalidIdentifier, match="cursor"):
+            store.list("default", cursor=bad)
+    with pytest.raises(InvalidIdentifier, match="cursor"):
+        store.list("other", cursor=cursor)
+    for limit in (0, -1, 1001):
+        with pytest.raises(InvalidIdentifier, match="limit"):
+            store.list("default", limit=limit)

@@ -1,0 +1,293 @@
+import base64
+import hashlib
+import hmac
+import os
+import pickle
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+from cryptography.hazmat.primitives.ciphers.aead import AESGCM
+from hypothesis import given
+from hypothesis import strategies as st
+
+from templates.errors import SealError
+from templates.sealing import (
+    OVERHEAD_BYTES,
+    KeyringSealer,
+    MasterKeyring,
+    derive_key,
+    encode_parts,
+    sealed_key_id,
+)
+
+KEY = hashlib.sha256(b"a key for tests").digest()
+OTHER = hashlib.sha256(b"another key for tests").digest()
+
+Parts = Sequence[str | bytes | int]
+parts = st.lists(st.one_of(st.text(max_size=8), st.binary(max_size=8), st.integers()), max_size=4)
+
+
+def write(path: Path, *lines: bytes, mode: int = 0o600) -> Path:
+    path.write_bytes(b"".join(line + b"\n" for line in lines))
+    path.chmod(mode)
+    return path
+
+
+def hkdf_by_hand(key: bytes, info: bytes) -> bytes:
+    extracted = hmac.digest(bytes(32), key, hashlib.sha256)
+    return hmac.digest(extracted, info + b"\x01", hashlib.sha256)
+
+
+@given(plaintext=st.binary(max_size=200), purpose=st.text(max_size=10), bound=parts)
+def test_what_is_sealed_opens_again(plaintext: bytes, purpose: str, bound: Parts) -> None:
+    keyring = MasterKeyring([KEY])
+    sealed = keyring.seal(plaintext, purpose=purpose, bound_to=bound)
+    assert len(sealed) == len(plaintext) + OVERHEAD_BYTES
+    assert keyring.open(sealed, purpose=purpose, bound_to=bound) == plaintext
+
+
+def test_a_blob_is_the_documented_format() -> None:
+    """Opened with nothing but the standard library's HMAC and AES-GCM."""
+    sealed = MasterKeyring([KEY]).seal(b"text", purpose="p", bound_to=["t", b"b", -7])
+    key_id = hashlib.sha256(hkdf_by_hand(KEY, b"veilface/1/key-id")).digest()[:8]
+    assert sealed[:9] == b"\x01" + key_id
+    aad = sealed[:9] + (4).to_bytes(4, "big")
+    for kind, body in ((b"t", b"p"), (b"t", b"t"), (b"b", b"b"), (b"i", b"-7")):
+        aad += kind + len(body).to_bytes(8, "big") + body
+    cipher = AESGCM(hkdf_by_hand(KEY, b"veilface/1/seal/p"))
+    assert cipher.decrypt(sealed[9:21], sealed[21:], aad) == b"text"
+
+
+def test_derive_key_is_hkdf_sha256() -> None:
+    assert derive_key(KEY, "label") == hkdf_by_hand(KEY, b"veilface/1/label")
+
+
+def test_nonces_differ() -> None:
+    keyring = MasterKeyring([KEY])
+    sealed = {keyring.seal(b"same", purpose="p", bound_to=[]) for _ in range(100)}
+    assert len({blob[9:21] for blob in sealed}) == 100
+
+
+@given(first=parts, second=parts)
+def test_different_parts_have_different_encodings(first: Parts, second: Parts) -> None:
+    same = first == second and [type(part) for part in first] == [type(part) for part in second]
+    assert (encode_parts(*first) == encode_parts(*second)) == same
+
+
+def test_shifting_a_boundary_changes_the_encoding() -> None:
+    assert encode_parts("ab", "c") != encode_parts("a", "bc")
+    assert encode_parts("1") != encode_parts(1)
+    assert encode_parts("a", "") != encode_parts("a")
+
+
+def test_any_altered_byte_is_noticed() -> None:
+    keyring = MasterKeyring([KEY])
+    sealed = keyring.seal(b"text", purpose="p", bound_to=["a"])
+    for position in range(len(sealed)):
+        altered = bytearray(sealed)
+        altered[position] ^= 1
+        with pytest.raises(SealError):
+            keyring.open(bytes(altered), purpose="p", bound_to=["a"])
+
+
+@pytest.mark.parametrize(
+    ("purpose", "bound"), [("q", ["a"]), ("p", ["b"]), ("p", []), ("p", ["a", ""])]
+)
+def test_a_blob_opens_only_where_it_belongs(purpose: str, bound: Parts) -> None:
+    keyring = MasterKeyring([KEY])
+    sealed = keyring.seal(b"text", purpose="p", bound_to=["a"])
+    with pytest.raises(SealError, match="altered, or belongs elsewhere"):
+        keyring.open(sealed, purpose=purpose, bound_to=bound)
+
+
+@pytest.mark.parametrize("length", [0, 1, OVERHEAD_BYTES - 1])
+def test_a_truncated_blob_is_refused(length: int) -> None:
+    keyring = MasterKeyring([KEY])
+    sealed = keyring.seal(b"", purpose="p", bound_to=[])[:length]
+    with pytest.raises(SealError, match="at least"):
+        keyring.open(sealed, purpose="p", bound_to=[])
+
+
+def test_another_key_is_named_in_the_error() -> None:
+    sealed = MasterKeyring([KEY]).seal(b"text", purpose="p", bound_to=[])
+    with pytest.raises(SealError, match=sealed_key_id(sealed)):
+        MasterKeyring([OTHER]).open(sealed, purpose="p", bound_to=[])
+
+
+def test_an_older_key_still_opens() -> None:
+    sealed = MasterKeyring([KEY]).seal(b"text", purpose="p", bound_to=[])
+    keyring = MasterKeyring([OTHER, KEY])
+    assert keyring.open(sealed, purpose="p", bound_to=[]) == b"text"
+    renewed = keyring.rewrap(sealed, purpose="p", bound_to=[])
+    assert sealed_key_id(renewed) == keyring.current != sealed_key_id(sealed)
+    assert MasterKeyring([OTHER]).open(renewed, purpose="p", bound_to=[]) == b"text"
+
+
+def test_a_created_file_is_private_and_random(tmp_path: Path) -> None:
+    keyring = MasterKeyring.create(tmp_path / "key")
+    assert (tmp_path / "key").stat().st_mode & 0o777 == 0o600
+    assert len(base64.b64decode((tmp_path / "key").read_bytes())) == 32
+    assert list(tmp_path.iterdir()) == [tmp_path / "key"]
+    assert keyring.current != MasterKeyring.create(tmp_path / "key2").current
+
+
+def test_an_existing_file_is_never_overwritten(tmp_path: Path) -> None:
+    path = write(tmp_path / "key", b"precious")
+    with pytest.raises(SealError, match="exists already"):
+        MasterKeyring.create(path)
+    assert path.read_bytes() == b"precious\n"
+
+
+def test_of_many_creators_exactly_one_succeeds(tmp_path: Path) -> None:
+    made: list[str] = []
+    refused: list[SealError] = []
+    start = threading.Barrier(8)
+
+    def create() -> None:
+        start.wait()
+        try:
+            made.append(MasterKeyring.create(tmp_path / "key").current)
+        except SealError as error:
+            refused.append(error)
+
+    threads = [threading.Thread(target=create) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(made) == 1
+    assert len(refused) == 7
+    assert MasterKeyring.load(tmp_path / "key").current == made[0]
+
+
+@pytest.mark.parametrize("mode", [0o640, 0o604, 0o660, 0o610, 0o777])
+def test_a_file_that_others_may_use_is_refused(tmp_path: Path, mode: int) -> None:
+    path = write(tmp_path / "key", base64.b64encode(KEY), mode=mode)
+    with pytest.raises(SealError, match="chmod 600"):
+        MasterKeyring.load(path)
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        ([], "holds no key"),
+        ([b"not base64!"], "not base64"),
+        ([b"\xff\xfe"], "not text"),
+        ([base64.b64encode(KEY) + b" " + base64.b64encode(OTHER)], "not base64"),
+        ([base64.b64encode(KEY[:31])], "31 bytes"),
+        ([base64.b64encode(KEY + b"x")], "33 bytes"),
+        ([base64.b64encode(bytes(32))], "pattern"),
+        ([base64.b64encode(b"\xaa" * 32)], "pattern"),
+        ([base64.b64encode(bytes(range(32)))], "pattern"),
+        ([base64.b64encode(KEY[:16] * 2)], "pattern"),
+        ([base64.b64encode(b"correct horse battery staple 32!")], "readable text"),
+        ([base64.b64encode(KEY), base64.b64encode(KEY)], "same key twice"),
+        ([base64.b64encode(KEY), base64.b64encode(bytes(32))], "key 2"),
+        ([b"A" * 100_000], "more than"),
+    ],
+)
+def test_a_bad_file_is_refused(tmp_path: Path, lines: list[bytes], message: str) -> None:
+    with pytest.raises(SealError, match=message):
+        MasterKeyring.load(write(tmp_path / "key", *lines))
+
+
+def test_things_that_are_no_file_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(SealError, match="does not exist"):
+        MasterKeyring.load(tmp_path / "absent")
+    with pytest.raises(SealError, match="not a regular file"):
+        MasterKeyring.load(tmp_path)
+    os.mkfifo(tmp_path / "pipe", 0o600)
+    with pytest.raises(SealError, match="not a regular file"):
+        MasterKeyring.load(tmp_path / "pipe")
+
+
+def test_random_keys_pass_the_weakness_check() -> None:
+    for _ in range(2000):
+        MasterKeyring([os.urandom(32)])
+
+
+@pytest.mark.parametrize("separator", [",", "\n", " ", ", "])
+def test_keys_from_a_setting(separator: str) -> None:
+    text = separator.join(base64.b64encode(key).decode() for key in (KEY, OTHER))
+    assert MasterKeyring.from_text(text).key_ids == MasterKeyring([KEY, OTHER]).key_ids
+    with pytest.raises(SealError, match="holds no key"):
+        MasterKeyring.from_text("")
+
+
+def test_rotating_the_file_is_followed_while_running(tmp_path: Path) -> None:
+    running = MasterKeyring.create(tmp_path / "key")
+    first = running.current
+    sealed = running.seal(b"old", purpose="p", bound_to=[])
+
+    second = MasterKeyring.add_current(tmp_path / "key")
+    assert running.key_ids == (second, first)
+    assert (tmp_path / "key").stat().st_mode & 0o777 == 0o600
+    assert sealed_key_id(running.seal(b"new", purpose="p", bound_to=[])) == second
+    assert running.open(sealed, purpose="p", bound_to=[]) == b"old"
+
+    assert MasterKeyring.drop_retired(tmp_path / "key") == 1
+    assert running.key_ids == (second,)
+    with pytest.raises(SealError, match=first):
+        running.open(sealed, purpose="p", bound_to=[])
+
+
+def test_a_blob_under_a_key_that_was_just_added_opens(tmp_path: Path) -> None:
+    running = MasterKeyring.create(tmp_path / "key")
+    MasterKeyring.add_current(tmp_path / "key")
+    sealed = MasterKeyring.load(tmp_path / "key").seal(b"new", purpose="p", bound_to=[])
+    assert running.open(sealed, purpose="p", bound_to=[]) == b"new"
+
+
+@pytest.mark.parametrize("damage", ["removed", "opened to others", "emptied"])
+def test_a_service_keeps_its_keys_while_the_file_is_broken(tmp_path: Path, damage: str) -> None:
+    path = tmp_path / "key"
+    running = MasterKeyring.create(path)
+    sealed = running.seal(b"text", purpose="p", bound_to=[])
+    match damage:
+        case "removed":
+            path.unlink()
+        case "opened to others":
+            MasterKeyring.add_current(path)
+            path.chmod(0o644)
+        case "emptied":
+            path.write_bytes(b"")
+    assert running.open(sealed, purpose="p", bound_to=[]) == b"text"
+    assert running.current == sealed_key_id(sealed)
+
+
+def test_keys_do_not_show(tmp_path: Path) -> None:
+    keyring = MasterKeyring.create(tmp_path / "key")
+    key = base64.b64decode((tmp_path / "key").read_bytes())
+    shown = repr(keyring) + repr(KeyringSealer(keyring)) + repr(vars(keyring))
+    for form in (key.hex(), repr(key)[2:-1], base64.b64encode(key).decode()):
+        assert form not in shown
+    assert keyring.current in repr(keyring)
+    with pytest.raises(TypeError, match="not serialised"):
+        pickle.dumps(keyring)
+
+
+def test_a_bad_key_is_not_quoted_in_the_error(tmp_path: Path) -> None:
+    text = b"correct horse battery staple 32!"
+    with pytest.raises(SealError) as caught:
+        MasterKeyring.load(write(tmp_path / "key", base64.b64encode(text)))
+    assert "correct" not in str(caught.value)
+    assert base64.b64encode(text).decode() not in str(caught.value)
+
+
+def test_the_sealer_binds_context_and_purpose() -> None:
+    keyring = MasterKeyring([KEY])
+    pool = KeyringSealer(keyring, purpose="decoys")
+    sealed = pool.seal(b"rows", context="pool 1")
+    assert pool.open(sealed, context="pool 1") == b"rows"
+    assert KeyringSealer(MasterKeyring([OTHER, KEY]), purpose="decoys").open(
+        sealed, context="pool 1"
+    )
+    for sealer, context in (
+        (pool, "pool 2"),
+        (KeyringSealer(keyring, purpose="cache"), "pool 1"),
+        (KeyringSealer(MasterKeyring([OTHER]), purpose="decoys"), "pool 1"),
+    ):
+        with pytest.raises(SealError):
+            sealer.open(sealed, context=context)
