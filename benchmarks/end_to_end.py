@@ -17,25 +17,20 @@ import base64
 import csv
 import json
 import os
-import secrets
-import socket
-import subprocess
-import sys
 import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import httpx
 import numpy as np
 import numpy.typing as npt
-from sqlalchemy import create_engine, text
-from sqlalchemy.engine import make_url
 
+from benchmarks.deployment import database, service, veilface
 from models.extraction import Extractor
 from models.pack import FacePolicy, ModelPack
 from templates.decoys import DecoyGenerator
@@ -44,9 +39,7 @@ from templates.wire import encode
 from verify.datasets import labelled_folder
 from verify.metrics import wilson
 
-VEILFACE = Path(sys.executable).with_name("veilface")
 PHOTOS_ENROLLED = 3
-DEFAULT_POSTGRES = "postgresql://postgres@127.0.0.1:5432/postgres"
 
 
 @dataclass(frozen=True)
@@ -108,75 +101,6 @@ def impostor_attempts(people: Sequence[Person], each: int) -> Iterator[tuple[Per
         for probe in person.probes:
             for step in steps:
                 yield people[(position + int(step)) % count], probe
-
-
-def veilface(*arguments: str | Path, env: dict[str, str]) -> str:
-    """Run the installed command; its standard output. A failure ends the benchmark."""
-    done = subprocess.run(
-        [str(VEILFACE), *map(str, arguments)], env=env, text=True, capture_output=True, check=False
-    )
-    if done.returncode:
-        raise SystemExit(f"veilface {arguments[0]} failed: {done.stderr.strip()}")
-    return done.stdout
-
-
-def free_port() -> int:
-    """A local port that nobody listens on now."""
-    with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
-        port: int = listener.getsockname()[1]
-        return port
-
-
-@contextmanager
-def database(kind: str, work: Path) -> Iterator[str]:
-    """A fresh SQLite file, or a fresh PostgreSQL database that is dropped afterwards."""
-    if kind == "sqlite":
-        yield f"sqlite:///{work / 'veilface.db'}"
-        return
-    server = make_url(os.environ.get("VEILFACE_TEST_POSTGRES_URL", DEFAULT_POSTGRES)).set(
-        drivername="postgresql+psycopg"
-    )
-    admin = create_engine(server, isolation_level="AUTOCOMMIT")
-    name = f"veilface_bench_{secrets.token_hex(4)}"
-    with admin.connect() as connection:
-        connection.execute(text(f'CREATE DATABASE "{name}"'))
-    try:
-        yield server.set(database=name).render_as_string(hide_password=False)
-    finally:
-        with admin.connect() as connection:
-            connection.execute(text(f'DROP DATABASE "{name}" WITH (FORCE)'))
-        admin.dispose()
-
-
-@contextmanager
-def service(env: dict[str, str], *, workers: int, log: Path) -> Iterator[str]:
-    """``veilface serve`` on a free port; yields its base URL once it is ready."""
-    port = free_port()
-    with log.open("wb") as sink:
-        process = subprocess.Popen(
-            [str(VEILFACE), "serve", "--port", str(port), "--workers", str(workers)],
-            env=env,
-            stdout=sink,
-            stderr=sink,
-        )
-        url = f"http://127.0.0.1:{port}"
-        try:
-            for _ in range(240):
-                if process.poll() is not None:
-                    raise SystemExit(f"veilface serve ended: {log.read_text()[-2000:]}")
-                try:
-                    if httpx.get(f"{url}/health/ready", timeout=5).status_code == 200:
-                        break
-                except httpx.TransportError:
-                    pass
-                time.sleep(0.25)
-            else:
-                raise SystemExit(f"the service did not become ready: {log.read_text()[-2000:]}")
-            yield url
-        finally:
-            process.terminate()
-            process.wait(timeout=30)
 
 
 def enroll_photos(

@@ -1,0 +1,284 @@
+"""How many templates a wolf probe opens, with and without the cohort test, and what a thief can do.
+
+Templates of LFW people are attacked with lifted probes that lie near every face: principal axes of
+face descriptors through the origin, and the same axes with a plausible foot point along the mean
+face. The attacker learns them from FairFace, the contract is calibrated on LFW people who are not
+attacked. The input checks of the service are switched off here, so that the figures are those of
+the decision alone; how many wolves the checks would refuse is counted beside them.
+
+Example
+-------
+::
+
+    python -m benchmarks.hostile_probes --data ../shared/data --dims 4,8
+"""
+
+import argparse
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from models.extraction import Extractor
+from models.pack import ModelPack
+from templates.contract import Binding, Calibration, Contract, Level
+from templates.decoys import DecoyGenerator
+from templates.distances import paired_distances, pairwise_distances, similarity
+from templates.lifting import Strategy, lift
+from templates.randomness import Keystream
+from templates.rotation import ROTATION_VERSION, tenant_rotation
+from templates.subspace import AffineSubspace, SubspaceBatch
+from verify import CalibrationOptions, calibrate, labelled_folder
+from verify.cohort import cohort_statistics
+
+Array = npt.NDArray[np.float64]
+AXES = 64
+ATTACKED = 700
+
+
+@dataclass(frozen=True)
+class Wolf:
+    """A lifted probe that is built to lie near everybody."""
+
+    family: str
+    subspace: AffineSubspace
+
+
+@dataclass(frozen=True)
+class Faces:
+    """Unit descriptors with the names of their people."""
+
+    descriptors: npt.NDArray[np.float32]
+    names: npt.NDArray[np.str_]
+
+    def only(self, keep: npt.NDArray[np.bool_]) -> "Faces":
+        """Rows where ``keep`` holds."""
+        return Faces(self.descriptors[keep], self.names[keep])
+
+
+def wolves(faces: npt.NDArray[np.float32], m: int, foot_norm: float, seed: int) -> list[Wolf]:
+    """Wolf probes of dimension m that are learnt from (N, n) unit descriptors."""
+    rng = np.random.default_rng(seed)
+    mean = faces.mean(axis=0, dtype=np.float64)
+    axes = np.linalg.svd(faces - mean, full_matrices=False)[2][:AXES].astype(np.float64)
+    uncentred = np.linalg.svd(faces.astype(np.float64), full_matrices=False)[2][:AXES]
+
+    def bases() -> Iterator[Array]:
+        yield axes[:m]
+        yield uncentred[:m]
+        yield axes[m : 2 * m]
+        for width in (2, 4):
+            for _ in range(4):
+                mix = np.linalg.qr(rng.standard_normal((width * m, m)))[0]
+                yield mix.T @ axes[: width * m]
+
+    found = []
+    for basis in bases():
+        found.append(Wolf("axes through the origin", subspace(np.zeros_like(mean), basis)))
+        for factor in (0.8, 1.0, 1.2):
+            direction = mean - basis.T @ (basis @ mean)
+            foot = factor * foot_norm * direction / np.linalg.norm(direction)
+            found.append(Wolf("foot point along the mean face", subspace(foot, basis)))
+    return found
+
+
+def subspace(foot: Array, basis: Array) -> AffineSubspace:
+    """Canonical subspace; the basis is orthonormalised, the foot point made orthogonal to it."""
+    orthonormal = np.linalg.qr(basis.T)[0].T
+    return AffineSubspace(
+        foot=(foot - orthonormal.T @ (orthonormal @ foot)).astype(np.float32),
+        basis=np.ascontiguousarray(orthonormal, dtype=np.float32),
+    )
+
+
+def decisions(
+    probes: SubspaceBatch | npt.NDArray[np.float32],
+    templates: SubspaceBatch,
+    contract: Contract,
+    calibration: Calibration,
+    level: Level,
+    *,
+    paired: bool = False,
+) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+    """Accepted by the threshold alone, and by threshold and cohort test; (P, T), or (P,) paired."""
+    compare = paired_distances if paired else pairwise_distances
+    distances = compare(probes, templates, metric=calibration.metric, steps=calibration.steps)
+    scores = np.asarray(similarity(distances), dtype=np.float64)
+    means, spreads = cohort_statistics(
+        probes, contract.cohort, metric=calibration.metric, steps=calibration.steps
+    )
+    if not paired:
+        means, spreads = means[:, None], spreads[:, None]
+    near = scores >= level.similarity_threshold
+    return near, near & ((scores - means) / spreads >= level.cohort_threshold)
+
+
+def percent(accepted: npt.NDArray[np.bool_]) -> dict[str, object]:
+    """Share of accepted trials, with its counts."""
+    return {
+        "accepted": int(accepted.sum()),
+        "trials": int(accepted.size),
+        "percent": round(100 * float(accepted.mean()), 3),
+    }
+
+
+def contract_of(
+    pack: ModelPack, faces: Faces, source: DecoyGenerator, m: int, probe_dims: Sequence[int]
+) -> Contract:
+    """Calibrate a contract for adversarial templates of dimension m."""
+    info = pack.info
+    binding = Binding(
+        embedder_sha256=info.embedder_sha256,
+        preprocessing=info.preprocessing,
+        n=info.n,
+        strategy=Strategy.ADVERSARIAL,
+        m=m,
+        decoy_source_id=source.source_id,
+        rotation_version=ROTATION_VERSION,
+    )
+    return calibrate(
+        faces.descriptors,
+        [str(name) for name in faces.names],
+        binding=binding,
+        source=source,
+        options=CalibrationOptions(probe_dims=tuple(probe_dims)),
+    ).contract
+
+
+def wolf_table(
+    contract: Contract,
+    attacked: SubspaceBatch,
+    attacker_faces: npt.NDArray[np.float32],
+    m: int,
+    level_name: str,
+) -> dict[str, object]:
+    """Acceptance of every wolf by the attacked templates, by family."""
+    calibration = contract.calibration("s2s", probe_m=m)
+    level = calibration.level(level_name)
+    low, high = calibration.foot_point_norm or (0.0, 1.0)
+    pack = wolves(attacker_faces, m, foot_norm=(low + high) / 2, seed=m)
+    near, accepted = decisions(
+        SubspaceBatch.of([wolf.subspace for wolf in pack]), attacked, contract, calibration, level
+    )
+    table: dict[str, object] = {"wolves": len(pack), "templates": len(attacked)}
+    for family in sorted({wolf.family for wolf in pack}):
+        rows = np.array([wolf.family == family for wolf in pack])
+        norms = [wolf.subspace.foot_norm for wolf in pack if wolf.family == family]
+        table[family] = {
+            "variants": int(rows.sum()),
+            "refused_by_the_input_checks": sum(not low <= norm <= high for norm in norms),
+            "worst_threshold_only_percent": round(100 * float(near[rows].mean(axis=1).max()), 2),
+            "worst_with_cohort_percent": round(100 * float(accepted[rows].mean(axis=1).max()), 2),
+            "mean_threshold_only_percent": round(100 * float(near[rows].mean()), 2),
+            "mean_with_cohort_percent": round(100 * float(accepted[rows].mean()), 2),
+        }
+    return table
+
+
+def genuine_table(
+    contract: Contract, source: DecoyGenerator, faces: Faces, m: int, level_name: str, seed: int
+) -> dict[str, object]:
+    """FNMR of lifted genuine probes, by the threshold alone and with the cohort test."""
+    calibration = contract.calibration("s2s", probe_m=m)
+    level = calibration.level(level_name)
+    first, second = [], []
+    for name in np.unique(faces.names):
+        rows = np.flatnonzero(faces.names == name)
+        if len(rows) > 1:
+            first.append(rows[0])
+            second.append(rows[1])
+    with Keystream.seeded("genuine", m, seed) as stream:
+        templates = lift(
+            faces.descriptors[first], strategy=Strategy.ADVERSARIAL, m=contract.binding.m,
+            source=source, stream=stream,
+        )  # fmt: skip
+        probes = lift(
+            faces.descriptors[second], strategy=Strategy.ADVERSARIAL, m=m,
+            source=source, stream=stream,
+        )  # fmt: skip
+    near, accepted = decisions(probes, templates, contract, calibration, level, paired=True)
+    return {"threshold_only_rejected": percent(~near), "with_cohort_rejected": percent(~accepted)}
+
+
+def thief_table(
+    contract: Contract, templates: SubspaceBatch, victims: npt.NDArray[np.float32], level_name: str
+) -> dict[str, object]:
+    """What one stolen template opens, for what else the thief has.
+
+    Without the right to send embeddings the thief has no call to make: a template holds no photo.
+    """
+    calibration = contract.calibration("p2s")
+    level = calibration.level(level_name)
+    feet = templates.feet.astype(np.float64)
+    norms = np.linalg.norm(feet, axis=1, keepdims=True)
+    inside = feet + np.sqrt(1 - norms**2) * templates.bases[:, 0]
+    foot_points = feet / norms
+    turned = inside @ tenant_rotation(bytes(range(32)), templates.n).T
+
+    def tried(probes: Array) -> dict[str, object]:
+        rows = np.ascontiguousarray(probes, dtype=np.float32)
+        return percent(decisions(rows, templates, contract, calibration, level, paired=True)[1])
+
+    return {
+        "level": level_name,
+        "without_embeddings_right": "HTTP 403 forbidden, whatever the probe",
+        "with_right_and_rotation_key": tried(inside),
+        "with_right_without_rotation_key": tried(turned),
+        "foot_point_as_probe_with_right_and_rotation_key": tried(foot_points),
+        "cosine_of_foot_point_to_victim_mean": round(
+            float(np.mean(np.sum(foot_points * victims, axis=1))), 4
+        ),
+    }
+
+
+def main() -> None:
+    """Calibrate, attack, print the tables as JSON."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
+    parser.add_argument("--pack", type=Path, help="default: DATA/packs/w600k_mbf")
+    parser.add_argument("--dims", default="4,8", help="template and probe dimensions, s-to-s")
+    parser.add_argument("--thief-dims", default="16,32", help="template dimensions, p-to-s")
+    parser.add_argument("--level", default="fmr-1e-2")
+    args = parser.parse_args()
+    pack = ModelPack.load(args.pack or args.data / "packs" / "w600k_mbf")
+    crops = labelled_folder(args.data / "lfw" / "aligned112")
+    lfw = Faces(
+        Extractor(pack).extract(list(crops.paths), aligned=True).descriptors,
+        np.array(crops.identities),
+    )
+    fairface = (
+        Extractor(pack)
+        .extract(sorted((args.data / "fairface" / "train").glob("*.jpg")))
+        .descriptors
+    )
+    half = len(fairface) // 2
+    source = DecoyGenerator.fit(fairface[:half])
+    people = np.unique(lfw.names)
+    attacked_people = np.random.default_rng(0).permutation(people)[:ATTACKED]
+    is_attacked = np.isin(lfw.names, attacked_people)
+    attacked, others = lfw.only(is_attacked), lfw.only(~is_attacked)
+    victims = attacked.descriptors[np.unique(attacked.names, return_index=True)[1]]
+    report: dict[str, object] = {"level": args.level}
+    for m in map(int, args.dims.split(",")):
+        contract = contract_of(pack, others, source, m, [m])
+        with Keystream.seeded("attacked", m) as stream:
+            templates = lift(
+                victims, strategy=Strategy.ADVERSARIAL, m=m, source=source, stream=stream
+            )
+        report[f"wolves, m = {m}"] = wolf_table(contract, templates, fairface[half:], m, args.level)
+        report[f"genuine, m = {m}"] = genuine_table(contract, source, attacked, m, args.level, 0)
+    for m in map(int, args.thief_dims.split(",")):
+        contract = contract_of(pack, others, source, m, [0])
+        with Keystream.seeded("stolen", m) as stream:
+            templates = lift(
+                victims, strategy=Strategy.ADVERSARIAL, m=m, source=source, stream=stream
+            )
+        report[f"stolen template, m = {m}"] = thief_table(contract, templates, victims, "fmr-1e-3")
+    print(json.dumps(report, indent=2))
+
+
+if __name__ == "__main__":
+    main()
