@@ -1,0 +1,270 @@
+"""``veilface calibrate``: thresholds for stated false match rates."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from api.cli.console import emit, message, progress, say, show, table, warn_of_demo_model
+from api.cli.descriptors import extract
+from api.cli.errors import CommandError, UsageError
+from api.cli.files import read_bounded, read_names
+from api.cli.options import AsJson, takes_settings
+from api.preparation import calibrate_folder
+from api.runtime import file_sealer, open_keyring, open_pack
+from api.settings import Settings
+from models.demo import DEMO_NOTICE
+from templates.contract import Calibration, Contract, Rate
+from templates.decoys import load_source
+from templates.distances import Metric
+from templates.lifting import Strategy
+from verify import CalibrationOptions, CalibrationReport, labelled_folder
+
+MOST_SHOWN = 20
+
+
+class Protocol(StrEnum):
+    """How levels are set."""
+
+    FMR = "fmr"
+    TEN_FOLD = "ten-fold"
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command()(calibrate)
+
+
+@takes_settings("pack", "providers", "data_dir", "database_url", "master_key_file")
+def calibrate(
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            help="Labelled faces: one subfolder for each person, with photos in it (as LFW has "
+            "them).",
+            show_default=False,
+        ),
+    ],
+    *,
+    settings: Settings,
+    decoys: Annotated[
+        Path | None,
+        typer.Option(
+            help="The file of `decoys build`. Unset: `decoys.veil` in `data_dir`.",
+            show_default=False,
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="The contract file. Unset: `contract.json` in `data_dir`.", show_default=False
+        ),
+    ] = None,
+    strategy: Annotated[
+        Strategy, typer.Option(help="How templates are lifted.")
+    ] = Strategy.ADVERSARIAL,
+    dim: Annotated[int, typer.Option(min=1, max=128, help="Dimension m of stored templates.")] = 16,
+    probe_dims: Annotated[
+        str,
+        typer.Option(
+            help="Dimensions of lifted probes that clients may send, for example `2,4,8`. Raw "
+            "probes, such as photos, are always calibrated."
+        ),
+    ] = "",
+    metric: Annotated[Metric, typer.Option(help="The distance that decides.")] = Metric.SPHERICAL,
+    protocol: Annotated[
+        Protocol,
+        typer.Option(help="`ten-fold` adds the paper's threshold of best accuracy as a level."),
+    ] = Protocol.FMR,
+    aligned: Annotated[
+        bool, typer.Option("--aligned", help="The photos are aligned square crops already.")
+    ] = False,
+    exclude_people: Annotated[
+        Path | None,
+        typer.Option(
+            help="People to leave out, such as those of a test: a folder whose subfolders are "
+            "named like them, or a text file with a name on each line.",
+            show_default=False,
+        ),
+    ] = None,
+    aliases: Annotated[
+        Path | None,
+        typer.Option(
+            help="People who occur under two names: a text file, `second name,first name` on each "
+            "line.",
+            show_default=False,
+        ),
+    ] = None,
+    photos: Annotated[
+        int, typer.Option(min=1, max=10, help="Most photos averaged into one template.")
+    ] = 3,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the random choices.")] = 0,
+    as_json: AsJson = False,
+) -> None:
+    """Measure private templates of labelled people, and write the contract file.
+
+    Needs: a model pack, a decoys file, and photos of people with two photos or more each. 80
+    people resolve FMR 1e-2 and 1e-3; lower targets need more people, and those that the data
+    cannot resolve are refused. The contract file belongs to the master key that is in force.
+
+    Example: `veilface calibrate lfw --pack buffalo_l --decoys decoys.veil --out contract.json
+    --strategy adversarial --dim 16`
+    """
+    dims = parse_dims(probe_dims)
+    pack = open_pack(settings)
+    if pack is None:
+        raise UsageError("a contract is bound to a model pack; name it with --pack")
+    if dim >= pack.info.n:
+        raise UsageError(f"--dim must be below the {pack.info.n} numbers of a descriptor")
+    labelled = labelled_folder(folder)
+    keyring = open_keyring(settings)
+    sealer = file_sealer(keyring)
+    source = load_source(decoys or settings.resolved_decoys_file, sealer)
+    if source.n != pack.info.n:
+        raise CommandError(
+            f"the decoys have {source.n} numbers each, the pack gives {pack.info.n}; build the "
+            "decoys with this pack"
+        )
+    exclude = frozenset() if exclude_people is None else read_names(exclude_people)
+    extraction, acquired = extract(pack, labelled.paths, aligned=aligned, what="embedding photos")
+    with progress("calibrating", 100) as advance:
+        shown = 0
+
+        def report(_what: str, share: float) -> None:
+            nonlocal shown
+            step = max(0, int(100 * share) - shown)
+            shown += step
+            advance(step)
+
+        done = calibrate_folder(
+            labelled,
+            extraction,
+            pack=pack,
+            source=source,
+            strategy=strategy,
+            m=dim,
+            options=CalibrationOptions(
+                protocol="ten-fold" if protocol is Protocol.TEN_FOLD else "fmr",
+                metric=metric,
+                probe_dims=(0, *dims),
+                photos_per_enrollment=photos,
+                seed=seed,
+            ),
+            exclude=exclude,
+            aliases={} if aliases is None else read_aliases(aliases),
+            progress=report,
+        )
+    path = out or settings.resolved_contract_file
+    path.parent.mkdir(parents=True, exist_ok=True)
+    done.contract.save(path, sealer)
+    demo = warn_of_demo_model(pack.info.embedder_sha256)
+    if as_json:
+        emit(
+            {
+                "out": str(path),
+                **({"notice": DEMO_NOTICE} if demo else {}),
+                "contract": done.contract.public(),
+                "failure_to_acquire": acquired.to_json(),
+                **_report_json(done.report),
+            }
+        )
+        return
+    for calibration in done.contract.calibrations:
+        show(levels_table(calibration))
+    _tell(done.contract, done.report)
+    say(f"{acquired}.")
+    say(f"{path}: contract {done.contract.contract_id[:16]}.")
+
+
+def parse_dims(text: str) -> tuple[int, ...]:
+    """Read ``2,4,8``.
+
+    Raises
+    ------
+    UsageError
+        Something else, or a dimension twice.
+    """
+    parts = [part.strip() for part in text.split(",") if part.strip()]
+    if not all(part.isdecimal() and 1 <= int(part) <= 128 for part in parts):
+        raise UsageError("--probe-dims takes dimensions from 1 to 128, separated by commas")
+    dims = tuple(int(part) for part in parts)
+    if len(set(dims)) != len(dims):
+        raise UsageError("--probe-dims names a dimension twice")
+    return dims
+
+
+def read_aliases(file: Path) -> dict[str, str]:
+    """Read ``second name,first name`` lines."""
+    text = read_bounded(file, 16 * 2**20).decode("utf-8", errors="replace")
+    names: dict[str, str] = {}
+    for number, line in enumerate(text.splitlines(), start=1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        second, comma, first = (part.strip() for part in line.partition(","))
+        if not (second and comma and first):
+            raise CommandError(f"{file.name}, line {number}: expected `second name,first name`")
+        names[second] = first
+    return names
+
+
+def levels_table(calibration: Calibration) -> Any:
+    """Show what one calibration found."""
+    kind = "raw probes" if calibration.mode == "p2s" else f"lifted probes m={calibration.probe_m}"
+    columns = ("level", "similarity", "cohort score", "FMR seen (95 %)", "FNMR seen (95 %)")
+    listing = table(f"{kind}, {calibration.metric} distance", *columns)
+    for level in calibration.levels:
+        listing.add_row(
+            level.name,
+            f"{level.similarity_threshold:.4f}",
+            f"{level.cohort_threshold:.3f}",
+            shown_rate(level.fmr),
+            shown_rate(level.fnmr),
+        )
+    return listing
+
+
+def shown_rate(rate: Rate) -> str:
+    """Write a rate with its counts and interval."""
+    return (
+        f"{100 * rate.value:.3g} % ({rate.errors}/{rate.trials}; "
+        f"{100 * rate.ci_low:.2g}-{100 * rate.ci_high:.2g} %)"
+    )
+
+
+def _tell(contract: Contract, report: CalibrationReport) -> None:
+    for sentence in report.unresolved:
+        say(f"Not set: {sentence}.")
+    if report.suspicious:
+        say(
+            f"{len(report.suspicious)} pairs of people are suspiciously alike (cosine above "
+            f"{report.suspicious_above:g}); look at them, and name the same people in --aliases:"
+        )
+        for pair in report.suspicious[:MOST_SHOWN]:
+            say(f"  {pair.first},{pair.second}  {pair.cosine:.3f}")
+        if len(report.suspicious) > MOST_SHOWN:
+            message(f"note: {len(report.suspicious) - MOST_SHOWN} more; see --json")
+    say(
+        f"Default level: {contract.default_level}. Photos of one enrollment must be alike to "
+        f"{contract.photo_consistency:.3f}, set on {report.consistency_pairs} pairs."
+    )
+
+
+def _report_json(report: CalibrationReport) -> dict[str, Any]:
+    return {
+        "consistency_pairs": report.consistency_pairs,
+        "unresolved": list(report.unresolved),
+        "suspicious_above": report.suspicious_above,
+        "suspicious": [
+            {"first": pair.first, "second": pair.second, "cosine": pair.cosine}
+            for pair in report.suspicious
+        ],
+        "ten_fold": [
+            {
+                "accuracy_mean": folds.accuracy_mean,
+                "accuracy_std": folds.accuracy_std,
+                "threshold_mean": folds.threshold_mean,
+            }
+            for folds in report.ten_folds
+        ],
+    }

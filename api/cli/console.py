@@ -1,0 +1,72 @@
+"""Where the command line speaks: results on stdout, everything else on stderr."""
+
+import json
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from models.demo import DEMO_NOTICE, is_demo_model
+
+Advance = Callable[[int], None]
+
+_WIDTH_OF_A_FILE = 160  # where nobody looks at a terminal, tables are not squeezed to 80 columns
+
+
+def message(text: str) -> None:
+    """Say something to the person; it does not disturb a program that reads stdout."""
+    typer.echo(text, err=True)
+
+
+def emit(value: Mapping[str, Any] | Sequence[Any]) -> None:
+    """Write one JSON value to stdout."""
+    typer.echo(json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False))
+
+
+def say(text: str) -> None:
+    """Write one line of the result to stdout."""
+    typer.echo(text)
+
+
+def table(title: str, *columns: str) -> Table:
+    """Make an empty table; numbers are the caller's to align."""
+    made = Table(title=title, title_justify="left", title_style="bold")
+    for column in columns:
+        made.add_column(column, overflow="fold")
+    return made
+
+
+def show(*tables: Table) -> None:
+    """Write tables to stdout."""
+    width = None if sys.stdout.isatty() else _WIDTH_OF_A_FILE
+    console = Console(file=sys.stdout, width=width)
+    for each in tables:
+        console.print(each)
+
+
+def warn_of_demo_model(embedder_sha256: str) -> bool:
+    """Say so where the embedder is the demo model; returns whether it is."""
+    if not is_demo_model(embedder_sha256):
+        return False
+    message(f"note: {DEMO_NOTICE}")
+    return True
+
+
+@contextmanager
+def progress(description: str, total: int | None) -> Iterator[Advance]:
+    """Show a progress bar on stderr while the block runs; call the result with what was done."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+    )
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, transient=not console.is_terminal) as bar:
+        task = bar.add_task(description, total=total)
+        yield lambda done: bar.advance(task, done)

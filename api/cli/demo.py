@@ -1,0 +1,147 @@
+"""``veilface demo``: everything once, with nothing configured."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from api.cli.console import emit, message, say, show, table
+from api.cli.options import AsJson
+from api.demo import Outcome, run_demo
+from models.demo import DEMO_NOTICE
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command()(demo)
+
+
+def demo(
+    *,
+    folder: Annotated[
+        Path, typer.Option(help="Where the data go; an earlier demo there is replaced.")
+    ] = Path("demo-data"),
+    pack: Annotated[
+        Path | None,
+        typer.Option(
+            help="A real model pack, together with --faces. Unset: a model that is built here and "
+            "recognises drawn faces only.",
+            show_default=False,
+        ),
+    ] = None,
+    faces: Annotated[
+        Path | None,
+        typer.Option(
+            help="Real faces, one subfolder for each person; 8 people need 5 photos each, and the "
+            "others serve as decoys and for the calibration.",
+            show_default=False,
+        ),
+    ] = None,
+    dim: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            max=128,
+            help="Dimension m of the templates. Unset: 16, or 8 with the demo model.",
+            show_default=False,
+        ),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Enroll, verify and erase people through the real service, in under a minute.
+
+    Needs nothing: no weights, no database, no network. It draws faces, makes decoys and a
+    contract, starts the REST service on a free local port, uses it over HTTP, checks what it
+    answers, and leaves a folder that `veilface serve` can use. Exit status 1 means that something
+    was not as promised.
+
+    Example: `veilface demo`, or with real weights and faces
+    `veilface demo --pack buffalo_l --faces lfw`
+    """
+    outcome = run_demo(
+        folder, pack=pack, faces=faces, m=dim, say=lambda text: message(f"... {text}")
+    )
+    if as_json:
+        emit(_json(outcome))
+    else:
+        _print(outcome)
+    for fault in outcome.faults:
+        message(f"error: {fault}")
+    if outcome.faults:
+        raise typer.Exit(1)
+
+
+def _print(outcome: Outcome) -> None:
+    notice = f"  ({DEMO_NOTICE})" if outcome.demo_model else ""
+    if outcome.demo_model:
+        say(f"\n{DEMO_NOTICE}\n")
+    people = table(
+        f"Who was accepted, at level {outcome.default_level}{notice}",
+        "person",
+        "own photos",
+        "photos of others",
+    )
+    for person in outcome.people:
+        people.add_row(
+            person.name,
+            f"{person.genuine_accepted} of {person.genuine_trials} accepted",
+            f"{person.impostor_trials - person.impostors_accepted} of {person.impostor_trials} "
+            "rejected",
+        )
+    levels = table(
+        f"Security levels{notice}",
+        "level",
+        "stated FMR",
+        "genuine accepted",
+        "impostors accepted",
+    )
+    for level in outcome.levels:
+        levels.add_row(
+            level.level,
+            f"{100 * level.fmr:g} %",
+            f"{level.genuine_accepted} of {level.genuine_trials}",
+            f"{level.impostors_accepted} of {level.impostor_trials}",
+        )
+    stored = table(
+        f"What is stored: {outcome.strategy}{notice}",
+        "person",
+        "template",
+        "‖p‖ = cos(face, foot point)",
+        "in the database",
+        "ends with (ciphertext)",
+    )
+    for entry in outcome.stored:
+        stored.add_row(
+            entry.name,
+            f"{entry.template_bytes} bytes",
+            f"{entry.foot_norm:.3f}",
+            f"{entry.ciphertext_bytes} bytes, AES-256-GCM",
+            entry.ciphertext_excerpt,
+        )
+    show(people, levels, stored)
+    for refusal in outcome.refused_photos:
+        say(f"Not usable, counted as rejected: {refusal}")
+    if outcome.receipt:
+        say(
+            f"Erased {outcome.erased}: {outcome.rows_after_erasure} rows left, and a signed "
+            f"receipt that holds, naming pseudonym {outcome.receipt['subject'][:16]}…"
+        )
+    folder = outcome.folder
+    say(
+        f"\nDone in {outcome.seconds:.0f} s. Start the service on the same data:\n\n"
+        f"  veilface serve --config {folder}/veilface.toml\n\n"
+        "and ask it, in another terminal (the API key is in a file that only you can read):\n\n"
+        f'  curl -H "Authorization: Bearer $(cat {folder}/api-key)" '
+        "http://127.0.0.1:8421/v1/subjects\n"
+    )
+    if outcome.demo_model:
+        say(DEMO_NOTICE)
+
+
+def _json(outcome: Outcome) -> dict[str, Any]:
+    value = dataclasses.asdict(outcome)
+    value["folder"] = str(outcome.folder)
+    if outcome.demo_model:
+        value["notice"] = DEMO_NOTICE
+    return value

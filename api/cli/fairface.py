@@ -1,0 +1,124 @@
+"""FairFace's label files, also as spreadsheets have left them.
+
+Columns are ``file,age,gender,race,service_test``; ``file`` is a path relative to the folder of the
+label file. Spreadsheets turn the ages 3-9 and 10-19 into dates; those are repaired here.
+"""
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+from api.cli.errors import CommandError
+from templates.decoys import Attributes
+
+AGES = (
+    "0-2",
+    "3-9",
+    "10-19",
+    "20-29",
+    "30-39",
+    "40-49",
+    "50-59",
+    "60-69",
+    "more than 70",
+)
+GENDERS = ("Male", "Female")
+RACES = (
+    "East Asian",
+    "Southeast Asian",
+    "Middle Eastern",
+    "Latino_Hispanic",
+    "Black",
+    "White",
+    "Indian",
+)
+# 3-9 read as a date is 3 September or 9 March; 10-19 is 19 October or October (20)19.
+_DATES = {
+    "03-sep": "3-9",
+    "3-sep": "3-9",
+    "sep-03": "3-9",
+    "sep-3": "3-9",
+    "09-mar": "3-9",
+    "9-mar": "3-9",
+    "mar-09": "3-9",
+    "mar-9": "3-9",
+    "19-oct": "10-19",
+    "oct-19": "10-19",
+}
+_NEEDED = ("file", "age", "gender", "race")
+_MAX_BYTES = 64 * 2**20
+
+
+@dataclass(frozen=True)
+class Label:
+    """The labels of one photo; ``age`` is one of ``AGES``."""
+
+    age: str
+    gender: str
+    race: str
+
+    @property
+    def attributes(self) -> Attributes:
+        """What lifting may ask for."""
+        return Attributes(gender=self.gender, race=self.race)
+
+
+def repaired_age(text: str) -> str | None:
+    """Return the age range that a cell means; None for one that means none.
+
+    Examples
+    --------
+    >>> repaired_age("03-Sep"), repaired_age("Oct-19"), repaired_age("20-29")
+    ('3-9', '10-19', '20-29')
+    """
+    plain = text.strip()
+    return plain if plain in AGES else _DATES.get(plain.lower())
+
+
+def label_files(source: Path) -> list[Path]:
+    """Label files of a photo folder: inside it, or beside it."""
+    return [
+        *sorted(source.glob("fairface_label_*.csv")),
+        *sorted(source.resolve().parent.glob("fairface_label_*.csv")),
+    ]
+
+
+def read_labels(file: Path) -> dict[Path, Label]:
+    """Read a label file: labels by the resolved path of the photo.
+
+    Raises
+    ------
+    CommandError
+        Naming the file, the line, and what was expected.
+    """
+    labels: dict[Path, Label] = {}
+    folder = file.resolve().parent
+    if file.stat().st_size > _MAX_BYTES:
+        raise CommandError(f"{file.name} has more than {_MAX_BYTES} bytes; is it a label file?")
+    try:
+        with file.open(encoding="utf-8-sig", newline="") as stream:
+            reader = csv.DictReader(stream)
+            missing = [name for name in _NEEDED if name not in (reader.fieldnames or [])]
+            if missing:
+                raise CommandError(f"{file.name} lacks the columns {', '.join(missing)}")
+            for row in reader:
+                label = _label(row, where=f"{file.name}, line {reader.line_num}")
+                labels[(folder / row["file"].strip()).resolve()] = label
+    except (UnicodeDecodeError, csv.Error):
+        raise CommandError(f"{file.name} is not a CSV file in UTF-8") from None
+    return labels
+
+
+def _label(row: dict[str, str], *, where: str) -> Label:
+    if any(not row.get(name) for name in _NEEDED):
+        raise CommandError(f"{where}: a cell is empty")
+    age = repaired_age(row["age"])
+    if age is None:
+        raise CommandError(
+            f"{where}: the age is none of {', '.join(AGES)}, and no date that a spreadsheet makes "
+            "of one"
+        )
+    for name, known in (("gender", GENDERS), ("race", RACES)):
+        if row[name] not in known:
+            raise CommandError(f"{where}: the {name} is none of {', '.join(known)}")
+    return Label(age=age, gender=row["gender"], race=row["race"])

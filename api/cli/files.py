@@ -1,0 +1,64 @@
+"""Reading and writing files under limits, and finding the photos of a folder."""
+
+import os
+from pathlib import Path
+
+from api.cli.errors import CommandError
+
+PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp"})
+
+
+def read_bounded(path: Path, most: int) -> bytes:
+    """Read a file that has at most ``most`` bytes."""
+    with path.open("rb") as file:
+        data = file.read(most + 1)
+    if len(data) > most:
+        raise CommandError(f"{path} has more than {most} bytes; is it the right file?")
+    return data
+
+
+def write_private(path: Path, data: bytes) -> None:
+    """Write a file that only its owner may read; one that is there is replaced."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.unlink(missing_ok=True)
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    with os.fdopen(descriptor, "wb") as file:
+        file.write(data)
+
+
+def find_photos(folder: Path) -> list[Path]:
+    """All JPEG, PNG and WebP files below a folder, in the order of their paths.
+
+    Raises
+    ------
+    CommandError
+        It is no folder, or has no photo.
+    """
+    if not folder.is_dir():
+        raise CommandError(f"{folder} is not a folder")
+    found = sorted(
+        path
+        for path in folder.rglob("*")
+        if path.suffix.lower() in PHOTO_SUFFIXES and path.is_file()
+    )
+    if not found:
+        raise CommandError(f"{folder} has no .jpg, .jpeg, .png or .webp file, at any depth")
+    return found
+
+
+def read_names(source: Path) -> frozenset[str]:
+    """Names to leave out: the subfolders of a folder, or the lines of a text file.
+
+    Lines are names of people, or paths of photos relative to the folder that is read; empty lines
+    and lines that start with ``#`` say nothing.
+    """
+    if source.is_dir():
+        return frozenset(path.name for path in source.iterdir() if path.is_dir())
+    lines = read_bounded(source, 16 * 2**20).decode("utf-8", errors="replace").splitlines()
+    return frozenset(line.strip() for line in lines if line.strip() and line[:1] != "#")
+
+
+def is_left_out(photo: Path, folder: Path, names: frozenset[str]) -> bool:
+    """Whether a photo of the folder belongs to a name that is left out."""
+    relative = photo.relative_to(folder)
+    return relative.as_posix() in names or any(part in names for part in relative.parts[:-1])

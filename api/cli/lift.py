@@ -1,0 +1,208 @@
+"""``veilface lift``: a client makes its own private template; no face leaves its machine."""
+
+import base64
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from api.cli.console import emit, say, warn_of_demo_model
+from api.cli.errors import CommandError, UsageError
+from api.cli.files import read_bounded, write_private
+from api.cli.options import AsJson
+from enroll.enroller import MAX_PHOTOS, mean_descriptor
+from enroll.errors import InconsistentImages
+from models.errors import ModelError
+from models.pack import FacePolicy, ModelPack
+from templates import wire
+from templates.binding import Binding
+from templates.canonical import parse_object
+from templates.decoys import DecoyGenerator
+from templates.errors import ContractError
+from templates.lifting import lift as lift_descriptors
+from templates.randomness import Keystream
+
+MAX_CONTRACT_BYTES = 256 * 2**20
+MAX_PHOTO_BYTES = 64 * 2**20
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command()(lift)
+
+
+def lift(
+    photos: Annotated[
+        list[Path],
+        typer.Argument(help=f"1 to {MAX_PHOTOS} photos of one person.", show_default=False),
+    ],
+    *,
+    pack: Annotated[Path, typer.Option(help="The model pack of the contract.", show_default=False)],
+    generator: Annotated[
+        Path,
+        typer.Option(
+            help="The decoy generator: the bytes of `GET /v1/contract/generator`, or the file "
+            "that `decoys build` wrote.",
+            show_default=False,
+        ),
+    ],
+    contract: Annotated[
+        Path,
+        typer.Option(
+            help="The JSON of `GET /v1/contract`, or the contract file. Only its public part is "
+            "read.",
+            show_default=False,
+        ),
+    ],
+    out: Annotated[
+        Path,
+        typer.Option(
+            help="Where the template's bytes go. `-` writes a JSON body for REST to stdout.",
+            show_default=False,
+        ),
+    ],
+    probe: Annotated[
+        bool, typer.Option("--probe", help="Make a probe for verify, not an enrollment.")
+    ] = False,
+    dim: Annotated[
+        int | None,
+        typer.Option(
+            help="Dimension of a probe, one that the contract is calibrated for. Unset: the "
+            "largest of these. An enrollment always has the contract's own.",
+            show_default=False,
+        ),
+    ] = None,
+    face: Annotated[
+        FacePolicy,
+        typer.Option(help="What a photo with several faces means: an error, or the largest."),
+    ] = FacePolicy.SINGLE,
+    as_json: AsJson = False,
+) -> None:
+    """Turn photos into a private template on this machine, without any key of the service.
+
+    Needs: the service's model pack, `GET /v1/contract` and `GET /v1/contract/generator` saved to
+    files. Send the result as `{"template": …}`; the key needs the right `embeddings`. Several
+    photos of one person are averaged before they are lifted. Never lift the same photo twice for
+    enrollment: two templates of one descriptor give it away.
+
+    Example: `veilface lift me-1.jpg me-2.jpg --pack buffalo_l --generator generator.bin
+    --contract contract.json --out me.veil`
+    """
+    if len(photos) > MAX_PHOTOS:
+        raise UsageError(f"a template is made from 1 to {MAX_PHOTOS} photos, not {len(photos)}")
+    public = read_contract(contract)
+    binding = public.binding
+    m = public.dimension(probe=probe, dim=dim)
+    source = DecoyGenerator.load(generator)
+    binding.require_source(source_id=source.source_id)
+    models = ModelPack.load(pack, threads=1)
+    info = models.info
+    binding.require_embedder(
+        embedder_sha256=info.embedder_sha256, preprocessing=info.preprocessing, n=info.n
+    )
+    rows = np.stack([embed_file(models, photo, policy=face) for photo in photos])
+    try:
+        descriptor = mean_descriptor(rows, consistency=public.photo_consistency)
+    except InconsistentImages as error:
+        named = ", ".join(photos[index].name for index in error.photos)
+        raise CommandError(
+            f"these photos do not look like the same person: {named}; give photos of one person"
+        ) from None
+    with Keystream.fresh() as stream:
+        batch = lift_descriptors(
+            descriptor[None], strategy=binding.strategy, m=m, source=source, stream=stream
+        )
+    data = wire.encode(batch[0], contract_id=binding.contract_id)
+    warn_of_demo_model(info.embedder_sha256)
+    if str(out) == "-":
+        emit({"template": base64.b64encode(data).decode("ascii")})
+        return
+    write_private(out, data)
+    facts: dict[str, Any] = {
+        "out": str(out),
+        "bytes": len(data),
+        "kind": "probe" if probe else "enrollment",
+        "m": m,
+        "photos": len(photos),
+        "contract_id": binding.contract_id,
+    }
+    if as_json:
+        emit(facts)
+    else:
+        say(f"{out}: {facts['kind']} template of {len(photos)} photos, m = {m}, {len(data)} bytes.")
+
+
+def embed_file(pack: ModelPack, photo: Path, *, policy: FacePolicy) -> np.ndarray[Any, Any]:
+    """Embed one photo file; an error names the file. Returns float32 (n,), unit norm."""
+    data = read_bounded(photo, MAX_PHOTO_BYTES)
+    try:
+        return pack.embed_photo(data, policy=policy).embedding
+    except ModelError as error:
+        raise CommandError(f"{photo.name}: {error}") from None
+
+
+class PublicContract:
+    """What a client may know of a contract.
+
+    Parameters
+    ----------
+    document
+        The JSON object of ``GET /v1/contract``, or of the contract file.
+
+    Raises
+    ------
+    ContractError
+        It is no contract, or contradicts itself.
+    """
+
+    def __init__(self, document: dict[str, Any]) -> None:
+        self.binding = Binding.from_json(document.get("binding"))
+        if document.get("contract_id") != self.binding.contract_id:
+            raise ContractError("the contract_id is not the hash of the binding")
+        consistency = document.get("photo_consistency")
+        if not isinstance(consistency, int | float) or not -1 <= consistency <= 1:
+            raise ContractError("the contract lacks its photo_consistency")
+        self.photo_consistency = float(consistency)
+        entries = document.get("calibrations")
+        if not isinstance(entries, list) or not all(isinstance(each, dict) for each in entries):
+            raise ContractError("the contract lacks its calibrations")
+        self.probe_dimensions: list[int] = sorted(
+            {
+                int(each["probe_m"])
+                for each in entries
+                if each.get("mode") == "s2s" and isinstance(each.get("probe_m"), int)
+            }
+        )
+
+    def dimension(self, *, probe: bool, dim: int | None) -> int:
+        """Choose the dimension of the lift.
+
+        Raises
+        ------
+        UsageError
+            The contract does not take templates of the dimension.
+        """
+        if not probe:
+            if dim not in (None, self.binding.m):
+                raise UsageError(
+                    f"an enrollment under this contract has dimension {self.binding.m}; add "
+                    "--probe to make a probe of another one"
+                )
+            return self.binding.m
+        known = ", ".join(map(str, self.probe_dimensions))
+        if not self.probe_dimensions:
+            raise CommandError(
+                "the contract takes no lifted probes; calibrate it with --probe-dims"
+            )
+        if dim is None:
+            return self.probe_dimensions[-1]
+        if dim not in self.probe_dimensions:
+            raise UsageError(f"the contract takes lifted probes of dimension {known}, not {dim}")
+        return dim
+
+
+def read_contract(path: Path) -> PublicContract:
+    """Read the public part of a contract from a file."""
+    document = parse_object(read_bounded(path, MAX_CONTRACT_BYTES), what="the contract")
+    return PublicContract(dict(document))

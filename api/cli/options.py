@@ -1,0 +1,115 @@
+"""Options that several commands share, and settings as flags.
+
+A setting is declared once, in ``api.settings``. A command that takes settings names them, and
+gets one flag for each with the same help, and the :class:`Settings` that result.
+"""
+
+import functools
+import inspect
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any, ParamSpec, TypeVar
+
+import typer
+from pydantic.fields import FieldInfo
+
+from api.settings import CONFIG_VARIABLE, ENV_PREFIX, Settings, load_settings
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+STORE = ("data_dir", "database_url", "master_key_file")
+LOCAL = (*STORE, "contract_file", "decoys_file", "pack", "providers", "onnx_threads")
+
+AsJson = Annotated[
+    bool, typer.Option("--json", help="Write JSON to stdout; messages stay on stderr.")
+]
+Tenant = Annotated[
+    str | None,
+    typer.Option(help="Tenant. Unset: the setting `default_tenant`.", show_default=False),
+]
+
+
+def takes_settings(*names: str) -> Callable[[Callable[..., R]], Callable[..., R]]:
+    """Give a command a flag for each named setting, and ``--config``.
+
+    The command's parameter ``settings`` receives what flags, environment and TOML file say.
+    """
+
+    def decorate(command: Callable[..., R]) -> Callable[..., R]:
+        @functools.wraps(command)
+        def run(**given: Any) -> R:
+            flags = {name: given.pop(name) for name in names}
+            with configured_by(given.pop("config")):
+                return command(settings=load_settings(**flags), **given)
+
+        own = [p for p in inspect.signature(command).parameters.values() if p.name != "settings"]
+        flags = [_flag(name, Settings.model_fields[name]) for name in names]
+        parameters = [*own, _CONFIG, *flags]
+        keyword_only = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in parameters]
+        # Typer reads these two; the wrapped command would show it the parameter `settings`.
+        run.__signature__ = inspect.Signature(keyword_only)  # type: ignore[attr-defined]
+        run.__annotations__ = {p.name: p.annotation for p in keyword_only}
+        del run.__wrapped__
+        return run
+
+    return decorate
+
+
+@contextmanager
+def configured_by(file: Path | None) -> Iterator[None]:
+    """Let the TOML file named on the command line win over ``VEILFACE_CONFIG``.
+
+    The variable stays set while the command runs: the workers of ``serve`` read it too.
+    """
+    before = os.environ.get(CONFIG_VARIABLE)
+    if file is not None:
+        os.environ[CONFIG_VARIABLE] = str(file)
+    try:
+        yield
+    finally:
+        if file is not None:
+            if before is None:
+                del os.environ[CONFIG_VARIABLE]
+            else:
+                os.environ[CONFIG_VARIABLE] = before
+
+
+_CONFIG = inspect.Parameter(
+    "config",
+    inspect.Parameter.KEYWORD_ONLY,
+    default=None,
+    annotation=Annotated[
+        Path | None,
+        typer.Option(
+            help=f"TOML file with settings. Unset: `{CONFIG_VARIABLE}`, then `veilface.toml`.",
+            rich_help_panel="Settings",
+            show_default=False,
+        ),
+    ],
+)
+_KINDS: dict[Any, Any] = {Path: Path, int: int, bool: bool, Path | None: Path}
+
+
+def _flag(name: str, declared: FieldInfo) -> inspect.Parameter:
+    shown = "" if declared.default is None else f" Default: `{_shown(declared.default)}`."
+    flag = name.replace("_", "-")
+    kind = _KINDS.get(declared.annotation, str)
+    option = typer.Option(
+        f"--{flag}/--no-{flag}" if kind is bool else f"--{flag}",
+        help=f"{declared.description}{shown} Variable: `{ENV_PREFIX}{name.upper()}`.",
+        rich_help_panel="Settings",
+        show_default=False,
+    )
+    return inspect.Parameter(
+        name,
+        inspect.Parameter.KEYWORD_ONLY,
+        default=None,
+        annotation=Annotated[kind | None, option],
+    )
+
+
+def _shown(value: Any) -> str:
+    return ",".join(value) if isinstance(value, tuple) else str(value)

@@ -1,0 +1,168 @@
+"""``veilface enroll`` and ``veilface verify``: on this machine, against the store itself."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from api.cli.console import emit, say, warn_of_demo_model
+from api.cli.errors import CommandError, UsageError
+from api.cli.files import read_bounded
+from api.cli.options import LOCAL, AsJson, Tenant, takes_settings
+from api.runtime import Runtime
+from api.settings import Settings
+from enroll.enroller import MAX_PHOTOS
+from enroll.errors import InconsistentImages, PhotoRejected
+from models.errors import ModelError
+from models.pack import FacePolicy
+from templates.decoys import Attributes
+from templates.store.subjects import Source
+
+Subject = Annotated[str, typer.Argument(help="Name of the person.", show_default=False)]
+Face = Annotated[
+    FacePolicy,
+    typer.Option(help="What a photo with several faces means: an error, or the largest."),
+]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+    app.command()(enroll)
+    app.command()(verify)
+
+
+@takes_settings(*LOCAL)
+def enroll(
+    subject: Subject,
+    photos: Annotated[
+        list[Path],
+        typer.Argument(help=f"1 to {MAX_PHOTOS} photos of that person.", show_default=False),
+    ],
+    *,
+    settings: Settings,
+    gender: Annotated[
+        str | None,
+        typer.Option(help="For a hybrid+ contract: used for lifting, never stored."),
+    ] = None,
+    race: Annotated[
+        str | None,
+        typer.Option(help="For a hybrid+ contract: used for lifting, never stored."),
+    ] = None,
+    tenant: Tenant = None,
+    face: Face = FacePolicy.SINGLE,
+    as_json: AsJson = False,
+) -> None:
+    """Enroll a person from photos, or replace the enrollment.
+
+    Needs: what `serve` needs (contract, decoys, pack); the service may run meanwhile. All photos
+    must show one and the same person. Only the private template is stored.
+
+    Example: `veilface enroll alice alice-1.jpg alice-2.jpg alice-3.jpg --pack buffalo_l`
+    """
+    if len(photos) > MAX_PHOTOS:
+        raise UsageError(f"an enrollment has 1 to {MAX_PHOTOS} photos, not {len(photos)}")
+    data = [read_bounded(photo, settings.max_image_bytes) for photo in photos]
+    runtime = Runtime.open(settings)
+    try:
+        _require_pack(runtime)
+        name = _tenant(runtime, tenant)
+        epoch = runtime.epoch(name)
+        try:
+            enrollment = runtime.enroll_photos(
+                name, epoch, data, policy=face, attributes=Attributes(gender, race)
+            )
+        except PhotoRejected as error:
+            raise CommandError(f"{photos[error.index].name}: {error.cause}") from None
+        except InconsistentImages as error:
+            differing = ", ".join(photos[index].name for index in error.photos)
+            raise CommandError(
+                f"these photos do not look like the same person: {differing}; give clear photos "
+                "of one person"
+            ) from None
+        stored = runtime.put(
+            name, subject, epoch, enrollment, source=Source.PHOTOS, photos=len(photos)
+        )
+        warn_of_demo_model(runtime.contract.binding.embedder_sha256)
+    finally:
+        runtime.close()
+    if as_json:
+        emit(
+            {
+                "subject_id": subject,
+                "tenant": name,
+                "template_id": stored.template_id,
+                "contract_id": enrollment.contract_id,
+                "replaced": not stored.created,
+                "photos": len(photos),
+            }
+        )
+    else:
+        done = "Enrolled" if stored.created else "Replaced the enrollment of"
+        say(f"{done} {subject} from {len(photos)} photos; stored {len(enrollment.wire)} bytes.")
+
+
+@takes_settings(*LOCAL)
+def verify(
+    subject: Subject,
+    photo: Annotated[Path, typer.Argument(help="The photo to check.", show_default=False)],
+    *,
+    settings: Settings,
+    level: Annotated[
+        str | None,
+        typer.Option(help="Security level. Unset: the contract's default.", show_default=False),
+    ] = None,
+    tenant: Tenant = None,
+    face: Face = FacePolicy.SINGLE,
+    as_json: AsJson = False,
+) -> None:
+    """Check whether a photo shows a person; exit status 0 accept, 1 reject.
+
+    Needs: what `serve` needs; the service may run meanwhile. Status 1 with a message that starts
+    with `error:` means that no decision was made.
+
+    Example: `veilface verify alice today.jpg --pack buffalo_l --level fmr-1e-4`
+    """
+    data = read_bounded(photo, settings.max_image_bytes)
+    runtime = Runtime.open(settings)
+    try:
+        _require_pack(runtime)
+        name = _tenant(runtime, tenant)
+        found = runtime.store.get(name, subject)
+        if found is None:
+            raise CommandError(f"tenant {name} has no subject of that name; enroll it first")
+        try:
+            embedding = runtime.embed(data, policy=face).embedding
+        except ModelError as error:
+            raise CommandError(f"{photo.name}: {error}") from None
+        verifier = runtime.verifier(name, found.record.rotation_epoch)
+        decision = verifier.decide_embedding(embedding, found.wire, level=level)
+        warn_of_demo_model(runtime.contract.binding.embedder_sha256)
+    finally:
+        runtime.close()
+    answer: dict[str, Any] = {
+        "decision": "accept" if decision.accepted else "reject",
+        "reason": decision.reason,
+        "level": decision.level,
+        "fmr": decision.fmr,
+        "contract_id": decision.contract_id,
+        "calibration_id": decision.calibration_id,
+    }
+    if as_json:
+        emit(answer)
+    else:
+        say(f"{answer['decision']}: {subject}, level {decision.level}, FMR {decision.fmr:g}")
+    if not decision.accepted:
+        raise typer.Exit(1)
+
+
+def _require_pack(runtime: Runtime) -> None:
+    if runtime.pack is None:
+        raise UsageError("photos need a model pack; name it with --pack")
+
+
+def _tenant(runtime: Runtime, named: str | None) -> str:
+    """Choose the tenant; only the default one is made where it is missing."""
+    name = named or runtime.settings.default_tenant
+    if name == runtime.settings.default_tenant:
+        return runtime.store.tenants.create(name).name
+    return runtime.store.tenants.get(name).name

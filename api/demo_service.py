@@ -1,0 +1,74 @@
+"""``veilface serve`` as a process of its own, for the demo."""
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+
+from api.errors import StartError
+
+START_TIMEOUT_S = 40.0
+
+
+@contextlib.contextmanager
+def running_service(folder: Path) -> Iterator[httpx.Client]:
+    """Start ``veilface serve`` on a free local port; a client with the bootstrap key."""
+    port = _free_port()
+    log, shown = folder / "serve.log", folder / "serve.out"
+    command = [sys.executable, "-m", "api.cli", "serve", "--config", str(folder / "veilface.toml")]
+    # Settings of the person who runs the demo must not reach it.
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("VEILFACE_")}
+    with log.open("wb") as errors, shown.open("wb") as output:
+        process = subprocess.Popen(  # noqa: S603 - our own command, no shell
+            [*command, "--port", str(port)],
+            stdout=output,
+            stderr=errors,
+            env={**environment, "PYTHONUNBUFFERED": "1"},
+        )
+        try:
+            url = f"http://127.0.0.1:{port}"
+            _await_ready(process, url, log)
+            token = next(line for line in shown.read_text().splitlines() if line.startswith("vf_"))
+            shown.unlink()
+            _write_token(folder / "api-key", token)
+            headers = {"Authorization": f"Bearer {token}"}
+            with httpx.Client(base_url=url, headers=headers, timeout=30.0) as client:
+                yield client
+        finally:
+            process.send_signal(signal.SIGTERM)
+            try:
+                process.wait(timeout=20)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def _await_ready(process: "subprocess.Popen[bytes]", url: str, log: Path) -> None:
+    deadline = time.monotonic() + START_TIMEOUT_S
+    while time.monotonic() < deadline:
+        if process.poll() is not None:
+            raise StartError(f"the service stopped at its start; {log} says why")
+        with contextlib.suppress(httpx.TransportError):
+            if httpx.get(f"{url}/health/ready", timeout=2.0).status_code == httpx.codes.OK:
+                return
+        time.sleep(0.1)
+    raise StartError(f"the service was not ready in {START_TIMEOUT_S:.0f} s; {log} says why")
+
+
+def _write_token(path: Path, token: str) -> None:
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    with os.fdopen(descriptor, "w") as file:
+        file.write(token + "\n")

@@ -1,0 +1,155 @@
+"""From folders of photos to what ``serve`` loads: the decoy source and the contract.
+
+The commands ``decoys build`` and ``calibrate`` and the demo are callers of these functions.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from models.extraction import Extraction
+from models.pack import ModelPack
+from templates.canonical import Json
+from templates.contract import Binding
+from templates.decoys import Attributes, DecoyGenerator, DecoyPool, DecoySource
+from templates.errors import VeilfaceError
+from templates.lifting import Strategy
+from templates.rotation import ROTATION_VERSION
+from verify import Calibrated, CalibrationOptions, LabelledFolder, calibrate, read_lfw_pairs
+
+Advance = Callable[[int], None]
+
+
+class PreparationError(VeilfaceError):
+    """The photos do not suffice for what is to be made of them."""
+
+
+@dataclass(frozen=True)
+class Acquisition:
+    """How many photos gave a descriptor, and why the others did not (failure to acquire).
+
+    Parameters
+    ----------
+    photos
+        Photos that were tried.
+    failures
+        Count by reason: a code such as ``no_face``.
+    """
+
+    photos: int
+    failures: Mapping[str, int]
+
+    @classmethod
+    def of(cls, extraction: Extraction) -> "Acquisition":
+        """Count the failures of an extraction."""
+        reasons = Counter(failure.code for failure in extraction.failures)
+        return cls(
+            photos=len(extraction.paths) + len(extraction.failures),
+            failures=dict(sorted(reasons.items())),
+        )
+
+    @property
+    def failed(self) -> int:
+        """Photos without a descriptor."""
+        return sum(self.failures.values())
+
+    def to_json(self) -> dict[str, Json]:
+        """JSON form."""
+        return {"photos": self.photos, "failed": self.failed, "reasons": dict(self.failures)}
+
+    def __str__(self) -> str:
+        reasons = ", ".join(f"{count} {code}" for code, count in self.failures.items())
+        return f"{self.failed} of {self.photos} photos failed to acquire" + (
+            f" ({reasons})" if reasons else ""
+        )
+
+
+def make_generator(extraction: Extraction) -> DecoyGenerator:
+    """Fit the generator of decoys that belong to nobody."""
+    return DecoyGenerator.fit(extraction.descriptors)
+
+
+def make_pool(extraction: Extraction, labels: Mapping[Path, Attributes] | None) -> DecoyPool:
+    """Make a pool of real descriptors, labelled where labels are given.
+
+    Raises
+    ------
+    PreparationError
+        A photo has no label: hybrid+ could not tell what it is.
+    """
+    if labels is None:
+        return DecoyPool(extraction.descriptors)
+    found = [labels.get(path.resolve()) for path in extraction.paths]
+    missing = [path.name for path, label in zip(extraction.paths, found, strict=True) if not label]
+    if missing:
+        raise PreparationError(
+            f"{len(missing)} photos have no label, the first is {missing[0]}; give the label file "
+            "of this folder, or leave those photos out"
+        )
+    return DecoyPool(extraction.descriptors, labels=[label for label in found if label])
+
+
+def binding_for(pack: ModelPack, source: DecoySource, *, strategy: Strategy, m: int) -> Binding:
+    """Bind a pack, a decoy source and a way of lifting."""
+    info = pack.info
+    return Binding(
+        embedder_sha256=info.embedder_sha256,
+        preprocessing=info.preprocessing,
+        n=info.n,
+        strategy=strategy,
+        m=m,
+        decoy_source_id=source.source_id,
+        rotation_version=ROTATION_VERSION,
+    )
+
+
+def calibrate_folder(
+    folder: LabelledFolder,
+    extraction: Extraction,
+    *,
+    pack: ModelPack,
+    source: DecoySource,
+    strategy: Strategy,
+    m: int,
+    options: CalibrationOptions,
+    exclude: Collection[str] = (),
+    aliases: Mapping[str, str] | None = None,
+    progress: Callable[[str, float], None] | None = None,
+) -> Calibrated:
+    """Calibrate on the descriptors of a labelled folder.
+
+    LFW's own pairs are used for the ten-fold protocol where ``pairs.txt`` lies in the folder.
+    """
+    name_of = dict(zip(folder.paths, folder.identities, strict=True))
+    pairs_file = folder.root / "pairs.txt"
+    pairs = None
+    if options.protocol == "ten-fold" and pairs_file.is_file():
+        missing = [failure.path for failure in extraction.failures]
+        pairs = read_lfw_pairs(pairs_file, extraction.paths, missing=missing)
+    more: dict[str, Any] = {} if progress is None else {"progress": progress}
+    return calibrate(
+        extraction.descriptors,
+        [name_of[path] for path in extraction.paths],
+        binding=binding_for(pack, source, strategy=strategy, m=m),
+        source=source,
+        options=options,
+        exclude=exclude,
+        aliases=aliases,
+        pairs=pairs,
+        recorded=recorded_of(pack),
+        dataset=folder.root.resolve().name,
+        **more,
+    )
+
+
+def recorded_of(pack: ModelPack) -> dict[str, Json]:
+    """Facts that a contract records without binding them."""
+    detector = pack.info.detector
+    facts: dict[str, Json] = {"pack": pack.info.name}
+    if detector is not None:
+        facts["detector"] = detector.kind
+        facts["detector_sha256"] = detector.sha256
+        facts["detector_input_size"] = list(detector.input_size)
+    return facts
