@@ -1,0 +1,90 @@
+"""Synthetic people: descriptors that cluster by person, and contracts calibrated on them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from templates.contract import Binding
+from templates.decoys import DecoyGenerator, DecoyPool
+from templates.lifting import Strategy
+from templates.rotation import ROTATION_VERSION
+from verify import Calibrated, CalibrationOptions, calibrate
+
+N = 64
+M = 6
+
+
+@dataclass(frozen=True, eq=False)
+class People:
+    """Unit descriptors (K, n), and K names."""
+
+    descriptors: NDArray[np.float32]
+    names: list[str]
+
+
+def unit(rows: NDArray[np.floating]) -> NDArray[np.float32]:
+    return np.asarray(rows / np.linalg.norm(rows, axis=-1, keepdims=True), dtype=np.float32)
+
+
+def draw_people(
+    count: int,
+    *,
+    photos: tuple[int, ...] = (4, 1, 3),
+    n: int = N,
+    noise: float = 0.5,
+    seed: int = 0,
+) -> People:
+    """Draw ``count`` people; person i has ``photos[i % len(photos)]`` photos."""
+    rng = np.random.default_rng(seed)
+    owner = np.repeat(np.arange(count), [photos[i % len(photos)] for i in range(count)])
+    centres = unit(rng.normal(size=(count, n)))
+    rows = unit(centres[owner] + noise * unit(rng.normal(size=(len(owner), n))))
+    return People(rows, [f"person-{seed}-{i:04d}" for i in owner])
+
+
+def make_generator(n: int = N) -> DecoyGenerator:
+    return DecoyGenerator.fit(draw_people(400, photos=(1,), n=n, seed=101).descriptors)
+
+
+def make_pool(n: int = N) -> DecoyPool:
+    return DecoyPool(draw_people(400, photos=(1,), n=n, seed=101).descriptors)
+
+
+def make_binding(
+    source_id: str, *, strategy: Strategy = Strategy.ADVERSARIAL, m: int = M
+) -> Binding:
+    return Binding(
+        embedder_sha256="ab" * 32,
+        preprocessing={"size": 112, "mean": [127.5, 127.5, 127.5], "flip": False},
+        n=N,
+        strategy=strategy,
+        m=m,
+        decoy_source_id=source_id,
+        rotation_version=ROTATION_VERSION,
+    )
+
+
+def calibrate_people(
+    people: People,
+    *,
+    options: CalibrationOptions | None = None,
+    strategy: Strategy = Strategy.ADVERSARIAL,
+) -> Calibrated:
+    source = make_generator()
+    return calibrate(
+        people.descriptors,
+        people.names,
+        binding=make_binding(source.source_id, strategy=strategy),
+        source=source,
+        options=options
+        or CalibrationOptions(
+            probe_dims=(0, 2), lifted_probes=300, lifted_impostor_pairs=30_000, steps=20
+        ),
+    )
+
+
+def random_rotation(n: int = N, seed: int = 5) -> NDArray[np.float64]:
+    """Haar-distributed orthogonal matrix, by QR."""
+    q, r = np.linalg.qr(np.random.default_rng(seed).normal(size=(n, n)))
+    return np.asarray(q * np.sign(np.diagonal(r)))

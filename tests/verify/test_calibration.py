@@ -1,0 +1,303 @@
+"""Calibration against brute force, and against people that it has not seen."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from enroll import Enroller
+from templates import wire
+from templates.contract import Contract
+from templates.errors import ContractError, ContractMismatch, InvalidEmbedding
+from templates.randomness import Keystream
+from templates.subspace import SubspaceBatch
+from tests.verify.synthetic import (
+    People,
+    calibrate_people,
+    draw_people,
+    make_binding,
+    make_generator,
+    make_pool,
+    random_rotation,
+)
+from verify import Calibrated, CalibrationOptions, Verifier, calibrate
+from verify.calibration_mode import ACCURACY_LEVEL
+from verify.cohort import client_source, make_cohort
+from verify.comparisons import Lifter, honest_norms, point_trials, through_wire
+from verify.trials import enrolled_means, plan_trials
+
+
+def spherical(
+    probe: NDArray[np.floating], foot: NDArray[np.floating], basis: NDArray[np.floating]
+) -> float:
+    """Similarity of METHOD §3 in float64: e·p + s‖D e‖."""
+    e, p, d = (array.astype(np.float64) for array in (probe, foot, basis))
+    return float(e @ p + np.sqrt(1 - p @ p) * np.linalg.norm(d @ e))
+
+
+def test_point_trials_agree_with_brute_force() -> None:
+    people = draw_people(12)
+    source = make_generator()
+    rng = np.random.default_rng(0)
+    plan = plan_trials(people.names, photos_per_enrollment=3, rng=rng)
+    lifter = Lifter(make_binding(source.source_id).strategy, source, "0" * 64)
+    with Keystream.seeded("test") as stream:
+        templates = lifter.lift(enrolled_means(people.descriptors, plan), m=6, stream=stream)
+        cohort = make_cohort(source, strategy=lifter.strategy, m=6, stream=stream, size=10)
+    options = CalibrationOptions()
+    impostors, genuine = point_trials(
+        people.descriptors,
+        plan,
+        templates,
+        cohort,
+        metric=options.metric,
+        steps=options.steps,
+        most_cells=10**6,
+        rng=rng,
+        progress=lambda _what, _share: None,
+    )
+    expected, expected_z, seen = [], [], []
+    for photo, descriptor in enumerate(people.descriptors):
+        crowd = [spherical(descriptor, t.foot, t.basis) for t in cohort]
+        for person, template in enumerate(templates):
+            score = spherical(descriptor, template.foot, template.basis)
+            if person != plan.person_of[photo]:
+                expected.append(score)
+                expected_z.append((score - np.mean(crowd)) / np.std(crowd, ddof=1))
+                seen.append((plan.person_of[photo], person))
+    cells = np.flatnonzero(np.isfinite(impostors.similarities))
+    assert impostors.trials == len(cells) == len(expected)
+    np.testing.assert_allclose(impostors.similarities[cells], expected, atol=2e-6)
+    np.testing.assert_allclose(impostors.cohort_scores[cells], expected_z, atol=2e-4)
+    np.testing.assert_array_equal(impostors.people_of(cells), seen)
+    assert impostors.person_pairs == 12 * 11 // 2
+    weights = rng.integers(0, 4, 12).astype(float)
+    total = sum(weights[a] * weights[b] for a, b in seen)
+    assert impostors.weighted_trials(weights) == pytest.approx(total)
+    own = [
+        spherical(people.descriptors[photo], templates[person].foot, templates[person].basis)
+        for photo, person in zip(plan.genuine, plan.person_of[plan.genuine], strict=True)
+    ]
+    np.testing.assert_allclose(genuine.similarities, own, atol=2e-6)
+    np.testing.assert_array_equal(genuine.people, plan.person_of[plan.genuine])
+
+
+def test_bounded_memory_takes_a_subset_of_the_probes() -> None:
+    people = draw_people(20)
+    options = CalibrationOptions(most_cells=20 * 30, targets=(1e-1,))
+    contract = calibrate_people(people, options=options).contract
+    facts = contract.calibrations[0].calibrated_on
+    assert facts["impostor_trials"] == 30 * 19
+    total = len(people.names) * 19
+    assert facts["impostor_sample"] == f"random subset of {total} cross-identity pairs"
+
+
+def test_levels_fall_to_the_smallest_that_the_data_resolve(calibrated: Calibrated) -> None:
+    point, lifted = calibrated.contract.calibrations
+    facts = point.calibrated_on
+    # 150 people give 400 photos, and 400 x 149 impostor trials of 150 x 149 / 2 pairs.
+    assert (facts["photos"], facts["impostor_trials"]) == (400, 400 * 149)
+    assert facts["impostor_sample"] == "all cross-identity pairs"
+    assert facts["genuine_trials"] == 50 * (4 - 3) + 50 * (3 - 2)
+    assert [level.name for level in point.levels] == ["fmr-1e-2", "fmr-1e-3"]
+    assert (lifted.mode, lifted.probe_m) == ("s2s", 2)
+    assert any("raw probes: FMR 0.0001 is not resolved" in s for s in calibrated.report.unresolved)
+    for calibration in (point, lifted):
+        for level in calibration.levels:
+            assert level.target_fmr is not None
+            assert 0.9 * level.target_fmr <= level.fmr.value <= level.target_fmr
+            assert level.fmr.ci_low < level.fmr.value < level.fmr.ci_high
+        thresholds = [level.similarity_threshold for level in calibration.levels]
+        assert thresholds == sorted(thresholds)
+    assert calibrated.contract.default_level == "fmr-1e-3"
+
+
+def service_outcomes(
+    contract: Contract, people: People, *, level: str
+) -> tuple[list[bool], list[bool]]:
+    """Enroll and verify as the service does, with a rotation; accepted genuine and impostors."""
+    rotation = random_rotation()
+    enroller = Enroller(contract, make_generator(), rotation=rotation)
+    verifier = Verifier(contract, rotation=rotation)
+    names = sorted(set(people.names))
+    photos = {n: [i for i, own in enumerate(people.names) if own == n] for n in names}
+    stored = {n: enroller.from_embeddings(people.descriptors[photos[n][:3]]).wire for n in names}
+    genuine, impostor = [], []
+    for probe_name in names:
+        probe = people.descriptors[photos[probe_name][3]]
+        for name in names:
+            accepted = verifier.decide_embedding(probe, stored[name], level=level).accepted
+            (genuine if name == probe_name else impostor).append(accepted)
+    return genuine, impostor
+
+
+def test_thresholds_hold_for_people_that_calibration_has_not_seen(calibrated: Calibrated) -> None:
+    relaxed = replace(calibrated.contract, photo_consistency=-1.0)
+    genuine, impostor = service_outcomes(
+        relaxed, draw_people(40, photos=(4,), seed=77), level="fmr-1e-2"
+    )
+    # 1,560 attempts at 1e-2: 15.6 expected; 40 is six standard deviations away.
+    assert 0 < sum(impostor) <= 40
+    assert sum(genuine) >= 38
+
+
+def test_recalibration_keeps_the_contract_and_its_cohort(
+    people: People, calibrated: Calibrated
+) -> None:
+    source = make_generator()
+    again = calibrate(
+        people.descriptors,
+        people.names,
+        binding=calibrated.contract.binding,
+        source=source,
+        cohort=calibrated.contract.cohort,
+        options=CalibrationOptions(seed=1),
+    ).contract
+    assert again.contract_id == calibrated.contract.contract_id
+    assert again.cohort_id == calibrated.contract.cohort_id
+    assert (
+        again.calibrations[0].calibration_id != calibrated.contract.calibrations[0].calibration_id
+    )
+
+
+def test_the_cohort_is_new_every_time_and_the_rest_follows_the_seed() -> None:
+    people = draw_people(30)
+    options = CalibrationOptions(targets=(1e-1, 1e-2))
+    first, second = (calibrate_people(people, options=options).contract for _ in range(2))
+    assert first.cohort_id != second.cohort_id
+    assert first.template_foot_point_norm == second.template_foot_point_norm
+    assert first.photo_consistency == second.photo_consistency
+
+
+def test_excluded_people_are_left_out(people: People) -> None:
+    source = make_generator()
+    result = calibrate(
+        people.descriptors,
+        people.names,
+        binding=make_binding(source.source_id),
+        source=source,
+        exclude=set(people.names[:40]),
+    )
+    facts = result.contract.calibrations[0].calibrated_on
+    gone = set(people.names[:40])
+    assert facts["excluded_photos"] == sum(name in gone for name in people.names)
+    assert facts["people"] == 150 - len(gone)
+
+
+def test_one_person_under_two_names_is_reported_and_can_be_merged() -> None:
+    people = draw_people(40, photos=(3,), noise=0.3)
+    split = ["second name" if i == 0 else name for i, name in enumerate(people.names)]
+    source = make_generator()
+    options = CalibrationOptions(targets=(1e-1,), suspicious_above=0.7)
+
+    def run(aliases: dict[str, str]) -> Calibrated:
+        return calibrate(
+            people.descriptors,
+            split,
+            binding=make_binding(source.source_id),
+            source=source,
+            options=options,
+            aliases=aliases,
+        )
+
+    found = run({}).report.suspicious
+    assert {found[0].first, found[0].second} == {"second name", people.names[0]}
+    assert not run({"second name": people.names[0]}).report.suspicious
+
+
+def test_ten_fold_adds_the_accuracy_level(people: People) -> None:
+    options = CalibrationOptions(protocol="ten-fold", probe_dims=(0,))
+    result = calibrate_people(people, options=options)
+    calibration = result.contract.calibrations[0]
+    level = calibration.level(ACCURACY_LEVEL)
+    (folds,) = result.report.ten_folds
+    assert level.target_fmr is None
+    assert level.similarity_threshold == pytest.approx(np.mean(folds.thresholds))
+    assert calibration.calibrated_on["ten_fold_accuracy"] == pytest.approx(folds.accuracy_mean)
+    assert folds.accuracy_mean > 0.95
+    # Same marginal quantile: the cohort test alone accepts as many as the similarity alone would,
+    # so the joint rate is that of neither.
+    other = calibration.level("fmr-1e-2")
+    stricter = level.similarity_threshold > other.similarity_threshold
+    assert (level.cohort_threshold > other.cohort_threshold) == stricter
+    assert (level.fmr.value < other.fmr.value) == stricter
+
+
+def test_a_pool_contract_calibrates_and_its_clients_get_a_generator() -> None:
+    pool = make_pool()
+    generator = client_source(pool)
+    assert generator.source_id == client_source(pool).source_id
+    assert generator.source_id != pool.source_id
+    decoys = generator.draw(1, 50, stream=Keystream.seeded("x"))[0]
+    entries = pool.draw(1, len(pool), stream=Keystream.seeded("y"))[0]
+    assert (decoys @ entries.T).max() < 0.95  # none of the pool's people is among them
+    people = draw_people(30)
+    from templates.lifting import Strategy
+
+    contract = calibrate(
+        people.descriptors,
+        people.names,
+        binding=make_binding(pool.source_id, strategy=Strategy.SUB_HYBRID),
+        source=pool,
+        options=CalibrationOptions(
+            targets=(1e-1,), probe_dims=(0, 2), lifted_probes=40, lifted_impostor_pairs=800, steps=5
+        ),
+    ).contract
+    assert [entry.mode for entry in contract.calibrations] == ["p2s", "s2s"]
+
+
+def test_honest_norms_widen_the_observed_range_and_stay_positive() -> None:
+    low, high = honest_norms(np.array([0.3, 0.35, 0.4]))
+    assert (low, high) == pytest.approx((0.25, 0.45))
+    low, high = honest_norms(np.array([0.01, 0.99]))
+    assert (low, high) == pytest.approx((0.005, 1.0))
+
+
+def test_the_wire_changes_scores_by_less_than_a_thousandth() -> None:
+    source = make_generator()
+    people = draw_people(20, photos=(1,))
+    lifter = Lifter(make_binding(source.source_id).strategy, source, "0" * 64)
+    with Keystream.seeded("wire") as stream:
+        cohort = make_cohort(source, strategy=lifter.strategy, m=6, stream=stream, size=20)
+    sent = through_wire(cohort, contract_id="0" * 64)
+    for before, after in zip(cohort, sent, strict=True):
+        for probe in people.descriptors[:5]:
+            change = spherical(probe, before.foot, before.basis) - spherical(
+                probe, after.foot, after.basis
+            )
+            assert abs(change) < 1e-3
+    data = wire.encode(cohort[0], contract_id="0" * 64, dtype="float16")
+    np.testing.assert_array_equal(wire.decode(data).subspace.foot, sent[0].foot)
+
+
+def test_what_does_not_fit_is_refused(people: People) -> None:
+    source = make_generator()
+    binding = make_binding(source.source_id)
+    with pytest.raises(ContractMismatch, match="decoy source"):
+        calibrate(people.descriptors, people.names, binding=make_binding("0" * 64), source=source)
+    with pytest.raises(ContractError, match="shape"):
+        calibrate(people.descriptors, people.names[:-1], binding=binding, source=source)
+    with pytest.raises(ContractError, match="two people"):
+        calibrate(people.descriptors, ["one"] * len(people.names), binding=binding, source=source)
+    with pytest.raises(ContractError, match="resolve no level"):
+        calibrate(people.descriptors[:8], people.names[:8], binding=binding, source=source)
+    with pytest.raises(InvalidEmbedding):
+        calibrate(2 * people.descriptors, people.names, binding=binding, source=source)
+
+
+def test_lifted_probes_have_recorded_foot_point_norms(calibrated: Calibrated) -> None:
+    _, lifted = calibrated.contract.calibrations
+    assert lifted.foot_point_norm is not None
+    low, high = lifted.foot_point_norm
+    source = make_generator()
+    from templates.lifting import lift
+
+    probes: SubspaceBatch = lift(
+        draw_people(200, photos=(1,), seed=31).descriptors,
+        strategy=calibrated.contract.binding.strategy,
+        m=2,
+        source=source,
+        stream=Keystream.seeded("norms"),
+    )
+    assert ((probes.foot_norms > low) & (probes.foot_norms < high)).all()

@@ -1,0 +1,109 @@
+from pathlib import Path
+
+import pytest
+
+from verify import DatasetError, labelled_folder, read_lfw_pairs
+from verify.tenfold import FOLDS
+
+
+def make_folder(root: Path, photos: dict[str, int]) -> Path:
+    for name, count in photos.items():
+        (root / name).mkdir(parents=True)
+        for i in range(1, count + 1):
+            (root / name / f"{name}_{i:04d}.jpg").write_bytes(b"not opened here")
+    return root
+
+
+def test_people_and_photos_are_listed_in_order(tmp_path: Path) -> None:
+    root = make_folder(tmp_path, {"Bob": 2, "Ann": 1})
+    (root / "pairs.txt").write_text("x")
+    (root / ".DS_Store").write_text("x")
+    (root / "Ann" / "notes.txt").write_text("x")
+    folder = labelled_folder(root)
+    assert folder.identities == ("Ann", "Bob", "Bob")
+    assert [path.name for path in folder.paths] == ["Ann_0001.jpg", "Bob_0001.jpg", "Bob_0002.jpg"]
+    assert folder.ignored == ("Ann/notes.txt", "pairs.txt")
+    assert (len(folder), folder.people) == (3, 2)
+
+
+def test_all_faults_are_listed_at_once(tmp_path: Path) -> None:
+    root = make_folder(tmp_path, {"Bob": 1, "Nobody": 0})
+    (root / "stray.png").write_bytes(b"")
+    (root / "Bob" / "more").mkdir()
+    with pytest.raises(DatasetError) as caught:
+        labelled_folder(root)
+    text = str(caught.value)
+    assert "3 fault(s)" in text
+    assert "stray.png" in text
+    assert "Nobody holds no photo" in text
+    assert "Bob/more is a folder" in text
+
+
+@pytest.mark.parametrize("kind", ["absent", "file", "empty"])
+def test_what_is_no_labelled_folder_is_refused(tmp_path: Path, kind: str) -> None:
+    root = tmp_path / "root"
+    if kind == "file":
+        root.write_text("x")
+    if kind == "empty":
+        root.mkdir()
+    with pytest.raises(DatasetError, match="root/Person/photo"):
+        labelled_folder(root)
+
+
+def pairs_text(*, separator: str = "\t") -> str:
+    fold = [separator.join(["Ann", "1", "2"]), separator.join(["Ann", "1", "Bob", "3"])]
+    return "\n".join([f"10{separator}1", *fold * FOLDS]) + "\n"
+
+
+@pytest.mark.parametrize("separator", ["\t", " "])
+def test_lfw_pairs_become_positions(tmp_path: Path, separator: str) -> None:
+    folder = labelled_folder(make_folder(tmp_path / "faces", {"Ann": 2, "Bob": 3}))
+    file = tmp_path / "pairs.txt"
+    file.write_text(pairs_text(separator=separator))
+    pairs = read_lfw_pairs(file, folder.paths)
+    assert len(pairs) == 2 * FOLDS
+    assert [pair.fold for pair in pairs] == [k // 2 for k in range(2 * FOLDS)]
+    assert (pairs[0].first, pairs[0].second, pairs[0].same) == (0, 1, True)
+    assert (pairs[1].first, pairs[1].second, pairs[1].same) == (0, 4, False)
+
+
+def test_pairs_of_photos_without_a_descriptor_are_left_out(tmp_path: Path) -> None:
+    folder = labelled_folder(make_folder(tmp_path / "faces", {"Ann": 2, "Bob": 3}))
+    file = tmp_path / "pairs.txt"
+    file.write_text(pairs_text())
+    found, failed = folder.paths[:4], folder.paths[4:]
+    pairs = read_lfw_pairs(file, found, missing=failed)
+    assert len(pairs) == FOLDS
+    assert all(pair.same for pair in pairs)
+    with pytest.raises(DatasetError, match="Bob/Bob_0003, which is not there"):
+        read_lfw_pairs(file, found)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "does not begin with"),
+        ("10\n", "does not begin with"),
+        ("ten\t300\n", "does not begin with"),
+        ("5\t1\n", "has 5 folds"),
+        ("10\t1\nAnn\t1\t2\n", "promises 20 pairs and holds 1"),
+        (pairs_text().replace("Ann\t1\t2", "Ann\t1", 1), "line 2 is not of the form Name i j"),
+        (pairs_text().replace("Bob\t3", "Bob\tx", 1), "line 3 is not of the form NameA"),
+    ],
+)
+def test_broken_pairs_are_refused_by_line(tmp_path: Path, text: str, message: str) -> None:
+    folder = labelled_folder(make_folder(tmp_path / "faces", {"Ann": 2, "Bob": 3}))
+    file = tmp_path / "pairs.txt"
+    file.write_text(text)
+    with pytest.raises(DatasetError, match=message):
+        read_lfw_pairs(file, folder.paths)
+
+
+def test_the_real_lfw_protocol(lfw_aligned: Path) -> None:
+    folder = labelled_folder(lfw_aligned)
+    assert (len(folder), "pairs.txt" in folder.ignored) == (7701, True)
+    pairs = read_lfw_pairs(lfw_aligned / "pairs.txt", folder.paths)
+    assert len(pairs) == 6000
+    assert sum(pair.same for pair in pairs) == 3000
+    for pair in pairs:
+        assert (folder.identities[pair.first] == folder.identities[pair.second]) == pair.same

@@ -1,0 +1,65 @@
+import numpy as np
+import pytest
+
+from tests.verify.synthetic import draw_people
+from verify import raw_pairs
+from verify.raw_pairs import consistency_threshold, suspicious_pairs
+
+
+@pytest.fixture(autouse=True)
+def _small_tiles(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(raw_pairs, "TILE", 7)
+
+
+def brute_force(descriptors: np.ndarray, person_of: np.ndarray) -> list[tuple[float, int, int]]:
+    return [
+        (float(descriptors[i] @ descriptors[j]), int(person_of[i]), int(person_of[j]))
+        for i in range(len(descriptors))
+        for j in range(i + 1, len(descriptors))
+        if person_of[i] != person_of[j]
+    ]
+
+
+def test_consistency_threshold_is_exceeded_by_the_stated_share() -> None:
+    people = draw_people(30, n=16)
+    person_of = np.unique(people.names, return_inverse=True)[1]
+    threshold, pairs = consistency_threshold(
+        people.descriptors, person_of, fmr=0.01, rng=np.random.default_rng(0)
+    )
+    cosines = [cosine for cosine, _, _ in brute_force(people.descriptors, person_of)]
+    assert pairs == len(cosines)
+    assert sum(cosine >= threshold for cosine in cosines) == int(0.01 * len(cosines))
+
+
+def test_consistency_of_many_photos_is_set_on_a_subset(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(raw_pairs, "MOST_PHOTOS", 20)
+    people = draw_people(60, photos=(1,), n=16)
+    _, pairs = consistency_threshold(
+        people.descriptors, np.arange(60), fmr=0.1, rng=np.random.default_rng(0)
+    )
+    assert pairs == 20 * 19 // 2
+
+
+def test_one_person_under_two_names_is_reported_first() -> None:
+    people = draw_people(40, photos=(2,), noise=0.3)
+    names = [*people.names, "second name"]
+    descriptors = np.concatenate([people.descriptors, people.descriptors[6:7]])
+    found, person_of = np.unique(names, return_inverse=True)
+    suspicious = suspicious_pairs(descriptors, person_of, list(found), above=0.6)
+    expected = {
+        frozenset((a, b)) for cosine, a, b in brute_force(descriptors, person_of) if cosine >= 0.6
+    }
+    assert {pair.first for pair in suspicious[:1]} | {pair.second for pair in suspicious[:1]} == {
+        names[6],
+        "second name",
+    }
+    assert suspicious[0].cosine == pytest.approx(1.0, abs=1e-3)
+    assert len(suspicious) == len(expected)
+
+
+def test_a_single_person_gives_no_threshold() -> None:
+    people = draw_people(1, photos=(5,))
+    with pytest.raises(ValueError, match="two people"):
+        consistency_threshold(
+            people.descriptors, np.zeros(5, dtype=np.int64), fmr=0.1, rng=np.random.default_rng(0)
+        )
