@@ -1,0 +1,250 @@
+"""Enrollment: what is stored, what is refused, and what never shows."""
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from enroll import Enroller, Enrollment, InconsistentImages, PhotoRejected
+from enroll.enroller import mean_descriptor
+from models.errors import NoFace
+from templates import wire
+from templates.contract import Contract
+from templates.decoys import Attributes, DecoyPool
+from templates.errors import ContractMismatch, InvalidEmbedding, InvalidTemplate, VeilfaceError
+from templates.lifting import Strategy, lift
+from templates.subspace import AffineSubspace
+from tests.verify.synthetic import (
+    M,
+    N,
+    calibrate_people,
+    draw_people,
+    make_binding,
+    make_generator,
+    random_rotation,
+    unit,
+)
+from verify import CalibrationOptions, calibrate
+
+ROTATION = random_rotation()
+PHOTOS = draw_people(4, photos=(4,), noise=0.4, seed=55).descriptors
+
+
+@pytest.fixture(scope="module")
+def contract() -> Contract:
+    options = CalibrationOptions(targets=(1e-1, 1e-2))
+    return calibrate_people(draw_people(60), options=options).contract
+
+
+@pytest.fixture(scope="module")
+def enroller(contract: Contract) -> Enroller:
+    return Enroller(contract, make_generator(), rotation=ROTATION)
+
+
+def stored_template(enrollment: Enrollment) -> AffineSubspace:
+    """Un-rotated, as the descriptors are."""
+    return wire.decode(enrollment.wire).subspace.rotated(ROTATION.T)
+
+
+def test_the_template_holds_the_mean_of_the_photos_and_is_rotated(
+    contract: Contract, enroller: Enroller
+) -> None:
+    enrollment = enroller.from_embeddings(PHOTOS[:3])
+    mean = PHOTOS[:3].astype(np.float64).mean(axis=0)
+    mean /= np.linalg.norm(mean)
+    template = stored_template(enrollment)
+    assert template.m == M
+    assert template.contains(mean[None], tol=2e-3).all()
+    assert not template.contains(PHOTOS[:3], tol=0.05).any()
+    rotated = wire.decode(enrollment.wire)
+    assert not rotated.subspace.contains(mean[None], tol=0.3).any()
+    assert rotated.contract_id == enrollment.contract_id == contract.contract_id
+    assert rotated.dtype == "float16"
+    assert [result.index for result in enrollment.per_photo] == [0, 1, 2]
+
+
+def test_two_enrollments_share_nothing_but_the_mean(enroller: Enroller) -> None:
+    first, second = (enroller.from_embeddings(PHOTOS[:3]) for _ in range(2))
+    assert first.template_id != second.template_id
+    assert len(first.template_id) == 32
+    spans = [stored_template(entry).basis.astype(np.float64) for entry in (first, second)]
+    # Shared decoys would give principal angles of 0; generic 6-spaces of 64 numbers do not.
+    assert np.linalg.svd(spans[0] @ spans[1].T, compute_uv=False).max() < 0.99
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.integers(1, 5), st.integers(0, 10**6), st.floats(-0.5, 0.99))
+def test_consistency_is_every_pairwise_cosine(count: int, seed: int, limit: float) -> None:
+    rows = unit(np.random.default_rng(seed).normal(size=(count, 8)) + 0.7)
+    cosines = {
+        (i, j): float(rows[i].astype(float) @ rows[j].astype(float))
+        for i, j in itertools.combinations(range(count), 2)
+    }
+    differing = tuple(pair for pair, cosine in cosines.items() if cosine < limit)
+    if differing:
+        with pytest.raises(InconsistentImages) as caught:
+            mean_descriptor(rows, consistency=limit)
+        assert caught.value.pairs == differing
+        assert caught.value.photos == tuple(sorted({i for pair in differing for i in pair}))
+    else:
+        mean = mean_descriptor(rows, consistency=limit)
+        assert np.linalg.norm(mean) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_a_stranger_among_the_photos_is_named_without_numbers(enroller: Enroller) -> None:
+    mixed = np.stack([PHOTOS[0], PHOTOS[4], PHOTOS[1]])
+    with pytest.raises(InconsistentImages) as caught:
+        enroller.from_embeddings(mixed)
+    assert caught.value.pairs == ((0, 1), (1, 2))
+    assert isinstance(caught.value, VeilfaceError)
+    assert "0." not in str(caught.value)
+
+
+def test_photos_that_cancel_are_inconsistent_at_any_limit() -> None:
+    opposite = np.stack([PHOTOS[0], -PHOTOS[0]])
+    with pytest.raises(InconsistentImages):
+        mean_descriptor(opposite, consistency=-1.0)
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [np.zeros((0, N)), np.repeat(PHOTOS[:1], 11, axis=0), 2 * PHOTOS[:1], PHOTOS[:1, :5]],
+    ids=["none", "eleven", "norm", "short"],
+)
+def test_malformed_embeddings_are_refused(enroller: Enroller, rows: NDArray[np.float32]) -> None:
+    with pytest.raises(InvalidEmbedding):
+        enroller.from_embeddings(rows)
+
+
+class FakePack:
+    """Stands for a model pack: the photo's byte is the row of ``PHOTOS``; 255 has no face."""
+
+    def __init__(self, contract: Contract, **changes: object) -> None:
+        binding = contract.binding
+        facts = {
+            "embedder_sha256": binding.embedder_sha256,
+            "preprocessing": dict(binding.preprocessing),
+            "n": binding.n,
+        } | changes
+        self.info = type("Info", (), facts)
+
+    def embed_photo(self, photo: bytes, **_: object) -> object:
+        if photo == b"\xff":
+            raise NoFace("no face was found")
+        return type("Sample", (), {"embedding": PHOTOS[photo[0]], "quality": "good"})
+
+
+def test_photos_are_embedded_and_enrolled(contract: Contract, enroller: Enroller) -> None:
+    enrollment = enroller.from_photos(FakePack(contract), [b"\x00", b"\x01"])  # type: ignore[arg-type]
+    assert [(r.index, r.quality) for r in enrollment.per_photo] == [(0, "good"), (1, "good")]
+    mean = unit((PHOTOS[0] + PHOTOS[1])[None])
+    assert stored_template(enrollment).contains(mean, tol=2e-3).all()
+
+
+def test_one_unusable_photo_refuses_the_set(contract: Contract, enroller: Enroller) -> None:
+    with pytest.raises(PhotoRejected, match="photo 1: no face") as caught:
+        enroller.from_photos(FakePack(contract), [b"\x00", b"\xff"])  # type: ignore[arg-type]
+    assert caught.value.index == 1
+    assert isinstance(caught.value.cause, NoFace)
+    with pytest.raises(ValueError, match="1 to 10 photos"):
+        enroller.from_photos(FakePack(contract), [b"\x00"] * 11)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"embedder_sha256": "cd" * 32}, "embedder abab.* the pack's is cdcd"),
+        ({"n": 128}, "64 numbers, the pack gives 128"),
+        (
+            {"preprocessing": {"size": 112, "mean": [0, 0, 0], "flip": False}},
+            r"mean: contract \[127.5.*pack \[0",
+        ),
+    ],
+)
+def test_another_pack_is_refused_naming_both_sides(
+    contract: Contract, enroller: Enroller, changes: dict[str, object], message: str
+) -> None:
+    with pytest.raises(ContractMismatch, match=message):
+        enroller.from_photos(FakePack(contract, **changes), [b"\x00"])  # type: ignore[arg-type]
+
+
+def test_another_source_or_rotation_is_refused(contract: Contract) -> None:
+    other = DecoyPool(PHOTOS)
+    with pytest.raises(ContractMismatch, match=other.source_id[:16]):
+        Enroller(contract, other, rotation=ROTATION)
+    with pytest.raises(ContractMismatch, match="turns 8"):
+        Enroller(contract, make_generator(), rotation=np.eye(8))
+
+
+def client_template(contract: Contract, *, m: int = M) -> AffineSubspace:
+    return lift(PHOTOS[:1], strategy=contract.binding.strategy, m=m, source=make_generator())[0]
+
+
+def test_a_clients_template_is_rotated_and_kept(contract: Contract, enroller: Enroller) -> None:
+    sent = client_template(contract)
+    enrollment = enroller.from_template(wire.encode(sent, contract_id=contract.contract_id))
+    assert enrollment.per_photo == ()
+    assert stored_template(enrollment).contains(PHOTOS[:1], tol=3e-3).all()
+    assert not wire.decode(enrollment.wire).subspace.contains(PHOTOS[:1], tol=0.3).any()
+
+
+def test_clients_templates_that_break_the_contract_are_refused(
+    contract: Contract, enroller: Enroller
+) -> None:
+    contract_id = contract.contract_id
+    good = client_template(contract)
+    with pytest.raises(ContractMismatch, match="the template belongs to the contract dddd"):
+        enroller.from_template(wire.encode(good, contract_id="d" * 64))
+    with pytest.raises(InvalidTemplate, match="m = 6, not n = 64 and m = 5"):
+        enroller.from_template(wire.encode(client_template(contract, m=5), contract_id=contract_id))
+    central = AffineSubspace(np.zeros(N, dtype=np.float32), good.basis)
+    with pytest.raises(InvalidTemplate, match="foot point is outside the range"):
+        enroller.from_template(wire.encode(central, contract_id=contract_id))
+    with pytest.raises(InvalidTemplate):
+        enroller.from_template(b"")
+
+
+def test_nothing_private_shows(enroller: Enroller) -> None:
+    enrollment = enroller.from_embeddings(PHOTOS[:3])
+    text = repr(enrollment)
+    assert "wire" not in text
+    assert len(text) < 400
+    assert {field.name for field in dataclasses.fields(enrollment)} == {
+        "wire",
+        "template_id",
+        "contract_id",
+        "per_photo",
+    }
+
+
+def test_hybrid_plus_takes_attributes_and_does_without() -> None:
+    people = draw_people(60, seed=3)
+    labels = [Attributes("Male", "White"), Attributes("Female", "Black")]
+    pool = DecoyPool(
+        draw_people(200, photos=(1,), seed=101).descriptors,
+        labels=[labels[i % 2] for i in range(200)],
+    )
+    result = calibrate(
+        people.descriptors,
+        people.names,
+        binding=make_binding(pool.source_id, strategy=Strategy.HYBRID_PLUS),
+        source=pool,
+        options=CalibrationOptions(targets=(1e-1,)),
+        attributes=[labels[0]] * len(people.names),
+    )
+    contract = dataclasses.replace(result.contract, photo_consistency=-1.0)
+    enroller = Enroller(contract, pool, rotation=ROTATION)
+    for attributes in (labels[0], None):
+        template = stored_template(enroller.from_embeddings(PHOTOS[:3], attributes=attributes))
+        inside = template.contains(pool.draw(1, 200, stream=_stream())[0], tol=5e-3)
+        assert inside.sum() == M // 2  # the decoys; the other directions are random
+
+
+def _stream() -> object:
+    from templates.randomness import Keystream
+
+    return Keystream.seeded("all")
