@@ -1,1 +1,61 @@
-"""From bytes to embedding: decoding, packs, detection, alignment, embedding."""
+"""From bytes to embedding: decoding, packs, detection, alignment, embedding.
+
+Photos of strangers come in, unit vectors go out; nothing here knows of templates or of HTTP.
+"""
+
+from models.boxes import Face
+from models.cache import CacheSealer, EmbeddingCache
+from models.decoding import ImageLimits, decode_image
+from models.errors import (
+    CacheError,
+    FaceError,
+    FaceTooSmall,
+    ImageError,
+    LowQuality,
+    ModelError,
+    MultipleFaces,
+    NoFace,
+    PackError,
+    ProviderUnavailable,
+)
+from models.extraction import Extraction, Extractor, Failure
+from models.pack import (
+    DetectorInfo,
+    FacePolicy,
+    FaceSample,
+    GraphReport,
+    ModelPack,
+    PackInfo,
+    inspect,
+)
+from models.quality import Quality, QualityLimits
+
+__all__ = [
+    "CacheError",
+    "CacheSealer",
+    "DetectorInfo",
+    "EmbeddingCache",
+    "Extraction",
+    "Extractor",
+    "Face",
+    "FaceError",
+    "FacePolicy",
+    "FaceSample",
+    "FaceTooSmall",
+    "Failure",
+    "GraphReport",
+    "ImageError",
+    "ImageLimits",
+    "LowQuality",
+    "ModelError",
+    "ModelPack",
+    "MultipleFaces",
+    "NoFace",
+    "PackError",
+    "PackInfo",
+    "ProviderUnavailable",
+    "Quality",
+    "QualityLimits",
+    "decode_image",
+    "inspect",
+]

@@ -8,7 +8,7 @@ from models.errors import PackError
 
 # Left eye, right eye, nose, left and right mouth corner as the viewer sees them, for 112 x 112
 # (FORMATS, "Alignment").
-TEMPLATE_112 = np.array(
+TEMPLATE_112: NDArray[np.float64] = np.array(
     [
         [38.2946, 51.6963],
         [73.5318, 51.5014],
@@ -39,10 +39,10 @@ def template(size: int) -> NDArray[np.float64]:
         For any other size, for which there is no common template.
     """
     if size > 0 and size % 112 == 0:
-        return TEMPLATE_112 * (size / 112)
+        return np.asarray(TEMPLATE_112 * (size / 112))
     if size > 0 and size % 128 == 0:
         ratio = size / 128
-        return TEMPLATE_112 * ratio + np.array([8 * ratio, 0.0])
+        return np.asarray(TEMPLATE_112 * ratio + np.array([8 * ratio, 0.0]))
     raise PackError(
         f"There is no common alignment template for a {size} x {size} embedder; sizes are"
         " multiples of 112 or of 128."

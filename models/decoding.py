@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from models.errors import ImageError
 
@@ -112,7 +112,7 @@ def _decode(data: bytes, limits: ImageLimits) -> NDArray[np.uint8]:
         warnings.simplefilter("ignore")
         try:
             image = Image.open(io.BytesIO(data), formats=FORMATS)
-        except Image.UnidentifiedImageError:
+        except UnidentifiedImageError:
             raise ImageError(
                 "unsupported_image", "The file is not a JPEG, PNG or WebP picture, or is damaged."
             ) from None

@@ -23,6 +23,7 @@ class Detector(Protocol):
     kind: str
     sizes: tuple[Size, ...]
     score_threshold: float
+    recommended_score: float
 
     def detect_once(self, image: NDArray[np.uint8], size: Size) -> list[Face]:
         """Faces found in one pass on a canvas of ``size``, in pixels of ``image``."""

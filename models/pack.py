@@ -252,7 +252,8 @@ class ModelPack:
             crop = self.align(image, face)
             measured = measure(crop, face)
         if quality is not None:
-            check(measured, quality)
+            recommended = 0.0 if self._detector is None else self._detector.recommended_score
+            check(measured, quality, recommended_score=recommended)
         return crop, measured, face
 
     def embed_photo(
@@ -307,8 +308,8 @@ class ModelPack:
         if height != width:
             raise ImageError(
                 "unsupported_image",
-                f"The pack {self.info.name} has no detector and takes aligned square crops only;"
-                f" this picture has {width} x {height} pixels.",
+                f"An aligned crop must be square; this picture has {width} x {height} pixels. For"
+                " other photos the pack needs a detector.",
             )
         size = self.crop_size
         if height == size:

@@ -7,11 +7,23 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from models.alignment import similarity_transform, template
 from models.boxes import Face
 from models.errors import FaceTooSmall, LowQuality, MultipleFaces, NoFace
 
-# Rec. 601 luma, what cv2 uses for RGB to grey.
-_CENTRAL = 0.2  # share cut off each side of the crop: hair and background do not vote
+# All measures are taken on a 112 x 112 crop without its margin, so that limits hold for every
+# embedder and hair and background do not vote.
+_SIDE = 112
+_MARGIN = 20
+# Detail finer than this is noise of the sensor and of JPEG, which blur does not remove.
+_SMOOTHING = 1.5
+# Geometry of the mean face on the template: half the distance of the eyes over how far the nose
+# stands out of the plane of eyes and mouth; the same for the distance from eyes to mouth; and
+# where the nose lies between eyes (0) and mouth (1) when the face looks straight ahead (mean of
+# both public detectors on LFW).
+_EYES_PER_NOSE = 1.41
+_HEIGHT_PER_NOSE = 3.26
+_NEUTRAL_NOSE = 0.545
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,12 +37,12 @@ class Quality:
     face_size
         Shorter side of the detected box in pixels; ``None`` for crops that came aligned.
     sharpness
-        Noise-free detail of the aligned crop, see `measure_sharpness`; no unit.
+        Fine detail of the aligned crop, see `measure_sharpness`; no unit, about 3 for a sharp
+        photo, below 0.5 for one that is useless.
     brightness
         Mean luma of the centre of the aligned crop, 0...255.
     yaw, pitch, roll
-        Degrees, estimated from the five points, see `measure_pose`; ``None`` for crops that came
-        aligned.
+        Degrees, see `measure_pose`; ``None`` for crops that came aligned.
     """
 
     score: float | None
@@ -48,12 +60,13 @@ class Quality:
 
 @dataclass(frozen=True, kw_only=True)
 class QualityLimits:
-    """What a face must reach. Defaults: docs/models.md, chosen on real photos.
+    """What a face must reach. How the defaults were measured: docs/models.md.
 
     Attributes
     ----------
     min_score
-        Detector confidence.
+        Detector confidence; ``None`` takes the detector's own recommendation, since detectors
+        differ in what a value means.
     min_face_size
         Shorter side of the box in pixels.
     min_sharpness, min_brightness, max_brightness
@@ -61,26 +74,25 @@ class QualityLimits:
     max_yaw, max_pitch, max_roll
         Absolute degrees.
     second_face_share
-        A second face counts when its area is at least this share of the main face's.
+        A second face counts when its area is at least this share of the main face's: 0.25 means
+        half as wide.
     """
 
-    min_score: float = 0.5
-    min_face_size: float = 32.0
-    min_sharpness: float = 0.0
-    min_brightness: float = 25.0
+    min_score: float | None = None
+    min_face_size: float = 24.0
+    min_sharpness: float = 0.5
+    min_brightness: float = 18.0
     max_brightness: float = 235.0
-    max_yaw: float = 60.0
-    max_pitch: float = 50.0
-    max_roll: float = 60.0
+    max_yaw: float = 70.0
+    max_pitch: float = 55.0
+    max_roll: float = 45.0
     second_face_share: float = 0.25
 
 
 DEFAULT_QUALITY = QualityLimits()
 
 
-def measure(
-    crop: NDArray[np.uint8], face: Face | None, *, keypoints: NDArray[np.floating] | None = None
-) -> Quality:
+def measure(crop: NDArray[np.uint8], face: Face | None) -> Quality:
     """Measure one face.
 
     Parameters
@@ -90,52 +102,100 @@ def measure(
     face
         The detection it came from; ``None`` for crops that came aligned.
     """
-    centre = _centre(crop)
+    grey = cv2.cvtColor(crop, cv2.COLOR_RGB2GRAY)
+    if grey.shape != (_SIDE, _SIDE):
+        grey = cv2.resize(grey, (_SIDE, _SIDE), interpolation=cv2.INTER_AREA)
     yaw = pitch = roll = None
     if face is not None:
         yaw, pitch, roll = measure_pose(face.keypoints)
     return Quality(
         score=None if face is None else face.score,
         face_size=None if face is None else min(face.width, face.height),
-        sharpness=measure_sharpness(centre),
-        brightness=float(centre.mean()),
+        sharpness=measure_sharpness(np.asarray(grey, dtype=np.uint8)),
+        brightness=float(grey[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN].mean()),
         yaw=yaw,
         pitch=pitch,
         roll=roll,
     )
 
 
-def _centre(crop: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Grey centre of a crop, always 112-scale, so that limits hold for every embedder size."""
-    grey = cv2.cvtColor(crop, cv2.COLOR_RGB2GRAY)
-    if grey.shape[0] != 112:
-        grey = cv2.resize(grey, (112, 112), interpolation=cv2.INTER_AREA)
-    cut = round(112 * _CENTRAL)
-    return np.asarray(grey[cut:-cut, cut:-cut], dtype=np.uint8)
-
-
 def measure_sharpness(grey: NDArray[np.uint8]) -> float:
-    """Variance of the Laplacian over the variance of the picture.
+    """Fine detail in the direction that has least of it.
 
-    The quotient does not depend on exposure or contrast, which the plain variance of the
-    Laplacian does, so dark skin or soft light is not taken for blur.
+    Second differences of the smoothed picture along the rows, the columns and both diagonals; the
+    least mean square of the four, over the variance of the picture, times 1000. A shaken camera
+    blurs one direction only, which the usual variance of the Laplacian misses. Dividing by the
+    variance makes it independent of exposure and contrast, so that dark skin or soft light is not
+    taken for blur.
+
+    Parameters
+    ----------
+    grey
+        uint8, shape (112, 112).
     """
-    values = grey.astype(np.float64)
-    variance = float(values.var())
-    if variance < 1e-9:
+    smooth = cv2.GaussianBlur(grey.astype(np.float64), (0, 0), _SMOOTHING)
+    window = slice(_MARGIN, -_MARGIN)
+    variance = float(smooth[window, window].var())
+    if variance < 1e-6:
         return 0.0
-    laplacian = cv2.Laplacian(values, cv2.CV_64F, ksize=1)[1:-1, 1:-1]
-    return float(laplacian.var()) / variance
+    # Diagonal neighbours are sqrt(2) apart, which doubles a second difference.
+    directions = (((0, 1), 1.0), ((1, 0), 1.0), ((1, 1), 0.5), ((1, -1), 0.5))
+    energies = []
+    for (down, right), weight in directions:
+        step = (down, right)
+        ahead = np.roll(smooth, step, axis=(0, 1))
+        behind = np.roll(smooth, (-down, -right), axis=(0, 1))
+        second = (ahead - 2 * smooth + behind)[window, window] * weight
+        energies.append(float((second * second).mean()))
+    return 1000 * min(energies) / variance
 
 
 def measure_pose(keypoints: NDArray[np.floating]) -> tuple[float, float, float]:
-    """Yaw, pitch and roll in degrees from the five points."""
-    left, right, nose, mouth_left, mouth_right = np.asarray(keypoints, dtype=np.float64)
-    return 0.0, 0.0, float(np.degrees(np.arctan2(right[1] - left[1], right[0] - left[0])))
+    """Yaw, pitch and roll of a face from its five points, in degrees.
+
+    The nose stands out of the plane of eyes and mouth, so turning the head moves it sideways
+    between the eyes, and nodding moves it between eyes and mouth. Under weak perspective its
+    shift over its height is the tangent of the angle. The order of faces by angle is sound; single
+    values are good to about 10 degrees, and an open mouth or a smile reads as a nod.
+
+    Parameters
+    ----------
+    keypoints
+        Shape (5, 2), pixels.
+
+    Returns
+    -------
+    yaw : float
+        Positive when the nose points to the right of the picture.
+    pitch : float
+        Positive when the face looks down.
+    roll : float
+        Positive when the head is turned clockwise in the picture.
+    """
+    matrix = similarity_transform(keypoints, template(_SIDE))
+    points = np.asarray(keypoints, dtype=np.float64) @ matrix[:, :2].T + matrix[:, 2]
+    left, right, nose, mouth_left, mouth_right = points
+    eyes, mouth = (left + right) / 2, (mouth_left + mouth_right) / 2
+    axis = mouth - eyes
+    height = float(np.hypot(*axis)) or 1e-9
+    along = float((nose - eyes) @ axis) / height**2
+    across = float(axis[1] * (nose - eyes)[0] - axis[0] * (nose - eyes)[1]) / height
+    half_eyes = float(np.hypot(*(right - left))) / 2 or 1e-9
+    yaw = np.degrees(np.arctan(_EYES_PER_NOSE * across / half_eyes))
+    pitch = np.degrees(np.arctan(_HEIGHT_PER_NOSE * (along - _NEUTRAL_NOSE)))
+    roll = np.degrees(np.arctan2(-matrix[1, 0], matrix[0, 0]))
+    return float(yaw), float(pitch), float(roll)
 
 
-def check(quality: Quality, limits: QualityLimits = DEFAULT_QUALITY) -> None:
+def check(
+    quality: Quality, limits: QualityLimits = DEFAULT_QUALITY, *, recommended_score: float = 0.0
+) -> None:
     """Refuse a face that fails a limit.
+
+    Parameters
+    ----------
+    recommended_score
+        What ``min_score`` is where the limits leave it open.
 
     Raises
     ------
@@ -150,17 +210,42 @@ def check(quality: Quality, limits: QualityLimits = DEFAULT_QUALITY) -> None:
             f" {limits.min_face_size:.0f} are needed. Come closer or send a larger photo.",
             details={"size": _measured(quality.face_size, limits.min_face_size)},
         )
+    min_score = recommended_score if limits.min_score is None else limits.min_score
     failed: dict[str, object] = {}
-    if quality.score is not None and quality.score < limits.min_score:
-        failed["score"] = _measured(quality.score, limits.min_score)
+    if quality.score is not None and quality.score < min_score:
+        failed["score"] = _measured(quality.score, min_score)
     if quality.sharpness < limits.min_sharpness:
         failed["blur"] = _measured(quality.sharpness, limits.min_sharpness)
     if quality.brightness < limits.min_brightness:
         failed["darkness"] = _measured(quality.brightness, limits.min_brightness)
     if quality.brightness > limits.max_brightness:
         failed["brightness"] = _measured(quality.brightness, limits.max_brightness)
+    angles = {
+        "yaw": (quality.yaw, limits.max_yaw),
+        "pitch": (quality.pitch, limits.max_pitch),
+        "roll": (quality.roll, limits.max_roll),
+    }
+    pose = {
+        name: _measured(value, limit)
+        for name, (value, limit) in angles.items()
+        if value is not None and abs(value) > limit
+    }
+    if pose:
+        failed["pose"] = pose
     if failed:
-        raise LowQuality("The face is not good enough: " + ", ".join(failed), details=failed)
+        remedies = " ".join(_REMEDIES[name] for name in failed)
+        raise LowQuality(
+            f"The photo is not good enough ({', '.join(failed)}). {remedies}", details=failed
+        )
+
+
+_REMEDIES = {
+    "score": "Show the face unobstructed.",
+    "blur": "Hold the camera still and focus on the face.",
+    "darkness": "Put more light on the face.",
+    "brightness": "Put less light on the face.",
+    "pose": "Look into the camera.",
+}
 
 
 def _measured(value: float, limit: float) -> dict[str, float]:

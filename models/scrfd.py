@@ -17,6 +17,7 @@ from models.sessions import Session
 
 STRIDES = (8, 16, 32)
 SCORE_THRESHOLD = 0.5
+RECOMMENDED_SCORE = 0.6  # for photos of a person who wants to be seen
 OVERLAP = 0.4
 
 
@@ -38,6 +39,7 @@ class Scrfd:
 
     kind = "scrfd"
     score_threshold = SCORE_THRESHOLD
+    recommended_score = RECOMMENDED_SCORE
 
     def __init__(
         self,

@@ -30,6 +30,7 @@ class Role(StrEnum):
 
 
 DETECTORS = frozenset({Role.SCRFD, Role.YUNET})
+_YUNET_NAMES = frozenset(YUNET_OUTPUTS)
 
 
 @dataclass(frozen=True)
@@ -119,7 +120,7 @@ def classify(signature: Signature, *, input_size: int | None = None) -> tuple[Ro
     size = signature.image_size
     if size is None:
         return Role.UNKNOWN, f"{len(signature.inputs)} input(s), not one image (batch, 3, h, w)"
-    if YUNET_OUTPUTS_SET <= {output.name for output in signature.outputs}:
+    if _YUNET_NAMES.issubset(output.name for output in signature.outputs):
         return Role.YUNET, "outputs cls_8 ... kps_32"
     detector = _scrfd(signature)
     if detector is not None:
@@ -130,9 +131,6 @@ def classify(signature: Signature, *, input_size: int | None = None) -> tuple[Ro
     if size == (192, 192):
         return Role.LANDMARKS, "192 x 192 input; ignored"
     return _embedder(signature, size, input_size)
-
-
-YUNET_OUTPUTS_SET = frozenset(YUNET_OUTPUTS)
 
 
 def _scrfd(signature: Signature) -> tuple[Role, str] | None:

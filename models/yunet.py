@@ -17,6 +17,7 @@ from models.sessions import Session
 
 STRIDES = (8, 16, 32)
 SCORE_THRESHOLD = 0.6
+RECOMMENDED_SCORE = 0.7  # for photos of a person who wants to be seen
 OVERLAP = 0.3
 OUTPUTS = tuple(f"{role}_{stride}" for role in ("cls", "obj", "bbox", "kps") for stride in STRIDES)
 # exp of a wild regression must not overflow; 2**10 strides exceed any canvas.
@@ -40,6 +41,7 @@ class YuNet:
 
     kind = "yunet"
     score_threshold = SCORE_THRESHOLD
+    recommended_score = RECOMMENDED_SCORE
 
     def __init__(
         self,

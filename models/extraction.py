@@ -1,0 +1,275 @@
+"""Embed many files: in parallel, with a cache, and with an account of every file that failed."""
+
+import hashlib
+import json
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeRemainingColumn,
+)
+
+from models.cache import EmbeddingCache
+from models.decoding import DEFAULT_LIMITS, ImageLimits, decode_image
+from models.errors import FaceError, ImageError
+from models.pack import FacePolicy, ModelPack
+from models.quality import QualityLimits
+from models.sessions import default_workers
+
+# Crops of one chunk are in memory at once (128 x 37 kB at 112 pixels), photos only one per worker.
+_CHUNK = 128
+_QUIET_SECONDS = 2.0
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A file from which no embedding was acquired, and why."""
+
+    path: Path
+    code: str
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class Extraction:
+    """Result of one bulk run.
+
+    Attributes
+    ----------
+    descriptors
+        float32, shape (k, n), unit rows, in the order of ``paths``. Never shown by ``repr``.
+    paths
+        The k files that were embedded, in the order in which they were given.
+    failures
+        All others, in the order in which they were given.
+    cached
+        How many of ``paths`` came from the cache.
+    """
+
+    descriptors: NDArray[np.float32] = field(repr=False)
+    paths: list[Path]
+    failures: list[Failure]
+    cached: int
+
+    @property
+    def attempts(self) -> int:
+        """Number of files that were tried."""
+        return len(self.paths) + len(self.failures)
+
+    @property
+    def failure_to_acquire(self) -> float:
+        """FTA of ISO/IEC 19795-1: failed files over all files; 0 where there were none."""
+        return len(self.failures) / self.attempts if self.attempts else 0.0
+
+    def failure_counts(self) -> dict[str, int]:
+        """Failures by code, most frequent first."""
+        return dict(Counter(failure.code for failure in self.failures).most_common())
+
+
+class Extractor:
+    """Embeds files with one pack.
+
+    Parameters
+    ----------
+    pack
+        The models.
+    cache
+        Where known embeddings are kept; ``None`` computes all anew.
+    policy
+        ``LARGEST`` by default: labelled sets state whom a photo shows, and bystanders are common.
+    quality
+        Limits; ``None`` (default) takes every face that is found, as public protocols do.
+    aligned
+        Take the files as aligned crops: no detection.
+    workers
+        Threads that decode, detect and align; ``None`` for one per core.
+    limits
+        Of the decoder.
+    """
+
+    def __init__(
+        self,
+        pack: ModelPack,
+        *,
+        cache: EmbeddingCache | None = None,
+        policy: FacePolicy = FacePolicy.LARGEST,
+        quality: QualityLimits | None = None,
+        aligned: bool = False,
+        workers: int | None = None,
+        limits: ImageLimits = DEFAULT_LIMITS,
+    ) -> None:
+        self._pack = pack
+        self._cache = cache
+        self._policy = policy
+        self._quality = quality
+        self._aligned = aligned or pack.info.detector is None
+        self._workers = workers or default_workers()
+        self._limits = limits
+        self._key_prefix = self._settings_digest()
+
+    def extract(self, paths: Iterable[str | Path], *, progress: bool | None = None) -> Extraction:
+        """Embed files.
+
+        Parameters
+        ----------
+        paths
+            Files, in any order; the order of the result follows it.
+        progress
+            Show a bar on stderr once the run takes more than two seconds; ``None`` only where
+            stderr is a terminal.
+
+        Returns
+        -------
+        Extraction
+            Every path is in ``paths`` or in ``failures``.
+
+        Raises
+        ------
+        ModelError
+            If inference itself fails, which is not the fault of a file.
+        """
+        files = [Path(path) for path in paths]
+        rows: list[NDArray[np.float32]] = []
+        done: list[Path] = []
+        failures: list[Failure] = []
+        cached = 0
+        bar = _Bar(len(files), shown=sys.stderr.isatty() if progress is None else progress)
+        try:
+            with bar, ThreadPoolExecutor(self._workers) as pool:
+                for start in range(0, len(files), _CHUNK):
+                    chunk = files[start : start + _CHUNK]
+                    prepared = list(pool.map(self._prepare, chunk))
+                    embedded = self._embed([item for item in prepared if item.crop is not None])
+                    for path, item in zip(chunk, prepared, strict=True):
+                        if item.failure is not None:
+                            failures.append(item.failure)
+                            continue
+                        cached += item.embedding is not None
+                        rows.append(
+                            embedded[item.key] if item.embedding is None else item.embedding
+                        )
+                        done.append(path)
+                    bar.advance(len(chunk))
+        finally:
+            if self._cache is not None:
+                self._cache.flush()
+        descriptors = np.stack(rows) if rows else np.empty((0, self._pack.info.n), np.float32)
+        return Extraction(np.ascontiguousarray(descriptors), done, failures, cached)
+
+    def _settings_digest(self) -> bytes:
+        """Everything besides the picture that an embedding depends on."""
+        info = self._pack.info
+        detector = None
+        if not self._aligned and info.detector is not None:
+            detector = [info.detector.sha256, list(info.detector.input_size), self._policy.value]
+        settings = {
+            "embedder": info.embedder_sha256,
+            "preprocessing": info.preprocessing,
+            "detector": detector,
+            # A cached embedding must not outlive a stricter gate.
+            "quality": None if self._quality is None else repr(self._quality),
+        }
+        return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).digest()
+
+    def _prepare(self, path: Path) -> "_Prepared":
+        """Read, look up, decode, find the face; whatever is wrong with the file is an answer."""
+        try:
+            data = _read(path, self._limits.max_bytes)
+            key = hashlib.sha256(self._key_prefix + hashlib.sha256(data).digest()).digest()
+            known = None if self._cache is None else self._cache.get(key)
+            if known is not None:
+                return _Prepared(key, embedding=known)
+            if self._aligned:
+                crop = self._pack.as_aligned(decode_image(data, limits=self._limits))
+            else:
+                crop, _, _ = self._pack.crop_photo(
+                    data, policy=self._policy, quality=self._quality, limits=self._limits
+                )
+            return _Prepared(key, crop=crop)
+        except (ImageError, FaceError) as error:
+            return _Prepared(b"", failure=Failure(path, error.code, str(error)))
+        except OSError as error:
+            reason = f"The file cannot be read: {error.strerror}."
+            return _Prepared(b"", failure=Failure(path, "unreadable_file", reason))
+
+    def _embed(self, items: Sequence["_Prepared"]) -> dict[bytes, NDArray[np.float32]]:
+        """Embed the crops of a chunk in batches; copies of one file are computed once."""
+        unique = {item.key: item.crop for item in items if item.crop is not None}
+        if not unique:
+            return {}
+        embeddings = self._pack.embed(np.stack(list(unique.values())))
+        result = dict(zip(unique, embeddings, strict=True))
+        if self._cache is not None:
+            for key, embedding in result.items():
+                self._cache.put(key, embedding)
+        return result
+
+
+@dataclass(frozen=True, eq=False)
+class _Prepared:
+    """One file before embedding: exactly one of the last three is set."""
+
+    key: bytes
+    crop: NDArray[np.uint8] | None = field(default=None, repr=False)
+    embedding: NDArray[np.float32] | None = field(default=None, repr=False)
+    failure: Failure | None = None
+
+
+def _read(path: Path, max_bytes: int) -> bytes:
+    with path.open("rb") as file:
+        # One byte more than allowed, so that the decoder sees that it is too much.
+        return file.read(max_bytes + 1)
+
+
+class _Bar:
+    """A progress bar that appears when the work turns out to be long."""
+
+    def __init__(self, total: int, *, shown: bool) -> None:
+        self._total = total
+        self._shown = shown
+        self._started = time.monotonic()
+        self._done = 0
+        self._progress: Progress | None = None
+
+    def __enter__(self) -> "_Bar":
+        return self
+
+    def advance(self, count: int) -> None:
+        self._done += count
+        if not self._shown:
+            return
+        if self._progress is None:
+            if time.monotonic() - self._started < _QUIET_SECONDS:
+                return
+            self._progress = Progress(
+                TextColumn("Embedding faces"),
+                BarColumn(),
+                MofNCompleteColumn(),
+                TimeRemainingColumn(),
+                console=Console(stderr=True),
+            )
+            self._progress.start()
+            self._progress.add_task("faces", total=self._total)
+        self._progress.update(self._progress.task_ids[0], completed=self._done)
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self._progress is not None:
+            self._progress.stop()
