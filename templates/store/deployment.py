@@ -72,7 +72,8 @@ def insert_once(connection: Connection, table: type[Base], **values: object) -> 
     """Insert a row unless its key is taken; True if it was inserted."""
     insert = sqlite_insert if connection.dialect.name == "sqlite" else postgresql_insert
     statement = insert(table).values(**values).on_conflict_do_nothing()
-    return connection.execute(statement).rowcount == 1
+    # The inserted row is asked for, because drivers do not agree on the row count here.
+    return connection.execute(statement.returning(sa.literal(1))).first() is not None
 
 
 def mark_master_key(database: Database, keyring: MasterKeyring, clock: Clock) -> None:

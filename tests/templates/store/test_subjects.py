@@ -102,18 +102,18 @@ def test_subject_ids_keep_to_the_rule(text: str) -> None:
             checked_subject_id(text)
 
 
-@pytest.mark.parametrize("bad", ["", "x" * 129, "a b", "a/b", "ä", "a\n", "a\x00", "%", "..\\"])
-def test_a_bad_subject_id_is_refused_everywhere(store: TemplateStore, bad: str) -> None:
+def test_a_bad_subject_id_is_refused_everywhere(store: TemplateStore) -> None:
     calls = (
-        lambda: put(store, bad, b"wire"),
-        lambda: store.get("default", bad),
-        lambda: store.describe("default", bad),
-        lambda: store.erase("default", bad),
-        lambda: store.receipt("default", bad),
+        lambda bad: put(store, bad, b"wire"),
+        lambda bad: store.get("default", bad),
+        lambda bad: store.describe("default", bad),
+        lambda bad: store.erase("default", bad),
+        lambda bad: store.receipt("default", bad),
     )
     for call in calls:
-        with pytest.raises(InvalidIdentifier):
-            call()
+        for bad in ("", "x" * 129, "a b", "a/b", "ä", "a\n", "a\x00", "%", "..\\"):
+            with pytest.raises(InvalidIdentifier):
+                call(bad)
 
 
 def test_the_longest_subject_id_is_taken(store: TemplateStore) -> None:
@@ -167,13 +167,17 @@ SWAPS = {
 }
 
 
-@pytest.mark.parametrize("swap", SWAPS)
-def test_a_row_moved_in_the_database_does_not_open(
-    store: TemplateStore, database_url: str, swap: str
+def test_a_row_moved_in_the_database_does_not_open(store: TemplateStore, database_url: str) -> None:
+    for tenant, subject, columns in SWAPS.values():
+        swap_and_read(store, database_url, tenant, subject, columns.split())
+
+
+def swap_and_read(
+    store: TemplateStore, database_url: str, tenant: str, subject: str, columns: list[str]
 ) -> None:
     put(store, "ada", b"wire of ada", template_id="same")
-    tenant, subject, columns = SWAPS[swap]
     put(store, subject, b"another wire", tenant=tenant, template_id="same")
+    assert wire_of(store, "ada") == b"wire of ada"
     source = next(
         row
         for row in rows(database_url)
@@ -183,7 +187,7 @@ def test_a_row_moved_in_the_database_does_not_open(
         store,
         database_url,
         "ada",
-        **{column: getattr(source, column) for column in columns.split()},
+        **{column: getattr(source, column) for column in columns},
     )
     with pytest.raises(SealError, match="does not open"):
         store.get("default", "ada")
@@ -191,31 +195,26 @@ def test_a_row_moved_in_the_database_does_not_open(
     assert wire_of(store, subject, tenant=tenant) == b"another wire"
 
 
-@pytest.mark.parametrize(
-    ("column", "value"),
-    [
-        ("contract_id", "d" * 64),
-        ("template_id", "t-2"),
-        ("rotation_epoch", 2),
-        ("tenant_id", "other"),
-        ("subject_id", "eve"),
-        ("ciphertext", b""),
-        ("ciphertext", b"\x02" * 60),
-        ("wrapped_key", b""),
-    ],
-)
 def test_a_row_relabelled_in_the_database_does_not_open(
-    store: TemplateStore, database_url: str, column: str, value: str | int | bytes
+    store: TemplateStore, database_url: str
 ) -> None:
-    put(store, "ada", b"wire", template_id="t-1")
-    tenant, subject = "default", "ada"
-    if column == "tenant_id":
-        tenant, value = "other", store.tenants.get("other").id
-    if column == "subject_id":
-        subject = "eve"
-    change(store, database_url, "ada", **{column: value})
-    with pytest.raises(SealError):
-        store.get(tenant, subject)
+    other = store.tenants.get("other").id
+    changes = {
+        "a": ("contract_id", "d" * 64),
+        "b": ("template_id", "t-2"),
+        "c": ("rotation_epoch", 2),
+        "d": ("tenant_id", other),
+        "e": ("subject_id", "eve"),
+        "f": ("ciphertext", b""),
+        "g": ("ciphertext", b"\x02" * 60),
+        "h": ("wrapped_key", b""),
+    }
+    for subject, (column, value) in changes.items():
+        put(store, subject, b"wire", template_id="t-1")
+        change(store, database_url, subject, **{column: value})
+        tenant = "other" if column == "tenant_id" else "default"
+        with pytest.raises(SealError):
+            store.get(tenant, "eve" if column == "subject_id" else subject)
 
 
 def test_a_subject_under_another_row_id_does_not_open(

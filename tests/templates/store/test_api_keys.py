@@ -1,0 +1,172 @@
+import hashlib
+import hmac
+import threading
+from datetime import timedelta
+from unittest import mock
+
+import pytest
+import sqlalchemy as sa
+
+from templates.errors import StoreError
+from templates.sealing import MasterKeyring
+from templates.store import NewApiKey, Right, TemplateStore, UnknownTenant, probe_key
+from templates.store.database import Database
+from templates.store.schema import ApiKeyRow
+from tests.templates.store.conftest import Clock
+
+
+def test_a_token_finds_its_key(store: TemplateStore, clock: Clock) -> None:
+    new = store.api_keys.create("default", [Right.ENROLL, "verify"], label="front end")
+    start, prefix, secret = new.token.split("_")
+    assert (start, prefix, len(secret)) == ("vf", new.key.prefix, 64)
+    found = store.api_keys.verify(new.token)
+    assert found is not None
+    assert (found.tenant, found.label) == ("default", "front end")
+    assert found.rights == {Right.ENROLL, Right.VERIFY}
+    assert found.created_at == clock.time
+    assert store.api_keys.get(prefix) is not None
+    assert store.api_keys.get("nothing") is None
+
+
+def test_the_token_is_not_stored_and_does_not_show(store: TemplateStore, database_url: str) -> None:
+    new = store.api_keys.create("default", [Right.VERIFY])
+    secret = new.token.split("_")[2]
+    assert secret not in repr(new)
+    database = Database(database_url)
+    row = database.read(lambda each: each.execute(sa.select(ApiKeyRow)).one())
+    assert row.token_hash == hashlib.sha256(new.token.encode()).digest()
+    for value in row:
+        stored = value if isinstance(value, bytes) else str(value).encode()
+        assert secret.encode() not in stored
+        assert bytes.fromhex(secret) not in stored
+        assert probe_key(new.token) not in stored
+    database.close()
+
+
+def test_a_wrong_token_is_refused(store: TemplateStore) -> None:
+    token = store.api_keys.create("default", [Right.VERIFY]).token
+    last = "0" if token[-1] != "0" else "1"
+    _, prefix, secret = token.split("_")
+    for wrong in (
+        "",
+        "vf_",
+        prefix,
+        token[:-1],
+        token[:-1] + last,
+        token + "0",
+        token.upper(),
+        f" {token}",
+        f"{token}\n",
+        f"vf_{'0' * 12}_{secret}",
+        f"vf_{prefix}_{'0' * 64}",
+        "vf_" + "x" * 100_000,
+        "vf_\udc80",
+    ):
+        assert store.api_keys.verify(wrong) is None, wrong
+    assert store.api_keys.verify(token) is not None
+
+
+def test_every_token_is_compared_in_constant_time(store: TemplateStore) -> None:
+    """An unknown prefix runs the same comparison as a known one with a wrong secret."""
+    token = store.api_keys.create("default", [Right.VERIFY]).token
+    wrong = token[:-1] + ("0" if token[-1] != "0" else "1")
+    with mock.patch("templates.store.api_keys.hmac.compare_digest", wraps=hmac.compare_digest) as c:
+        for each in (wrong, f"vf_{'0' * 12}_{'0' * 64}", "nonsense"):
+            assert store.api_keys.verify(each) is None
+    assert c.call_count == 3
+    assert all(len(call.args[0]) == len(call.args[1]) == 32 for call in c.call_args_list)
+
+
+def test_expiry_and_revocation(store: TemplateStore, clock: Clock) -> None:
+    keys = store.api_keys
+    short = keys.create("default", [Right.VERIFY], expires_at=clock.time + timedelta(hours=1))
+    long = keys.create("default", [Right.VERIFY])
+    assert keys.verify(short.token)
+    clock.pass_by(minutes=59, seconds=59)
+    assert keys.verify(short.token)
+    clock.pass_by(seconds=1)
+    assert keys.verify(short.token) is None
+    assert keys.verify(long.token)
+    assert keys.revoke(long.key.prefix)
+    assert not keys.revoke(long.key.prefix)
+    assert not keys.revoke("nothing")
+    assert keys.verify(long.token) is None
+    listed = {key.prefix: key for key in keys.all()}
+    assert listed[long.key.prefix].revoked_at == clock.time
+
+
+def test_use_is_noted_to_the_minute(store: TemplateStore, clock: Clock) -> None:
+    new = store.api_keys.create("default", [Right.VERIFY])
+
+    def last_used_after(**passed: float) -> float | None:
+        clock.pass_by(**passed)
+        store.api_keys.verify(new.token)
+        key = store.api_keys.get(new.key.prefix)
+        assert key is not None
+        assert key.last_used_at is not None
+        return (key.last_used_at - new.key.created_at).total_seconds()
+
+    assert last_used_after(seconds=5) == 5
+    assert last_used_after(seconds=50) == 5
+    assert last_used_after(seconds=30) == 85
+
+
+def test_keys_are_listed_by_tenant(store: TemplateStore) -> None:
+    mine = store.api_keys.create("default", [Right.VERIFY])
+    theirs = store.api_keys.create("other", [Right.ADMIN])
+    assert [key.prefix for key in store.api_keys.all(tenant="other")] == [theirs.key.prefix]
+    assert {key.prefix for key in store.api_keys.all()} == {mine.key.prefix, theirs.key.prefix}
+
+
+def test_nonsense_is_refused(store: TemplateStore) -> None:
+    with pytest.raises(UnknownTenant):
+        store.api_keys.create("nobody", [Right.VERIFY])
+    with pytest.raises(StoreError, match="at least one right"):
+        store.api_keys.create("default", [])
+    with pytest.raises(StoreError, match="enroll, verify"):
+        store.api_keys.create("default", ["root"])
+    for label in ("x" * 129, "a\nb"):
+        with pytest.raises(StoreError, match="label"):
+            store.api_keys.create("default", [Right.VERIFY], label=label)
+
+
+def test_client_and_server_know_the_same_probe_key(store: TemplateStore) -> None:
+    first = store.api_keys.create("default", [Right.VERIFY])
+    second = store.api_keys.create("default", [Right.VERIFY])
+    assert store.api_keys.probe_key(first.key.prefix) == probe_key(first.token)
+    assert len({probe_key(first.token), probe_key(second.token)}) == 2
+    with pytest.raises(StoreError, match="vf_<prefix>_<secret>"):
+        probe_key("nonsense")
+    with pytest.raises(StoreError, match="no API key"):
+        store.api_keys.probe_key("nothing")
+
+
+def test_bootstrap_happens_once(database_url: str, keyring: MasterKeyring) -> None:
+    made: list[NewApiKey | None] = []
+    first_start = TemplateStore(database_url, keyring)
+    first_start.upgrade()
+    first_start.close()
+    start = threading.Barrier(6)
+
+    def worker() -> None:
+        store = TemplateStore(database_url, keyring)
+        start.wait()
+        made.append(store.api_keys.bootstrap())
+        store.close()
+
+    threads = [threading.Thread(target=worker) for _ in range(6)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    (first,) = [new for new in made if new is not None]
+    assert len(made) == 6
+    store = TemplateStore(database_url, keyring)
+    assert store.api_keys.bootstrap() is None
+    found = store.api_keys.verify(first.token)
+    assert found is not None
+    assert found.tenant == "default"
+    assert Right.ADMIN in found.rights
+    store.api_keys.revoke(found.prefix)
+    assert store.api_keys.bootstrap() is None  # not even when no key is left
+    store.close()

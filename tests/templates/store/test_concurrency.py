@@ -1,0 +1,171 @@
+"""Many at once, and death at any moment: a subject is wholly old, wholly new or wholly gone."""
+
+import hashlib
+import json
+import os
+import random
+import signal
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import TextIO
+
+import pytest
+import sqlalchemy as sa
+
+from templates.sealing import MasterKeyring
+from templates.store import TemplateStore
+from templates.store.schema import ReceiptRow, SubjectRow, TemplateRow
+from tests.templates.store.conftest import put
+
+SUBJECTS = ("ada", "eve", "kim")
+ERASE_EVERY = 5
+
+# The children do nothing but use the store; threads that other tests left behind are not theirs.
+pytestmark = pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork:DeprecationWarning")
+
+
+def wire_of(number: int) -> bytes:
+    """A template that shows whether it is whole: its number, and bytes that follow from it."""
+    head = number.to_bytes(8, "big")
+    return head + hashlib.shake_256(head).digest(20_000)
+
+
+def number_of(wire: bytes) -> int:
+    """Number of a whole template; an assertion fails for a mixture."""
+    number = int.from_bytes(wire[:8], "big")
+    assert wire == wire_of(number)
+    return number
+
+
+def mix(store: TemplateStore, seed: int, steps: int) -> Counter[str]:
+    """Use a few subjects at random; returns how often each was created and erased."""
+    generator, done = random.Random(seed), Counter[str]()
+    for step in range(steps):
+        subject = generator.choice(SUBJECTS)
+        match generator.randrange(4):
+            case 0 | 1:
+                if put(store, subject, wire_of(seed * 10_000 + step)).created:
+                    done[f"created {subject}"] += 1
+            case 2:
+                if (found := store.get("default", subject)) is not None:
+                    number_of(found.wire)
+                    done["read"] += 1
+            case 3:
+                if store.erase("default", subject).erased:
+                    done[f"erased {subject}"] += 1
+    return done
+
+
+def write_for_ever(store: TemplateStore, subject: str, output: TextIO) -> None:
+    """Enroll, replace and erase; acknowledge each finished step by its number."""
+    step = 0
+    while True:
+        step += 1
+        if step % ERASE_EVERY == 0:
+            store.erase("default", subject)
+        else:
+            put(store, subject, wire_of(step))
+        print(step, file=output, flush=True)
+
+
+def fork(work: Callable[[TextIO], None]) -> tuple[int, TextIO]:
+    """Run `work` in another process; returns its id and what it writes."""
+    reading, writing = os.pipe()
+    child = os.fork()
+    if child == 0:
+        try:
+            os.close(reading)
+            with os.fdopen(writing, "w") as output:
+                work(output)
+            os._exit(0)
+        except BaseException:
+            os._exit(1)
+    os.close(writing)
+    return child, os.fdopen(reading)
+
+
+def assert_equal_to_a_serial_order(store: TemplateStore, done: Counter[str]) -> None:
+    """In any serial order, creations and erasures of a subject alternate."""
+    for subject in SUBJECTS:
+        found = store.get("default", subject)
+        alive = done[f"created {subject}"] - done[f"erased {subject}"]
+        assert alive == (0 if found is None else 1), subject
+        if found is not None:
+            number_of(found.wire)
+
+    def orphans(connection: sa.Connection) -> int:
+        joined = sa.join(
+            SubjectRow, TemplateRow, SubjectRow.id == TemplateRow.subject_pk, full=True
+        )
+        either = sa.or_(SubjectRow.id.is_(None), TemplateRow.subject_pk.is_(None))
+        query = sa.select(sa.func.count()).select_from(joined).where(either)
+        return connection.execute(query).scalar_one()
+
+    assert store._database.read(orphans) == 0
+    held = sa.select(sa.func.count()).where(ReceiptRow.body.contains('"held":true'))
+    receipts = store._database.read(lambda each: each.execute(held).scalar_one())
+    assert receipts == sum(done[f"erased {subject}"] for subject in SUBJECTS)
+
+
+def test_threads_on_the_same_subjects(
+    store: TemplateStore, database_url: str, key_file: Path
+) -> None:
+    stores = [store, TemplateStore(database_url, MasterKeyring.load(key_file))]
+    counts: list[Counter[str]] = []
+    errors: list[BaseException] = []
+
+    def use(seed: int) -> None:
+        try:
+            counts.append(mix(stores[seed % 2], seed, 40))
+        except BaseException as error:
+            errors.append(error)
+
+    threads = [threading.Thread(target=use, args=(seed,)) for seed in range(6)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert errors == []
+    done = sum(counts, Counter[str]())
+    assert done["read"] > 0
+    assert_equal_to_a_serial_order(store, done)
+    stores[1].close()
+
+
+def test_processes_on_the_same_subjects(store: TemplateStore) -> None:
+    def work(seed: int) -> Callable[[TextIO], None]:
+        return lambda output: json.dump(mix(store, seed, 60), output)
+
+    workers = [fork(work(seed)) for seed in range(10, 14)]
+    done: Counter[str] = Counter()
+    for child, output in workers:
+        with output:
+            done.update(json.load(output))
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    assert done["read"] > 0
+    assert_equal_to_a_serial_order(store, done)
+
+
+def test_a_killed_writer_leaves_whole_subjects(store: TemplateStore) -> None:
+    """The state is that of the last acknowledged step, or of the one after it."""
+    generator = random.Random(5)
+    for round_number in range(12):
+        subject = f"s{round_number}"
+        child, output = fork(lambda to, subject=subject: write_for_ever(store, subject, to))
+        with output:
+            acknowledged = [output.readline() for _ in range(generator.randrange(1, 12))]
+            time.sleep(generator.uniform(0, 0.02))
+            os.kill(child, signal.SIGKILL)
+            acknowledged += output.read().splitlines()
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
+
+        last = int(acknowledged[-1])
+        found = store.get("default", subject)
+        state = 0 if found is None else number_of(found.wire)
+        assert state in {0 if step % ERASE_EVERY == 0 else step for step in (last, last + 1)}
+        # The locks of the dead are free.
+        store.erase("default", subject)
+        assert store.get("default", subject) is None

@@ -1,0 +1,277 @@
+import json
+import random
+from datetime import datetime
+from pathlib import Path
+
+import pytest
+import sqlalchemy as sa
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+
+from templates.errors import StoreError
+from templates.sealing import MasterKeyring
+from templates.store import Claim, Receipt, TemplateStore, verify_receipt
+from templates.store.database import Database
+from templates.store.schema import (
+    Base,
+    FailedAttemptsRow,
+    IdempotencyRow,
+    ReceiptRow,
+    SubjectRow,
+    TemplateRow,
+)
+from tests.templates.store.conftest import Clock, put
+
+
+def count(database: Database, table: type[Base]) -> int:
+    query = sa.select(sa.func.count()).select_from(table)
+    return database.read(lambda each: each.execute(query).scalar_one())
+
+
+def test_everything_about_the_subject_goes_at_once(
+    store: TemplateStore, database_url: str, clock: Clock
+) -> None:
+    database = Database(database_url)
+    for name in ("ada", "eve"):
+        put(store, name, b"wire")
+        claim = store.idempotency.claim(
+            "default", actor="key", key=f"enroll {name}", request=b"r", subject_id=name
+        )
+        assert isinstance(claim, Claim)
+        store.idempotency.finish(claim, status=201, body=name.encode())
+        failed = sa.insert(FailedAttemptsRow).values(
+            tenant_id=store.tenants.get("default").id,
+            pseudonym=store.pseudonym("default", name),
+            consecutive=1,
+            total=2,
+            last_failed_at=clock.time,
+        )
+        database.write(lambda each, failed=failed: each.execute(failed))
+
+    erasure = store.erase("default", "ada")
+
+    assert erasure.erased
+    assert erasure.log_purged
+    assert erasure.receipt.held
+    assert store.get("default", "ada") is None
+    assert store.describe("default", "ada") is None
+    for table in (SubjectRow, TemplateRow, IdempotencyRow, FailedAttemptsRow):
+        assert count(database, table) == 1, table  # eve's
+    assert store.get("default", "eve") is not None
+    database.close()
+
+
+def test_erasing_again_gives_the_same_receipt(store: TemplateStore, clock: Clock) -> None:
+    put(store, "ada", b"wire")
+    first = store.erase("default", "ada")
+    clock.pass_by(days=1)
+    again = store.erase("default", "ada")
+    assert not again.erased
+    assert again.receipt == first.receipt == store.receipt("default", "ada")
+
+
+def test_erasing_after_a_second_enrollment_gives_a_second_receipt(
+    store: TemplateStore, clock: Clock
+) -> None:
+    put(store, "ada", b"wire")
+    first = store.erase("default", "ada")
+    clock.pass_by(days=1)
+    put(store, "ada", b"wire")
+    second = store.erase("default", "ada")
+    assert second.erased
+    assert second.receipt != first.receipt
+    assert store.erase("default", "ada").receipt == second.receipt
+
+
+def test_erasing_who_was_never_enrolled_says_so(store: TemplateStore) -> None:
+    erasure = store.erase("default", "nobody")
+    assert not erasure.erased
+    assert not erasure.receipt.held
+    assert store.erase("default", "nobody").receipt == erasure.receipt
+
+
+def test_a_receipt_names_the_subject_by_its_pseudonym_only(
+    store: TemplateStore, clock: Clock
+) -> None:
+    put(store, "ada", b"wire")
+    receipt = store.erase("default", "ada").receipt
+    assert "ada" not in json.dumps(receipt.to_json())
+    claims = verify_receipt(receipt, store.receipt_public_key())
+    assert claims["subject"] == store.pseudonym("default", "ada")
+    assert claims["tenant"] == "default"
+    assert claims["held"] is True
+    assert datetime.fromisoformat(claims["erased_at"]) == clock.time
+
+
+def test_a_receipt_is_plain_ed25519(store: TemplateStore) -> None:
+    receipt = store.erase("default", "ada").receipt
+    key = Ed25519PublicKey.from_public_bytes(store.receipt_public_key())
+    key.verify(receipt.signature, receipt.body.encode())
+
+
+def test_an_altered_or_foreign_receipt_is_refused(store: TemplateStore, tmp_path: Path) -> None:
+    receipt = store.erase("default", "ada").receipt
+    key = store.receipt_public_key()
+    altered = Receipt(receipt.body.replace("false", "true"), receipt.signature)
+    assert altered.body != receipt.body
+    with pytest.raises(StoreError, match="signature"):
+        verify_receipt(altered, key)
+    foreign = TemplateStore(
+        f"sqlite:///{tmp_path / 'foreign.db'}", MasterKeyring.create(tmp_path / "foreign.key")
+    )
+    foreign.upgrade()
+    with pytest.raises(StoreError, match="signature"):
+        verify_receipt(receipt, foreign.receipt_public_key())
+    with pytest.raises(StoreError, match="32 bytes"):
+        verify_receipt(receipt, b"short")
+    foreign.close()
+
+
+def test_a_receipt_survives_json(store: TemplateStore) -> None:
+    receipt = store.erase("default", "ada").receipt
+    assert Receipt.from_json(json.loads(json.dumps(receipt.to_json()))) == receipt
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        None,
+        [],
+        {},
+        {"body": "x"},
+        {"body": 1, "signature": "AA=="},
+        {"body": "x", "signature": "!"},
+        {"body": "x" * 5000, "signature": "AA=="},
+        {"body": "x", "signature": "AA==", "more": 1},
+    ],
+)
+def test_what_is_no_receipt_is_refused(value: object) -> None:
+    with pytest.raises(StoreError):
+        Receipt.from_json(value)
+
+
+def test_pseudonyms_are_keyed_and_unambiguous(store: TemplateStore, tmp_path: Path) -> None:
+    assert store.pseudonym("a", "bc") != store.pseudonym("ab", "c")
+    assert store.pseudonym("default", "ada") == store.pseudonym("default", "ada")
+    foreign = TemplateStore(
+        f"sqlite:///{tmp_path / 'foreign.db'}", MasterKeyring.create(tmp_path / "foreign.key")
+    )
+    foreign.upgrade()
+    assert foreign.pseudonym("default", "ada") != store.pseudonym("default", "ada")
+    foreign.close()
+
+
+def pieces(blob: bytes) -> list[bytes]:
+    """Short runs of a blob: a page boundary may cut a long one in two."""
+    return [blob[at : at + 12] for at in range(0, len(blob) - 12, 12)]
+
+
+def found(folder: Path, wanted: list[bytes]) -> dict[str, int]:
+    """How many of the pieces stand in each file of the folder."""
+    counts = {}
+    for path in sorted(folder.iterdir()):
+        content = path.read_bytes()
+        if hits := sum(piece in content for piece in wanted):
+            counts[path.name] = hits
+    return counts
+
+
+@pytest.mark.parametrize("checkpointed", [False, True])
+@pytest.mark.parametrize("action", ["erase", "replace"])
+def test_sqlite_files_keep_nothing_of_what_was_removed(
+    tmp_path: Path, keyring: MasterKeyring, checkpointed: bool, action: str
+) -> None:
+    folder = tmp_path / "data"
+    folder.mkdir()
+    url = f"sqlite:///{folder / 'veilface.db'}"
+    store = TemplateStore(url, keyring)
+    store.upgrade()
+    store.tenants.create("default")
+    generator = random.Random(3)
+    for number in range(20):
+        put(store, f"s{number}", generator.randbytes(17_000))
+    database = Database(url)
+    row = database.read(
+        lambda each: each.execute(
+            sa.select(SubjectRow.wrapped_key, TemplateRow.ciphertext)
+            .join(TemplateRow, TemplateRow.subject_pk == SubjectRow.id)
+            .where(SubjectRow.subject_id == "s7")
+        ).one()
+    )
+    if checkpointed:
+        assert database.purge_log()
+    ciphertext, wrapped_key = pieces(row.ciphertext), pieces(row.wrapped_key[9:])
+    # The control: before the removal they are all there.
+    assert max(found(folder, ciphertext).values()) >= 0.95 * len(ciphertext)
+    assert max(found(folder, wrapped_key).values()) >= 1
+
+    if action == "erase":
+        assert store.erase("default", "s7").log_purged
+        assert found(folder, [b"s7\x00"]) == {}
+    else:
+        put(store, "s7", generator.randbytes(17_000))
+
+    assert found(folder, ciphertext) == {}
+    assert found(folder, wrapped_key) == {}
+    assert (folder / "veilface.db-wal").stat().st_size == 0
+    others = store.get("default", "s8")
+    assert others is not None
+    database.close()
+    store.close()
+
+
+def test_a_long_reader_delays_the_purge_and_is_reported(
+    tmp_path: Path, keyring: MasterKeyring
+) -> None:
+    url = f"sqlite:///{tmp_path / 'veilface.db'}"
+    store = TemplateStore(url, keyring, timeout=0.2)
+    store.upgrade()
+    store.tenants.create("default")
+    put(store, "ada", b"wire" * 1000)
+    database = Database(url)
+
+    def read_while_erasing(connection: sa.Connection) -> None:
+        assert connection.execute(sa.select(SubjectRow.id)).all()
+        assert not store.erase("default", "ada").log_purged
+
+    database.read(read_while_erasing)
+    assert store.get("default", "ada") is None
+    assert store.purge()
+    assert (tmp_path / "veilface.db-wal").stat().st_size == 0
+    database.close()
+    store.close()
+
+
+def test_postgresql_keeps_no_row_after_compacting(
+    postgres_url: str, keyring: MasterKeyring
+) -> None:
+    """What the documentation says of VACUUM: dead rows are in the table's file until then."""
+    store = TemplateStore(postgres_url, keyring)
+    store.upgrade()
+    store.tenants.create("default")
+    put(store, "ada", random.Random(4).randbytes(300))
+    database = Database(postgres_url)
+    size = sa.text("SELECT pg_relation_size('templates') + pg_relation_size('subjects')")
+
+    def relation_size() -> int:
+        return database.read(lambda each: each.execute(size).scalar_one())
+
+    store.erase("default", "ada")
+    assert relation_size() > 0
+    store.compact()
+    assert relation_size() == 0
+    assert store.receipt("default", "ada") is not None
+    database.close()
+    store.close()
+
+
+def test_compacting_keeps_the_rest(store: TemplateStore) -> None:
+    put(store, "ada", b"wire")
+    put(store, "eve", b"wire")
+    store.erase("default", "eve")
+    store.compact()
+    assert store.get("default", "ada") is not None
+    assert count_receipts(store) == 1
+
+
+def count_receipts(store: TemplateStore) -> int:
+    return count(store._database, ReceiptRow)

@@ -1,0 +1,126 @@
+import threading
+
+import pytest
+import sqlalchemy as sa
+
+from templates.errors import StoreError
+from templates.store import Answer, Claim, IdempotencyConflict, TemplateStore, UnknownTenant
+from templates.store.database import Database
+from templates.store.schema import IdempotencyRow
+from tests.templates.store.conftest import Clock
+
+
+def claim(store: TemplateStore, key: str = "k", request: bytes = b"r", **more: str) -> Claim:
+    claimed = store.idempotency.claim("default", actor="key 1", key=key, request=request, **more)
+    assert isinstance(claimed, Claim)
+    return claimed
+
+
+def answer(store: TemplateStore, key: str = "k", request: bytes = b"r") -> Answer:
+    given = store.idempotency.claim("default", actor="key 1", key=key, request=request)
+    assert isinstance(given, Answer)
+    return given
+
+
+def test_a_repeated_request_gets_the_first_answer(store: TemplateStore) -> None:
+    assert store.idempotency.finish(claim(store), status=201, body=b'{"ok":true}')
+    assert answer(store) == answer(store) == Answer(201, b'{"ok":true}')
+
+
+def test_another_request_with_the_key_is_a_conflict(store: TemplateStore) -> None:
+    store.idempotency.finish(claim(store), status=201, body=b"")
+    with pytest.raises(IdempotencyConflict, match="another request"):
+        claim(store, request=b"something else")
+
+
+def test_keys_belong_to_an_actor_and_a_tenant(store: TemplateStore) -> None:
+    claim(store)
+    for tenant, actor in (("default", "key 2"), ("other", "key 1")):
+        claimed = store.idempotency.claim(tenant, actor=actor, key="k", request=b"other")
+        assert isinstance(claimed, Claim)
+
+
+def test_a_running_request_is_a_conflict_until_its_claim_lapses(
+    store: TemplateStore, clock: Clock
+) -> None:
+    dead = claim(store)
+    clock.pass_by(seconds=59)
+    with pytest.raises(IdempotencyConflict, match="still running"):
+        claim(store)
+    clock.pass_by(seconds=1)
+    alive = claim(store)
+    assert not store.idempotency.finish(dead, status=500, body=b"late")
+    assert store.idempotency.finish(alive, status=200, body=b"alive")
+    assert answer(store).body == b"alive"
+
+
+def test_a_released_key_is_free(store: TemplateStore) -> None:
+    store.idempotency.release(claim(store))
+    again = claim(store, request=b"other")
+    store.idempotency.finish(again, status=200, body=b"")
+    store.idempotency.release(again)  # an answer stays
+    assert answer(store, request=b"other").status == 200
+
+
+def test_answers_are_kept_for_a_day(store: TemplateStore, clock: Clock) -> None:
+    store.idempotency.finish(claim(store), status=200, body=b"")
+    clock.pass_by(hours=23)
+    claim(store, key="later")
+    assert store.idempotency.expire() == 0
+    clock.pass_by(hours=1)
+    assert store.idempotency.expire() == 1
+    claim(store, request=b"anything")
+
+
+def test_erasing_the_subject_takes_its_records_and_late_answers(store: TemplateStore) -> None:
+    done = claim(store, key="done", subject_id="ada")
+    store.idempotency.finish(done, status=201, body=b"about ada")
+    running = claim(store, key="running", subject_id="ada")
+    store.idempotency.finish(claim(store, key="eve", subject_id="eve"), status=201, body=b"eve")
+    store.erase("default", "ada")
+    assert not store.idempotency.finish(running, status=201, body=b"about ada")
+    claim(store, key="done")
+    assert answer(store, key="eve").body == b"eve"
+
+
+def test_key_and_request_are_stored_as_keyed_hashes(
+    store: TemplateStore, database_url: str
+) -> None:
+    claim(store, key="enroll-ada", request=b"digest of a photo", subject_id="ada")
+    database = Database(database_url)
+    row = database.read(lambda each: each.execute(sa.select(IdempotencyRow)).one())
+    stored = b"|".join(v if isinstance(v, bytes) else str(v).encode() for v in row)
+    for plain in (b"enroll-ada", b"digest of a photo", b"ada"):
+        assert plain not in stored
+    assert row.pseudonym == store.pseudonym("default", "ada")
+    database.close()
+
+
+def test_of_many_at_once_one_runs(store: TemplateStore) -> None:
+    outcomes: list[str] = []
+    start = threading.Barrier(8)
+
+    def request() -> None:
+        start.wait()
+        try:
+            outcomes.append(type(store.idempotency.claim(*args, **named)).__name__)
+        except IdempotencyConflict:
+            outcomes.append("conflict")
+
+    args, named = ("default",), {"actor": "key 1", "key": "k", "request": b"r"}
+    threads = [threading.Thread(target=request) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(outcomes) == ["Claim"] + ["conflict"] * 7
+
+
+def test_nonsense_is_refused(store: TemplateStore) -> None:
+    for key in ("", "x" * 256):
+        with pytest.raises(StoreError, match="1 to 255"):
+            claim(store, key=key)
+    with pytest.raises(UnknownTenant):
+        store.idempotency.claim("nobody", actor="a", key="k", request=b"")
+    with pytest.raises(StoreError, match="not kept"):
+        store.idempotency.finish(claim(store), status=200, body=bytes(65 * 1024))

@@ -1,0 +1,156 @@
+import threading
+from pathlib import Path
+
+import pytest
+import sqlalchemy as sa
+
+from templates.errors import SealError
+from templates.sealing import MasterKeyring
+from templates.store import TemplateStore, probe_key
+from templates.store.database import Database
+from templates.store.rewrap import WRAPPED_COLUMNS
+from templates.store.schema import Base, TemplateRow
+from tests.templates.store.conftest import put
+
+SUBJECTS = [f"s{number}" for number in range(12)]
+
+
+def wires(store: TemplateStore) -> dict[str, bytes]:
+    found = {name: store.get("default", name) for name in SUBJECTS}
+    return {name: each.wire for name, each in found.items() if each is not None}
+
+
+def test_a_rotation_leaves_nothing_under_the_old_key(
+    store: TemplateStore, database_url: str, key_file: Path, keyring: MasterKeyring
+) -> None:
+    for name in SUBJECTS:
+        put(store, name, name.encode())
+    new = store.api_keys.create("default", ["verify"])
+    pseudonym, rotation = store.pseudonym("default", "s1"), store.tenants.rotation_key("default")
+    old = keyring.current
+    total = sum(store.wrapping_keys().values())
+    assert store.wrapping_keys() == {old: total}
+    before = ciphertexts(database_url)
+
+    current = MasterKeyring.add_current(key_file)
+    assert store.wrapping_keys() == {old: total}
+    batches: list[int] = []
+    assert store.rewrap(batch=5, progress=batches.append) == total
+    assert sum(batches) == total
+    assert max(batches) == 5
+    assert store.wrapping_keys() == {current: total}
+    assert store.rewrap() == 0
+    assert ciphertexts(database_url) == before  # templates are not touched
+
+    MasterKeyring.drop_retired(key_file)
+    fresh = TemplateStore(database_url, MasterKeyring.load(key_file))
+    fresh.check()
+    assert wires(fresh) == {name: name.encode() for name in SUBJECTS}
+    assert fresh.pseudonym("default", "s1") == pseudonym
+    assert fresh.tenants.rotation_key("default") == rotation
+    assert fresh.api_keys.probe_key(new.key.prefix) == probe_key(new.token)
+    fresh.close()
+
+
+def ciphertexts(database_url: str) -> set[bytes]:
+    database = Database(database_url)
+    found = database.read(
+        lambda each: set(each.execute(sa.select(TemplateRow.ciphertext)).scalars())
+    )
+    database.close()
+    return found
+
+
+def test_dropping_the_old_key_too_early_fails_at_the_start(
+    store: TemplateStore, database_url: str, key_file: Path
+) -> None:
+    put(store, "ada", b"wire")
+    MasterKeyring.add_current(key_file)
+    backup = key_file.read_bytes()
+    MasterKeyring.drop_retired(key_file)
+    early = TemplateStore(database_url, MasterKeyring.load(key_file))
+    with pytest.raises(SealError, match="not the master key"):
+        early.check()
+    with pytest.raises(SealError, match="put the missing key back"):
+        early.rewrap()
+    key_file.write_bytes(backup)
+    late = TemplateStore(database_url, MasterKeyring.load(key_file))
+    late.rewrap()
+    late.check()
+    early.close()
+    late.close()
+
+
+def test_an_interrupted_rotation_goes_on_where_it_stopped(
+    store: TemplateStore, key_file: Path
+) -> None:
+    for name in SUBJECTS:
+        put(store, name, name.encode())
+    MasterKeyring.add_current(key_file)
+
+    def stop(count: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        store.rewrap(batch=5, progress=stop)
+    counts = store.wrapping_keys()
+    assert sorted(counts.values())[0] == 5
+    assert wires(store) == {name: name.encode() for name in SUBJECTS}  # both keys open meanwhile
+    store.check()
+    store.rewrap()
+    assert len(store.wrapping_keys()) == 1
+    assert wires(store) == {name: name.encode() for name in SUBJECTS}
+
+
+def test_a_service_in_use_loses_nothing(
+    store: TemplateStore, database_url: str, key_file: Path
+) -> None:
+    for name in SUBJECTS:
+        put(store, name, name.encode())
+    # A service with its own copy of the keyring, as another process has.
+    service = TemplateStore(database_url, MasterKeyring.load(key_file))
+    latest = {name: name.encode() for name in SUBJECTS}
+    errors: list[Exception] = []
+    stop = threading.Event()
+
+    def use() -> None:
+        number = 0
+        try:
+            while not stop.is_set():
+                name = SUBJECTS[number % len(SUBJECTS)]
+                wire = f"{name} {number}".encode()
+                put(service, name, wire)
+                latest[name] = wire
+                found = service.get("default", SUBJECTS[(7 * number) % len(SUBJECTS)])
+                assert found is not None
+                number += 1
+        except Exception as error:
+            errors.append(error)
+
+    thread = threading.Thread(target=use)
+    thread.start()
+    for _ in range(3):
+        MasterKeyring.add_current(key_file)
+        store.rewrap(batch=3)
+    stop.set()
+    thread.join()
+    assert errors == []
+    store.rewrap()
+    MasterKeyring.drop_retired(key_file)
+    fresh = TemplateStore(database_url, MasterKeyring.load(key_file))
+    assert wires(fresh) == latest
+    service.close()
+    fresh.close()
+
+
+def test_every_wrapped_column_of_the_schema_is_known() -> None:
+    """A table that is added with a wrapped blob must be added to the rotation as well."""
+    wrapped = {
+        (table.name, column.name)
+        for table in Base.metadata.tables.values()
+        for column in table.columns
+        if column.name.startswith("wrapped_")
+    }
+    known = {(each.table.__tablename__, each.blob.key) for each in WRAPPED_COLUMNS}
+    assert known == wrapped
+    assert len(WRAPPED_COLUMNS) == 5

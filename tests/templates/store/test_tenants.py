@@ -1,0 +1,40 @@
+import pytest
+
+from templates.errors import StoreError
+from templates.store import InvalidIdentifier, TemplateStore, UnknownTenant
+
+
+def test_a_tenant_is_made_once(store: TemplateStore) -> None:
+    first = store.tenants.create("acme")
+    assert store.tenants.create("acme") == first == store.tenants.get("acme")
+    assert [tenant.name for tenant in store.tenants.all()] == ["acme", "default", "other"]
+
+
+def test_a_bad_name_is_refused(store: TemplateStore) -> None:
+    for name in ("", "x" * 65, "a b", "a/b", "ä", "a\n"):
+        with pytest.raises(InvalidIdentifier, match="1 to 64"):
+            store.tenants.create(name)
+
+
+def test_an_unknown_tenant_is_said(store: TemplateStore) -> None:
+    with pytest.raises(UnknownTenant, match="'nobody'"):
+        store.tenants.get("nobody")
+    with pytest.raises(UnknownTenant, match="epoch 2"):
+        store.tenants.rotation_key("default", epoch=2)
+
+
+def test_each_tenant_has_a_rotation_key_of_its_own(store: TemplateStore) -> None:
+    mine, theirs = store.tenants.rotation_key("default"), store.tenants.rotation_key("other")
+    assert len(mine.key) == 32
+    assert mine.key != theirs.key
+    assert mine == store.tenants.rotation_key("default", epoch=1)
+    assert repr(mine) == "RotationKey(epoch=1)"
+
+
+def test_secrets_are_made_once_and_differ_by_name(store: TemplateStore) -> None:
+    assert len(store.secrets.get("export")) == 32
+    assert store.secrets.get("export") == store.secrets.get("export")
+    assert store.secrets.get("export") != store.secrets.get("pseudonym")
+    assert store.secrets.get("export").hex() not in repr(store.secrets)
+    with pytest.raises(StoreError):
+        store.secrets.get("no spaces")
