@@ -3,9 +3,7 @@
 The commands ``decoys build`` and ``calibrate`` and the demo are callers of these functions.
 """
 
-from collections import Counter
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,51 +17,25 @@ from templates.lifting import Strategy
 from templates.rotation import ROTATION_VERSION
 from verify import Calibrated, CalibrationOptions, LabelledFolder, calibrate, read_lfw_pairs
 
-Advance = Callable[[int], None]
-
 
 class PreparationError(VeilfaceError):
     """The photos do not suffice for what is to be made of them."""
 
 
-@dataclass(frozen=True)
-class Acquisition:
-    """How many photos gave a descriptor, and why the others did not (failure to acquire).
+def acquired(extraction: Extraction) -> str:
+    """Say how many photos gave no descriptor, and why (failure to acquire)."""
+    reasons = ", ".join(f"{n} {code}" for code, n in extraction.failure_counts().items())
+    counts = f"{len(extraction.failures)} of {extraction.attempts} photos failed to acquire"
+    return f"{counts} ({reasons})" if reasons else counts
 
-    Parameters
-    ----------
-    photos
-        Photos that were tried.
-    failures
-        Count by reason: a code such as ``no_face``.
-    """
 
-    photos: int
-    failures: Mapping[str, int]
-
-    @classmethod
-    def of(cls, extraction: Extraction) -> "Acquisition":
-        """Count the failures of an extraction."""
-        reasons = Counter(failure.code for failure in extraction.failures)
-        return cls(
-            photos=len(extraction.paths) + len(extraction.failures),
-            failures=dict(sorted(reasons.items())),
-        )
-
-    @property
-    def failed(self) -> int:
-        """Photos without a descriptor."""
-        return sum(self.failures.values())
-
-    def to_json(self) -> dict[str, Json]:
-        """JSON form."""
-        return {"photos": self.photos, "failed": self.failed, "reasons": dict(self.failures)}
-
-    def __str__(self) -> str:
-        reasons = ", ".join(f"{count} {code}" for code, count in self.failures.items())
-        return f"{self.failed} of {self.photos} photos failed to acquire" + (
-            f" ({reasons})" if reasons else ""
-        )
+def acquired_json(extraction: Extraction) -> dict[str, Json]:
+    """Give :func:`acquired` as JSON."""
+    return {
+        "photos": extraction.attempts,
+        "failed": len(extraction.failures),
+        "reasons": dict(extraction.failure_counts()),
+    }
 
 
 def make_generator(extraction: Extraction) -> DecoyGenerator:

@@ -7,12 +7,12 @@ from typing import Annotated, Any
 import typer
 
 from api.cli.console import emit, message, progress, say, show, table, warn_of_demo_model
-from api.cli.descriptors import extract
+from api.cli.descriptors import BULK, Aligned, Flip, bulk_pack, extract
 from api.cli.errors import CommandError, UsageError
 from api.cli.files import read_bounded, read_names
 from api.cli.options import AsJson, takes_settings
-from api.preparation import calibrate_folder
-from api.runtime import file_sealer, open_keyring, open_pack
+from api.preparation import acquired, acquired_json, calibrate_folder
+from api.runtime import file_sealer, open_keyring
 from api.settings import Settings
 from models.demo import DEMO_NOTICE
 from templates.contract import Calibration, Contract, Rate
@@ -36,7 +36,7 @@ def register(app: typer.Typer) -> None:
     app.command()(calibrate)
 
 
-@takes_settings("pack", "providers", "data_dir", "database_url", "master_key_file")
+@takes_settings(*BULK)
 def calibrate(
     folder: Annotated[
         Path,
@@ -77,9 +77,8 @@ def calibrate(
         Protocol,
         typer.Option(help="`ten-fold` adds the paper's threshold of best accuracy as a level."),
     ] = Protocol.FMR,
-    aligned: Annotated[
-        bool, typer.Option("--aligned", help="The photos are aligned square crops already.")
-    ] = False,
+    aligned: Aligned = False,
+    flip: Flip = False,
     exclude_people: Annotated[
         Path | None,
         typer.Option(
@@ -112,9 +111,7 @@ def calibrate(
     --strategy adversarial --dim 16`
     """
     dims = parse_dims(probe_dims)
-    pack = open_pack(settings)
-    if pack is None:
-        raise UsageError("a contract is bound to a model pack; name it with --pack")
+    pack = bulk_pack(settings, flip=flip, why="a contract is bound to a model pack")
     if dim >= pack.info.n:
         raise UsageError(f"--dim must be below the {pack.info.n} numbers of a descriptor")
     labelled = labelled_folder(folder)
@@ -127,7 +124,7 @@ def calibrate(
             "decoys with this pack"
         )
     exclude = frozenset() if exclude_people is None else read_names(exclude_people)
-    extraction, acquired = extract(pack, labelled.paths, aligned=aligned, what="embedding photos")
+    extraction = extract(pack, labelled.paths, aligned=aligned)
     with progress("calibrating", 100) as advance:
         shown = 0
 
@@ -165,7 +162,7 @@ def calibrate(
                 "out": str(path),
                 **({"notice": DEMO_NOTICE} if demo else {}),
                 "contract": done.contract.public(),
-                "failure_to_acquire": acquired.to_json(),
+                "failure_to_acquire": acquired_json(extraction),
                 **_report_json(done.report),
             }
         )
@@ -173,7 +170,7 @@ def calibrate(
     for calibration in done.contract.calibrations:
         show(levels_table(calibration))
     _tell(done.contract, done.report)
-    say(f"{acquired}.")
+    say(f"{acquired(extraction)}.")
     say(f"{path}: contract {done.contract.contract_id[:16]}.")
 
 

@@ -8,13 +8,13 @@ import numpy as np
 import typer
 
 from api.cli.console import emit, message, say, warn_of_demo_model
-from api.cli.descriptors import extract
-from api.cli.errors import CommandError, UsageError
+from api.cli.descriptors import BULK, Aligned, Flip, bulk_pack, extract
+from api.cli.errors import CommandError
 from api.cli.fairface import label_files, read_labels
 from api.cli.files import find_photos, is_left_out, read_names
 from api.cli.options import AsJson, takes_settings
-from api.preparation import make_generator, make_pool
-from api.runtime import file_sealer, open_keyring, open_pack
+from api.preparation import acquired, acquired_json, make_generator, make_pool
+from api.runtime import file_sealer, open_keyring
 from api.settings import Settings
 from templates.decoys import Attributes, DecoyGenerator
 
@@ -34,7 +34,7 @@ def decoys() -> None:
 
 
 @app.command()
-@takes_settings("pack", "providers", "data_dir", "database_url", "master_key_file")
+@takes_settings(*BULK)
 def build(
     photos: Annotated[
         Path,
@@ -75,9 +75,8 @@ def build(
         typer.Option(min=1, help="Take this many photos, chosen at random.", show_default=False),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of that choice.")] = 0,
-    aligned: Annotated[
-        bool, typer.Option("--aligned", help="The photos are aligned square crops already.")
-    ] = False,
+    aligned: Aligned = False,
+    flip: Flip = False,
     as_json: AsJson = False,
 ) -> None:
     """Make the lifting database from a folder of face photos.
@@ -87,9 +86,7 @@ def build(
 
     Example: `veilface decoys build fairface/train --pack buffalo_l --out decoys.veil`
     """
-    pack = open_pack(settings)
-    if pack is None:
-        raise UsageError("decoys are descriptors of a model pack; name it with --pack")
+    pack = bulk_pack(settings, flip=flip, why="decoys are descriptors of a model pack")
     chosen = find_photos(photos)
     found = len(chosen)
     if exclude is not None:
@@ -102,7 +99,7 @@ def build(
         picked = np.random.default_rng(seed).choice(len(chosen), limit, replace=False)
         chosen = [chosen[index] for index in sorted(picked.tolist())]
     attributes = _labels(photos, labels)
-    extraction, acquired = extract(pack, chosen, aligned=aligned, what="embedding photos")
+    extraction = extract(pack, chosen, aligned=aligned)
     source = (
         make_generator(extraction) if kind is Kind.GENERATOR else make_pool(extraction, attributes)
     )
@@ -124,13 +121,13 @@ def build(
                 "descriptors": len(extraction.descriptors),
                 "labelled": labelled,
                 "left_out": left_out,
-                "failure_to_acquire": acquired.to_json(),
+                "failure_to_acquire": acquired_json(extraction),
             }
         )
         return
     made = f"{kind} from {len(extraction.descriptors)} descriptors"
     say(f"{path}: {made}{', labelled' if labelled else ''}, id {source.source_id[:16]}.")
-    say(f"Left out: {left_out}. {acquired}.")
+    say(f"Left out: {left_out}. {acquired(extraction)}.")
     if kind is Kind.POOL:
         message(
             "note: who is in a pool is accepted by every template that uses them as a decoy; "

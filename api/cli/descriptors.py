@@ -1,18 +1,49 @@
 """Descriptors of many photos, with a progress bar and an account of the failures."""
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
-from api.cli.console import message, progress
-from api.cli.errors import CommandError
-from api.preparation import Acquisition
+import typer
+
+from api.cli.console import message
+from api.cli.errors import CommandError, UsageError
+from api.preparation import acquired
+from api.settings import Settings
 from models.extraction import Extraction, Extractor
 from models.pack import ModelPack
 
+BULK = ("pack", "providers", "data_dir", "database_url", "master_key_file")
 
-def extract(
-    pack: ModelPack, photos: Sequence[Path], *, aligned: bool, what: str
-) -> tuple[Extraction, Acquisition]:
+Aligned = Annotated[
+    bool, typer.Option("--aligned", help="The photos are aligned square crops already.")
+]
+Flip = Annotated[
+    bool,
+    typer.Option(
+        "--flip",
+        help="Add the descriptor of the mirrored face. Decoys and contract must agree on it.",
+    ),
+]
+
+
+def bulk_pack(settings: Settings, *, flip: bool, why: str) -> ModelPack:
+    """Load the pack with as many threads as there are processors.
+
+    Raises
+    ------
+    UsageError
+        No pack is named; ``why`` says what it is needed for.
+    """
+    if settings.pack is None:
+        raise UsageError(f"{why}; name the pack with --pack")
+    return ModelPack.load(
+        settings.pack, providers=settings.providers, threads=os.cpu_count(), flip=flip
+    )
+
+
+def extract(pack: ModelPack, photos: Sequence[Path], *, aligned: bool) -> Extraction:
     """Embed photos; those that fail are counted, reported and left out.
 
     Raises
@@ -20,14 +51,12 @@ def extract(
     CommandError
         No photo gave a descriptor.
     """
-    with progress(what, len(photos)) as advance:
-        extraction = Extractor(pack, aligned=aligned).extract(photos, progress=advance)
-    acquired = Acquisition.of(extraction)
-    if acquired.failed:
-        message(f"note: {acquired}")
-    if not len(extraction.descriptors):
+    extraction = Extractor(pack, aligned=aligned).extract(photos)
+    if not extraction.paths:
         raise CommandError(
-            f"no photo gave a descriptor: {acquired}; are these photos of faces, and does "
-            "--aligned fit them?"
+            f"no photo gave a descriptor: {acquired(extraction)}; are these photos of faces, and "
+            "does --aligned fit them?"
         )
-    return extraction, acquired
+    if extraction.failures:
+        message(f"note: {acquired(extraction)}")
+    return extraction

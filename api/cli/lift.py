@@ -96,7 +96,7 @@ def lift(
     m = public.dimension(probe=probe, dim=dim)
     source = DecoyGenerator.load(generator)
     binding.require_source(source_id=source.source_id)
-    models = ModelPack.load(pack, threads=1)
+    models = ModelPack.load(pack, threads=1, flip=bool(binding.preprocessing.get("flip")))
     info = models.info
     binding.require_embedder(
         embedder_sha256=info.embedder_sha256, preprocessing=info.preprocessing, n=info.n

@@ -90,7 +90,7 @@ _CONFIG = inspect.Parameter(
         ),
     ],
 )
-_KINDS: dict[Any, Any] = {Path: Path, int: int, bool: bool, Path | None: Path}
+_KINDS: dict[Any, Any] = {Path: Path, int: int, float: float, bool: bool, Path | None: Path}
 
 
 def _flag(name: str, declared: FieldInfo) -> inspect.Parameter:

@@ -10,7 +10,7 @@ from api.app import uvicorn_options
 from api.cli.console import message, say, warn_of_demo_model
 from api.cli.errors import CommandError
 from api.cli.options import takes_settings
-from api.runtime import Runtime
+from api.runtime import Runtime, bootstrap_token
 from api.settings import Settings
 
 
@@ -39,9 +39,9 @@ def serve(
     runtime = Runtime.open(settings)
     try:
         embedder = runtime.contract.binding.embedder_sha256
-        new_key = None
+        token = None
         if not check:
-            new_key = runtime.store.api_keys.bootstrap(tenant=settings.default_tenant)
+            token = bootstrap_token(runtime.store, settings)
     finally:
         runtime.close()
     if warn_of_demo_model(embedder) and not settings.demo:
@@ -49,9 +49,9 @@ def serve(
     if check:
         say("Everything fits: contract, decoys, pack, database and master key.")
         return
-    if new_key is not None:
-        say(f"API key with all rights of tenant {new_key.key.tenant}, shown only now:")
-        say(new_key.token)
+    if token is not None:
+        say(f"API key with all rights of tenant {settings.default_tenant}, shown only now:")
+        say(token)
     settings = settings.model_copy(update={"port": free_port(settings.host, settings.port)})
     message(f"Veilface listens on http://{settings.host}:{settings.port}")
     try:

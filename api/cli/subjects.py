@@ -14,7 +14,7 @@ from api.settings import Settings
 from enroll.enroller import MAX_PHOTOS
 from enroll.errors import InconsistentImages, PhotoRejected
 from models.errors import ModelError
-from models.pack import FacePolicy
+from models.pack import FacePolicy, ModelPack
 from templates.decoys import Attributes
 from templates.store.subjects import Source
 
@@ -64,12 +64,16 @@ def enroll(
     data = [read_bounded(photo, settings.max_image_bytes) for photo in photos]
     runtime = Runtime.open(settings)
     try:
-        _require_pack(runtime)
+        pack = _required_pack(runtime)
         name = _tenant(runtime, tenant)
         epoch = runtime.epoch(name)
         try:
-            enrollment = runtime.enroll_photos(
-                name, epoch, data, policy=face, attributes=Attributes(gender, race)
+            enrollment = runtime.enroller(name, epoch).from_photos(
+                pack,
+                data,
+                attributes=Attributes(gender, race),
+                policy=face,
+                limits=runtime.image_limits,
             )
         except PhotoRejected as error:
             raise CommandError(f"{photos[error.index].name}: {error.cause}") from None
@@ -125,17 +129,18 @@ def verify(
     data = read_bounded(photo, settings.max_image_bytes)
     runtime = Runtime.open(settings)
     try:
-        _require_pack(runtime)
+        pack = _required_pack(runtime)
         name = _tenant(runtime, tenant)
         found = runtime.store.get(name, subject)
         if found is None:
             raise CommandError(f"tenant {name} has no subject of that name; enroll it first")
+        verifier = runtime.verifier(name, found.record.rotation_epoch)
         try:
-            embedding = runtime.embed(data, policy=face).embedding
+            decision = verifier.decide_photo(
+                pack, data, found.wire, level=level, policy=face, limits=runtime.image_limits
+            )
         except ModelError as error:
             raise CommandError(f"{photo.name}: {error}") from None
-        verifier = runtime.verifier(name, found.record.rotation_epoch)
-        decision = verifier.decide_embedding(embedding, found.wire, level=level)
         warn_of_demo_model(runtime.contract.binding.embedder_sha256)
     finally:
         runtime.close()
@@ -155,9 +160,10 @@ def verify(
         raise typer.Exit(1)
 
 
-def _require_pack(runtime: Runtime) -> None:
+def _required_pack(runtime: Runtime) -> ModelPack:
     if runtime.pack is None:
         raise UsageError("photos need a model pack; name it with --pack")
+    return runtime.pack
 
 
 def _tenant(runtime: Runtime, named: str | None) -> str:

@@ -1,0 +1,100 @@
+"""A deployment that the commands themselves made, from drawn faces and the demo model."""
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from api.cli import app
+from models.demo import build_demo_pack
+from models.synthetic import draw_face, encode_photo
+
+DIM = 8
+PROBE_DIM = 4
+
+
+@dataclass(frozen=True)
+class Ran:
+    """What a command did."""
+
+    status: int
+    stdout: str
+    stderr: str
+
+    @property
+    def json(self) -> Any:
+        return json.loads(self.stdout)
+
+
+def run(*arguments: str | Path) -> Ran:
+    """Run a command in this process."""
+    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return Ran(result.exit_code, result.stdout, result.stderr)
+
+
+def draw(folder: Path, seeds: range, photos: range) -> Path:
+    """Write photos of drawn people to ``folder/person-<seed>/<photo>.png``."""
+    for seed in seeds:
+        person = folder / f"person-{seed}"
+        person.mkdir(parents=True, exist_ok=True)
+        for photo in photos:
+            (person / f"{photo}.png").write_bytes(encode_photo(draw_face(seed, photo)))
+    return folder
+
+
+@dataclass(frozen=True)
+class World:
+    """Folders that the commands read and wrote."""
+
+    root: Path
+    pack: Path
+    decoy_faces: Path
+    labelled: Path
+    people: Path
+    data: Path
+    built: Any
+    calibrated: Any
+
+    def photos(self, seed: int, numbers: range) -> list[Path]:
+        return [self.people / f"person-{seed}" / f"{number}.png" for number in numbers]
+
+
+@pytest.fixture(scope="session")
+def world(tmp_path_factory: pytest.TempPathFactory) -> World:
+    root = tmp_path_factory.mktemp("world")
+    pack = build_demo_pack(root / "pack")
+    decoy_faces = draw(root / "decoy-faces", range(5000, 5150), range(1))
+    labelled = draw(root / "labelled", range(6000, 6050), range(4))
+    people = draw(root / "people", range(1, 5), range(5))
+    data = root / "data"
+    built = run("decoys", "build", decoy_faces, "--pack", pack, "--data-dir", data, "--json")
+    assert built.status == 0, built.stderr
+    calibrated = run(
+        *("calibrate", labelled, "--pack", pack, "--data-dir", data, "--dim", str(DIM)),
+        *("--probe-dims", str(PROBE_DIM), "--json"),
+    )
+    assert calibrated.status == 0, calibrated.stderr
+    return World(root, pack, decoy_faces, labelled, people, data, built.json, calibrated.json)
+
+
+@pytest.fixture
+def data(world: World, tmp_path: Path) -> Path:
+    """A data folder of this test alone: contract, decoys and master key, no database yet."""
+    return Path(shutil.copytree(world.data, tmp_path / "data"))
+
+
+@pytest.fixture
+def veilface(world: World, data: Path) -> Callable[..., Ran]:
+    """Run a command on the test's data folder."""
+
+    def call(*arguments: str | Path) -> Ran:
+        return run(*arguments, "--data-dir", data)
+
+    return call

@@ -1,0 +1,64 @@
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from api.cli.errors import CommandError, Commands, UsageError, sentence
+from models.errors import PackError
+from templates.errors import SealError
+from tests.api.cli.conftest import run
+
+SECRET = "0.123456789"
+
+
+def failing_app(error: Exception) -> typer.Typer:
+    app = typer.Typer(cls=Commands, pretty_exceptions_enable=False)
+
+    @app.command()
+    def fail() -> None:
+        raise error
+
+    @app.command()
+    def other() -> None:
+        """So that there is a group."""
+
+    return app
+
+
+@pytest.mark.parametrize(
+    ("error", "said", "status"),
+    [
+        (SealError("the key is another one"), "error: the key is another one", 1),
+        (PackError("no embedder here"), "error: no embedder here", 1),
+        (CommandError("give photos"), "error: give photos", 1),
+        (UsageError("not both"), "error: not both", 2),
+        (FileNotFoundError(2, "No such file or directory", "x.jpg"), "x.jpg: No such file", 1),
+        (PermissionError(13, "Permission denied", "key"), "key: Permission denied", 1),
+        (MemoryError(), "not enough memory", 1),
+    ],
+)
+def test_an_error_is_one_sentence_and_a_status(error, said, status):
+    result = CliRunner().invoke(failing_app(error), ["fail"])
+    assert result.exit_code == status
+    assert said in result.stderr
+    assert "Traceback" not in result.stderr
+    assert result.stdout == ""
+
+
+def test_an_unexpected_error_shows_its_place_and_never_its_text():
+    result = CliRunner().invoke(failing_app(ValueError(f"descriptor {SECRET}")), ["fail"])
+    assert result.exit_code == 1
+    assert SECRET not in result.stderr
+    assert "ValueError at test_errors.py:" in result.stderr
+
+
+def test_a_cause_does_not_leak_either():
+    error = CommandError("the pack is broken")
+    error.__cause__ = ValueError(SECRET)
+    assert sentence(error) == "the pack is broken"
+
+
+def test_a_missing_pack_is_named():
+    ran = run("models", "inspect", "/nonexistent/pack")
+    assert ran.status == 1
+    assert "/nonexistent/pack does not exist" in ran.stderr
+    assert ran.stdout == ""

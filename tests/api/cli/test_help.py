@@ -1,0 +1,79 @@
+"""Every command explains itself, and docs/cli.md knows every command and option."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer.main
+
+from api.cli import app
+from tests.api.cli.conftest import run
+
+DOCS = Path(__file__).resolve().parents[3] / "docs" / "cli.md"
+PROMISED = {
+    *("demo", "serve", "enroll", "verify", "lift", "calibrate"),
+    *("decoys build", "models inspect", "db upgrade", "db check", "db current"),
+    *("keys create", "keys list", "keys revoke", "keys master", "keys rotate", "keys rewrap"),
+    "keys verify-receipt",
+}
+
+
+def commands(group: Any, *path: str) -> Iterator[tuple[tuple[str, ...], Any]]:
+    for name, command in group.commands.items():
+        if hasattr(command, "commands"):
+            yield from commands(command, *path, name)
+        else:
+            yield (*path, name), command
+
+
+ALL = dict(commands(typer.main.get_command(app)))
+
+
+def test_the_commands_are_those_promised():
+    assert {" ".join(path) for path in ALL} == PROMISED
+
+
+@pytest.mark.parametrize("path", ALL, ids=" ".join)
+def test_help_lets_a_newcomer_act(path):
+    shown = run(*path, "--help")
+    assert shown.status == 0
+    text = ALL[path].help
+    assert "Example: " in text
+    assert f"veilface {' '.join(path)}" in text
+    assert all(
+        getattr(parameter, "help", None) or parameter.name == "help"
+        for parameter in ALL[path].params
+    )
+
+
+@pytest.mark.parametrize("path", ALL, ids=" ".join)
+def test_the_documentation_knows_every_command_and_option(path):
+    text = DOCS.read_text(encoding="utf-8")
+    heading = f"## `veilface {' '.join(path)}`"
+    assert heading in text
+    section = text.split(heading, 1)[1].split("\n## ", 1)[0]
+    own = [
+        name
+        for parameter in ALL[path].params
+        if getattr(parameter, "rich_help_panel", None) != "Settings"
+        for name in parameter.opts
+        if name.startswith("--") and name not in ("--help", "--json")
+    ]
+    assert [name for name in own if f"`{name}" not in section] == []
+    takes_settings = any(
+        getattr(parameter, "rich_help_panel", None) == "Settings" for parameter in ALL[path].params
+    )
+    assert ("Settings as flags: " in section) == takes_settings
+    assert ("`--json`" in section) == any("--json" in p.opts for p in ALL[path].params)
+
+
+def test_no_command_shows_the_help_and_is_wrong_usage():
+    shown = run()
+    assert shown.status == 2
+    assert "veilface demo" in shown.stdout + shown.stderr
+
+
+@pytest.mark.parametrize("arguments", [["unknown"], ["verify"], ["serve", "--port", "x"]])
+def test_wrong_usage_is_status_2(arguments):
+    assert run(*arguments).status == 2
