@@ -279,18 +279,19 @@ def predicted_attributes(
     return predicted
 
 
-def prepare(args: argparse.Namespace, work: Path, env: dict[str, str], probe_dims: str) -> None:
+def prepare(args: argparse.Namespace, work: Path, env: dict[str, str]) -> None:
     """Decoys and contract by the command line, people of the attempts left out."""
     data = args.data
+    probe_dims = ["--probe-dims", str(args.probe_dim)] if args.probe_dim else []
     kind = "pool" if args.pool else "generator"
     veilface(
-        "decoys", "build", data / "fairface", "--split", "train", "--pack", args.pack,
+        "decoys", "build", data / "fairface" / "train", "--pack", args.pack,
         "--kind", kind, "--out", work / "decoys.veil", env=env,
     )  # fmt: skip
     veilface(
         "calibrate", data / "lfw" / "aligned112", "--aligned", "--pack", args.pack,
         "--decoys", work / "decoys.veil", "--strategy", args.strategy, "--dim", str(args.dim),
-        "--probe-dims", probe_dims, "--exclude-people", data / "lfw" / "photos",
+        *probe_dims, "--exclude-people", data / "lfw" / "photos",
         "--out", work / "contract.json", env=env,
     )  # fmt: skip
 
@@ -325,10 +326,21 @@ def main() -> None:
             "VEILFACE_CONTRACT_FILE": str(work / "contract.json"),
         }
         started = time.perf_counter()
-        prepare(args, work, env, str(args.probe_dim or 4))
+        prepare(args, work, env)
         prepared = time.perf_counter()
         token = json.loads(
-            veilface("keys", "create", "--json", "--rights", "enroll,verify,embeddings", env=env)
+            veilface(
+                "keys",
+                "create",
+                "--json",
+                "--right",
+                "enroll",
+                "--right",
+                "verify",
+                "--right",
+                "embeddings",
+                env=env,
+            )
         )["token"]
         pack = ModelPack.load(args.pack)
         people = people_of(args.data / "lfw" / "photos")
