@@ -26,7 +26,7 @@ from templates.lifting import Strategy, lift
 from templates.subspace import AffineSubspace
 
 MAX_PHOTOS = 10
-WIRE_DTYPE = "float16"
+WIRE_DTYPE: wire.WireDtype = "float16"
 
 
 @dataclass(frozen=True)

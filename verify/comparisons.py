@@ -20,7 +20,7 @@ from verify.cohort import Probes, cohort_statistics
 from verify.thresholds import Genuine, Impostors
 from verify.trials import Indices, Plan, impostor_sample
 
-WIRE_DTYPE = "float16"
+WIRE_DTYPE: wire.WireDtype = "float16"
 PROBE_TILE = 256
 PAIR_TILE_BYTES = 128 * 2**20
 
