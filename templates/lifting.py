@@ -273,6 +273,8 @@ def _decoys(
     """Draw decoys, and draw again where one photo came twice or is the subject's own."""
     decoys = source.draw(len(points), k, stream=stream, unlike=unlike, sub_databases=sub_databases)
     repeated = np.flatnonzero(_repeats(points, decoys))
+    if repeated.size:
+        decoys = decoys.copy()  # the array is the source's
     for _ in range(_REDRAWS):
         if not repeated.size:
             return decoys
