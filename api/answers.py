@@ -8,6 +8,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from api.errors import ApiError
+from models.demo import DEMO_NOTICE
 
 
 class JsonAnswer(Response):
@@ -29,6 +30,8 @@ def answer(
 ) -> JsonAnswer:
     """Return a success with the request id in its body."""
     content = {**body, "request_id": request.state.request_id}
+    if request.app.state.settings.demo:
+        content["notice"] = DEMO_NOTICE
     return JsonAnswer(content, status_code=status, headers=dict(headers or {}))
 
 

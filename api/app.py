@@ -40,7 +40,7 @@ def create_app(
             runtime = await anyio.to_thread.run_sync(open_runtime, settings)
         except StartError as error:
             # Its sentence is written for the operator and holds no secret.
-            log("start failed: " + str(error), level=logging.ERROR)
+            log("start failed: " + str(error), severity=logging.ERROR)
             raise
         app.state.runtime = runtime
         app.state.gate = Gate(slots=settings.resolved_compute_slots, waiting=settings.queue_limit)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import anyio
+from starlette.datastructures import FormData
 from starlette.formparsers import MultiPartException, MultiPartParser
 from starlette.requests import Request
 
@@ -70,6 +71,22 @@ class _InMemoryParser(MultiPartParser):
         self._max_images = max_images
         self._max_image_bytes = max_image_bytes
         self._image_bytes = 0
+        self._complete = False
+
+    def on_end(self) -> None:
+        self._complete = True
+
+    async def parse(self) -> FormData:
+        try:
+            form = await super().parse()
+            if not self._complete:
+                # Otherwise a truncated form would pass with the photos that came before the cut.
+                raise MultiPartException("the last boundary is missing")
+        except BaseException:
+            for file in self._files_to_close_on_error:
+                file.close()
+            raise
+        return form
 
     def on_headers_finished(self) -> None:
         super().on_headers_finished()

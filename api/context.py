@@ -13,9 +13,9 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from api.answers import error_answer
 from api.errors import ApiError
 from api.logging import log
+from models.demo import DEMO_NOTICE
 
 SANE_REQUEST_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{7,63}")
-DEMO_NOTICE = "demo model: not for authentication"
 SECURITY_HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Cache-Control": "no-store",
@@ -82,7 +82,7 @@ class RequestContext:
             route = scope.get("route")
             log(
                 "request",
-                level=logging.ERROR if fields.get("code") == "internal_error" else logging.INFO,
+                severity=logging.ERROR if fields.get("code") == "internal_error" else logging.INFO,
                 request_id=request_id,
                 method=scope["method"],
                 route=getattr(route, "path", None),

@@ -36,9 +36,12 @@ async def stream_limited(request: Request, limit: int) -> AsyncGenerator[bytes, 
         {"Connection": "close"},
     )
     declared = request.headers.get("content-length")
-    # A length of twenty digits is refused without converting it.
-    if declared is not None and (len(declared) > 18 or int(declared) > limit):
-        raise too_large
+    if declared is not None:
+        if not (declared.isascii() and declared.isdecimal()):
+            raise ApiError("malformed_request", "Content-Length is not a number")
+        # A length of twenty digits is refused without converting it.
+        if len(declared) > 18 or int(declared) > limit:
+            raise too_large
     seen = 0
     async for chunk in request.stream():
         seen += len(chunk)

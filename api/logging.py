@@ -25,7 +25,7 @@ FIELDS = frozenset(
         "key_id",
         "subject",
         "decision",
-        "level",
+        "security_level",
         "error_type",
         "receipt_id",
         "contract_id",
@@ -66,7 +66,7 @@ class _ToStderr(logging.StreamHandler[Any]):
         super().emit(record)
 
 
-def log(event: str, *, level: int = logging.INFO, **fields: Any) -> None:
+def log(event: str, *, severity: int = logging.INFO, **fields: Any) -> None:
     """Write one line.
 
     Parameters
@@ -80,7 +80,7 @@ def log(event: str, *, level: int = logging.INFO, **fields: Any) -> None:
     if unknown:
         raise ValueError(f"log fields that are not declared: {sorted(unknown)}")
     kept = {name: value for name, value in fields.items() if value is not None}
-    logging.getLogger(LOGGER).log(level, event, extra={"fields": kept})
+    logging.getLogger(LOGGER).log(severity, event, extra={"fields": kept})
 
 
 def configure(level: str) -> None:

@@ -111,3 +111,12 @@ IMPORT_BODY = _body(
         "examples": {"import": {"value": {"export": "VkZYMS4uLg=="}}},
     },
 )
+
+
+def codes_table() -> str:
+    """Write the table of ``docs/errors.md`` from the one table of codes."""
+    rows = ["| status | code | meaning |", "|---|---|---|"]
+    for entry in ERROR_CODES.values():
+        later = " Comes with a later release." if entry.reserved else ""
+        rows.append(f"| {entry.status} | `{entry.code}` | {entry.meaning}{later} |")
+    return "\n".join(rows) + "\n"

@@ -22,11 +22,11 @@ from sqlalchemy.exc import ArgumentError
 from api.errors import ApiError, StartError
 from api.settings import Settings
 from api.transfer import Exported, ExportKey, seal_export
-from enroll import Enroller, Enrollment, PhotoRejected
+from enroll import Enroller, Enrollment
 from enroll.enroller import WIRE_DTYPE
 from models.decoding import ImageLimits
-from models.errors import ModelError, PackError
-from models.pack import FacePolicy, FaceSample, ModelPack
+from models.errors import ModelError
+from models.pack import ModelPack
 from templates import wire
 from templates.contract import Contract
 from templates.decoys import Attributes, DecoyGenerator, DecoyPool, load_source
@@ -209,6 +209,15 @@ def open_pack(settings: Settings, contract: Contract | None = None) -> ModelPack
     return pack
 
 
+def _lacking(what: str) -> ApiError:
+    return ApiError(
+        "model_unavailable",
+        f"this service runs without a {what}: send templates, or ask its operator",
+        {},
+        {"Retry-After": "60"},
+    )
+
+
 class NoDecoys:
     """The decoy source of a service that has none: it enrolls clients' templates only."""
 
@@ -314,8 +323,26 @@ class Runtime:
                 self._verifiers[tenant, epoch] = found
         return found
 
-    def require_photos(self, *, lifting: bool = False) -> None:
-        """Refuse photos where there is no pack, or, for lifting, no decoys.
+    def require_decoys(self) -> None:
+        """Refuse to lift where there are no decoys and the strategy needs some.
+
+        Raises
+        ------
+        ApiError
+            ``model_unavailable``.
+        """
+        if self.source is None and self.contract.binding.strategy is not Strategy.RANDOM:
+            raise _lacking("decoys file")
+
+    @property
+    def image_limits(self) -> ImageLimits:
+        """What a photo may cost before it is decoded, by the settings."""
+        return ImageLimits(
+            max_bytes=self.settings.max_image_bytes, max_pixels=self.settings.max_image_pixels
+        )
+
+    def required_pack(self) -> ModelPack:
+        """Return the pack.
 
         Raises
         ------
@@ -323,63 +350,8 @@ class Runtime:
             ``model_unavailable``.
         """
         if self.pack is None:
-            lacking = "model pack: send a template"
-        elif (
-            lifting
-            and self.source is None
-            and self.contract.binding.strategy is not Strategy.RANDOM
-        ):
-            lacking = "decoys file: send a template"
-        else:
-            return
-        raise ApiError(
-            "model_unavailable",
-            f"this service runs without a {lacking}, or ask its operator",
-            {},
-            {"Retry-After": "60"},
-        )
-
-    def embed(self, photo: bytes, *, policy: FacePolicy) -> FaceSample:
-        """Turn one photo into an embedding, under the limits of the settings.
-
-        Raises
-        ------
-        ModelError
-            If the photo has no usable face.
-        """
-        if self.pack is None:
-            raise PackError("there is no model pack")
-        limits = ImageLimits(
-            max_bytes=self.settings.max_image_bytes, max_pixels=self.settings.max_image_pixels
-        )
-        return self.pack.embed_photo(photo, policy=policy, limits=limits)
-
-    def enroll_photos(
-        self,
-        tenant: str,
-        epoch: int,
-        photos: Sequence[bytes],
-        *,
-        policy: FacePolicy,
-        attributes: Attributes,
-    ) -> Enrollment:
-        """Turn 1 to 10 photos of one person into one template.
-
-        Raises
-        ------
-        PhotoRejected, InconsistentImages
-        """
-        samples = []
-        for index, photo in enumerate(photos):
-            try:
-                samples.append(self.embed(photo, policy=policy))
-            except ModelError as error:
-                raise PhotoRejected(index, error) from error
-        return self.enroller(tenant, epoch).from_embeddings(
-            np.stack([sample.embedding for sample in samples]),
-            attributes=attributes,
-            qualities=[sample.quality for sample in samples],
-        )
+            raise _lacking("model pack")
+        return self.pack
 
     def put(
         self,

@@ -70,7 +70,8 @@ async def enroll(
     query = query_of(request, ("face",))
     async with gate.admitted():
         if content_type(request) == "multipart/form-data":
-            runtime.require_photos(lifting=True)
+            runtime.required_pack()
+            runtime.require_decoys()
             form = await read_form(
                 request,
                 max_bytes=settings.max_request_bytes,
@@ -112,15 +113,15 @@ async def _enroll_photos(
     idempotency_key: str | None,
 ) -> Response:
     runtime: Runtime = request.app.state.runtime
-    photos = form.images("images")
+    pack, photos = runtime.required_pack(), form.images("images")
     reject_unknown(form.fields, ("attributes", "face"))
     policy = face_policy(one_of(form.fields, query, "face"))
     attributes = parse_attributes(form.fields.get("attributes"))
 
     def work() -> Outcome:
         epoch = runtime.epoch(caller.tenant)
-        enrollment = runtime.enroll_photos(
-            caller.tenant, epoch, photos, policy=policy, attributes=attributes
+        enrollment = runtime.enroller(caller.tenant, epoch).from_photos(
+            pack, photos, attributes=attributes, policy=policy, limits=runtime.image_limits
         )
         return _stored(runtime, caller.tenant, subject, epoch, enrollment, Source.PHOTOS)
 

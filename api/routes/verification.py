@@ -61,7 +61,7 @@ async def verify(
         else:
             decide = await _sent_probe(request, runtime, caller, query)
         decision = await gate.compute(lambda: _decide(runtime, caller, subject, decide))
-    request.state.log["level"] = decision.level
+    request.state.log["security_level"] = decision.level
     request.state.log["decision"] = "accept" if decision.accepted else "reject"
     body: dict[str, Any] = {
         "decision": "accept" if decision.accepted else "reject",
@@ -77,7 +77,7 @@ async def verify(
 
 
 async def _photo_probe(request: Request, runtime: Runtime, query: dict[str, str]) -> Decide:
-    runtime.require_photos()
+    pack = runtime.required_pack()
     settings = runtime.settings
     form = await read_form(
         request,
@@ -92,8 +92,9 @@ async def _photo_probe(request: Request, runtime: Runtime, query: dict[str, str]
     policy = face_policy(one_of(form.fields, query, "face"))
 
     def decide(verifier: Verifier, stored: bytes | None) -> Decision:
-        embedding = runtime.embed(photo, policy=policy).embedding
-        return verifier.decide_embedding(embedding, stored, level=level)
+        return verifier.decide_photo(
+            pack, photo, stored, level=level, policy=policy, limits=runtime.image_limits
+        )
 
     return decide
 

@@ -1,0 +1,34 @@
+"""A running application on SQLite, and on PostgreSQL where a test asks for both."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from api.app import create_app
+from tests.api.client import Client
+from tests.api.deployment import Deployment, bearer, deploy
+from tests.databases import database_url, postgres_database, postgres_url  # noqa: F401
+
+
+@pytest.fixture(scope="module")
+def deployment(tmp_path_factory: pytest.TempPathFactory) -> Deployment:
+    """A deployment on SQLite, shared by the tests of one module."""
+    return deploy(tmp_path_factory.mktemp("deployment"))
+
+
+@pytest.fixture(scope="module")
+def client(deployment: Deployment) -> Iterator[Client]:
+    """A client with the bootstrap key: all rights."""
+    with Client(create_app(deployment.settings)) as running:
+        running.headers.update(bearer(deployment.token))
+        yield running
+
+
+@pytest.fixture
+def both(tmp_path: Path, database_url: str) -> Iterator[tuple[Client, Deployment]]:  # noqa: F811
+    """A fresh deployment on each database, with a client that has all rights."""
+    deployment = deploy(tmp_path, database_url=database_url)
+    with Client(create_app(deployment.settings)) as running:
+        running.headers.update(bearer(deployment.token))
+        yield running, deployment

@@ -1,0 +1,174 @@
+"""A small real deployment: a tiny ONNX pack, a contract, decoys, a database, API keys."""
+
+import functools
+import io
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+from numpy.typing import NDArray
+from onnx import TensorProto, helper, numpy_helper
+from PIL import Image
+
+from api.runtime import bootstrap_token, file_sealer, open_keyring, open_store, prepare_database
+from api.settings import Settings
+from models.pack import ModelPack
+from templates.contract import Binding, Calibration, Contract, Level, Rate
+from templates.decoys import DecoyGenerator, DecoySource
+from templates.distances import DEFAULT_STEPS, Metric
+from templates.lifting import Strategy
+from templates.randomness import Keystream
+from templates.rotation import ROTATION_VERSION
+from verify.cohort import make_cohort
+
+N = 64
+M = 8
+PROBE_M = 2
+RATE = Rate(errors=1, trials=1000, ci_low=0.0, ci_high=0.01)
+
+
+def write_pack(folder: Path) -> Path:
+    """A pack without a detector: a fixed random projection of the pooled crop."""
+    rng = np.random.default_rng(1)
+    matrix = rng.normal(size=(14 * 14 * 3, N)).astype(np.float32)
+    graph = helper.make_graph(
+        [
+            helper.make_node(
+                "AveragePool", ["data"], ["pooled"], kernel_shape=[8, 8], strides=[8, 8]
+            ),
+            helper.make_node("Flatten", ["pooled"], ["flat"], axis=1),
+            helper.make_node("MatMul", ["flat", "matrix"], ["embedding"]),
+        ],
+        "tiny",
+        [helper.make_tensor_value_info("data", TensorProto.FLOAT, ["batch", 3, 112, 112])],
+        [helper.make_tensor_value_info("embedding", TensorProto.FLOAT, ["batch", N])],
+        [numpy_helper.from_array(matrix, "matrix")],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    folder.mkdir(parents=True, exist_ok=True)
+    onnx.save(model, folder / "tiny.onnx")
+    return folder
+
+
+def picture(person: int, shot: int = 0) -> NDArray[np.uint8]:
+    """A 112 x 112 pattern of one "person", with a little noise of the shot."""
+    base = np.random.default_rng([7, person]).integers(0, 256, (14, 14, 3))
+    noise = np.random.default_rng([8, person, shot]).normal(0, 8, (14, 14, 3))
+    small = np.clip(base + noise, 0, 255).astype(np.uint8)
+    return np.repeat(np.repeat(small, 8, axis=0), 8, axis=1)
+
+
+def photo(person: int, shot: int = 0, *, form: str = "PNG", **options: Any) -> bytes:
+    """:func:`picture` as a file."""
+    out = io.BytesIO()
+    Image.fromarray(picture(person, shot)).save(out, form, **options)
+    return out.getvalue()
+
+
+def unit(rows: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Rows of norm 1."""
+    return (rows / np.linalg.norm(rows, axis=-1, keepdims=True)).astype(np.float32)
+
+
+@functools.cache
+def make_source(n: int = N) -> DecoyGenerator:
+    rng = np.random.default_rng(3)
+    return DecoyGenerator.fit(unit(rng.normal(size=(400, n))))
+
+
+def make_contract(pack: ModelPack, source: DecoySource, **changes: Any) -> Contract:
+    """A contract whose thresholds suit the patterns of :func:`picture`."""
+    binding = Binding(
+        **{
+            "embedder_sha256": pack.info.embedder_sha256,
+            "preprocessing": pack.info.preprocessing,
+            "n": pack.info.n,
+            "strategy": Strategy.ADVERSARIAL,
+            "m": M,
+            "decoy_source_id": source.source_id,
+            "rotation_version": ROTATION_VERSION,
+            **changes,
+        }
+    )
+    levels = (
+        Level("fmr-1e-2", 1e-2, 0.75, 2.0, RATE, RATE),
+        Level("fmr-1e-3", 1e-3, 0.8, 2.5, RATE, RATE),
+        Level("accuracy", None, 0.7, 2.0, RATE, RATE),
+    )
+    calibrations = (
+        Calibration("p2s", Metric.SPHERICAL, 0, DEFAULT_STEPS, levels, None),
+        Calibration("s2s", Metric.SPHERICAL, PROBE_M, DEFAULT_STEPS, levels, (0.3, 0.95)),
+    )
+    return Contract(
+        binding=binding,
+        recorded={"pack": pack.info.name},
+        calibrations=calibrations,
+        default_level="fmr-1e-3",
+        photo_consistency=0.5,
+        template_foot_point_norm=(0.1, 0.8),
+        cohort=make_cohort(
+            source, strategy=binding.strategy, m=M, stream=Keystream.seeded("cohort"), size=40
+        ),
+    )
+
+
+@dataclass(frozen=True)
+class Deployment:
+    """Files of a deployment, its settings and the token of its first key."""
+
+    settings: Settings
+    token: str
+    contract: Contract
+    source: DecoySource
+
+    def key(self, *rights: str, tenant: str = "default") -> str:
+        """Make another API key; return its token."""
+        store = open_store(self.settings, open_keyring(self.settings))
+        try:
+            store.tenants.create(tenant)
+            return store.api_keys.create(tenant, rights).token
+        finally:
+            store.close()
+
+
+def deploy(folder: Path, *, database_url: str | None = None, **changes: Any) -> Deployment:
+    """Write a deployment into ``folder``."""
+    pack_dir = write_pack(folder / "tiny")
+    pack, source = ModelPack.load(pack_dir, threads=1), make_source()
+    settings = Settings(
+        **{
+            "data_dir": folder / "data",
+            "database_url": database_url,
+            "pack": pack_dir,
+            "compute_slots": 2,
+            **changes,
+        }
+    )
+    keyring = open_keyring(settings)
+    contract = make_contract(pack, source)
+    contract.save(settings.resolved_contract_file, file_sealer(keyring))
+    source.save(settings.resolved_decoys_file)
+    store = open_store(settings, keyring)
+    try:
+        prepare_database(store)
+        token = bootstrap_token(store, settings)
+    finally:
+        store.close()
+    assert token is not None
+    return Deployment(settings, token, contract, source)
+
+
+def bearer(token: str) -> dict[str, str]:
+    return {"Authorization": f"Bearer {token}"}
+
+
+def images(*files: bytes, name: str = "images") -> list[tuple[str, tuple[str, bytes, str]]]:
+    """Files for httpx's ``files=``."""
+    return [(name, (f"{i}.png", data, "image/png")) for i, data in enumerate(files)]
+
+
+def codes(answers: Iterable[Any]) -> list[int]:
+    return [answer.status_code for answer in answers]

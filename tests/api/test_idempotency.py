@@ -1,0 +1,119 @@
+import threading
+from typing import Any
+
+import pytest
+
+from tests.api.client import Client
+from tests.api.deployment import Deployment, bearer, images, photo
+from tests.api.shapes import assert_error
+
+
+def put(client: Client, key: str | None, *files: bytes, subject: str = "idem", **more: Any) -> Any:
+    headers = {} if key is None else {"Idempotency-Key": key}
+    headers |= more.pop("headers", {})
+    return client.put(
+        f"/v1/subjects/{subject}/enrollment", files=images(*files), headers=headers, **more
+    )
+
+
+def without_request_id(answer: Any) -> dict[str, Any]:
+    body = dict(answer.json())
+    del body["request_id"]
+    return body
+
+
+def test_the_same_request_is_answered_once(both: tuple[Client, Deployment]) -> None:
+    client, _ = both
+    first = put(client, "key-1", photo(1))
+    # httpx picks a new multipart boundary: the bytes differ, the request does not.
+    second = put(client, "key-1", photo(1))
+    assert (first.status_code, second.status_code) == (201, 201)
+    assert without_request_id(first) == without_request_id(second)
+    assert first.json()["request_id"] != second.json()["request_id"]
+    assert "idempotency-replayed" not in first.headers
+    assert second.headers["idempotency-replayed"] == "true"
+    third = put(client, None, photo(1))
+    assert (third.status_code, third.json()["replaced"]) == (200, True)
+
+
+def test_another_request_under_the_key_conflicts(both: tuple[Client, Deployment]) -> None:
+    client, deployment = both
+    assert put(client, "key-2", photo(1)).status_code == 201
+    for answer in (
+        put(client, "key-2", photo(2)),
+        put(client, "key-2", photo(1), photo(1, 1)),
+        put(client, "key-2", photo(1), subject="somebody-else"),
+        put(client, "key-2", photo(1), data={"face": "largest"}),
+        put(client, "key-2", photo(1), data={"attributes": '{"gender": "Male"}'}),
+        client.delete("/v1/subjects/idem", headers={"Idempotency-Key": "key-2"}),
+    ):
+        assert_error(answer, 409, "idempotency_conflict")
+    # Another API key is another client: its keys do not meet ours.
+    other = bearer(deployment.key("enroll"))
+    assert put(client, "key-2", photo(2), headers=other).status_code == 200
+
+
+def test_a_refused_write_gives_the_key_back(client: Client) -> None:
+    assert_error(put(client, "key-3", photo(1), photo(2)), 422, "inconsistent_images")
+    assert put(client, "key-3", photo(1), subject="key-3").status_code == 201
+
+
+def test_deletion(both: tuple[Client, Deployment]) -> None:
+    client, _ = both
+    put(client, None, photo(1))
+    headers = {"Idempotency-Key": "delete-1"}
+    first = client.delete("/v1/subjects/idem", headers=headers)
+    # Enrolled anew: the repeated deletion is the old one and must not erase again.
+    put(client, None, photo(1))
+    second = client.delete("/v1/subjects/idem", headers=headers)
+    assert without_request_id(first) == without_request_id(second)
+    assert second.headers["idempotency-replayed"] == "true"
+    assert client.get("/v1/subjects/idem").status_code == 200
+
+
+def test_import(client: Client) -> None:
+    put(client, None, photo(1))
+    data = client.get("/v1/subjects/idem/export").json()["export"]
+    headers = {"Idempotency-Key": "import-1"}
+    first = client.post("/v1/subjects/import", json={"export": data}, headers=headers)
+    second = client.post("/v1/subjects/import", json={"export": data}, headers=headers)
+    assert without_request_id(first) == without_request_id(second)
+    assert second.json()["subject_id"] == "idem"
+
+
+def test_many_at_once_write_once(both: tuple[Client, Deployment]) -> None:
+    client, _ = both
+    answers: list[Any] = []
+    start = threading.Barrier(6)
+
+    def send() -> None:
+        start.wait()
+        answers.append(put(client, "at-once", photo(1), subject="once"))
+
+    threads = [threading.Thread(target=send) for _ in range(6)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert {answer.status_code for answer in answers} <= {201, 409}
+    assert len({a.json()["template_id"] for a in answers if a.status_code == 201}) == 1
+    final = put(client, "at-once", photo(1), subject="once")
+    assert final.status_code == 201
+    assert final.headers["idempotency-replayed"] == "true"
+
+
+def test_records_hold_no_subject_and_no_token(client: Client, deployment: Deployment) -> None:
+    put(client, "secret-key-name", photo(1), subject="named-subject")
+    files = list(deployment.settings.data_dir.glob("veilface.db*"))
+    stored = b"".join(path.read_bytes() for path in files)
+    assert b"named-subject" in stored  # the subjects table: the control of this search
+    assert b"secret-key-name" not in stored
+    client.delete("/v1/subjects/named-subject")
+    stored = b"".join(path.read_bytes() for path in files)
+    assert b"named-subject" not in stored
+    assert deployment.token.encode() not in stored
+
+
+@pytest.mark.parametrize("key", ["", "with space", "x" * 256, "tab\tx"])
+def test_a_key_must_be_visible_and_short(client: Client, key: str) -> None:
+    assert_error(put(client, key, photo(1)), 422, "validation_failed")

@@ -1,0 +1,222 @@
+import tempfile
+from collections.abc import AsyncIterator
+
+import anyio
+import httpx
+import pytest
+
+from api.bodies import MAX_FIELD_BYTES
+from api.errors import ApiError
+from api.limits import MAX_JSON_BYTES, Gate
+from tests.api.client import Client
+from tests.api.deployment import Deployment, images, photo
+from tests.api.shapes import assert_error
+
+ENROLL, VERIFY = "/v1/subjects/limits/enrollment", "/v1/subjects/limits/verify"
+MIB = 1024 * 1024
+
+
+def padded(size: int) -> bytes:
+    """A picture of exactly this many bytes: a decoder stops at the end of the PNG."""
+    data = photo(1)
+    return data + b"\x00" * (size - len(data))
+
+
+def test_declared_length_is_refused_before_the_body_is_read(client: Client) -> None:
+    for method, path in (("PUT", ENROLL), ("POST", VERIFY), ("POST", "/v1/subjects/import")):
+        answer = client.request(
+            method,
+            path,
+            content=b"x",
+            headers={"Content-Length": str(10**9), "Content-Type": "application/json"},
+        )
+        assert_error(answer, 413, "request_too_large")
+
+
+def test_a_length_that_is_no_sane_number_does_no_harm(client: Client) -> None:
+    answer = client.post(
+        VERIFY, content=b"{}", headers={"Content-Length": "9" * 50, "Content-Type": "x/y"}
+    )
+    assert_error(answer, 413, "request_too_large")
+
+
+@pytest.mark.parametrize("kind", ["application/json", "multipart/form-data; boundary=b"])
+def test_a_chunked_body_is_counted_while_it_comes(
+    client: Client, deployment: Deployment, kind: str
+) -> None:
+    sent = 0
+
+    async def chunks() -> AsyncIterator[bytes]:
+        nonlocal sent
+        yield b'--b\r\nContent-Disposition: form-data; name="x"; filename="f"\r\n\r\n'
+        for _ in range(200):
+            sent += 1
+            yield b"\x00" * MIB
+
+    answer = client.post(VERIFY, content=chunks(), headers={"Content-Type": kind})
+    expected = "request_too_large" if kind == "application/json" else "image_too_large"
+    assert_error(answer, 413, expected)
+
+
+def test_json_has_a_limit_of_its_own(client: Client) -> None:
+    body = b'{"template": "' + b"A" * MAX_JSON_BYTES + b'"}'
+    answer = client.put(ENROLL, content=body, headers={"Content-Type": "application/json"})
+    assert assert_error(answer, 413, "request_too_large") == {"limit_bytes": MAX_JSON_BYTES}
+
+
+def test_an_image_may_be_as_large_as_the_limit_and_no_larger(
+    client: Client, deployment: Deployment
+) -> None:
+    limit = deployment.settings.max_image_bytes
+    fits = client.put(ENROLL, files=images(padded(limit)))
+    assert fits.status_code in (200, 201)
+    details = assert_error(
+        client.put(ENROLL, files=images(photo(1), padded(limit + 1))), 413, "image_too_large"
+    )
+    assert details == {"limit_bytes": limit, "image": 1}
+
+
+def test_eleven_images_are_too_many(client: Client) -> None:
+    answer = client.put(ENROLL, files=images(*[photo(1)] * 11))
+    assert assert_error(answer, 413, "too_many_images") == {"limit": 10}
+    answer = client.post(VERIFY, files=images(photo(1), photo(1), name="image"))
+    assert assert_error(answer, 413, "too_many_images") == {"limit": 1}
+    assert client.put(ENROLL, files=images(*[photo(1, i) for i in range(10)])).status_code == 200
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        b"",
+        b"--b\r\n",
+        b"no boundary at all",
+        b'--b\r\nContent-Disposition: form-data; name="images"; filename="f"\r\n\r\nabc',
+        b"--b\r\nContent-Disposition: form-data\r\n\r\nx\r\n--b--\r\n",
+        b"--b\r\n\r\nx\r\n--b--\r\n",
+        b"--b\r\nX: " + b"y" * 100_000 + b"\r\n\r\nx\r\n--b--\r\n",
+        b"--b\r\n" + b"X: y\r\n" * 1000 + b"\r\nx\r\n--b--\r\n",
+        b'--b\r\nContent-Disposition: form-data; name="face"\r\n\r\n'
+        + b"x" * (MAX_FIELD_BYTES + 1)
+        + b"\r\n--b--\r\n",
+        b'--b\r\nContent-Disposition: form-data; name="a"\r\n\r\nx\r\n' * 17 + b"--b--\r\n",
+    ],
+)
+def test_broken_multipart_is_malformed(client: Client, body: bytes) -> None:
+    answer = client.put(
+        ENROLL, content=body, headers={"Content-Type": "multipart/form-data; boundary=b"}
+    )
+    code = answer.json()["error"]["code"]
+    assert_error(answer, 422 if code == "validation_failed" else 400, code)
+    assert code in ("malformed_request", "validation_failed")
+
+
+def test_multipart_without_a_boundary_is_malformed(client: Client) -> None:
+    for kind in (
+        "multipart/form-data",
+        "multipart/form-data; boundary=",
+        "multipart/form-data; charset=x",
+    ):
+        answer = client.put(ENROLL, content=b"--b--", headers={"Content-Type": kind})
+        assert_error(answer, 400, "malformed_request")
+
+
+@pytest.mark.parametrize(
+    "body",
+    [b"", b"{", b"[]", b"1", b"null", b'"x"', b"\xff\xfe", b"[" * 100_000, b'{"a":' * 50_000,
+     b'{"embedding": [1' + b"0" * 5000 + b"]}"],
+)  # fmt: skip
+def test_broken_json_is_malformed(client: Client, body: bytes) -> None:
+    for method, path in (("PUT", ENROLL), ("POST", VERIFY), ("POST", "/v1/subjects/import")):
+        answer = client.request(
+            method, path, content=body, headers={"Content-Type": "application/json"}
+        )
+        assert_error(answer, 400, "malformed_request")
+
+
+def test_no_photo_is_ever_written_to_a_file(
+    client: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = []
+    for name in ("TemporaryFile", "NamedTemporaryFile", "mkstemp", "_mkstemp_inner"):
+        original = getattr(tempfile, name)
+        monkeypatch.setattr(
+            tempfile, name, lambda *a, _of=original, **k: made.append(_of) or _of(*a, **k)
+        )
+    control = tempfile.SpooledTemporaryFile(max_size=MIB)  # noqa: SIM115
+    control.write(b"\x00" * (2 * MIB))
+    control.close()
+    assert made, "the control must be seen"
+    made.clear()
+    answer = client.put(ENROLL, files=images(*[padded(3 * MIB) for _ in range(9)]))
+    assert answer.status_code in (200, 201)
+    assert client.post(VERIFY, files=images(padded(9 * MIB), name="image")).status_code == 200
+    assert made == []
+
+
+def test_a_body_that_does_not_arrive_is_given_up(client: Client, deployment: Deployment) -> None:
+    from api.bodies import read_json
+
+    async def never() -> None:
+        from starlette.requests import Request
+
+        async def receive() -> dict[str, object]:
+            await anyio.sleep(60)
+            return {}
+
+        request = Request({"type": "http", "headers": []}, receive)
+        with pytest.raises(ApiError, match="did not arrive") as caught:
+            await read_json(request, max_bytes=100, timeout_s=0.05)
+        assert caught.value.code == "malformed_request"
+
+    anyio.run(never)
+
+
+def test_the_gate_turns_the_next_one_away() -> None:
+    async def scenario() -> None:
+        gate = Gate(slots=1, waiting=1)
+        async with gate.admitted(), gate.admitted():
+            with pytest.raises(ApiError) as caught:
+                async with gate.admitted():
+                    pass
+            assert caught.value.code == "overloaded"
+            assert caught.value.headers["Retry-After"]
+        async with gate.admitted():
+            pass
+
+    anyio.run(scenario)
+
+
+def test_no_more_compute_at_once_than_there_are_slots() -> None:
+    import threading
+    import time
+
+    running, most, lock = 0, 0, threading.Lock()
+
+    def work() -> None:
+        nonlocal running, most
+        with lock:
+            running += 1
+            most = max(most, running)
+        time.sleep(0.02)
+        with lock:
+            running -= 1
+
+    async def scenario() -> None:
+        gate = Gate(slots=2, waiting=100)
+        async with anyio.create_task_group() as group:
+            for _ in range(8):
+                group.start_soon(gate.compute, work)
+
+    anyio.run(scenario)
+    assert most == 2
+
+
+def test_overload_is_an_answer(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(client.app.state.gate, "_room", 0)
+    for answer in (
+        client.put(ENROLL, files=images(photo(1))),
+        client.post(VERIFY, json={"embedding": [1.0]}),
+        client.post("/v1/subjects/import", json={"export": ""}),
+    ):
+        assert isinstance(answer, httpx.Response)
+        assert_error(answer, 503, "overloaded")
