@@ -1,8 +1,8 @@
-"""Decoys that belong to nobody: a distribution fitted to real descriptors.
+"""Decoys that belong to nobody, spread like real descriptors.
 
 The generator holds statistics, not people: it may be given to clients that lift on their own
 (PRODUCT "Contract"). Every draw is fresh, so no decoy exists outside its one template, and it
-does not depend on the subject (METHOD §4.2 to §4.5).
+does not depend on the subject (METHOD §4.2 to §4.5). docs/decoys.md says how it was chosen.
 """
 
 import hashlib
@@ -16,58 +16,66 @@ from numpy.typing import NDArray
 from templates.decoys import container
 from templates.decoys.files import read_bounded, write_private
 from templates.decoys.source import MAX_DIMENSION, Attributes
+from templates.decoys.statistics import (
+    MAX_COMPONENTS,
+    DescriptorStatistics,
+    band_edges,
+    feature_count,
+    leading_axes,
+)
 from templates.errors import DecoyError
 from templates.randomness import Keystream
 
 GENERATOR_FORMAT = "veilface decoy generator"
 GENERATOR_VERSION = 1
-MAX_GENERATOR_BYTES = MAX_DIMENSION * (MAX_DIMENSION + 1) * 4 + container.MAX_HEADER + 8
-MIN_SAMPLES = 100
-_CHUNK = 4096
-"""Decoys drawn at once: bounds the float64 scratch memory at 16 MB for n = 512."""
+_Q = feature_count(MAX_DIMENSION)
+MAX_GENERATOR_BYTES = (
+    4 * (MAX_DIMENSION * (MAX_DIMENSION + 1) + MAX_COMPONENTS * (1 + _Q + _Q * _Q))
+    + container.MAX_HEADER
+    + 8
+)
+_PARTS = ("mean", "axes", "weights", "centres", "spreads")
+_CHUNK = 2048
+"""Decoys made at once: bounds the float64 scratch memory at some 20 MB for n = 512."""
+_SMALLEST_NORM = 1e-4
 
 
 class DecoyGenerator:
-    """A Gaussian with the full covariance of real descriptors, its samples normalised.
+    """Draws descriptors of nobody from the statistics of real descriptors.
 
     Parameters
     ----------
-    mean
-        float32, shape (n,).
-    factor
-        float32, shape (n, n): a sample is ``mean + z @ factor`` with standard normal z, so
-        ``factor.T @ factor`` is the covariance.
+    statistics
+        As `fit` finds them.
 
-    Raises
-    ------
-    DecoyError
-        Wrong shapes or values that are not finite.
+    Notes
+    -----
+    A decoy is x / ‖x‖ with x = mean + z · axes. A component of the Gaussian mixture is chosen,
+    and gives the leading coordinates of z and the log energy of each band; inside a band z has
+    a uniform direction and that energy. See `templates.decoys.statistics` for why.
 
     References
     ----------
-    METHOD §3 (Gaussian decoys) and §4.5 (drawn independently of the subject's attributes).
+    METHOD §3 (a Gaussian with full covariance, which this refines), §4.5 (independence of the
+    subject's attributes). The bands are a Gaussian scale mixture: S. Lyu & E. P. Simoncelli,
+    "Modeling multiscale subbands of photographic images with fields of Gaussian scale
+    mixtures", PAMI 2009.
     """
 
-    def __init__(self, mean: NDArray[np.floating], factor: NDArray[np.floating]) -> None:
-        self._mean = np.array(mean, dtype="<f4", order="C", copy=True)
-        self._factor = np.array(factor, dtype="<f4", order="C", copy=True)
-        n = self._mean.shape[0] if self._mean.ndim == 1 else 0
-        if not 2 <= n <= MAX_DIMENSION or self._factor.shape != (n, n):
-            raise DecoyError(
-                "a decoy generator needs a mean of shape (n,) and a factor of shape (n, n); "
-                f"seen {self._mean.shape} and {self._factor.shape}"
-            )
-        if not (np.isfinite(self._mean).all() and np.isfinite(self._factor).all()):
-            raise DecoyError("the decoy generator holds values that are not finite")
-        # Beyond these bounds a sample overflows or collapses to zero before it is normalised.
-        scale = float(np.abs(self._factor).max())
-        if not 1e-6 <= scale <= 1e3 or float(np.abs(self._mean).max()) > 1e3:
-            raise DecoyError("the decoy generator holds values far from those of unit descriptors")
-        self.n: int = n
+    def __init__(self, statistics: DescriptorStatistics) -> None:
+        self._statistics = statistics
+        self.n: int = statistics.n
         self.source_id: str = hashlib.sha256(self.to_bytes()).hexdigest()
+        self._cumulative = np.cumsum(statistics.weights.astype(np.float64))
+        self._spreads = np.ascontiguousarray(statistics.spreads.transpose(0, 2, 1), np.float64)
 
     def __repr__(self) -> str:
         return f"DecoyGenerator(n={self.n}, id {self.source_id[:12]})"
+
+    @property
+    def statistics(self) -> DescriptorStatistics:
+        """The fitted statistics."""
+        return self._statistics
 
     @classmethod
     def fit(cls, descriptors: NDArray[np.floating]) -> Self:
@@ -76,25 +84,17 @@ class DecoyGenerator:
         Parameters
         ----------
         descriptors
-            float32, shape (N, n), unit rows, N ≥ 100.
+            float32, shape (N, n), unit rows, N ≥ 100; several thousand give good decoys.
 
         Raises
         ------
         DecoyError
             Too few descriptors, or descriptors that are not finite unit vectors.
         """
-        x = np.asarray(descriptors, dtype=np.float64)
-        if x.ndim != 2 or x.shape[0] < MIN_SAMPLES:
-            raise DecoyError(
-                f"a decoy generator needs at least {MIN_SAMPLES} descriptors of shape (N, n); "
-                f"seen {x.shape}"
-            )
-        if not np.all(np.abs(np.linalg.norm(x, axis=1) - 1.0) <= 1e-3):
-            raise DecoyError("the descriptors to fit are not all finite unit vectors")
-        mean = x.mean(axis=0)
-        values, vectors = np.linalg.eigh(np.cov(x, rowvar=False))
-        factor = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
-        return cls(mean, factor)
+        # Imported here, because it loads scikit-learn, which a client that draws does not need.
+        from templates.decoys.fitting import fit_statistics
+
+        return cls(fit_statistics(descriptors))
 
     def draw(
         self,
@@ -123,18 +123,42 @@ class DecoyGenerator:
         if sub_databases is not None:
             raise DecoyError("a decoy generator has no sub-databases; use a decoy pool")
         decoys = np.empty((rows * k, self.n), dtype=np.float32)
-        mean, factor = self._mean.astype(np.float64), self._factor.astype(np.float64)
         for start in range(0, len(decoys), _CHUNK):
-            count = min(_CHUNK, len(decoys) - start)
-            x = mean + stream.normal((count, self.n)) @ factor
-            x /= np.linalg.norm(x, axis=1, keepdims=True)
-            decoys[start : start + count] = x
+            stop = min(start + _CHUNK, len(decoys))
+            decoys[start:stop] = self._sample(stop - start, stream)
         return decoys.reshape(rows, k, self.n)
+
+    def _sample(self, count: int, stream: Keystream) -> NDArray[np.float32]:
+        statistics = self._statistics
+        lead, edges = leading_axes(self.n), band_edges(self.n)
+        uniform = stream.uniform((count,))
+        # The weights may add up to slightly less than 1, hence the minimum.
+        chosen = np.minimum(
+            np.searchsorted(self._cumulative, uniform, side="right"), len(self._cumulative) - 1
+        )
+        noise = stream.normal((count, feature_count(self.n)))
+        features = statistics.centres[chosen].astype(np.float64)
+        for component in range(len(self._cumulative)):
+            mine = chosen == component
+            features[mine] += noise[mine] @ self._spreads[component]
+        z = np.empty((count, self.n), dtype=np.float32)
+        z[:, :lead] = features[:, :lead]
+        directions = stream.normal((count, self.n - lead))
+        widths = np.diff(edges)
+        squares = np.add.reduceat(directions**2, edges[:-1] - lead, axis=1) / widths
+        # Clipped, because a hostile generator could make the exponential overflow.
+        sizes = np.exp(np.clip(features[:, lead:], -20.0, 20.0)) / np.sqrt(squares)
+        z[:, lead:] = directions * np.repeat(sizes, widths, axis=1)
+        x = statistics.mean + z @ statistics.axes
+        norms = np.linalg.norm(x.astype(np.float64), axis=1, keepdims=True)
+        if not (norms > _SMALLEST_NORM).all() or not np.isfinite(norms).all():
+            raise DecoyError("the decoy generator makes vectors without a direction; fit it anew")
+        return np.asarray(x / norms, dtype=np.float32)
 
     def to_bytes(self) -> bytes:
         """Serialise; equal generators give equal bytes, and `source_id` is their SHA-256."""
         fields: container.Fields = {"format": GENERATOR_FORMAT, "version": GENERATOR_VERSION}
-        return container.encode(fields, {"factor": self._factor, "mean": self._mean})
+        return container.encode(fields, {name: getattr(self._statistics, name) for name in _PARTS})
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
@@ -150,9 +174,10 @@ class DecoyGenerator:
         )
         if fields != {"format": GENERATOR_FORMAT, "version": GENERATOR_VERSION}:
             raise DecoyError(f"this is not a decoy generator of version {GENERATOR_VERSION}")
-        if set(arrays) != {"factor", "mean"} or any(a.dtype != np.float32 for a in arrays.values()):
+        if set(arrays) != set(_PARTS) or any(a.dtype != np.float32 for a in arrays.values()):
             raise DecoyError("the decoy generator has missing or unknown parts")
-        return cls(arrays["mean"].astype(np.float32), arrays["factor"].astype(np.float32))
+        parts = {name: array.astype(np.float32) for name, array in arrays.items()}
+        return cls(DescriptorStatistics(**parts))
 
     def save(self, path: Path) -> None:
         """Write the generator as a plain file: it holds nothing of any single person.

@@ -1,17 +1,14 @@
 """Opening a decoy file without being told what it holds."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from templates.decoys.generator import DecoyGenerator
 from templates.decoys.pool import POOL_MAGIC, DecoyPool
 from templates.errors import DecoyError
-
-if TYPE_CHECKING:
-    from templates.sealing import Sealer
+from templates.sealing import Sealer
 
 
-def load_source(path: Path, sealer: "Sealer") -> DecoyPool | DecoyGenerator:
+def load_source(path: Path, sealer: Sealer) -> DecoyPool | DecoyGenerator:
     """Load a sealed pool or a plain generator, told apart by the first bytes of the file.
 
     Raises

@@ -9,7 +9,7 @@ import hashlib
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +19,7 @@ from templates.decoys.files import read_bounded, write_private
 from templates.decoys.source import MAX_DIMENSION, Attributes
 from templates.errors import DecoyError
 from templates.randomness import Keystream
-
-if TYPE_CHECKING:
-    from templates.sealing import Sealer
+from templates.sealing import Sealer
 
 POOL_MAGIC = b"VEILFACE DECOY POOL 1\n"
 POOL_CONTEXT = "veilface decoy pool 1"
@@ -188,7 +186,7 @@ class DecoyPool:
             {"descriptors": self._descriptors, "gender": gender_codes, "race": race_codes},
         )
 
-    def save(self, path: Path, sealer: "Sealer") -> None:
+    def save(self, path: Path, sealer: Sealer) -> None:
         """Write the pool, sealed, to a file that only its owner may read.
 
         Raises
@@ -199,7 +197,7 @@ class DecoyPool:
         write_private(path, POOL_MAGIC + sealer.seal(self._encode(), context=POOL_CONTEXT))
 
     @classmethod
-    def load(cls, path: Path, sealer: "Sealer") -> Self:
+    def load(cls, path: Path, sealer: Sealer) -> Self:
         """Read what `save` wrote.
 
         Raises

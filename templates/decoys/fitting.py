@@ -1,0 +1,130 @@
+"""Fitting the decoy generator's statistics to real descriptors.
+
+Kept apart from `generator`, so that a client that only draws decoys does not load scikit-learn.
+"""
+
+import warnings
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.mixture import GaussianMixture
+
+from templates.decoys.statistics import DescriptorStatistics, band_edges, leading_axes
+from templates.errors import DecoyError
+
+MIN_DESCRIPTORS = 100
+MAX_DESCRIPTORS = 2_000_000
+_FOLDS = 10
+_COMPONENTS = 4
+_PER_COMPONENT = 500
+"""A component describes at least hundreds of people on average: it is a crowd, not a person."""
+_UNIT_TOLERANCE = 1e-3
+
+
+def fit_statistics(descriptors: NDArray[np.floating]) -> DescriptorStatistics:
+    """Estimate the statistics of real descriptors.
+
+    Parameters
+    ----------
+    descriptors
+        float32, shape (N, n), unit rows (tolerance 1e-3), N ≥ 100; several thousand give good
+        decoys, and with N < n single people could be recognised in the result.
+
+    Returns
+    -------
+    DescriptorStatistics
+        A deterministic function of the descriptors.
+
+    Raises
+    ------
+    DecoyError
+        Too few descriptors, descriptors that are not finite unit vectors, or that hardly vary.
+
+    Notes
+    -----
+    The variance along a sample's own principal axes is biased: too large along the first, too
+    small along the last (by 40 % at N = 7 n). Everything but the axes themselves is therefore
+    estimated on descriptors that took no part in finding the axes, by cross-fitting [1]_.
+
+    References
+    ----------
+    .. [1] D. Bartz, "Cross-validation based nonlinear shrinkage", 2016.
+    """
+    x = _checked(descriptors)
+    n = x.shape[1]
+    mean = x.mean(axis=0)
+    axes = _principal_axes(x)
+    coordinates = _cross_fitted(x, axes)
+    deviations = np.sqrt(np.mean(coordinates**2, axis=0))
+    if deviations[0] <= 1e-6:
+        raise DecoyError("the descriptors to fit hardly differ from each other")
+    # An axis on which nothing varies stays an axis on which nothing varies.
+    whitened = coordinates / np.maximum(deviations, 1e-12)
+    mixture = _mixture(_features(whitened))
+    return DescriptorStatistics(
+        mean=mean.astype(np.float32),
+        axes=(axes[:n] * deviations[:, None]).astype(np.float32),
+        weights=mixture.weights_.astype(np.float32),
+        centres=mixture.means_.astype(np.float32),
+        spreads=np.linalg.cholesky(mixture.covariances_).astype(np.float32),
+    )
+
+
+def _checked(descriptors: NDArray[np.floating]) -> NDArray[np.float64]:
+    x = np.asarray(descriptors)
+    if x.ndim != 2 or not MIN_DESCRIPTORS <= x.shape[0] <= MAX_DESCRIPTORS or x.shape[1] < 2:
+        raise DecoyError(
+            f"a decoy generator is fitted to {MIN_DESCRIPTORS} or more descriptors, shape (N, n); "
+            f"seen {x.shape}"
+        )
+    x = x.astype(np.float64)
+    # Written so that a NaN fails it too.
+    if not np.all(np.abs(np.linalg.norm(x, axis=1) - 1.0) <= _UNIT_TOLERANCE):
+        raise DecoyError("the descriptors to fit are not all finite unit vectors")
+    return x
+
+
+def _principal_axes(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Eigenvectors of the covariance as rows, largest variance first."""
+    _, vectors = np.linalg.eigh(np.cov(x, rowvar=False))
+    return np.ascontiguousarray(vectors[:, ::-1].T)
+
+
+def _cross_fitted(x: NDArray[np.float64], axes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Coordinates of every descriptor along axes that were found without it, shape (N, n).
+
+    The leading axes of a fold span nearly the same space as those of all descriptors, but may
+    come in another order or sign; a rotation inside that space makes them comparable. On the
+    minor axes only the energy of a band counts, which needs no such care.
+    """
+    lead = leading_axes(x.shape[1])
+    fold = np.arange(len(x)) % _FOLDS
+    coordinates = np.empty_like(x)
+    for number in range(_FOLDS):
+        others = x[fold != number]
+        own_axes = _principal_axes(others)
+        u, _, vt = np.linalg.svd(axes[:lead] @ own_axes[:lead].T)
+        own_axes[:lead] = u @ vt @ own_axes[:lead]
+        coordinates[fold == number] = (x[fold == number] - others.mean(axis=0)) @ own_axes.T
+    return coordinates
+
+
+def _features(whitened: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Leading coordinates, then half the log mean square of every band: shape (N, q)."""
+    n = whitened.shape[1]
+    edges = band_edges(n)
+    squares = np.add.reduceat(whitened**2, edges[:-1], axis=1) / np.diff(edges)
+    log_energies = 0.5 * np.log(np.maximum(squares, 1e-8))
+    return np.hstack([whitened[:, : leading_axes(n)], log_energies])
+
+
+def _mixture(features: NDArray[np.float64]) -> GaussianMixture:
+    components = int(np.clip(len(features) // _PER_COMPONENT, 1, _COMPONENTS))
+    # The log energies vary by about 0.1: scikit-learn's additive regularisation must be far
+    # below the square of that. The seed fixes the start of the expectation-maximisation only.
+    mixture = GaussianMixture(components, reg_covar=1e-5, max_iter=300, n_init=3, random_state=0)
+    with warnings.catch_warnings():
+        # A mixture a step short of its optimum is as good a generator.
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        return mixture.fit(features)
