@@ -233,14 +233,14 @@ def test_a_deadlock_is_tried_again(postgres_url: str, keyring: MasterKeyring) ->
     for name in ("a", "b"):
         store.tenants.create(name)
     database = Database(postgres_url)
-    both_hold_one = threading.Barrier(2, timeout=10)
+    both_hold_one = threading.Barrier(2, timeout=60)
     runs: list[str] = []
 
     def bump(connection: sa.Connection, first: str, second: str) -> None:
         runs.append(first)
         add = sa.update(TenantRow).values(rotation_epoch=TenantRow.rotation_epoch + 1)
         connection.execute(add.where(TenantRow.name == first))
-        if len(runs) <= 2:
+        if len(runs) <= 2:  # a first run, not a repetition
             both_hold_one.wait()
         connection.execute(add.where(TenantRow.name == second))
 
@@ -252,7 +252,7 @@ def test_a_deadlock_is_tried_again(postgres_url: str, keyring: MasterKeyring) ->
         thread.start()
     for thread in threads:
         thread.join()
-    assert len(runs) == 3  # one of them was the victim, and ran again
+    assert len(runs) >= 3  # one of them was the victim, and ran again
     assert {tenant.rotation_epoch for tenant in store.tenants.all()} == {3}
     database.close()
     store.close()
