@@ -18,7 +18,7 @@ from templates.randomness import Keystream
 from templates.subspace import SubspaceBatch
 from verify.cohort import Probes, cohort_statistics
 from verify.thresholds import Genuine, Impostors
-from verify.trials import Indices, Plan, impostor_sample
+from verify.trials import Indices, Plan, impostor_groups
 
 WIRE_DTYPE: wire.WireDtype = "float16"
 PROBE_TILE = 256
@@ -168,8 +168,8 @@ def lifted_trials(
 ) -> LiftedTrials:
     """Compare lifted probes with their person's template, and with a random subset of others.
 
-    Probes are at most ``most_probes`` photos, genuine ones first; each meets the same number of
-    other people's templates, ``impostor_pairs`` in all.
+    Probes are at most ``most_probes`` photos, genuine ones first. Groups of them meet groups of
+    other people's templates, about ``impostor_pairs`` pairs in all.
     """
     what = f"comparing lifted probes, m = {probe_m}"
     genuine_photos = plan.genuine
@@ -181,42 +181,42 @@ def lifted_trials(
     owners = plan.person_of[chosen]
     probes = lifter.lift(descriptors[chosen], m=probe_m, stream=stream)
     means, spreads = np.empty(len(chosen)), np.empty(len(chosen))
-    for start in range(0, len(chosen), PROBE_TILE):
-        rows = slice(start, start + PROBE_TILE)
-        means[rows], spreads[rows] = cohort_statistics(
-            probes[rows], cohort, metric=metric, steps=steps
-        )
-        progress(what, 0.5 * min(1.0, (start + PROBE_TILE) / len(chosen)))
-
-    def compare(positions: Indices, people: Indices) -> NDArray[np.float32]:
-        return _paired(probes, positions, templates, people, metric, steps, progress, what)
-
-    own_positions = np.arange(len(genuine_photos), dtype=np.int64)
+    scores: list[NDArray[np.float32]] = []
+    cohort_scores: list[NDArray[np.float32]] = []
+    met: list[Indices] = []
+    for rows, people in impostor_groups(plan, len(chosen), pairs=impostor_pairs, rng=rng):
+        group = probes[rows]
+        means[rows], spreads[rows] = cohort_statistics(group, cohort, metric=metric, steps=steps)
+        distances = pairwise_distances(group, templates[people], metric=metric, steps=steps)
+        close = np.asarray(similarity(distances), dtype=np.float32)
+        z = ((close - means[rows, None]) / spreads[rows, None]).astype(np.float32)
+        others = owners[rows, None] != people[None, :]
+        row, column = np.nonzero(others)
+        scores.append(close[others])
+        cohort_scores.append(z[others])
+        met.append(np.stack([owners[rows][row], people[column]], axis=1))
+        progress(what, rows.stop / len(chosen))
+    pair_people = np.concatenate(met)
     own = owners[: len(genuine_photos)]
-    mated = compare(own_positions, own) if len(own) else np.empty(0, dtype=np.float32)
-    positions, people = impostor_sample(plan, chosen, pairs=impostor_pairs, rng=rng)
-    non_mated = compare(positions, people)
-    pair_people = np.stack([owners[positions], people], axis=1)
+    first = np.arange(len(own), dtype=np.int64)
+    mated = pair_similarities(probes, templates, first, own, metric=metric, steps=steps)
     keys, repeats = np.unique(pair_people, axis=0, return_counts=True)
     unordered = np.unique(np.sort(keys, axis=1), axis=0)
 
     def weighted_trials(weights: NDArray[np.float64]) -> float:
         return float(np.sum(repeats * weights[keys[:, 0]] * weights[keys[:, 1]]))
 
-    def z(scores: NDArray[np.float32], rows: Indices) -> NDArray[np.float32]:
-        return ((scores - means[rows]) / spreads[rows]).astype(np.float32)
-
     impostors = Impostors(
-        similarities=non_mated,
-        cohort_scores=z(non_mated, positions),
-        trials=len(positions),
+        similarities=np.concatenate(scores),
+        cohort_scores=np.concatenate(cohort_scores),
+        trials=len(pair_people),
         people=len(plan.people),
         person_pairs=len(unordered),
         people_of=lambda flat: pair_people[flat],
         weighted_trials=weighted_trials,
     )
-    genuine = Genuine(mated, z(mated, own_positions), own)
-    return LiftedTrials(impostors, genuine, probes.foot_norms)
+    mated_z = ((mated - means[: len(own)]) / spreads[: len(own)]).astype(np.float32)
+    return LiftedTrials(impostors, Genuine(mated, mated_z, own), probes.foot_norms)
 
 
 def pair_similarities(
@@ -229,21 +229,6 @@ def pair_similarities(
     steps: int,
 ) -> NDArray[np.float32]:
     """Similarities of the pairs (probes[positions[i]], templates[numbers[i]]), by tiles."""
-    return _paired(
-        probes, positions, templates, numbers, metric, steps, lambda _what, _share: None, ""
-    )
-
-
-def _paired(
-    probes: Probes,
-    positions: Indices,
-    templates: SubspaceBatch,
-    numbers: Indices,
-    metric: Metric,
-    steps: int,
-    progress: Progress,
-    what: str,
-) -> NDArray[np.float32]:
     dimension = templates.m + 2 + (probes.m if isinstance(probes, SubspaceBatch) else 0)
     tile = max(1, PAIR_TILE_BYTES // (4 * templates.n * dimension))
     out = np.empty(len(positions), dtype=np.float32)
@@ -253,7 +238,6 @@ def _paired(
             probes[positions[rows]], templates[numbers[rows]], metric=metric, steps=steps
         )
         out[rows] = similarity(distances)
-        progress(what, 0.5 + 0.5 * min(1.0, (start + tile) / len(positions)))
     return out
 
 

@@ -1,12 +1,14 @@
 """Who is compared with whom in a calibration: enrollments, genuine probes, impostor pairs."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 Indices = NDArray[np.int64]
+
+GROUP = 50
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,17 +101,16 @@ def chosen_photos(
     return np.asarray(photos, dtype=np.int64), [named[index] for index in photos]
 
 
-def impostor_sample(
-    plan: Plan, probes: Indices, *, pairs: int, rng: np.random.Generator
-) -> tuple[Indices, Indices]:
-    """Draw distinct impostor pairs: (positions in ``probes``, people), about ``pairs`` of them.
+def impostor_groups(
+    plan: Plan, probes: int, *, pairs: int, rng: np.random.Generator, size: int = GROUP
+) -> Iterator[tuple[slice, Indices]]:
+    """Split ``probes`` into groups, and draw for each the people it is compared with.
 
-    Every probe meets the same number of other people's templates, drawn without repetition.
+    A group meets all of its people, drawn without repetition, so that its comparisons are one
+    matrix product; the next group meets others. Together about ``pairs`` comparisons. Those of a
+    probe with its own person are among them, and are no impostor trials.
     """
-    others = len(plan.people) - 1
-    each = min(others, -(-pairs // len(probes)))
-    positions = np.repeat(np.arange(len(probes), dtype=np.int64), each)
-    people = np.concatenate([rng.choice(others, size=each, replace=False) for _ in probes])
-    # Skipping over the probe's own person maps 0 … others - 1 onto everybody else.
-    own = plan.person_of[probes][positions]
-    return positions, (people + (people >= own)).astype(np.int64)
+    each = min(len(plan.people), -(-pairs // probes))
+    for start in range(0, probes, size):
+        people = np.sort(rng.choice(len(plan.people), size=each, replace=False))
+        yield slice(start, min(start + size, probes)), people.astype(np.int64)

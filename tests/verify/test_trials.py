@@ -3,7 +3,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.verify.synthetic import draw_people
-from verify.trials import chosen_photos, enrolled_means, impostor_sample, plan_trials
+from verify.trials import chosen_photos, enrolled_means, impostor_groups, plan_trials
 
 names = st.lists(st.sampled_from(["a", "b", "c", "d"]), min_size=1, max_size=30)
 
@@ -31,19 +31,20 @@ def test_means_are_unit_and_of_the_enrolled_photos() -> None:
         np.testing.assert_allclose(mean, total / np.linalg.norm(total), atol=1e-6)
 
 
-def test_impostor_sample_never_meets_its_own_person_and_never_repeats() -> None:
+def test_impostor_groups_cover_all_probes_with_distinct_people() -> None:
     plan = plan_trials(
         ["a"] * 3 + ["b"] * 2 + list("cdefgh"),
         photos_per_enrollment=1,
         rng=np.random.default_rng(0),
     )
-    probes = np.arange(11)
-    positions, people = impostor_sample(plan, probes, pairs=40, rng=np.random.default_rng(1))
-    assert len(positions) == 44
-    assert len(set(zip(positions.tolist(), people.tolist(), strict=True))) == 44
-    assert not (plan.person_of[probes[positions]] == people).any()
-    everybody, _ = impostor_sample(plan, probes, pairs=10**6, rng=np.random.default_rng(1))
-    assert len(everybody) == 11 * 7
+    groups = list(impostor_groups(plan, 11, pairs=40, rng=np.random.default_rng(1), size=3))
+    assert [i for rows, _ in groups for i in range(rows.start, rows.stop)] == list(range(11))
+    for _, people in groups:
+        assert len(set(people.tolist())) == len(people) == 4
+        assert set(people.tolist()) <= set(range(8))
+    assert len({tuple(people) for _, people in groups}) > 1
+    everybody = impostor_groups(plan, 11, pairs=10**6, rng=np.random.default_rng(1))
+    assert all(len(people) == 8 for _, people in everybody)
 
 
 def test_excluded_people_and_second_names() -> None:
