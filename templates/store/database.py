@@ -78,7 +78,9 @@ class Database:
         except _DATABASE_ERRORS as error:
             raise _translated(error) from None
 
-    def write(self, work: Callable[[Connection], T], *, lock: str | None = None) -> T:
+    def write(
+        self, work: Callable[[Connection], T], *, lock: str | None = None, wait: float | None = None
+    ) -> T:
         """Run `work` in one transaction and commit it; all or nothing.
 
         Parameters
@@ -88,6 +90,9 @@ class Database:
         lock
             Writes with the same lock name run one after the other, over all processes. (On SQLite
             all writes do.)
+        wait
+            Seconds to wait for a lock that another write holds; the timeout by default, 0 for
+            as long as it takes. (PostgreSQL only.)
         """
         here = self._here()
         for attempt in range(1, _ATTEMPTS + 1):
@@ -97,9 +102,7 @@ class Database:
                     with here.writing, here.writers.begin() as connection:
                         return work(connection)
                 with here.writers.begin() as connection:
-                    if lock is not None:
-                        number = _lock_number(lock)
-                        connection.execute(sa.select(sa.func.pg_advisory_xact_lock(number)))
+                    connection.execute(self._locked(lock, wait))
                     return work(connection)
             except DBAPIError as error:
                 if attempt < _ATTEMPTS and _state(error.orig) in _RETRIED_STATES:
@@ -147,6 +150,14 @@ class Database:
     def close(self) -> None:
         """Close the connections of this process that are idle."""
         self._here().engine.dispose()
+
+    def _locked(self, lock: str | None, wait: float | None) -> sa.Select[Any]:
+        milliseconds = str(round(1000 * (self._timeout if wait is None else wait)))
+        limit = sa.func.set_config("lock_timeout", milliseconds, True)
+        if lock is None:
+            return sa.select(limit)
+        # PostgreSQL takes the columns of this in their order: the limit holds for the lock.
+        return sa.select(limit, sa.func.pg_advisory_xact_lock(_lock_number(lock)))
 
     def _here(self) -> "_Process":
         if self._process.pid != os.getpid():
@@ -294,6 +305,8 @@ def _translated(error: Exception) -> StoreError:
         state = _state(cause)
         if state == "42P01":
             return StoreError("a table is missing: run `veilface db upgrade`")
+        if state == "55P03":
+            return StoreUnavailable("another write holds the same rows for too long")
         if lost or state[:2] in _UNAVAILABLE_CLASSES or _without_answer(cause):
             return StoreUnavailable(f"the PostgreSQL server does not answer ({name} {state})")
         return StoreError(f"PostgreSQL refused the statement ({name} {state})")

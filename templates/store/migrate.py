@@ -19,12 +19,16 @@ _LOCK = "veilface schema"
 
 def upgrade(database: Database, revision: str = "head") -> None:
     """Migrate upwards. Of several workers that start at once, one migrates and the rest wait."""
-    database.write(lambda connection: command.upgrade(_config(connection), revision), lock=_LOCK)
+    database.write(
+        lambda connection: command.upgrade(_config(connection), revision), lock=_LOCK, wait=0
+    )
 
 
 def downgrade(database: Database, revision: str) -> None:
     """Migrate downwards, to ``"base"`` for an empty database; data of dropped tables goes."""
-    database.write(lambda connection: command.downgrade(_config(connection), revision), lock=_LOCK)
+    database.write(
+        lambda connection: command.downgrade(_config(connection), revision), lock=_LOCK, wait=0
+    )
 
 
 def current_revision(database: Database) -> str | None:

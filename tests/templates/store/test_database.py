@@ -155,6 +155,26 @@ def test_a_busy_sqlite_file_is_store_unavailable(tmp_path: Path, keyring: Master
     store.close()
 
 
+def test_a_write_that_hangs_does_not_hang_the_others(
+    postgres_url: str, keyring: MasterKeyring
+) -> None:
+    store = TemplateStore(postgres_url, keyring, timeout=0.2)
+    store.upgrade()
+    store.tenants.create("default")
+    put(store, "ada", b"wire")
+    database = Database(postgres_url)
+
+    def hang(connection: sa.Connection) -> None:
+        with pytest.raises(StoreUnavailable, match="too long"):
+            put(store, "ada", b"other")
+        put(store, "eve", b"wire")
+
+    database.write(hang, lock="subject default ada")
+    put(store, "ada", b"other")
+    database.close()
+    store.close()
+
+
 def test_a_full_disk_is_said_and_harms_nothing(tmp_path: Path, keyring: MasterKeyring) -> None:
     """SQLite's page limit gives the same error as a full disk (SQLITE_FULL)."""
     store = TemplateStore(f"sqlite:///{tmp_path / 'veilface.db'}", keyring, pool_size=1)
