@@ -110,15 +110,17 @@ def uvicorn_options(settings: Settings) -> dict[str, Any]:
 
 
 def environment_of(settings: Settings) -> dict[str, str]:
-    """Write the settings that differ from their defaults as environment variables."""
-    variables = {}
-    for name, field in Settings.model_fields.items():
-        value = getattr(settings, name)
-        if value == field.default:
-            continue
-        text = ",".join(value) if isinstance(value, tuple) else str(value)
-        variables[ENV_PREFIX + name.upper()] = text
-    return variables
+    """Write the settings as environment variables.
+
+    All of them, because a setting that equals its default may have been given as a flag, over
+    another value in the TOML file.
+    """
+    values = {name: getattr(settings, name) for name in Settings.model_fields}
+    return {
+        ENV_PREFIX + name.upper(): ",".join(value) if isinstance(value, tuple) else str(value)
+        for name, value in values.items()
+        if value is not None
+    }
 
 
 async def _known_error(request: Request, error: Exception) -> Response:

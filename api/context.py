@@ -6,6 +6,7 @@ import secrets
 import time
 from typing import Any
 
+import anyio
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -16,6 +17,8 @@ from api.logging import log
 from models.demo import DEMO_NOTICE
 
 SANE_REQUEST_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{7,63}")
+LINGER_S = 5.0
+LINGER_BYTES = 64 * 1024 * 1024
 SECURITY_HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Cache-Control": "no-store",
@@ -29,6 +32,35 @@ def request_id_of(offered: str | None) -> str:
     if offered is not None and SANE_REQUEST_ID.fullmatch(offered):
         return offered
     return secrets.token_hex(16)
+
+
+class _Body:
+    """The request body as it is received, and its end where nobody wanted to read it.
+
+    A server that closes a connection on which data still arrives resets it, and the client may
+    never see the answer that says why. So after an answer that came early (a body that is too
+    large, a key that is unknown) the rest is read and dropped, for a while.
+    """
+
+    def __init__(self, scope: Scope, receive: Receive) -> None:
+        headers = Headers(scope=scope)
+        self._receive = receive
+        self._expects_continue = "expect" in headers
+        self._ended = "content-length" not in headers and "transfer-encoding" not in headers
+
+    async def receive(self) -> Message:
+        message = await self._receive()
+        self._expects_continue = False
+        self._ended = message["type"] != "http.request" or not message.get("more_body", False)
+        return message
+
+    async def linger(self) -> None:
+        """Drop what still comes. A client that waits for ``100 Continue`` is not sent it."""
+        dropped = 0
+        with anyio.move_on_after(LINGER_S):
+            while not self._ended and not self._expects_continue and dropped < LINGER_BYTES:
+                message = await self.receive()
+                dropped += len(message.get("body", b""))
 
 
 class RequestContext:
@@ -52,9 +84,14 @@ class RequestContext:
         fields: dict[str, Any] = {}
         state["request_id"], state["log"] = request_id, fields
         started, status = time.perf_counter(), 0
+        body = _Body(scope, receive)
 
         async def send_with_headers(message: Message) -> None:
             nonlocal status
+            if message["type"] == "http.response.body" and not message.get("more_body"):
+                await send({**message, "more_body": True})
+                await body.linger()
+                message = {"type": "http.response.body", "body": b""}
             if message["type"] == "http.response.start":
                 status = message["status"]
                 headers = MutableHeaders(scope=message)
@@ -66,7 +103,7 @@ class RequestContext:
             await send(message)
 
         try:
-            await self._app(scope, receive, send_with_headers)
+            await self._app(scope, body.receive, send_with_headers)
         except ClientDisconnect:
             fields["code"] = "client_disconnected"
         except Exception as error:

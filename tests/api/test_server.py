@@ -1,0 +1,143 @@
+"""The service as it is run: uvicorn, two worker processes, real sockets, signals."""
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import httpx
+import pytest
+
+from api.app import environment_of
+from tests.api.deployment import Deployment, bearer, deploy, images, photo
+from tests.api.shapes import assert_error
+
+RUN = """
+import uvicorn
+from api.app import uvicorn_options
+from api.settings import load_settings
+uvicorn.run(**uvicorn_options(load_settings()))
+"""
+
+
+def free_port() -> int:
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        return int(listener.getsockname()[1])
+
+
+class Server:
+    def __init__(self, deployment: Deployment, folder: Path) -> None:
+        self.deployment = deployment
+        self.log = folder / "stderr"
+        self.url = f"http://127.0.0.1:{deployment.settings.port}"
+        with self.log.open("wb") as stderr:
+            self.process = subprocess.Popen(
+                [sys.executable, "-c", RUN],
+                cwd=Path(__file__).resolve().parents[2],
+                env={**environment_of(deployment.settings), "OMP_NUM_THREADS": "1"},
+                stderr=stderr,
+            )
+
+    def wait(self) -> None:
+        for _ in range(600):
+            if self.process.poll() is not None:
+                pytest.fail(self.log.read_text())
+            try:
+                if httpx.get(f"{self.url}/health/ready").status_code == 200:
+                    return
+            except httpx.TransportError:
+                time.sleep(0.05)
+        pytest.fail("the server did not get ready: " + self.log.read_text())
+
+    def stop(self) -> int:
+        self.process.send_signal(signal.SIGTERM)
+        return self.process.wait(timeout=30)
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    folder = tmp_path_factory.mktemp("server")
+    running = Server(deploy(folder, workers=2, port=free_port(), compute_slots=1), folder)
+    try:
+        running.wait()
+        yield running
+    finally:
+        if running.process.poll() is None:
+            running.process.kill()
+            running.process.wait()
+
+
+@pytest.fixture(scope="module")
+def http(server: Server) -> Iterator[httpx.Client]:
+    with httpx.Client(base_url=server.url, headers=bearer(server.deployment.token)) as client:
+        yield client
+
+
+def test_workers_share_the_database_and_nothing_else(server: Server, http: httpx.Client) -> None:
+    assert http.put("/v1/subjects/a/enrollment", files=images(photo(1))).status_code == 201
+
+    def verify(person: int) -> str:
+        # A connection of its own each time, so that either worker answers.
+        answer = httpx.post(
+            f"{server.url}/v1/subjects/a/verify",
+            files=images(photo(person, 3), name="image"),
+            headers=bearer(server.deployment.token),
+            timeout=30,
+        )
+        return str(answer.json()["decision"])
+
+    with ThreadPoolExecutor(8) as pool:
+        decisions = list(pool.map(verify, [1, 2] * 12))
+    assert decisions == ["accept", "reject"] * 12
+    lines = [json.loads(line) for line in server.log.read_text().splitlines()]
+    assert len({line["pid"] for line in lines if line["event"] == "started"}) == 2
+
+
+def test_a_large_body_gets_its_answer(server: Server, http: httpx.Client) -> None:
+    limits = server.deployment.settings
+    image = photo(1) + b"\x00" * limits.max_image_bytes
+    answer = http.put("/v1/subjects/a/enrollment", files=images(image))
+    assert_error(answer, 413, "image_too_large")
+    answer = http.put("/v1/subjects/a/enrollment", files=images(*[image[:-100_000]] * 5))
+    assert_error(answer, 413, "request_too_large")
+
+    def chunks() -> Iterator[bytes]:
+        for _ in range(64):
+            yield b"x" * 1024 * 1024
+
+    answer = http.put(
+        "/v1/subjects/a/enrollment",
+        content=chunks(),
+        headers={"Content-Type": "application/json"},
+    )
+    assert_error(answer, 413, "request_too_large")
+    assert http.get("/health/live").status_code == 200
+
+
+def test_a_client_that_goes_away_does_no_harm(server: Server, http: httpx.Client) -> None:
+    for _ in range(5):
+        with socket.create_connection(("127.0.0.1", server.deployment.settings.port)) as raw:
+            raw.sendall(
+                b"PUT /v1/subjects/a/enrollment HTTP/1.1\r\nHost: x\r\n"
+                + f"Authorization: Bearer {server.deployment.token}\r\n".encode()
+                + b"Content-Type: multipart/form-data; boundary=b\r\nContent-Length: 100000\r\n\r\n"
+                + b'--b\r\nContent-Disposition: form-data; name="images"; filename="f"\r\n\r\nabc'
+            )
+    assert http.get("/health/ready").status_code == 200
+    assert http.get("/v1/subjects/a").status_code == 200
+
+
+def test_stopping_finishes_what_runs_and_logs_only_json(server: Server) -> None:
+    assert server.stop() == 0
+    lines = [json.loads(line) for line in server.log.read_text().splitlines()]
+    assert sum(line["event"] == "stopped" for line in lines) == 2
+    events = {line["event"] for line in lines}
+    assert not any("HTTP/1.1" in event for event in events)
+    assert not any(line.get("status", 0) >= 500 for line in lines)
+    assert server.deployment.token not in server.log.read_text()
