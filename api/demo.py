@@ -10,6 +10,7 @@ holds whatever did not go as promised.
 
 import base64
 import contextlib
+import math
 import shutil
 import sqlite3
 import tempfile
@@ -20,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 import httpx
-from scipy.stats import binom
 
 from api.demo_cast import ENROLLED_PHOTOS, PROBE_PHOTOS, Cast, Scale, drawn_cast, found_cast
 from api.demo_service import running_service
@@ -41,7 +41,7 @@ from verify import CalibrationOptions, LabelledFolder
 MARKER = "# Written by `veilface demo`, which replaces this folder when it runs again."
 TENANT = "default"
 # A run fails if the level's FMR makes so many accepted impostors less likely than this.
-LEAST_LIKELY = 0.01
+LEAST_LIKELY = 0.001
 
 Say = Callable[[str], None]
 
@@ -354,7 +354,7 @@ def _stored(folder: Path, names: Sequence[str]) -> tuple[Stored, ...]:
                     template_bytes=len(subject.wire),
                     foot_norm=float(foot_norm),
                     ciphertext_bytes=len(ciphertext),
-                    ciphertext_excerpt=ciphertext[-16:].hex(),
+                    ciphertext_excerpt=_middle(ciphertext).hex(),
                 )
             )
     finally:
@@ -370,6 +370,12 @@ def _ciphertext(folder: Path, name: str) -> bytes:
             (name,),
         ).fetchone()
     return bytes(row[0])
+
+
+def _middle(data: bytes, count: int = 16) -> bytes:
+    """Cut some bytes from the middle: away from the header and the authentication tag."""
+    start = (len(data) - count) // 2
+    return data[start : start + count]
 
 
 def _rows(folder: Path, name: str) -> int:
@@ -400,10 +406,16 @@ def _faults(people: Sequence[Person], levels: Sequence[LevelCount]) -> list[str]
         if 2 * person.genuine_accepted < person.genuine_trials
     ]
     for level in levels:
-        likelihood = binom.sf(level.impostors_accepted - 1, level.impostor_trials, level.fmr)
+        likelihood = at_least(level.impostors_accepted, level.impostor_trials, level.fmr)
         if likelihood < LEAST_LIKELY:
             faults.append(
                 f"level {level.level} accepted {level.impostors_accepted} of "
                 f"{level.impostor_trials} impostors, more than its FMR of {level.fmr:g} explains"
             )
     return faults
+
+
+def at_least(errors: int, trials: int, rate: float) -> float:
+    """Probability of ``errors`` or more among independent trials that err at ``rate``."""
+    fewer = (math.comb(trials, k) * rate**k * (1 - rate) ** (trials - k) for k in range(errors))
+    return max(0.0, 1.0 - math.fsum(fewer))

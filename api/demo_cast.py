@@ -17,9 +17,9 @@ class Scale:
 
     enrolled: int = 8
     strangers: int = 6
-    decoy_people: int = 800
-    calibration_people: int = 160
-    calibration_photos: int = 5
+    decoy_people: int = 600
+    calibration_people: int = 100
+    calibration_photos: int = 4
 
 
 @dataclass(frozen=True)

@@ -109,7 +109,7 @@ def _print(outcome: Outcome) -> None:
         "template",
         "‖p‖ = cos(face, foot point)",
         "in the database",
-        "ends with (ciphertext)",
+        "16 bytes of it (ciphertext)",
     )
     for entry in outcome.stored:
         stored.add_row(

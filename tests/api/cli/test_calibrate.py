@@ -1,0 +1,99 @@
+import pytest
+
+from api.cli.calibrate import parse_dims, read_aliases
+from api.cli.errors import CommandError, UsageError
+from api.runtime import file_sealer
+from models.demo import DEMO_NOTICE
+from templates.contract import Contract
+from templates.sealing import MasterKeyring
+from tests.api.cli.conftest import DIM, PROBE_DIM, run
+
+
+def test_the_contract_is_what_serve_loads(world):
+    contract = Contract.load(
+        world.data / "contract.json", file_sealer(MasterKeyring.load(world.data / "master.key"))
+    )
+    assert contract.contract_id == world.calibrated["contract"]["contract_id"]
+    assert contract.binding.m == DIM
+    assert str(contract.binding.strategy) == "adversarial"
+    assert contract.binding.decoy_source_id == world.built["source_id"]
+    assert [(entry.mode, entry.probe_m) for entry in contract.calibrations] == [
+        ("p2s", 0),
+        ("s2s", PROBE_DIM),
+    ]
+    assert contract.recorded["pack"] == "pack"
+
+
+def test_the_demo_model_is_named_and_the_cohort_is_not_shown(world):
+    assert world.calibrated["notice"] == DEMO_NOTICE
+    assert "cohort" not in world.calibrated["contract"]
+    level = world.calibrated["contract"]["calibrations"][0]["levels"][0]
+    assert level["name"] == "fmr-1e-2"
+    assert level["fmr"]["errors"] / level["fmr"]["trials"] <= 0.01
+    assert level["fnmr"]["errors"] / level["fnmr"]["trials"] <= 0.1
+    assert world.calibrated["failure_to_acquire"]["photos"] == 200
+
+
+def test_people_are_left_out_and_ten_fold_adds_a_level(world, veilface, data, tmp_path):
+    listing = tmp_path / "names.txt"
+    listing.write_text("person-6000\nperson-6001\n")
+    ran = veilface(
+        *("calibrate", world.labelled, "--pack", world.pack, "--dim", "4"),
+        *("--exclude-people", listing, "--protocol", "ten-fold", "--strategy", "hybrid"),
+        *("--out", tmp_path / "contract.json", "--photos", "2"),
+    )
+    assert ran.status == 0, ran.stderr
+    assert "accuracy" in ran.stdout
+    assert DEMO_NOTICE in ran.stderr
+    contract = Contract.load(
+        tmp_path / "contract.json", file_sealer(MasterKeyring.load(data / "master.key"))
+    )
+    facts = contract.calibration("p2s").calibrated_on
+    assert facts["people"] == 48
+    assert facts["excluded_photos"] == 8
+    assert contract.calibration("p2s").level("accuracy").target_fmr is None
+
+
+def test_other_decoys_are_refused_in_a_sentence(world, veilface, tmp_path):
+    ran = veilface(
+        *("calibrate", world.labelled, "--pack", world.pack, "--decoys", tmp_path / "absent")
+    )
+    assert ran.status == 1
+    assert "absent" in ran.stderr
+    assert ran.stdout == ""
+
+
+def test_a_folder_of_another_layout_is_refused(world, veilface, tmp_path):
+    (tmp_path / "photo.jpg").write_bytes(b"x")
+    ran = veilface("calibrate", tmp_path, "--pack", world.pack)
+    assert ran.status == 1
+    assert "expected root/Person/photo.jpg" in ran.stderr
+
+
+def test_a_dimension_that_the_descriptor_does_not_have_is_refused(world, data):
+    ran = run(
+        *("calibrate", world.labelled, "--pack", world.pack, "--data-dir", data),
+        *("--probe-dims", "2,2"),
+    )
+    assert ran.status == 2
+    assert "twice" in ran.stderr
+
+
+@pytest.mark.parametrize(("text", "dims"), [("", ()), ("2,4, 8", (2, 4, 8)), ("16", (16,))])
+def test_probe_dimensions_are_read(text, dims):
+    assert parse_dims(text) == dims
+
+
+@pytest.mark.parametrize("text", ["0", "2;4", "a", "-1", "129"])
+def test_wrong_probe_dimensions_are_refused(text):
+    with pytest.raises(UsageError):
+        parse_dims(text)
+
+
+def test_aliases_are_read(tmp_path):
+    file = tmp_path / "aliases.csv"
+    file.write_text("# second, first\nBill_C,William_C\n\n")
+    assert read_aliases(file) == {"Bill_C": "William_C"}
+    file.write_text("only one name\n")
+    with pytest.raises(CommandError, match="line 1"):
+        read_aliases(file)

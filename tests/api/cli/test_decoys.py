@@ -1,0 +1,102 @@
+import shutil
+import stat
+
+import pytest
+
+from api.runtime import file_sealer
+from models.demo import DEMO_NOTICE
+from templates.decoys import DecoyGenerator, DecoyPool, load_source
+from templates.sealing import MasterKeyring
+from tests.api.cli.conftest import run
+
+RACES = ("White", "Black", "Indian")
+
+
+def test_a_generator_is_made(world):
+    assert world.built["kind"] == "generator"
+    assert world.built["descriptors"] == 150
+    assert world.built["failure_to_acquire"] == {"photos": 150, "failed": 0, "reasons": {}}
+    source = DecoyGenerator.load(world.data / "decoys.veil")
+    assert source.source_id == world.built["source_id"]
+    assert source.n == 256
+
+
+@pytest.fixture
+def labelled_source(world, tmp_path):
+    """Twelve photos laid out as FairFace is, one of them broken."""
+    train = tmp_path / "train"
+    train.mkdir()
+    lines = ["file,age,gender,race,service_test"]
+    for number, photo in enumerate(sorted(world.decoy_faces.rglob("*.png"))[:12]):
+        shutil.copy(photo, train / f"{number}.png")
+        gender = "Female" if number % 2 else "Male"
+        lines.append(f"train/{number}.png,03-Sep,{gender},{RACES[number % 3]},FALSE")
+    (train / "5.png").write_bytes(b"not a picture")
+    (tmp_path / "fairface_label_train.csv").write_text("\n".join(lines) + "\n")
+    return train
+
+
+def test_a_pool_is_sealed_and_keeps_the_labels(world, veilface, data, labelled_source, tmp_path):
+    out = tmp_path / "pool.veil"
+    ran = veilface(
+        *("decoys", "build", labelled_source, "--pack", world.pack, "--kind", "pool"),
+        *("--out", out, "--json"),
+    )
+    assert ran.status == 0, ran.stderr
+    assert ran.json["labelled"]
+    assert ran.json["descriptors"] == 11
+    assert ran.json["failure_to_acquire"]["reasons"] == {"unsupported_image": 1}
+    assert "1 of 12 photos failed to acquire" in ran.stderr
+    assert DEMO_NOTICE in ran.stderr
+    assert stat.S_IMODE(out.stat().st_mode) == 0o600
+    sealer = file_sealer(MasterKeyring.load(data / "master.key"))
+    pool = load_source(out, sealer)
+    assert isinstance(pool, DecoyPool)
+    assert pool.labelled
+    assert pool.source_id == ran.json["source_id"]
+
+
+def test_people_and_photos_are_left_out(world, veilface, labelled_source, tmp_path):
+    listing = tmp_path / "leave-out.txt"
+    listing.write_text("0.png\n5.png\n")
+    ran = veilface(
+        *("decoys", "build", labelled_source, "--pack", world.pack, "--kind", "pool"),
+        *("--out", tmp_path / "pool.veil", "--exclude", listing, "--limit", "8", "--json"),
+    )
+    assert ran.status == 0, ran.stderr
+    assert ran.json["left_out"] == 2
+    assert ran.json["descriptors"] == 8
+    assert ran.json["failure_to_acquire"]["failed"] == 0
+
+
+def test_a_photo_without_a_label_is_refused_for_a_pool(world, veilface, labelled_source, tmp_path):
+    shutil.copy(labelled_source / "0.png", labelled_source / "stranger.png")
+    ran = veilface(
+        *("decoys", "build", labelled_source, "--pack", world.pack, "--kind", "pool"),
+        *("--out", tmp_path / "pool.veil"),
+    )
+    assert ran.status == 1
+    assert "1 photos have no label, the first is stranger.png" in ran.stderr
+    assert not (tmp_path / "pool.veil").exists()
+
+
+def test_too_few_photos_for_a_generator_are_refused(world, veilface, labelled_source, tmp_path):
+    ran = veilface(
+        *("decoys", "build", labelled_source, "--pack", world.pack),
+        *("--out", tmp_path / "few.veil"),
+    )
+    assert ran.status == 1
+    assert "100 or more descriptors" in ran.stderr
+
+
+def test_no_usable_photo_is_refused(world, veilface, tmp_path):
+    (tmp_path / "broken.jpg").write_bytes(b"\xff\xd8\xff")
+    ran = veilface("decoys", "build", tmp_path, "--pack", world.pack)
+    assert ran.status == 1
+    assert "no photo gave a descriptor: 1 of 1 photos" in ran.stderr
+
+
+def test_a_pack_must_be_named(world, tmp_path):
+    ran = run("decoys", "build", world.decoy_faces, "--data-dir", tmp_path)
+    assert ran.status == 2
+    assert "--pack" in ran.stderr

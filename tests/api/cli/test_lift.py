@@ -1,0 +1,130 @@
+import base64
+import json
+import stat
+
+import numpy as np
+import pytest
+
+from api.runtime import file_sealer
+from models.demo import DEMO_NOTICE
+from models.pack import ModelPack
+from templates import wire
+from templates.contract import Contract
+from templates.sealing import MasterKeyring
+from tests.api.cli.conftest import DIM, PROBE_DIM, run
+
+
+@pytest.fixture
+def public(world, tmp_path):
+    """The answer of GET /v1/contract, as a client has it."""
+    contract = Contract.load(
+        world.data / "contract.json", file_sealer(MasterKeyring.load(world.data / "master.key"))
+    )
+    file = tmp_path / "public.json"
+    file.write_text(json.dumps({**contract.public(), "photos": True, "request_id": "x"}))
+    return file
+
+
+@pytest.fixture
+def lift(world, public):
+    def call(*arguments):
+        return run(
+            *("lift", *arguments, "--pack", world.pack, "--contract", public),
+            *("--generator", world.data / "decoys.veil"),
+        )
+
+    return call
+
+
+def test_an_enrollment_holds_the_descriptor_of_the_photos(world, lift, tmp_path):
+    out = tmp_path / "me.veil"
+    photos = world.photos(1, range(3))
+    ran = lift(*photos, "--out", out, "--json")
+    assert ran.status == 0, ran.stderr
+    assert DEMO_NOTICE in ran.stderr
+    data = out.read_bytes()
+    assert ran.json["bytes"] == len(data) == wire.encoded_size(256, DIM)
+    assert stat.S_IMODE(out.stat().st_mode) == 0o600
+    received = wire.decode(data)
+    assert received.contract_id == world.calibrated["contract"]["contract_id"]
+    assert received.subspace.m == DIM
+    pack = ModelPack.load(world.pack)
+    mean = sum(pack.embed_photo(photo.read_bytes()).embedding for photo in photos)
+    mean = (mean / np.linalg.norm(mean)).astype(np.float64)
+    foot = received.subspace.foot.astype(np.float64)
+    basis = received.subspace.basis.astype(np.float64)
+    residual = (mean - foot) - basis.T @ (basis @ (mean - foot))
+    assert np.linalg.norm(residual) < 5e-3  # float16
+    assert ran.json["kind"] == "enrollment"
+
+
+def test_two_lifts_share_nothing_but_the_descriptor(world, lift, tmp_path):
+    for name in ("a", "b"):
+        assert lift(*world.photos(1, range(1)), "--out", tmp_path / name).status == 0
+    first, second = (wire.decode((tmp_path / name).read_bytes()).subspace for name in ("a", "b"))
+    overlap = np.linalg.svd(first.basis @ second.basis.T, compute_uv=False)
+    assert overlap.max() < 0.999
+
+
+def test_a_probe_has_a_calibrated_dimension_and_can_go_to_stdout(world, lift):
+    (photo,) = world.photos(1, range(1))
+    ran = lift(photo, "--probe", "--out", "-")
+    assert ran.status == 0
+    received = wire.decode(base64.b64decode(ran.json["template"]))
+    assert received.subspace.m == PROBE_DIM
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "said"),
+    [
+        (("--dim", "5"), 2, "add --probe"),
+        (("--probe", "--dim", "5"), 2, f"of dimension {PROBE_DIM}, not 5"),
+    ],
+)
+def test_other_dimensions_are_refused(world, lift, tmp_path, arguments, status, said):
+    ran = lift(*world.photos(1, range(1)), *arguments, "--out", tmp_path / "x")
+    assert ran.status == status
+    assert said in ran.stderr
+    assert not (tmp_path / "x").exists()
+
+
+def test_photos_of_two_people_are_refused_by_name(world, lift, tmp_path):
+    photos = [*world.photos(1, range(1)), *world.photos(2, range(1, 2))]
+    ran = lift(*photos, "--out", tmp_path / "x")
+    assert ran.status == 1
+    assert "do not look like the same person: 0.png, 1.png" in ran.stderr
+
+
+def test_a_changed_contract_is_refused(world, lift, public, tmp_path):
+    document = json.loads(public.read_text())
+    document["binding"]["m"] = 2
+    public.write_text(json.dumps(document))
+    ran = lift(*world.photos(1, range(1)), "--out", tmp_path / "x")
+    assert ran.status == 1
+    assert "contract_id" in ran.stderr
+
+
+def test_other_decoys_and_other_weights_are_refused(world, public, tmp_path, yunet_pack_dir):
+    other = tmp_path / "other.veil"
+    made = run(
+        *("decoys", "build", world.labelled, "--pack", world.pack, "--out", other),
+        *("--data-dir", tmp_path / "d"),
+    )
+    assert made.status == 0
+    photo = world.photos(1, range(1))
+    base = ("lift", *photo, "--contract", public, "--out", tmp_path / "x")
+    ran = run(*base, "--pack", world.pack, "--generator", other)
+    assert ran.status == 1
+    assert "bound to the decoy source" in ran.stderr
+    ran = run(*base, "--pack", yunet_pack_dir, "--generator", world.data / "decoys.veil")
+    assert ran.status == 1
+    assert "the pack gives 128" in ran.stderr
+
+
+def test_the_contract_file_itself_does_as_well(world, tmp_path):
+    ran = run(
+        *("lift", *world.photos(1, range(1)), "--pack", world.pack, "--out", tmp_path / "x"),
+        *("--contract", world.data / "contract.json"),
+        *("--generator", world.data / "decoys.veil"),
+    )
+    assert ran.status == 0, ran.stderr

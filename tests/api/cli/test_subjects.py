@@ -1,0 +1,57 @@
+from models.demo import DEMO_NOTICE
+
+STORED = ("--tenant", "default")
+
+
+def test_enroll_then_accept_and_reject(world, veilface):
+    enrolled = veilface("enroll", "ann", *world.photos(1, range(3)), "--pack", world.pack, "--json")
+    assert enrolled.status == 0, enrolled.stderr
+    assert enrolled.json["replaced"] is False
+    assert enrolled.json["photos"] == 3
+    assert DEMO_NOTICE in enrolled.stderr
+
+    own = veilface("verify", "ann", *world.photos(1, range(3, 4)), "--pack", world.pack, "--json")
+    assert own.status == 0, own.stderr
+    assert own.json["decision"] == "accept"
+    assert own.json["fmr"] == 0.01
+    assert own.json["contract_id"] == world.calibrated["contract"]["contract_id"]
+    assert "distance" not in own.json
+    assert DEMO_NOTICE in own.stderr
+
+    other = veilface("verify", "ann", *world.photos(2, range(1)), "--pack", world.pack)
+    assert other.status == 1
+    assert other.stdout.startswith("reject: ann")
+
+    again = veilface("enroll", "ann", *world.photos(1, range(1)), "--pack", world.pack, "--json")
+    assert again.json["replaced"] is True
+
+
+def test_what_stands_in_the_way_is_named(world, veilface, tmp_path):
+    broken = tmp_path / "broken.png"
+    broken.write_bytes(b"no picture")
+    photo = world.photos(1, range(1))
+    pack = ("--pack", world.pack)
+    cases = [
+        (("verify", "nobody", *photo, *pack), 1, "has no subject of that name"),
+        (("enroll", "ann", *photo, broken, *pack), 1, "broken.png"),
+        (("enroll", "ann", *photo, tmp_path / "absent.png", *pack), 1, "No such file"),
+        (("enroll", "ann", *photo, *world.photos(2, range(1)), *pack), 1, "same person"),
+        (("enroll", "ann", *photo, *pack, "--tenant", "elsewhere"), 1, "no tenant"),
+        (("enroll", "ann", *(photo * 11), *pack), 2, "1 to 10 photos"),
+        (("enroll", "ann", *photo), 2, "--pack"),
+    ]
+    for arguments, status, said in cases:
+        ran = veilface(*arguments)
+        assert (ran.status, ran.stdout) == (status, ""), (arguments, ran)
+        assert said in ran.stderr
+        assert ran.stderr.startswith(("error: ", "note: "))
+
+
+def test_an_unknown_level_names_those_there_are(world, veilface):
+    veilface("enroll", "ann", *world.photos(1, range(3)), "--pack", world.pack)
+    ran = veilface(
+        *("verify", "ann", *world.photos(1, range(3, 4)), "--pack", world.pack),
+        *("--level", "fmr-1e-9"),
+    )
+    assert ran.status == 1
+    assert "fmr-1e-2" in ran.stderr
