@@ -10,15 +10,11 @@ of this size reaches. The associated data holds the header and the parts that th
 blob to, each with its length in front, so that no two lists of parts have the same encoding.
 """
 
-import base64
-import binascii
 import contextlib
 import hashlib
-import itertools
 import os
-import stat
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn, Protocol, Self
 
@@ -28,17 +24,23 @@ from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
 from templates.errors import SealError
+from templates.key_file import (
+    KEY_BYTES,
+    Stamp,
+    check_keys,
+    parse_keys,
+    read_key_file,
+    stamp_of,
+    write_key_file,
+)
 
-KEY_BYTES = 32
 KEY_ID_BYTES = 8
 NONCE_BYTES = 12
 TAG_BYTES = 16
 OVERHEAD_BYTES = 1 + KEY_ID_BYTES + NONCE_BYTES + TAG_BYTES
 
 _VERSION = 1
-_MAX_FILE_BYTES = 64 * 1024
 _MAX_PLAINTEXT_BYTES = 2**31 - 1 - OVERHEAD_BYTES  # the limit of one call of the AES-GCM library
-_MIN_DISTINCT_BYTES = 16  # 32 random bytes have fewer with a probability of about 1e-15
 
 
 class Sealer(Protocol):
@@ -102,7 +104,7 @@ class MasterKeyring:
     def __init__(self, keys: Sequence[bytes], *, source: str = "the master keyring") -> None:
         self._source = source
         self._path: Path | None = None
-        self._stamp: tuple[int, int, int] | None = None
+        self._stamp: Stamp | None = None
         self._lock = threading.Lock()
         self._keys = _Keys(keys, source=source)
 
@@ -116,7 +118,7 @@ class MasterKeyring:
             If the file is absent, readable by group or others, or holds anything else.
         """
         path = Path(path)
-        keys, stamp = _read_key_file(path)
+        keys, stamp = read_key_file(path)
         keyring = cls(keys, source=f"the key file {path}")
         keyring._path, keyring._stamp = path, stamp
         return keyring
@@ -134,13 +136,13 @@ class MasterKeyring:
             If the file exists already or cannot be written.
         """
         path = Path(path)
-        _write_key_file(path, [os.urandom(KEY_BYTES)], replace=False)
+        write_key_file(path, [os.urandom(KEY_BYTES)], replace=False)
         return cls.load(path)
 
     @classmethod
     def from_text(cls, text: str, *, source: str = "the environment variable") -> Self:
         """Read keys from a setting: base64, separated by white space or commas."""
-        return cls(_parse_keys(text.replace(",", " ").split(), source=source), source=source)
+        return cls(parse_keys(text.replace(",", " ").split(), source=source), source=source)
 
     @staticmethod
     def add_current(path: str | Path) -> str:
@@ -149,9 +151,9 @@ class MasterKeyring:
         The file is replaced in one step. Afterwards re-wrap the store, then :meth:`drop_retired`.
         """
         path = Path(path)
-        keys, _ = _read_key_file(path)
+        keys, _ = read_key_file(path)
         fresh = os.urandom(KEY_BYTES)
-        _write_key_file(path, [fresh, *keys], replace=True)
+        write_key_file(path, [fresh, *keys], replace=True)
         return _key_id(fresh).hex()
 
     @staticmethod
@@ -162,8 +164,8 @@ class MasterKeyring:
         ``TemplateStore.wrapping_keys()`` first.
         """
         path = Path(path)
-        keys, _ = _read_key_file(path)
-        _write_key_file(path, keys[:1], replace=True)
+        keys, _ = read_key_file(path)
+        write_key_file(path, keys[:1], replace=True)
         return len(keys) - 1
 
     @property
@@ -244,14 +246,14 @@ class MasterKeyring:
         if self._path is None:
             return
         try:
-            if _stamp(self._path.stat()) == self._stamp:
+            if stamp_of(self._path.stat()) == self._stamp:
                 return
         except OSError:
             return  # the keys in memory stay good while the file is away
         # A file that is broken at this moment must not stop a service that has its keys: a blob
         # under a key that is not in memory still fails, with the id of that key.
         with self._lock, contextlib.suppress(SealError):
-            keys, stamp = _read_key_file(self._path)
+            keys, stamp = read_key_file(self._path)
             self._keys, self._stamp = _Keys(keys, source=self._source), stamp
 
     def __repr__(self) -> str:
@@ -301,13 +303,7 @@ class _Keys:
     """An immutable set of checked keys, and the keys derived from them so far."""
 
     def __init__(self, keys: Sequence[bytes], *, source: str) -> None:
-        if not keys:
-            raise SealError(f"{source} holds no key")
-        for number, key in enumerate(keys, start=1):
-            if fault := _weakness(key):
-                raise SealError(f"key {number} of {source} {fault}")
-        if len(set(keys)) != len(keys):
-            raise SealError(f"{source} holds the same key twice")
+        check_keys(keys, source=source)
         self._masters = {_key_id(key): key for key in keys}
         self._derived: dict[tuple[bytes, str], bytes] = {}
         self.ids = tuple(self._masters)
@@ -326,92 +322,3 @@ def _bind(header: bytes, purpose: str, bound_to: Sequence[str | bytes | int]) ->
 
 def _key_id(key: bytes) -> bytes:
     return hashlib.sha256(derive_key(key, "key-id")).digest()[:KEY_ID_BYTES]
-
-
-def _weakness(key: bytes) -> str | None:
-    """Say what is wrong with a key, for keys that nobody drew at random."""
-    advice = "make one with `veilface keys master`"
-    if len(key) != KEY_BYTES:
-        return f"has {len(key)} bytes, not {KEY_BYTES}: {advice}"
-    steps = {(b - a) % 256 for a, b in itertools.pairwise(key)}
-    if len(set(key)) < _MIN_DISTINCT_BYTES or len(steps) == 1 or key[:16] == key[16:]:
-        return f"is a pattern, not random bytes: {advice}"
-    if all(0x20 <= byte < 0x7F for byte in key):
-        return f"is readable text, not random bytes: {advice}"
-    return None
-
-
-def _parse_keys(encoded: Iterable[str], *, source: str) -> list[bytes]:
-    keys = []
-    for number, line in enumerate(encoded, start=1):
-        try:
-            keys.append(base64.b64decode(line, validate=True))
-        except (binascii.Error, ValueError):
-            raise SealError(f"key {number} of {source} is not base64") from None
-    return keys
-
-
-def _stamp(status: os.stat_result) -> tuple[int, int, int]:
-    return status.st_ino, status.st_mtime_ns, status.st_size
-
-
-def _read_key_file(path: Path) -> tuple[list[bytes], tuple[int, int, int]]:
-    source = f"the key file {path}"
-    try:
-        # Not blocking: a named pipe in the place of the file would hold the start for ever.
-        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
-    except FileNotFoundError:
-        raise SealError(f"{source} does not exist: make it with `veilface keys master`") from None
-    except OSError as error:
-        raise SealError(f"{source} cannot be opened: {error.strerror}") from None
-    try:
-        status = os.fstat(descriptor)
-        if not stat.S_ISREG(status.st_mode):
-            raise SealError(f"{source} is not a regular file")
-        if status.st_mode & 0o077:
-            raise SealError(
-                f"{source} may be read by others (mode {stat.S_IMODE(status.st_mode):04o}): "
-                "`chmod 600` it, and replace the keys if others could have read them"
-            )
-        if status.st_size > _MAX_FILE_BYTES:
-            raise SealError(f"{source} has {status.st_size} bytes, more than {_MAX_FILE_BYTES}")
-        data = os.read(descriptor, _MAX_FILE_BYTES)
-    except OSError as error:
-        raise SealError(f"{source} cannot be read: {error.strerror}") from None
-    finally:
-        os.close(descriptor)
-    try:
-        text = data.decode("ascii")
-    except UnicodeDecodeError:
-        raise SealError(f"{source} is not text: it holds one base64 key on each line") from None
-    keys = _parse_keys((line.strip() for line in text.splitlines() if line.strip()), source=source)
-    _Keys(keys, source=source)
-    return keys, _stamp(status)
-
-
-def _write_key_file(path: Path, keys: Sequence[bytes], *, replace: bool) -> None:
-    """Write beside the place, then link or rename into it: nobody ever sees half a file."""
-    text = b"".join(base64.b64encode(key) + b"\n" for key in keys)
-    draft = path.with_name(f".{path.name}.{os.urandom(8).hex()}")
-    try:
-        descriptor = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
-        try:
-            with os.fdopen(descriptor, "wb") as file:
-                file.write(text)
-                file.flush()
-                os.fsync(file.fileno())
-            if replace:
-                draft.replace(path)
-            else:
-                path.hardlink_to(draft)
-        finally:
-            draft.unlink(missing_ok=True)
-        directory = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(directory)
-        finally:
-            os.close(directory)
-    except FileExistsError:
-        raise SealError(f"the key file {path} exists already and is not overwritten") from None
-    except OSError as error:
-        raise SealError(f"the key file {path} cannot be written: {error.strerror}") from None

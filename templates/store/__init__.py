@@ -4,12 +4,12 @@ Everything that a secret could be read from is encrypted; see ``docs/storage.md`
 """
 
 from templates.store.api_keys import ApiKey, NewApiKey, Right, probe_key
+from templates.store.erasure import Erasure
 from templates.store.idempotency import Answer, Claim, IdempotencyConflict
 from templates.store.identifiers import InvalidIdentifier, UnknownTenant
 from templates.store.receipts import Receipt, verify_receipt
 from templates.store.repository import TemplateStore
 from templates.store.subjects import (
-    Erasure,
     Source,
     StoredTemplate,
     SubjectPage,

@@ -9,9 +9,10 @@ from templates.store import deployment, migrate, rewrap
 from templates.store.api_keys import ApiKeys
 from templates.store.database import Database
 from templates.store.deployment import Secrets
+from templates.store.erasure import Erasure, Erasures
 from templates.store.idempotency import Idempotency
 from templates.store.identifiers import Clock, utc_now
-from templates.store.receipts import ReceiptSigner
+from templates.store.receipts import Receipt, ReceiptSigner
 from templates.store.schema import FailedAttemptsRow, IdempotencyRow, SubjectRow, TemplateRow
 from templates.store.subjects import Subjects
 from templates.store.tenants import Tenants
@@ -36,11 +37,12 @@ class TemplateStore(Subjects):
     ) -> None:
         database = Database(url, pool_size=pool_size, max_overflow=max_overflow, timeout=timeout)
         self.secrets = Secrets(database, keyring, clock)
-        signer = ReceiptSigner(self.secrets)
-        super().__init__(database, keyring, signer, clock)
+        super().__init__(database, keyring, clock)
+        self._signer = ReceiptSigner(self.secrets)
+        self._erasures = Erasures(database, self._signer, clock)
         self.tenants = Tenants(database, keyring, clock)
         self.api_keys = ApiKeys(database, keyring, self.tenants, clock)
-        self.idempotency = Idempotency(database, self.secrets, signer, clock)
+        self.idempotency = Idempotency(database, self.secrets, self._signer, clock)
 
     def upgrade(self) -> None:
         """Bring the schema to this program's version; safe when several workers start at once."""
@@ -56,6 +58,14 @@ class TemplateStore(Subjects):
     def close(self) -> None:
         """Close the idle connections of this process."""
         self._database.close()
+
+    def erase(self, tenant: str, subject_id: str) -> Erasure:
+        """Erase a subject and sign a receipt; see :meth:`Erasures.erase`."""
+        return self._erasures.erase(tenant, subject_id)
+
+    def receipt(self, tenant: str, subject_id: str) -> Receipt | None:
+        """Return the latest erasure receipt of a subject, or None."""
+        return self._erasures.receipt(tenant, subject_id)
 
     def ping(self) -> None:
         """Raise :class:`StoreUnavailable` unless the database answers a query."""

@@ -1,4 +1,4 @@
-"""Subjects and their templates: put, get, describe, list, erase."""
+"""Subjects and their templates: put, get, describe, list."""
 
 import base64
 import binascii
@@ -22,15 +22,7 @@ from templates.store.identifiers import (
     checked_opaque_id,
     checked_subject_id,
 )
-from templates.store.receipts import Receipt, ReceiptSigner
-from templates.store.schema import (
-    FailedAttemptsRow,
-    IdempotencyRow,
-    ReceiptRow,
-    SubjectRow,
-    TemplateRow,
-    TenantRow,
-)
+from templates.store.schema import SubjectRow, TemplateRow, TenantRow
 
 MAX_WIRE_BYTES = 4 * 1024 * 1024  # a float32 template of n = 4096, m = 128 has 2.1 MB
 MAX_PAGE = 1000
@@ -86,35 +78,12 @@ class SubjectPage:
     next_cursor: str | None
 
 
-@dataclass(frozen=True)
-class Erasure:
-    """What :meth:`Subjects.erase` did.
-
-    Attributes
-    ----------
-    receipt
-        The signed receipt.
-    erased
-        Whether this call removed a template; False when there was none (any more).
-    log_purged
-        False if a long reader kept SQLite from emptying its write-ahead log just now; the next
-        erasure or ``purge_log`` does it.
-    """
-
-    receipt: Receipt
-    erased: bool
-    log_purged: bool
-
-
 class Subjects:
     """Repository of subjects."""
 
-    def __init__(
-        self, database: Database, keyring: MasterKeyring, signer: ReceiptSigner, clock: Clock
-    ) -> None:
+    def __init__(self, database: Database, keyring: MasterKeyring, clock: Clock) -> None:
         self._database = database
         self._keyring = keyring
-        self._signer = signer
         self._clock = clock
 
     def put(
@@ -165,10 +134,10 @@ class Subjects:
             )
 
         def work(connection: Connection) -> bool:
-            tenant_id, current_epoch = _tenant(connection, tenant)
+            tenant_id, current_epoch = tenant_row(connection, tenant)
             epoch = current_epoch if rotation_epoch is None else rotation_epoch
             now = self._clock()
-            known = _subject_pk(connection, tenant_id, subject_id)
+            known = subject_row_id(connection, tenant_id, subject_id)
             subject_pk = known or uuid.uuid4().hex
             owner = Owner(tenant_id, subject_pk, subject_id, contract_id, template_id, epoch)
             envelope = close_envelope(wire, owner, self._keyring)
@@ -209,7 +178,7 @@ class Subjects:
             )
             return known is None
 
-        created = self._database.write(work, lock=_lock(tenant, subject_id))
+        created = self._database.write(work, lock=subject_lock(tenant, subject_id))
         if not created:
             self._database.purge_log()
         return StoredTemplate(template_id=template_id, created=created)
@@ -290,71 +259,6 @@ class Subjects:
             next_cursor=self._cursor(tenant, records[-1]) if len(rows) > limit else None,
         )
 
-    def erase(self, tenant: str, subject_id: str) -> Erasure:
-        """Remove all that is held of a subject, its data key included; leave a signed receipt.
-
-        In one transaction: template, metadata, data key, failed attempts and idempotency records
-        go, the receipt comes. Erasing again returns the receipt of the first time; erasing who
-        was never enrolled leaves a receipt that says nothing was held.
-        """
-        checked_subject_id(subject_id)
-        pseudonym = self._signer.pseudonym(tenant, subject_id)
-        self._signer.public_key()  # obtains the signing key before the transaction needs it
-
-        def work(connection: Connection) -> tuple[Receipt, bool]:
-            tenant_id, _ = _tenant(connection, tenant)
-            for table in (FailedAttemptsRow, IdempotencyRow):
-                connection.execute(
-                    sa.delete(table).where(
-                        table.tenant_id == tenant_id, table.pseudonym == pseudonym
-                    )
-                )
-            subject_pk = _subject_pk(connection, tenant_id, subject_id)
-            if subject_pk is None:
-                earlier = connection.execute(
-                    sa.select(ReceiptRow.body, ReceiptRow.signature)
-                    .where(ReceiptRow.pseudonym == pseudonym)
-                    .order_by(ReceiptRow.sequence.desc())
-                    .limit(1)
-                ).one_or_none()
-                if earlier is not None:
-                    return Receipt(earlier.body, earlier.signature), False
-            else:
-                connection.execute(
-                    sa.delete(TemplateRow).where(TemplateRow.subject_pk == subject_pk)
-                )
-                connection.execute(sa.delete(SubjectRow).where(SubjectRow.id == subject_pk))
-            now = self._clock()
-            held = subject_pk is not None
-            receipt = self._signer.sign(
-                tenant=tenant, pseudonym=pseudonym, held=held, erased_at=now
-            )
-            connection.execute(
-                sa.insert(ReceiptRow).values(
-                    pseudonym=pseudonym,
-                    body=receipt.body,
-                    signature=receipt.signature,
-                    created_at=now,
-                )
-            )
-            return receipt, held
-
-        receipt, erased = self._database.write(work, lock=_lock(tenant, subject_id))
-        return Erasure(receipt=receipt, erased=erased, log_purged=self._database.purge_log())
-
-    def receipt(self, tenant: str, subject_id: str) -> Receipt | None:
-        """Return the latest erasure receipt of a subject, or None."""
-        pseudonym = self._signer.pseudonym(tenant, checked_subject_id(subject_id))
-        row = self._database.read(
-            lambda each: each.execute(
-                sa.select(ReceiptRow.body, ReceiptRow.signature)
-                .where(ReceiptRow.pseudonym == pseudonym)
-                .order_by(ReceiptRow.sequence.desc())
-                .limit(1)
-            ).one_or_none()
-        )
-        return None if row is None else Receipt(row.body, row.signature)
-
     def _cursor(self, tenant: str, last: SubjectRecord) -> str:
         sealed = self._keyring.seal(
             last.subject_id.encode(), purpose=_CURSOR_PURPOSE, bound_to=[tenant]
@@ -405,7 +309,8 @@ def _record(columns: Any) -> SubjectRecord:
     return SubjectRecord(**{**values, "source": Source(values["source"])})
 
 
-def _tenant(connection: Connection, name: str) -> tuple[str, int]:
+def tenant_row(connection: Connection, name: str) -> tuple[str, int]:
+    """Row id and rotation epoch of a tenant, or :class:`UnknownTenant`."""
     row = connection.execute(
         sa.select(TenantRow.id, TenantRow.rotation_epoch).where(TenantRow.name == name)
     ).one_or_none()
@@ -414,7 +319,8 @@ def _tenant(connection: Connection, name: str) -> tuple[str, int]:
     return row.id, row.rotation_epoch
 
 
-def _subject_pk(connection: Connection, tenant_id: str, subject_id: str) -> str | None:
+def subject_row_id(connection: Connection, tenant_id: str, subject_id: str) -> str | None:
+    """Row id of a subject, or None."""
     return connection.execute(
         sa.select(SubjectRow.id).where(
             SubjectRow.tenant_id == tenant_id, SubjectRow.subject_id == subject_id
@@ -422,5 +328,6 @@ def _subject_pk(connection: Connection, tenant_id: str, subject_id: str) -> str 
     ).scalar_one_or_none()
 
 
-def _lock(tenant: str, subject_id: str) -> str:
+def subject_lock(tenant: str, subject_id: str) -> str:
+    """Name of the lock under which a subject is written."""
     return f"subject {tenant} {subject_id}"
