@@ -282,17 +282,18 @@ def predicted_attributes(
 def prepare(args: argparse.Namespace, work: Path, env: dict[str, str]) -> None:
     """Decoys and contract by the command line, people of the attempts left out."""
     data = args.data
+    cache = ["--cache", args.cache] if args.cache else []
     probe_dims = ["--probe-dims", str(args.probe_dim)] if args.probe_dim else []
     kind = "pool" if args.pool else "generator"
     veilface(
         "decoys", "build", data / "fairface" / "train", "--pack", args.pack,
-        "--kind", kind, "--out", work / "decoys.veil", env=env,
+        "--kind", kind, *cache, "--out", work / "decoys.veil", env=env,
     )  # fmt: skip
     veilface(
         "calibrate", data / "lfw" / "aligned112", "--aligned", "--pack", args.pack,
         "--decoys", work / "decoys.veil", "--strategy", args.strategy, "--dim", str(args.dim),
         *probe_dims, "--exclude-people", data / "lfw" / "photos",
-        "--out", work / "contract.json", env=env,
+        *cache, "--out", work / "contract.json", env=env,
     )  # fmt: skip
 
 
@@ -311,6 +312,8 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--clients", type=int, default=4)
     parser.add_argument("--work", type=Path, help="keep decoys, contract, database and log here")
+    parser.add_argument("--cache", type=Path, help="sealed embeddings, shared between runs")
+    parser.add_argument("--master-key", type=Path, help="the key file that the cache belongs to")
     args = parser.parse_args()
     args.pack = args.pack or args.data / "packs" / "w600k_mbf"
 
@@ -324,6 +327,7 @@ def main() -> None:
             "VEILFACE_PACK": str(args.pack),
             "VEILFACE_DECOYS_FILE": str(work / "decoys.veil"),
             "VEILFACE_CONTRACT_FILE": str(work / "contract.json"),
+            "VEILFACE_MASTER_KEY_FILE": str(args.master_key or work / "master.key"),
         }
         started = time.perf_counter()
         prepare(args, work, env)

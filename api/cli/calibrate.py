@@ -79,6 +79,7 @@ def calibrate(
     ] = Protocol.FMR,
     aligned: Aligned = False,
     flip: Flip = False,
+    cache: Cache = None,
     exclude_people: Annotated[
         Path | None,
         typer.Option(
@@ -124,7 +125,7 @@ def calibrate(
             "decoys with this pack"
         )
     exclude = frozenset() if exclude_people is None else read_names(exclude_people)
-    extraction = extract(pack, labelled.paths, aligned=aligned)
+    extraction = extract(pack, labelled.paths, aligned=aligned, settings=settings, cache=cache)
     with progress("calibrating", 100) as advance:
         shown = 0
 

@@ -77,6 +77,7 @@ def build(
     seed: Annotated[int, typer.Option(min=0, help="Seed of that choice.")] = 0,
     aligned: Aligned = False,
     flip: Flip = False,
+    cache: Cache = None,
     as_json: AsJson = False,
 ) -> None:
     """Make the lifting database from a folder of face photos.
@@ -99,7 +100,7 @@ def build(
         picked = np.random.default_rng(seed).choice(len(chosen), limit, replace=False)
         chosen = [chosen[index] for index in sorted(picked.tolist())]
     attributes = _labels(photos, labels)
-    extraction = extract(pack, chosen, aligned=aligned)
+    extraction = extract(pack, chosen, aligned=aligned, settings=settings, cache=cache)
     source = (
         make_generator(extraction) if kind is Kind.GENERATOR else make_pool(extraction, attributes)
     )

@@ -10,7 +10,9 @@ import typer
 from api.cli.console import message
 from api.cli.errors import CommandError, UsageError
 from api.preparation import acquired
+from api.runtime import file_sealer, open_keyring
 from api.settings import Settings
+from models.cache import EmbeddingCache
 from models.extraction import Extraction, Extractor
 from models.pack import ModelPack
 
@@ -24,6 +26,14 @@ Flip = Annotated[
     typer.Option(
         "--flip",
         help="Add the descriptor of the mirrored face. Decoys and contract must agree on it.",
+    ),
+]
+Cache = Annotated[
+    Path | None,
+    typer.Option(
+        help="Keep embeddings in this file, sealed with the master key, so that the next run on "
+        "the same photos is quick. Unset: they are not kept.",
+        show_default=False,
     ),
 ]
 
@@ -43,7 +53,14 @@ def bulk_pack(settings: Settings, *, flip: bool, why: str) -> ModelPack:
     )
 
 
-def extract(pack: ModelPack, photos: Sequence[Path], *, aligned: bool) -> Extraction:
+def extract(
+    pack: ModelPack,
+    photos: Sequence[Path],
+    *,
+    aligned: bool,
+    settings: Settings,
+    cache: Path | None,
+) -> Extraction:
     """Embed photos; those that fail are counted, reported and left out.
 
     Raises
@@ -51,7 +68,12 @@ def extract(pack: ModelPack, photos: Sequence[Path], *, aligned: bool) -> Extrac
     CommandError
         No photo gave a descriptor.
     """
-    extraction = Extractor(pack, aligned=aligned).extract(photos)
+    kept = None
+    if cache is not None:
+        kept = EmbeddingCache.open_file(cache, file_sealer(open_keyring(settings)))
+    extraction = Extractor(pack, aligned=aligned, cache=kept).extract(photos)
+    if kept is not None:
+        kept.flush()
     if not extraction.paths:
         raise CommandError(
             f"no photo gave a descriptor: {acquired(extraction)}; are these photos of faces, and "
