@@ -136,8 +136,9 @@ class Deployment:
 
 def deploy(folder: Path, *, database_url: str | None = None, **changes: Any) -> Deployment:
     """Write a deployment into ``folder``."""
-    pack_dir = write_pack(folder / "tiny")
-    pack, source = ModelPack.load(pack_dir, threads=1), make_source()
+    pack_dir = changes.pop("pack", None) or write_pack(folder / "tiny")
+    pack = ModelPack.load(pack_dir, threads=1)
+    source = make_source(pack.info.n)
     settings = Settings(
         **{
             "data_dir": folder / "data",
