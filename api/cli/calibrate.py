@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from api.cli.console import emit, message, progress, say, show, table, warn_of_demo_model
-from api.cli.descriptors import BULK, Aligned, Flip, bulk_pack, extract
+from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, extract
 from api.cli.errors import CommandError, UsageError
 from api.cli.files import read_bounded, read_names
 from api.cli.options import AsJson, takes_settings

@@ -8,7 +8,7 @@ import numpy as np
 import typer
 
 from api.cli.console import emit, message, say, warn_of_demo_model
-from api.cli.descriptors import BULK, Aligned, Flip, bulk_pack, extract
+from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, extract
 from api.cli.errors import CommandError
 from api.cli.fairface import label_files, read_labels
 from api.cli.files import find_photos, is_left_out, read_names
