@@ -1,0 +1,154 @@
+"""What one verify request costs beyond the bare model inference, and the share of each step.
+
+Every round sends one photo to a running service and, in turn, runs detection, alignment and
+embedding alone on the same decoded photo in this process, with the same number of ONNX threads.
+The figures are medians over the rounds, so that a noisy machine disturbs both alike.
+
+Example
+-------
+::
+
+    python -m benchmarks.request_overhead --work FOLDER    # a folder of benchmarks.end_to_end
+"""
+
+import argparse
+import json
+import os
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from statistics import median
+from typing import TypeVar
+
+import httpx
+import numpy as np
+
+from api.runtime import Runtime
+from api.settings import load_settings
+from benchmarks.deployment import service, veilface
+from benchmarks.end_to_end import enroll_photos, people_of, verify_photo
+from models.decoding import decode_image
+from models.pack import ModelPack
+
+T = TypeVar("T")
+
+
+class Clock:
+    """Milliseconds by step, over many rounds."""
+
+    def __init__(self) -> None:
+        self.steps: dict[str, list[float]] = {}
+
+    def time(self, step: str, call: Callable[[], T]) -> T:
+        """Run ``call`` and book its time under ``step``."""
+        started = time.perf_counter()
+        result = call()
+        self.steps.setdefault(step, []).append(1000 * (time.perf_counter() - started))
+        return result
+
+    def medians(self) -> dict[str, float]:
+        """Median of every step."""
+        return {step: round(median(times), 3) for step, times in self.steps.items()}
+
+
+def main() -> None:
+    """Time rounds of request and bare inference, then each step of the service in this process."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
+    parser.add_argument("--pack", type=Path, help="default: DATA/packs/w600k_mbf")
+    parser.add_argument("--work", type=Path, required=True, help="holds contract and decoys")
+    parser.add_argument("--master-key", type=Path, help="default: WORK/master.key")
+    parser.add_argument("--rounds", type=int, default=200)
+    parser.add_argument("--threads", type=int, default=1)
+    args = parser.parse_args()
+    packs = args.pack or args.data / "packs" / "w600k_mbf"
+    people = people_of(args.data / "lfw" / "photos")
+    clock = Clock()
+    with ExitStack() as stack:
+        fresh = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        settings = {
+            "VEILFACE_DATA_DIR": str(fresh),
+            "VEILFACE_DATABASE_URL": f"sqlite:///{fresh / 'veilface.db'}",
+            "VEILFACE_PACK": str(packs),
+            "VEILFACE_DECOYS_FILE": str(args.work / "decoys.veil"),
+            "VEILFACE_CONTRACT_FILE": str(args.work / "contract.json"),
+            "VEILFACE_MASTER_KEY_FILE": str(args.master_key or args.work / "master.key"),
+            "VEILFACE_ONNX_THREADS": str(args.threads),
+        }
+        env = os.environ | settings
+        token = json.loads(
+            veilface("keys", "create", "--json", "--right", "enroll", "--right", "verify", env=env)
+        )["token"]
+        address = stack.enter_context(service(env, workers=1, log=fresh / "serve.log"))
+        client = stack.enter_context(
+            httpx.Client(base_url=address, headers={"Authorization": f"Bearer {token}"}, timeout=60)
+        )
+        enrolled = people[:8]
+        for person in enrolled:
+            enroll_photos(client, person, None).raise_for_status()
+        pack = ModelPack.load(packs, threads=args.threads)
+        attempts = [(person, photo) for person in enrolled for photo in person.probes]
+        for turn in range(-10, args.rounds):
+            person, photo = attempts[turn % len(attempts)]
+            image = decode_image(photo.read_bytes())
+
+            def bare(picture: np.ndarray = image) -> object:
+                face = max(pack.detect(picture), key=lambda found: found.area)
+                return pack.embed(pack.align(picture, face)[None])
+
+            def ask(name: str = person.name, probe: Path = photo) -> object:
+                return verify_photo(client, name, probe, "fmr-1e-3").raise_for_status()
+
+            if turn < 0:
+                bare(), ask()
+                continue
+            clock.time("bare inference", bare)
+            clock.time("request", ask)
+        os.environ.update(settings)
+        steps = steps_of(Runtime.open(load_settings()), pack, attempts, args.rounds)
+    totals = clock.medians()
+    ratio = [
+        a / b for a, b in zip(clock.steps["request"], clock.steps["bare inference"], strict=True)
+    ]
+    report = {
+        "rounds": args.rounds,
+        "onnx_threads": args.threads,
+        "median_ms": totals,
+        "overhead_ms": round(totals["request"] - totals["bare inference"], 3),
+        "ratio_of_medians": round(totals["request"] / totals["bare inference"], 3),
+        "median_of_ratios": round(median(ratio), 3),
+        "steps_median_ms": steps,
+    }
+    print(json.dumps(report, indent=2))
+
+
+def steps_of(
+    runtime: Runtime, pack: ModelPack, attempts: list[tuple[object, Path]], rounds: int
+) -> dict[str, float]:
+    """Median milliseconds of every step of a request, run one by one in this process."""
+    clock = Clock()
+    tenant = runtime.settings.default_tenant
+    ours = runtime.of(tenant)
+    for turn in range(rounds):
+        person, photo = attempts[turn % len(attempts)]
+        data = photo.read_bytes()
+        image = clock.time("decode the photo", lambda d=data: decode_image(d))
+        faces = clock.time("detect", lambda i=image: pack.detect(i))
+        face = max(faces, key=lambda found: found.area)
+        crop = clock.time("align", lambda i=image, f=face: pack.align(i, f))
+        embedding = clock.time("embed", lambda c=crop: pack.embed(c[None])[0])
+        name = person.name  # type: ignore[attr-defined]
+        found = clock.time("fetch and decrypt", lambda n=name: runtime.store.get(tenant, n))
+        assert found is not None
+        clock.time(
+            "compare and decide",
+            lambda e=embedding, w=found.wire: ours.verifier.decide_embedding(e, w),
+        )
+    runtime.close()
+    return clock.medians()
+
+
+if __name__ == "__main__":
+    main()
