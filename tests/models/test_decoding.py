@@ -1,0 +1,352 @@
+import io
+import struct
+import tracemalloc
+import warnings
+import zlib
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image, PngImagePlugin
+
+from models.decoding import ImageLimits, decode_image
+from models.errors import ImageError
+
+
+def encode(image: Image.Image, kind: str = "PNG", **options) -> bytes:
+    file = io.BytesIO()
+    image.save(file, kind, **options)
+    return file.getvalue()
+
+
+def picture(height: int = 40, width: int = 60) -> np.ndarray:
+    y, x = np.mgrid[:height, :width]
+    return np.stack([x * 4, y * 5, (x + y) * 2], axis=-1).astype(np.uint8)
+
+
+def chunk(kind: bytes, content: bytes) -> bytes:
+    return (
+        struct.pack(">I", len(content))
+        + kind
+        + content
+        + struct.pack(">I", zlib.crc32(kind + content))
+    )
+
+
+def code_of(data: bytes, **limits) -> str:
+    with pytest.raises(ImageError) as caught:
+        decode_image(data, limits=ImageLimits(**limits))
+    assert str(caught.value).endswith(".")
+    return caught.value.code
+
+
+@pytest.mark.parametrize("kind", ["PNG", "WEBP"])
+def test_lossless_rgb_is_returned_as_it_was(kind):
+    data = encode(
+        Image.fromarray(picture()), kind, **({"lossless": True} if kind == "WEBP" else {})
+    )
+    pixels = decode_image(data)
+    np.testing.assert_array_equal(pixels, picture())
+    assert pixels.flags.c_contiguous
+    assert pixels.dtype == np.uint8
+
+
+def test_jpeg_is_close():
+    pixels = decode_image(encode(Image.fromarray(picture()), "JPEG", quality=95))
+    assert np.abs(pixels.astype(int) - picture()).mean() < 3
+
+
+# CIPA DC-008: which side of the picture the first row and the first column are.
+CAMERA = {
+    1: lambda a: a,
+    2: np.fliplr,
+    3: lambda a: np.rot90(a, 2),
+    4: np.flipud,
+    5: lambda a: np.transpose(a, (1, 0, 2)),
+    6: lambda a: np.rot90(a, 1),
+    7: lambda a: np.transpose(np.rot90(a, 2), (1, 0, 2)),
+    8: lambda a: np.rot90(a, -1),
+}
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("kind", ["PNG", "WEBP"])
+def test_exif_orientation_is_undone(orientation, kind):
+    stored = np.ascontiguousarray(CAMERA[orientation](picture()))
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    options = {"lossless": True} if kind == "WEBP" else {}
+    data = encode(Image.fromarray(stored), kind, exif=exif, **options)
+    np.testing.assert_array_equal(decode_image(data), picture())
+
+
+def test_exif_behind_the_pixels_of_a_png_counts():
+    exif = Image.Exif()
+    exif[0x0112] = 3
+    plain = encode(Image.fromarray(np.ascontiguousarray(np.rot90(picture(), 2))))
+    end = plain.rindex(b"IEND") - 4
+    data = plain[:end] + chunk(b"eXIf", exif.tobytes()[6:]) + plain[end:]
+    np.testing.assert_array_equal(decode_image(data), picture())
+
+
+@pytest.mark.parametrize("orientation", [0, 9, 65535])
+def test_an_orientation_that_does_not_exist_is_ignored(orientation):
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    np.testing.assert_array_equal(
+        decode_image(encode(Image.fromarray(picture()), exif=exif)), picture()
+    )
+
+
+def test_broken_exif_neither_warns_nor_refuses():
+    exif = b"Exif\0\0MM\0*\0\0\0\x08\xff\xff" + b"\x01\x12\0\x03\xff\xff\xff\xff" * 40
+    data = encode(Image.fromarray(picture()), "JPEG", exif=exif)
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.simplefilter("always")
+        assert decode_image(data).shape == (40, 60, 3)
+    assert seen == []
+
+
+def test_sixteen_bit_grey_is_scaled_not_clipped():
+    values = np.array([[0, 128, 257, 32768, 65535]], dtype=np.uint16)
+    pixels = decode_image(encode(Image.fromarray(values)))
+    expected = np.rint(values / 65535 * 255).astype(np.uint8)
+    np.testing.assert_array_equal(pixels, np.repeat(expected[:, :, None], 3, axis=2))
+
+
+def test_sixteen_bit_colour_is_scaled_not_clipped():
+    rows = np.array([[0, 1000, 40000], [65535, 257, 32768]], dtype=">u2")
+    raw = b"".join(b"\0" + row.tobytes() for row in rows)
+    data = (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", struct.pack(">IIBBBBB", 1, 2, 16, 2, 0, 0, 0))
+        + chunk(b"IDAT", zlib.compress(raw))
+        + chunk(b"IEND", b"")
+    )
+    pixels = decode_image(data)
+    assert np.abs(pixels[:, 0].astype(float) - rows.astype(float) / 257).max() <= 1
+
+
+def test_grey_becomes_three_equal_channels():
+    pixels = decode_image(encode(Image.fromarray(picture()[..., 0])))
+    np.testing.assert_array_equal(pixels, np.repeat(picture()[:, :, :1], 3, axis=2))
+
+
+def test_one_bit_picture():
+    pixels = decode_image(encode(Image.fromarray(picture()[..., 0] > 100)))
+    np.testing.assert_array_equal(pixels[..., 1], np.where(picture()[..., 0] > 100, 255, 0))
+
+
+@pytest.mark.parametrize("mode", ["RGBA", "LA"])
+def test_transparency_lies_over_white(mode):
+    alpha = np.tile(np.array([0, 128, 255], dtype=np.uint8), (4, 1))
+    image = Image.new("RGB", (3, 4), (40, 40, 40)).convert(mode)
+    image.putalpha(Image.fromarray(alpha))
+    pixels = decode_image(encode(image)).astype(float)
+    share = alpha[:, :, None] / 255
+    assert np.abs(pixels - (share * 40 + (1 - share) * 255)).max() <= 1
+
+
+def test_palette_with_transparency():
+    image = Image.new("P", (2, 1))
+    image.putpalette([10, 20, 30, 200, 100, 50])
+    image.putpixel((1, 0), 1)
+    data = encode(image, transparency=0)
+    np.testing.assert_array_equal(decode_image(data)[0], [[255, 255, 255], [200, 100, 50]])
+
+
+def test_cmyk_jpeg_is_converted():
+    image = Image.new("CMYK", (16, 16), (0, 255, 255, 0))  # no cyan: red
+    red, green, blue = decode_image(encode(image, "JPEG", quality=100))[8, 8]
+    assert red > 240
+    assert max(green, blue) < 20
+
+
+def test_a_phone_picture_with_several_frames_gives_the_first():
+    first = Image.fromarray(picture())
+    second = Image.new("RGB", (60, 40))
+    data = encode(first, "MPO", save_all=True, append_images=[second], quality=95)
+    assert Image.open(io.BytesIO(data)).format == "MPO"
+    assert np.abs(decode_image(data).astype(int) - picture()).mean() < 3
+
+
+@pytest.mark.parametrize("kind", ["PNG", "WEBP"])
+def test_animations_are_refused_by_name(kind):
+    frames = [Image.new("RGB", (20, 20), (60 * i, 0, 0)) for i in range(3)]
+    data = encode(frames[0], kind, save_all=True, append_images=frames[1:])
+    with pytest.raises(ImageError, match="animated") as caught:
+        decode_image(data)
+    assert caught.value.code == "unsupported_image"
+
+
+@pytest.mark.parametrize("kind", ["GIF", "BMP", "TIFF", "PPM", "ICO", "TGA"])
+def test_other_formats_are_refused(kind):
+    assert code_of(encode(Image.fromarray(picture()), kind)) == "unsupported_image"
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"\0", b"not a picture", b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"]
+)
+def test_what_is_no_picture_is_refused(data):
+    assert code_of(data) == "unsupported_image"
+
+
+@pytest.mark.parametrize(
+    ("kind", "share"), [("PNG", 0.5), ("JPEG", 0.5), ("WEBP", 0.5), ("PNG", 0.9)]
+)
+def test_truncated_pictures_are_refused(kind, share):
+    noise = np.random.default_rng(0).integers(0, 256, (80, 80, 3), dtype=np.uint8)
+    data = encode(Image.fromarray(noise), kind)
+    assert code_of(data[: int(len(data) * share)]) == "unsupported_image"
+
+
+def test_a_picture_without_pixels_is_refused():
+    data = (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", struct.pack(">IIBBBBB", 0, 5, 8, 2, 0, 0, 0))
+        + chunk(b"IDAT", zlib.compress(b""))
+        + chunk(b"IEND", b"")
+    )
+    assert code_of(data) == "unsupported_image"
+
+
+def bomb(width: int, height: int, *extra: bytes) -> bytes:
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))
+        + b"".join(extra)
+        + chunk(b"IDAT", zlib.compress(b"\0" * 1000))
+        + chunk(b"IEND", b"")
+    )
+
+
+def test_limits_on_bytes_pixels_and_sides():
+    data = encode(Image.fromarray(picture()))
+    assert code_of(data, max_bytes=len(data) - 1) == "image_too_large"
+    assert code_of(data, max_pixels=40 * 60 - 1) == "image_too_large"
+    assert code_of(data, max_side=59) == "image_too_large"
+    assert decode_image(
+        data, limits=ImageLimits(max_bytes=len(data), max_pixels=2400, max_side=60)
+    ).shape == (40, 60, 3)
+
+
+def peak_bytes(data: bytes) -> int:
+    tracemalloc.start()
+    try:
+        decode_image(data)
+    except ImageError:
+        pass
+    finally:
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+    return peak
+
+
+@pytest.mark.parametrize(("width", "height"), [(50_000, 50_000), (2**31 - 1, 1), (1, 2**31 - 1)])
+def test_pixel_bombs_are_refused_from_the_header(width, height):
+    assert code_of(bomb(width, height)) == "image_too_large"
+    assert peak_bytes(bomb(width, height)) < 2**20
+
+
+def test_webp_canvas_bomb_is_refused_before_its_decoder_starts():
+    canvas = (16_383 - 1).to_bytes(3, "little") * 2
+    vp8x = b"VP8X" + struct.pack("<I", 10) + b"\0\0\0\0" + canvas
+    data = b"RIFF" + struct.pack("<I", 4 + len(vp8x)) + b"WEBP" + vp8x
+    assert code_of(data) == "image_too_large"
+
+
+@pytest.mark.parametrize("kind", [b"iCCP", b"zTXt", b"iTXt"])
+def test_compressed_metadata_bombs_stay_small(kind):
+    packed = zlib.compress(b"\0" * (40 * 2**20), 9)
+    head = {b"iCCP": b"x\0\0", b"zTXt": b"x\0\0", b"iTXt": b"x\0\1\0\0\0"}[kind]
+    data = bomb(8, 8, chunk(kind, head + packed))
+    assert peak_bytes(data) < 16 * 2**20
+
+
+def test_many_small_text_chunks_stay_bounded():
+    packed = zlib.compress(b"a" * (2**20 - 1), 9)
+    data = bomb(8, 8, *(chunk(b"zTXt", b"k%d\0\0" % i + packed) for i in range(200)))
+    assert peak_bytes(data) < 200 * 2**20
+
+
+def test_jpeg_with_thousands_of_scans_is_refused():
+    data = encode(Image.fromarray(picture(64, 64)), "JPEG", progressive=True)
+    start = data.rindex(b"\xff\xda")
+    scan = data[start:-2]
+    assert decode_image(data).shape == (64, 64, 3)
+    assert code_of(data[:-2] + scan * 200 + b"\xff\xd9") == "unsupported_image"
+
+
+def test_no_warning_leaves_the_decoder_from_a_large_picture():
+    data = encode(Image.new("L", (10_000, 9_500)))  # above Pillow's own warning
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.simplefilter("always")
+        assert code_of(data) == "image_too_large"
+    assert seen == []
+
+
+def samples() -> list[bytes]:
+    image = Image.fromarray(picture())
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    exif[0x010F] = "maker"
+    text = PngImagePlugin.PngInfo()
+    text.add_text("Comment", "hello", zip=True)
+    frames = [Image.new("RGB", (20, 20), (60 * i, 0, 0)) for i in range(2)]
+    return [
+        encode(image, "JPEG", exif=exif),
+        encode(image, "JPEG", progressive=True),
+        encode(image.convert("CMYK"), "JPEG"),
+        encode(image, "PNG", exif=exif, pnginfo=text),
+        encode(image.convert("P"), "PNG", transparency=3),
+        encode(frames[0], "PNG", save_all=True, append_images=frames[1:]),
+        encode(image, "WEBP", exif=exif),
+        encode(image.convert("RGBA"), "WEBP", lossless=True),
+    ]
+
+
+SAMPLES = samples()
+
+
+def harmless(data: bytes) -> None:
+    """Either pixels or an `ImageError`, and never a warning (the suite turns those to errors)."""
+    try:
+        pixels = decode_image(data)
+    except ImageError as error:
+        assert error.code in ("unsupported_image", "image_too_large")
+        assert error.__cause__ is None
+    else:
+        assert pixels.dtype == np.uint8
+        assert pixels.ndim == 3
+        assert pixels.shape[2] == 3
+        assert pixels.flags.c_contiguous
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.sampled_from(SAMPLES), st.data())
+def test_nothing_else_escapes_on_flipped_bytes(sample, data):
+    broken = bytearray(sample)
+    flips = data.draw(
+        st.lists(st.tuples(st.integers(0, len(broken) - 1), st.integers(1, 255)), max_size=8)
+    )
+    for position, mask in flips:
+        broken[position] ^= mask
+    harmless(bytes(broken))
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.sampled_from(SAMPLES), st.floats(0, 1), st.binary(max_size=64))
+def test_nothing_else_escapes_on_cut_and_patched_bytes(sample, share, patch):
+    cut = int(len(sample) * share)
+    harmless(sample[:cut])
+    harmless(sample[:cut] + patch + sample[cut + len(patch) :])
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    st.binary(max_size=300),
+    st.sampled_from([b"", b"\xff\xd8\xff\xe1", b"\x89PNG\r\n\x1a\n", b"RIFF\x40\0\0\0WEBPVP8X"]),
+)
+def test_nothing_else_escapes_on_noise(noise, head):
+    harmless(head + noise)
