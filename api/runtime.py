@@ -1,212 +1,66 @@
-"""What the settings name, opened: the same objects for the service and for the command line.
+"""What answers a request, opened once in each process, for the service and the command line.
 
 ::
 
-    settings ─▶ open_keyring ─▶ open_store           keys, db, enough for a service of no pack
+    settings ─▶ open_keyring ─▶ open_store           enough for keys and db
                      └────────▶ open_contract ┐
-                                open_decoys   ├─▶ Runtime.enroller(tenant) / .verifier(tenant)
+                                open_decoys   ├─▶ Runtime.enroller / .verifier (tenant, epoch)
                                 open_pack     ┘
 """
 
 import threading
+from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import inspect, select, table
-from sqlalchemy.engine import Connection, make_url
-from sqlalchemy.exc import ArgumentError
 
-from api.errors import ApiError, StartError
+from api.errors import ApiError
+from api.opening import (
+    file_sealer,
+    open_contract,
+    open_decoys,
+    open_keyring,
+    open_pack,
+    open_store,
+    prepare_database,
+    try_inference,
+)
 from api.settings import Settings
 from api.transfer import Exported, ExportKey, seal_export
 from enroll import Enroller, Enrollment
 from enroll.enroller import WIRE_DTYPE
 from models.decoding import ImageLimits
-from models.errors import ModelError
 from models.pack import ModelPack
 from templates import wire
 from templates.contract import Contract
-from templates.decoys import Attributes, DecoyGenerator, DecoyPool, load_source
-from templates.errors import ContractMismatch, DecoyError, VeilfaceError
+from templates.decoys import Attributes, DecoyGenerator, DecoyPool
+from templates.errors import DecoyError, SealError
 from templates.lifting import Strategy
 from templates.randomness import Keystream
 from templates.rotation import tenant_rotation
-from templates.sealing import KeyringSealer, MasterKeyring
+from templates.sealing import MasterKeyring
 from templates.store import TemplateStore
-from templates.store.database import Database
-from templates.store.envelope import Owner, close_envelope, open_envelope
+from templates.store.envelope import Envelope, Owner, close_envelope, open_envelope
 from templates.store.subjects import Source, StoredTemplate
 from verify import Verifier
 
+__all__ = [
+    "Runtime",
+    "bootstrap_token",
+    "file_sealer",
+    "open_contract",
+    "open_decoys",
+    "open_keyring",
+    "open_pack",
+    "open_store",
+    "prepare_database",
+    "try_inference",
+]
 
-def database_in_use(url: str) -> bool:
-    """Tell whether the database holds a row of ours; an absent SQLite file holds none.
-
-    Raises
-    ------
-    StoreError
-        If the database does not answer.
-    """
-    if url.startswith("sqlite") and not Path(make_url(url).database or "").exists():
-        return False
-    database = Database(url)
-
-    def any_row(connection: Connection) -> bool:
-        return any(
-            connection.execute(select(1).select_from(table(name)).limit(1)).first() is not None
-            for name in inspect(connection).get_table_names()
-            if name != "alembic_version"
-        )
-
-    try:
-        return database.read(any_row)
-    finally:
-        database.close()
-
-
-def file_sealer(keyring: MasterKeyring) -> KeyringSealer:
-    """Return what seals the files that belong to the deployment: contract, decoy pool, cache."""
-    return KeyringSealer(keyring)
-
-
-def open_keyring(settings: Settings) -> MasterKeyring:
-    """Load the master keys, or create the first one while nothing is stored yet.
-
-    Raises
-    ------
-    StartError
-        If the file is absent although the database holds something, or cannot be used.
-    """
-    path = settings.resolved_master_key_file
-    try:
-        if path.exists():
-            return MasterKeyring.load(path)
-        if database_in_use(settings.resolved_database_url):
-            raise StartError(
-                f"the master key file {path} is missing, but the database holds data sealed "
-                "with it; put the file back from its copy"
-            )
-        path.parent.mkdir(parents=True, exist_ok=True)
-        return MasterKeyring.create(path)
-    except StartError:
-        raise
-    except (OSError, ArgumentError, VeilfaceError) as error:
-        raise StartError(f"the master key file {path} cannot be used: {error}") from error
-
-
-def open_store(settings: Settings, keyring: MasterKeyring) -> TemplateStore:
-    """Open the store; :func:`prepare_database` must have run once before.
-
-    Raises
-    ------
-    StartError
-        If the URL is wrong or the SQLite file cannot be made.
-    """
-    try:
-        if settings.database_url is None:
-            settings.data_dir.mkdir(parents=True, exist_ok=True)
-        return TemplateStore(settings.resolved_database_url, keyring)
-    except (OSError, VeilfaceError) as error:
-        raise StartError(f"the database cannot be opened: {error}") from None
-
-
-def prepare_database(store: TemplateStore) -> None:
-    """Bring the schema up to date, and hold the master key against it.
-
-    Several processes may do so at once; the command line does it before it starts workers.
-
-    Raises
-    ------
-    StartError
-        If the database does not answer, or belongs to another master key or a newer program.
-    """
-    try:
-        store.upgrade()
-    except VeilfaceError as error:
-        raise StartError(f"the database cannot be used: {error}") from None
-
-
-def open_contract(settings: Settings, keyring: MasterKeyring) -> Contract:
-    """Load the contract file.
-
-    Raises
-    ------
-    StartError
-        If the file is absent, broken, or sealed with another master key.
-    """
-    path = settings.resolved_contract_file
-    if not path.is_file():
-        raise StartError(
-            f"there is no contract file {path}; `veilface calibrate` writes one "
-            "(setting contract_file)"
-        )
-    try:
-        return Contract.load(path, file_sealer(keyring))
-    except (OSError, VeilfaceError) as error:
-        raise StartError(f"the contract file {path} cannot be used: {error}") from error
-
-
-def open_decoys(
-    settings: Settings, keyring: MasterKeyring, contract: Contract
-) -> DecoyPool | DecoyGenerator | None:
-    """Load the decoy source that the contract is bound to; None when none is set.
-
-    Raises
-    ------
-    StartError
-        If a named file is absent or broken, or is another source than the contract's.
-    """
-    path = settings.resolved_decoys_file
-    if not path.is_file():
-        if settings.decoys_file is None:
-            return None
-        raise StartError(f"there is no decoys file {path} (setting decoys_file)")
-    try:
-        source = load_source(path, file_sealer(keyring))
-    except (OSError, VeilfaceError) as error:
-        raise StartError(f"the decoys file {path} cannot be used: {error}") from error
-    try:
-        contract.binding.require_source(source_id=source.source_id)
-    except ContractMismatch as error:
-        raise StartError(f"the decoys file {path} is not the contract's: {error}") from error
-    return source
-
-
-def open_pack(settings: Settings, contract: Contract | None = None) -> ModelPack | None:
-    """Load the model pack and hold it against the contract; None when none is set.
-
-    Raises
-    ------
-    StartError
-        If the pack is broken, or its embedder is not the contract's.
-    """
-    if settings.pack is None:
-        return None
-    try:
-        pack = ModelPack.load(
-            settings.pack,
-            providers=settings.providers,
-            threads=settings.onnx_threads,
-            flip=contract is not None and bool(contract.binding.preprocessing.get("flip")),
-        )
-    except (OSError, ModelError) as error:
-        raise StartError(f"the model pack {settings.pack} cannot be used: {error}") from error
-    if contract is not None:
-        try:
-            contract.binding.require_embedder(
-                embedder_sha256=pack.info.embedder_sha256,
-                preprocessing=pack.info.preprocessing,
-                n=pack.info.n,
-            )
-        except ContractMismatch as error:
-            raise StartError(
-                f"the pack {settings.pack} does not belong to the contract "
-                f"{settings.resolved_contract_file}: {error}"
-            ) from error
-    return pack
+TENANTS_KEPT = 64
+"""Tenants whose rotations a process keeps: 2 MB each where n = 512."""
 
 
 def _lacking(what: str) -> ApiError:
@@ -238,6 +92,15 @@ class NoDecoys:
         raise DecoyError("the service has no decoys file, so it cannot enroll photos")
 
 
+@dataclass(frozen=True, eq=False)
+class _ForTenant:
+    """What works with one epoch of one tenant's rotation, (n, n)."""
+
+    rotation: NDArray[np.float64] = field(repr=False)
+    enroller: Enroller
+    verifier: Verifier
+
+
 @dataclass(eq=False)
 class Runtime:
     """Everything that answers a request, opened once in each process."""
@@ -250,16 +113,13 @@ class Runtime:
     pack: ModelPack | None
     export_key: ExportKey
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
-    _rotations: dict[tuple[str, int], NDArray[np.float64]] = field(default_factory=dict, repr=False)
-    _enrollers: dict[tuple[str, int], Enroller] = field(default_factory=dict, repr=False)
-    _verifiers: dict[tuple[str, int], Verifier] = field(default_factory=dict, repr=False)
+    _tenants: OrderedDict[tuple[str, int], _ForTenant] = field(
+        default_factory=OrderedDict, repr=False
+    )
 
     def __post_init__(self) -> None:
-        owner = Owner("", "stand-in", "", self.contract.contract_id, "", 0)
-        nobody = wire.encode(
-            self.contract.cohort[0], contract_id=self.contract.contract_id, dtype=WIRE_DTYPE
-        )
-        self._stand_in = (close_envelope(nobody, owner, self.keyring), owner)
+        self._nobody = Owner("", "stand-in", "", self.contract.contract_id, "", 0)
+        self._stand_in = self._close_stand_in()
 
     @classmethod
     def open(cls, settings: Settings) -> "Runtime":
@@ -291,37 +151,36 @@ class Runtime:
         """Return the epoch of the rotation that the tenant's new templates are in."""
         return self.store.tenants.get(tenant).rotation_epoch
 
-    def rotation(self, tenant: str, epoch: int) -> NDArray[np.float64]:
-        """Return a tenant's rotation of one epoch, (n, n); computed once and kept."""
-        found = self._rotations.get((tenant, epoch))
-        if found is None:
-            key = self.store.tenants.rotation_key(tenant, epoch=epoch).key
-            found = tenant_rotation(key, self.contract.binding.n)
-            with self._lock:
-                self._rotations[tenant, epoch] = found
-        return found
-
     def enroller(self, tenant: str, epoch: int) -> Enroller:
         """Return the tenant's enroller for one epoch of its rotation."""
-        found = self._enrollers.get((tenant, epoch))
-        if found is None:
-            found = Enroller(
-                self.contract,
-                self.source or NoDecoys(self.contract),
-                rotation=self.rotation(tenant, epoch),
-            )
-            with self._lock:
-                self._enrollers[tenant, epoch] = found
-        return found
+        return self._of(tenant, epoch).enroller
 
     def verifier(self, tenant: str, epoch: int) -> Verifier:
         """Return the tenant's verifier for one epoch of its rotation."""
-        found = self._verifiers.get((tenant, epoch))
-        if found is None:
-            found = Verifier(self.contract, rotation=self.rotation(tenant, epoch))
-            with self._lock:
-                self._verifiers[tenant, epoch] = found
-        return found
+        return self._of(tenant, epoch).verifier
+
+    def _of(self, tenant: str, epoch: int) -> _ForTenant:
+        named = (tenant, epoch)
+        with self._lock:
+            found = self._tenants.get(named)
+            if found is not None:
+                self._tenants.move_to_end(named)
+                return found
+        # Outside of the lock: it takes a query and a QR decomposition.
+        key = self.store.tenants.rotation_key(tenant, epoch=epoch).key
+        rotation = tenant_rotation(key, self.contract.binding.n)
+        made = _ForTenant(
+            rotation=rotation,
+            enroller=Enroller(
+                self.contract, self.source or NoDecoys(self.contract), rotation=rotation
+            ),
+            verifier=Verifier(self.contract, rotation=rotation),
+        )
+        with self._lock:
+            self._tenants[named] = made
+            while len(self._tenants) > TENANTS_KEPT:
+                self._tenants.popitem(last=False)
+        return made
 
     def require_decoys(self) -> None:
         """Refuse to lift where there are no decoys and the strategy needs some.
@@ -394,7 +253,7 @@ class Runtime:
         binding.require_contract(found.record.contract_id, what="the stored template")
         stored = wire.decode(found.wire, max_n=binding.n, max_m=binding.m)
         # A rotation's inverse is its transpose.
-        plain = stored.subspace.rotated(self.rotation(tenant, found.record.rotation_epoch).T)
+        plain = stored.subspace.rotated(self._of(tenant, found.record.rotation_epoch).rotation.T)
         exported = Exported(
             subject_id=subject,
             contract_id=self.contract.contract_id,
@@ -406,7 +265,17 @@ class Runtime:
 
     def open_stand_in(self) -> bytes:
         """Decrypt a template of nobody: the work that a stored one would have cost."""
-        return open_envelope(self._stand_in[0], self._stand_in[1], self.keyring)
+        try:
+            return open_envelope(self._stand_in, self._nobody, self.keyring)
+        except SealError:
+            # The master key that it was sealed with was retired since.
+            self._stand_in = self._close_stand_in()
+            return open_envelope(self._stand_in, self._nobody, self.keyring)
+
+    def _close_stand_in(self) -> Envelope:
+        contract = self.contract
+        plain = wire.encode(contract.cohort[0], contract_id=contract.contract_id, dtype=WIRE_DTYPE)
+        return close_envelope(plain, self._nobody, self.keyring)
 
     def close(self) -> None:
         """Let go of the database's connections."""
@@ -420,26 +289,3 @@ def bootstrap_token(store: TemplateStore, settings: Settings) -> str | None:
     """
     made = store.api_keys.bootstrap(tenant=settings.default_tenant)
     return None if made is None else made.token
-
-
-def try_inference(pack: ModelPack) -> None:
-    """Run the whole pack once, on grey noise, so that a broken graph stops the start.
-
-    Raises
-    ------
-    StartError
-        If it fails, or gives something else than one finite unit vector.
-    """
-    size = pack.crop_size
-    noise = np.random.default_rng(0).integers(0, 256, (size, size, 3), dtype=np.uint8)
-    try:
-        if pack.info.detector is not None:
-            pack.detect(noise)
-        embedding = pack.embed(noise[None])
-    except ModelError as error:
-        raise StartError(
-            f"the pack {pack.info.name} fails on its first picture: {error}"
-        ) from error
-    norm = float(np.linalg.norm(embedding))
-    if embedding.shape != (1, pack.info.n) or not abs(norm - 1.0) < 1e-3:
-        raise StartError(f"the pack {pack.info.name} does not give a unit vector")

@@ -10,7 +10,8 @@ import pytest
 
 from api.app import create_app
 from api.errors import StartError
-from api.runtime import Runtime, database_in_use, file_sealer, open_keyring, try_inference
+from api.opening import database_in_use, file_sealer, open_keyring, try_inference
+from api.runtime import Runtime
 from api.settings import Settings
 from models.pack import ModelPack
 from templates.decoys import DecoyGenerator

@@ -1,13 +1,16 @@
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from api.app import create_app
 from api.schemas import VerifyAnswer
 from templates import wire
 from templates.lifting import Strategy, lift
 from templates.randomness import Keystream
+from templates.sealing import MasterKeyring
 from templates.subspace import AffineSubspace
 from tests.api.client import Client
 from tests.api.deployment import PROBE_M, Deployment, N, bearer, images, photo
@@ -274,3 +277,25 @@ def test_largest_face_is_accepted_as_a_field(client: Client, token: str) -> None
     for request in ({"data": {"face": "largest"}}, {"params": {"face": "largest"}}):
         answer = ask(client, token, files=images(photo(1), name="image"), **request)
         assert answer.json()["decision"] == "accept"
+
+
+def test_a_retired_master_key_does_not_tell_who_is_enrolled(
+    tmp_path: Path,
+) -> None:
+    own = deploy(tmp_path)
+    with Client(create_app(own.settings), headers=bearer(own.token)) as client:
+        verifier = bearer(own.key("verify"))
+        assert client.put("/v1/subjects/a/enrollment", files=images(photo(1))).status_code == 201
+        runtime = client.app.state.runtime
+        path = own.settings.resolved_master_key_file
+        MasterKeyring.add_current(path)
+        runtime.store.rewrap()
+        MasterKeyring.drop_retired(path)
+        for subject, decision in (("a", "accept"), ("nobody", "reject")):
+            answer = client.post(
+                f"/v1/subjects/{subject}/verify",
+                files=images(photo(1, 4), name="image"),
+                headers=verifier,
+            )
+            assert answer.status_code == 200, answer.text
+            assert answer.json()["decision"] == decision

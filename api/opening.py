@@ -1,0 +1,213 @@
+"""From settings to opened things: keys, database, contract, decoys, pack.
+
+Each function raises :class:`api.errors.StartError` with one sentence: which file or setting, what
+is wrong with it, and what to do.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from sqlalchemy import inspect, select, table
+from sqlalchemy.engine import Connection, make_url
+from sqlalchemy.exc import ArgumentError
+
+from api.errors import StartError
+from api.settings import Settings
+from models.errors import ModelError
+from models.pack import ModelPack
+from templates.contract import Contract
+from templates.decoys import DecoyGenerator, DecoyPool, load_source
+from templates.errors import ContractMismatch, VeilfaceError
+from templates.sealing import KeyringSealer, MasterKeyring
+from templates.store import TemplateStore
+from templates.store.database import Database
+
+
+def database_in_use(url: str) -> bool:
+    """Tell whether the database holds a row of ours; an absent SQLite file holds none.
+
+    Raises
+    ------
+    StoreError
+        If the database does not answer.
+    """
+    if url.startswith("sqlite") and not Path(make_url(url).database or "").exists():
+        return False
+    database = Database(url)
+
+    def any_row(connection: Connection) -> bool:
+        return any(
+            connection.execute(select(1).select_from(table(name)).limit(1)).first() is not None
+            for name in inspect(connection).get_table_names()
+            if name != "alembic_version"
+        )
+
+    try:
+        return database.read(any_row)
+    finally:
+        database.close()
+
+
+def file_sealer(keyring: MasterKeyring) -> KeyringSealer:
+    """Return what seals the files that belong to the deployment: contract, decoy pool, cache."""
+    return KeyringSealer(keyring)
+
+
+def open_keyring(settings: Settings) -> MasterKeyring:
+    """Load the master keys, or create the first one while nothing is stored yet.
+
+    Raises
+    ------
+    StartError
+        If the file is absent although the database holds something, or cannot be used.
+    """
+    path = settings.resolved_master_key_file
+    try:
+        if path.exists():
+            return MasterKeyring.load(path)
+        if database_in_use(settings.resolved_database_url):
+            raise StartError(
+                f"the master key file {path} is missing, but the database holds data sealed "
+                "with it; put the file back from its copy"
+            )
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return MasterKeyring.create(path)
+    except StartError:
+        raise
+    except (OSError, ArgumentError, VeilfaceError) as error:
+        raise StartError(f"the master key file {path} cannot be used: {error}") from error
+
+
+def open_store(settings: Settings, keyring: MasterKeyring) -> TemplateStore:
+    """Open the store; :func:`prepare_database` must have run once before.
+
+    Raises
+    ------
+    StartError
+        If the URL is wrong or the SQLite file cannot be made.
+    """
+    try:
+        if settings.database_url is None:
+            settings.data_dir.mkdir(parents=True, exist_ok=True)
+        return TemplateStore(settings.resolved_database_url, keyring)
+    except (OSError, VeilfaceError) as error:
+        raise StartError(f"the database cannot be opened: {error}") from None
+
+
+def prepare_database(store: TemplateStore) -> None:
+    """Bring the schema up to date, and hold the master key against it.
+
+    Several processes may do so at once; the command line does it before it starts workers.
+
+    Raises
+    ------
+    StartError
+        If the database does not answer, or belongs to another master key or a newer program.
+    """
+    try:
+        store.upgrade()
+    except VeilfaceError as error:
+        raise StartError(f"the database cannot be used: {error}") from None
+
+
+def open_contract(settings: Settings, keyring: MasterKeyring) -> Contract:
+    """Load the contract file.
+
+    Raises
+    ------
+    StartError
+        If the file is absent, broken, or sealed with another master key.
+    """
+    path = settings.resolved_contract_file
+    if not path.is_file():
+        raise StartError(
+            f"there is no contract file {path}; `veilface calibrate` writes one "
+            "(setting contract_file)"
+        )
+    try:
+        return Contract.load(path, file_sealer(keyring))
+    except (OSError, VeilfaceError) as error:
+        raise StartError(f"the contract file {path} cannot be used: {error}") from error
+
+
+def open_decoys(
+    settings: Settings, keyring: MasterKeyring, contract: Contract
+) -> DecoyPool | DecoyGenerator | None:
+    """Load the decoy source that the contract is bound to; None when none is set.
+
+    Raises
+    ------
+    StartError
+        If a named file is absent or broken, or is another source than the contract's.
+    """
+    path = settings.resolved_decoys_file
+    if not path.is_file():
+        if settings.decoys_file is None:
+            return None
+        raise StartError(f"there is no decoys file {path} (setting decoys_file)")
+    try:
+        source = load_source(path, file_sealer(keyring))
+    except (OSError, VeilfaceError) as error:
+        raise StartError(f"the decoys file {path} cannot be used: {error}") from error
+    try:
+        contract.binding.require_source(source_id=source.source_id)
+    except ContractMismatch as error:
+        raise StartError(f"the decoys file {path} is not the contract's: {error}") from error
+    return source
+
+
+def open_pack(settings: Settings, contract: Contract | None = None) -> ModelPack | None:
+    """Load the model pack and hold it against the contract; None when none is set.
+
+    Raises
+    ------
+    StartError
+        If the pack is broken, or its embedder is not the contract's.
+    """
+    if settings.pack is None:
+        return None
+    try:
+        pack = ModelPack.load(
+            settings.pack,
+            providers=settings.providers,
+            threads=settings.onnx_threads,
+            flip=contract is not None and bool(contract.binding.preprocessing.get("flip")),
+        )
+    except (OSError, ModelError) as error:
+        raise StartError(f"the model pack {settings.pack} cannot be used: {error}") from error
+    if contract is not None:
+        try:
+            contract.binding.require_embedder(
+                embedder_sha256=pack.info.embedder_sha256,
+                preprocessing=pack.info.preprocessing,
+                n=pack.info.n,
+            )
+        except ContractMismatch as error:
+            raise StartError(
+                f"the pack {settings.pack} does not belong to the contract "
+                f"{settings.resolved_contract_file}: {error}"
+            ) from error
+    return pack
+
+
+def try_inference(pack: ModelPack) -> None:
+    """Run the whole pack once, on grey noise, so that a broken graph stops the start.
+
+    Raises
+    ------
+    StartError
+        If it fails, or gives something else than one finite unit vector.
+    """
+    size = pack.crop_size
+    noise = np.random.default_rng(0).integers(0, 256, (size, size, 3), dtype=np.uint8)
+    try:
+        if pack.info.detector is not None:
+            pack.detect(noise)
+        embedding = pack.embed(noise[None])
+    except ModelError as error:
+        raise StartError(
+            f"the pack {pack.info.name} fails on its first picture: {error}"
+        ) from error
+    norm = float(np.linalg.norm(embedding))
+    if embedding.shape != (1, pack.info.n) or not abs(norm - 1.0) < 1e-3:
+        raise StartError(f"the pack {pack.info.name} does not give a unit vector")
