@@ -1,0 +1,108 @@
+"""Every command of the README is run: here with real weights, or by CI."""
+
+import os
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+BLOCKS = re.findall(r"^```sh\n(.*?)^```", (ROOT / "README.md").read_text(), flags=re.M | re.S)
+PORT = 8421
+
+
+def with_values(block: str, values: dict[str, str]) -> str:
+    """The block with the newcomer's paths in place of the README's examples."""
+    for name, value in values.items():
+        block, found = re.subn(rf"^{name}=.*$", f"{name}={value}", block, flags=re.M)
+        assert found == 1, f"the README no longer sets {name}"
+    return block
+
+
+def shell(script: str, folder: Path, env: dict[str, str]) -> str:
+    """Run a script as bash would, stopping at the first failure; its output."""
+    done = subprocess.run(
+        ["bash", "-euo", "pipefail", "-c", script],
+        cwd=folder,
+        env=env,
+        text=True,
+        capture_output=True,
+        timeout=280,
+    )
+    assert done.returncode == 0, f"{script}\n{done.stderr}"
+    return done.stdout
+
+
+@pytest.fixture
+def newcomer(tmp_path: Path) -> Iterator[tuple[Path, dict[str, str]]]:
+    """An empty folder with the installed command on the path."""
+    bin_folder = tmp_path / ".venv" / "bin"
+    bin_folder.mkdir(parents=True)
+    (bin_folder / "activate").write_text(f"export PATH={Path(sys.executable).parent}:$PATH\n")
+    yield tmp_path, {k: v for k, v in os.environ.items() if not k.startswith("VEILFACE_")}
+
+
+def test_the_first_block_is_what_ci_runs() -> None:
+    commands = BLOCKS[0].split("\n")[:-1]
+    assert commands == ["make demo", "make test"]
+    ci = (ROOT / ".ci" / "run").read_text()
+    assert all(command in ci for command in commands)
+
+
+@pytest.mark.timeout(580)
+def test_the_real_path_from_weights_to_a_receipt(
+    newcomer: tuple[Path, dict[str, str]], mbf_pack_dir: Path, fairface: Path, lfw_photos: Path
+) -> None:
+    folder, env = newcomer
+    faces, people = folder / "faces", folder / "people"
+    faces.mkdir()
+    people.mkdir()
+    for photo in sorted((fairface / "train").glob("*.jpg"))[:200]:
+        (faces / photo.name).symlink_to(photo)
+    names = sorted(person for person in lfw_photos.iterdir() if person.is_dir())
+    enrolled, *calibrated = names
+    for person in calibrated:
+        (people / person.name).symlink_to(person)
+    for index, photo in enumerate(sorted(enrolled.glob("*.jpg"))[:3], start=1):
+        (folder / f"anna{index}.jpg").symlink_to(photo)
+
+    values = {"PACK": str(mbf_pack_dir), "FACES": str(faces), "PEOPLE": str(people)}
+    prepare, serve = with_values(BLOCKS[1], values).rsplit("\nveilface serve", 1)
+    key = shell(f'{prepare}\necho "$KEY"', folder, env).splitlines()[-1]
+    assert key.startswith("vf_")
+
+    activate = ". .venv/bin/activate"
+    pack = f"PACK={mbf_pack_dir}"
+    server = subprocess.Popen(
+        ["bash", "-c", f"{activate}\n{pack}\nexec veilface serve{serve}"],
+        cwd=folder,
+        env=env,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        wait_until_ready(server)
+        script = BLOCKS[2].replace("curl ", "curl --silent --show-error --fail-with-body ")
+        answers = shell(f"{activate}\nKEY={key}\n{script}", folder, env)
+    finally:
+        server.terminate()
+        server.wait(timeout=30)
+    assert '"decision":"accept"' in answers.replace(": ", ":")
+
+
+def wait_until_ready(server: subprocess.Popen[bytes]) -> None:
+    """Wait for the service of the README, on its own port."""
+    for _ in range(240):
+        assert server.poll() is None, "veilface serve ended"
+        try:
+            if httpx.get(f"http://127.0.0.1:{PORT}/health/ready", timeout=5).status_code == 200:
+                return
+        except httpx.TransportError:
+            pass
+        time.sleep(0.25)
+    pytest.fail("the service of the README did not become ready")
