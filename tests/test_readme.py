@@ -5,7 +5,6 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
@@ -39,12 +38,12 @@ def shell(script: str, folder: Path, env: dict[str, str]) -> str:
 
 
 @pytest.fixture
-def newcomer(tmp_path: Path) -> Iterator[tuple[Path, dict[str, str]]]:
+def newcomer(tmp_path: Path) -> tuple[Path, dict[str, str]]:
     """An empty folder with the installed command on the path."""
     bin_folder = tmp_path / ".venv" / "bin"
     bin_folder.mkdir(parents=True)
     (bin_folder / "activate").write_text(f"export PATH={Path(sys.executable).parent}:$PATH\n")
-    yield tmp_path, {k: v for k, v in os.environ.items() if not k.startswith("VEILFACE_")}
+    return tmp_path, {k: v for k, v in os.environ.items() if not k.startswith("VEILFACE_")}
 
 
 def test_the_first_block_is_what_ci_runs() -> None:
