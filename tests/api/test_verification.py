@@ -13,7 +13,7 @@ from templates.randomness import Keystream
 from templates.sealing import MasterKeyring
 from templates.subspace import AffineSubspace
 from tests.api.client import Client
-from tests.api.deployment import PROBE_M, Deployment, N, bearer, images, photo
+from tests.api.deployment import PROBE_M, Deployment, N, bearer, deploy, images, photo
 from tests.api.shapes import assert_answer, assert_error
 from tests.api.test_enrollment import b64
 
