@@ -9,10 +9,8 @@ holds whatever did not go as promised.
 """
 
 import base64
-import contextlib
 import math
 import shutil
-import sqlite3
 import tempfile
 import time
 from collections.abc import Callable, Sequence
@@ -24,6 +22,7 @@ import httpx
 
 from api.demo_cast import ENROLLED_PHOTOS, PROBE_PHOTOS, Cast, Scale, drawn_cast, found_cast
 from api.demo_service import running_service
+from api.demo_storage import Stored, read_stored, rows_of
 from api.errors import StartError
 from api.preparation import calibrate_folder, make_generator
 from api.receipts import verify_answer
@@ -31,15 +30,12 @@ from api.runtime import file_sealer
 from models.demo import build_demo_pack, is_demo_model
 from models.extraction import Extraction, Extractor
 from models.pack import ModelPack
-from templates import wire
 from templates.contract import Contract
 from templates.lifting import Strategy
 from templates.sealing import MasterKeyring
-from templates.store import TemplateStore
 from verify import CalibrationOptions, LabelledFolder
 
 MARKER = "# Written by `veilface demo`, which replaces this folder when it runs again."
-TENANT = "default"
 # A run fails if the level's FMR makes so many accepted impostors less likely than this.
 LEAST_LIKELY = 0.001
 
@@ -67,19 +63,6 @@ class LevelCount:
     genuine_trials: int
     impostors_accepted: int
     impostor_trials: int
-
-
-@dataclass(frozen=True)
-class Stored:
-    """What the database's file holds of one person; the excerpt is ciphertext."""
-
-    name: str
-    n: int
-    m: int
-    template_bytes: int
-    foot_norm: float
-    ciphertext_bytes: int
-    ciphertext_excerpt: str
 
 
 @dataclass(frozen=True)
@@ -226,25 +209,31 @@ def _play(
     say(f"enrolling {len(cast.enrolled)} people over HTTP")
     refused: list[str] = []
     faults: list[str] = []
+    enrolled: list[str] = []
     for name, photos in cast.enrolled.items():
-        answer = _send(client, "PUT", f"/v1/subjects/{name}/enrollment", photos[:ENROLLED_PHOTOS])
-        if answer.status_code != httpx.codes.CREATED:
+        path = f"/v1/subjects/{name}/enrollment"
+        answer = _send(client, "PUT", path, photos[:ENROLLED_PHOTOS], face=cast.face)
+        if answer.status_code == httpx.codes.CREATED:
+            enrolled.append(name)
+        else:
             faults.append(f"{name} was not enrolled: {_code(answer)}")
+    if not enrolled:
+        raise StartError("nobody could be enrolled: " + "; ".join(faults))
     say("verifying genuine and impostor photos over HTTP")
     levels = [level.name for level in contract.calibration("p2s").levels]
     default = contract.default_level
-    attempts = _attempts(client, cast, levels, refused)
+    attempts = _attempts(client, cast, enrolled, levels, refused)
     people = tuple(
         Person(name, *_count(attempts, level=default, subject=name)) for name in cast.enrolled
     )
     counts = tuple(
         LevelCount(level, _fmr(contract, level), *_count(attempts, level=level)) for level in levels
     )
-    stored = _stored(folder, list(cast.enrolled))
+    stored = read_stored(folder, enrolled)
     say("erasing one person and checking the receipt")
-    erased = next(iter(cast.enrolled))
+    erased = enrolled[0]
     receipt, erasure_faults = _erase(client, erased, cast.enrolled[erased][-1])
-    rows = _rows(folder, erased)
+    rows = rows_of(folder, erased)
     faults += erasure_faults + _faults(people, counts)
     if rows:
         faults.append(f"{rows} rows of {erased} are left in the database after the erasure")
@@ -277,21 +266,34 @@ class _Attempt:
 
 
 def _attempts(
-    client: httpx.Client, cast: Cast, levels: Sequence[str], refused: list[str]
+    client: httpx.Client,
+    cast: Cast,
+    enrolled: Sequence[str],
+    levels: Sequence[str],
+    refused: list[str],
 ) -> list[_Attempt]:
-    """Show every probe photo to every enrolled subject, at every level."""
+    """Show every probe photo to every enrolled subject, at every level.
+
+    An enrollment that was refused counts as failed genuine attempts of that person.
+    """
     probes = [
         (name, photo)
         for name, photos in cast.enrolled.items()
         for photo in photos[ENROLLED_PHOTOS : ENROLLED_PHOTOS + PROBE_PHOTOS]
     ]
     probes += list(cast.strangers.items())
-    found: list[_Attempt] = []
+    found = [
+        _Attempt(name, True, level, False)
+        for name in cast.enrolled
+        if name not in enrolled
+        for level in levels
+        for _ in range(PROBE_PHOTOS)
+    ]
     for owner, photo in probes:
-        for subject in cast.enrolled:
+        for subject in enrolled:
             for level in levels:
                 path = f"/v1/subjects/{subject}/verify"
-                answer = _send(client, "POST", path, [photo], level=level)
+                answer = _send(client, "POST", path, [photo], level=level, face=cast.face)
                 if answer.status_code != httpx.codes.OK:
                     refusal = f"{owner}/{photo.name}: {_code(answer)}"
                     if refusal not in refused:
@@ -332,56 +334,6 @@ def _count(
 def _fmr(contract: Contract, name: str) -> float:
     level = contract.calibration("p2s").level(name)
     return level.fmr.value if level.target_fmr is None else level.target_fmr
-
-
-def _stored(folder: Path, names: Sequence[str]) -> tuple[Stored, ...]:
-    """Read the database's file as a thief would, and open it with the master key beside that."""
-    url = f"sqlite:///{(folder / 'veilface.db').resolve()}"
-    store = TemplateStore(url, MasterKeyring.load(folder / "master.key"))
-    found = []
-    try:
-        for name in names:
-            subject = store.get(TENANT, name)
-            if subject is None:
-                continue
-            foot_norm = wire.decode(subject.wire).subspace.foot_norm
-            ciphertext = _ciphertext(folder, name)
-            found.append(
-                Stored(
-                    name=name,
-                    n=subject.record.n,
-                    m=subject.record.m,
-                    template_bytes=len(subject.wire),
-                    foot_norm=float(foot_norm),
-                    ciphertext_bytes=len(ciphertext),
-                    ciphertext_excerpt=_middle(ciphertext).hex(),
-                )
-            )
-    finally:
-        store.close()
-    return tuple(found)
-
-
-def _ciphertext(folder: Path, name: str) -> bytes:
-    with contextlib.closing(sqlite3.connect(folder / "veilface.db")) as database:
-        row = database.execute(
-            "SELECT t.ciphertext FROM templates t JOIN subjects s ON s.id = t.subject_pk "
-            "WHERE s.subject_id = ?",
-            (name,),
-        ).fetchone()
-    return bytes(row[0])
-
-
-def _middle(data: bytes, count: int = 16) -> bytes:
-    """Cut some bytes from the middle: away from the header and the authentication tag."""
-    start = (len(data) - count) // 2
-    return data[start : start + count]
-
-
-def _rows(folder: Path, name: str) -> int:
-    with contextlib.closing(sqlite3.connect(folder / "veilface.db")) as database:
-        query = "SELECT count(*) FROM subjects WHERE subject_id = ?"
-        return int(database.execute(query, (name,)).fetchone()[0])
 
 
 def _erase(client: httpx.Client, name: str, photo: Path) -> tuple[dict[str, Any], list[str]]:

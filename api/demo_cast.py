@@ -24,10 +24,15 @@ class Scale:
 
 @dataclass(frozen=True)
 class Cast:
-    """Who plays which part: photo files, by person."""
+    """Who plays which part: photo files, by person.
+
+    ``face`` is what a photo with several faces means: labelled photos of the press show
+    bystanders, so real ones are taken as showing the largest.
+    """
 
     enrolled: dict[str, list[Path]]
     strangers: dict[str, Path]
+    face: str = "single"
 
 
 def drawn_cast(folder: Path, scratch: Path, size: Scale) -> tuple[Cast, list[Path], LabelledFolder]:
@@ -81,6 +86,7 @@ def found_cast(faces: Path, size: Scale) -> tuple[Cast, list[Path], LabelledFold
         Cast(
             {name: photos_of[name][:needed] for name in able},
             {name: photos_of[name][0] for name in strangers},
+            face="largest",
         ),
         [path for name in rest if name in for_decoys for path in photos_of[name]],
         LabelledFolder(

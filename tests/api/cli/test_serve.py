@@ -1,0 +1,108 @@
+"""``serve`` as its own process, as an operator starts it."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import httpx
+import pytest
+
+from models.demo import DEMO_NOTICE
+from tests.api.cli.conftest import run
+
+
+@contextmanager
+def started(folder: Path, *arguments: str) -> Iterator[tuple["subprocess.Popen[bytes]", str]]:
+    """Start the service and wait until it listens; hand out the process and its URL."""
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("VEILFACE_")}
+    with (folder / "out").open("w") as output, (folder / "err").open("w") as errors:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "api.cli", "serve", "--port", "0", *arguments],
+            env={**environment, "PYTHONUNBUFFERED": "1"},
+            stdout=output,
+            stderr=errors,
+        )
+    try:
+        deadline = time.monotonic() + 60
+        while time.monotonic() < deadline and process.poll() is None:
+            told = (folder / "err").read_text()
+            if "listens on " in told:
+                url = told.split("listens on ", 1)[1].split()[0]
+                try:
+                    if httpx.get(f"{url}/health/ready").status_code == 200:
+                        yield process, url
+                        return
+                except httpx.TransportError:
+                    pass
+            time.sleep(0.1)
+        raise AssertionError((folder / "err").read_text())
+    finally:
+        process.kill()
+        process.wait()
+
+
+def test_the_first_start_prints_a_key_once_and_sigterm_stops_it(world, data, tmp_path):
+    common = ("--data-dir", str(data), "--pack", str(world.pack))
+    with started(tmp_path, *common) as (process, url):
+        told = (tmp_path / "out").read_text().split()
+        (token,) = [word for word in told if word.startswith("vf_")]
+        answer = httpx.get(f"{url}/v1/contract", headers={"Authorization": f"Bearer {token}"})
+        assert answer.status_code == 200
+        assert answer.json()["notice"] == DEMO_NOTICE
+        assert httpx.get(f"{url}/v1/contract").status_code == 401
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(timeout=30) in (0, -signal.SIGTERM)
+    log = (tmp_path / "err").read_text()
+    assert DEMO_NOTICE in log
+    assert token not in log
+    assert "Traceback" not in log
+
+    again = run("serve", "--check", *common)
+    assert again.status == 0
+    assert "vf_" not in again.stdout
+
+
+def test_what_does_not_fit_stops_the_start_with_a_sentence(world, data, tmp_path):
+    absent = run("serve", "--data-dir", tmp_path / "empty")
+    assert absent.status == 1
+    assert "veilface calibrate" in absent.stderr
+    (data / "contract.json").write_text("{}")
+    broken = run("serve", "--data-dir", data, "--pack", world.pack)
+    assert broken.status == 1
+    assert broken.stderr.startswith("error: the contract file")
+    assert "Traceback" not in broken.stderr
+
+
+def test_another_pack_than_the_contracts_is_refused(data, yunet_pack_dir):
+    ran = run("serve", "--check", "--data-dir", data, "--pack", yunet_pack_dir)
+    assert ran.status == 1
+    assert "does not belong to the contract" in ran.stderr
+
+
+def test_a_taken_port_is_named(world, data):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        ran = run("serve", "--data-dir", data, "--pack", world.pack, "--port", str(port))
+    assert ran.status == 1
+    assert f"cannot listen on 127.0.0.1:{port}" in ran.stderr
+
+
+@pytest.mark.parametrize("arguments", [("--help",), ("db", "current", "--json")])
+def test_the_module_is_the_command(tmp_path, arguments):
+    ran = subprocess.run(
+        [sys.executable, "-m", "api.cli", *arguments],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "VEILFACE_DATA_DIR": str(tmp_path)},
+    )
+    assert ran.returncode == 0
+    assert ran.stderr == ""
