@@ -5,7 +5,7 @@ import json
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -32,6 +32,8 @@ from models.sessions import default_workers
 # Crops of one chunk are in memory at once (128 x 37 kB at 112 pixels), photos only one per worker.
 _CHUNK = 128
 _QUIET_SECONDS = 2.0
+
+Advance = Callable[[int], None]
 
 
 @dataclass(frozen=True)
@@ -120,7 +122,9 @@ class Extractor:
         self._limits = limits
         self._key_prefix = self._settings_digest()
 
-    def extract(self, paths: Iterable[str | Path], *, progress: bool | None = None) -> Extraction:
+    def extract(
+        self, paths: Iterable[str | Path], *, progress: bool | Advance | None = None
+    ) -> Extraction:
         """Embed files.
 
         Parameters
@@ -129,7 +133,8 @@ class Extractor:
             Files, in any order; the order of the result follows it.
         progress
             Show a bar on stderr once the run takes more than two seconds; ``None`` only where
-            stderr is a terminal.
+            stderr is a terminal. A function is called instead with the number of files done since
+            the last call.
 
         Returns
         -------
@@ -146,7 +151,7 @@ class Extractor:
         done: list[Path] = []
         failures: list[Failure] = []
         cached = 0
-        bar = _Bar(len(files), shown=sys.stderr.isatty() if progress is None else progress)
+        bar = _Bar(len(files), progress)
         try:
             with bar, ThreadPoolExecutor(self._workers) as pool:
                 for start in range(0, len(files), _CHUNK):
@@ -237,9 +242,10 @@ def _read(path: Path, max_bytes: int) -> bytes:
 class _Bar:
     """A progress bar that appears when the work turns out to be long."""
 
-    def __init__(self, total: int, *, shown: bool) -> None:
+    def __init__(self, total: int, wish: bool | Advance | None) -> None:
         self._total = total
-        self._shown = shown
+        self._shown = sys.stderr.isatty() if wish is None else wish is True
+        self._tell = wish if callable(wish) else None
         self._started = time.monotonic()
         self._done = 0
         self._progress: Progress | None = None
@@ -249,6 +255,8 @@ class _Bar:
 
     def advance(self, count: int) -> None:
         self._done += count
+        if self._tell is not None:
+            self._tell(count)
         if not self._shown:
             return
         if self._progress is None:

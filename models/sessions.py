@@ -111,10 +111,11 @@ class Session:
     def _create(self) -> Any:
         options = ort.SessionOptions()
         options.log_severity_level = _LOG_ERRORS_ONLY
-        # Both caches are keyed by, or grow with, the shapes they have seen and give nothing back.
-        # Photos have many shapes. docs/models.md has the measurement.
-        options.enable_cpu_mem_arena = False
+        # Memory patterns are kept for every input shape ever seen, and photos have many shapes.
+        # The arena stays: it levels off at the largest canvas and batch, which are bounded
+        # (docs/models.md has the measurement).
         options.enable_mem_pattern = False
+        options.enable_cpu_mem_arena = True
         if self.threads is not None:
             options.intra_op_num_threads = self.threads
             options.inter_op_num_threads = 1

@@ -1,5 +1,6 @@
 """What an ONNX graph is, told from its inputs, outputs and first nodes; never from its name."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -81,7 +82,7 @@ def read_signature(model: bytes, *, name: str) -> Signature:
     graph = proto.graph
     if not graph.node:
         raise PackError(f"{name} is not a readable ONNX model: its graph is empty.")
-    if any(tensor.data_location == TensorProto.EXTERNAL for tensor in graph.initializer):
+    if any(tensor.data_location == TensorProto.EXTERNAL for tensor in _tensors(proto)):
         raise PackError(
             f"{name} keeps its weights in another file; convert it to a single .onnx file, so"
             " that its hash covers the weights."
@@ -93,6 +94,27 @@ def read_signature(model: bytes, *, name: str) -> Signature:
         outputs=tuple(_tensor(value) for value in graph.output),
         first_nodes=tuple(node.op_type for node in graph.node[:FIRST_NODES]),
     )
+
+
+def _tensors(proto: ModelProto) -> Iterator[TensorProto]:
+    """Every tensor of a model: weights, constants of nodes, those of nested graphs."""
+    graphs = [proto.graph]
+    nodes = [node for function in proto.functions for node in function.node]
+    while graphs or nodes:
+        if graphs:
+            graph = graphs.pop()
+            yield from graph.initializer
+            for sparse in graph.sparse_initializer:
+                yield sparse.values
+                yield sparse.indices
+            nodes.extend(graph.node)
+            continue
+        for attribute in nodes.pop().attribute:
+            yield attribute.t
+            yield from attribute.tensors
+            if attribute.HasField("g"):
+                graphs.append(attribute.g)
+            graphs.extend(attribute.graphs)
 
 
 def _tensor(value: ValueInfoProto) -> Tensor:

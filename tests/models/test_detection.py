@@ -1,0 +1,232 @@
+import numpy as np
+import pytest
+
+from models.boxes import Face
+from models.decoding import decode_image
+from models.detection import RETRY_BORDER, canvas_sizes, find_faces, letterbox
+from models.errors import ModelError
+from models.pack import ModelPack
+from models.scrfd import Scrfd
+from models.yunet import OUTPUTS, YuNet, _trimmed
+
+STRIDES = (8, 16, 32)
+
+
+class Replay:
+    """A session that answers with prepared arrays and keeps what it was fed."""
+
+    name = "replay.onnx"
+
+    def __init__(self, answer):
+        self.answer = answer
+        self.fed = []
+
+    def run(self, feeds, outputs=None):
+        (blob,) = feeds.values()
+        self.fed.append(blob)
+        return self.answer(blob, outputs)
+
+
+def test_letterbox_keeps_the_aspect_ratio_in_the_top_left_corner():
+    image = np.full((50, 100, 3), 200, np.uint8)
+    canvas, scale = letterbox(image, (64, 64), enlarge=True)
+    assert scale == pytest.approx(0.64)
+    assert (canvas[:32] == 200).all()
+    assert (canvas[32:] == 0).all()
+
+
+def test_letterbox_does_not_enlarge_unless_told():
+    image = np.full((10, 20, 3), 9, np.uint8)
+    canvas, scale = letterbox(image, (64, 64), enlarge=False)
+    assert scale == 1.0
+    np.testing.assert_array_equal(canvas[:10, :20], image)
+    assert letterbox(image, (64, 64), enlarge=True)[1] == pytest.approx(3.2)
+
+
+@pytest.mark.parametrize("shape", [(1, 16_000), (16_000, 1), (1, 1)])
+def test_letterbox_of_slivers(shape):
+    canvas, _ = letterbox(np.full((*shape, 3), 7, np.uint8), (64, 64), enlarge=True)
+    assert canvas.shape == (64, 64, 3)
+    assert canvas[0, 0, 0] == 7
+
+
+def test_canvas_sizes():
+    assert canvas_sizes(640, None) == ((640, 640), (320, 320))
+    assert canvas_sizes(320, None) == ((320, 320),)
+    assert canvas_sizes(640, (480, 640)) == ((480, 640),)
+
+
+def scrfd_answer(hits, *, batched=False, anchors=2):
+    """Nine outputs at 64 x 64 with candidates ``(stride, row, column, anchor, score)``."""
+
+    def answer(blob, _outputs):
+        rows, columns = blob.shape[2:]
+        outputs = {1: [], 4: [], 10: []}
+        for stride in STRIDES:
+            cells = (rows // stride) * (columns // stride) * anchors
+            arrays = {w: np.zeros((cells, w), np.float32) for w in outputs}
+            for s, row, column, anchor, score in hits:
+                if s == stride:
+                    k = (row * (columns // stride) + column) * anchors + anchor
+                    arrays[1][k] = score
+                    arrays[4][k] = [1, 0.5, 2, 3]
+                    arrays[10][k] = np.arange(10) / 4
+            for width, array in arrays.items():
+                outputs[width].append(array[None] if batched else array)
+        return [*outputs[10], *outputs[1], *outputs[4]]  # the order is not to be relied on
+
+    return answer
+
+
+@pytest.mark.parametrize("batched", [False, True])
+@pytest.mark.parametrize("anchors", [1, 2])
+def test_scrfd_decodes_distances_from_the_cell(batched, anchors):
+    hits = [(16, 1, 2, anchors - 1, 0.9), (8, 7, 0, 0, 0.49)]
+    session = Replay(scrfd_answer(hits, batched=batched, anchors=anchors))
+    detector = Scrfd(session, input_name="x", size=64)
+    image = np.full((32, 32, 3), 255, np.uint8)  # enlarged by 2
+    (face,) = detector.detect_once(image, (64, 64))
+    corner = np.array([2 * 16, 1 * 16])
+    expected = np.array([*(corner - [16, 8]), *(corner + np.array([32, 48]))]) / 2
+    np.testing.assert_allclose(face.box, expected)
+    points = (corner + np.arange(10).reshape(5, 2) / 4 * 16) / 2
+    np.testing.assert_allclose(face.keypoints, points)
+    assert face.score == pytest.approx(0.9)
+
+
+def test_scrfd_input_is_rgb_minus_half_over_128_on_a_zero_canvas():
+    session = Replay(scrfd_answer([]))
+    image = np.zeros((32, 64, 3), np.uint8)
+    image[..., 0], image[..., 2] = 255, 10
+    Scrfd(session, input_name="x", size=64).detect_once(image, (64, 64))
+    blob = session.fed[0][0]
+    np.testing.assert_allclose(blob[:, 0, 0], (np.array([255, 0, 10]) - 127.5) / 128)
+    np.testing.assert_allclose(blob[:, -1, -1], -127.5 / 128)
+
+
+def test_scrfd_refuses_outputs_that_do_not_fit_the_canvas():
+    session = Replay(lambda blob, o: scrfd_answer([])(np.zeros((1, 3, 72, 64)), o))
+    with pytest.raises(ModelError, match="stride 8 do not fit"):
+        Scrfd(session, input_name="x").detect_once(np.zeros((9, 9, 3), np.uint8), (64, 64))
+
+
+def test_scrfd_drops_candidates_that_are_not_finite():
+    def answer(blob, outputs):
+        arrays = scrfd_answer([(8, 1, 1, 0, 0.9)])(blob, outputs)
+        arrays[6][:] = np.inf
+        return arrays
+
+    detector = Scrfd(Replay(answer), input_name="x")
+    assert detector.detect_once(np.zeros((64, 64, 3), np.uint8), (64, 64)) == []
+
+
+def test_yunet_decodes_centres_and_log_sides():
+    def answer(blob, outputs):
+        assert blob.shape == (1, 3, 64, 96)
+        np.testing.assert_array_equal(blob[0, :, 0, 0], [30, 20, 10])  # BGR, 0...255
+        arrays = {}
+        for name in outputs:
+            role, stride = name.split("_")
+            width = {"cls": 1, "obj": 1, "bbox": 4, "kps": 10}[role]
+            arrays[name] = np.zeros(
+                (1, (64 // int(stride)) * (96 // int(stride)), width), np.float32
+            )
+        k = 1 * (96 // 16) + 3  # row 1, column 3 at stride 16
+        arrays["cls_16"][0, k], arrays["obj_16"][0, k] = 0.9, 0.8
+        arrays["cls_8"][0, 5], arrays["obj_8"][0, 5] = 0.5, 0.6  # sqrt(0.3) < 0.6
+        arrays["bbox_16"][0, k] = [0.5, 0.25, np.log(2), np.log(3)]
+        arrays["kps_16"][0, k] = np.arange(10) / 4
+        return [arrays[name] for name in outputs]
+
+    image = np.zeros((40, 70, 3), np.uint8)
+    image[...] = [10, 20, 30]
+    (face,) = YuNet(Replay(answer), input_name="x").detect_once(image, (640, 640))
+    assert face.score == pytest.approx(np.sqrt(0.72))
+    centre = np.array([3.5, 1.25]) * 16
+    np.testing.assert_allclose(
+        face.box, [*(centre - [16, 24]), *(centre + np.array([16, 24]))], rtol=1e-5
+    )
+    np.testing.assert_allclose(
+        face.keypoints, np.array([3, 1]) * 16 + np.arange(10).reshape(5, 2) * 4, rtol=1e-5
+    )
+
+
+def test_yunet_asks_for_its_outputs_by_name():
+    assert OUTPUTS[:3] == ("cls_8", "cls_16", "cls_32")
+    assert len(OUTPUTS) == 12
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (250, 250), (40, 4000), (3000, 2000), (641, 640)])
+def test_yunet_canvas_is_whole_blocks_and_bounded(shape):
+    size = _trimmed(np.zeros((*shape, 3), np.uint8), (640, 640))
+    assert all(side % 32 == 0 and 32 <= side <= 640 for side in size)
+
+
+class Picky:
+    """Finds a face only from the ``wanted``-th look on."""
+
+    kind, score_threshold, recommended_score = "picky", 0.5, 0.6
+    sizes = ((640, 640), (320, 320))
+
+    def __init__(self, wanted):
+        self.wanted, self.seen = wanted, []
+
+    def detect_once(self, image, size):
+        self.seen.append((image, size))
+        if len(self.seen) != self.wanted:
+            return []
+        height, width = image.shape[:2]
+        middle = np.array([width / 2, height / 2], np.float32)
+        return [Face(np.concatenate([middle - 5, middle + 5]), 0.9, np.tile(middle, (5, 1)))]
+
+
+@pytest.mark.parametrize("wanted", [1, 2, 3])
+@pytest.mark.parametrize("shape", [(100, 60), (1500, 1000)])
+def test_looks_again_small_and_then_in_a_border(wanted, shape):
+    image = np.full((*shape, 3), 255, np.uint8)
+    detector = Picky(wanted)
+    (face,) = find_faces(detector, image)
+    assert len(detector.seen) == wanted
+    if wanted == 2:
+        assert detector.seen[1][1] == (320, 320)
+    if wanted == 3:
+        bordered = detector.seen[2][0]
+        assert bordered[0].max() == 0
+        assert max(bordered.shape) <= 640 * (1 + 2 * RETRY_BORDER) + 1
+        share = (
+            (bordered.min(axis=(1, 2)) == 0).mean(),
+            (bordered[bordered.shape[0] // 2].min(1) == 0),
+        )
+        assert share[1].mean() == pytest.approx(0.8 / 1.8, abs=0.03)
+    # The middle of the picture, however it was looked at.
+    np.testing.assert_allclose(face.keypoints[0], [shape[1] / 2, shape[0] / 2], atol=1)
+
+
+def test_nothing_found_is_an_empty_list():
+    assert find_faces(Picky(99), np.zeros((30, 30, 3), np.uint8)) == []
+
+
+@pytest.mark.parametrize("name", ["w600k_mbf", "yunet_mobilefacenet128"])
+def test_real_detectors_find_the_centre_face_and_follow_a_mirror(name, shared_data, lfw_photos):
+    pack = ModelPack.load(shared_data / "packs" / name, threads=1)
+    for photo in sorted(lfw_photos.glob("*/*_0001.jpg"))[:6]:
+        image = decode_image(photo.read_bytes())
+        face = pack.detect(image)[0]
+        middle = (face.box[:2] + face.box[2:]) / 2
+        assert np.abs(middle - 125).max() < 30  # LFW photos are centred on their face
+        eyes, mouth = face.keypoints[:2], face.keypoints[3:]
+        assert eyes[0, 0] < eyes[1, 0]
+        assert mouth[0, 0] < mouth[1, 0]
+        assert eyes[:, 1].max() < face.keypoints[2, 1] < mouth[:, 1].min()
+        mirrored = pack.detect(np.ascontiguousarray(image[:, ::-1]))[0]
+        back = mirrored.keypoints[[1, 0, 2, 4, 3]] * [-1, 1] + [249, 0]
+        assert np.abs(back - face.keypoints).max() < 16
+
+
+@pytest.mark.parametrize("name", ["w600k_mbf", "yunet_mobilefacenet128"])
+def test_real_detectors_find_a_face_that_fills_the_picture(name, shared_data, lfw_aligned):
+    """Aligned crops are tighter than a detector is used to: the retries are for them."""
+    pack = ModelPack.load(shared_data / "packs" / name, threads=1)
+    crops = sorted(lfw_aligned.glob("*/*_0001.jpg"))[:40:2]
+    found = [bool(pack.detect(decode_image(path.read_bytes()))) for path in crops]
+    assert sum(found) >= len(found) - 1

@@ -1,0 +1,94 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from models.embedding import MAX_BATCH, Embedder, Preprocessing
+from models.errors import ModelError
+from models.sessions import Session
+from tests.models.graphs import pooled, pooling_embedder, unit
+
+
+def embedder(model=None, *, batch=None, size=112, **changes) -> Embedder:
+    settings = {
+        "alignment": "arcface-112",
+        "size": size,
+        "channel_order": "rgb",
+        "mean": (127.5,) * 3,
+        "scale": (127.5,) * 3,
+        "flip": False,
+    } | changes
+    session = Session(model or pooling_embedder(), name="pooling.onnx", threads=1)
+    return Embedder(
+        session, input_name="image", preprocessing=Preprocessing(**settings), batch=batch
+    )
+
+
+POOLING = embedder()
+
+
+def crops(count: int, seed: int = 0, size: int = 112) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (count, size, size, 3), dtype=np.uint8)
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.integers(1, 2 * MAX_BATCH + 3), st.integers(0, 99))
+def test_rows_are_the_normalised_output_whatever_the_batch(count, seed):
+    pictures = crops(count, seed)
+    rows = POOLING.embed(pictures, flip=False)
+    np.testing.assert_allclose(rows, unit(pooled(pictures)), atol=2e-5)
+    np.testing.assert_allclose(np.linalg.norm(rows, axis=1), 1, atol=1e-6)
+    assert rows.dtype == np.float32
+    assert rows.flags.c_contiguous
+
+
+def test_flip_adds_the_raw_embedding_of_the_mirror_before_normalising():
+    pictures = crops(5)
+    expected = unit(pooled(pictures) + pooled(pictures[:, :, ::-1]))
+    np.testing.assert_allclose(POOLING.embed(pictures, flip=True), expected, atol=2e-5)
+
+
+def test_no_crops_give_no_rows():
+    assert POOLING.embed(crops(0), flip=True).shape == (0, POOLING.n)
+
+
+def test_a_fixed_batch_is_filled_up():
+    fixed = embedder(pooling_embedder(batch=4), batch=4)
+    pictures = crops(6)
+    np.testing.assert_allclose(fixed.embed(pictures, flip=False), unit(pooled(pictures)), atol=2e-5)
+
+
+def test_mean_scale_and_channel_order():
+    changed = embedder(channel_order="bgr", mean=(10, 20, 30), scale=(2, 4, 8))
+    pictures = crops(2)
+    x = (pictures[..., ::-1].astype(float) - [10, 20, 30]) / [2, 4, 8]
+    expected = unit(x.reshape(2, 7, 16, 7, 16, 3).mean((2, 4)).transpose(0, 3, 1, 2).reshape(2, -1))
+    np.testing.assert_allclose(changed.embed(pictures, flip=False), expected, atol=2e-5)
+
+
+def test_normalisation_inside_the_graph_is_fed_0_to_255():
+    inside = embedder(pooling_embedder(inside=True), mean=(0,) * 3, scale=(1,) * 3)
+    pictures = crops(2)
+    np.testing.assert_allclose(
+        inside.embed(pictures, flip=False), POOLING.embed(pictures, flip=False), atol=1e-5
+    )
+
+
+@pytest.mark.parametrize("factor", [0.0, float("nan"), float("inf")])
+def test_a_zero_or_endless_output_is_an_error(factor):
+    with pytest.raises(ModelError, match=r"pooling\.onnx"):
+        embedder(pooling_embedder(factor=factor)).embed(crops(1), flip=False)
+
+
+def test_a_crop_that_gives_zero_is_an_error():
+    grey = np.full((1, 112, 112, 3), 100, np.uint8)
+    with pytest.raises(ModelError, match="zero or not finite"):
+        embedder(mean=(100,) * 3).embed(grey, flip=False)
+
+
+@pytest.mark.parametrize(
+    "bad", [crops(1)[0], crops(1, size=96), crops(1).astype(np.float32), crops(1)[..., :1]]
+)
+def test_other_shapes_and_types_are_refused(bad):
+    with pytest.raises(ModelError, match=r"uint8 of shape \(B, 112, 112, 3\)"):
+        POOLING.embed(bad, flip=False)
