@@ -17,6 +17,7 @@ import os
 import secrets
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -131,12 +132,12 @@ class Contract:
                 raise ContractError("a calibration_id is not the hash of its calibration")
         object.__setattr__(self, "calibrations", identified)
 
-    @property
+    @cached_property
     def contract_id(self) -> str:
         """SHA-256 of the binding's canonical JSON."""
         return self.binding.contract_id
 
-    @property
+    @cached_property
     def cohort_id(self) -> str:
         """SHA-256 over the cohort's float32 numbers, feet then bases, little-endian."""
         digester = hashlib.sha256(str(self.cohort.bases.shape).encode())

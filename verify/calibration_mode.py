@@ -76,7 +76,7 @@ class CalibrationOptions:
     photos_per_enrollment: int = 3
     consistency_fmr: float = 1e-3
     suspicious_above: float = 0.5
-    most_cells: int = 60_000_000
+    most_cells: int = 40_000_000
     lifted_probes: int = 2_000
     lifted_impostor_pairs: int = 300_000
     seed: int = 0

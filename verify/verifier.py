@@ -175,7 +175,7 @@ class Verifier:
     def _template(self, stored: bytes | None) -> SubspaceBatch:
         binding = self._contract.binding
         data = self._stand_in if stored is None else stored
-        received = wire.decode(data, max_n=binding.n, max_m=binding.m)
+        received = wire.decode(data)
         binding.require_contract(received.contract_id, what="the stored template")
         subspace = received.subspace
         if (subspace.n, subspace.m) != (binding.n, binding.m):
