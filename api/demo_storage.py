@@ -71,6 +71,7 @@ def _middle(data: bytes, count: int = 16) -> bytes:
 
 
 def rows_of(folder: Path, name: str) -> int:
+    """Count the rows that name a person in the clear."""
     with contextlib.closing(sqlite3.connect(folder / "veilface.db")) as database:
         query = "SELECT count(*) FROM subjects WHERE subject_id = ?"
         return int(database.execute(query, (name,)).fetchone()[0])
