@@ -16,7 +16,8 @@ from sklearn.decomposition import FastICA
 from sklearn.mixture import GaussianMixture
 
 from templates.decoys import Attributes, DecoyGenerator, DecoyPool, DecoySource
-from templates.decoys.fitting import _cross_fitted, _principal_axes
+from templates.decoys.fitting import cross_fitted, mixture_features, principal_axes
+from templates.decoys.statistics import DescriptorStatistics
 from templates.randomness import Keystream
 
 Array = npt.NDArray[np.float64]
@@ -79,8 +80,8 @@ def gaussian_of_unscaled(data: FitData) -> Sampler:
 def gaussian_cross_fitted(data: FitData) -> Sampler:
     """Variances along the principal axes estimated on descriptors that did not find the axes."""
     x = data.x
-    axes = _principal_axes(x)
-    deviations = np.sqrt(np.mean(_cross_fitted(x, axes) ** 2, axis=0))
+    axes = principal_axes(x)
+    deviations = np.sqrt(np.mean(cross_fitted(x, axes) ** 2, axis=0))
     return _affine(x.mean(axis=0), axes * deviations[:, None])
 
 
@@ -117,7 +118,7 @@ def gaussian_mixture(data: FitData) -> Sampler:
 def copula(data: FitData) -> Sampler:
     """Independent principal coordinates, each with its empirical quantiles."""
     x = data.x
-    mean, axes = x.mean(axis=0), _principal_axes(x)
+    mean, axes = x.mean(axis=0), principal_axes(x)
     return _quantiles((x - mean) @ axes.T, mean, axes)
 
 
@@ -138,7 +139,7 @@ def rotation_gaussianization(data: FitData, *, layers: int = 12) -> Sampler:
     """Marginal Gaussianization and a random rotation, in turn (RBIG), sampled backwards."""
     x = data.x
     n = x.shape[1]
-    mean, axes = x.mean(axis=0), _principal_axes(x)
+    mean, axes = x.mean(axis=0), principal_axes(x)
     z = (x - mean) @ axes.T
     scales = z.std(axis=0)
     z /= scales
@@ -181,14 +182,12 @@ def neighbour_mixture(data: FitData) -> Sampler:
 def bands_without_clusters(data: FitData) -> Sampler:
     """The product's generator with a single component: energies, but no clusters."""
     x = data.x
-    axes = _principal_axes(x)
-    from templates.decoys import fitting
-
-    coordinates = _cross_fitted(x, axes)
+    axes = principal_axes(x)
+    coordinates = cross_fitted(x, axes)
     deviations = np.sqrt(np.mean(coordinates**2, axis=0))
-    features = fitting._features(coordinates / deviations)
+    features = mixture_features(coordinates / deviations)
     mixture = GaussianMixture(1, reg_covar=1e-5).fit(features)
-    statistics = fitting.DescriptorStatistics(
+    statistics = DescriptorStatistics(
         mean=x.mean(axis=0).astype(np.float32),
         axes=(axes * deviations[:, None]).astype(np.float32),
         weights=mixture.weights_.astype(np.float32),

@@ -54,14 +54,14 @@ def fit_statistics(descriptors: NDArray[np.floating]) -> DescriptorStatistics:
     x = _checked(descriptors)
     n = x.shape[1]
     mean = x.mean(axis=0)
-    axes = _principal_axes(x)
-    coordinates = _cross_fitted(x, axes)
+    axes = principal_axes(x)
+    coordinates = cross_fitted(x, axes)
     deviations = np.sqrt(np.mean(coordinates**2, axis=0))
     if deviations[0] <= 1e-6:
         raise DecoyError("the descriptors to fit hardly differ from each other")
     # An axis on which nothing varies stays an axis on which nothing varies.
     whitened = coordinates / np.maximum(deviations, 1e-12)
-    mixture = _mixture(_features(whitened))
+    mixture = _mixture(mixture_features(whitened))
     return DescriptorStatistics(
         mean=mean.astype(np.float32),
         axes=(axes[:n] * deviations[:, None]).astype(np.float32),
@@ -85,13 +85,13 @@ def _checked(descriptors: NDArray[np.floating]) -> NDArray[np.float64]:
     return x
 
 
-def _principal_axes(x: NDArray[np.float64]) -> NDArray[np.float64]:
+def principal_axes(x: NDArray[np.float64]) -> NDArray[np.float64]:
     """Eigenvectors of the covariance as rows, largest variance first."""
     _, vectors = np.linalg.eigh(np.cov(x, rowvar=False))
     return np.ascontiguousarray(vectors[:, ::-1].T)
 
 
-def _cross_fitted(x: NDArray[np.float64], axes: NDArray[np.float64]) -> NDArray[np.float64]:
+def cross_fitted(x: NDArray[np.float64], axes: NDArray[np.float64]) -> NDArray[np.float64]:
     """Coordinates of every descriptor along axes that were found without it, shape (N, n).
 
     The leading axes of a fold span nearly the same space as those of all descriptors, but may
@@ -103,14 +103,14 @@ def _cross_fitted(x: NDArray[np.float64], axes: NDArray[np.float64]) -> NDArray[
     coordinates = np.empty_like(x)
     for number in range(_FOLDS):
         others = x[fold != number]
-        own_axes = _principal_axes(others)
+        own_axes = principal_axes(others)
         u, _, vt = np.linalg.svd(axes[:lead] @ own_axes[:lead].T)
         own_axes[:lead] = u @ vt @ own_axes[:lead]
         coordinates[fold == number] = (x[fold == number] - others.mean(axis=0)) @ own_axes.T
     return coordinates
 
 
-def _features(whitened: NDArray[np.float64]) -> NDArray[np.float64]:
+def mixture_features(whitened: NDArray[np.float64]) -> NDArray[np.float64]:
     """Leading coordinates, then half the log mean square of every band: shape (N, q)."""
     n = whitened.shape[1]
     edges = band_edges(n)
