@@ -137,14 +137,16 @@ async def read_form(
             ) from None
     files: list[tuple[str, bytes]] = []
     fields: dict[str, str] = {}
-    for name, value in form.multi_items():
-        if isinstance(value, str):
-            if name in fields:
+    try:
+        for name, value in form.multi_items():
+            if not isinstance(value, str):
+                files.append((name, value.file.read()))
+            elif name in fields:
                 raise ApiError("validation_failed", "a form field is given twice")
-            fields[name] = value
-        else:
-            files.append((name, value.file.read()))
-            value.file.close()
+            else:
+                fields[name] = value
+    finally:
+        await form.close()
     return Form(files=tuple(files), fields=fields)
 
 
@@ -217,10 +219,11 @@ def text_field(value: Any, name: str, *, max_length: int = 64) -> str | None:
     """
     if value is None:
         return None
-    if not isinstance(value, str) or not 0 < len(value) <= max_length:
+    # A lone surrogate, which JSON can write and UTF-8 cannot, is not printable.
+    if not isinstance(value, str) or not 0 < len(value) <= max_length or not value.isprintable():
         raise ApiError(
             "validation_failed",
-            f"{name} must be a string of 1 to {max_length} characters",
+            f"{name} must be a string of 1 to {max_length} printable characters",
             {"field": name},
         )
     return value

@@ -160,7 +160,10 @@ def parse_attributes(text: str | None) -> Attributes:
     if (
         not isinstance(value, dict)
         or not set(value) <= {"gender", "race"}
-        or not all(isinstance(label, str) and 0 < len(label) <= 64 for label in value.values())
+        or not all(
+            isinstance(label, str) and 0 < len(label) <= 64 and label.isprintable()
+            for label in value.values()
+        )
     ):
         raise ApiError(
             "validation_failed",
