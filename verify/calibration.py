@@ -1,7 +1,7 @@
 """From labelled descriptors to a contract: thresholds for stated false match rates."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,6 +58,11 @@ class Calibrated:
     report: CalibrationReport
 
 
+def _part_of(progress: Progress, number: int, parts: int) -> Progress:
+    """Report the progress of one of several equal parts as progress of the whole."""
+    return lambda what, share: progress(what, (number + share) / parts)
+
+
 def _silent(_what: str, _share: float) -> None:
     """Show no progress."""
 
@@ -110,7 +115,7 @@ def calibrate(
     dataset
         What the descriptors came from, for the contract file.
     progress
-        Called with what is being done and a share in [0, 1].
+        Called with what is being done and the share of the whole, which rises from 0 to 1.
 
     Returns
     -------
@@ -166,8 +171,9 @@ def calibrate(
     calibrations: list[Calibration] = []
     unresolved: list[str] = []
     ten_folds: list[TenFold] = []
-    for probe_m in chosen_options.probe_dims:
-        entry, missing, folds = calibrate_mode(bench, probe_m, rng)
+    for number, probe_m in enumerate(chosen_options.probe_dims):
+        part = replace(bench, progress=_part_of(progress, number, len(chosen_options.probe_dims)))
+        entry, missing, folds = calibrate_mode(part, probe_m, rng)
         calibrations.append(entry)
         unresolved += missing
         ten_folds += [folds] if folds else []

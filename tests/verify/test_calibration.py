@@ -170,6 +170,25 @@ def test_the_cohort_is_new_every_time_and_the_rest_follows_the_seed() -> None:
     assert first.photo_consistency == second.photo_consistency
 
 
+def test_progress_rises_from_nothing_to_the_whole() -> None:
+    people = draw_people(30)
+    source = make_generator()
+    shares: list[float] = []
+    calibrate(
+        people.descriptors,
+        people.names,
+        binding=make_binding(source.source_id),
+        source=source,
+        options=CalibrationOptions(
+            targets=(1e-1,), probe_dims=(0, 2), lifted_probes=60, lifted_impostor_pairs=600, steps=5
+        ),
+        progress=lambda _what, share: shares.append(share),
+    )
+    assert shares == sorted(shares)
+    assert (shares[0], shares[-1]) == (0.0, 1.0)
+    assert 0.5 in shares
+
+
 def test_excluded_people_are_left_out(people: People) -> None:
     source = make_generator()
     result = calibrate(
