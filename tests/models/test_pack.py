@@ -1,0 +1,339 @@
+import hashlib
+import io
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from models.decoding import decode_image
+from models.errors import (
+    FaceTooSmall,
+    ImageError,
+    MultipleFaces,
+    NoFace,
+    PackError,
+    ProviderUnavailable,
+)
+from models.pack import FacePolicy, ModelPack, inspect
+from models.quality import QualityLimits
+from models.signature import Role
+from tests.models import graphs
+from tests.models.graphs import pooled, pooling_embedder, unit, write_pack
+
+GENDER = graphs.shaped([("data", ["N", 3, 96, 96])], [("fc1", [1, 3])])
+LANDMARKS = graphs.shaped([("data", ["N", 3, 192, 192])], [("fc1", [1, 212])])
+
+
+def png(pixels: np.ndarray) -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, "PNG")
+    return file.getvalue()
+
+
+def crop(size: int = 112, width: int | None = None) -> np.ndarray:
+    return np.random.default_rng(1).integers(0, 256, (size, width or size, 3), dtype=np.uint8)
+
+
+def test_a_folder_with_graphs_that_are_not_needed(tmp_path):
+    folder = write_pack(tmp_path / "mine", emb=pooling_embedder(), g=GENDER, l=LANDMARKS)
+    info = ModelPack.load(folder).info
+    assert (info.name, info.n, info.detector) == ("mine", 147, None)
+    assert info.embedder_sha256 == hashlib.sha256(pooling_embedder()).hexdigest()
+    assert json.loads(json.dumps(info.preprocessing)) == {
+        "alignment": "arcface-112",
+        "size": 112,
+        "channel_order": "rgb",
+        "mean": [127.5] * 3,
+        "scale": [127.5] * 3,
+        "flip": False,
+    }
+
+
+def test_a_nested_folder_of_the_same_name(tmp_path):
+    write_pack(tmp_path / "antelopev2" / "antelopev2", emb=pooling_embedder())
+    assert ModelPack.load(tmp_path / "antelopev2").info.name == "antelopev2"
+    write_pack(tmp_path / "other" / "inner", emb=pooling_embedder())
+    with pytest.raises(PackError, match=r"no \.onnx files"):
+        ModelPack.load(tmp_path / "other")
+
+
+def test_a_single_embedder_file(tmp_path):
+    folder = write_pack(tmp_path, face=pooling_embedder(), other=pooling_embedder(128))
+    assert ModelPack.load(folder / "face.onnx").info.name == "face"
+
+
+@pytest.mark.parametrize("missing", ["nowhere", "readme.txt"])
+def test_no_pack_there(tmp_path, missing):
+    (tmp_path / "readme.txt").write_text("hello")
+    with pytest.raises(PackError, match=missing):
+        ModelPack.load(tmp_path / missing)
+
+
+def test_two_embedders_are_named(tmp_path):
+    folder = write_pack(tmp_path, one=pooling_embedder(), two=pooling_embedder(128))
+    with pytest.raises(PackError, match=r"2 embedders: one\.onnx and two\.onnx; leave one"):
+        ModelPack.load(folder)
+
+
+def test_two_detectors_are_named(tmp_path):
+    folder = write_pack(
+        tmp_path, e=pooling_embedder(), s=graphs.scrfd_shapes(), y=graphs.yunet_shapes()
+    )
+    with pytest.raises(PackError, match=r"2 detectors: s\.onnx and y\.onnx"):
+        ModelPack.load(folder)
+
+
+def test_a_detector_without_keypoints_is_refused(tmp_path):
+    folder = write_pack(tmp_path, e=pooling_embedder(), d=graphs.scrfd_shapes(keypoints=False))
+    with pytest.raises(PackError, match=r"d\.onnx.*without keypoints"):
+        ModelPack.load(folder)
+
+
+def test_no_embedder_says_what_was_seen(tmp_path):
+    folder = write_pack(tmp_path, g=GENDER, d=graphs.yunet_shapes())
+    with pytest.raises(PackError, match=r"no embedder. Seen: d\.onnx: .*; g\.onnx: 96 x 96"):
+        ModelPack.load(folder)
+
+
+def test_a_broken_file_is_named(tmp_path):
+    folder = write_pack(tmp_path, e=pooling_embedder(), broken=b"oops")
+    with pytest.raises(PackError, match=r"broken\.onnx"):
+        ModelPack.load(folder)
+
+
+def test_an_embedder_that_does_not_embed_is_named(tmp_path):
+    fake = graphs.shaped([("x", ["N", 3, 112, 112])], [("y", ["N", 512])])
+    with pytest.raises(PackError, match=r"fake\.onnx"):
+        ModelPack.load(write_pack(tmp_path, fake=fake))
+
+
+def test_an_absent_accelerator_is_refused(tmp_path):
+    with pytest.raises(ProviderUnavailable):
+        ModelPack.load(write_pack(tmp_path, e=pooling_embedder()), providers=("tensorrt",))
+
+
+def test_pack_toml_overrides_what_the_graph_says(tmp_path):
+    folder = write_pack(tmp_path, e=pooling_embedder())
+    (folder / "pack.toml").write_text(
+        '[embedder]\nmean = 0\nscale = [1, 2, 4]\nchannel_order = "bgr"\n'
+    )
+    pack = ModelPack.load(folder)
+    pictures = crop()[None]
+    x = pictures[..., ::-1] / np.array([1, 2, 4])
+    expected = unit(x.reshape(1, 7, 16, 7, 16, 3).mean((2, 4)).transpose(0, 3, 1, 2).reshape(1, -1))
+    np.testing.assert_allclose(pack.embed(pictures), expected, atol=2e-5)
+    assert pack.info.preprocessing["channel_order"] == "bgr"
+
+
+def test_pack_toml_states_an_open_input_size(tmp_path):
+    folder = write_pack(tmp_path, e=pooling_embedder("side"))
+    with pytest.raises(PackError, match=r"input_size in pack\.toml"):
+        ModelPack.load(folder)
+    (folder / "pack.toml").write_text("[embedder]\ninput_size = 128\n")
+    assert ModelPack.load(folder).crop_size == 128
+
+
+def test_pack_toml_cannot_contradict_the_graph(tmp_path):
+    folder = write_pack(tmp_path, e=pooling_embedder())
+    (folder / "pack.toml").write_text("[embedder]\ninput_size = 128\n")
+    with pytest.raises(PackError, match="takes 112 only"):
+        ModelPack.load(folder)
+
+
+def test_normalisation_inside_shows_in_the_preprocessing(tmp_path):
+    info = ModelPack.load(write_pack(tmp_path, e=pooling_embedder(inside=True))).info
+    assert info.preprocessing["mean"] == [0.0] * 3
+    assert info.preprocessing["scale"] == [1.0] * 3
+
+
+def test_flip_of_the_pack_is_part_of_the_preprocessing_and_is_used(tmp_path):
+    folder = write_pack(tmp_path, e=pooling_embedder())
+    pack = ModelPack.load(folder, flip=True)
+    pictures = crop()[None]
+    assert pack.info.preprocessing["flip"] is True
+    expected = unit(pooled(pictures) + pooled(pictures[:, :, ::-1]))
+    np.testing.assert_allclose(pack.embed(pictures), expected, atol=2e-5)
+    np.testing.assert_allclose(pack.embed(pictures, flip=False), unit(pooled(pictures)), atol=2e-5)
+
+
+@pytest.fixture
+def blind(tmp_path) -> ModelPack:
+    return ModelPack.load(write_pack(tmp_path / "blind", e=pooling_embedder()))
+
+
+def test_without_a_detector_an_aligned_crop_is_embedded(blind):
+    sample = blind.embed_photo(png(crop()), quality=None)
+    np.testing.assert_allclose(sample.embedding, unit(pooled(crop()[None]))[0], atol=2e-5)
+    assert sample.box is None
+    assert sample.quality.score is None
+
+
+def test_without_a_detector_a_square_is_resized(blind):
+    doubled = crop().repeat(2, axis=0).repeat(2, axis=1)
+    sample = blind.embed_photo(png(doubled), quality=None)
+    np.testing.assert_allclose(sample.embedding, unit(pooled(crop()[None]))[0], atol=2e-5)
+
+
+def test_without_a_detector_other_shapes_are_refused(blind):
+    with pytest.raises(ImageError, match="must be square") as caught:
+        blind.embed_photo(png(crop(112, 150)))
+    assert caught.value.code == "unsupported_image"
+    with pytest.raises(PackError, match="has no detector"):
+        blind.detect(crop())
+
+
+def test_neither_samples_nor_faces_show_numbers_of_a_descriptor(blind):
+    sample = blind.embed_photo(png(crop()), quality=None)
+    assert "embedding" not in repr(sample)
+    assert "array" not in repr(sample)
+
+
+def test_inspect_reports_also_what_cannot_be_loaded(tmp_path, mbf_pack_dir):
+    folder = write_pack(tmp_path, a=pooling_embedder(), b=pooling_embedder(128), g=GENDER)
+    reports = {report.file: report for report in inspect(folder)}
+    assert [r.role for r in reports.values()] == [Role.EMBEDDER, Role.EMBEDDER, Role.GENDER_AGE]
+    assert "ignored" in reports["g.onnx"].reason
+    real = {report.file: report for report in inspect(mbf_pack_dir)}
+    assert real["w600k_mbf.onnx"].inputs == "input[?, 3, 112, 112]"
+    digest = hashlib.sha256((mbf_pack_dir / "w600k_mbf.onnx").read_bytes()).hexdigest()
+    assert real["w600k_mbf.onnx"].sha256 == digest
+
+
+# -- real models and real faces ----------------------------------------------------------------
+
+
+@pytest.fixture(scope="module", params=["w600k_mbf", "yunet_mobilefacenet128"])
+def real(request, shared_data) -> ModelPack:
+    return ModelPack.load(shared_data / "packs" / request.param, threads=1)
+
+
+def test_real_packs_are_recognised(real):
+    expected = {"w600k_mbf": (512, "scrfd", 127.5), "yunet_mobilefacenet128": (128, "yunet", 0.0)}
+    n, kind, mean = expected[real.info.name]
+    assert (real.info.n, real.info.detector.kind) == (n, kind)
+    assert real.info.preprocessing["mean"] == [mean] * 3
+
+
+def people(lfw_photos, count: int) -> list[list[bytes]]:
+    folders = sorted(p for p in lfw_photos.iterdir() if p.is_dir())
+    step = max(1, len(folders) // count)
+    return [
+        [path.read_bytes() for path in sorted(folder.glob("*.jpg"))[:2]]
+        for folder in folders[::step][:count]
+    ]
+
+
+def test_same_and_different_people_are_far_apart(real, lfw_photos):
+    """From bytes to embedding: nobody is closer to a stranger than to themselves."""
+    vectors = np.array(
+        [
+            [real.embed_photo(data, policy=FacePolicy.LARGEST).embedding for data in photos]
+            for photos in people(lfw_photos, 12)
+        ]
+    )
+    np.testing.assert_allclose(np.linalg.norm(vectors, axis=2), 1, atol=1e-5)
+    cosines = vectors[:, 0] @ vectors[:, 1].T
+    same, different = np.diag(cosines), cosines[~np.eye(len(cosines), dtype=bool)]
+    assert same.min() > different.max()
+    assert same.mean() > 0.5
+    assert abs(different.mean()) < 0.1
+
+
+def test_own_alignment_agrees_with_the_public_crops(real, lfw_photos, lfw_aligned):
+    """The same LFW photo, aligned here and by the makers of the verification set."""
+    pairs = [
+        (path, lfw_aligned / path.relative_to(lfw_photos))
+        for path in sorted(lfw_photos.glob("*/*_0001.jpg"))
+        if (lfw_aligned / path.relative_to(lfw_photos)).exists()
+    ][:10]
+    assert len(pairs) >= 5
+    own = [real.embed_photo(p.read_bytes(), policy=FacePolicy.LARGEST).embedding for p, _ in pairs]
+    public = real.embed(np.stack([decode_image(crop.read_bytes()) for _, crop in pairs]))
+    cosines = (np.stack(own) * public).sum(axis=1)
+    assert np.median(cosines) > 0.9
+    assert cosines.min() > 0.7
+
+
+def test_lfw_pairs_are_told_apart(mbf_pack_dir, lfw_aligned):
+    """A slice of view 2 at the threshold of FMR 1e-4 that data/README.md states."""
+    pack = ModelPack.load(mbf_pack_dir, threads=1)
+    lines = (lfw_aligned / "pairs.txt").read_text().splitlines()[1:]
+    genuine = [line.split("\t") for line in lines[:25]]
+    impostor = [line.split("\t") for line in lines[300:325]]
+    names = [(n, i, n, j) for n, i, j in genuine] + [tuple(line) for line in impostor]
+    crops = [
+        decode_image((lfw_aligned / n / f"{n}_{int(i):04d}.jpg").read_bytes())
+        for a, i, b, j in names
+        for n, i in ((a, i), (b, j))
+    ]
+    rows = pack.embed(np.stack(crops)).reshape(-1, 2, pack.info.n)
+    accepted = (rows[:, 0] * rows[:, 1]).sum(axis=1) > 0.309
+    assert accepted[:25].sum() >= 24
+    assert accepted[25:].sum() == 0
+
+
+def side_by_side(lfw_photos, shrink: int) -> bytes:
+    """Two people's photos in one picture, the second smaller by ``shrink`` and at the far side."""
+    first, second = (decode_image(photos[0]) for photos in people(lfw_photos, 2))
+    picture = np.zeros((250, 500, 3), np.uint8)
+    picture[:, :250] = first
+    small = second[::shrink, ::shrink]
+    picture[: len(small), 500 - len(small) :] = small
+    return png(picture)
+
+
+def test_two_people_are_refused_unless_the_largest_is_asked_for(real, lfw_photos):
+    both = side_by_side(lfw_photos, 1)
+    with pytest.raises(MultipleFaces):
+        real.embed_photo(both)
+    alone = real.embed_photo(people(lfw_photos, 2)[0][0], policy=FacePolicy.LARGEST, quality=None)
+    smaller = side_by_side(lfw_photos, 2)
+    chosen = real.embed_photo(smaller, policy=FacePolicy.LARGEST, quality=None)
+    assert chosen.embedding @ alone.embedding > 0.8
+
+
+def test_a_small_face_in_the_middle_does_not_hide_a_large_one(real, lfw_photos):
+    """The rank prefers the middle; a larger face elsewhere still counts as a second one."""
+    large, small = (decode_image(photos[0]) for photos in people(lfw_photos, 2))
+    picture = np.zeros((250, 600, 3), np.uint8)
+    picture[:, :250] = large
+    picture[60:185, 300:425] = small[::2, ::2]
+    assert real.detect(picture)[0].box[0] > 250
+    with pytest.raises(MultipleFaces):
+        real.embed_photo(png(picture))
+
+
+def test_a_small_bystander_does_not_refuse_a_photo(real, lfw_photos):
+    assert real.embed_photo(side_by_side(lfw_photos, 3)).box[2] < 250
+
+
+def test_a_picture_without_a_face(real):
+    with pytest.raises(NoFace, match="No face"):
+        real.embed_photo(png(np.full((200, 300, 3), 90, np.uint8)))
+
+
+def test_a_tiny_face(real, lfw_photos):
+    photo = people(lfw_photos, 1)[0][0]
+    with pytest.raises(FaceTooSmall):
+        real.embed_photo(photo, policy=FacePolicy.LARGEST, quality=QualityLimits(min_face_size=500))
+
+
+def test_a_turned_picture_is_found_by_its_exif(real, lfw_photos):
+    image = Image.open(io.BytesIO(people(lfw_photos, 1)[0][0]))
+    plain, turned = io.BytesIO(), io.BytesIO()
+    image.save(plain, "PNG")
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    image.transpose(Image.Transpose.ROTATE_90).save(turned, "PNG", exif=exif)
+    options = {"policy": FacePolicy.LARGEST, "quality": None}
+    upright = real.embed_photo(plain.getvalue(), **options).embedding
+    np.testing.assert_allclose(
+        real.embed_photo(turned.getvalue(), **options).embedding, upright, atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 3000), (3000, 1), (5, 5), (2000, 40)])
+def test_pictures_of_strange_shapes_have_no_face(real, shape):
+    with pytest.raises(NoFace):
+        real.embed_photo(png(np.full((*shape, 3), 120, np.uint8)))

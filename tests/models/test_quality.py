@@ -1,0 +1,236 @@
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from models.alignment import TEMPLATE_112
+from models.boxes import Face
+from models.decoding import decode_image
+from models.errors import FaceTooSmall, LowQuality, MultipleFaces, NoFace
+from models.pack import ModelPack
+from models.quality import (
+    Quality,
+    QualityLimits,
+    check,
+    measure,
+    measure_pose,
+    measure_sharpness,
+    select_face,
+)
+
+# A head in millimetres: eyes, nose and mouth as FORMATS' template has them (1.8 mm per pixel), the
+# nose 22 mm in front. x to the right of the picture, y down, z towards the camera.
+HEAD = np.column_stack([(TEMPLATE_112 - TEMPLATE_112.mean(0)) * 1.8, [0, 0, 22, 0, 0]])
+GOOD = Quality(
+    score=0.9, face_size=100.0, sharpness=3.0, brightness=120.0, yaw=0.0, pitch=0.0, roll=0.0
+)
+
+
+def photographed(yaw=0.0, pitch=0.0, roll=0.0, distance=900.0) -> np.ndarray:
+    """The five points of a turned head through a pinhole camera."""
+    a, b, c = np.radians([yaw, pitch, roll])
+    turn = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
+    nod = np.array([[1, 0, 0], [0, np.cos(b), np.sin(b)], [0, -np.sin(b), np.cos(b)]])
+    tilt = np.array([[np.cos(c), -np.sin(c), 0], [np.sin(c), np.cos(c), 0], [0, 0, 1]])
+    points = HEAD @ (tilt @ nod @ turn).T
+    return points[:, :2] * 500 / (distance - points[:, 2:]) + 200
+
+
+@pytest.mark.parametrize("yaw", [-50, -30, -10, 10, 30, 50])
+def test_yaw_of_a_turned_head(yaw):
+    measured, _, _ = measure_pose(photographed(yaw=yaw))
+    assert measured == pytest.approx(yaw, abs=8)
+
+
+@pytest.mark.parametrize("nod", [-30, -15, 15, 30])
+def test_pitch_follows_a_nod(nod):
+    straight = measure_pose(photographed())[1]
+    measured = measure_pose(photographed(pitch=nod))[1]
+    assert np.sign(measured - straight) == np.sign(nod)
+    assert abs(measured - straight) == pytest.approx(abs(nod), abs=12)
+
+
+@given(st.floats(-170, 170), st.floats(0.2, 5), st.floats(-40, 40))
+def test_tilt_and_size_change_roll_only(roll, factor, yaw):
+    upright = measure_pose(photographed(yaw=yaw))
+    tilted = measure_pose(photographed(yaw=yaw, roll=roll) * factor)
+    assert tilted[:2] == pytest.approx(upright[:2], abs=1e-6)
+    assert tilted[2] == pytest.approx(upright[2] + roll, abs=1e-6)
+
+
+def test_points_that_coincide_but_two_do_not_divide_by_zero():
+    points = np.zeros((5, 2))
+    points[4] = 1
+    assert np.isfinite(measure_pose(points)).all()
+
+
+def texture(seed: int = 0) -> np.ndarray:
+    noise = np.random.default_rng(seed).normal(size=(112, 112))
+    smooth = cv2.GaussianBlur(noise, (0, 0), 1.2)
+    return np.clip(128 + 40 * smooth / smooth.std(), 0, 255).astype(np.uint8)
+
+
+def streak(length: int, angle: float) -> np.ndarray:
+    kernel = np.zeros((length, length))
+    middle = length // 2
+    for r in np.linspace(-middle, middle, 8 * length):
+        y, x = middle + r * np.sin(angle), middle + r * np.cos(angle)
+        kernel[round(y), round(x)] = 1
+    return kernel / kernel.sum()
+
+
+@pytest.mark.parametrize("angle", [0, np.pi / 4, np.pi / 2, 3 * np.pi / 4])
+def test_motion_blur_in_any_direction_is_seen(angle):
+    sharp = texture()
+    moved = cv2.filter2D(sharp, -1, streak(15, angle), borderType=cv2.BORDER_REFLECT)
+    assert measure_sharpness(moved) < 0.35 * measure_sharpness(sharp)
+
+
+def test_sharpness_falls_with_blur_and_ignores_exposure_and_contrast():
+    sharp = texture()
+    values = [measure_sharpness(cv2.GaussianBlur(sharp, (0, 0), s)) for s in (1, 2, 3, 4)]
+    assert all(np.diff([measure_sharpness(sharp), *values]) < 0)
+    soft = (sharp * 0.4 + 10).astype(np.uint8)
+    assert measure_sharpness(soft) == pytest.approx(measure_sharpness(sharp), rel=0.05)
+
+
+def test_a_flat_picture_has_no_detail():
+    assert measure_sharpness(np.full((112, 112), 77, np.uint8)) == 0.0
+
+
+def test_measures_do_not_depend_on_the_embedders_size():
+    crop = np.repeat(texture()[:, :, None], 3, axis=2)
+    large = cv2.resize(crop, (224, 224), interpolation=cv2.INTER_NEAREST)
+    small, big = measure(crop, None), measure(large, None)
+    assert big.sharpness == pytest.approx(small.sharpness, rel=1e-6)
+    assert big.brightness == pytest.approx(small.brightness)
+    assert small.score is None
+    assert small.yaw is None
+
+
+def test_the_good_pass():
+    check(GOOD)
+    check(Quality(**{**GOOD.as_dict(), "score": None, "face_size": None, "yaw": None}))
+
+
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [
+        ({"score": 0.1}, "score"),
+        ({"sharpness": 0.1}, "blur"),
+        ({"brightness": 3.0}, "darkness"),
+        ({"brightness": 253.0}, "brightness"),
+        ({"yaw": -88.0}, "pose"),
+        ({"pitch": 80.0}, "pose"),
+        ({"roll": 179.0}, "pose"),
+    ],
+)
+def test_each_failure_is_named_with_value_and_limit(change, name):
+    with pytest.raises(LowQuality, match=name) as caught:
+        check(Quality(**(GOOD.as_dict() | change)), recommended_score=0.6)
+    assert list(caught.value.details) == [name]
+    detail = caught.value.details[name]
+    (value,) = change.values()
+    if name == "pose":
+        (axis,) = change
+        assert detail == {axis: {"value": value, "limit": getattr(QualityLimits(), f"max_{axis}")}}
+    else:
+        assert detail["value"] == value
+    assert caught.value.code == "low_quality"
+
+
+def test_all_failures_are_named_at_once():
+    bad = Quality(**(GOOD.as_dict() | {"sharpness": 0.0, "brightness": 1.0, "yaw": 80.0}))
+    with pytest.raises(LowQuality) as caught:
+        check(bad)
+    assert list(caught.value.details) == ["blur", "darkness", "pose"]
+
+
+def test_stated_score_limit_wins_over_the_detectors():
+    quality = Quality(**(GOOD.as_dict() | {"score": 0.65}))
+    check(quality, QualityLimits(min_score=0.6), recommended_score=0.7)
+    with pytest.raises(LowQuality):
+        check(quality, recommended_score=0.7)
+
+
+def test_a_small_face_is_told_apart():
+    with pytest.raises(FaceTooSmall) as caught:
+        check(Quality(**(GOOD.as_dict() | {"face_size": 12.0, "sharpness": 0.0})))
+    assert caught.value.code == "face_too_small"
+    assert caught.value.details == {"size": {"value": 12.0, "limit": 24.0}}
+
+
+def face(side: float) -> Face:
+    return Face(np.array([0, 0, side, side], np.float32), 0.9, np.zeros((5, 2), np.float32))
+
+
+def test_a_second_face_counts_from_half_the_width_on():
+    main = face(100)
+    assert select_face([main, face(49)], single=True, limits=QualityLimits()) is main
+    with pytest.raises(MultipleFaces, match="2 faces") as caught:
+        select_face([main, face(51), face(20)], single=True, limits=QualityLimits())
+    assert caught.value.details == {"faces": 2}
+    assert select_face([main, face(51)], single=False, limits=QualityLimits()) is main
+    with pytest.raises(MultipleFaces):
+        select_face([main, face(1)], single=True, limits=None)
+
+
+def test_no_face():
+    with pytest.raises(NoFace) as caught:
+        select_face([], single=False, limits=None)
+    assert caught.value.code == "no_face"
+
+
+DEGRADED = {
+    "defocus": (lambda x: cv2.GaussianBlur(x, (0, 0), 6), "blur"),
+    "shaken": (lambda x: cv2.filter2D(x, -1, streak(25, 0.0)), "blur"),
+    "dark": (lambda x: (x * 0.08).astype(np.uint8), "darkness"),
+    "overexposed": (lambda x: np.clip(x * 6.0 + 60, 0, 255).astype(np.uint8), "brightness"),
+}
+
+
+@pytest.fixture(scope="module")
+def pack(mbf_pack_dir):
+    return ModelPack.load(mbf_pack_dir, threads=1, detector_size=320)
+
+
+@pytest.fixture(scope="module")
+def photos(lfw_photos):
+    paths = sorted(lfw_photos.glob("*/*_0001.jpg"))[::8]
+    return [decode_image(path.read_bytes()) for path in paths]
+
+
+def refusal(pack, image) -> set[str]:
+    faces = pack.detect(image)
+    if not faces:
+        return {"no_face"}
+    try:
+        check(measure(pack.align(image, faces[0]), faces[0]), recommended_score=0.6)
+    except LowQuality as error:
+        return set(error.details)
+    return set()
+
+
+def test_good_real_photos_pass(pack, photos):
+    assert [refusal(pack, photo) for photo in photos] == [set()] * len(photos)
+
+
+@pytest.mark.parametrize("kind", DEGRADED)
+def test_degraded_real_photos_are_refused_by_name(pack, photos, kind):
+    spoil, name = DEGRADED[kind]
+    reasons = [refusal(pack, spoil(photo)) for photo in photos]
+    named = sum(bool(reason & {name, "no_face"}) for reason in reasons)
+    assert named >= 0.9 * len(photos), reasons
+
+
+def test_profiles_are_refused_for_their_pose(pack, fairface):
+    """Profiles and frontal faces of the set, told apart by eye."""
+    sides = {"11884": 1, "10365": -1, "12204": 1, "11997": 1, "12656": -1}
+    for name, side in sides.items():
+        image = decode_image((fairface / "train" / f"{name}.jpg").read_bytes())
+        assert "pose" in refusal(pack, image)
+        assert np.sign(measure_pose(pack.detect(image)[0].keypoints)[0]) == side
+    for name in ("10336", "10376", "10852"):
+        image = decode_image((fairface / "train" / f"{name}.jpg").read_bytes())
+        assert "pose" not in refusal(pack, image)
