@@ -56,7 +56,8 @@ class Server:
         pytest.fail("the server did not get ready: " + self.log.read_text())
 
     def stop(self) -> int:
-        self.process.send_signal(signal.SIGTERM)
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGTERM)
         return self.process.wait(timeout=30)
 
 
@@ -133,7 +134,40 @@ def test_a_client_that_goes_away_does_no_harm(server: Server, http: httpx.Client
     assert http.get("/v1/subjects/a").status_code == 200
 
 
+def test_a_client_that_asks_first_is_told_at_once(server: Server) -> None:
+    with socket.create_connection(("127.0.0.1", server.deployment.settings.port)) as raw:
+        raw.settimeout(20)
+        raw.sendall(
+            b"PUT /v1/subjects/a/enrollment HTTP/1.1\r\nHost: x\r\nExpect: 100-continue\r\n"
+            b"Authorization: Bearer vf_x\r\nContent-Length: 100000000\r\n\r\n"
+        )
+        first = raw.recv(65536)
+    assert first.startswith(b"HTTP/1.1 401")
+
+
 def test_stopping_finishes_what_runs_and_logs_only_json(server: Server) -> None:
+    body = (
+        b'--b\r\nContent-Disposition: form-data; name="image"; filename="f"\r\n\r\n'
+        + photo(1, 5)
+        + b"\r\n--b--\r\n"
+    )
+    with socket.create_connection(("127.0.0.1", server.deployment.settings.port)) as raw:
+        raw.settimeout(30)
+        raw.sendall(
+            b"POST /v1/subjects/a/verify HTTP/1.1\r\nHost: x\r\n"
+            + f"Authorization: Bearer {server.deployment.token}\r\n".encode()
+            + b"Content-Type: multipart/form-data; boundary=b\r\n"
+            + f"Content-Length: {len(body)}\r\n\r\n".encode()
+            + body[:1000]
+        )
+        time.sleep(1)  # until a worker has begun to read
+        server.process.send_signal(signal.SIGTERM)
+        time.sleep(1)
+        raw.sendall(body[1000:])
+        seen = b""
+        while piece := raw.recv(65536):
+            seen += piece
+        assert b'"decision":"accept"' in seen
     assert server.stop() == 0
     lines = [json.loads(line) for line in server.log.read_text().splitlines()]
     assert sum(line["event"] == "stopped" for line in lines) == 2
