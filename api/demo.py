@@ -24,9 +24,9 @@ from api.demo_cast import ENROLLED_PHOTOS, PROBE_PHOTOS, Cast, Scale, drawn_cast
 from api.demo_service import running_service
 from api.demo_storage import Stored, read_stored, rows_of
 from api.errors import StartError
+from api.opening import file_sealer
 from api.preparation import calibrate_folder, make_generator
 from api.receipts import verify_answer
-from api.runtime import file_sealer
 from models.demo import build_demo_pack, is_demo_model
 from models.extraction import Extraction, Extractor
 from models.pack import ModelPack
@@ -91,7 +91,7 @@ def run_demo(
     *,
     pack: Path | None = None,
     faces: Path | None = None,
-    m: int | None = None,
+    m: int = 16,
     scale: Scale | None = None,
     say: Say = lambda _: None,
 ) -> Outcome:
@@ -105,7 +105,7 @@ def run_demo(
     pack, faces
         A model pack and a folder ``Person/photo.jpg`` for a real run; both or none.
     m
-        Dimension of the templates; 8 for the demo model and 16 for a pack by default.
+        Dimension of the templates.
     scale
         Numbers of people and photos that are drawn.
     say
@@ -153,7 +153,7 @@ def _calibrate(
     decoy_photos: Sequence[Path],
     labelled: LabelledFolder,
     *,
-    m: int | None,
+    m: int,
     say: Say,
 ) -> Contract:
     """Do what ``decoys build`` and ``calibrate`` do."""
@@ -170,7 +170,7 @@ def _calibrate(
         pack=pack,
         source=generator,
         strategy=Strategy.ADVERSARIAL,
-        m=m or (8 if is_demo_model(pack.info.embedder_sha256) else 16),
+        m=m,
         options=CalibrationOptions(photos_per_enrollment=ENROLLED_PHOTOS),
     )
     keyring = MasterKeyring.create(folder / "master.key")

@@ -58,13 +58,14 @@ def _free_port() -> int:
 
 def _await_ready(process: "subprocess.Popen[bytes]", url: str, log: Path) -> None:
     deadline = time.monotonic() + START_TIMEOUT_S
-    while time.monotonic() < deadline:
-        if process.poll() is not None:
-            raise StartError(f"the service stopped at its start; {log} says why")
-        with contextlib.suppress(httpx.TransportError):
-            if httpx.get(f"{url}/health/ready", timeout=2.0).status_code == httpx.codes.OK:
-                return
-        time.sleep(0.1)
+    with httpx.Client(base_url=url, timeout=2.0) as client:
+        while time.monotonic() < deadline:
+            if process.poll() is not None:
+                raise StartError(f"the service stopped at its start; {log} says why")
+            with contextlib.suppress(httpx.TransportError):
+                if client.get("/health/ready").status_code == httpx.codes.OK:
+                    return
+            time.sleep(0.1)
     raise StartError(f"the service was not ready in {START_TIMEOUT_S:.0f} s; {log} says why")
 
 

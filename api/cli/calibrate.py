@@ -11,8 +11,8 @@ from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, extract
 from api.cli.errors import CommandError, UsageError
 from api.cli.files import read_bounded, read_names
 from api.cli.options import AsJson, takes_settings
+from api.opening import file_sealer, open_keyring
 from api.preparation import acquired, acquired_json, calibrate_folder
-from api.runtime import file_sealer, open_keyring
 from api.settings import Settings
 from models.demo import DEMO_NOTICE
 from templates.contract import Calibration, Contract, Rate

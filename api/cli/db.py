@@ -4,7 +4,7 @@ import typer
 
 from api.cli.console import emit, message, say
 from api.cli.options import STORE, AsJson, takes_settings
-from api.runtime import open_keyring, open_store
+from api.opening import open_keyring, open_store
 from api.settings import Settings
 from templates.errors import VeilfaceError
 from templates.store.database import Database

@@ -38,15 +38,7 @@ def demo(
             show_default=False,
         ),
     ] = None,
-    dim: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            max=128,
-            help="Dimension m of the templates. Unset: 16, or 8 with the demo model.",
-            show_default=False,
-        ),
-    ] = None,
+    dim: Annotated[int, typer.Option(min=1, max=128, help="Dimension m of the templates.")] = 16,
     as_json: AsJson = False,
 ) -> None:
     """Enroll, verify and erase people through the real service, in under a minute.

@@ -9,8 +9,8 @@ import typer
 
 from api.cli.console import message
 from api.cli.errors import CommandError, UsageError
+from api.opening import file_sealer, open_keyring
 from api.preparation import acquired
-from api.runtime import file_sealer, open_keyring
 from api.settings import Settings
 from models.cache import EmbeddingCache
 from models.extraction import Extraction, Extractor

@@ -14,8 +14,8 @@ from api.cli.console import emit, message, progress, say, show, table
 from api.cli.errors import CommandError, UsageError
 from api.cli.files import read_bounded
 from api.cli.options import STORE, AsJson, takes_settings
+from api.opening import file_sealer, open_keyring, open_store, prepare_database
 from api.receipts import verify_answer
-from api.runtime import file_sealer, open_keyring, open_store, prepare_database
 from api.settings import Settings
 from templates.canonical import parse_object
 from templates.contract import Contract

@@ -2,7 +2,7 @@ import pytest
 
 from api.cli.calibrate import parse_dims, read_aliases
 from api.cli.errors import CommandError, UsageError
-from api.runtime import file_sealer
+from api.opening import file_sealer
 from models.demo import DEMO_NOTICE
 from templates.contract import Contract
 from templates.sealing import MasterKeyring

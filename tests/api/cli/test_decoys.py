@@ -3,7 +3,7 @@ import stat
 
 import pytest
 
-from api.runtime import file_sealer
+from api.opening import file_sealer
 from models.demo import DEMO_NOTICE
 from templates.decoys import DecoyGenerator, DecoyPool, load_source
 from templates.sealing import MasterKeyring

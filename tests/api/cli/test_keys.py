@@ -4,8 +4,8 @@ import stat
 
 import pytest
 
+from api.opening import file_sealer
 from api.receipts import receipt_json
-from api.runtime import file_sealer
 from templates.contract import Contract
 from templates.sealing import MasterKeyring
 from templates.store import TemplateStore

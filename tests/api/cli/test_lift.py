@@ -5,7 +5,7 @@ import stat
 import numpy as np
 import pytest
 
-from api.runtime import file_sealer
+from api.opening import file_sealer
 from models.demo import DEMO_NOTICE
 from models.pack import ModelPack
 from templates import wire
