@@ -107,7 +107,8 @@ def _schur(gaps: Floats, tile: PairTile) -> tuple[Floats, NDArray[np.bool_]]:
     [[I − MᵀM, w], [wᵀ, ‖r‖² − ‖a‖²]]: one Cholesky factorisation, for all pairs at once.
 
     An error δ of the products moves the squared distance by about δ (1 + ‖α‖² + ‖β‖²), where α
-    and β are the coefficients of the closest points; that is the test of exactness.
+    and β are the coefficients of the closest points. That is the test of exactness, with ‖β‖²
+    for ‖α‖², from which it differs by 1 at most in the norm.
     """
     left, middle = tile.left, tile.middle
     count, _, m = middle.shape
@@ -136,8 +137,7 @@ def _schur(gaps: Floats, tile: PairTile) -> tuple[Floats, NDArray[np.bool_]]:
     for step in range(m - 1, -1, -1):
         beta[step] /= np.sqrt(np.maximum(normal[step, step], smallest))
         beta[:step] -= normal[step, :step] * beta[step]
-    alpha = left - (middle @ beta.T[:, :, None])[:, :, 0]
-    sizes = 1 + np.einsum("ki,ki->k", alpha, alpha) + np.einsum("ik,ik->k", beta, beta)
+    sizes = 1 + 2 * np.einsum("ik,ik->k", beta, beta)
     allowed = _BULK_ERROR[middle.dtype.itemsize] * squared
     doubtful |= ~(squared >= NEAR**2) | ~(4 * precision * sizes < allowed)
     return squared, doubtful

@@ -187,8 +187,8 @@ def _starts(problem: _Problem) -> Floats:
     """Starts of v, shape (K, 2, m_E): the leading right singular vector of B with both signs.
 
     The objective has one or two local maxima, on either side of that vector, and its two signs
-    lead to both: on 10,000 pairs of lifted faces, random subspaces and wolves none of 64 random
-    restarts ended higher. The vector is a column of a power of BᵀB, which serves as well as the
+    lead to both: of 45,000 pairs of lifted faces, random subspaces and wolves one (in R⁸) ended
+    more than 10⁻⁴ below random restarts. The vector is a column of a power of BᵀB, as good as the
     exact one and is cheaper.
     """
     power = problem.transposed @ problem.b
@@ -287,7 +287,8 @@ def _near(
             t * (p[:, None, :] @ columns)[:, 0, :],
             (s * t)[:, :, None] * (d @ columns),
         )
-        _, best = _maximise(problem, v[part, None, :].astype(np.float64), max(steps, 2))
+        starts = np.concatenate([v[part, None, :], _starts(problem)], axis=1)
+        _, best = _maximise(problem, starts, steps)
         u = _normalised(problem.g + (problem.b @ best[:, :, None])[:, :, 0])
         best = _normalised(problem.h + (u[:, None, :] @ problem.b)[:, 0, :])
         x = p + s * _normalised((u[:, None, :] @ d)[:, 0, :])
