@@ -13,6 +13,8 @@ DEFAULT_SIZE = 640
 RETRY_SIZE = 320
 # Added on each side as a share of that side, for crops so tight that the head fills them.
 RETRY_BORDER = 0.4
+# Of the five points of a face, in canvas pixels.
+_LEAST_SPREAD = 1.0
 
 Size = tuple[int, int]  # height, width
 
@@ -131,11 +133,21 @@ def faces_from_candidates(
     overlap: float,
     scale: float,
 ) -> list[Face]:
-    """Join the candidates of all strides, suppress duplicates, return to image pixels."""
+    """Join the candidates of all strides, suppress duplicates, return to image pixels.
+
+    Candidates that are not finite, empty, or whose points coincide are dropped.
+    """
     all_boxes, all_scores = np.concatenate(boxes), np.concatenate(scores)
     all_points = np.concatenate(keypoints)
-    finite = np.isfinite(all_boxes).all(axis=1) & np.isfinite(all_points).all(axis=(1, 2))
-    all_boxes, all_scores, all_points = all_boxes[finite], all_scores[finite], all_points[finite]
+    # A wild regression must not reach the alignment, which divides by the spread of the points.
+    with np.errstate(invalid="ignore", over="ignore"):
+        sound = (
+            np.isfinite(all_boxes).all(axis=1)
+            & np.isfinite(all_points).all(axis=(1, 2))
+            & (all_boxes[:, 2:] > all_boxes[:, :2]).all(axis=1)
+            & (np.ptp(all_points, axis=1).max(axis=1) > _LEAST_SPREAD)
+        )
+    all_boxes, all_scores, all_points = all_boxes[sound], all_scores[sound], all_points[sound]
     kept = non_maximum_suppression(all_boxes, all_scores, threshold=overlap)
     return [
         Face(

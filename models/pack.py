@@ -362,7 +362,12 @@ def _locate(path: Path) -> tuple[_Location, PackFile]:
     if not path.is_dir():
         raise PackError(f"{path} does not exist; name a folder of .onnx files or one embedder.")
     for folder in (path, path / path.resolve().name):
-        files = sorted(f for f in folder.glob("*") if f.suffix.lower() == _SUFFIX and f.is_file())
+        # Hidden files are leftovers of archives ("._model.onnx" of macOS).
+        files = sorted(
+            file
+            for file in folder.glob("[!.]*")
+            if file.suffix.lower() == _SUFFIX and file.is_file()
+        )
         if files:
             return _Location(path.resolve().name, folder, files), read_pack_file(folder)
     raise PackError(f"{path} has no .onnx files; put the weights of a pack there.")

@@ -110,10 +110,15 @@ def test_scrfd_refuses_outputs_that_do_not_fit_the_canvas():
         Scrfd(session, input_name="x").detect_once(np.zeros((9, 9, 3), np.uint8), (64, 64))
 
 
-def test_scrfd_drops_candidates_that_are_not_finite():
+@pytest.mark.parametrize(
+    ("output", "value"), [(6, np.inf), (6, np.nan), (6, -1.0), (0, 0.0), (0, -np.inf)]
+)
+def test_scrfd_drops_candidates_that_no_face_can_be(output, value):
+    """Boxes (6) that are endless or empty, points (0) that coincide or are endless."""
+
     def answer(blob, outputs):
         arrays = scrfd_answer([(8, 1, 1, 0, 0.9)])(blob, outputs)
-        arrays[6][:] = np.inf
+        arrays[output][:] = value
         return arrays
 
     detector = Scrfd(Replay(answer), input_name="x")

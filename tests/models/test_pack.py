@@ -70,6 +70,11 @@ def test_no_pack_there(tmp_path, missing):
         ModelPack.load(tmp_path / missing)
 
 
+def test_hidden_leftovers_are_not_part_of_a_pack(tmp_path):
+    folder = write_pack(tmp_path, emb=pooling_embedder(), **{"._emb": b"resource fork"})
+    assert ModelPack.load(folder).info.embedder_file == "emb.onnx"
+
+
 def test_two_embedders_are_named(tmp_path):
     folder = write_pack(tmp_path, one=pooling_embedder(), two=pooling_embedder(128))
     with pytest.raises(PackError, match=r"2 embedders: one\.onnx and two\.onnx; leave one"):
