@@ -21,7 +21,7 @@ FLOAT32_TOLERANCE = 1e-5
 # Directions closer than this to the span of the others, relative to their own length, are noise
 # of float32 inputs rather than directions.
 _LEAST_PIVOT = 1e-5
-_TILE_BYTES = 64 << 20
+_TILE_BYTES = 16 << 20
 
 Floats = NDArray[np.float32] | NDArray[np.float64]
 
