@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from api.cli.console import emit, message, progress, say, show, table, warn_of_demo_model
+from api.cli.console import demo_notice, emit, message, progress, say, show, table
 from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, extract
 from api.cli.errors import CommandError, UsageError
 from api.cli.files import read_bounded, read_names
@@ -14,7 +14,6 @@ from api.cli.options import AsJson, takes_settings
 from api.opening import file_sealer, open_keyring
 from api.preparation import acquired, acquired_json, calibrate_folder
 from api.settings import Settings
-from models.demo import DEMO_NOTICE
 from templates.contract import Calibration, Contract, Rate
 from templates.decoys import load_source
 from templates.distances import Metric
@@ -156,12 +155,12 @@ def calibrate(
     path = out or settings.resolved_contract_file
     path.parent.mkdir(parents=True, exist_ok=True)
     done.contract.save(path, sealer)
-    demo = warn_of_demo_model(pack.info.embedder_sha256)
+    notice = demo_notice(pack.info.embedder_sha256, n=pack.info.n)
     if as_json:
         emit(
             {
                 "out": str(path),
-                **({"notice": DEMO_NOTICE} if demo else {}),
+                **notice,
                 "contract": done.contract.public(),
                 "failure_to_acquire": acquired_json(extraction),
                 **_report_json(done.report),

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from models.demo import DEMO_NOTICE, is_demo_model
+from models.demo import DEMO_DIMENSION, DEMO_NOTICE, is_demo_model
 
 Advance = Callable[[int], None]
 
@@ -49,12 +49,15 @@ def show(*tables: Table) -> None:
         console.print(each)
 
 
-def warn_of_demo_model(embedder_sha256: str) -> bool:
-    """Say so where the embedder is the demo model; returns whether it is."""
-    if not is_demo_model(embedder_sha256):
-        return False
+def demo_notice(embedder_sha256: str, *, n: int) -> dict[str, str]:
+    """Say so on stderr where the embedder is the demo model; the same as a part of JSON.
+
+    ``n`` is its dimension: a model of another one is not compared, which takes a second.
+    """
+    if n != DEMO_DIMENSION or not is_demo_model(embedder_sha256):
+        return {}
     message(f"note: {DEMO_NOTICE}")
-    return True
+    return {"notice": DEMO_NOTICE}
 
 
 @contextmanager

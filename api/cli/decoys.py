@@ -7,7 +7,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from api.cli.console import emit, message, say, warn_of_demo_model
+from api.cli.console import demo_notice, emit, message, say
 from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, extract
 from api.cli.errors import CommandError
 from api.cli.fairface import label_files, read_labels
@@ -110,7 +110,7 @@ def build(
         source.save(path)
     else:
         source.save(path, file_sealer(open_keyring(settings)))
-    warn_of_demo_model(pack.info.embedder_sha256)
+    notice = demo_notice(pack.info.embedder_sha256, n=pack.info.n)
     labelled = attributes is not None and kind is Kind.POOL
     if as_json:
         emit(
@@ -123,6 +123,7 @@ def build(
                 "labelled": labelled,
                 "left_out": left_out,
                 "failure_to_acquire": acquired_json(extraction),
+                **notice,
             }
         )
         return

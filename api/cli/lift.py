@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from api.cli.console import emit, say, warn_of_demo_model
+from api.cli.console import demo_notice, emit, say
 from api.cli.errors import CommandError, UsageError
 from api.cli.files import read_bounded, write_private
 from api.cli.options import AsJson
@@ -114,7 +114,7 @@ def lift(
             descriptor[None], strategy=binding.strategy, m=m, source=source, stream=stream
         )
     data = wire.encode(batch[0], contract_id=binding.contract_id)
-    warn_of_demo_model(info.embedder_sha256)
+    notice = demo_notice(info.embedder_sha256, n=info.n)
     if str(out) == "-":
         emit({"template": base64.b64encode(data).decode("ascii")})
         return
@@ -126,6 +126,7 @@ def lift(
         "m": m,
         "photos": len(photos),
         "contract_id": binding.contract_id,
+        **notice,
     }
     if as_json:
         emit(facts)

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from api.cli.console import emit, say, show, table, warn_of_demo_model
+from api.cli.console import demo_notice, emit, say, show, table
 from api.cli.options import AsJson
 from models.errors import ModelError
 from models.pack import ModelPack
@@ -84,4 +84,4 @@ def inspect(
             say(f"Usable: {info.n} numbers per descriptor, {detector}.")
     if info is None:
         raise typer.Exit(1)
-    warn_of_demo_model(info.embedder_sha256)
+    demo_notice(info.embedder_sha256, n=info.n)

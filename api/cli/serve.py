@@ -7,7 +7,7 @@ import typer
 import uvicorn
 
 from api.app import uvicorn_options
-from api.cli.console import message, say, warn_of_demo_model
+from api.cli.console import demo_notice, message, say
 from api.cli.errors import CommandError
 from api.cli.options import takes_settings
 from api.runtime import Runtime, bootstrap_token
@@ -38,13 +38,13 @@ def serve(
     """
     runtime = Runtime.open(settings)
     try:
-        embedder = runtime.contract.binding.embedder_sha256
+        binding = runtime.contract.binding
         token = None
         if not check:
             token = bootstrap_token(runtime.store, settings)
     finally:
         runtime.close()
-    if warn_of_demo_model(embedder) and not settings.demo:
+    if demo_notice(binding.embedder_sha256, n=binding.n) and not settings.demo:
         settings = settings.model_copy(update={"demo": True})
     if check:
         say("Everything fits: contract, decoys, pack, database and master key.")

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from api.cli.console import emit, say, warn_of_demo_model
+from api.cli.console import demo_notice, emit, say
 from api.cli.errors import CommandError, UsageError
 from api.cli.files import read_bounded
 from api.cli.options import LOCAL, AsJson, Tenant, takes_settings
@@ -86,7 +86,8 @@ def enroll(
         stored = runtime.put(
             name, subject, epoch, enrollment, source=Source.PHOTOS, photos=len(photos)
         )
-        warn_of_demo_model(runtime.contract.binding.embedder_sha256)
+        binding = runtime.contract.binding
+        notice = demo_notice(binding.embedder_sha256, n=binding.n)
     finally:
         runtime.close()
     if as_json:
@@ -98,6 +99,7 @@ def enroll(
                 "contract_id": enrollment.contract_id,
                 "replaced": not stored.created,
                 "photos": len(photos),
+                **notice,
             }
         )
     else:
@@ -141,7 +143,8 @@ def verify(
             )
         except ModelError as error:
             raise CommandError(f"{photo.name}: {error}") from None
-        warn_of_demo_model(runtime.contract.binding.embedder_sha256)
+        binding = runtime.contract.binding
+        notice = demo_notice(binding.embedder_sha256, n=binding.n)
     finally:
         runtime.close()
     answer: dict[str, Any] = {
@@ -151,6 +154,7 @@ def verify(
         "fmr": decision.fmr,
         "contract_id": decision.contract_id,
         "calibration_id": decision.calibration_id,
+        **notice,
     }
     if as_json:
         emit(answer)

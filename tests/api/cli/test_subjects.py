@@ -16,6 +16,7 @@ def test_enroll_then_accept_and_reject(world, veilface):
     assert own.json["fmr"] == 0.01
     assert own.json["contract_id"] == world.calibrated["contract"]["contract_id"]
     assert "distance" not in own.json
+    assert own.json["notice"] == enrolled.json["notice"] == DEMO_NOTICE
     assert DEMO_NOTICE in own.stderr
 
     other = veilface("verify", "ann", *world.photos(2, range(1)), "--pack", world.pack)
