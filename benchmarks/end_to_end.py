@@ -31,10 +31,12 @@ import numpy as np
 import numpy.typing as npt
 
 from benchmarks.deployment import database, service, veilface
+from models.cache import EmbeddingCache
 from models.extraction import Extractor
 from models.pack import FacePolicy, ModelPack
 from templates.decoys import DecoyGenerator
 from templates.lifting import Strategy, lift
+from templates.sealing import KeyringSealer, MasterKeyring
 from templates.wire import encode
 from verify.datasets import labelled_folder
 from verify.metrics import wilson
@@ -196,7 +198,7 @@ def attempt_all(
                 f"/v1/subjects/{person.name}/enrollment",
                 json={"template": lifting.template(person.enroll, lifting.m)},
             )
-        return enroll_photos(client, person, attributes and attributes[person.name])
+        return enroll_photos(client, person, attributes[person.name] if attributes else None)
 
     def verify(attempt: tuple[str, Path]) -> httpx.Response:
         subject, photo = attempt
@@ -221,7 +223,13 @@ def attempt_all(
 
 
 def raw_outcome(
-    pack: ModelPack, people: Sequence[Person], calibration: Path, *, fmr: float, impostors: int
+    pack: ModelPack,
+    people: Sequence[Person],
+    calibration: Path,
+    *,
+    fmr: float,
+    impostors: int,
+    cache: EmbeddingCache | None,
 ) -> dict[str, object]:
     """The same attempts with raw descriptors and a cosine threshold at the same FMR target.
 
@@ -231,7 +239,7 @@ def raw_outcome(
     names = {person.name for person in people}
     faces = labelled_folder(calibration)
     keep = [i for i, name in enumerate(faces.identities) if name not in names]
-    crops = Extractor(pack).extract([faces.paths[i] for i in keep], aligned=True)
+    crops = Extractor(pack, aligned=True, cache=cache).extract([faces.paths[i] for i in keep])
     identity = np.unique([faces.identities[i] for i in keep], return_inverse=True)[1]
     cosines = crops.descriptors @ crops.descriptors.T
     impostor = cosines[np.triu(identity[:, None] != identity[None, :], k=1)]
@@ -260,12 +268,17 @@ def raw_outcome(
 
 
 def predicted_attributes(
-    pack: ModelPack, people: Sequence[Person], fairface: Path, neighbours: int = 10
+    pack: ModelPack,
+    people: Sequence[Person],
+    fairface: Path,
+    *,
+    cache: EmbeddingCache | None,
+    neighbours: int = 10,
 ) -> dict[str, dict[str, str]]:
     """Gender and race of every person by K-NN of their enrollment photos on FairFace labels."""
     with (fairface / "fairface_label_train.csv").open(newline="") as table:
         labels = {row["file"]: row for row in csv.DictReader(table)}
-    gallery = Extractor(pack).extract([fairface / name for name in labels])
+    gallery = Extractor(pack, cache=cache).extract([fairface / name for name in labels])
     rows = [labels[str(path.relative_to(fairface))] for path in gallery.paths]
     predicted: dict[str, dict[str, str]] = {}
     for person in people:
@@ -347,9 +360,11 @@ def main() -> None:
             )
         )["token"]
         pack = ModelPack.load(args.pack)
+        keyring = MasterKeyring.load(Path(env["VEILFACE_MASTER_KEY_FILE"]))
+        cache = EmbeddingCache.open_file(args.cache, KeyringSealer(keyring)) if args.cache else None
         people = people_of(args.data / "lfw" / "photos")
         attributes = (
-            predicted_attributes(pack, people, args.data / "fairface")
+            predicted_attributes(pack, people, args.data / "fairface", cache=cache)
             if args.strategy == "hybrid+"
             else None
         )
@@ -383,7 +398,12 @@ def main() -> None:
             "workers": args.workers,
             "service": outcome.summary(),
             "raw": raw_outcome(
-                pack, people, args.data / "lfw" / "aligned112", fmr=target, impostors=args.impostors
+                pack,
+                people,
+                args.data / "lfw" / "aligned112",
+                fmr=target,
+                impostors=args.impostors,
+                cache=cache,
             ),
             "seconds": {
                 "decoys_and_calibration": round(prepared - started, 1),

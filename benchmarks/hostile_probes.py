@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from models.cache import EmbeddingCache
 from models.extraction import Extractor
 from models.pack import ModelPack
 from templates.contract import Binding, Calibration, Contract, Level
@@ -30,6 +31,7 @@ from templates.distances import paired_distances, pairwise_distances, similarity
 from templates.lifting import Strategy, lift
 from templates.randomness import Keystream
 from templates.rotation import ROTATION_VERSION, tenant_rotation
+from templates.sealing import KeyringSealer, MasterKeyring
 from templates.subspace import AffineSubspace, SubspaceBatch
 from verify import CalibrationOptions, calibrate, labelled_folder
 from verify.cohort import cohort_statistics
@@ -242,15 +244,21 @@ def main() -> None:
     parser.add_argument("--dims", default="4,8", help="template and probe dimensions, s-to-s")
     parser.add_argument("--thief-dims", default="16,32", help="template dimensions, p-to-s")
     parser.add_argument("--level", default="fmr-1e-2")
+    parser.add_argument("--cache", type=Path, help="sealed embeddings of an earlier run")
+    parser.add_argument("--master-key", type=Path, help="the key file that the cache belongs to")
     args = parser.parse_args()
+    cache = None
+    if args.cache and args.master_key:
+        keyring = MasterKeyring.load(args.master_key)
+        cache = EmbeddingCache.open_file(args.cache, KeyringSealer(keyring))
     pack = ModelPack.load(args.pack or args.data / "packs" / "w600k_mbf")
     crops = labelled_folder(args.data / "lfw" / "aligned112")
     lfw = Faces(
-        Extractor(pack).extract(list(crops.paths), aligned=True).descriptors,
+        Extractor(pack, aligned=True, cache=cache).extract(crops.paths).descriptors,
         np.array(crops.identities),
     )
     fairface = (
-        Extractor(pack)
+        Extractor(pack, cache=cache)
         .extract(sorted((args.data / "fairface" / "train").glob("*.jpg")))
         .descriptors
     )

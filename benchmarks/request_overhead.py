@@ -16,22 +16,24 @@ import json
 import os
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from statistics import median
-from typing import TypeVar
+from typing import ParamSpec, TypeVar
 
 import httpx
 import numpy as np
+import numpy.typing as npt
 
 from api.runtime import Runtime
 from api.settings import load_settings
 from benchmarks.deployment import service, veilface
-from benchmarks.end_to_end import enroll_photos, people_of, verify_photo
+from benchmarks.end_to_end import Person, enroll_photos, people_of, verify_photo
 from models.decoding import decode_image
 from models.pack import ModelPack
 
+P = ParamSpec("P")
 T = TypeVar("T")
 
 
@@ -41,10 +43,10 @@ class Clock:
     def __init__(self) -> None:
         self.steps: dict[str, list[float]] = {}
 
-    def time(self, step: str, call: Callable[[], T]) -> T:
+    def time(self, step: str, call: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
         """Run ``call`` and book its time under ``step``."""
         started = time.perf_counter()
-        result = call()
+        result = call(*args, **kwargs)
         self.steps.setdefault(step, []).append(1000 * (time.perf_counter() - started))
         return result
 
@@ -94,18 +96,12 @@ def main() -> None:
             person, photo = attempts[turn % len(attempts)]
             image = decode_image(photo.read_bytes())
 
-            def bare(picture: np.ndarray = image) -> object:
-                face = max(pack.detect(picture), key=lambda found: found.area)
-                return pack.embed(pack.align(picture, face)[None])
-
-            def ask(name: str = person.name, probe: Path = photo) -> object:
-                return verify_photo(client, name, probe, "fmr-1e-3").raise_for_status()
-
             if turn < 0:
-                bare(), ask()
+                bare_inference(pack, image)
+                request(client, person, photo)
                 continue
-            clock.time("bare inference", bare)
-            clock.time("request", ask)
+            clock.time("bare inference", bare_inference, pack, image)
+            clock.time("request", request, client, person, photo)
         os.environ.update(settings)
         steps = steps_of(Runtime.open(load_settings()), pack, attempts, args.rounds)
     totals = clock.medians()
@@ -124,28 +120,36 @@ def main() -> None:
     print(json.dumps(report, indent=2))
 
 
+def bare_inference(pack: ModelPack, image: npt.NDArray[np.uint8]) -> None:
+    """Detect, align and embed one decoded photo."""
+    face = max(pack.detect(image), key=lambda found: found.area)
+    pack.embed(pack.align(image, face)[None])
+
+
+def request(client: httpx.Client, person: Person, photo: Path) -> None:
+    """Verify one photo over HTTP."""
+    verify_photo(client, person.name, photo, "fmr-1e-3").raise_for_status()
+
+
 def steps_of(
-    runtime: Runtime, pack: ModelPack, attempts: list[tuple[object, Path]], rounds: int
+    runtime: Runtime, pack: ModelPack, attempts: Sequence[tuple[Person, Path]], rounds: int
 ) -> dict[str, float]:
     """Median milliseconds of every step of a request, run one by one in this process."""
     clock = Clock()
     tenant = runtime.settings.default_tenant
-    ours = runtime.of(tenant)
+    verifier = runtime.verifier(tenant, runtime.epoch(tenant))
     for turn in range(rounds):
         person, photo = attempts[turn % len(attempts)]
         data = photo.read_bytes()
-        image = clock.time("decode the photo", lambda d=data: decode_image(d))
-        faces = clock.time("detect", lambda i=image: pack.detect(i))
+        image = clock.time("decode the photo", decode_image, data)
+        faces = clock.time("detect", pack.detect, image)
         face = max(faces, key=lambda found: found.area)
-        crop = clock.time("align", lambda i=image, f=face: pack.align(i, f))
-        embedding = clock.time("embed", lambda c=crop: pack.embed(c[None])[0])
-        name = person.name  # type: ignore[attr-defined]
-        found = clock.time("fetch and decrypt", lambda n=name: runtime.store.get(tenant, n))
-        assert found is not None
-        clock.time(
-            "compare and decide",
-            lambda e=embedding, w=found.wire: ours.verifier.decide_embedding(e, w),
-        )
+        crop = clock.time("align", pack.align, image, face)
+        embedding = clock.time("embed", pack.embed, crop[None])[0]
+        found = clock.time("fetch and decrypt", runtime.store.get, tenant, person.name)
+        if found is None:
+            raise SystemExit(f"{person.name} is not enrolled")
+        clock.time("compare and decide", verifier.decide_embedding, embedding, found.wire)
     runtime.close()
     return clock.medians()
 
