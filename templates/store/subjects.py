@@ -183,8 +183,18 @@ class Subjects:
             self._database.purge_log()
         return StoredTemplate(template_id=template_id, created=created)
 
-    def get(self, tenant: str, subject_id: str) -> SubjectTemplate | None:
+    def get(
+        self, tenant: str, subject_id: str, *, contract_id: str | None = None
+    ) -> SubjectTemplate | None:
         """Return a subject with its decrypted template, or None.
+
+        Parameters
+        ----------
+        tenant, subject_id
+            Whose it is.
+        contract_id
+            If given, a template of another contract is as good as none: nothing of it is read or
+            decrypted, so that it costs what a subject costs that does not exist.
 
         Raises
         ------
@@ -204,6 +214,8 @@ class Subjects:
             .join(TenantRow, TenantRow.id == SubjectRow.tenant_id)
             .where(TenantRow.name == tenant, SubjectRow.subject_id == subject_id)
         )
+        if contract_id is not None:
+            query = query.where(TemplateRow.contract_id == contract_id)
         row = self._database.read(lambda each: each.execute(query).one_or_none())
         if row is None:
             return None

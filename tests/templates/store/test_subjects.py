@@ -310,3 +310,14 @@ def test_a_cursor_shows_nothing_and_cannot_be_made(store: TemplateStore) -> None
     for limit in (0, -1, 1001):
         with pytest.raises(InvalidIdentifier, match="limit"):
             store.list("default", limit=limit)
+
+
+def test_a_template_of_another_contract_is_as_good_as_none(
+    store: TemplateStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    put(store, "ada", b"wire")
+    found = store.get("default", "ada", contract_id=CONTRACT)
+    assert found is not None
+    assert found.wire == b"wire"
+    monkeypatch.setattr(store._keyring, "open", None)  # nothing may be decrypted
+    assert store.get("default", "ada", contract_id="d" * 64) is None
