@@ -28,6 +28,7 @@ from api.opening import (
     try_inference,
 )
 from api.settings import Settings
+from api.stand_ins import STAND_IN_SECRET, StandIns
 from api.transfer import Exported, ExportKey, seal_export
 from enroll import Enroller, Enrollment
 from enroll.enroller import WIRE_DTYPE
@@ -36,13 +37,12 @@ from models.pack import ModelPack
 from templates import wire
 from templates.contract import Contract
 from templates.decoys import Attributes, DecoyGenerator, DecoyPool
-from templates.errors import DecoyError, SealError
+from templates.errors import DecoyError
 from templates.lifting import Strategy
 from templates.randomness import Keystream
 from templates.rotation import tenant_rotation
 from templates.sealing import MasterKeyring
 from templates.store import TemplateStore
-from templates.store.envelope import Envelope, Owner, close_envelope, open_envelope
 from templates.store.subjects import Source, StoredTemplate
 from verify import Verifier
 
@@ -118,8 +118,9 @@ class Runtime:
     )
 
     def __post_init__(self) -> None:
-        self._nobody = Owner("", "stand-in", "", self.contract.contract_id, "", 0)
-        self._stand_in = self._close_stand_in()
+        self.stand_ins = StandIns(
+            self.contract, self.keyring, key=self.store.secrets.get(STAND_IN_SECRET)
+        )
 
     @classmethod
     def open(cls, settings: Settings) -> "Runtime":
@@ -262,20 +263,6 @@ class Runtime:
             wire=wire.encode(plain, contract_id=self.contract.contract_id, dtype="float32"),
         )
         return seal_export(exported, key=self.export_key, tenant=tenant)
-
-    def open_stand_in(self) -> bytes:
-        """Decrypt a template of nobody: the work that a stored one would have cost."""
-        try:
-            return open_envelope(self._stand_in, self._nobody, self.keyring)
-        except SealError:
-            # The master key that it was sealed with was retired since.
-            self._stand_in = self._close_stand_in()
-            return open_envelope(self._stand_in, self._nobody, self.keyring)
-
-    def _close_stand_in(self) -> Envelope:
-        contract = self.contract
-        plain = wire.encode(contract.cohort[0], contract_id=contract.contract_id, dtype=WIRE_DTYPE)
-        return close_envelope(plain, self._nobody, self.keyring)
 
     def close(self) -> None:
         """Let go of the database's connections."""

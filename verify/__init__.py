@@ -7,6 +7,7 @@ from verify.calibration import Calibrated, CalibrationReport, calibrate
 from verify.calibration_mode import CalibrationOptions
 from verify.datasets import DatasetError, LabelledFolder, labelled_folder, read_lfw_pairs
 from verify.decision import Decision
+from verify.stand_ins import StandIn, pick_stand_in
 from verify.verifier import Verifier
 
 __all__ = [
@@ -16,8 +17,10 @@ __all__ = [
     "DatasetError",
     "Decision",
     "LabelledFolder",
+    "StandIn",
     "Verifier",
     "calibrate",
     "labelled_folder",
+    "pick_stand_in",
     "read_lfw_pairs",
 ]

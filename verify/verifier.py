@@ -16,6 +16,7 @@ from templates.errors import ContractMismatch, InvalidTemplate
 from templates.subspace import AffineSubspace, SubspaceBatch
 from verify.cohort import Probes, cohort_statistics
 from verify.decision import Decision
+from verify.stand_ins import StandIn
 
 
 @dataclass(frozen=True)
@@ -55,23 +56,12 @@ class Verifier:
             )
         self._contract = contract
         self._rotation = rotation
-        self._stand_in = wire.encode(
-            contract.cohort[0].rotated(rotation), contract_id=contract.contract_id, dtype="float16"
-        )
-
-    @property
-    def stand_in(self) -> bytes:
-        """Wire bytes of a template of nobody, of the size that every stored template has.
-
-        Deciding against it, for a subject that does not exist, costs what a real one costs.
-        """
-        return self._stand_in
 
     def decide_photo(
         self,
         pack: ModelPack,
         photo: bytes,
-        stored: bytes | None,
+        stored: bytes | StandIn,
         *,
         level: str | None = None,
         policy: FacePolicy = FacePolicy.SINGLE,
@@ -97,7 +87,7 @@ class Verifier:
     def decide_embedding(
         self,
         embedding: NDArray[np.floating],
-        stored: bytes | None,
+        stored: bytes | StandIn,
         *,
         level: str | None = None,
         metric: Metric | None = None,
@@ -107,8 +97,8 @@ class Verifier:
         Parameters
         ----------
         stored
-            Wire bytes of the subject's template; None where the subject does not exist. The same
-            work is then done on a template of nobody, and the answer is a rejection.
+            Wire bytes of the subject's template; a :class:`StandIn` where the subject does not
+            exist. The same work is then done on it, and the answer is a rejection.
         level
             Name of a level; the contract's default where None.
         metric
@@ -132,7 +122,7 @@ class Verifier:
     def decide_template(
         self,
         probe: bytes,
-        stored: bytes | None,
+        stored: bytes | StandIn,
         *,
         level: str | None = None,
         metric: Metric | None = None,
@@ -172,20 +162,29 @@ class Verifier:
                 "lift a unit-norm descriptor with the contract's decoys"
             )
 
-    def _template(self, stored: bytes | None) -> SubspaceBatch:
+    def _template(self, stored: bytes | StandIn) -> SubspaceBatch:
         binding = self._contract.binding
-        data = self._stand_in if stored is None else stored
-        received = wire.decode(data)
+        received = wire.decode(stored.wire if isinstance(stored, StandIn) else stored)
         binding.require_contract(received.contract_id, what="the stored template")
         subspace = received.subspace
         if (subspace.n, subspace.m) != (binding.n, binding.m):
             raise InvalidTemplate("the stored template has dimensions other than the contract's")
+        if isinstance(stored, StandIn):
+            subspace = stored.mirrored(subspace)
         return SubspaceBatch.of([subspace])
 
-    def _decide(self, rule: _Rule, probe: Probes, turned: Probes, stored: bytes | None) -> Decision:
+    def _decide(
+        self, rule: _Rule, probe: Probes, turned: Probes, stored: bytes | StandIn
+    ) -> Decision:
         calibration, level = rule.calibration, rule.level
+        unknown = isinstance(stored, StandIn)
+        # A stand-in is not in the tenant's rotation, so neither is the probe: turning both leaves
+        # their distance as it is. The turned probe was computed in either case.
         distances = paired_distances(
-            turned, self._template(stored), metric=calibration.metric, steps=calibration.steps
+            probe if unknown else turned,
+            self._template(stored),
+            metric=calibration.metric,
+            steps=calibration.steps,
         )
         distance = float(distances[0])
         score = float(np.asarray(similarity(distances), dtype=np.float64)[0])
@@ -196,7 +195,8 @@ class Verifier:
         # Both tests are evaluated, and NaN fails either, so no input is accepted by an exception.
         similar = score >= level.similarity_threshold
         singular = cohort_score >= level.cohort_threshold
-        accepted = bool(similar and singular and stored is not None)
+        # The cohort test of a member of the cohort is no independent one: never accept by it.
+        accepted = bool(similar and singular and not unknown)
         return Decision(
             accepted=accepted,
             reason="match" if accepted else "no_match",

@@ -15,11 +15,12 @@ from api.openapi import BODY, EVERY_CALL, PHOTO, VERIFY_BODY, error_responses
 from api.runtime import Runtime
 from api.schemas import VerifyAnswer
 from api.values import embedding_of, face_policy, one_of
-from verify import Decision, Verifier
+from templates.errors import ContractMismatch
+from verify import Decision, StandIn, Verifier
 
 router = APIRouter(prefix="/v1/subjects", tags=["subjects"])
 
-Decide = Callable[[Verifier, bytes | None], Decision]
+Decide = Callable[[Verifier, bytes | StandIn], Decision]
 
 CODES = (
     *EVERY_CALL,
@@ -51,8 +52,9 @@ async def verify(
     """Rights: `verify`, and `embeddings` for a probe that is no photo.
 
     A subject that does not exist is answered as one that does not match, in the same shape and
-    with the same work; only keys with `enroll` or `admin` are told `not_enrolled`. The distance
-    is returned only to keys with `scores`.
+    with the same work, and so is one that was enrolled under another contract; only keys with
+    `enroll` or `admin` are told `not_enrolled` or `contract_mismatch`. The distance is returned
+    only to keys with `scores`.
     """
     query = query_of(request, ("level", "face"))
     async with gate.admitted():
@@ -91,7 +93,7 @@ async def _photo_probe(request: Request, runtime: Runtime, query: dict[str, str]
     level = one_of(form.fields, query, "level")
     policy = face_policy(one_of(form.fields, query, "face"))
 
-    def decide(verifier: Verifier, stored: bytes | None) -> Decision:
+    def decide(verifier: Verifier, stored: bytes | StandIn) -> Decision:
         return verifier.decide_photo(
             pack, photo, stored, level=level, policy=policy, limits=runtime.image_limits
         )
@@ -125,10 +127,24 @@ async def _sent_probe(
 def _decide(runtime: Runtime, caller: Caller, subject: str, decide: Decide) -> Decision:
     # Asked for in either case, so that a subject that does not exist costs no further query.
     epoch = runtime.epoch(caller.tenant)
-    found = runtime.store.get(caller.tenant, subject)
+    contract_id = runtime.contract.contract_id
+    found = runtime.store.get(caller.tenant, subject, contract_id=contract_id)
     if found is None:
         if caller.sees_enrollment:
-            raise ApiError("not_enrolled", "the tenant has no such subject")
-        runtime.open_stand_in()
-        return decide(runtime.verifier(caller.tenant, epoch), None)
+            raise _why_not(runtime, caller.tenant, subject)
+        stand_in = runtime.stand_ins.open(caller.tenant, subject)
+        return decide(runtime.verifier(caller.tenant, epoch), stand_in)
     return decide(runtime.verifier(caller.tenant, found.record.rotation_epoch), found.wire)
+
+
+def _why_not(runtime: Runtime, tenant: str, subject: str) -> Exception:
+    """Say why there is no template to decide by, to a key that may know who is enrolled."""
+    record = runtime.store.describe(tenant, subject)
+    if record is None:
+        return ApiError("not_enrolled", "the tenant has no such subject")
+    try:
+        runtime.contract.binding.require_contract(record.contract_id, what="the stored template")
+    except ContractMismatch as error:
+        return error
+    # It was enrolled between the two looks.
+    return ApiError("not_enrolled", "the tenant had no such subject a moment ago; send it again")

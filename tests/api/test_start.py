@@ -12,6 +12,7 @@ from api.app import create_app
 from api.errors import StartError
 from api.opening import database_in_use, file_sealer, open_keyring, try_inference
 from api.runtime import Runtime
+from api.schemas import VerifyAnswer
 from api.settings import Settings
 from models.pack import ModelPack
 from templates.decoys import DecoyGenerator
@@ -27,7 +28,7 @@ from tests.api.deployment import (
     unit,
     write_pack,
 )
-from tests.api.shapes import assert_error
+from tests.api.shapes import assert_answer, assert_error
 from tests.api.test_enrollment import b64, lifted
 
 
@@ -232,6 +233,20 @@ def test_a_template_of_an_older_contract_is_refused(fresh: Deployment) -> None:
     with Client(create_app(fresh.settings), headers=bearer(fresh.token)) as client:
         probe = client.post("/v1/subjects/a/verify", files=images(photo(1), name="image"))
         assert_error(probe, 409, "contract_mismatch")
+        # A key that may not know who is enrolled is answered as for a subject that does not exist.
+        blind = bearer(fresh.key("verify"))
+        answers = []
+        for subject in ("a", "nobody"):
+            answer = client.post(
+                f"/v1/subjects/{subject}/verify",
+                files=images(photo(1), name="image"),
+                headers=blind,
+            )
+            body = assert_answer(answer, 200, VerifyAnswer)
+            del body["request_id"]
+            answers.append(body)
+        assert answers[0] == answers[1]
+        assert (answers[0]["decision"], answers[0]["reason"]) == ("reject", "no_match")
         assert_error(client.get("/v1/subjects/a/export"), 409, "contract_mismatch")
         assert client.get("/v1/subjects/a").json()["current"] is False
         put = client.put("/v1/subjects/a/enrollment", files=images(photo(1)))

@@ -1,4 +1,5 @@
 import math
+import os
 from pathlib import Path
 from typing import Any
 
@@ -7,6 +8,7 @@ import pytest
 
 from api.app import create_app
 from api.schemas import VerifyAnswer
+from api.stand_ins import StandIns
 from templates import wire
 from templates.lifting import Strategy, lift
 from templates.randomness import Keystream
@@ -145,6 +147,27 @@ def test_distance_only_with_the_right_to_scores(
         )
         assert set(body) == PRODUCT_KEYS | {"distance"}
         assert 0 < body["distance"] <= 2
+
+
+def test_distances_do_not_tell_who_is_unknown(client: Client, deployment: Deployment) -> None:
+    rights = ("verify", "scores", "embeddings")
+    descriptor = embedding(client, 2)
+
+    def distance(subject: str, tenant: str = "default") -> float:
+        scored = deployment.key(*rights, tenant=tenant)
+        answer = ask(client, scored, subject, json={"embedding": descriptor})
+        return float(assert_answer(answer, 200, VerifyAnswer)["distance"])
+
+    distances = [distance(f"unknown-{i}") for i in range(8)]
+    assert len(set(distances)) == 8
+    assert distances[0] == distance("unknown-0")
+    # Other tenants and other deployments give the same name another stand-in.
+    assert distance("unknown-0", tenant="elsewhere") != distances[0]
+    other = StandIns(
+        deployment.contract, client.app.state.runtime.keyring, key=os.urandom(32)
+    ).open("default", "unknown-0")
+    own = client.app.state.runtime.stand_ins.open("default", "unknown-0")
+    assert (other.mirror != own.mirror).any()
 
 
 def test_embeddings_and_lifted_probes(client: Client, sender: str, deployment: Deployment) -> None:

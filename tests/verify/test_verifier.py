@@ -1,6 +1,7 @@
 """Decisions against brute force, hostile probes, and subjects that do not exist."""
 
 import dataclasses
+import hashlib
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -15,7 +16,7 @@ from templates.errors import ContractMismatch, InvalidEmbedding, InvalidTemplate
 from templates.lifting import lift
 from templates.subspace import AffineSubspace
 from tests.verify.synthetic import M, N, draw_people, make_generator, random_rotation, unit
-from verify import Calibrated, Decision, Verifier
+from verify import Calibrated, Decision, StandIn, Verifier, pick_stand_in
 
 NEW = draw_people(12, photos=(4,), seed=55)
 ROTATION = random_rotation()
@@ -47,6 +48,14 @@ def lifted(
         descriptor[None], strategy=contract.binding.strategy, m=m, source=make_generator()
     )[0]
     return wire.encode(template, contract_id=contract_id or contract.contract_id)
+
+
+def nobody(contract: Contract, number: int) -> StandIn:
+    """The stand-in of one unknown subject."""
+    digest = hashlib.sha256(f"unknown {number}".encode()).digest()
+    index, mirror = pick_stand_in(contract.cohort, digest)
+    plain = wire.encode(contract.cohort[index], contract_id=contract.contract_id, dtype="float16")
+    return StandIn(plain, mirror)
 
 
 def spherical(probe: NDArray[np.floating], template: AffineSubspace) -> float:
@@ -94,13 +103,14 @@ def test_either_test_alone_rejects(contract: Contract, stored: list[bytes], fail
 
 
 def test_unknown_subject_is_rejected_by_the_same_work(
-    verifier: Verifier, stored: list[bytes], monkeypatch: pytest.MonkeyPatch
+    contract: Contract, verifier: Verifier, stored: list[bytes]
 ) -> None:
     probe = NEW.descriptors[3]
     real = verifier.decide_embedding(probe, stored[0])
-    unknown = verifier.decide_embedding(probe, None)
+    stand_in = nobody(contract, 0)
+    unknown = verifier.decide_embedding(probe, stand_in)
     assert (unknown.accepted, unknown.reason) == (False, "no_match")
-    assert len(verifier.stand_in) == len(stored[0])
+    assert len(stand_in.wire) == len(stored[0])
     changed = {
         field.name
         for field in dataclasses.fields(Decision)
@@ -108,11 +118,51 @@ def test_unknown_subject_is_rejected_by_the_same_work(
     }
     assert changed == {"accepted", "reason", "similarity", "distance", "cohort_score"}
     # Even a probe that lies in the stand-in is rejected.
-    stand_in = wire.decode(verifier.stand_in).subspace.rotated(ROTATION.T)
-    inside = unit((stand_in.foot + stand_in.radius * stand_in.basis[0])[None])[0]
-    caught = verifier.decide_embedding(inside, None)
+    template = stand_in.mirrored(wire.decode(stand_in.wire).subspace)
+    template.validate(1e-3)
+    inside = unit((template.foot + template.radius * template.basis[0])[None])[0]
+    caught = verifier.decide_embedding(inside, stand_in)
     assert caught.similarity > 0.99
     assert not caught.accepted
+
+
+def test_unknown_subjects_keep_their_distances_and_differ(
+    contract: Contract, verifier: Verifier, stored: list[bytes]
+) -> None:
+    probe = NEW.descriptors[3]
+    more = 4 * len(contract.cohort)  # so many share a member of the cohort
+    distances = [
+        verifier.decide_embedding(probe, nobody(contract, i)).distance for i in range(more)
+    ]
+    again = [verifier.decide_embedding(probe, nobody(contract, i)).distance for i in range(5)]
+    assert again == distances[:5]
+    assert len(set(distances)) == more
+    # Brute force for one: the mirror image, computed by the matrix of the reflection.
+    stand_in = nobody(contract, 7)
+    template = wire.decode(stand_in.wire).subspace
+    u = stand_in.mirror.astype(np.float64)
+    turned = template.rotated(np.eye(N) - 2 * np.outer(u, u))
+    assert verifier.decide_embedding(probe, stand_in).similarity == pytest.approx(
+        spherical(probe, turned), abs=1e-5
+    )
+
+
+def test_distances_to_unknown_subjects_are_those_of_impostors(
+    contract: Contract, verifier: Verifier, stored: list[bytes]
+) -> None:
+    impostor, unknown = [], []
+    for i in range(12):
+        probe = NEW.descriptors[4 * i + 3]
+        impostor += [
+            verifier.decide_embedding(probe, stored[j]).distance for j in range(12) if j != i
+        ]
+        unknown += [
+            verifier.decide_embedding(probe, nobody(contract, 100 * i + j)).distance
+            for j in range(11)
+        ]
+    spread = np.std(impostor)
+    assert abs(np.mean(unknown) - np.mean(impostor)) < 0.5 * spread
+    assert 0.6 < np.std(unknown) / spread < 1.6
 
 
 @pytest.mark.parametrize(
@@ -164,7 +214,8 @@ def test_lifted_probes_are_decided(
     assert sum(decision.accepted for decision in impostor) <= 1
     expected = contract.calibration("s2s", None, 2).calibration_id
     assert {decision.calibration_id for decision in genuine} == {expected}
-    assert not verifier.decide_template(lifted(contract, NEW.descriptors[3]), None).accepted
+    unknown = verifier.decide_template(lifted(contract, NEW.descriptors[3]), nobody(contract, 1))
+    assert not unknown.accepted
 
 
 def test_lifted_probes_that_are_not_honest_are_refused(
