@@ -109,15 +109,27 @@ class SignedReceipt(_Shape):
     signature: str = Field(description="Ed25519 over the UTF-8 bytes of `body`, base64.")
 
 
+class ErasedItem(_Shape):
+    """Records of one kind that the erasure removed."""
+
+    item: Literal["template", "data_key", "metadata", "failed_attempts", "idempotency_records"]
+    count: int
+
+
 class ReceiptClaims(BaseModel):
     """What `body` says, for reading only: it is not signed in this form."""
 
-    model_config = ConfigDict(extra="allow")
+    model_config = ConfigDict(extra="forbid")
 
+    kind: Literal["veilface-erasure-receipt"]
+    version: Literal[1]
+    receipt_id: str = Field(description="Random; no two receipts share one.")
     tenant: str
     subject: str = Field(description="Pseudonym: HMAC of the subject id under a secret key.")
-    held: bool = Field(description="False: nothing was stored.")
-    erased_at: str
+    erased_at: str = Field(examples=["2026-01-31T12:00:00.000000+00:00"])
+    held: bool = Field(description="False: no template was stored.")
+    contract_id: str | None = Field(description="Of the template; null: none was held.")
+    erased: list[ErasedItem] = Field(description="Every kind of record, with what was removed.")
     signing_key: str = Field(description="`receipt_key.key_id` of GET /v1/contract.")
 
 

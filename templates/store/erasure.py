@@ -7,7 +7,7 @@ from sqlalchemy.engine import Connection
 
 from templates.store.database import Database
 from templates.store.identifiers import Clock, checked_subject_id
-from templates.store.receipts import Receipt, ReceiptSigner
+from templates.store.receipts import Erased, Receipt, ReceiptSigner
 from templates.store.schema import (
     FailedAttemptsRow,
     IdempotencyRow,
@@ -51,7 +51,8 @@ class Erasures:
 
         In one transaction: template, metadata, data key, failed attempts and idempotency records
         go, the receipt comes. Erasing again returns the receipt of the first time; erasing who
-        was never enrolled leaves a receipt that says nothing was held.
+        was never enrolled leaves a receipt that says nothing was held. The receipt counts what its
+        own call removed.
         """
         checked_subject_id(subject_id)
         pseudonym = self._signer.pseudonym(tenant, subject_id)
@@ -59,12 +60,15 @@ class Erasures:
 
         def work(connection: Connection) -> tuple[Receipt, bool]:
             tenant_id, _ = tenant_row(connection, tenant)
-            for table in (FailedAttemptsRow, IdempotencyRow):
-                connection.execute(
+            named_by_pseudonym = {
+                table: connection.execute(
                     sa.delete(table).where(
                         table.tenant_id == tenant_id, table.pseudonym == pseudonym
                     )
-                )
+                ).rowcount
+                for table in (FailedAttemptsRow, IdempotencyRow)
+            }
+            contract_id, templates, subjects = None, 0, 0
             subject_pk = subject_row_id(connection, tenant_id, subject_id)
             if subject_pk is None:
                 earlier = connection.execute(
@@ -76,14 +80,28 @@ class Erasures:
                 if earlier is not None:
                     return Receipt(earlier.body, earlier.signature), False
             else:
-                connection.execute(
+                contract_id = connection.execute(
+                    sa.select(TemplateRow.contract_id).where(TemplateRow.subject_pk == subject_pk)
+                ).scalar_one()
+                templates = connection.execute(
                     sa.delete(TemplateRow).where(TemplateRow.subject_pk == subject_pk)
-                )
-                connection.execute(sa.delete(SubjectRow).where(SubjectRow.id == subject_pk))
+                ).rowcount
+                subjects = connection.execute(
+                    sa.delete(SubjectRow).where(SubjectRow.id == subject_pk)
+                ).rowcount
             now = self._clock()
-            held = subject_pk is not None
             receipt = self._signer.sign(
-                tenant=tenant, pseudonym=pseudonym, held=held, erased_at=now
+                tenant=tenant,
+                pseudonym=pseudonym,
+                erased=Erased(
+                    contract_id=contract_id,
+                    template=templates,
+                    data_key=subjects,  # a column of the subject's row, with the metadata
+                    metadata=subjects,
+                    failed_attempts=named_by_pseudonym[FailedAttemptsRow],
+                    idempotency_records=named_by_pseudonym[IdempotencyRow],
+                ),
+                erased_at=now,
             )
             connection.execute(
                 sa.insert(ReceiptRow).values(
@@ -93,7 +111,7 @@ class Erasures:
                     created_at=now,
                 )
             )
-            return receipt, held
+            return receipt, subject_pk is not None
 
         receipt, erased = self._database.write(work, lock=subject_lock(tenant, subject_id))
         return Erasure(receipt=receipt, erased=erased, log_purged=self._database.purge_log())

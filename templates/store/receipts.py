@@ -1,7 +1,7 @@
 """Signed erasure receipts.
 
-A receipt is a canonical JSON text and its Ed25519 signature (RFC 8032). It names the subject by a
-pseudonym, HMAC-SHA256 of tenant and subject id under a key of the deployment: whoever holds the
+A receipt is a canonical JSON text (``templates.canonical``) and its Ed25519 signature (RFC 8032). It
+names the subject by a pseudonym, HMAC-SHA256 of tenant and subject id under a key of the deployment: whoever holds the
 subject id and asks the deployment can find the receipt, nobody else learns whom it is about.
 """
 
@@ -10,13 +10,15 @@ import binascii
 import hashlib
 import hmac
 import json
-from dataclasses import dataclass
+import uuid
+from dataclasses import dataclass, fields
 from datetime import datetime
 from typing import Any
 
 from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 
+from templates.canonical import canonical_json
 from templates.errors import StoreError
 from templates.sealing import encode_parts
 from templates.store.deployment import Secrets
@@ -29,13 +31,46 @@ _VERSION = 1
 
 
 @dataclass(frozen=True)
+class Erased:
+    """What one erasure removed, in numbers of records.
+
+    Attributes
+    ----------
+    contract_id
+        Contract of the template; None where there was none.
+    template, data_key, metadata
+        1 or 0: they come and go together.
+    failed_attempts, idempotency_records
+        Records that named the subject by its pseudonym.
+    """
+
+    contract_id: str | None
+    template: int
+    data_key: int
+    metadata: int
+    failed_attempts: int
+    idempotency_records: int
+
+    @property
+    def items(self) -> list[dict[str, Any]]:
+        """Every kind of record with its count, in the order above."""
+        return [
+            {"item": each.name, "count": getattr(self, each.name)}
+            for each in fields(self)
+            if each.name != "contract_id"
+        ]
+
+
+@dataclass(frozen=True)
 class Receipt:
     """Proof that a subject's data was erased, or that none was held.
 
     Attributes
     ----------
     body
-        Canonical JSON: kind, version, tenant, subject (pseudonym), held, erased_at, signing_key.
+        Canonical JSON: kind, version, receipt_id, tenant, subject (pseudonym), erased_at, held,
+        contract_id (null where nothing was held), erased (list of item and count), signing_key
+        (:func:`key_fingerprint`).
     signature
         64 bytes, Ed25519 over the UTF-8 bytes of `body`.
     """
@@ -87,23 +122,24 @@ class ReceiptSigner:
         """The 32 bytes that verify this deployment's receipts."""
         return self._private().public_key().public_bytes_raw()
 
-    def sign(self, *, tenant: str, pseudonym: str, held: bool, erased_at: datetime) -> Receipt:
-        """Write and sign a receipt."""
+    def sign(self, *, tenant: str, pseudonym: str, erased: Erased, erased_at: datetime) -> Receipt:
+        """Write and sign a receipt, with a random id of its own."""
         private = self._private()
-        body = json.dumps(
+        body = canonical_json(
             {
                 "kind": _KIND,
                 "version": _VERSION,
+                "receipt_id": uuid.uuid4().hex,
                 "tenant": tenant,
                 "subject": pseudonym,
-                "held": held,
                 "erased_at": erased_at.isoformat(),
+                "held": erased.contract_id is not None,
+                "contract_id": erased.contract_id,
+                "erased": erased.items,
                 "signing_key": key_fingerprint(private.public_key().public_bytes_raw()),
-            },
-            sort_keys=True,
-            separators=(",", ":"),
+            }
         )
-        return Receipt(body, private.sign(body.encode()))
+        return Receipt(body.decode(), private.sign(body))
 
     def _private(self) -> Ed25519PrivateKey:
         return Ed25519PrivateKey.from_private_bytes(self._secrets.get(RECEIPT_SECRET))

@@ -51,6 +51,9 @@ def test_erasing_leaves_a_receipt_that_verifies(both: tuple[Client, Deployment])
     assert claims == first["claims"]
     assert claims["held"] is True
     assert claims["signing_key"] == key["key_id"]
+    assert claims["contract_id"] == deployment.contract.contract_id
+    counts = {entry["item"]: entry["count"] for entry in claims["erased"]}
+    assert (counts["template"], counts["data_key"], counts["metadata"]) == (1, 1, 1)
     assert "gone" not in json.dumps(first)
     assert_error(client.get("/v1/subjects/gone"), 404, "not_enrolled")
     probe = client.post(

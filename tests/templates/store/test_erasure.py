@@ -1,5 +1,6 @@
 import json
 import random
+import re
 from datetime import datetime
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from templates.errors import StoreError
 from templates.sealing import MasterKeyring
 from templates.store import Claim, Receipt, TemplateStore, verify_receipt
 from templates.store.database import Database
+from templates.store.receipts import key_fingerprint
 from templates.store.schema import (
     Base,
     FailedAttemptsRow,
@@ -19,7 +21,7 @@ from templates.store.schema import (
     SubjectRow,
     TemplateRow,
 )
-from tests.templates.store.conftest import Clock, put
+from tests.templates.store.conftest import CONTRACT, Clock, put
 
 
 def count(database: Database, table: type[Base]) -> int:
@@ -57,6 +59,15 @@ def test_everything_about_the_subject_goes_at_once(
     for table in (SubjectRow, TemplateRow, IdempotencyRow, FailedAttemptsRow):
         assert count(database, table) == 1, table  # eve's
     assert store.get("default", "eve") is not None
+    claims = verify_receipt(erasure.receipt, store.receipt_public_key())
+    assert claims["contract_id"] == CONTRACT
+    assert claims["erased"] == [
+        {"item": "template", "count": 1},
+        {"item": "data_key", "count": 1},
+        {"item": "metadata", "count": 1},
+        {"item": "failed_attempts", "count": 1},
+        {"item": "idempotency_records", "count": 1},
+    ]
     database.close()
 
 
@@ -86,20 +97,33 @@ def test_erasing_who_was_never_enrolled_says_so(store: TemplateStore) -> None:
     erasure = store.erase("default", "nobody")
     assert not erasure.erased
     assert not erasure.receipt.held
+    assert erasure.receipt.claims["contract_id"] is None
+    assert {entry["count"] for entry in erasure.receipt.claims["erased"]} == {0}
     assert store.erase("default", "nobody").receipt == erasure.receipt
 
 
 def test_a_receipt_names_the_subject_by_its_pseudonym_only(
     store: TemplateStore, clock: Clock
 ) -> None:
-    put(store, "ada", b"wire")
-    receipt = store.erase("default", "ada").receipt
-    assert "ada" not in json.dumps(receipt.to_json())
+    put(store, "lovelace", b"wire")
+    receipt = store.erase("default", "lovelace").receipt
+    assert "lovelace" not in json.dumps(receipt.to_json())
     claims = verify_receipt(receipt, store.receipt_public_key())
-    assert claims["subject"] == store.pseudonym("default", "ada")
+    assert claims["subject"] == store.pseudonym("default", "lovelace")
     assert claims["tenant"] == "default"
     assert claims["held"] is True
     assert datetime.fromisoformat(claims["erased_at"]) == clock.time
+
+
+def test_a_receipt_has_an_id_and_a_canonical_body(store: TemplateStore) -> None:
+    receipts = [store.erase("default", name).receipt for name in ("ada", "eve")]
+    ids = {receipt.claims["receipt_id"] for receipt in receipts}
+    assert len(ids) == 2
+    assert all(re.fullmatch("[0-9a-f]{32}", each) for each in ids)
+    for receipt in receipts:
+        written = json.dumps(json.loads(receipt.body), sort_keys=True, separators=(",", ":"))
+        assert receipt.body == written
+        assert receipt.claims["signing_key"] == key_fingerprint(store.receipt_public_key())
 
 
 def test_a_receipt_is_plain_ed25519(store: TemplateStore) -> None:
