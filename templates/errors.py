@@ -12,9 +12,24 @@
     │   ├── ContractMismatch     a template, pack or decoy source of another contract
     │   └── Uncalibrated         no calibration for the requested mode, metric, dimension or level
     ├── SealError                a ciphertext that does not open, or a key that cannot be used
-    └── StoreError
-        ├── StoreUnavailable     the database does not answer
-        └── NotEnrolled          no such subject
+    ├── StoreError
+    │   ├── StoreUnavailable     the database does not answer
+    │   ├── NotEnrolled          no such subject
+    │   ├── InvalidIdentifier    a subject id, tenant name or cursor that breaks the rules [1]
+    │   ├── UnknownTenant        no tenant of this name [1]
+    │   └── IdempotencyConflict  a key that was used for another request, or still runs [2]
+    ├── EnrollmentError [3]
+    │   ├── PhotoRejected        one photo has no usable face
+    │   └── InconsistentImages   the photos do not show one and the same person
+    ├── DatasetError [4]         a dataset that cannot be read
+    ├── StartError [5]           the service or a command cannot start
+    ├── PreparationError [6]     decoys or a contract that cannot be made
+    └── CommandError [7]         a command that cannot be done
+        └── UsageError           wrong usage of a command
+
+Each is defined here, or next to what raises it: [1] ``templates.store.identifiers``,
+[2] ``templates.store.idempotency``, [3] ``enroll.errors``, [4] ``verify.datasets``,
+[5] ``api.errors``, [6] ``api.preparation``, [7] ``api.cli.errors``.
 
 Messages name the cause and the remedy. They never hold a number of a descriptor, a template or
 an image, nor a key.

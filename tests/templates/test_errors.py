@@ -1,0 +1,36 @@
+"""The tree in the docstring of ``templates.errors`` is the tree of classes."""
+
+import re
+from collections.abc import Iterator
+
+import api.cli
+import api.preparation  # noqa: F401
+import verify.datasets  # noqa: F401
+from templates import errors
+
+ROOMS = ("templates", "enroll", "verify", "api")
+
+
+def drawn(text: str) -> Iterator[tuple[str, str | None]]:
+    """Every class of the tree with the one it hangs from."""
+    above: list[str] = []
+    for line in text.splitlines():
+        found = re.match(r"    ([│├└─ ]*)([A-Z]\w+)", line)
+        if found is not None:
+            depth = len(found[1]) // 4
+            yield found[2], above[depth - 1] if depth else None
+            above[depth:] = [found[2]]
+
+
+def defined(kind: type[Exception]) -> Iterator[tuple[str, str | None]]:
+    """Every subclass that the rooms define, with its base."""
+    for child in kind.__subclasses__():
+        if child.__module__.split(".")[0] in ROOMS:
+            yield child.__name__, kind.__name__
+            yield from defined(child)
+
+
+def test_the_tree_is_true() -> None:
+    assert errors.__doc__ is not None
+    tree = sorted(drawn(errors.__doc__), key=str)
+    assert tree == sorted([("VeilfaceError", None), *defined(errors.VeilfaceError)], key=str)
