@@ -4,6 +4,7 @@ import logging
 import os
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from functools import partial
 from typing import Any
 
 import anyio.to_thread
@@ -15,6 +16,7 @@ from starlette.responses import Response
 from api.answers import error_answer
 from api.context import RequestContext
 from api.errors import ApiError, StartError, api_error
+from api.housekeeping import purge_regularly
 from api.limits import Gate
 from api.logging import configure, log, uvicorn_log_config
 from api.openapi import DESCRIPTION
@@ -52,7 +54,14 @@ def create_app(
             pack=None if runtime.pack is None else runtime.pack.info.name,
         )
         try:
-            yield
+            async with anyio.create_task_group() as tasks:
+                tasks.start_soon(
+                    partial(purge_regularly, runtime.store, every_s=settings.purge_interval_s)
+                )
+                try:
+                    yield
+                finally:
+                    tasks.cancel_scope.cancel()
         finally:
             await anyio.to_thread.run_sync(runtime.close)
             log("stopped", pid=os.getpid())

@@ -134,6 +134,13 @@ class Settings(BaseSettings):
         "can exchange subjects. Unset: a key kept in the database, which only this deployment "
         "can open.",
     )
+    purge_interval_s: float = Field(
+        600.0,
+        ge=1,
+        le=86_400,
+        description="Seconds between two rounds in which a worker removes expired records and, "
+        "on SQLite, empties the write-ahead log; the first is at the start.",
+    )
     log_level: Literal["debug", "info", "warning", "error"] = Field(
         "info", description="Least severe log line that is written."
     )

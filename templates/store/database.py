@@ -113,11 +113,11 @@ class Database:
                 raise _translated(error) from None
         raise AssertionError("the last attempt returns or raises")
 
-    def purge_log(self) -> bool:
+    def purge_log(self, *, wait: float | None = None) -> bool:
         """Move SQLite's write-ahead log into the database file and empty it.
 
         What a transaction removed may still stand in the log until then. Waits for readers up to
-        the timeout; False if one outlasted it. Nothing to do on PostgreSQL.
+        `wait` seconds, or the timeout; False if one outlasted it. Nothing to do on PostgreSQL.
         """
         if not self.is_sqlite:
             return True
@@ -125,7 +125,14 @@ class Database:
         try:
             with here.writing, here.engine.connect() as connection:
                 # On the driver's connection: SQLAlchemy would begin a transaction around it.
-                busy, _, _ = _driver(connection).execute(_EMPTY_LOG).fetchone()
+                driver = _driver(connection)
+                try:
+                    if wait is not None:
+                        driver.execute(_busy_timeout(wait))
+                    busy, _, _ = driver.execute(_EMPTY_LOG).fetchone()
+                finally:
+                    if wait is not None:
+                        driver.execute(_busy_timeout(self._timeout))
         except sqlite3.OperationalError:
             return False
         except _DATABASE_ERRORS as error:
@@ -146,6 +153,15 @@ class Database:
         except _DATABASE_ERRORS as error:
             raise _translated(error) from None
         self.purge_log()
+
+    def size(self) -> int:
+        """Bytes of the database: of its file (SQLite), or as the server counts (PostgreSQL)."""
+        query = (
+            "SELECT page_count * page_size FROM pragma_page_count(), pragma_page_size()"
+            if self.is_sqlite
+            else "SELECT pg_database_size(current_database())"
+        )
+        return int(self.read(lambda each: each.exec_driver_sql(query).scalar_one()))
 
     def close(self) -> None:
         """Close the connections of this process that are idle."""
@@ -273,6 +289,10 @@ def _set_wal(cursor: Any) -> None:
                 "put the database file on a local disk"
             )
         return
+
+
+def _busy_timeout(seconds: float) -> str:
+    return f"PRAGMA busy_timeout = {round(1000 * seconds)}"
 
 
 def _driver(connection: Connection) -> Any:

@@ -25,6 +25,7 @@ from templates.store.schema import IdempotencyRow, TenantRow
 
 RETENTION = timedelta(hours=24)
 CLAIM = timedelta(minutes=1)
+BATCH = 500
 MAX_KEY = 255
 MAX_BODY_BYTES = 64 * 1024
 
@@ -157,9 +158,20 @@ class Idempotency:
         self._database.write(lambda each: each.execute(statement))
 
     def expire(self) -> int:
-        """Remove records that are older than a day; returns how many."""
-        statement = sa.delete(IdempotencyRow).where(IdempotencyRow.expires_at <= self._clock())
-        return self._database.write(lambda each: each.execute(statement).rowcount)
+        """Remove records that are older than a day; returns how many.
+
+        In small transactions, so that after a long pause no write waits for all of it.
+        """
+        primary_key = (IdempotencyRow.tenant_id, IdempotencyRow.actor, IdempotencyRow.key_hash)
+        expired = (
+            sa.select(*primary_key).where(IdempotencyRow.expires_at <= self._clock()).limit(BATCH)
+        )
+        statement = sa.delete(IdempotencyRow).where(sa.tuple_(*primary_key).in_(expired))
+        removed = 0
+        # Read first: a round that finds nothing, and most do, takes no lock.
+        while self._database.read(lambda each: each.execute(expired).first()) is not None:
+            removed += self._database.write(lambda each: each.execute(statement).rowcount)
+        return removed
 
 
 def _is(claim: Claim) -> tuple[sa.ColumnElement[bool], ...]:

@@ -1,8 +1,9 @@
 """Signed erasure receipts.
 
-A receipt is a canonical JSON text (``templates.canonical``) and its Ed25519 signature (RFC 8032). It
-names the subject by a pseudonym, HMAC-SHA256 of tenant and subject id under a key of the deployment: whoever holds the
-subject id and asks the deployment can find the receipt, nobody else learns whom it is about.
+A receipt is a canonical JSON text (``templates.canonical``) and its Ed25519 signature (RFC 8032).
+It names the subject by a pseudonym, HMAC-SHA256 of tenant and subject id under a key of the
+deployment: whoever holds the subject id and asks the deployment can find the receipt, nobody else
+learns whom it is about.
 """
 
 import base64

@@ -89,10 +89,22 @@ class TemplateStore(Subjects):
         """Count what each master key still wraps; an absent key may be dropped from the file."""
         return rewrap.wrapping_keys(self._database)
 
-    def purge(self) -> bool:
-        """Remove expired records, and on SQLite empty the write-ahead log."""
+    def purge(self, *, wait: float | None = None) -> bool:
+        """Remove expired records, and on SQLite empty the write-ahead log.
+
+        Parameters
+        ----------
+        wait
+            Seconds that emptying the log may wait for readers, and so make writers wait; the
+            store's timeout by default.
+
+        Returns
+        -------
+        bool
+            False if a reader outlasted the wait: the log is emptied another time.
+        """
         self.idempotency.expire()
-        return self._database.purge_log()
+        return self._database.purge_log(wait=wait)
 
     def compact(self) -> None:
         """Rewrite the tables of subjects, so that no page keeps what was erased.
@@ -102,6 +114,10 @@ class TemplateStore(Subjects):
         the free pages back to the file system.
         """
         self._database.compact([table.__tablename__ for table in _HOLD_SUBJECT_DATA])
+
+    def size(self) -> int:
+        """Bytes that the database takes on disk, without the write-ahead log."""
+        return self._database.size()
 
 
 _HOLD_SUBJECT_DATA = (SubjectRow, TemplateRow, FailedAttemptsRow, IdempotencyRow)

@@ -1,6 +1,7 @@
 import json
 import random
 import re
+import time
 from datetime import datetime
 from pathlib import Path
 
@@ -256,10 +257,17 @@ def test_a_long_reader_delays_the_purge_and_is_reported(
     def read_while_erasing(connection: sa.Connection) -> None:
         assert connection.execute(sa.select(SubjectRow.id)).all()
         assert not store.erase("default", "ada").log_purged
+        started = time.monotonic()
+        assert not patient.purge(wait=0.05)
+        assert time.monotonic() - started < 5  # not the store's timeout
+        timeout = sa.text("PRAGMA busy_timeout")
+        assert patient._database.read(lambda each: each.execute(timeout).scalar_one()) == 30_000
 
+    patient = TemplateStore(url, keyring, timeout=30)
     database.read(read_while_erasing)
     assert store.get("default", "ada") is None
     assert store.purge()
+    patient.close()
     assert (tmp_path / "veilface.db-wal").stat().st_size == 0
     database.close()
     store.close()

@@ -1,10 +1,18 @@
 import threading
+from typing import Any
 
 import pytest
 import sqlalchemy as sa
 
 from templates.errors import StoreError
-from templates.store import Answer, Claim, IdempotencyConflict, TemplateStore, UnknownTenant
+from templates.store import (
+    Answer,
+    Claim,
+    IdempotencyConflict,
+    TemplateStore,
+    UnknownTenant,
+    idempotency,
+)
 from templates.store.database import Database
 from templates.store.schema import IdempotencyRow
 from tests.templates.store.conftest import Clock
@@ -124,3 +132,25 @@ def test_nonsense_is_refused(store: TemplateStore) -> None:
         store.idempotency.claim("nobody", actor="a", key="k", request=b"")
     with pytest.raises(StoreError, match="not kept"):
         store.idempotency.finish(claim(store), status=200, body=bytes(65 * 1024))
+
+
+def test_many_expired_records_go_in_small_transactions(
+    store: TemplateStore, clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(idempotency, "BATCH", 3)
+    for number in range(8):
+        claim(store, key=f"k{number}")
+    clock.pass_by(hours=25)
+    claim(store, key="young")
+    sizes: list[int] = []
+    write = store._database.write
+
+    def counted(work: Any, **named: Any) -> Any:
+        sizes.append(write(work, **named))
+        return sizes[-1]
+
+    monkeypatch.setattr(store._database, "write", counted)
+    assert store.idempotency.expire() == 8
+    assert sizes == [3, 3, 2]
+    assert store.idempotency.expire() == 0
+    assert sizes == [3, 3, 2]
