@@ -1,4 +1,4 @@
-"""``veilface db``: the schema of the database."""
+"""``veilface db``: the schema of the database, and its files."""
 
 import typer
 
@@ -15,7 +15,7 @@ app = typer.Typer(no_args_is_help=True)
 
 @app.callback()
 def db() -> None:
-    """Bring the database's schema up to date, or check it."""
+    """Bring the database's schema up to date, check it, or compact its files."""
 
 
 @app.command()
@@ -79,6 +79,32 @@ def current(*, settings: Settings, as_json: AsJson = False) -> None:
         emit({"current": found, "needed": needed})
     else:
         say(f"The database is at {found or 'no schema yet'}; this version needs {needed}.")
+
+
+@app.command()
+@takes_settings(*STORE)
+def compact(*, settings: Settings, as_json: AsJson = False) -> None:
+    """Rewrite the database's files, so that no page keeps what was erased.
+
+    On PostgreSQL this is `VACUUM (FULL)` of the tables that hold subject data: remains of erased
+    rows go, and each table is locked meanwhile. SQLite overwrites what is erased at once; there
+    this is `VACUUM`, which gives free space back. Both need free disk as large as the data, and
+    make writes wait: run it when few requests come.
+
+    Example: `veilface db compact --data-dir veilface-data`
+    """
+    store = open_store(settings, open_keyring(settings))
+    try:
+        store.check()
+        before = store.size()
+        store.compact()
+        after = store.size()
+    finally:
+        store.close()
+    if as_json:
+        emit({"bytes_before": before, "bytes_after": after})
+    else:
+        say(f"Compacted the database: {before:,} bytes before, {after:,} after.")
 
 
 def _revision(settings: Settings) -> str | None:
