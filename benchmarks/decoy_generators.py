@@ -17,23 +17,16 @@ import csv
 import json
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from sklearn.discriminant_analysis import QuadraticDiscriminantAnalysis
-from sklearn.ensemble import HistGradientBoostingClassifier
-from sklearn.linear_model import LogisticRegression
 from sklearn.metrics import roc_auc_score
-from sklearn.model_selection import StratifiedKFold
-from sklearn.neural_network import MLPClassifier
-from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import StandardScaler
-from sklearn.svm import SVC
 
 from benchmarks.decoy_candidates import CANDIDATES, FitData, source
+from benchmarks.decoy_separation import areas
 from models.extraction import Extractor
 from models.pack import ModelPack
 from templates.decoys import DecoyGenerator, DecoySource
@@ -44,9 +37,7 @@ from verify.datasets import read_lfw_pairs
 from verify.metrics import fnmr_at_fmr
 from verify.tenfold import Pair, ten_fold
 
-Array = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.float32]
-Classifier = tuple[Callable[[Array], Array], Callable[[], object]]
 FITTED = 3500
 SAME_PERSON = 0.5
 """Cosine above which two FairFace faces count as one person: FMR below 1e-5 with this pack."""
@@ -123,101 +114,6 @@ def _labels(path: Path) -> Iterable[tuple[str, tuple[str, str]]]:
             yield row["file"], (row["gender"], row["race"])
 
 
-@dataclass(frozen=True)
-class Coordinates:
-    """What a well-informed attacker looks at: the generator's own principal axes."""
-
-    mean: Array
-    axes: Array
-    deviations: Array
-
-    @classmethod
-    def of(cls, rows: Rows) -> "Coordinates":
-        """Moments of the fitted descriptors, which the generator gives away."""
-        x = rows.astype(np.float64)
-        values, vectors = np.linalg.eigh(np.cov(x, rowvar=False))
-        return cls(x.mean(axis=0), vectors[:, ::-1].T, np.sqrt(np.maximum(values[::-1], 1e-12)))
-
-    def whitened(self, rows: npt.NDArray[np.floating]) -> Array:
-        """Coordinates of unit variance, shape (N, n)."""
-        return (rows - self.mean) @ self.axes.T / self.deviations
-
-
-def classifiers(
-    frame: Coordinates,
-) -> dict[str, tuple[Callable[[Array], Array], Callable[[], object]]]:
-    """Name → (features of descriptors, classifier)."""
-
-    def scaled(estimator: object) -> object:
-        return make_pipeline(StandardScaler(), estimator)
-
-    def with_squares(x: Array) -> Array:
-        z = frame.whitened(x)
-        return np.hstack([z, np.minimum(z**2, 30.0)])
-
-    def energies(x: Array) -> Array:
-        z = frame.whitened(x).reshape(len(x), -1, 16)
-        return np.hstack(
-            [
-                0.5 * np.log((z**2).mean(axis=2)),
-                np.abs(z).mean(axis=2),
-                np.minimum(z**4, 300).mean(axis=2),
-                z.reshape(len(x), -1)[:, :64],
-            ]
-        )
-
-    def mlp() -> object:
-        return scaled(
-            MLPClassifier((128,), alpha=3.0, max_iter=40, early_stopping=True, random_state=0)
-        )
-
-    def boosting() -> object:
-        return HistGradientBoostingClassifier(
-            max_iter=120, learning_rate=0.07, max_leaf_nodes=8, random_state=0
-        )
-
-    def as_given(x: Array) -> Array:
-        return x
-
-    return {
-        "logistic": (as_given, lambda: scaled(LogisticRegression(C=1e-3, max_iter=300))),
-        "svm": (lambda x: x * np.sqrt(x.shape[1]), lambda: SVC(C=3.0)),
-        "mlp": (as_given, mlp),
-        "boosting, energies": (energies, boosting),
-        "logistic, squares": (
-            with_squares,
-            lambda: scaled(LogisticRegression(C=1e-3, max_iter=300)),
-        ),
-        "svm, 8 axes": (lambda x: frame.whitened(x)[:, :8], lambda: scaled(SVC(C=1.0))),
-        "svm, whitened": (frame.whitened, lambda: scaled(SVC(C=3.0))),
-        "mlp, whitened": (frame.whitened, mlp),
-        "quadratic, whitened": (
-            frame.whitened,
-            lambda: QuadraticDiscriminantAnalysis(reg_param=0.3),
-        ),
-    }
-
-
-def area(
-    real: Rows, generated: Rows, features: Callable[[Array], Array], make: Callable[[], object]
-) -> tuple[float, float, float]:
-    """AUC of three-fold cross-validated scores, with a 95 % bootstrap interval."""
-    x = features(np.vstack([real, generated]).astype(np.float64))
-    y = np.repeat([0, 1], [len(real), len(generated)])
-    scores = np.empty(len(y))
-    for train, test in StratifiedKFold(3, shuffle=True, random_state=0).split(x, y):
-        model = make().fit(x[train], y[train])  # type: ignore[attr-defined]
-        if hasattr(model, "decision_function"):
-            scores[test] = model.decision_function(x[test])
-        else:
-            scores[test] = model.predict_proba(x[test])[:, 1]
-    rng = np.random.default_rng(0)
-    picks = [rng.integers(len(y), size=len(y)) for _ in range(200)]
-    spread = [roc_auc_score(y[p], scores[p]) for p in picks]
-    low, high = np.percentile(spread, [2.5, 97.5])
-    return float(roc_auc_score(y, scores)), float(low), float(high)
-
-
 def separation(faces: Faces, names: list[str]) -> dict[str, object]:
     """AUC per generator and classifier; 0.5 is the aim.
 
@@ -239,12 +135,23 @@ def separation(faces: Faces, names: list[str]) -> dict[str, object]:
         else:
             left, fitted = real, faces.fit.descriptors
             right = source(name, faces.fit).draw(len(real), 1, stream=stream)[:, 0]
-        row = {
-            what: [round(v, 3) for v in area(left, right, *pair)]
-            for what, pair in classifiers(Coordinates.of(fitted)).items()
-        }
+        row = areas(left, right, fitted)
         report[name] = row
         print(json.dumps({name: row, "s": round(time.perf_counter() - started)}), flush=True)
+    return report
+
+
+def estimation(faces: Faces, counts: list[int]) -> dict[str, object]:
+    """What more fitted faces would bring: AUCs when the truth is of the generator's own family."""
+    truth = DecoyGenerator.fit(np.vstack([faces.fit.descriptors, faces.unseen()]))
+    report: dict[str, object] = {}
+    for count in counts:
+        stream = Keystream.seeded("estimation", count)
+        fitted = truth.draw(count, 1, stream=stream)[:, 0]
+        left = truth.draw(2745, 1, stream=stream)[:, 0]
+        right = DecoyGenerator.fit(fitted).draw(len(left), 1, stream=stream)[:, 0]
+        report[str(count)] = areas(left, right, fitted)
+        print(json.dumps({str(count): report[str(count)]}), flush=True)
     return report
 
 
@@ -399,7 +306,7 @@ def main() -> None:
     parser.add_argument("--embeddings", type=Path)
     parser.add_argument(
         "--part",
-        choices=["separation", "accuracy", "s2s", "leakage", "memorisation"],
+        choices=["separation", "estimation", "accuracy", "s2s", "leakage", "memorisation"],
         required=True,
     )
     parser.add_argument("--generators", help="comma-free names separated by ';'; default: all")
@@ -414,6 +321,8 @@ def main() -> None:
     match args.part:
         case "separation":
             report = separation(faces, [name for name in names if name != "real pool"])
+        case "estimation":
+            report = estimation(faces, [5000, 20000, 80000])
         case "accuracy":
             report = accuracy(faces, names, dims, args.seeds, "p2s")
         case "s2s":
