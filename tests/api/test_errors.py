@@ -74,7 +74,9 @@ def test_every_exception_of_the_rooms_has_a_code() -> None:
         return [kind] if not below else [leaf for each in below for leaf in leaves(each)]
 
     # Raised before there is a server, or by rooms that requests do not reach.
-    elsewhere = {"StartError", "DatasetError", "CacheError", "AlignmentError", "CliError"}
+    elsewhere = {
+        *("StartError", "DatasetError", "CacheError", "AlignmentError", "PreparationError"),
+    }
     for root in (template_errors.VeilfaceError, model_errors.ModelError):
         for kind in leaves(root):
             if kind.__name__ in elsewhere or kind.__module__.startswith(("api.cli", "tests")):
