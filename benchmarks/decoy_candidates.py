@@ -127,7 +127,7 @@ def independent_components(data: FitData) -> Sampler:
     x = data.x
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        ica = FastICA(128, whiten="unit-variance", max_iter=60, random_state=0).fit(x)
+        ica = FastICA(64, whiten="unit-variance", max_iter=30, random_state=0).fit(x)
     sources = ica.transform(x)
     low = _quantiles(sources, x.mean(axis=0), ica.mixing_.T)
     rest = x - ica.inverse_transform(sources)
