@@ -40,7 +40,7 @@ from verify.tenfold import Pair, ten_fold
 Rows = npt.NDArray[np.float32]
 FITTED = 3500
 SAME_PERSON = 0.5
-"""Cosine above which two FairFace faces count as one person: FMR below 1e-5 on LFW with this pack."""
+"""Cosine above which two faces count as one person (FMR below 1e-5 on LFW)."""
 
 
 @dataclass(frozen=True)
