@@ -263,7 +263,7 @@ def main() -> None:
         .descriptors
     )
     half = len(fairface) // 2
-    source = DecoyGenerator.fit(fairface[:half])
+    source = DecoyGenerator.fit(fairface)
     people = np.unique(lfw.names)
     attacked_people = np.random.default_rng(0).permutation(people)[:ATTACKED]
     is_attacked = np.isin(lfw.names, attacked_people)
