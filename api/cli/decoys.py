@@ -18,6 +18,9 @@ from api.preparation import acquired, acquired_json, make_generator, make_pool
 from api.settings import Settings
 from templates.decoys import Attributes, DecoyGenerator
 
+FACES_PER_DIMENSION = 4
+"""Below that many fitted faces, membership of the fit shows in the statistics (docs/decoys.md)."""
+
 app = typer.Typer(no_args_is_help=True)
 
 
@@ -104,6 +107,12 @@ def build(
     source = (
         make_generator(extraction) if kind is Kind.GENERATOR else make_pool(extraction, attributes)
     )
+    if kind is Kind.GENERATOR and len(extraction.descriptors) < FACES_PER_DIMENSION * source.n:
+        message(
+            f"note: {len(extraction.descriptors)} faces for {source.n} numbers each: from so few, "
+            "who was among them can be guessed from the generator; take "
+            f"{FACES_PER_DIMENSION * source.n} or more"
+        )
     path = out or settings.resolved_decoys_file
     path.parent.mkdir(parents=True, exist_ok=True)
     if isinstance(source, DecoyGenerator):

@@ -21,6 +21,16 @@ def test_a_generator_is_made(world):
     assert source.n == 256
 
 
+@pytest.mark.parametrize(("kind", "noted"), [("generator", True), ("pool", False)])
+def test_too_few_faces_for_a_generator_are_noted(world, veilface, tmp_path, kind, noted):
+    ran = veilface(
+        *("decoys", "build", world.decoy_faces, "--pack", world.pack, "--kind", kind),
+        *("--out", tmp_path / "decoys.veil"),
+    )
+    assert ran.status == 0, ran.stderr
+    assert ("150 faces for 256 numbers each" in ran.stderr) is noted
+
+
 @pytest.fixture
 def labelled_source(world, tmp_path):
     """Twelve photos laid out as FairFace is, one of them broken."""
