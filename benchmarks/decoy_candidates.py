@@ -74,7 +74,7 @@ def gaussian(data: FitData) -> Sampler:
 def gaussian_of_unscaled(data: FitData) -> Sampler:
     """Full covariance of the embeddings before they are scaled to unit length."""
     assert data.norms is not None
-    return gaussian(FitData(data.x * data.norms[:, None], data.classes))
+    return gaussian(FitData((data.x * data.norms[:, None]).astype(np.float32), data.classes))
 
 
 def gaussian_cross_fitted(data: FitData) -> Sampler:
@@ -159,7 +159,7 @@ def rotation_gaussianization(data: FitData, *, layers: int = 12) -> Sampler:
         for rotation, table in reversed(steps):
             y = np.column_stack([_monotone(y[:, j], grid, table[:, j]) for j in range(n)])
             y = y @ rotation.T
-        return mean + (y * scales) @ axes
+        return np.asarray(mean + (y * scales) @ axes, dtype=np.float64)
 
     return sample
 
@@ -174,7 +174,7 @@ def neighbour_mixture(data: FitData) -> Sampler:
         others = nearest[centre[:, None], rng.integers(1, 20, size=(count, 4))]
         members = np.hstack([centre[:, None], others])
         shares = rng.dirichlet(np.ones(5), size=count)
-        return np.einsum("ck,ckn->cn", shares, x[members])
+        return np.asarray(np.einsum("ck,ckn->cn", shares, x[members]), dtype=np.float64)
 
     return sample
 
@@ -236,7 +236,7 @@ def _of(generator: DecoyGenerator) -> Sampler:
 
 def _root(covariance: Array) -> Array:
     values, vectors = np.linalg.eigh(covariance)
-    return np.sqrt(np.maximum(values, 0))[:, None] * vectors.T
+    return np.asarray(np.sqrt(np.maximum(values, 0))[:, None] * vectors.T, dtype=np.float64)
 
 
 def _affine(mean: Array, factor: Array) -> Sampler:
@@ -258,4 +258,7 @@ def _quantiles(coordinates: Array, mean: Array, axes: Array) -> Sampler:
 def _monotone(values: Array, from_: Array, to: Array) -> Array:
     """Piecewise linear map of one grid to another, continued with slope 1 beyond its ends."""
     inside = np.interp(values, from_, to)
-    return inside + np.minimum(values - from_[0], 0) + np.maximum(values - from_[-1], 0)
+    return np.asarray(
+        inside + np.minimum(values - from_[0], 0) + np.maximum(values - from_[-1], 0),
+        dtype=np.float64,
+    )

@@ -64,7 +64,8 @@ class Faces:
 
 def _each_once(rows: Rows) -> Rows:
     """Without the faces that resemble an earlier one."""
-    return rows[np.tril(rows @ rows.T, -1).max(axis=1) < SAME_PERSON]
+    first = np.tril(rows @ rows.T, -1).max(axis=1) < SAME_PERSON
+    return np.ascontiguousarray(rows[first])
 
 
 def load(data: Path, embeddings: Path | None) -> Faces:
