@@ -3,6 +3,12 @@
 Photos of strangers come in, unit vectors go out; nothing here knows of templates or of HTTP.
 """
 
+import os
+
+# Before onnxruntime loads: its official builds report usage to their maker, and keep a device id
+# and a database of events below the home folder. A service for faces does neither.
+os.environ["ORT_DISABLE_TELEMETRY"] = "1"
+
 from models.boxes import Face
 from models.cache import CacheSealer, EmbeddingCache
 from models.decoding import ImageLimits, decode_image

@@ -1,0 +1,274 @@
+"""A search for leaked biometric numbers in raw bytes.
+
+Given vectors (embeddings, decoys, model inputs) and byte strings (photo files, pixels, tokens),
+:class:`LeakSearch` finds any run of them in a blob:
+
+- numbers as float16, bfloat16, float32 or float64, in either byte order, at any byte position;
+- numbers as decimal text of three digits after the point or more (JSON, CSV, a printed array);
+- byte strings as they are;
+- all of that inside base64 (either alphabet, any alignment) and hexadecimal (either case).
+
+Runs are looked up by four consecutive numbers (or eight bytes), at every byte position of the
+blob, and a hit is then compared number by number. The comparison has a tolerance, because a server
+that embeds a photo again may differ in the last bits. It finds no run shorter than seven numbers,
+nothing that was compressed or encrypted, and no sum of a vector with something else.
+"""
+
+import base64
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import KDTree
+
+RUN = 4  # numbers in a window
+STRIDE = 4  # between two windows of a vector: every run of RUN + STRIDE - 1 numbers holds one
+BYTES = 16  # bytes of a byte string that must agree
+BYTE_STRIDE = 16
+TEXT_RUN = 6
+RELATIVE = 4e-3  # float16 and bfloat16 round by at most 2⁻⁹
+
+_HASH = np.uint64(0x9E3779B97F4A7C15)
+_TABLE_BITS = 22
+_MOST_AS_TEXT = 4096  # numbers of a vector: nobody prints a picture as decimals
+_FLOATS = {"float16": 2, "bfloat16": 2, "float32": 4, "float64": 8}
+_NUMBER = re.compile(rb"\.(\d{3,20})(?:[eE]([-+]?\d{1,3}))?")
+_BEFORE = re.compile(rb"-?\d{0,3}$")
+_BASE64 = re.compile(rb"[A-Za-z0-9+/_-]{24,}")
+_HEX = re.compile(rb"[0-9a-fA-F]{32,}")
+_URL_ALPHABET = bytes.maketrans(b"-_", b"+/")
+
+
+@dataclass(frozen=True)
+class Leak:
+    """Where what was found."""
+
+    what: str
+    form: str
+    offset: int
+
+
+class LeakSearch:
+    """Knows what must not be found.
+
+    Parameters
+    ----------
+    vectors
+        Arrays by name, any shape; each is searched as the flat run of its numbers, and negated.
+    strings
+        Byte strings by name, 16 bytes or more.
+    """
+
+    def __init__(
+        self,
+        *,
+        vectors: Mapping[str, ArrayLike] | None = None,
+        strings: Mapping[str, bytes] | None = None,
+    ) -> None:
+        self._names: list[str] = []
+        flat: list[NDArray[np.float64]] = []
+        for name, values in (vectors or {}).items():
+            for sign, label in ((1.0, name), (-1.0, f"{name}, negated")):
+                self._names.append(label)
+                flat.append(sign * np.asarray(values, dtype=np.float64).ravel())
+        self._windows, self._window_owner = _windows_of(flat, RUN, STRIDE)
+        self._tables = {
+            name: _Table(_keys_of(_top_halves(self._windows, name))) for name in _FLOATS
+        }
+        short = [vector if len(vector) <= _MOST_AS_TEXT else vector[:0] for vector in flat]
+        text_windows, self._text_owner = _windows_of(short, TEXT_RUN, 3, spread=0.02)
+        self._text = KDTree(text_windows) if len(text_windows) else None
+        self._string_names = list(strings or {})
+        self._chunks, self._chunk_owner = _chunks_of(list((strings or {}).values()))
+        self._strings = _Table(self._chunks[:, :8].copy().view("<u8")[:, 0])
+
+    def find(self, blob: bytes) -> list[Leak]:
+        """Everything found in a blob, the first of each thing and form."""
+        found: dict[tuple[str, str], Leak] = {}
+        for form, content in [("", blob), *_decoded(blob)]:
+            for leak in self._find_plain(content):
+                named = Leak(leak.what, f"{form}{leak.form}", leak.offset)
+                found.setdefault((named.what, named.form), named)
+        return list(found.values())
+
+    def _find_plain(self, blob: bytes) -> Iterator[Leak]:
+        raw = np.frombuffer(blob, dtype=np.uint8)
+        if len(raw) >= BYTES:
+            yield from self._find_strings(raw)
+        first, second = raw[:-1].astype(np.uint64), raw[1:].astype(np.uint64)
+        for little in (True, False):
+            low, high = (first, second) if little else (second, first)
+            halves = low | high << np.uint64(8)
+            for name, size in _FLOATS.items():
+                if len(raw) >= RUN * size:
+                    yield from self._find_floats(raw, halves, name, little=little)
+        yield from self._find_text(blob)
+
+    def _find_strings(self, raw: NDArray[np.uint8]) -> Iterator[Leak]:
+        count = len(raw) - BYTES + 1
+        keys = np.zeros(count, dtype=np.uint64)
+        for byte in range(8):
+            keys |= raw[byte : byte + count].astype(np.uint64) << np.uint64(8 * byte)
+        for offset, row in self._strings.hits(keys):
+            if raw[offset : offset + BYTES].tobytes() == self._chunks[row].tobytes():
+                yield Leak(self._string_names[self._chunk_owner[row]], "bytes", offset)
+
+    def _find_floats(
+        self, raw: NDArray[np.uint8], halves: NDArray[np.uint64], name: str, *, little: bool
+    ) -> Iterator[Leak]:
+        size = _FLOATS[name]
+        # The upper two bytes of a number stand last in little-endian order, first in big-endian.
+        skip = size - 2 if little else 0
+        count = len(raw) - RUN * size + 1
+        keys = np.zeros(count, dtype=np.uint64)
+        for place in range(RUN):
+            start = skip + place * size
+            keys |= halves[start : start + count] << np.uint64(16 * place)
+        order = "little" if little else "big"
+        for offset, row in self._tables[name].hits(keys):
+            numbers = _numbers(raw[offset : offset + RUN * size].tobytes(), name, little=little)
+            wanted = self._windows[row]
+            if np.allclose(numbers, wanted, rtol=RELATIVE, atol=1e-7):
+                owner = self._names[self._window_owner[row]]
+                yield Leak(owner, f"{name}, {order}-endian", offset)
+
+    def _find_text(self, blob: bytes) -> Iterator[Leak]:
+        if self._text is None:
+            return
+        for offsets, numbers in _decimal_runs(blob):
+            if len(numbers) < TEXT_RUN:
+                continue
+            rows = np.lib.stride_tricks.sliding_window_view(np.array(numbers), TEXT_RUN)
+            found = self._text.query(rows, p=np.inf, distance_upper_bound=6e-4)
+            distances, nearest = np.asarray(found[0]), np.asarray(found[1])
+            for at in np.flatnonzero(np.isfinite(distances)):
+                yield Leak(self._names[self._text_owner[nearest[at]]], "decimals", offsets[at])
+
+
+class _Table:
+    """Rows by 64-bit key; a bitmap decides most look-ups."""
+
+    def __init__(self, keys: NDArray[np.uint64]) -> None:
+        self._order = np.argsort(keys, kind="stable")
+        self._keys = keys[self._order]
+        self._seen = np.zeros(1 << _TABLE_BITS, dtype=bool)
+        self._seen[_slot(keys)] = True
+
+    def hits(self, keys: NDArray[np.uint64]) -> Iterator[tuple[int, int]]:
+        """Positions in `keys` and the rows that have the key there."""
+        candidates = np.flatnonzero(self._seen[_slot(keys)])
+        wanted = keys[candidates]
+        low = np.searchsorted(self._keys, wanted, side="left")
+        high = np.searchsorted(self._keys, wanted, side="right")
+        for at in np.flatnonzero(high > low):
+            for row in self._order[low[at] : high[at]]:
+                yield int(candidates[at]), int(row)
+
+
+def _slot(keys: NDArray[np.uint64]) -> NDArray[np.int64]:
+    return ((keys * _HASH) >> np.uint64(64 - _TABLE_BITS)).astype(np.int64)
+
+
+def _windows_of(
+    vectors: Sequence[NDArray[np.float64]], run: int, stride: int, *, spread: float = 1e-3
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Windows of all vectors and the vector each is of; flat ones (a black border) say nothing."""
+    parts, owners = [np.empty((0, run))], [np.empty(0, dtype=np.int64)]
+    for owner, vector in enumerate(vectors):
+        if len(vector) < run:
+            continue
+        rows = np.lib.stride_tricks.sliding_window_view(vector, run)[::stride]
+        varied = rows.max(axis=1) - rows.min(axis=1) > spread
+        rows = rows[varied & (np.abs(rows).min(axis=1) > 1e-6)]
+        parts.append(rows)
+        owners.append(np.full(len(rows), owner, dtype=np.int64))
+    return np.ascontiguousarray(np.concatenate(parts)), np.concatenate(owners)
+
+
+def _chunks_of(strings: Sequence[bytes]) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+    """Pieces of all byte strings with at least six different bytes in the first eight."""
+    parts = [np.empty((0, BYTES), dtype=np.uint8)]
+    owners = [np.empty(0, dtype=np.int64)]
+    for owner, string in enumerate(strings):
+        raw = np.frombuffer(string, dtype=np.uint8)
+        if len(raw) < BYTES:
+            raise ValueError(f"a byte string to search for has {BYTES} bytes or more")
+        rows = np.lib.stride_tricks.sliding_window_view(raw, BYTES)[::BYTE_STRIDE]
+        ordered = np.sort(rows[:, :8], axis=1)
+        rows = rows[(np.diff(ordered, axis=1) != 0).sum(axis=1) >= 5]
+        parts.append(rows)
+        owners.append(np.full(len(rows), owner, dtype=np.int64))
+    return np.ascontiguousarray(np.concatenate(parts)), np.concatenate(owners)
+
+
+def as_bytes(values: ArrayLike, name: str, *, little: bool) -> bytes:
+    """Numbers as they would stand in a file, for `name` in float16, bfloat16, float32, float64."""
+    order: Literal["<", ">"] = "<" if little else ">"
+    if name == "bfloat16":
+        bits = np.asarray(values, dtype="<f4").view("<u4")
+        halves = ((bits + np.uint32(0x8000)) >> np.uint32(16)).astype(f"{order}u2")
+        return halves.tobytes()
+    return np.asarray(values, dtype=np.dtype(name).newbyteorder(order)).tobytes()
+
+
+def _numbers(data: bytes, name: str, *, little: bool) -> NDArray[np.float64]:
+    order: Literal["<", ">"] = "<" if little else ">"
+    if name == "bfloat16":
+        bits = np.frombuffer(data, dtype=f"{order}u2").astype(np.uint32) << np.uint32(16)
+        return bits.view(np.float32).astype(np.float64)
+    stored = np.frombuffer(data, dtype=np.dtype(name).newbyteorder(order))
+    with np.errstate(invalid="ignore"):
+        return stored.astype(np.float64)
+
+
+def _top_halves(windows: NDArray[np.float64], name: str) -> NDArray[np.uint64]:
+    """Sign, exponent and first bits of the mantissa: 16 bits a number, blind to the last bits."""
+    size = _FLOATS[name]
+    stored = np.frombuffer(as_bytes(windows.ravel(), name, little=True), dtype=np.uint8)
+    tops = stored.reshape(-1, size)[:, size - 2 :].astype(np.uint64)
+    return (tops[:, 0] | tops[:, 1] << np.uint64(8)).reshape(-1, RUN)
+
+
+def _keys_of(halves: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    keys = np.zeros(len(halves), dtype=np.uint64)
+    for place in range(RUN):
+        keys |= halves[:, place] << np.uint64(16 * place)
+    return keys
+
+
+def _decimal_runs(blob: bytes) -> Iterator[tuple[list[int], list[float]]]:
+    """Decimal numbers that follow each other closely, with the offset of each."""
+    offsets: list[int] = []
+    numbers: list[float] = []
+    end = 0
+    for match in _NUMBER.finditer(blob):
+        before = _BEFORE.search(blob, max(0, match.start() - 4), match.start())
+        text = (before.group() if before else b"") + match.group()
+        if numbers and match.start() - end > 24:
+            yield offsets, numbers
+            offsets, numbers = [], []
+        offsets.append(match.start())
+        numbers.append(float(text))
+        end = match.end()
+    yield offsets, numbers
+
+
+def _decoded(blob: bytes) -> Iterable[tuple[str, bytes]]:
+    """What base64 and hexadecimal text in a blob stands for, at each alignment."""
+    runs = [match.group().translate(_URL_ALPHABET) for match in _BASE64.finditer(blob)]
+    for phase in range(4):
+        parts = []
+        for run in runs:
+            aligned = run[phase:]
+            parts.append(base64.b64decode(aligned[: len(aligned) // 4 * 4]))
+        yield f"base64 at {phase}: ", b"\0".join(parts)
+    hexes = [match.group() for match in _HEX.finditer(blob)]
+    for phase in range(2):
+        parts = [
+            bytes.fromhex(run[phase : phase + (len(run) - phase) // 2 * 2].decode())
+            for run in hexes
+        ]
+        yield f"hexadecimal at {phase}: ", b"\0".join(parts)
