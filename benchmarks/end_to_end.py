@@ -371,7 +371,11 @@ def main() -> None:
         address = stack.enter_context(service(env, workers=args.workers, log=work / "serve.log"))
         client = stack.enter_context(
             httpx.Client(
-                base_url=address, headers={"Authorization": f"Bearer {token}"}, timeout=120
+                base_url=address,
+                headers={"Authorization": f"Bearer {token}"},
+                timeout=120,
+                # A kept connection stays with one worker; new ones reach all of them.
+                limits=httpx.Limits(max_keepalive_connections=0),
             )
         )
         attempted = time.perf_counter()
