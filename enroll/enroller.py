@@ -2,7 +2,7 @@
 
 The order matters: the photos' embeddings are averaged first and lifted once, because two lifts of
 one person meet in that person's descriptor (METHOD §4.6). Randomness is fresh for every template
-and destroyed with it. The tenant's rotation comes last, so that clients never need it.
+and dropped with it. The tenant's rotation comes last, so that clients never need it.
 """
 
 import secrets
@@ -23,6 +23,7 @@ from templates.decoys import Attributes, DecoySource
 from templates.embedding import unit_rows
 from templates.errors import ContractMismatch, InvalidTemplate
 from templates.lifting import Strategy, lift
+from templates.randomness import Keystream
 from templates.subspace import AffineSubspace
 
 MAX_PHOTOS = 10
@@ -163,7 +164,7 @@ class Enroller:
         descriptor = mean_descriptor(rows, consistency=self._contract.photo_consistency)
         binding = self._contract.binding
         named = [attributes or Attributes()] if binding.strategy is Strategy.HYBRID_PLUS else None
-        # Without a stream, lift draws from a fresh one and destroys it.
+        # Without a stream, lift draws from a fresh one and drops it.
         lifted = lift(
             descriptor[None],
             strategy=binding.strategy,
@@ -177,6 +178,8 @@ class Enroller:
 
     def from_template(self, data: bytes) -> Enrollment:
         """Enroll a template that a client lifted, in the wire format, un-rotated.
+
+        The set is kept; its basis is drawn anew.
 
         Raises
         ------
@@ -200,7 +203,11 @@ class Enroller:
                 "the template's foot point is outside the range that the contract recorded: "
                 "lift a unit-norm descriptor with the contract's decoys"
             )
-        return self._finish(subspace, per_photo=())
+        # The client knows its rows. Rotated as they are, they would be pairs (x, R x) of the
+        # tenant's rotation for whoever sees them stored; of a fresh basis only the set is known.
+        with Keystream.fresh() as stream:
+            spanned = AffineSubspace.through(subspace.foot, subspace.basis, stream=stream)
+        return self._finish(spanned, per_photo=())
 
     def _finish(
         self, subspace: AffineSubspace, *, per_photo: tuple[PhotoResult, ...]

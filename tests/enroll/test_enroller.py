@@ -192,6 +192,22 @@ def test_a_clients_template_is_rotated_and_kept(contract: Contract, enroller: En
     assert not wire.decode(enrollment.wire).subspace.contains(PHOTOS[:1], tol=0.3).any()
 
 
+def test_a_clients_basis_is_replaced_by_a_random_one_of_the_same_set(
+    contract: Contract, enroller: Enroller
+) -> None:
+    sent = client_template(contract)
+    data = wire.encode(sent, contract_id=contract.contract_id)
+    first, second = (stored_template(enroller.from_template(data)) for _ in range(2))
+    own = sent.basis.astype(np.float64)
+    for template in (first, second):
+        seen = template.basis.astype(np.float64)
+        np.testing.assert_allclose(seen.T @ seen, own.T @ own, atol=2e-3)
+        np.testing.assert_allclose(template.foot, sent.foot, atol=1e-3)
+        # Haar-distributed rows: that all lie near the client's has probability below 1e-9.
+        assert np.abs(seen @ own.T - np.eye(M)).max() > 0.1
+    assert np.abs(first.basis - second.basis).max() > 0.05
+
+
 def test_clients_templates_that_break_the_contract_are_refused(
     contract: Contract, enroller: Enroller
 ) -> None:
@@ -238,13 +254,14 @@ def test_hybrid_plus_takes_attributes_and_does_without() -> None:
     )
     contract = dataclasses.replace(result.contract, photo_consistency=-1.0)
     enroller = Enroller(contract, pool, rotation=ROTATION)
-    for attributes in (labels[0], None):
+    entries = draw_people(200, photos=(1,), seed=101).descriptors
+
+    def decoys(attributes: Attributes | None) -> list[Attributes]:
         template = stored_template(enroller.from_embeddings(PHOTOS[:3], attributes=attributes))
-        inside = template.contains(pool.draw(1, 200, stream=_stream())[0], tol=5e-3)
-        assert inside.sum() == M // 2  # the decoys; the other directions are random
+        inside = np.flatnonzero(template.contains(entries, tol=5e-3))
+        assert len(inside) == M // 2  # the decoys; the other directions are random
+        return [labels[i % 2] for i in inside.tolist()]
 
-
-def _stream() -> object:
-    from templates.randomness import Keystream
-
-    return Keystream.seeded("all")
+    for _ in range(8):  # ignored attributes would pass once in 2 ** 24
+        assert set(decoys(labels[0])) == {labels[1]}
+    assert {label for _ in range(20) for label in decoys(None)} == set(labels)
