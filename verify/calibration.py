@@ -219,9 +219,10 @@ def _lay_out(
     service = Lifter(binding.strategy, source, binding.contract_id)
     client = Lifter(plain_strategy(binding.strategy), client_source(source), binding.contract_id)
     progress("enrolling people", 0.0)
+    means = enrolled_means(data, plan)
     with Keystream.seeded("calibration templates", options.seed) as stream:
         templates = service.lift(
-            enrolled_means(data, plan),
+            means,
             m=binding.m,
             stream=stream,
             attributes=attributes and [attributes[photos[0]] for photos in plan.enrolled],
@@ -229,7 +230,12 @@ def _lay_out(
     if cohort is None:
         with Keystream.fresh() as stream:
             cohort = make_cohort(
-                source, strategy=binding.strategy, m=binding.m, stream=stream, size=COHORT_SIZE
+                source,
+                strategy=binding.strategy,
+                m=binding.m,
+                stream=stream,
+                size=COHORT_SIZE,
+                people=means,
             )
     return Bench(
         descriptors=data,

@@ -57,8 +57,13 @@ def make_cohort(
     m: int,
     stream: Keystream,
     size: int = COHORT_SIZE,
+    people: NDArray[np.float32] | None = None,
 ) -> SubspaceBatch:
     """Lift ``size`` descriptors of nobody, with decoys of nobody.
+
+    The hidden descriptors should be spread like those of the templates that a probe meets. Decoys
+    are fitted to other people, and to single photos; a wolf that knows the difference is nearer to
+    the templates than to such a cohort, and passes too often.
 
     Parameters
     ----------
@@ -67,6 +72,9 @@ def make_cohort(
         generator is fitted first.
     strategy, m
         The contract's.
+    people : (P, n) float32
+        Descriptors of the people of the calibration, as they are enrolled. The cohort's are drawn
+        from a generator fitted to them, where they are n or more; from ``source`` otherwise.
     stream
         Fresh for a service; seeded for experiments only, since the cohort is a secret.
 
@@ -76,7 +84,10 @@ def make_cohort(
         ``size`` templates, un-rotated.
     """
     nobody = client_source(source)
-    descriptors = nobody.draw(size, 1, stream=stream)[:, 0, :]
+    hidden = nobody
+    if people is not None and len(people) >= people.shape[1]:
+        hidden = DecoyGenerator.fit(people)
+    descriptors = hidden.draw(size, 1, stream=stream)[:, 0, :]
     return lift(descriptors, strategy=plain_strategy(strategy), m=m, source=nobody, stream=stream)
 
 
