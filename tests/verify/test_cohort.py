@@ -1,0 +1,59 @@
+"""The cohort stands for the templates that a probe meets, not for the decoys."""
+
+import numpy as np
+import pytest
+
+from templates.decoys import DecoyGenerator
+from templates.distances import Metric, pairwise_distances, similarity
+from templates.lifting import Strategy
+from templates.randomness import Keystream
+from templates.subspace import SubspaceBatch
+from verify.cohort import make_cohort
+
+N, M = 32, 4
+
+
+def around(axis: int, count: int, seed: int) -> np.ndarray:
+    """Unit vectors that lean towards one coordinate axis."""
+    rows = np.random.default_rng(seed).standard_normal((count, N)) * 0.4
+    rows[:, axis] += 1.5
+    return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def others() -> DecoyGenerator:
+    """Decoys of another population than the people's."""
+    return DecoyGenerator.fit(around(1, 600, seed=1))
+
+
+def cohort(source: DecoyGenerator, people: np.ndarray | None) -> SubspaceBatch:
+    with Keystream.seeded("cohort") as stream:
+        return make_cohort(
+            source, strategy=Strategy.ADVERSARIAL, m=M, stream=stream, size=200, people=people
+        )
+
+
+def nearness(templates: SubspaceBatch, probes: np.ndarray) -> float:
+    distances = pairwise_distances(probes, templates, metric=Metric.SPHERICAL, steps=50)
+    return float(np.mean(similarity(distances)))
+
+
+def test_the_cohort_is_spread_like_the_people(others: DecoyGenerator) -> None:
+    strangers = around(0, 100, seed=3)
+    fitted = cohort(others, around(0, 600, seed=2))
+    unfitted = cohort(others, None)
+    assert nearness(fitted, strangers) > nearness(unfitted, strangers) + 0.1
+    assert (fitted.n, fitted.m, len(fitted)) == (N, M, 200)
+
+
+def test_nobody_of_the_people_is_in_the_cohort(others: DecoyGenerator) -> None:
+    people = around(0, 600, seed=2)
+    distances = pairwise_distances(
+        people, cohort(others, people), metric=Metric.SPHERICAL, steps=50
+    )
+    assert distances.min() > 1e-3
+
+
+def test_too_few_people_leave_the_cohort_to_the_decoys(others: DecoyGenerator) -> None:
+    few = cohort(others, around(0, N - 1, seed=2))
+    np.testing.assert_array_equal(few.bases, cohort(others, None).bases)
