@@ -92,9 +92,9 @@ def decode(
         RecursionError,
         OverflowError,
         safetensors.SafetensorError,
-    ) as error:
+    ):
         # The parser's own words may quote the input, which may be a descriptor.
-        raise DecoyError(f"the {what} is not a valid safetensors file of this kind") from error
+        raise DecoyError(f"the {what} is not a valid safetensors file of this kind") from None
     if not canonical:
         raise DecoyError(f"the {what} is not in its canonical encoding; write it again")
     return fields, arrays

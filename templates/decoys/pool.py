@@ -26,6 +26,8 @@ POOL_CONTEXT = "veilface decoy pool 1"
 MAX_POOL_BYTES = 2 * 1024**3
 MAX_ENTRIES = 1_000_000
 UNIT_TOLERANCE = 1e-3
+# Rounding the numbers of a unit row to float32 moves its length by 2**-24 at most.
+_ROUNDING = 2.0**-23
 _FORMAT = "veilface decoy pool"
 _VERSION = 1
 _UNKNOWN = 255
@@ -38,7 +40,7 @@ class DecoyPool:
     Parameters
     ----------
     descriptors
-        float32, shape (N, n), unit rows (tolerance 1e-3).
+        float32, shape (N, n), unit rows (tolerance 1e-3). They are renormalised in float64.
     labels
         One `Attributes` per row, or None. Needed for ``unlike``.
 
@@ -63,6 +65,10 @@ class DecoyPool:
         wrong = int(np.count_nonzero(~(np.abs(norms - 1.0) <= UNIT_TOLERANCE)))
         if wrong:
             raise DecoyError(f"{wrong} of {len(array)} descriptors are not finite unit vectors")
+        # Rows of unit length to float32 rounding stay bit for bit as they are: a second division
+        # could change their last bit, and with it the id of a pool that is loaded again.
+        off = np.abs(norms - 1.0) > _ROUNDING
+        array[off] = array[off].astype(np.float64) / norms[off, None]
         if labels is not None and len(labels) != len(array):
             raise DecoyError(f"{len(labels)} labels for {len(array)} descriptors")
         array.flags.writeable = False

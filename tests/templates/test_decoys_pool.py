@@ -1,6 +1,7 @@
 """The sealed pool of real descriptors."""
 
 import itertools
+import traceback
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from templates.decoys import Attributes, DecoyGenerator, DecoyPool, DecoySource, load_source
+from templates.decoys import (
+    Attributes,
+    DecoyGenerator,
+    DecoyPool,
+    DecoySource,
+    container,
+    load_source,
+)
 from templates.decoys.pool import POOL_CONTEXT, POOL_MAGIC
 from templates.errors import DecoyError, SealError
 from templates.randomness import Keystream
@@ -182,6 +190,26 @@ def test_unlike_and_sub_databases_exclude_each_other(pool: DecoyPool) -> None:
 def test_rows_that_are_no_descriptors_are_refused(rows: NDArray[np.float32]) -> None:
     with pytest.raises(DecoyError):
         DecoyPool(rows)
+
+
+def test_draws_are_unit_and_a_loaded_pool_keeps_its_id() -> None:
+    rough = unit_rows(50, 16) * np.linspace(0.9991, 1.0009, 50, dtype=np.float32)[:, None]
+    pool = DecoyPool(rough)
+    drawn = pool.draw(1, 50, stream=Keystream.seeded(1))[0]
+    norms = np.linalg.norm(drawn.astype(np.float64), axis=1)
+    np.testing.assert_allclose(norms, 1.0, rtol=0, atol=2.0**-23)
+    ordered = drawn[np.argsort((drawn @ rough.T).argmax(axis=1))]
+    assert DecoyPool(ordered).source_id == pool.source_id
+
+
+def test_a_broken_container_does_not_chain_the_parsers_words() -> None:
+    header = b'{"a secret of the header": not JSON}'
+    with pytest.raises(DecoyError) as caught:
+        container.decode(len(header).to_bytes(8, "little") + header, what="pool", max_bytes=999)
+    text = "".join(traceback.format_exception(caught.value))
+    assert "DecoyError" in text
+    assert "JSONDecodeError" not in text
+    assert caught.value.__suppress_context__
 
 
 def test_labels_must_fit() -> None:
