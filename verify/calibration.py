@@ -17,7 +17,7 @@ from verify.calibration_mode import Bench, CalibrationOptions, calibrate_mode
 from verify.cohort import COHORT_SIZE, client_source, make_cohort, plain_strategy
 from verify.comparisons import Lifter, Progress, honest_norms
 from verify.raw_pairs import SuspiciousPair, consistency_threshold, suspicious_pairs
-from verify.tenfold import Pair, TenFold, random_pairs
+from verify.tenfold import Pair, TenFold, random_pairs, require_folds
 from verify.trials import Plan, chosen_photos, enrolled_means, plan_trials
 
 DEFAULT_LEVEL = "fmr-1e-3"
@@ -263,17 +263,28 @@ def _protocol_pairs(
     if pairs is None:
         return tuple(random_pairs(plan.person_of, rng=rng))
     place = {int(photo): position for position, photo in enumerate(kept)}
-    return tuple(
-        Pair(place[pair.first], place[pair.second], pair.same, pair.fold)
+    staying = [
+        (place[pair.first], place[pair.second], pair.fold)
         for pair in pairs
         if pair.first in place and pair.second in place
+    ]
+    # Two names of one person make a pair of the protocol genuine, whatever its file says.
+    placed = tuple(
+        Pair(first, second, bool(plan.person_of[first] == plan.person_of[second]), fold)
+        for first, second, fold in staying
     )
+    require_folds(placed)
+    return placed
 
 
 def _default_level(calibrations: Sequence[Calibration]) -> str:
-    """FMR 1e-3 where the first calibration resolves it, else its strictest level by target."""
-    levels = calibrations[0].levels
+    """FMR 1e-3 where all calibrations resolve it, else the strictest target that all do.
+
+    The laxest target is resolved by all of them, or the level of the ten-fold protocol is there.
+    """
+    shared = set.intersection(*({level.name for level in c.levels} for c in calibrations))
+    levels = [level for level in calibrations[0].levels if level.name in shared]
     if any(level.name == DEFAULT_LEVEL for level in levels):
         return DEFAULT_LEVEL
     targeted = [level for level in levels if level.target_fmr is not None]
-    return (targeted or list(levels))[-1].name
+    return (targeted or levels)[-1].name

@@ -51,7 +51,7 @@ class CalibrationOptions:
     probe_dims
         Dimensions of the probes: 0 for raw ones, others for lifted ones.
     targets
-        FMR targets; those that the data cannot resolve are left out and reported.
+        FMR targets, powers of ten; those that the data cannot resolve are left out and reported.
     photos_per_enrollment
         Most photos averaged into one template.
     consistency_fmr
@@ -81,8 +81,12 @@ class CalibrationOptions:
     lifted_impostor_pairs: int = 300_000
     seed: int = 0
 
+    def __post_init__(self) -> None:
+        for target in self.targets:
+            level_name(target)  # refuses what has no name, before anything is computed
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Bench:
     """Everything that the calibrations of one run share."""
 
@@ -151,7 +155,7 @@ def calibrate_mode(
         for target in kept
     ]
     folds = None
-    if bench.pairs:
+    if options.protocol == "ten-fold":
         folds = _ten_fold(bench, probe_m)
         levels.append(_accuracy_level(folds, tails, impostors, genuine, seed=options.seed))
     if not levels:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from templates.errors import ContractError
 from verify.metrics import most_errors, threshold_at_fmr
 
 TILE = 1024
@@ -40,7 +41,7 @@ def consistency_threshold(
 
     Raises
     ------
-    ValueError
+    ContractError
         Where there is no cross-identity pair.
     """
     if len(descriptors) > MOST_PHOTOS:
@@ -49,7 +50,9 @@ def consistency_threshold(
     cosines = [tile[mask] for _, tile, mask in _cross_tiles(descriptors, person_of)]
     impostor = np.concatenate(cosines) if cosines else np.empty(0, dtype=np.float32)
     if impostor.size == 0:
-        raise ValueError("photos of at least two people are needed")
+        raise ContractError(
+            "photo consistency needs photos of at least two people: add people, or exclude fewer"
+        )
     # Only the upper tail decides; sorting all pairs in float64 would triple the memory.
     tail = min(impostor.size, most_errors(fmr, impostor.size) + 2)
     highest = np.partition(impostor, impostor.size - tail)[-tail:]

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from templates.errors import ContractError
+
 FOLDS = 10
 
 
@@ -66,19 +68,36 @@ def best_threshold(similarities: ArrayLike, same: ArrayLike) -> float:
     return float((ranked[cut] + ranked[cut - 1]) / 2)
 
 
+def require_folds(pairs: Sequence[Pair]) -> None:
+    """Check that every fold has a pair.
+
+    Raises
+    ------
+    ContractError
+        Where a fold is empty or a fold number is outside 0 … 9.
+    """
+    if {pair.fold for pair in pairs} != set(range(FOLDS)):
+        raise ContractError(
+            f"the ten-fold protocol needs pairs in each of {FOLDS} folds, numbered from 0, and "
+            f"{len(pairs)} pairs are there: exclude fewer people, give other pairs, or calibrate "
+            "under protocol fmr"
+        )
+
+
 def ten_fold(similarities: ArrayLike, pairs: Sequence[Pair]) -> TenFold:
     """Run the protocol on the similarities of ``pairs``.
 
     Raises
     ------
-    ValueError
+    ContractError
         Where a fold is empty or a fold number is outside 0 … 9.
     """
+    require_folds(pairs)
     scores = np.asarray(similarities, dtype=np.float64)
     same = np.array([pair.same for pair in pairs], dtype=bool)
     folds = np.array([pair.fold for pair in pairs], dtype=np.int64)
-    if set(folds.tolist()) != set(range(FOLDS)) or scores.shape != same.shape:
-        raise ValueError(f"the protocol needs pairs in each of {FOLDS} folds, numbered from 0")
+    if scores.shape != same.shape:
+        raise ValueError("the protocol needs one similarity for each pair")
     accuracies, thresholds = [], []
     for fold in range(FOLDS):
         held = folds == fold
@@ -98,7 +117,7 @@ def random_pairs(
 
     Raises
     ------
-    ValueError
+    ContractError
         Where there are fewer genuine pairs than folds, or one person only.
     """
     groups = [np.flatnonzero(person_of == person) for person in np.unique(person_of)]
@@ -110,9 +129,10 @@ def random_pairs(
         for i, j in zip(*np.triu_indices(len(photos), k=1), strict=True)
     ]
     if len(genuine) < FOLDS or len(groups) < 2:
-        raise ValueError(
+        raise ContractError(
             f"the ten-fold protocol needs at least {FOLDS} pairs of photos of one person, and two "
-            "people"
+            f"people; seen {len(genuine)} pairs and {len(groups)} people: add photos, or calibrate "
+            "under protocol fmr"
         )
     count = min(most_per_class, len(genuine))
     chosen = [genuine[k] for k in rng.permutation(len(genuine))[:count]]

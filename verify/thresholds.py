@@ -5,6 +5,7 @@ both thresholds are set at one marginal quantile q, and q is the largest at whic
 on the impostor trials is at most the target.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from templates.contract import Level, Rate
+from templates.errors import ContractError
 from verify.metrics import between, most_errors, resolvable, subject_bootstrap
 
 TARGETS = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
@@ -25,7 +27,7 @@ Scores = NDArray[np.float32]
 Floats = NDArray[np.float64]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Impostors:
     """Impostor trials of one calibration.
 
@@ -54,7 +56,7 @@ class Impostors:
     weighted_trials: Callable[[Floats], float]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Genuine:
     """Genuine trials: (G,) similarities, cohort scores and people."""
 
@@ -95,7 +97,6 @@ class JointTails:
             np.sort(scores) for scores in (impostors.similarities, impostors.cohort_scores)
         )
         self._tail = (impostors.similarities, impostors.cohort_scores)
-        self._reach = impostors.trials
 
     def at_rank(self, rank: int) -> tuple[float, float]:
         """Thresholds that accept the ``rank`` highest scores of either test, ties aside."""
@@ -203,5 +204,15 @@ def make_level(
 
 
 def level_name(target: float) -> str:
-    """Name of the level of a target: ``fmr-1e-3``."""
-    return f"fmr-1e-{round(-np.log10(target))}"
+    """Name of the level of a target: ``fmr-1e-3``.
+
+    Raises
+    ------
+    ContractError
+        Where the target is no power of ten below 1: two targets must not share a name.
+    """
+    if 0 < target < 1:
+        exponent = round(-math.log10(target))
+        if exponent and math.isclose(target, 10.0**-exponent, rel_tol=1e-9):
+            return f"fmr-1e-{exponent}"
+    raise ContractError(f"{target:g} is no FMR target: use powers of ten below 1, such as 0.001")

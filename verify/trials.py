@@ -11,7 +11,7 @@ Indices = NDArray[np.int64]
 GROUP = 50
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Plan:
     """One enrollment per person, and which photos probe it.
 
@@ -32,11 +32,6 @@ class Plan:
     person_of: Indices
     enrolled: tuple[Indices, ...]
     genuine: Indices
-
-    @property
-    def person_pairs(self) -> int:
-        """Number of unordered pairs of different people."""
-        return len(self.people) * (len(self.people) - 1) // 2
 
 
 def plan_trials(

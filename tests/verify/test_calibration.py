@@ -22,9 +22,11 @@ from tests.verify.synthetic import (
     random_rotation,
 )
 from verify import Calibrated, CalibrationOptions, Verifier, calibrate
+from verify.calibration import _default_level, _protocol_pairs
 from verify.calibration_mode import ACCURACY_LEVEL
 from verify.cohort import client_source, make_cohort
 from verify.comparisons import Lifter, honest_norms, point_trials, through_wire
+from verify.tenfold import Pair
 from verify.trials import enrolled_means, plan_trials
 
 
@@ -241,6 +243,67 @@ def test_ten_fold_adds_the_accuracy_level(people: People) -> None:
     stricter = level.similarity_threshold > other.similarity_threshold
     assert (level.cohort_threshold > other.cohort_threshold) == stricter
     assert (level.fmr.value < other.fmr.value) == stricter
+
+
+def ten_pairs(people: People) -> list[Pair]:
+    """Ten genuine pairs of the first ten people with two photos, and ten impostor pairs."""
+    photos = {name: people.names.index(name) for name in sorted(set(people.names))}
+    several = [first for name, first in photos.items() if people.names.count(name) > 1][:10]
+    return [Pair(first, first + 1, True, fold) for fold, first in enumerate(several)] + [
+        Pair(first, several[fold - 1], False, fold) for fold, first in enumerate(several)
+    ]
+
+
+def test_ten_fold_pairs_that_do_not_suffice_are_refused() -> None:
+    people = draw_people(30)
+    source = make_generator()
+    binding = make_binding(source.source_id)
+    options = CalibrationOptions(protocol="ten-fold", targets=(1e-1,))
+    pairs = ten_pairs(people)
+
+    def run(given: list[Pair] | None, *, exclude: set[str], names: list[str]) -> Calibrated:
+        return calibrate(
+            people.descriptors,
+            names,
+            binding=binding,
+            source=source,
+            options=options,
+            pairs=given,
+            exclude=exclude,
+        )
+
+    in_pairs = {people.names[pair.first] for pair in pairs}
+    with pytest.raises(ContractError, match="0 pairs are there: exclude fewer people"):
+        run(pairs, exclude=in_pairs, names=people.names)
+    with pytest.raises(ContractError, match="each of 10 folds"):
+        run(pairs[:9], exclude=set(), names=people.names)
+    alone = [f"{name}-{i}" if i > 1 else name for i, name in enumerate(people.names)]
+    with pytest.raises(ContractError, match="at least 10 pairs of photos of one person"):
+        run(None, exclude=set(), names=alone)
+
+
+def test_pairs_of_two_names_of_one_person_are_genuine() -> None:
+    people = draw_people(30)
+    pairs = ten_pairs(people)
+    plan = plan_trials(people.names, photos_per_enrollment=3, rng=np.random.default_rng(0))
+    merged = replace(plan, person_of=plan.person_of.copy())
+    wrong = pairs[10]
+    merged.person_of[merged.person_of == plan.person_of[wrong.first]] = plan.person_of[wrong.second]
+    options = CalibrationOptions(protocol="ten-fold")
+    kept = np.arange(len(people.names))
+    rng = np.random.default_rng(0)
+    assert _protocol_pairs(options, pairs, kept, plan, rng) == tuple(pairs)
+    seen = _protocol_pairs(options, pairs, kept, merged, rng)
+    assert seen[10] == replace(wrong, same=True)
+    assert (*seen[:10], *seen[11:]) == (*pairs[:10], *pairs[11:])
+
+
+def test_the_default_level_is_one_that_all_calibrations_have(calibrated: Calibrated) -> None:
+    point, lifted = calibrated.contract.calibrations
+    shorter = replace(lifted, levels=lifted.levels[:1])
+    assert [level.name for level in shorter.levels] == ["fmr-1e-2"]
+    assert _default_level([point, lifted]) == "fmr-1e-3"
+    assert _default_level([point, shorter]) == "fmr-1e-2"
 
 
 def test_a_pool_contract_calibrates_and_its_clients_get_a_generator() -> None:

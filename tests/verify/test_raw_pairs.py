@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from templates.errors import ContractError
 from tests.verify.synthetic import draw_people
 from verify import raw_pairs
 from verify.raw_pairs import consistency_threshold, suspicious_pairs
@@ -59,7 +60,7 @@ def test_one_person_under_two_names_is_reported_first() -> None:
 
 def test_a_single_person_gives_no_threshold() -> None:
     people = draw_people(1, photos=(5,))
-    with pytest.raises(ValueError, match="two people"):
+    with pytest.raises(ContractError, match="two people"):
         consistency_threshold(
             people.descriptors, np.zeros(5, dtype=np.int64), fmr=0.1, rng=np.random.default_rng(0)
         )

@@ -3,6 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from templates.errors import ContractError
 from verify.tenfold import FOLDS, Pair, best_threshold, random_pairs, ten_fold
 
 trials = st.lists(
@@ -37,8 +38,10 @@ def test_ten_folds_choose_on_nine_and_apply_to_the_tenth() -> None:
 
 def test_a_missing_fold_is_refused() -> None:
     pairs = [Pair(0, 1, True, fold) for fold in range(9)]
-    with pytest.raises(ValueError, match="each of 10 folds"):
+    with pytest.raises(ContractError, match=r"each of 10 folds.*protocol fmr"):
         ten_fold(np.zeros(9), pairs)
+    with pytest.raises(ContractError, match="0 pairs are there"):
+        ten_fold(np.zeros(0), [])
 
 
 def test_random_pairs_are_balanced_true_and_distinct() -> None:
@@ -52,5 +55,5 @@ def test_random_pairs_are_balanced_true_and_distinct() -> None:
         assert (person_of[pair.first] == person_of[pair.second]) == pair.same
         assert pair.first != pair.second
     assert {pair.fold for pair in same} == set(range(FOLDS))
-    with pytest.raises(ValueError, match="two people"):
+    with pytest.raises(ContractError, match="two people; seen 0 pairs and 50 people"):
         random_pairs(np.arange(50), rng=np.random.default_rng(0))

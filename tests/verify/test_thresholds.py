@@ -4,6 +4,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from templates.errors import ContractError
+from verify import CalibrationOptions
 from verify.thresholds import (
     Genuine,
     Impostors,
@@ -106,3 +108,9 @@ def test_level_counts_both_errors_jointly() -> None:
 
 def test_level_names() -> None:
     assert [level_name(10.0**-k) for k in (2, 3, 6)] == ["fmr-1e-2", "fmr-1e-3", "fmr-1e-6"]
+    # Rounded to a power of ten, 3e-3 would carry the name of the stricter 1e-3.
+    for target in (3e-3, 1.001e-3, 1.0, 10.0, 0.0, -1e-3, float("nan")):
+        with pytest.raises(ContractError, match="powers of ten"):
+            level_name(target)
+        with pytest.raises(ContractError, match="powers of ten"):
+            CalibrationOptions(targets=(1e-2, target))
