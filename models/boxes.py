@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 MAX_CANDIDATES = 1000
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Face:
     """One detected face, in pixels of the upright image.
 

@@ -227,7 +227,7 @@ class Extractor:
 class _Prepared:
     """One file before embedding: exactly one of the last three is set."""
 
-    key: bytes
+    key: bytes = field(repr=False)
     crop: NDArray[np.uint8] | None = field(default=None, repr=False)
     embedding: NDArray[np.float32] | None = field(default=None, repr=False)
     failure: Failure | None = None

@@ -6,7 +6,7 @@ the header itself and compares it with the only headers there can be, before the
 
 import json
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple, NoReturn
 
 import numpy as np
@@ -36,7 +36,7 @@ _CONTRACT_ID = re.compile(r"[0-9a-f]{64}")
 class WireTemplate:
     """What the bytes of a template say."""
 
-    subspace: AffineSubspace
+    subspace: AffineSubspace = field(repr=False)
     contract_id: str
     dtype: WireDtype
 

@@ -141,7 +141,7 @@ def point_trials(
     ), genuine
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class LiftedTrials:
     """Scores of lifted probes, and the foot-point norms that honest lifts have."""
 

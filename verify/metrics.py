@@ -146,7 +146,7 @@ def resolvable(target: float, trials: int, *, expected_errors: float = RULE_OF_T
     return target * trials >= expected_errors * (1 - 1e-9)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ErrorCurve:
     """FMR and FNMR at every threshold that changes either (the DET curve's points).
 

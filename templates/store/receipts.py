@@ -12,7 +12,7 @@ import hashlib
 import hmac
 import json
 import uuid
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from datetime import datetime
 from typing import Any
 
@@ -77,7 +77,7 @@ class Receipt:
     """
 
     body: str
-    signature: bytes
+    signature: bytes = field(repr=False)
 
     @property
     def claims(self) -> dict[str, Any]:
