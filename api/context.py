@@ -76,6 +76,9 @@ class RequestContext:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request."""
+        if scope["type"] == "lifespan":
+            await self._start_and_stop(scope, receive, send)
+            return
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
@@ -127,3 +130,18 @@ class RequestContext:
                 duration_ms=round(1e3 * (time.perf_counter() - started), 2),
                 **fields,
             )
+
+    async def _start_and_stop(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass on the life of the worker, without the text of what ended it.
+
+        Starlette sends the traceback along, and the server would log it; both may hold anything.
+        """
+
+        async def send_without_text(message: Message) -> None:
+            await send({name: value for name, value in message.items() if name != "message"})
+
+        try:
+            await self._app(scope, receive, send_without_text)
+        except Exception as error:
+            log("worker failed", severity=logging.ERROR, error_type=type(error).__name__)
+            raise
