@@ -25,7 +25,9 @@ def running_service(folder: Path) -> Iterator[httpx.Client]:
     command = [sys.executable, "-m", "api.cli", "serve", "--config", str(folder / "veilface.toml")]
     # Settings of the person who runs the demo must not reach it.
     environment = {k: v for k, v in os.environ.items() if not k.startswith("VEILFACE_")}
-    with log.open("wb") as errors, shown.open("wb") as output:
+    shown.unlink(missing_ok=True)
+    # The first start prints a token with all rights: nobody else may read it on its way.
+    with log.open("wb") as errors, open(shown, "xb", opener=_privately) as output:
         process = subprocess.Popen(  # noqa: S603 - our own command, no shell
             [*command, "--port", str(port)],
             stdout=output,
@@ -48,6 +50,7 @@ def running_service(folder: Path) -> Iterator[httpx.Client]:
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
+            shown.unlink(missing_ok=True)
 
 
 def _free_port() -> int:
@@ -69,7 +72,10 @@ def _await_ready(process: "subprocess.Popen[bytes]", url: str, log: Path) -> Non
     raise StartError(f"the service was not ready in {START_TIMEOUT_S:.0f} s; {log} says why")
 
 
+def _privately(path: str, flags: int) -> int:
+    return os.open(path, flags, 0o600)
+
+
 def _write_token(path: Path, token: str) -> None:
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-    with os.fdopen(descriptor, "w") as file:
+    with open(path, "x", opener=_privately) as file:
         file.write(token + "\n")
