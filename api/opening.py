@@ -7,7 +7,7 @@ is wrong with it, and what to do.
 from pathlib import Path
 
 import numpy as np
-from sqlalchemy import inspect, select, table
+from sqlalchemy import inspect, select
 from sqlalchemy.engine import Connection, make_url
 from sqlalchemy.exc import ArgumentError
 
@@ -17,14 +17,17 @@ from models.errors import ModelError
 from models.pack import ModelPack
 from templates.contract import Contract
 from templates.decoys import DecoyGenerator, DecoyPool, load_source
-from templates.errors import ContractMismatch, VeilfaceError
+from templates.errors import ContractMismatch, SealError, VeilfaceError
 from templates.sealing import KeyringSealer, MasterKeyring
 from templates.store import TemplateStore
 from templates.store.database import Database
+from templates.store.schema import MasterKeyCheckRow
 
 
 def database_in_use(url: str) -> bool:
-    """Tell whether the database holds a row of ours; an absent SQLite file holds none.
+    """Tell whether a master key left its mark in the database; an absent SQLite file has none.
+
+    Tables of other applications in the same database are not looked at.
 
     Raises
     ------
@@ -35,15 +38,13 @@ def database_in_use(url: str) -> bool:
         return False
     database = Database(url)
 
-    def any_row(connection: Connection) -> bool:
-        return any(
-            connection.execute(select(1).select_from(table(name)).limit(1)).first() is not None
-            for name in inspect(connection).get_table_names()
-            if name != "alembic_version"
-        )
+    def marked(connection: Connection) -> bool:
+        if not inspect(connection).has_table(MasterKeyCheckRow.__tablename__):
+            return False
+        return connection.execute(select(MasterKeyCheckRow.id).limit(1)).first() is not None
 
     try:
-        return database.read(any_row)
+        return database.read(marked)
     finally:
         database.close()
 
@@ -59,23 +60,47 @@ def open_keyring(settings: Settings) -> MasterKeyring:
     Raises
     ------
     StartError
-        If the file is absent although the database holds something, or cannot be used.
+        If the file cannot be used; or it is absent, and the database holds something or does not
+        answer.
     """
     path = settings.resolved_master_key_file
     try:
         if path.exists():
             return MasterKeyring.load(path)
-        if database_in_use(settings.resolved_database_url):
-            raise StartError(
-                f"the master key file {path} is missing, but the database holds data sealed "
-                "with it; put the file back from its copy"
-            )
+        _require_unused(settings.resolved_database_url, path)
         path.parent.mkdir(parents=True, exist_ok=True)
-        return MasterKeyring.create(path)
+        return _create_or_load(path)
     except StartError:
         raise
-    except (OSError, ArgumentError, VeilfaceError) as error:
+    except (OSError, VeilfaceError) as error:
         raise StartError(f"the master key file {path} cannot be used: {error}") from error
+
+
+def _require_unused(url: str, path: Path) -> None:
+    try:
+        in_use = database_in_use(url)
+    except ArgumentError:
+        raise StartError("the database URL cannot be read (setting database_url)") from None
+    except (OSError, VeilfaceError) as error:
+        raise StartError(
+            f"there is no master key file {path}, and none is made while the database cannot be "
+            f"asked whether it holds data under an earlier one: {error}"
+        ) from error
+    if in_use:
+        raise StartError(
+            f"the master key file {path} is missing, but the database holds data sealed "
+            "with it; put the file back from its copy"
+        )
+
+
+def _create_or_load(path: Path) -> MasterKeyring:
+    try:
+        return MasterKeyring.create(path)
+    except SealError:
+        if not path.exists():
+            raise
+        # Another process made it since we looked: its key is everybody's.
+        return MasterKeyring.load(path)
 
 
 def open_store(settings: Settings, keyring: MasterKeyring) -> TemplateStore:
@@ -138,7 +163,8 @@ def open_decoys(
     Raises
     ------
     StartError
-        If a named file is absent or broken, or is another source than the contract's.
+        If a named file is absent or broken, is another source than the contract's, or was made
+        with another model or preprocessing.
     """
     path = settings.resolved_decoys_file
     if not path.is_file():
@@ -150,7 +176,7 @@ def open_decoys(
     except (OSError, VeilfaceError) as error:
         raise StartError(f"the decoys file {path} cannot be used: {error}") from error
     try:
-        contract.binding.require_source(source_id=source.source_id)
+        contract.binding.require_source(source_id=source.source_id, made_with=source.made_with)
     except ContractMismatch as error:
         raise StartError(f"the decoys file {path} is not the contract's: {error}") from error
     return source

@@ -1,21 +1,26 @@
 """A start that cannot work ends in one sentence; one that works needs little."""
 
 import stat
+from collections.abc import MutableMapping
 from pathlib import Path
 from typing import Any
 
+import anyio
 import numpy as np
 import onnx
 import pytest
+from sqlalchemy.engine import Connection
 
 from api.app import create_app
 from api.errors import StartError
-from api.opening import database_in_use, file_sealer, open_keyring, try_inference
+from api.opening import database_in_use, file_sealer, open_keyring, open_store, try_inference
 from api.runtime import Runtime
 from api.schemas import VerifyAnswer
 from api.settings import Settings
 from models.pack import ModelPack
 from templates.decoys import DecoyGenerator
+from templates.sealing import MasterKeyring
+from templates.store.database import Database
 from tests.api.client import Client
 from tests.api.deployment import (
     Deployment,
@@ -168,6 +173,50 @@ def test_whether_a_database_is_in_use(both: tuple[Client, Deployment], tmp_path:
     assert not (tmp_path / "none.db").exists()
 
 
+def test_another_applications_rows_do_not_count(tmp_path: Path, database_url: str) -> None:
+    database = Database(database_url)
+
+    def another_application(connection: Connection) -> None:
+        connection.exec_driver_sql("CREATE TABLE orders (id integer)")
+        connection.exec_driver_sql("INSERT INTO orders VALUES (1)")
+
+    database.write(another_application)
+    settings = Settings(data_dir=tmp_path / "data", database_url=database_url)
+    assert not database_in_use(database_url)
+    store = open_store(settings, open_keyring(settings))
+    store.upgrade()
+    assert database_in_use(database_url)
+    store.close()
+    database.close()
+
+
+def test_a_database_that_is_down_is_not_blamed_on_the_key_file(tmp_path: Path) -> None:
+    settings = Settings(data_dir=tmp_path / "data", database_url="postgresql://u@127.0.0.1:1/x")
+    with pytest.raises(StartError, match="database cannot be asked") as caught:
+        open_keyring(settings)
+    assert "cannot be used" not in str(caught.value)
+    settings.resolved_master_key_file.parent.mkdir(parents=True)
+    settings.resolved_master_key_file.write_text("nonsense")
+    with pytest.raises(StartError, match="master key file .* cannot be used"):
+        open_keyring(settings)
+
+
+def test_of_two_first_starts_at_once_the_second_takes_the_firsts_key(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = Settings(data_dir=tmp_path / "data")
+    made: list[str] = []
+
+    def meanwhile(_: str) -> bool:
+        path = settings.resolved_master_key_file
+        path.parent.mkdir(parents=True)
+        made.append(MasterKeyring.create(path).current)
+        return False
+
+    monkeypatch.setattr("api.opening.database_in_use", meanwhile)
+    assert [open_keyring(settings).current] == made
+
+
 def test_without_a_pack_templates_and_embeddings_work(fresh: Deployment) -> None:
     app = create_app(changed(fresh, pack=None))
     with Client(app, headers=bearer(fresh.token)) as client:
@@ -208,6 +257,33 @@ def test_a_failed_start_is_logged_in_one_sentence(
     with pytest.raises(StartError), Client(create_app(fresh.settings)):
         pass
     assert "start failed: there is no contract file" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("error", [RuntimeError("hunter2"), StartError("no contract")])
+def test_the_server_is_not_handed_the_text_of_a_failed_start(
+    fresh: Deployment, capfd: pytest.CaptureFixture[str], error: Exception
+) -> None:
+    """As uvicorn starts an application: what is sent to it ends in the log."""
+    sent: list[MutableMapping[str, Any]] = []
+
+    def fail(_: Settings) -> Runtime:
+        raise error
+
+    async def receive() -> MutableMapping[str, Any]:
+        return {"type": "lifespan.startup"}
+
+    async def send(message: MutableMapping[str, Any]) -> None:
+        sent.append(message)
+
+    async def start() -> None:
+        await create_app(fresh.settings, open_runtime=fail)({"type": "lifespan"}, receive, send)
+
+    with pytest.raises(type(error)):
+        anyio.run(start)
+    assert sent == [{"type": "lifespan.startup.failed"}]
+    logged = capfd.readouterr().err
+    assert "hunter2" not in logged
+    assert type(error).__name__ in logged
 
 
 def test_recalibration_keeps_the_templates(fresh: Deployment) -> None:
