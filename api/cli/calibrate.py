@@ -21,6 +21,8 @@ from templates.lifting import Strategy
 from verify import CalibrationOptions, CalibrationReport, labelled_folder
 
 MOST_SHOWN = 20
+LEAST_DECOYS = 8
+"""Fewer decoys in a template are noted: its foot point resembles the face (METHOD §4.1)."""
 
 
 class Protocol(StrEnum):
@@ -155,6 +157,8 @@ def calibrate(
     path = out or settings.resolved_contract_file
     path.parent.mkdir(parents=True, exist_ok=True)
     done.contract.save(path, sealer)
+    if note := concealment_note(strategy, dim):
+        message(f"note: {note}")
     notice = demo_notice(pack.info.embedder_sha256, n=pack.info.n)
     if as_json:
         emit(
@@ -172,6 +176,17 @@ def calibrate(
     _tell(done.contract, done.report)
     say(f"{acquired(extraction)}.")
     say(f"{path}: contract {done.contract.contract_id[:16]}.")
+
+
+def concealment_note(strategy: Strategy, m: int) -> str | None:
+    """Say what templates show whose directions have too few decoys among them, or None."""
+    if strategy.decoys(m) >= LEAST_DECOYS:
+        return None
+    return (
+        f"templates of strategy {strategy} and dimension {m} conceal little: the point of each "
+        "template nearest to the origin shows the face; use --strategy adversarial and --dim 16 "
+        "or more"
+    )
 
 
 def parse_dims(text: str) -> tuple[int, ...]:

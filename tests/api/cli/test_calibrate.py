@@ -1,10 +1,11 @@
 import pytest
 
-from api.cli.calibrate import parse_dims, read_aliases
+from api.cli.calibrate import concealment_note, parse_dims, read_aliases
 from api.cli.errors import CommandError, UsageError
 from api.opening import file_sealer
 from models.demo import DEMO_NOTICE
 from templates.contract import Contract
+from templates.lifting import Strategy
 from templates.sealing import MasterKeyring
 from tests.api.cli.conftest import DIM, PROBE_DIM, run
 
@@ -45,6 +46,9 @@ def test_people_are_left_out_and_ten_fold_adds_a_level(world, veilface, data, tm
     assert ran.status == 0, ran.stderr
     assert "accuracy" in ran.stdout
     assert DEMO_NOTICE in ran.stderr
+    # Hybrid lifting with m = 4 has two decoys.
+    assert "nearest to the origin shows the face" in " ".join(ran.stderr.split())
+    assert "conceal" not in ran.stdout
     contract = Contract.load(
         tmp_path / "contract.json", file_sealer(MasterKeyring.load(data / "master.key"))
     )
@@ -77,6 +81,24 @@ def test_a_dimension_that_the_descriptor_does_not_have_is_refused(world, data):
     )
     assert ran.status == 2
     assert "twice" in ran.stderr
+
+
+@pytest.mark.parametrize(
+    ("strategy", "m", "noted"),
+    [
+        ("random", 64, True),
+        ("adversarial", 7, True),
+        ("adversarial", 8, False),
+        ("sub-adversarial", 16, False),
+        ("hybrid", 15, True),
+        ("hybrid+", 16, False),
+    ],
+)
+def test_templates_that_conceal_little_are_noted(strategy, m, noted):
+    note = concealment_note(Strategy(strategy), m)
+    assert (note is not None) == noted
+    if note is not None:
+        assert "use --strategy adversarial and --dim 16 or more" in note
 
 
 @pytest.mark.parametrize(("text", "dims"), [("", ()), ("2,4, 8", (2, 4, 8)), ("16", (16,))])
