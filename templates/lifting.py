@@ -101,7 +101,7 @@ def lift(
     source : DecoySource, optional
         Required by every strategy but random.
     stream : Keystream, optional
-        For experiments. By default every template gets a fresh key, destroyed afterwards.
+        For experiments. By default every template gets a fresh key, dropped afterwards.
     attributes : sequence of Attributes, optional
         One per descriptor; required by hybrid+ and refused by the others.
 

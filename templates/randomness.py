@@ -30,8 +30,8 @@ Shape = int | tuple[int, ...]
 class Keystream:
     """ChaCha20 keystream turned into samples; the only source of randomness of ``templates``.
 
-    In production every template gets a stream of its own from :meth:`fresh`, which is destroyed
-    when the template is made (use it as a context manager). Experiments share one
+    In production every template gets a stream of its own from :meth:`fresh`, whose cipher is
+    dropped when the template is made (use it as a context manager). Experiments share one
     :meth:`seeded` stream.
 
     Examples
@@ -83,7 +83,11 @@ class Keystream:
         raise TypeError("a keystream is not copied or stored: two copies would repeat each other")
 
     def destroy(self) -> None:
-        """Free the cipher state, which OpenSSL overwrites; later draws raise ``ValueError``."""
+        """Drop the cipher; later draws raise ``ValueError``.
+
+        OpenSSL overwrites its state when it frees it. The key that the operating system gave is
+        an immutable object of Python: it is released, but cannot be overwritten.
+        """
         try:
             self._cipher.finalize()
         except AlreadyFinalized:
