@@ -13,6 +13,9 @@ from api.errors import ApiError
 MAX_JSON_BYTES = 4 * 1024 * 1024
 """Largest JSON body. The largest template that the wire format admits, in base64, fits."""
 
+MAX_WAITING_QUERIES = 256
+"""Requests that may wait for their turn to ask the database, most of all whose API key it is."""
+
 RETRY_AFTER_S = 1
 
 T = TypeVar("T")
@@ -67,7 +70,7 @@ class Gate:
         Requests that may compute at the same time.
     waiting : int
         Requests that may be inside and not compute: they send their body, or wait for a slot.
-        Their bodies are what bounds the worker's memory.
+        With the largest body, this bounds the memory for bodies.
     """
 
     def __init__(self, *, slots: int, waiting: int) -> None:
@@ -85,12 +88,7 @@ class Gate:
             ``overloaded``, with ``Retry-After``.
         """
         if self._room <= 0:
-            raise ApiError(
-                "overloaded",
-                "too many requests wait already; try again shortly",
-                {},
-                {"Retry-After": str(RETRY_AFTER_S)},
-            )
+            raise _overloaded()
         self._room -= 1
         try:
             yield
@@ -102,5 +100,22 @@ class Gate:
         return await anyio.to_thread.run_sync(work, limiter=self._slots)
 
     async def query(self, work: Callable[[], T]) -> T:
-        """Run ``work``, which asks the database and computes little, in a thread."""
+        """Run ``work``, which asks the database and computes little, in a thread.
+
+        Raises
+        ------
+        ApiError
+            ``overloaded``: anybody may make a request wait here, with a token of his own making.
+        """
+        if self._queries.statistics().tasks_waiting >= MAX_WAITING_QUERIES:
+            raise _overloaded()
         return await anyio.to_thread.run_sync(work, limiter=self._queries)
+
+
+def _overloaded() -> ApiError:
+    return ApiError(
+        "overloaded",
+        "too many requests wait already; try again shortly",
+        {},
+        {"Retry-After": str(RETRY_AFTER_S)},
+    )

@@ -94,15 +94,16 @@ class Settings(BaseSettings):
         ge=0,
         le=1024,
         description="Requests that may compute at the same time in one worker; the others "
-        "wait. 0: one for each processor.",
+        "wait. 0: one for each processor that the "
+        "process may use.",
     )
     queue_limit: int = Field(
         32,
         ge=1,
         le=100_000,
         description="Requests with a body that may send it or wait for a compute slot in one "
-        "worker; further ones are answered `overloaded`. With `max_request_bytes` it bounds a "
-        "worker's memory.",
+        "worker; further ones are answered `overloaded`. With `max_request_bytes` it bounds the "
+        "memory for bodies.",
     )
     workers: int = Field(1, ge=1, le=256, description="Server processes.")
     host: str = Field("127.0.0.1", description="Address to listen on.")
@@ -117,10 +118,11 @@ class Settings(BaseSettings):
         10 * MIB, ge=1024, le=256 * MIB, description="Largest photo, in bytes as sent."
     )
     max_image_pixels: int = Field(
-        40_000_000,
+        24_000_000,
         ge=10_000,
         le=400_000_000,
-        description="Largest photo, in pixels; checked before decoding.",
+        description="Largest photo, in pixels; checked before decoding, which takes up to 17 "
+        "bytes a pixel.",
     )
     max_images: int = Field(10, ge=1, le=10, description="Most photos in one enrollment.")
     default_tenant: str = Field(
@@ -197,7 +199,14 @@ class Settings(BaseSettings):
     @property
     def resolved_compute_slots(self) -> int:
         """Compute slots, with the default filled in."""
-        return self.compute_slots or os.cpu_count() or 1
+        return self.compute_slots or processors()
+
+
+def processors() -> int:
+    """Processors that this process may use; a container often may use fewer than there are."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def load_settings(**flags: Any) -> Settings:

@@ -63,7 +63,7 @@ def find_faces(detector: Detector, image: NDArray[np.uint8]) -> list[Face]:
             return faces
     height, width = image.shape[:2]
     top, left = round(height * RETRY_BORDER), round(width * RETRY_BORDER)
-    # Only what the canvas needs is kept, so that the border of a 40 MP photo costs no second one.
+    # Only what the canvas needs is kept, so that the border of a 24 MP photo costs no second one.
     shrink = min(1.0, max(detector.sizes[0]) / max(height, width))
     small = resize(image, max(1, round(height * shrink)), max(1, round(width * shrink)))
     fy, fx = small.shape[0] / height, small.shape[1] / width
