@@ -27,6 +27,10 @@ class Detector(Protocol):
     score_threshold: float
     recommended_score: float
 
+    def canvas(self, image: NDArray[np.uint8], size: Size) -> Size:
+        """The canvas that a pass of ``size`` really takes for ``image``."""
+        ...
+
     def detect_once(self, image: NDArray[np.uint8], size: Size) -> list[Face]:
         """Faces found in one pass on a canvas of ``size``, in pixels of ``image``."""
         ...
@@ -57,7 +61,12 @@ def find_faces(detector: Detector, image: NDArray[np.uint8]) -> list[Face]:
     list of Face
         In pixels of ``image``, best score first; empty when all passes found nothing.
     """
+    tried = set()
     for size in detector.sizes:
+        canvas = detector.canvas(image, size)
+        if canvas in tried:  # the same pass again would find the same
+            continue
+        tried.add(canvas)
         faces = detector.detect_once(image, size)
         if faces:
             return faces

@@ -53,6 +53,10 @@ class Scrfd:
         self._input_name = input_name
         self.sizes = canvas_sizes(size, fixed)
 
+    def canvas(self, image: NDArray[np.uint8], size: Size) -> Size:  # noqa: ARG002 - Detector
+        """Canvas of a pass: pictures are enlarged to fill it, so each size is another one."""
+        return size
+
     def detect_once(self, image: NDArray[np.uint8], size: Size) -> list[Face]:
         """Faces found in one pass on a canvas of ``size``, in pixels of ``image``."""
         canvas, scale = letterbox(image, size, enlarge=True)

@@ -56,10 +56,13 @@ class YuNet:
         self._fixed = fixed is not None
         self.sizes = canvas_sizes(size, fixed)
 
+    def canvas(self, image: NDArray[np.uint8], size: Size) -> Size:
+        """Canvas of a pass: no larger than the picture needs, unless the graph fixes it."""
+        return size if self._fixed else _trimmed(image, size)
+
     def detect_once(self, image: NDArray[np.uint8], size: Size) -> list[Face]:
         """Faces found in one pass on a canvas of ``size``, in pixels of ``image``."""
-        if not self._fixed:
-            size = _trimmed(image, size)
+        size = self.canvas(image, size)
         canvas, scale = letterbox(image, size, enlarge=False)
         blob = np.ascontiguousarray(canvas[:, :, ::-1].transpose(2, 0, 1)[None], dtype=np.float32)
         named = dict(

@@ -176,6 +176,9 @@ class Picky:
     def __init__(self, wanted):
         self.wanted, self.seen = wanted, []
 
+    def canvas(self, image, size):
+        return size
+
     def detect_once(self, image, size):
         self.seen.append((image, size))
         if len(self.seen) != self.wanted:
@@ -205,6 +208,24 @@ def test_looks_again_small_and_then_in_a_border(wanted, shape):
         assert share[1].mean() == pytest.approx(0.8 / 1.8, abs=0.03)
     # The middle of the picture, however it was looked at.
     np.testing.assert_allclose(face.keypoints[0], [shape[1] / 2, shape[0] / 2], atol=1)
+
+
+@pytest.mark.parametrize(("shape", "passes"), [((250, 250), 2), ((320, 200), 2), ((321, 200), 3)])
+def test_yunet_does_not_look_twice_at_one_canvas(shape, passes):
+    """A picture of at most 320 pixels trims to the same canvas at 640 and at 320."""
+
+    def answer(blob, outputs):
+        height, width = blob.shape[2:]
+        widths = {"cls": 1, "obj": 1, "bbox": 4, "kps": 10}
+        return [
+            np.zeros((1, (height // int(s)) * (width // int(s)), widths[role]), np.float32)
+            for role, s in (name.split("_") for name in outputs)
+        ]
+
+    session = Replay(answer)
+    assert find_faces(YuNet(session, input_name="x"), np.zeros((*shape, 3), np.uint8)) == []
+    canvases = [blob.shape[2:] for blob in session.fed]
+    assert len(canvases) == len(set(canvases)) == passes
 
 
 def test_nothing_found_is_an_empty_list():
