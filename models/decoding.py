@@ -278,7 +278,8 @@ def _rgb(image: Image.Image, orientation: int) -> NDArray[np.uint8]:
 def _strip(image: Image.Image) -> NDArray[np.uint8]:
     if image.mode.startswith("I"):
         grey = np.asarray(image).astype(np.float32) * np.float32(255 / 65535)
-        return np.rint(grey).clip(0, 255).astype(np.uint8)[:, :, None]  # for all three channels
+        whole = np.rint(grey).clip(0, 255).astype(np.uint8)
+        return np.broadcast_to(whole[:, :, None], (*whole.shape, 3))
     if image.mode in ("LA", "PA", "RGBA", "La", "RGBa") or "transparency" in image.info:
         image = image.convert("RGBA")
         canvas = Image.new("RGBA", image.size, (BACKGROUND,) * 3 + (255,))
