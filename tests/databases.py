@@ -21,11 +21,16 @@ from sqlalchemy.engine import make_url
 DEFAULT_SERVER = "postgresql://postgres@127.0.0.1:5432/postgres"
 
 
+def postgres_server() -> str:
+    """URL of the server that tests may make databases on."""
+    server = os.environ.get("VEILFACE_TEST_POSTGRES_URL", DEFAULT_SERVER)
+    return server.replace("postgresql+psycopg://", "postgresql://")
+
+
 @pytest.fixture(scope="session")
 def postgres_database() -> Iterator[str]:
     """URL of an empty database of this test run's own."""
-    server = os.environ.get("VEILFACE_TEST_POSTGRES_URL", DEFAULT_SERVER)
-    server = server.replace("postgresql+psycopg://", "postgresql://")
+    server = postgres_server()
     try:
         connection = psycopg.connect(server, autocommit=True, connect_timeout=3)
     except psycopg.OperationalError as error:

@@ -10,6 +10,7 @@ import base64
 import json
 import sqlite3
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ import psycopg
 import pytest
 
 from tests.api.cli.conftest import run
-from tests.databases import postgres_database  # noqa: F401
+from tests.databases import postgres_database, postgres_server  # noqa: F401
 from tests.leak_material import Material, make_material
 from tests.leak_places import copied_tables, files_of, relation_files
 from tests.leak_scene import Scene, play
@@ -43,11 +44,17 @@ def scene(
     request: pytest.FixtureRequest,
     material: Material,
     tmp_path_factory: pytest.TempPathFactory,
-) -> Scene:
+) -> Iterator[Scene]:
     folder = tmp_path_factory.mktemp(request.param)
     if request.param == "sqlite":
-        return play(material, folder, database_url=f"sqlite:///{folder / 'data' / 'veilface.db'}")
-    return play(material, folder, database_url=request.getfixturevalue("postgres_database"))
+        yield play(material, folder, database_url=f"sqlite:///{folder / 'data' / 'veilface.db'}")
+        return
+    url = request.getfixturevalue("postgres_database")
+    with psycopg.connect(postgres_server(), autocommit=True) as connection:
+        # The server's log is one for all databases: the controls that another run of these tests
+        # plants would be found in it.
+        connection.execute("SELECT pg_advisory_lock(hashtext('veilface leak tests'))")
+        yield play(material, folder, database_url=url)
 
 
 @pytest.fixture(scope="module")
