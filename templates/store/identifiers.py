@@ -6,11 +6,12 @@ from datetime import UTC, datetime
 
 from templates.errors import StoreError
 
-SUBJECT_ID_RULE = "1 to 128 characters out of A-Z a-z 0-9 . _ @ : -"
+SUBJECT_ID_RULE = "1 to 128 characters out of A-Z a-z 0-9 . _ @ : -, and is not . or .."
 TENANT_NAME_RULE = "1 to 64 characters out of A-Z a-z 0-9 . _ -"
 OPAQUE_ID_RULE = "1 to 64 characters out of A-Z a-z 0-9 _ -"
 
-_SUBJECT_ID = re.compile(r"[A-Za-z0-9._@:-]{1,128}")
+# A client or proxy may rewrite "." and ".." as path steps, and so name another resource.
+_SUBJECT_ID = re.compile(r"(?!\.{1,2}\Z)[A-Za-z0-9._@:-]{1,128}")
 _TENANT_NAME = re.compile(r"[A-Za-z0-9._-]{1,64}")
 _OPAQUE_ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
