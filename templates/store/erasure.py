@@ -29,8 +29,8 @@ class Erasure:
     erased
         Whether this call removed a template; False when there was none (any more).
     log_purged
-        False if a long reader kept SQLite from emptying its write-ahead log just now; the next
-        erasure or ``purge_log`` does it.
+        False if SQLite could not empty its write-ahead log just now, as beside a long reader; the
+        next erasure or ``purge_log`` does it.
     """
 
     receipt: Receipt
@@ -114,7 +114,7 @@ class Erasures:
             return receipt, subject_pk is not None
 
         receipt, erased = self._database.write(work, lock=subject_lock(tenant, subject_id))
-        return Erasure(receipt=receipt, erased=erased, log_purged=self._database.purge_log())
+        return Erasure(receipt=receipt, erased=erased, log_purged=self._database.try_purge_log())
 
     def receipt(self, tenant: str, subject_id: str) -> Receipt | None:
         """Return the latest erasure receipt of a subject, or None."""

@@ -82,7 +82,7 @@ class TemplateStore(Subjects):
     def rewrap(self, *, batch: int = 200, progress: Callable[[int], None] | None = None) -> int:
         """Bring all wrapped keys and secrets under the current key; see ``rewrap.rewrap``."""
         count = rewrap.rewrap(self._database, self._keyring, batch=batch, progress=progress)
-        self._database.purge_log()
+        self._database.try_purge_log()
         return count
 
     def wrapping_keys(self) -> dict[str, int]:

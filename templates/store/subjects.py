@@ -180,7 +180,7 @@ class Subjects:
 
         created = self._database.write(work, lock=subject_lock(tenant, subject_id))
         if not created:
-            self._database.purge_log()
+            self._database.try_purge_log()
         return StoredTemplate(template_id=template_id, created=created)
 
     def get(
