@@ -6,6 +6,7 @@ database asks for that (a deadlock, a serialisation failure), so it must do noth
 work.
 """
 
+import contextlib
 import hashlib
 import os
 import random
@@ -30,6 +31,7 @@ T = TypeVar("T")
 _ATTEMPTS = 5
 _RETRIED_STATES = {"40001", "40P01"}  # serialisation failure, deadlock
 _DATABASE_ERRORS = (SQLAlchemyError, sqlite3.Error, psycopg.Error, OSError)
+_WRITING = "veilface writing"  # lock that every write shares, see await_writers
 _EMPTY_LOG = "PRAGMA wal_checkpoint(TRUNCATE)"
 _UNAVAILABLE_CLASSES = {"08", "53", "57", "58"}  # connection, resources, operator, system
 
@@ -139,6 +141,12 @@ class Database:
             raise _translated(error) from None
         return not busy
 
+    def try_purge_log(self) -> bool:
+        """:meth:`purge_log` after a commit: what is written is written, so this never raises."""
+        with contextlib.suppress(StoreError):
+            return self.purge_log()
+        return False
+
     def compact(self, tables: Sequence[str]) -> None:
         """Rewrite tables (PostgreSQL) or the file (SQLite) without what was removed from them."""
         here = self._here()
@@ -167,13 +175,38 @@ class Database:
         """Close the connections of this process that are idle."""
         self._here().engine.dispose()
 
-    def _locked(self, lock: str | None, wait: float | None) -> sa.Select[Any]:
+    def await_writers(self) -> None:
+        """Return when every write that had begun before has ended.
+
+        A write that begins later sees whatever was changed before this call, files included.
+
+        Raises
+        ------
+        StoreUnavailable
+            If one takes longer than the timeout.
+        """
+        here = self._here()
+        try:
+            with here.writing, here.writers.begin() as connection:
+                # On SQLite the transaction itself waits for the other writers.
+                if not self.is_sqlite:
+                    alone = sa.func.pg_advisory_xact_lock(_lock_number(_WRITING))
+                    connection.execute(self._lock_limit(None))
+                    connection.execute(sa.select(alone))
+        except _DATABASE_ERRORS as error:
+            raise _translated(error) from None
+
+    def _lock_limit(self, wait: float | None) -> sa.Select[Any]:
         milliseconds = str(round(1000 * (self._timeout if wait is None else wait)))
-        limit = sa.func.set_config("lock_timeout", milliseconds, True)
+        return sa.select(sa.func.set_config("lock_timeout", milliseconds, True))
+
+    def _locked(self, lock: str | None, wait: float | None) -> sa.Select[Any]:
+        # PostgreSQL takes the columns of this in their order: the limit holds for the locks.
+        shared = sa.func.pg_advisory_xact_lock_shared(_lock_number(_WRITING))
+        statement = self._lock_limit(wait).add_columns(shared)
         if lock is None:
-            return sa.select(limit)
-        # PostgreSQL takes the columns of this in their order: the limit holds for the lock.
-        return sa.select(limit, sa.func.pg_advisory_xact_lock(_lock_number(lock)))
+            return statement
+        return statement.add_columns(sa.func.pg_advisory_xact_lock(_lock_number(lock)))
 
     def _here(self) -> "_Process":
         if self._process.pid != os.getpid():

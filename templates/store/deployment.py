@@ -78,17 +78,19 @@ def insert_once(connection: Connection, table: type[Base], **values: object) -> 
 
 def mark_master_key(database: Database, keyring: MasterKeyring, clock: Clock) -> None:
     """Leave a mark under the current master key in a database that has none yet."""
-    sealed = keyring.seal(_CHECK_TEXT, purpose=CHECK_PURPOSE, bound_to=[])
-    database.write(
-        lambda each: insert_once(
-            each,
+
+    def work(connection: Connection) -> None:
+        sealed = keyring.seal(_CHECK_TEXT, purpose=CHECK_PURPOSE, bound_to=[])
+        insert_once(
+            connection,
             MasterKeyCheckRow,
             id=1,
             wrapped_value=sealed,
             wrapping_key=sealed_key_id(sealed),
             created_at=clock(),
         )
-    )
+
+    database.write(work)
 
 
 def check_master_key(database: Database, keyring: MasterKeyring) -> None:

@@ -3,6 +3,10 @@
 Only wrapped keys and secrets are touched, never a template: the work is a few hundred bytes a
 subject. It runs in small transactions beside a service in use. Each row is replaced only if it
 still holds the blob that was read, so an enrollment that happens meanwhile is never undone.
+
+Whatever is sealed under the master key is sealed inside the transaction that stores it. So after
+waiting for the writes that were under way when the key changed, none can still appear under the old
+key.
 """
 
 from collections.abc import Callable, Sequence
@@ -112,10 +116,13 @@ def rewrap(
     SealError
         If a blob is under a key that the keyring lacks. What was re-wrapped before it stays so,
         and the next run goes on from there.
+    StoreUnavailable
+        If a write that was under way at the start does not end within the timeout.
     """
     total = 0
     while True:
         current = keyring.current
+        database.await_writers()
         for column in WRAPPED_COLUMNS:
             work = partial(_rewrap_batch, column=column, keyring=keyring, batch=batch)
             while any(counts := database.write(work)):

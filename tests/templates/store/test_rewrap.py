@@ -1,5 +1,7 @@
 import threading
+from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
+from typing import Any
 
 import pytest
 import sqlalchemy as sa
@@ -8,6 +10,7 @@ from templates.errors import SealError
 from templates.sealing import MasterKeyring
 from templates.store import TemplateStore, probe_key
 from templates.store.database import Database
+from templates.store.envelope import Envelope, close_envelope
 from templates.store.rewrap import WRAPPED_COLUMNS
 from templates.store.schema import Base, TemplateRow
 from tests.templates.store.conftest import put
@@ -139,6 +142,44 @@ def test_a_service_in_use_loses_nothing(
     MasterKeyring.drop_retired(key_file)
     fresh = TemplateStore(database_url, MasterKeyring.load(key_file))
     assert wires(fresh) == latest
+    service.close()
+    fresh.close()
+
+
+def test_a_write_that_sealed_before_the_rotation_is_waited_for(
+    store: TemplateStore,
+    database_url: str,
+    key_file: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It sealed under the old key and has not committed: no query can see it yet."""
+    service = TemplateStore(database_url, MasterKeyring.load(key_file))
+    service.pseudonym("default", "-")
+    sealed, go_on = threading.Event(), threading.Event()
+
+    def slowly(*arguments: Any) -> Envelope:
+        envelope = close_envelope(*arguments)
+        sealed.set()
+        assert go_on.wait(20)
+        return envelope
+
+    monkeypatch.setattr("templates.store.subjects.close_envelope", slowly)
+    with ThreadPoolExecutor(2) as threads:
+        writing = threads.submit(put, service, "ada", b"wire")
+        assert sealed.wait(20)
+        current = MasterKeyring.add_current(key_file)
+        rotating = threads.submit(store.rewrap)
+        early = wait([rotating], timeout=0.5).done
+        go_on.set()
+        writing.result()
+        rotating.result()
+    assert not early
+    assert set(store.wrapping_keys()) == {current}
+    MasterKeyring.drop_retired(key_file)
+    fresh = TemplateStore(database_url, MasterKeyring.load(key_file))
+    found = fresh.get("default", "ada")
+    assert found is not None
+    assert found.wire == b"wire"
     service.close()
     fresh.close()
 
