@@ -12,6 +12,33 @@ MAX_N = 4096
 MAX_M = 128
 
 
+def embedding_id(*, embedder_sha256: str, preprocessing: Mapping[str, object]) -> str:
+    """Name the space that descriptors lie in: equal for equal weights and equal preprocessing.
+
+    Decoys hide a descriptor only if they lie in its space; this id is how a decoy source says
+    which one that is (``DecoySource.made_with``).
+
+    Parameters
+    ----------
+    embedder_sha256
+        SHA-256 of the embedder's ONNX file, 64 hexadecimal digits.
+    preprocessing
+        Alignment template, size, channel order, mean, scale and flip.
+
+    Returns
+    -------
+    str
+        SHA-256 of the canonical JSON of both, 64 hexadecimal digits.
+
+    Raises
+    ------
+    ContractError
+        Where the preprocessing is not plain JSON.
+    """
+    plain = free_object(preprocessing, what="the preprocessing")
+    return digest({"embedder_sha256": embedder_sha256, "preprocessing": plain})
+
+
 @dataclass(frozen=True)
 class Binding:
     """What makes two templates comparable; its hash is the ``contract_id``.
@@ -60,6 +87,11 @@ class Binding:
         """SHA-256 of the canonical JSON, 64 hexadecimal digits."""
         return digest(self.to_json())
 
+    @property
+    def embedding_id(self) -> str:
+        """:func:`embedding_id` of the contract's embedder and preprocessing."""
+        return embedding_id(embedder_sha256=self.embedder_sha256, preprocessing=self.preprocessing)
+
     def to_json(self) -> dict[str, Json]:
         """JSON form: exactly what is hashed."""
         return {
@@ -102,14 +134,29 @@ class Binding:
             )
             raise ContractMismatch(f"the pack preprocesses otherwise than the contract: {sides}")
 
-    def require_source(self, *, source_id: str) -> None:
-        """Refuse a decoy source other than the contract's.
+    def require_source(self, *, source_id: str, made_with: str | None = None) -> None:
+        """Refuse a decoy source other than the contract's, or of another descriptor space.
+
+        Parameters
+        ----------
+        source_id
+            The source's id.
+        made_with
+            The source's ``made_with``; None, as of a source made in code, is not held against
+            the binding.
 
         Raises
         ------
         ContractMismatch
             Naming both sides.
         """
+        if made_with is not None and made_with != self.embedding_id:
+            raise ContractMismatch(
+                "the decoys are descriptors of another model or another preprocessing (made with "
+                f"{made_with[:16]}…, the contract's is {self.embedding_id[:16]}…), and hide "
+                "nothing; build the decoys with this pack and the same --flip, and calibrate "
+                "with them"
+            )
         if source_id != self.decoy_source_id:
             raise ContractMismatch(
                 f"the contract is bound to the decoy source {self.decoy_source_id[:16]}…, this one "

@@ -34,7 +34,8 @@ def fit_statistics(descriptors: NDArray[np.floating]) -> DescriptorStatistics:
     Returns
     -------
     DescriptorStatistics
-        A deterministic function of the descriptors.
+        The same for the same descriptors on one machine; another processor, BLAS or number of
+        threads rounds differently, and so gives another `source_id`.
 
     Raises
     ------

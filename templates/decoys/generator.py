@@ -1,8 +1,10 @@
 """Decoys that belong to nobody, spread like real descriptors.
 
-The generator holds statistics, not people: it may be given to clients that lift on their own
-(PRODUCT "Contract"). Every draw is fresh, so no decoy exists outside its one template, and it
-does not depend on the subject (METHOD §4.2 to §4.5). docs/decoys.md says how it was chosen.
+The generator holds moments, not descriptors, and is given to clients that lift on their own
+(PRODUCT "Contract"). The moments still tell who holds a photo whether that person was in the fit,
+better than chance (docs/decoys.md "Whether it remembers people"). Every draw is fresh, so no decoy
+exists outside its one template, and it does not depend on the subject (METHOD §4.2 to §4.5).
+docs/decoys.md says how it was chosen.
 """
 
 import hashlib
@@ -15,7 +17,7 @@ from numpy.typing import NDArray
 
 from templates.decoys import container
 from templates.decoys.files import read_bounded, write_private
-from templates.decoys.source import MAX_DIMENSION, Attributes
+from templates.decoys.source import MAX_DIMENSION, Attributes, checked_made_with, take_made_with
 from templates.decoys.statistics import (
     MAX_COMPONENTS,
     DescriptorStatistics,
@@ -47,6 +49,13 @@ class DecoyGenerator:
     ----------
     statistics
         As `fit` finds them.
+    made_with
+        `templates.binding.embedding_id` of the pack that gave the descriptors of the fit.
+
+    Raises
+    ------
+    DecoyError
+        `made_with` is not 64 lower-case hexadecimal digits.
 
     Notes
     -----
@@ -62,8 +71,9 @@ class DecoyGenerator:
     mixtures", PAMI 2009.
     """
 
-    def __init__(self, statistics: DescriptorStatistics) -> None:
+    def __init__(self, statistics: DescriptorStatistics, *, made_with: str | None = None) -> None:
         self._statistics = statistics
+        self.made_with: str | None = None if made_with is None else checked_made_with(made_with)
         self.n: int = statistics.n
         self.source_id: str = hashlib.sha256(self.to_bytes()).hexdigest()
         self._cumulative = np.cumsum(statistics.weights.astype(np.float64))
@@ -78,23 +88,26 @@ class DecoyGenerator:
         return self._statistics
 
     @classmethod
-    def fit(cls, descriptors: NDArray[np.floating]) -> Self:
+    def fit(cls, descriptors: NDArray[np.floating], *, made_with: str | None = None) -> Self:
         """Fit to real descriptors.
 
         Parameters
         ----------
         descriptors
             float32, shape (N, n), unit rows, N ≥ 100; several thousand give good decoys.
+        made_with
+            `templates.binding.embedding_id` of the pack that gave them.
 
         Raises
         ------
         DecoyError
-            Too few descriptors, or descriptors that are not finite unit vectors.
+            Too few descriptors, or descriptors that are not finite unit vectors or lie in a small
+            subspace.
         """
         # Imported here, because it loads scikit-learn, which a client that draws does not need.
         from templates.decoys.fitting import fit_statistics
 
-        return cls(fit_statistics(descriptors))
+        return cls(fit_statistics(descriptors), made_with=made_with)
 
     def draw(
         self,
@@ -157,7 +170,12 @@ class DecoyGenerator:
 
     def to_bytes(self) -> bytes:
         """Serialise; equal generators give equal bytes, and `source_id` is their SHA-256."""
-        fields: container.Fields = {"format": GENERATOR_FORMAT, "version": GENERATOR_VERSION}
+        fields: dict[str, str | int | list[str]] = {
+            "format": GENERATOR_FORMAT,
+            "version": GENERATOR_VERSION,
+        }
+        if self.made_with is not None:
+            fields["made_with"] = self.made_with
         return container.encode(fields, {name: getattr(self._statistics, name) for name in _PARTS})
 
     @classmethod
@@ -172,15 +190,19 @@ class DecoyGenerator:
         fields, arrays = container.decode(
             data, what="decoy generator", max_bytes=MAX_GENERATOR_BYTES
         )
+        made_with = take_made_with(fields)
         if fields != {"format": GENERATOR_FORMAT, "version": GENERATOR_VERSION}:
             raise DecoyError(f"this is not a decoy generator of version {GENERATOR_VERSION}")
         if set(arrays) != set(_PARTS) or any(a.dtype != np.float32 for a in arrays.values()):
             raise DecoyError("the decoy generator has missing or unknown parts")
         parts = {name: array.astype(np.float32) for name, array in arrays.items()}
-        return cls(DescriptorStatistics(**parts))
+        return cls(DescriptorStatistics(**parts), made_with=made_with)
 
     def save(self, path: Path) -> None:
-        """Write the generator as a plain file: it holds nothing of any single person.
+        """Write the generator as a plain file, which clients may have.
+
+        It holds no descriptor, but tells who holds a photo whether that person was in the fit,
+        better than chance (docs/decoys.md).
 
         Raises
         ------

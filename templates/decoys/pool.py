@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from templates.decoys import container
 from templates.decoys.files import read_bounded, write_private
-from templates.decoys.source import MAX_DIMENSION, Attributes
+from templates.decoys.source import MAX_DIMENSION, Attributes, checked_made_with, take_made_with
 from templates.errors import DecoyError
 from templates.randomness import Keystream
 from templates.sealing import Sealer
@@ -43,15 +43,22 @@ class DecoyPool:
         float32, shape (N, n), unit rows (tolerance 1e-3). They are renormalised in float64.
     labels
         One `Attributes` per row, or None. Needed for ``unlike``.
+    made_with
+        `templates.binding.embedding_id` of the pack that gave the descriptors.
 
     Raises
     ------
     DecoyError
-        Wrong shape, a row that is not a finite unit vector, or labels that do not fit.
+        Wrong shape, a row that is not a finite unit vector, labels that do not fit, or a
+        `made_with` that is not 64 lower-case hexadecimal digits.
     """
 
     def __init__(
-        self, descriptors: NDArray[np.floating], *, labels: Sequence[Attributes] | None = None
+        self,
+        descriptors: NDArray[np.floating],
+        *,
+        labels: Sequence[Attributes] | None = None,
+        made_with: str | None = None,
     ) -> None:
         array = np.array(descriptors, dtype="<f4", order="C", copy=True)
         if array.ndim != 2 or not 1 <= array.shape[0] <= MAX_ENTRIES:
@@ -75,6 +82,7 @@ class DecoyPool:
         self._descriptors = array
         self._labels = None if labels is None else tuple(labels)
         self.n: int = array.shape[1]
+        self.made_with: str | None = None if made_with is None else checked_made_with(made_with)
         self.source_id: str = hashlib.sha256(self._encode()).hexdigest()
 
     def __len__(self) -> int:
@@ -182,13 +190,15 @@ class DecoyPool:
 
     def _encode(self) -> bytes:
         labels = self._labels
+        fields: dict[str, str | int | list[str]] = {"format": _FORMAT, "version": _VERSION}
+        if self.made_with is not None:
+            fields["made_with"] = self.made_with
         if labels is None:
-            fields: container.Fields = {"format": _FORMAT, "version": _VERSION}
             return container.encode(fields, {"descriptors": self._descriptors})
         genders, gender_codes = _coded([label.gender for label in labels])
         races, race_codes = _coded([label.race for label in labels])
         return container.encode(
-            {"format": _FORMAT, "version": _VERSION, "genders": genders, "races": races},
+            {**fields, "genders": genders, "races": races},
             {"descriptors": self._descriptors, "gender": gender_codes, "race": race_codes},
         )
 
@@ -223,9 +233,10 @@ class DecoyPool:
         fields, arrays = container.decode(data, what="decoy pool", max_bytes=MAX_POOL_BYTES)
         if fields.get("format") != _FORMAT or fields.get("version") != _VERSION:
             raise DecoyError(f"this is not a decoy pool of version {_VERSION}")
+        made_with = take_made_with(fields)
         names = set(arrays)
         if names == {"descriptors"} and set(fields) == {"format", "version"}:
-            return cls(arrays["descriptors"].astype(np.float32))
+            return cls(arrays["descriptors"].astype(np.float32), made_with=made_with)
         if names != {"descriptors", "gender", "race"} or set(fields) != {
             "format",
             "version",
@@ -238,7 +249,7 @@ class DecoyPool:
         if len(genders) != len(races):
             raise DecoyError("the decoy pool has labels of different lengths")
         labels = [Attributes(g, r) for g, r in zip(genders, races, strict=True)]
-        return cls(arrays["descriptors"].astype(np.float32), labels=labels)
+        return cls(arrays["descriptors"].astype(np.float32), labels=labels, made_with=made_with)
 
 
 def _differs(label: Attributes, subject: Attributes) -> bool:

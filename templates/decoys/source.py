@@ -1,5 +1,6 @@
 """What lifting asks of a decoy source, whichever kind it is."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -7,10 +8,36 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from templates.errors import DecoyError
 from templates.randomness import Keystream
 
 MAX_DIMENSION = 4096
 """Largest descriptor dimension a source may have; the same bound as the wire format's."""
+_SHA256_HEX = re.compile(r"[0-9a-f]{64}")
+
+
+def take_made_with(fields: dict[str, object]) -> str | None:
+    """Take the ``made_with`` out of the fields of a file that may be hostile; None where absent.
+
+    Raises
+    ------
+    DecoyError
+        It is there, and is not 64 lower-case hexadecimal digits.
+    """
+    return checked_made_with(fields.pop("made_with")) if "made_with" in fields else None
+
+
+def checked_made_with(value: object) -> str:
+    """Give back a ``made_with`` that is one.
+
+    Raises
+    ------
+    DecoyError
+        It is not 64 lower-case hexadecimal digits.
+    """
+    if not isinstance(value, str) or not _SHA256_HEX.fullmatch(value):
+        raise DecoyError("made_with must be 64 lower-case hexadecimal digits, or absent")
+    return value
 
 
 @dataclass(frozen=True)
@@ -37,10 +64,14 @@ class DecoySource(Protocol):
         SHA-256, in hex, of the canonical content. Part of the contract.
     n
         Dimension of the descriptors.
+    made_with
+        `templates.binding.embedding_id` of the pack whose descriptors the source was made of; None
+        where the maker did not say. Part of the canonical content.
     """
 
     source_id: str
     n: int
+    made_with: str | None
 
     def draw(
         self,

@@ -235,8 +235,27 @@ def test_mismatches_name_both_sides() -> None:
         binding.require_embedder(**{**same, "preprocessing": preprocessing})
     with pytest.raises(ContractMismatch, match=r"cdcd.*0000"):
         binding.require_source(source_id="00" * 32)
+    binding.require_source(source_id="cd" * 32, made_with=binding.embedding_id)
+    with pytest.raises(ContractMismatch, match="build the decoys with this pack and the same --fl"):
+        binding.require_source(source_id="cd" * 32, made_with="00" * 32)
     with pytest.raises(ContractMismatch, match=r"it belongs to the contract 1111.*runs"):
         binding.require_contract("1" * 64, what="it")
+
+
+def test_the_embedding_id_names_the_weights_and_the_preprocessing() -> None:
+    binding = make_binding()
+    text = json.dumps(
+        {"embedder_sha256": "ab" * 32, "preprocessing": dict(binding.preprocessing)},
+        sort_keys=True,
+        separators=(",", ":"),
+    )
+    assert binding.embedding_id == hashlib.sha256(text.encode()).hexdigest()
+    assert dataclasses.replace(binding, m=binding.m - 1).embedding_id == binding.embedding_id
+    flipped = {**binding.preprocessing, "flip": "another"}
+    assert dataclasses.replace(binding, preprocessing=flipped).embedding_id != binding.embedding_id
+    assert (
+        dataclasses.replace(binding, embedder_sha256="ef" * 32).embedding_id != binding.embedding_id
+    )
 
 
 # --- the file ------------------------------------------------------------------------------

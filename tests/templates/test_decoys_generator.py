@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.stats import ks_2samp
 
-from templates.decoys import Attributes, DecoyGenerator, DecoySource, load_source
+from templates.decoys import Attributes, DecoyGenerator, DecoySource, container, load_source
 from templates.decoys.generator import GENERATOR_FORMAT, MAX_GENERATOR_BYTES
 from templates.decoys.statistics import (
     DescriptorStatistics,
@@ -24,6 +24,7 @@ from templates.randomness import Keystream
 from templates.sealing import KeyringSealer, MasterKeyring
 
 N = 80
+MADE = "5a" * 32
 Rows = NDArray[np.float32]
 
 
@@ -128,7 +129,7 @@ def test_few_descriptors_or_dimensions_are_enough_to_fit(count: int, n: int) -> 
 
 
 def test_descriptors_in_a_subspace_give_decoys_in_it() -> None:
-    """Demo descriptors, for one, may have fewer degrees of freedom than numbers."""
+    """Below 64 numbers; with more, a small subspace is refused (see below)."""
     plane = np.linalg.qr(np.random.default_rng(0).normal(size=(32, 8)))[0]
     x = np.random.default_rng(1).normal(size=(500, 8)) @ plane.T
     x /= np.linalg.norm(x, axis=1, keepdims=True)
@@ -347,14 +348,86 @@ def test_statistics_out_of_range_are_refused(changes: dict[str, NDArray[np.float
 
 def test_a_generator_of_nothing_says_so() -> None:
     """Statistics in range whose samples have no direction: an error, not NaN."""
-    axes = np.zeros((N, N))
+    axes = np.zeros((32, 32))
     axes[0, 0] = 1.0
-    q = feature_count(N)
+    q = feature_count(32)
     degenerate = DecoyGenerator(
-        DescriptorStatistics(**parts(axes=axes, spreads=np.zeros((2, q, q))))
+        DescriptorStatistics(
+            mean=np.zeros(32, np.float32),
+            axes=axes.astype(np.float32),
+            weights=np.ones(1, np.float32),
+            centres=np.zeros((1, q), np.float32),
+            spreads=np.zeros((1, q, q), np.float32),
+        )
     )
     with pytest.raises(DecoyError, match="without a direction"):
         degenerate.draw(2, 2, stream=Keystream.fresh())
+
+
+def few_axes(count: int) -> NDArray[np.float64]:
+    return np.diag((np.arange(N) < count).astype(np.float64))
+
+
+def test_decoys_of_few_dimensions_are_refused() -> None:
+    """They leave the hidden descriptor the one direction outside their subspace."""
+    with pytest.raises(DecoyError, match=r"over 9 of 80 dimensions.*at least 10"):
+        DescriptorStatistics(**parts(axes=few_axes(9)))
+    assert DescriptorStatistics(**parts(axes=few_axes(11))).participation > 10
+    x = np.random.default_rng(1).normal(size=(500, 8)) @ np.eye(N)[:8]
+    with pytest.raises(DecoyError, match="hide nothing"):
+        DecoyGenerator.fit(x / np.linalg.norm(x, axis=1, keepdims=True))
+
+
+def test_hiding_the_few_dimensions_in_the_mixture_or_in_parallel_axes_is_refused() -> None:
+    q = feature_count(N)
+    quiet = np.zeros((2, q))
+    quiet[:, leading_axes(N) :] = -9.0
+    loud = np.tile(np.diag([30.0] * 2 + [1.0] * (q - 2)), (2, 1, 1))
+    with pytest.raises(DecoyError, match="hide nothing"):
+        DescriptorStatistics(**parts(centres=quiet, spreads=loud))
+    parallel = np.zeros((N, N))
+    parallel[:, 0] = 1.0
+    with pytest.raises(DecoyError, match="not orthogonal"):
+        DescriptorStatistics(**parts(axes=parallel))
+
+
+def test_the_participation_ratio_is_that_of_what_is_drawn(fitted: DecoyGenerator) -> None:
+    """Estimated from decoys: their deviations along the axes, without any formula of the model."""
+    axes = fitted.statistics.axes.astype(np.float64)
+    units = axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    decoys = draw(fitted, 20000, "participation")
+    sigma = np.std(decoys @ units.T, axis=0)
+    assert fitted.statistics.participation == pytest.approx(
+        sigma.sum() ** 2 / (sigma**2).sum(), rel=0.05
+    )
+
+
+def test_what_made_the_descriptors_is_part_of_the_file_and_of_its_id(tmp_path: Path) -> None:
+    rows = face_like(200, seed=1, n=8)
+    plain, made, other = (DecoyGenerator.fit(rows, made_with=m) for m in (None, MADE, "1" * 64))
+    assert (plain.made_with, made.made_with) == (None, MADE)
+    assert len({plain.source_id, made.source_id, other.source_id}) == 3
+    made.save(tmp_path / "g")
+    loaded = DecoyGenerator.load(tmp_path / "g")
+    assert loaded.made_with == MADE
+    assert loaded.source_id == made.source_id
+    assert DecoyGenerator.from_bytes(plain.to_bytes()).made_with is None
+    assert np.array_equal(draw(plain, 5, "x"), draw(made, 5, "x"))
+
+
+@pytest.mark.parametrize(
+    "value", [None, 7, "", "a" * 63, "A" * 64, "g" * 64, "a" * 64 + "\n", ["a"]]
+)
+def test_a_hostile_made_with_is_refused(value: object) -> None:
+    """Null among them: absent and null would be two encodings of one content."""
+    generator = DecoyGenerator.fit(face_like(200, seed=1, n=8), made_with=MADE)
+    fields, arrays = container.decode(generator.to_bytes(), what="it", max_bytes=10**6)
+    data = container.encode({**fields, "made_with": value}, arrays)  # type: ignore[dict-item]
+    with pytest.raises(DecoyError, match="made_with must be 64"):
+        DecoyGenerator.from_bytes(data)
+    if isinstance(value, str):
+        with pytest.raises(DecoyError, match="made_with must be 64"):
+            DecoyGenerator(generator.statistics, made_with=value)
 
 
 @given(n=st.integers(2, 4096))

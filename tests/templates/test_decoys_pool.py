@@ -276,6 +276,35 @@ def test_the_file_is_private_and_shows_no_descriptor(tmp_path: Path, sealer: Key
     assert sorted(p.name for p in tmp_path.iterdir()) == ["decoys.veil", "master.key"]
 
 
+@pytest.mark.parametrize("labelled", [True, False])
+def test_what_made_the_descriptors_is_sealed_with_them(
+    tmp_path: Path, sealer: KeyringSealer, labelled: bool
+) -> None:
+    labels = cross_labels(20) if labelled else None
+    ids = set()
+    for made_with in (None, "5a" * 32, "5b" * 32):
+        pool = DecoyPool(unit_rows(20, 8), labels=labels, made_with=made_with)
+        pool.save(tmp_path / "p", sealer)
+        loaded = load_source(tmp_path / "p", sealer)
+        assert loaded.made_with == made_with
+        assert loaded.source_id == pool.source_id
+        ids.add(pool.source_id)
+    assert len(ids) == 3
+    with pytest.raises(DecoyError, match="made_with must be 64"):
+        DecoyPool(unit_rows(20, 8), made_with="5A" * 32)
+
+
+@pytest.mark.parametrize("value", [None, 1, "5A" * 32])
+def test_a_hostile_made_with_under_the_seal_is_refused(
+    tmp_path: Path, sealer: KeyringSealer, value: object
+) -> None:
+    fields = {"format": "veilface decoy pool", "version": 1, "made_with": value}
+    data = container.encode(fields, {"descriptors": unit_rows(20, 8)})  # type: ignore[arg-type]
+    (tmp_path / "p").write_bytes(POOL_MAGIC + sealer.seal(data, context=POOL_CONTEXT))
+    with pytest.raises(DecoyError, match="made_with must be 64"):
+        load_source(tmp_path / "p", sealer)
+
+
 def test_broken_files_are_refused(tmp_path: Path, sealer: KeyringSealer) -> None:
     path = tmp_path / "decoys.veil"
     DecoyPool(unit_rows(30, 8)).save(path, sealer)
