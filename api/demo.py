@@ -159,7 +159,7 @@ def _calibrate(
     """Do what ``decoys build`` and ``calibrate`` do."""
     pack = ModelPack.load(pack_path)
     say(f"embedding {len(decoy_photos)} faces for the decoys")
-    generator = make_generator(_extract(pack, decoy_photos))
+    generator = make_generator(_extract(pack, decoy_photos), pack)
     generator.save(folder / "decoys.veil")
     say(f"embedding {len(labelled)} photos of {labelled.people} people for the calibration")
     extraction = _extract(pack, labelled.paths)

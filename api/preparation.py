@@ -9,10 +9,11 @@ from typing import Any
 
 from models.extraction import Extraction
 from models.pack import ModelPack
+from templates.binding import embedding_id
 from templates.canonical import Json
 from templates.contract import Binding
 from templates.decoys import Attributes, DecoyGenerator, DecoyPool, DecoySource
-from templates.errors import VeilfaceError
+from templates.errors import ContractMismatch, VeilfaceError
 from templates.lifting import Strategy
 from templates.rotation import ROTATION_VERSION
 from verify import Calibrated, CalibrationOptions, LabelledFolder, calibrate, read_lfw_pairs
@@ -38,12 +39,42 @@ def acquired_json(extraction: Extraction) -> dict[str, Json]:
     }
 
 
-def make_generator(extraction: Extraction) -> DecoyGenerator:
-    """Fit the generator of decoys that belong to nobody."""
-    return DecoyGenerator.fit(extraction.descriptors)
+def made_with(pack: ModelPack) -> str:
+    """Name the space of the pack's descriptors, as decoys made of them carry it."""
+    return embedding_id(
+        embedder_sha256=pack.info.embedder_sha256, preprocessing=pack.info.preprocessing
+    )
 
 
-def make_pool(extraction: Extraction, labels: Mapping[Path, Attributes] | None) -> DecoyPool:
+def require_made_with(source: DecoySource, pack: ModelPack) -> None:
+    """Refuse decoys that are not, or do not say that they are, descriptors of this pack.
+
+    Raises
+    ------
+    ContractMismatch
+        They lie in another space than the descriptors that they are to hide, or may do so.
+    """
+    if source.made_with is None:
+        raise ContractMismatch(
+            "the decoys do not say which model they were made with; build the decoys with this "
+            "pack and the same --flip"
+        )
+    if source.made_with != made_with(pack):
+        raise ContractMismatch(
+            f"the decoys were made with another model or another preprocessing "
+            f"({source.made_with[:16]}…, this pack's is {made_with(pack)[:16]}…), and would hide "
+            "nothing; build the decoys with this pack and the same --flip"
+        )
+
+
+def make_generator(extraction: Extraction, pack: ModelPack) -> DecoyGenerator:
+    """Fit the generator of decoys that belong to nobody to descriptors of the pack."""
+    return DecoyGenerator.fit(extraction.descriptors, made_with=made_with(pack))
+
+
+def make_pool(
+    extraction: Extraction, labels: Mapping[Path, Attributes] | None, pack: ModelPack
+) -> DecoyPool:
     """Make a pool of real descriptors, labelled where labels are given.
 
     Raises
@@ -52,7 +83,7 @@ def make_pool(extraction: Extraction, labels: Mapping[Path, Attributes] | None) 
         A photo has no label: hybrid+ could not tell what it is.
     """
     if labels is None:
-        return DecoyPool(extraction.descriptors)
+        return DecoyPool(extraction.descriptors, made_with=made_with(pack))
     found = [labels.get(path.resolve()) for path in extraction.paths]
     missing = [path.name for path, label in zip(extraction.paths, found, strict=True) if not label]
     if missing:
@@ -60,13 +91,23 @@ def make_pool(extraction: Extraction, labels: Mapping[Path, Attributes] | None) 
             f"{len(missing)} photos have no label, the first is {missing[0]}; give the label file "
             "of this folder, or leave those photos out"
         )
-    return DecoyPool(extraction.descriptors, labels=[label for label in found if label])
+    return DecoyPool(
+        extraction.descriptors,
+        labels=[label for label in found if label],
+        made_with=made_with(pack),
+    )
 
 
 def binding_for(pack: ModelPack, source: DecoySource, *, strategy: Strategy, m: int) -> Binding:
-    """Bind a pack, a decoy source and a way of lifting."""
+    """Bind a pack, a decoy source and a way of lifting.
+
+    Raises
+    ------
+    ContractMismatch
+        The source says that it was made with another model or another preprocessing.
+    """
     info = pack.info
-    return Binding(
+    binding = Binding(
         embedder_sha256=info.embedder_sha256,
         preprocessing=info.preprocessing,
         n=info.n,
@@ -75,6 +116,8 @@ def binding_for(pack: ModelPack, source: DecoySource, *, strategy: Strategy, m: 
         decoy_source_id=source.source_id,
         rotation_version=ROTATION_VERSION,
     )
+    binding.require_source(source_id=source.source_id, made_with=source.made_with)
+    return binding
 
 
 def calibrate_folder(

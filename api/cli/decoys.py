@@ -105,7 +105,9 @@ def build(
     attributes = _labels(photos, labels)
     extraction = extract(pack, chosen, aligned=aligned, settings=settings, cache=cache)
     source = (
-        make_generator(extraction) if kind is Kind.GENERATOR else make_pool(extraction, attributes)
+        make_generator(extraction, pack)
+        if kind is Kind.GENERATOR
+        else make_pool(extraction, attributes, pack)
     )
     if kind is Kind.GENERATOR and len(extraction.descriptors) < FACES_PER_DIMENSION * source.n:
         message(
@@ -127,6 +129,7 @@ def build(
                 "out": str(path),
                 "kind": str(kind),
                 "source_id": source.source_id,
+                "made_with": source.made_with,
                 "n": source.n,
                 "descriptors": len(extraction.descriptors),
                 "labelled": labelled,

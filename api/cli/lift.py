@@ -95,7 +95,7 @@ def lift(
     binding = public.binding
     m = public.dimension(probe=probe, dim=dim)
     source = DecoyGenerator.load(generator)
-    binding.require_source(source_id=source.source_id)
+    binding.require_source(source_id=source.source_id, made_with=source.made_with)
     models = ModelPack.load(pack, threads=1, flip=bool(binding.preprocessing.get("flip")))
     info = models.info
     binding.require_embedder(
