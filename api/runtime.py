@@ -78,6 +78,7 @@ class NoDecoys:
     def __init__(self, contract: Contract) -> None:
         self.source_id = contract.binding.decoy_source_id
         self.n = contract.binding.n
+        self.made_with: str | None = None
 
     def draw(
         self,

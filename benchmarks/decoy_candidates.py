@@ -42,6 +42,7 @@ class SampledSource:
     """A candidate behind the protocol of lifting."""
 
     source_id = "experiment"
+    made_with: str | None = None
 
     def __init__(self, sample: Sampler, n: int) -> None:
         self.n = n

@@ -12,7 +12,7 @@ from api.cli.errors import CommandError, UsageError
 from api.cli.files import read_bounded, read_names
 from api.cli.options import AsJson, takes_settings
 from api.opening import file_sealer, open_keyring
-from api.preparation import acquired, acquired_json, calibrate_folder
+from api.preparation import acquired, acquired_json, calibrate_folder, require_made_with
 from api.settings import Settings
 from templates.contract import Calibration, Contract, Rate
 from templates.decoys import load_source
@@ -125,6 +125,7 @@ def calibrate(
             f"the decoys have {source.n} numbers each, the pack gives {pack.info.n}; build the "
             "decoys with this pack"
         )
+    require_made_with(source, pack)
     exclude = frozenset() if exclude_people is None else read_names(exclude_people)
     extraction = extract(pack, labelled.paths, aligned=aligned, settings=settings, cache=cache)
     with progress("calibrating", 100) as advance:
