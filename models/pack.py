@@ -274,7 +274,8 @@ class ModelPack:
         data
             JPEG, PNG or WebP.
         policy
-            ``SINGLE`` refuses a photo with several faces; ``LARGEST`` takes the best-ranked one.
+            ``SINGLE`` refuses a photo with several faces; ``LARGEST`` takes the
+            first in rank, the largest and most central one.
         quality
             Limits; ``None`` checks nothing but that there is a face.
         limits

@@ -74,8 +74,9 @@ class QualityLimits:
     max_yaw, max_pitch, max_roll
         Absolute degrees.
     second_face_share
-        A second face counts when its area is at least this share of the main face's: 0.25 means
-        half as wide.
+        A further face counts when it reaches ``min_face_size`` and its area is at least this share
+        of the main face's. 0, the default, counts every such face; 0.25 ignores people in the
+        background who are less than half as wide.
     """
 
     min_score: float | None = None
@@ -86,7 +87,7 @@ class QualityLimits:
     max_yaw: float = 70.0
     max_pitch: float = 55.0
     max_roll: float = 45.0
-    second_face_share: float = 0.25
+    second_face_share: float = 0.0
 
 
 DEFAULT_QUALITY = QualityLimits()
@@ -260,7 +261,7 @@ def select_face(faces: Sequence[Face], *, single: bool, limits: QualityLimits | 
     single
         Refuse when there is a second face; otherwise take the first.
     limits
-        Says how large a second face must be to count; ``None`` counts every face.
+        Say how large a further face must be to count; ``None`` counts every face.
 
     Raises
     ------
@@ -272,11 +273,18 @@ def select_face(faces: Sequence[Face], *, single: bool, limits: QualityLimits | 
     if not faces:
         raise NoFace("No face was found; send an upright photo that shows one face.")
     main = faces[0]
-    share = 0.0 if limits is None else limits.second_face_share
-    others = [face for face in faces[1:] if face.area >= share * main.area]
+    others = [face for face in faces[1:] if limits is None or _counts(face, main, limits)]
     if single and others:
         raise MultipleFaces(
             f"The photo shows {1 + len(others)} faces; send one with a single face.",
             details={"faces": 1 + len(others)},
         )
     return main
+
+
+def _counts(face: Face, main: Face, limits: QualityLimits) -> bool:
+    """Whether a further face is large enough to be a second person in the photo."""
+    return (
+        min(face.width, face.height) >= limits.min_face_size
+        and face.area >= limits.second_face_share * main.area
+    )

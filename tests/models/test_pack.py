@@ -309,8 +309,13 @@ def test_a_small_face_in_the_middle_does_not_hide_a_large_one(real, lfw_photos):
         real.embed_photo(png(picture))
 
 
-def test_a_small_bystander_does_not_refuse_a_photo(real, lfw_photos):
-    assert real.embed_photo(side_by_side(lfw_photos, 3)).box[2] < 250
+def test_a_small_bystander_refuses_a_photo_unless_the_limits_allow_it(real, lfw_photos):
+    photo = side_by_side(lfw_photos, 3)
+    with pytest.raises(MultipleFaces) as caught:
+        real.embed_photo(photo)
+    assert caught.value.details == {"faces": 2}
+    lenient = QualityLimits(second_face_share=0.25)
+    assert real.embed_photo(photo, quality=lenient).box[2] < 250
 
 
 def test_a_picture_without_a_face(real):

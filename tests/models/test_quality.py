@@ -165,15 +165,25 @@ def face(side: float) -> Face:
     return Face(np.array([0, 0, side, side], np.float32), 0.9, np.zeros((5, 2), np.float32))
 
 
-def test_a_second_face_counts_from_half_the_width_on():
-    main = face(100)
-    assert select_face([main, face(49)], single=True, limits=QualityLimits()) is main
-    with pytest.raises(MultipleFaces, match="2 faces") as caught:
-        select_face([main, face(51), face(20)], single=True, limits=QualityLimits())
-    assert caught.value.details == {"faces": 2}
-    assert select_face([main, face(51)], single=False, limits=QualityLimits()) is main
+def test_every_face_that_could_be_used_counts():
+    main, limits = face(400), QualityLimits()
+    assert select_face([main, face(23.9)], single=True, limits=limits) is main
+    with pytest.raises(MultipleFaces, match="3 faces") as caught:
+        select_face([main, face(24), face(23), face(30)], single=True, limits=limits)
+    assert caught.value.details == {"faces": 3}
+    # The main face is the first in rank, which need not be the largest.
+    with pytest.raises(MultipleFaces):
+        select_face([face(100), face(400)], single=True, limits=limits)
+    assert select_face([main, face(300)], single=False, limits=limits) is main
     with pytest.raises(MultipleFaces):
         select_face([main, face(1)], single=True, limits=None)
+
+
+def test_a_share_of_the_area_lets_small_faces_pass():
+    main, limits = face(100), QualityLimits(second_face_share=0.25)
+    assert select_face([main, face(49)], single=True, limits=limits) is main
+    with pytest.raises(MultipleFaces, match="2 faces"):
+        select_face([main, face(51), face(40)], single=True, limits=limits)
 
 
 def test_no_face():
