@@ -1,3 +1,4 @@
+import os
 from pathlib import Path
 
 import pytest
@@ -50,6 +51,17 @@ def test_defaults_lie_in_the_data_folder(elsewhere: Path) -> None:
     assert settings.resolved_master_key_file == Path("here/master.key")
     assert settings.resolved_contract_file == Path("here/contract.json")
     assert settings.resolved_decoys_file == Path("here/decoys.veil")
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="the system has no affinity")
+def test_a_slot_for_each_processor_that_the_process_may_use(
+    elsewhere: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: {2, 5, 7})
+    monkeypatch.setattr("os.cpu_count", lambda: 64)
+    assert load_settings().resolved_compute_slots == 3
+    assert load_settings(compute_slots=9).resolved_compute_slots == 9
 
 
 @pytest.mark.parametrize(
