@@ -77,6 +77,7 @@ class Gate:
         self._slots = anyio.CapacityLimiter(slots)
         self._queries = anyio.CapacityLimiter(max(4, 2 * slots))
         self._room = slots + waiting
+        self._asking = 0
 
     @asynccontextmanager
     async def admitted(self) -> AsyncIterator[None]:
@@ -107,9 +108,13 @@ class Gate:
         ApiError
             ``overloaded``: anybody may make a request wait here, with a token of his own making.
         """
-        if self._queries.statistics().tasks_waiting >= MAX_WAITING_QUERIES:
+        if self._asking >= self._queries.total_tokens + MAX_WAITING_QUERIES:
             raise _overloaded()
-        return await anyio.to_thread.run_sync(work, limiter=self._queries)
+        self._asking += 1
+        try:
+            return await anyio.to_thread.run_sync(work, limiter=self._queries)
+        finally:
+            self._asking -= 1
 
 
 def _overloaded() -> ApiError:

@@ -14,7 +14,6 @@
     ├── SealError                a ciphertext that does not open, or a key that cannot be used
     ├── StoreError
     │   ├── StoreUnavailable     the database does not answer
-    │   ├── NotEnrolled          no such subject
     │   ├── InvalidIdentifier    a subject id, tenant name or cursor that breaks the rules [1]
     │   ├── UnknownTenant        no tenant of this name [1]
     │   └── IdempotencyConflict  a key that was used for another request, or still runs [2]
@@ -82,7 +81,3 @@ class StoreError(VeilfaceError):
 
 class StoreUnavailable(StoreError):
     """The database does not answer."""
-
-
-class NotEnrolled(StoreError):
-    """The tenant has no such subject."""

@@ -131,7 +131,7 @@ class ApiKeys:
         The comparison takes the same time wherever the tokens differ, and an unknown prefix is
         compared too.
         """
-        match = _TOKEN.fullmatch(token) if len(token) <= 128 else None
+        match = _TOKEN.fullmatch(token)
         prefix = match[1] if match else ""
         row = self._database.read(
             lambda each: each.execute(
@@ -237,6 +237,11 @@ class ApiKeys:
         # A full or busy disk must not refuse a good key.
         with contextlib.suppress(StoreUnavailable):
             self._database.write(lambda each: each.execute(statement))
+
+
+def is_token(text: str) -> bool:
+    """Tell whether a text has the format of a token; no database is asked."""
+    return _TOKEN.fullmatch(text) is not None
 
 
 def probe_key(token: str) -> bytes:

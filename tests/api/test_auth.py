@@ -103,3 +103,40 @@ def test_a_key_of_photos_only_works(client: Client, deployment: Deployment) -> N
         "/v1/subjects/app/verify", files=images(photo(4, 1), name="image"), headers=app
     )
     assert probe.json()["decision"] == "accept"
+
+
+@pytest.mark.parametrize(
+    "token",
+    ["x", "vf_", "vf_" + "0" * 77, "vf_000000000000_" + "F" * 64, "vf_000000000000_" + "0" * 65],
+)
+def test_what_is_no_token_costs_no_query(
+    client: Client, monkeypatch: pytest.MonkeyPatch, token: str
+) -> None:
+    store = client.app.state.runtime.store
+    asked: list[str] = []
+    monkeypatch.setattr(store.api_keys, "verify", asked.append)
+    assert_error(client.get("/v1/contract", headers=bearer(token)), 401, "unauthorized")
+    assert asked == []
+    good = "vf_000000000000_" + "0" * 64
+    assert_error(client.get("/v1/contract", headers=bearer(good)), 401, "unauthorized")
+    assert asked == [good]
+
+
+def test_embeddings_are_refused_before_the_body_is_read(
+    client: Client, keys: dict[str, str]
+) -> None:
+    for method, path in (
+        ("PUT", "/v1/subjects/a/enrollment"),
+        ("POST", "/v1/subjects/a/verify"),
+    ):
+        answer = client.request(
+            method,
+            path,
+            content=b"x",
+            headers={
+                **bearer(keys["embeddings"]),
+                "Content-Type": "application/json",
+                "Content-Length": str(10**12),
+            },
+        )
+        assert assert_error(answer, 403, "forbidden") == {"missing": ["embeddings"]}

@@ -1,11 +1,17 @@
+import json
 import tempfile
+import threading
+from collections import Counter
 from collections.abc import AsyncIterator
+from typing import Any
 
 import anyio
+import anyio.from_thread
 import httpx
 import pytest
+from starlette.requests import Request
 
-from api.bodies import MAX_FIELD_BYTES
+from api.bodies import MAX_FIELD_BYTES, read_json
 from api.errors import ApiError
 from api.limits import MAX_JSON_BYTES, Gate
 from tests.api.client import Client
@@ -154,11 +160,7 @@ def test_no_photo_is_ever_written_to_a_file(
 
 
 def test_a_body_that_does_not_arrive_is_given_up(client: Client, deployment: Deployment) -> None:
-    from api.bodies import read_json
-
     async def never() -> None:
-        from starlette.requests import Request
-
         async def receive() -> dict[str, object]:
             await anyio.sleep(60)
             return {}
@@ -186,8 +188,61 @@ def test_the_gate_turns_the_next_one_away() -> None:
     anyio.run(scenario)
 
 
+def test_the_queue_for_the_database_has_an_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("api.limits.MAX_WAITING_QUERIES", 3)
+    go_on = threading.Event()
+    outcomes: list[str] = []
+
+    async def ask(gate: Gate) -> None:
+        try:
+            await gate.query(lambda: go_on.wait(20))
+        except ApiError as error:
+            outcomes.append(f"{error.code}, retry after {error.headers['Retry-After']}")
+        else:
+            outcomes.append("answered")
+
+    async def scenario() -> None:
+        gate = Gate(slots=1, waiting=1)  # four may ask at the same time
+        async with anyio.create_task_group() as group:
+            for _ in range(10):
+                group.start_soon(ask, gate)
+            while len(outcomes) < 3:
+                await anyio.sleep(0.01)
+            assert outcomes == ["overloaded, retry after 1"] * 3
+            go_on.set()
+        await ask(gate)
+
+    with anyio.from_thread.start_blocking_portal() as portal:
+        portal.start_task_soon(scenario).result(timeout=20)
+    assert Counter(outcomes) == {"overloaded, retry after 1": 3, "answered": 8}
+
+
+@pytest.mark.parametrize(("size", "apart"), [(60_000, False), (70_000, True)])
+def test_large_json_is_parsed_in_a_thread(
+    monkeypatch: pytest.MonkeyPatch, size: int, apart: bool
+) -> None:
+    parsed_by: list[int] = []
+    parse = json.loads
+
+    def loads(body: bytes) -> Any:
+        parsed_by.append(threading.get_ident())
+        return parse(body)
+
+    monkeypatch.setattr("api.bodies.json.loads", loads)
+    body = b'{"template": "' + b"A" * size + b'"}'
+
+    async def receive() -> dict[str, Any]:
+        return {"type": "http.request", "body": body, "more_body": False}
+
+    async def read() -> Any:
+        request = Request({"type": "http", "headers": []}, receive)
+        return await read_json(request, max_bytes=10**6, timeout_s=5)
+
+    assert anyio.run(read) == {"template": "A" * size}
+    assert [thread != threading.get_ident() for thread in parsed_by] == [apart]
+
+
 def test_no_more_compute_at_once_than_there_are_slots() -> None:
-    import threading
     import time
 
     running, most, lock = 0, 0, threading.Lock()
