@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import anyio
+import anyio.to_thread
 from starlette.datastructures import FormData
 from starlette.formparsers import MultiPartException, MultiPartParser
 from starlette.requests import Request
@@ -21,6 +22,8 @@ from api.limits import MAX_JSON_BYTES, read_limited, stream_limited
 
 MAX_FIELD_BYTES = 4096
 MAX_FIELDS = 16
+MAX_PARSED_AT_ONCE = 64 * 1024
+"""Bytes of JSON that are parsed on the event loop; more go to a thread."""
 
 
 @dataclass(frozen=True)
@@ -163,7 +166,10 @@ async def read_json(request: Request, *, max_bytes: int, timeout_s: float) -> di
     with _arrives_within(timeout_s):
         body = await read_limited(request, min(max_bytes, MAX_JSON_BYTES))
     try:
-        value = json.loads(body)
+        if len(body) > MAX_PARSED_AT_ONCE:
+            value = await anyio.to_thread.run_sync(json.loads, body)
+        else:
+            value = json.loads(body)
     except (ValueError, RecursionError):
         raise ApiError("malformed_request", "the body is not well-formed JSON") from None
     if not isinstance(value, dict):

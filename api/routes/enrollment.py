@@ -80,10 +80,10 @@ async def enroll(
                 timeout_s=settings.body_timeout_s,
             )
             return await _enroll_photos(request, caller, subject, form, query, idempotency_key)
+        caller.require("embeddings")
         body = await read_json(
             request, max_bytes=settings.max_request_bytes, timeout_s=settings.body_timeout_s
         )
-        caller.require("embeddings")
         reject_unknown([*body, *query], ("template",))
         template = base64_field(body.get("template"), "template", code="invalid_template")
 

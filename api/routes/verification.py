@@ -104,11 +104,11 @@ async def _photo_probe(request: Request, runtime: Runtime, query: dict[str, str]
 async def _sent_probe(
     request: Request, runtime: Runtime, caller: Caller, query: dict[str, str]
 ) -> Decide:
+    caller.require("embeddings")
     settings = runtime.settings
     body = await read_json(
         request, max_bytes=settings.max_request_bytes, timeout_s=settings.body_timeout_s
     )
-    caller.require("embeddings")
     reject_unknown(body, ("embedding", "template", "level"))
     if ("embedding" in body) == ("template" in body):
         raise ApiError(
