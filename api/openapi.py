@@ -10,8 +10,8 @@ Face authentication that never stores a face descriptor. Every error has one sha
 listed with every call. `X-Request-ID` is accepted, and returned in the header and in the body.
 """
 
-EVERY_CALL = ("unauthorized", "store_unavailable", "internal_error")
-BODY = ("malformed_request", "request_too_large", "validation_failed", "overloaded")
+EVERY_CALL = ("unauthorized", "store_unavailable", "overloaded", "internal_error")
+BODY = ("malformed_request", "request_too_large", "validation_failed")
 IDEMPOTENT = ("idempotency_conflict",)
 PHOTO = (
     "unsupported_image",
@@ -55,7 +55,9 @@ def _text(description: str, **extra: Any) -> dict[str, Any]:
 
 LEVEL = _text("Security level; default from the contract.", examples=["fmr-1e-3"])
 FACE = _text(
-    "Which face counts when a photo shows several: none (`single`, the default), or the largest.",
+    "Which face counts when a photo shows several: none (`single`, the default: the photo is "
+    "refused), or the first by rank (`largest`), which is large and near the middle: area − "
+    "2·distance², in pixels, the distance from the middle of the picture.",
     enum=["single", "largest"],
 )
 FILE = {"type": "string", "format": "binary"}

@@ -9,8 +9,7 @@ from starlette.responses import Response
 from api.answers import answer
 from api.deps import Enrolls, Erases, GateDep, IdempotencyDep, RuntimeDep, SubjectDep
 from api.errors import ApiError
-from api.idempotency import Outcome, once
-from api.openapi import EVERY_CALL, IDEMPOTENT, error_responses
+from api.openapi import EVERY_CALL, error_responses
 from api.receipts import receipt_json
 from api.schemas import ReceiptAnswer, SubjectAnswer, SubjectsAnswer
 from templates.store.subjects import SubjectRecord
@@ -64,9 +63,7 @@ async def get_subject(
 @router.delete(
     "/{subject_id}",
     response_model=ReceiptAnswer,
-    responses=error_responses(
-        *EVERY_CALL, *IDEMPOTENT, "forbidden", "not_enrolled", "validation_failed"
-    ),
+    responses=error_responses(*EVERY_CALL, "forbidden", "not_enrolled", "validation_failed"),
     summary="Erase a subject",
 )
 async def erase_subject(
@@ -75,15 +72,16 @@ async def erase_subject(
     subject: SubjectDep,
     runtime: RuntimeDep,
     gate: GateDep,
-    idempotency_key: IdempotencyDep,
+    _idempotency_key: IdempotencyDep,
 ) -> Response:
     """Right: `erase`. Erases template, metadata and data key; answers with a signed receipt.
 
-    Erasing again returns the same receipt. A key that also has `enroll` or `admin` is told of a
-    subject that never was there; another one gets a receipt that says nothing was held.
+    Erasing again returns the same receipt, and after another enrollment it erases that one: an
+    `Idempotency-Key` is accepted and changes nothing. A key that also has `enroll` or `admin` is
+    told of a subject that never was there; another one gets a receipt that says nothing was held.
     """
 
-    def work() -> Outcome:
+    def work() -> dict[str, Any]:
         store = runtime.store
         if (
             caller.sees_enrollment
@@ -91,19 +89,10 @@ async def erase_subject(
             and store.receipt(caller.tenant, subject) is None
         ):
             raise ApiError("not_enrolled", "the tenant never had such a subject")
-        return Outcome(200, receipt_json(store.erase(caller.tenant, subject).receipt))
+        return receipt_json(store.erase(caller.tenant, subject).receipt)
 
-    # The subject's records of idempotency are erased with it, so this one is not filed under it.
-    return await once(
-        request,
-        caller,
-        idempotency_key,
-        operation="erase",
-        asked=[subject],
-        subject=None,
-        work=work,
-        run=gate.query,
-    )
+    # No stored answer: after another enrollment it would claim an erasure that did not happen.
+    return answer(request, await gate.query(work))
 
 
 def _described(record: SubjectRecord, contract_id: str) -> dict[str, Any]:

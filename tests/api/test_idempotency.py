@@ -45,7 +45,6 @@ def test_another_request_under_the_key_conflicts(both: tuple[Client, Deployment]
         put(client, "key-2", photo(1), subject="somebody-else"),
         put(client, "key-2", photo(1), data={"face": "largest"}),
         put(client, "key-2", photo(1), data={"attributes": '{"gender": "Male"}'}),
-        client.delete("/v1/subjects/idem", headers={"Idempotency-Key": "key-2"}),
     ):
         assert_error(answer, 409, "idempotency_conflict")
     # Another API key is another client: its keys do not meet ours.
@@ -63,12 +62,19 @@ def test_deletion(both: tuple[Client, Deployment]) -> None:
     put(client, None, photo(1))
     headers = {"Idempotency-Key": "delete-1"}
     first = client.delete("/v1/subjects/idem", headers=headers)
-    # Enrolled anew: the repeated deletion is the old one and must not erase again.
+    again = client.delete("/v1/subjects/idem", headers=headers)
+    assert without_request_id(first) == without_request_id(again)
+    # Enrolled anew: the old receipt would claim an erasure that did not happen.
     put(client, None, photo(1))
     second = client.delete("/v1/subjects/idem", headers=headers)
-    assert without_request_id(first) == without_request_id(second)
-    assert second.headers["idempotency-replayed"] == "true"
-    assert client.get("/v1/subjects/idem").status_code == 200
+    assert second.json()["claims"]["held"] is True
+    assert without_request_id(first) != without_request_id(second)
+    assert_error(client.get("/v1/subjects/idem"), 404, "not_enrolled")
+    assert_error(
+        client.delete("/v1/subjects/idem", headers={"Idempotency-Key": "a b"}),
+        422,
+        "validation_failed",
+    )
 
 
 def test_import(client: Client) -> None:
