@@ -36,15 +36,8 @@ def serve(
 
     Example: `veilface serve --pack buffalo_l --data-dir veilface-data --workers 2`
     """
-    runtime = Runtime.open(settings)
-    try:
-        binding = runtime.contract.binding
-        token = None
-        if not check:
-            token = bootstrap_token(runtime.store, settings)
-    finally:
-        runtime.close()
-    if demo_notice(binding.embedder_sha256, n=binding.n) and not settings.demo:
+    token, demo = _opened_once(settings, check=check)
+    if demo and not settings.demo:
         settings = settings.model_copy(update={"demo": True})
     if check:
         say("Everything fits: contract, decoys, pack, database and master key.")
@@ -59,6 +52,25 @@ def serve(
     except SystemExit as error:
         if error.code:
             raise CommandError("the service did not start; its log says why") from None
+
+
+def _opened_once(settings: Settings, *, check: bool) -> tuple[str | None, bool]:
+    """Open everything and let go of it again, models included, before the workers open theirs.
+
+    Returns
+    -------
+    token : str or None
+        The first API key, made now; None where there is one, and for a mere check.
+    demo : bool
+        Whether the embedder is the demo model.
+    """
+    runtime = Runtime.open(settings)
+    try:
+        binding = runtime.contract.binding
+        token = None if check else bootstrap_token(runtime.store, settings)
+        return token, bool(demo_notice(binding.embedder_sha256, n=binding.n))
+    finally:
+        runtime.close()
 
 
 def free_port(host: str, port: int) -> int:

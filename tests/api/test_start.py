@@ -1,6 +1,8 @@
 """A start that cannot work ends in one sentence; one that works needs little."""
 
+import gc
 import stat
+import weakref
 from collections.abc import MutableMapping
 from pathlib import Path
 from typing import Any
@@ -21,6 +23,7 @@ from models.pack import ModelPack
 from templates.decoys import DecoyGenerator
 from templates.sealing import MasterKeyring
 from templates.store.database import Database
+from tests.api.cli.conftest import run
 from tests.api.client import Client
 from tests.api.deployment import (
     Deployment,
@@ -197,7 +200,7 @@ def test_a_database_that_is_down_is_not_blamed_on_the_key_file(tmp_path: Path) -
     assert "cannot be used" not in str(caught.value)
     settings.resolved_master_key_file.parent.mkdir(parents=True)
     settings.resolved_master_key_file.write_text("nonsense")
-    with pytest.raises(StartError, match="master key file .* cannot be used"):
+    with pytest.raises(StartError, match=r"master key file .* cannot be used"):
         open_keyring(settings)
 
 
@@ -284,6 +287,31 @@ def test_the_server_is_not_handed_the_text_of_a_failed_start(
     logged = capfd.readouterr().err
     assert "hunter2" not in logged
     assert type(error).__name__ in logged
+
+
+def test_serving_keeps_no_second_copy_of_the_models(
+    fresh: Deployment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The command opens everything to check it; the workers open it anew."""
+    opened: list[weakref.ref[Runtime]] = []
+    alive: list[bool] = []
+    really_open = Runtime.open
+
+    def remembered(settings: Settings) -> Runtime:
+        runtime = really_open(settings)
+        opened.append(weakref.ref(runtime))
+        return runtime
+
+    def serving(**_: Any) -> None:
+        gc.collect()
+        alive.extend(each() is not None for each in opened)
+
+    monkeypatch.setattr(Runtime, "open", remembered)
+    monkeypatch.setattr("api.cli.serve.uvicorn.run", serving)
+    folders = ("--data-dir", fresh.settings.data_dir, "--pack", str(fresh.settings.pack))
+    ran = run("serve", "--port", "0", *folders)
+    assert ran.status == 0, ran.stderr
+    assert alive == [False]
 
 
 def test_recalibration_keeps_the_templates(fresh: Deployment) -> None:
