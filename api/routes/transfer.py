@@ -23,17 +23,27 @@ router = APIRouter(prefix="/v1/subjects", tags=["transfer"])
     "/{subject_id}/export",
     response_model=ExportAnswer,
     responses=error_responses(
-        *EVERY_CALL, "forbidden", "not_enrolled", "validation_failed", "contract_mismatch"
+        *EVERY_CALL,
+        "forbidden",
+        "not_enrolled",
+        "not_found",
+        "validation_failed",
+        "contract_mismatch",
     ),
     summary="Export a subject, encrypted",
 )
 async def export_subject(
     request: Request, caller: Exports, subject: SubjectDep, runtime: RuntimeDep, gate: GateDep
 ) -> Response:
-    """Right: `export`. The template is un-rotated inside the encryption."""
+    """Right: `export`. The template is un-rotated inside the encryption.
+
+    Only keys with `enroll` or `admin` are told `not_enrolled`; others get `not_found`.
+    """
     exported = await gate.compute(lambda: runtime.export(caller.tenant, subject))
     if exported is None:
-        raise ApiError("not_enrolled", "the tenant has no such subject")
+        if caller.sees_enrollment:
+            raise ApiError("not_enrolled", "the tenant has no such subject")
+        raise ApiError("not_found", "there is nothing to export")
     return answer(
         request,
         {

@@ -170,6 +170,9 @@ def test_a_bad_export_key_file_stops_the_start(tmp_path: Path) -> None:
         ExportKey.from_file(path)
 
 
-def test_export_needs_its_right_and_a_subject(client: Client) -> None:
+def test_export_needs_its_right_and_a_subject(client: Client, deployment: Deployment) -> None:
     assert_error(client.get("/v1/subjects/nobody/export"), 404, "not_enrolled")
+    # Who is enrolled is told by this code to keys with enroll or admin only.
+    blind = bearer(deployment.key("export", "verify", "erase"))
+    assert_error(client.get("/v1/subjects/nobody/export", headers=blind), 404, "not_found")
     assert json.loads(client.get("/v1/subjects/nobody/export").text)["error"]["details"] == {}
