@@ -28,7 +28,6 @@ from templates.key_file import (
     KEY_BYTES,
     Stamp,
     check_keys,
-    parse_keys,
     read_key_file,
     stamp_of,
     write_key_file,
@@ -84,7 +83,7 @@ def derive_key(key: bytes, label: str) -> bytes:
 class MasterKeyring:
     """The master keys of a deployment; the first seals, all of them open.
 
-    Use :meth:`load`, :meth:`create` or :meth:`from_text`. A keyring that came from a file follows
+    Use :meth:`load` or :meth:`create`. A keyring that came from a file follows
     the file: when it changes, the keys are read again at the next seal, or when a blob names a key
     that is not in memory. So a running service picks up a rotation without a restart.
 
@@ -138,11 +137,6 @@ class MasterKeyring:
         path = Path(path)
         write_key_file(path, [os.urandom(KEY_BYTES)], replace=False)
         return cls.load(path)
-
-    @classmethod
-    def from_text(cls, text: str, *, source: str = "the environment variable") -> Self:
-        """Read keys from a setting: base64, separated by white space or commas."""
-        return cls(parse_keys(text.replace(",", " ").split(), source=source), source=source)
 
     @staticmethod
     def add_current(path: str | Path) -> str:

@@ -21,7 +21,10 @@ from templates.store.subjects import Source
 Subject = Annotated[str, typer.Argument(help="Name of the person.", show_default=False)]
 Face = Annotated[
     FacePolicy,
-    typer.Option(help="What a photo with several faces means: an error, or the largest."),
+    typer.Option(
+        help="What a photo with several faces means: an error, or the first by rank (large, and "
+        "near the middle)."
+    ),
 ]
 
 

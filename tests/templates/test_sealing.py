@@ -208,14 +208,6 @@ def test_random_keys_pass_the_weakness_check() -> None:
         MasterKeyring([os.urandom(32)])
 
 
-@pytest.mark.parametrize("separator", [",", "\n", " ", ", "])
-def test_keys_from_a_setting(separator: str) -> None:
-    text = separator.join(base64.b64encode(key).decode() for key in (KEY, OTHER))
-    assert MasterKeyring.from_text(text).key_ids == MasterKeyring([KEY, OTHER]).key_ids
-    with pytest.raises(SealError, match="holds no key"):
-        MasterKeyring.from_text("")
-
-
 def test_rotating_the_file_is_followed_while_running(tmp_path: Path) -> None:
     running = MasterKeyring.create(tmp_path / "key")
     first = running.current
