@@ -5,6 +5,7 @@ from api.cli.errors import CommandError, UsageError
 from api.opening import file_sealer
 from models.demo import DEMO_NOTICE
 from templates.contract import Contract
+from templates.decoys import DecoyGenerator
 from templates.lifting import Strategy
 from templates.sealing import MasterKeyring
 from tests.api.cli.conftest import DIM, PROBE_DIM, run
@@ -65,6 +66,21 @@ def test_other_decoys_are_refused_in_a_sentence(world, veilface, tmp_path):
     assert ran.status == 1
     assert "absent" in ran.stderr
     assert ran.stdout == ""
+
+
+def test_decoys_of_another_space_are_refused(world, veilface, data, tmp_path):
+    """As many numbers, but another preprocessing, another model, or nobody knows which."""
+    base = ("calibrate", world.labelled, "--pack", world.pack, "--out", tmp_path / "contract.json")
+    ran = veilface(*base, "--flip")
+    assert ran.status == 1
+    assert "build the decoys with this pack and the same --flip" in " ".join(ran.stderr.split())
+    statistics = DecoyGenerator.load(data / "decoys.veil").statistics
+    for made_with, said in (("5a" * 32, "another model"), (None, "do not say which model")):
+        DecoyGenerator(statistics, made_with=made_with).save(tmp_path / "decoys.veil")
+        ran = veilface(*base, "--decoys", tmp_path / "decoys.veil")
+        assert ran.status == 1
+        assert said in " ".join(ran.stderr.split())
+    assert not (tmp_path / "contract.json").exists()
 
 
 def test_a_folder_of_another_layout_is_refused(world, veilface, tmp_path):

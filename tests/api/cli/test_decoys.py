@@ -5,6 +5,7 @@ import pytest
 
 from api.opening import file_sealer
 from models.demo import DEMO_NOTICE
+from templates.contract import Binding
 from templates.decoys import DecoyGenerator, DecoyPool, load_source
 from templates.sealing import MasterKeyring
 from tests.api.cli.conftest import run
@@ -19,6 +20,8 @@ def test_a_generator_is_made(world):
     source = DecoyGenerator.load(world.data / "decoys.veil")
     assert source.source_id == world.built["source_id"]
     assert source.n == 256
+    binding = Binding.from_json(world.calibrated["contract"]["binding"])
+    assert source.made_with == binding.embedding_id == world.built["made_with"]
 
 
 @pytest.mark.parametrize(("kind", "noted"), [("generator", True), ("pool", False)])
@@ -64,6 +67,7 @@ def test_a_pool_is_sealed_and_keeps_the_labels(world, veilface, data, labelled_s
     assert isinstance(pool, DecoyPool)
     assert pool.labelled
     assert pool.source_id == ran.json["source_id"]
+    assert pool.made_with == world.built["made_with"]
 
 
 def test_people_and_photos_are_left_out(world, veilface, labelled_source, tmp_path):

@@ -9,7 +9,8 @@ from api.opening import file_sealer
 from models.demo import DEMO_NOTICE
 from models.pack import ModelPack
 from templates import wire
-from templates.contract import Contract
+from templates.contract import Binding, Contract
+from templates.decoys import DecoyGenerator
 from templates.sealing import MasterKeyring
 from tests.api.cli.conftest import DIM, PROBE_DIM, run
 
@@ -119,6 +120,26 @@ def test_other_decoys_and_other_weights_are_refused(world, public, tmp_path, yun
     ran = run(*base, "--pack", yunet_pack_dir, "--generator", world.data / "decoys.veil")
     assert ran.status == 1
     assert "the pack gives 128" in ran.stderr
+
+
+def test_decoys_of_another_model_are_refused_though_the_contract_names_them(
+    world, public, tmp_path
+):
+    other = tmp_path / "other.veil"
+    statistics = DecoyGenerator.load(world.data / "decoys.veil").statistics
+    source = DecoyGenerator(statistics, made_with="5a" * 32)
+    source.save(other)
+    document = json.loads(public.read_text())
+    document["binding"]["decoy_source_id"] = source.source_id
+    document["contract_id"] = Binding.from_json(document["binding"]).contract_id
+    public.write_text(json.dumps(document))
+    ran = run(
+        *("lift", *world.photos(1, range(1)), "--contract", public, "--out", tmp_path / "x"),
+        *("--pack", world.pack, "--generator", other),
+    )
+    assert ran.status == 1
+    assert "another model" in ran.stderr
+    assert not (tmp_path / "x").exists()
 
 
 def test_the_contract_file_itself_does_as_well(world, tmp_path):
