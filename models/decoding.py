@@ -50,6 +50,8 @@ MEMORY_AT_A_TIME = 24_000_000 * 17
 _STRIP_PIXELS = 2**18
 
 _PNG = b"\x89PNG\r\n\x1a\n"
+# Texts in which older programs keep the orientation; Pillow reads it from there.
+_ORIENTING_TEXTS = (b"Raw profile type exif", b"XML:com.adobe.xmp")
 
 
 class Turns:
@@ -175,7 +177,7 @@ def decode_image(data: bytes, *, limits: ImageLimits = DEFAULT_LIMITS) -> NDArra
 
 def _decode(data: bytes, limits: ImageLimits) -> NDArray[np.uint8]:
     _check_webp_canvas(data, limits)
-    _check_png_chunks(data)
+    data = _lean_png(data)
     with _metadata_lock, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
@@ -193,18 +195,30 @@ def _decode(data: bytes, limits: ImageLimits) -> NDArray[np.uint8]:
         return _rgb(image, orientation)
 
 
-def _check_png_chunks(data: bytes) -> None:
-    """Refuse a PNG file with a chunk that makes it animated.
+def _lean_png(data: bytes) -> bytes:
+    """Take the texts out of a PNG file, and refuse one with a chunk that makes it animated.
 
-    Only the names of chunks count: a text may contain the four letters.
+    Pillow unpacks texts of up to 64 million characters, 4 bytes each, and keeps them. Only the
+    names of chunks count: a text may contain the four letters.
     """
     if not data.startswith(_PNG):
-        return
-    at = len(_PNG)
+        return data
+    view, kept, start, at = memoryview(data), [], 0, len(_PNG)
+    wanted = set(_ORIENTING_TEXTS)
     while at + 8 <= len(data):
-        if data[at + 4 : at + 8] == b"acTL":
+        name = data[at + 4 : at + 8]
+        end = at + 12 + int.from_bytes(data[at : at + 4])  # length, name and checksum around it
+        if name == b"acTL":
             raise _animated("PNG")
-        at += 12 + int.from_bytes(data[at : at + 4])  # length, name and checksum around the body
+        if name in (b"tEXt", b"zTXt", b"iTXt") and end <= len(data):
+            keyword = data[at + 8 : at + 88].partition(b"\0")[0]
+            if keyword in wanted:
+                wanted.remove(keyword)  # a second one would only replace the first
+            else:
+                kept.append(view[start:at])
+                start = end
+        at = end
+    return b"".join([*kept, view[start:]]) if kept else data
 
 
 def _animated(name: str) -> ImageError:

@@ -376,10 +376,31 @@ def test_compressed_metadata_bombs_stay_small(kind):
     assert peak_bytes(data) < 16 * 2**20
 
 
-def test_many_small_text_chunks_stay_bounded():
-    packed = zlib.compress(b"a" * (2**20 - 1), 9)
-    data = bomb(8, 8, *(chunk(b"zTXt", b"k%d\0\0" % i + packed) for i in range(200)))
-    assert peak_bytes(data) < 200 * 2**20
+@pytest.mark.parametrize("keyword", [b"k%d", b"XML:com.adobe.xmp"])
+@pytest.mark.parametrize("text", ["a" * (2**20 - 1), "\N{GRINNING FACE}" + "a" * (2**20 - 9)])
+def test_many_text_chunks_stay_small(keyword, text):
+    """A character takes 4 bytes where the text holds one beyond the basic plane."""
+    packed = zlib.compress(text.encode(), 9)
+    heads = (keyword.replace(b"%d", b"%d" % i) + b"\0\1\0\0\0" for i in range(60))
+    extra = [chunk(b"iTXt", head + packed) for head in heads]
+    assert peak_bytes(bomb(8, 8, *extra)) < 16 * 2**20
+
+
+@pytest.mark.parametrize("before", [b"IDAT", b"IEND"])
+def test_an_orientation_in_a_text_of_a_png_counts(before):
+    packet = b'<rdf:Description tiff:Orientation="3"/>'
+    still = encode(Image.fromarray(np.ascontiguousarray(np.rot90(picture(), 2))))
+    text = chunk(b"iTXt", b"XML:com.adobe.xmp\0\0\0\0\0" + packet)
+    np.testing.assert_array_equal(decode_image(with_chunk(still, text, before=before)), picture())
+
+
+@pytest.mark.parametrize("orientation", [1, 6, 7, 8])
+def test_strips_are_turned_to_their_place(orientation):
+    upright = np.random.default_rng(5).integers(0, 256, (601, 997, 3), dtype=np.uint8)
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    stored = Image.fromarray(np.ascontiguousarray(CAMERA[orientation](upright)))
+    np.testing.assert_array_equal(decode_image(encode(stored, exif=exif)), upright)
 
 
 def test_jpeg_with_thousands_of_scans_is_refused():
