@@ -1,6 +1,5 @@
 """Descriptors of many photos, with a progress bar and an account of the failures."""
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -15,6 +14,7 @@ from api.settings import Settings
 from models.cache import EmbeddingCache
 from models.extraction import Extraction, Extractor
 from models.pack import ModelPack
+from models.sessions import default_workers
 
 BULK = ("pack", "providers", "data_dir", "database_url", "master_key_file")
 
@@ -49,7 +49,7 @@ def bulk_pack(settings: Settings, *, flip: bool, why: str) -> ModelPack:
     if settings.pack is None:
         raise UsageError(f"{why}; name the pack with --pack")
     return ModelPack.load(
-        settings.pack, providers=settings.providers, threads=os.cpu_count(), flip=flip
+        settings.pack, providers=settings.providers, threads=default_workers(), flip=flip
     )
 
 

@@ -75,7 +75,9 @@ def lift(
     ] = None,
     face: Annotated[
         FacePolicy,
-        typer.Option(help="What a photo with several faces means: an error, or the largest."),
+        typer.Option(
+            help="What a photo with several faces means: an error, or the first by size and nearness to the centre."
+        ),
     ] = FacePolicy.SINGLE,
     as_json: AsJson = False,
 ) -> None:
