@@ -76,7 +76,7 @@ def lift(
     face: Annotated[
         FacePolicy,
         typer.Option(
-            help="What a photo with several faces means: an error, or the first by size and nearness to the centre."
+            help="What several faces mean: an error, or the one that is largest and most central."
         ),
     ] = FacePolicy.SINGLE,
     as_json: AsJson = False,
