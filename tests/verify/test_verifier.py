@@ -136,7 +136,9 @@ def test_unknown_subjects_keep_their_distances_and_differ(
     ]
     again = [verifier.decide_embedding(probe, nobody(contract, i)).distance for i in range(5)]
     assert again == distances[:5]
-    assert len(set(distances)) == more
+    # Two of 1,600 float32 numbers of one range may be equal by chance (0.5 pairs are expected);
+    # without the mirror there would be no more distances than members.
+    assert len(set(distances)) >= more - 5
     # Brute force for one: the mirror image, computed by the matrix of the reflection.
     stand_in = nobody(contract, 7)
     template = wire.decode(stand_in.wire).subspace
