@@ -74,7 +74,7 @@ def draw_people(identities: range, photos: range, *, size: int = 112) -> NDArray
 def encode_photo(picture: NDArray[np.uint8]) -> bytes:
     """Encode an RGB picture, uint8 (h, w, 3), as a PNG file."""
     done, data = cv2.imencode(".png", np.ascontiguousarray(picture[:, :, ::-1]))
-    if not done:  # pragma: no cover - the encoder refuses only shapes that draw_face never makes
+    if not done:  # the encoder refuses only shapes that draw_face never makes
         raise ValueError("the picture cannot be encoded as PNG")
     return data.tobytes()
 
