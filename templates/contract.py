@@ -13,8 +13,6 @@ import base64
 import binascii
 import hashlib
 import json
-import os
-import secrets
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -37,6 +35,7 @@ from templates.levels import (
     check_norm_range,
     norm_range,
 )
+from templates.private_file import replace_private
 from templates.sealing import Sealer
 from templates.subspace import SubspaceBatch
 
@@ -190,7 +189,7 @@ class Contract:
         }
         sealed = sealer.seal(safetensors.numpy.save(tensors), context=_seal_context(document))
         document["cohort"] = base64.b64encode(sealed).decode("ascii")
-        _write_private(Path(path), _render(document))
+        replace_private(Path(path), _render(document))
 
     @classmethod
     def load(cls, path: Path | str, sealer: Sealer) -> "Contract":
@@ -287,23 +286,3 @@ def _read_bounded(path: Path) -> bytes:
 
 def _render(document: Mapping[str, Json]) -> bytes:
     return json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False).encode("utf-8")
-
-
-def _write_private(path: Path, data: bytes) -> None:
-    """Write beside the target, flush to disk, then replace: a reader sees the old or the new."""
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}.part")
-    descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-    try:
-        with os.fdopen(descriptor, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)

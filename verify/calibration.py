@@ -217,7 +217,8 @@ def _lay_out(
 ) -> Bench:
     """Enroll everybody, and draw the cohort where none is given."""
     service = Lifter(binding.strategy, source, binding.contract_id)
-    client = Lifter(plain_strategy(binding.strategy), client_source(source), binding.contract_id)
+    nobody = client_source(source)
+    client = Lifter(plain_strategy(binding.strategy), nobody, binding.contract_id)
     progress("enrolling people", 0.0)
     means = enrolled_means(data, plan)
     with Keystream.seeded("calibration templates", options.seed) as stream:
@@ -230,7 +231,7 @@ def _lay_out(
     if cohort is None:
         with Keystream.fresh() as stream:
             cohort = make_cohort(
-                source,
+                nobody,
                 strategy=binding.strategy,
                 m=binding.m,
                 stream=stream,

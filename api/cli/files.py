@@ -1,9 +1,9 @@
 """Reading and writing files under limits, and finding the photos of a folder."""
 
-import os
 from pathlib import Path
 
 from api.cli.errors import CommandError
+from templates.private_file import replace_private
 
 PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp"})
 
@@ -20,10 +20,7 @@ def read_bounded(path: Path, most: int) -> bytes:
 def write_private(path: Path, data: bytes) -> None:
     """Write a file that only its owner may read; one that is there is replaced."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.unlink(missing_ok=True)
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-    with os.fdopen(descriptor, "wb") as file:
-        file.write(data)
+    replace_private(path, data)
 
 
 def find_photos(folder: Path) -> list[Path]:

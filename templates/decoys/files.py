@@ -1,14 +1,14 @@
 """Reading and writing the files of decoy sources."""
 
 import os
-import tempfile
 from pathlib import Path
 
 from templates.errors import DecoyError
+from templates.private_file import replace_private
 
 
 def write_private(path: Path, data: bytes) -> None:
-    """Replace `path` at once by a file of mode 0600, so that a crash leaves the old or the new.
+    """Replace `path` at once by a file of mode 0600; see `replace_private`.
 
     Raises
     ------
@@ -16,16 +16,7 @@ def write_private(path: Path, data: bytes) -> None:
         The file cannot be written.
     """
     try:
-        handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-        try:
-            with os.fdopen(handle, "wb") as file:
-                file.write(data)
-                file.flush()
-                os.fsync(file.fileno())
-            Path(temporary).replace(path)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
+        replace_private(path, data)
     except OSError as error:
         raise DecoyError(f"cannot write {path.name}: {error.strerror}") from error
 

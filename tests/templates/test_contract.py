@@ -293,7 +293,7 @@ def test_a_failed_write_leaves_the_old_file(
     def fail(_: int) -> None:
         raise OSError("disk full")
 
-    monkeypatch.setattr(contract_module.os, "fsync", fail)
+    monkeypatch.setattr("os.fsync", fail)
     with pytest.raises(OSError, match="disk full"):
         make_contract(photo_consistency=0.5).save(path, SEALER)
     assert path.read_bytes() == before
