@@ -35,7 +35,7 @@ from templates.lifting import Strategy, lift
 from templates.randomness import Keystream
 from verify.datasets import read_lfw_pairs
 from verify.metrics import fnmr_at_fmr
-from verify.tenfold import Pair, ten_fold
+from verify.tenfold import Pair, pair_arrays, ten_fold
 
 Rows = npt.NDArray[np.float32]
 FITTED = 3500
@@ -172,7 +172,7 @@ def accuracy(
                 scores = _scores(first, second, decoys, m, seed, mode)
                 figures.append(
                     [
-                        ten_fold(scores, faces.pairs).accuracy_mean,
+                        ten_fold(scores, *pair_arrays(faces.pairs)).accuracy_mean,
                         *(
                             fnmr_at_fmr(scores[same], scores[~same], t)[1].value
                             for t in (1e-2, 1e-3)

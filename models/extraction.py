@@ -37,6 +37,17 @@ Advance = Callable[[int], None]
 
 
 @dataclass(frozen=True)
+class EncodedImage:
+    """An encoded photo in memory, and the name that stands for it in an :class:`Extraction`."""
+
+    name: str
+    data: bytes = field(repr=False)
+
+
+Source = str | Path | EncodedImage
+
+
+@dataclass(frozen=True)
 class Failure:
     """A file from which no embedding was acquired, and why."""
 
@@ -123,14 +134,15 @@ class Extractor:
         self._key_prefix = self._settings_digest()
 
     def extract(
-        self, paths: Iterable[str | Path], *, progress: bool | Advance | None = None
+        self, paths: Iterable[Source], *, progress: bool | Advance | None = None
     ) -> Extraction:
         """Embed files.
 
         Parameters
         ----------
         paths
-            Files, in any order; the order of the result follows it.
+            Files, or encoded photos, in any order; the order of the result follows it. An encoded
+            photo stands in the result under its name as a path.
         progress
             Show a bar on stderr once the run takes more than two seconds; ``None`` only where
             stderr is a terminal. A function is called instead with the number of files done since
@@ -146,7 +158,7 @@ class Extractor:
         ModelError
             If inference itself fails, which is not the fault of a file.
         """
-        files = [Path(path) for path in paths]
+        files = [path if isinstance(path, EncodedImage) else Path(path) for path in paths]
         rows: list[NDArray[np.float32]] = []
         done: list[Path] = []
         failures: list[Failure] = []
@@ -158,7 +170,8 @@ class Extractor:
                     chunk = files[start : start + _CHUNK]
                     prepared = list(pool.map(self._prepare, chunk))
                     embedded = self._embed([item for item in prepared if item.crop is not None])
-                    for path, item in zip(chunk, prepared, strict=True):
+                    for source, item in zip(chunk, prepared, strict=True):
+                        path = _named(source)
                         if item.failure is not None:
                             failures.append(item.failure)
                             continue
@@ -189,10 +202,11 @@ class Extractor:
         }
         return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).digest()
 
-    def _prepare(self, path: Path) -> "_Prepared":
+    def _prepare(self, source: Path | EncodedImage) -> "_Prepared":
         """Read, look up, decode, find the face; whatever is wrong with the file is an answer."""
+        path = _named(source)
         try:
-            data = _read(path, self._limits.max_bytes)
+            data = _read(source, self._limits.max_bytes)
             key = hashlib.sha256(self._key_prefix + hashlib.sha256(data).digest()).digest()
             known = None if self._cache is None else self._cache.get(key)
             if known is not None:
@@ -233,8 +247,14 @@ class _Prepared:
     failure: Failure | None = None
 
 
-def _read(path: Path, max_bytes: int) -> bytes:
-    with path.open("rb") as file:
+def _named(source: Path | EncodedImage) -> Path:
+    return Path(source.name) if isinstance(source, EncodedImage) else source
+
+
+def _read(source: Path | EncodedImage, max_bytes: int) -> bytes:
+    if isinstance(source, EncodedImage):
+        return source.data
+    with source.open("rb") as file:
         # One byte more than allowed, so that the decoder sees that it is too much.
         return file.read(max_bytes + 1)
 

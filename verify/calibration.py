@@ -17,7 +17,7 @@ from verify.calibration_mode import Bench, CalibrationOptions, calibrate_mode
 from verify.cohort import COHORT_SIZE, client_source, make_cohort, plain_strategy
 from verify.comparisons import Lifter, Progress, honest_norms
 from verify.raw_pairs import SuspiciousPair, consistency_threshold, suspicious_pairs
-from verify.tenfold import Pair, TenFold, random_pairs, require_folds
+from verify.tenfold import Pair, TenFold, pair_arrays, random_pairs, require_folds
 from verify.trials import Plan, chosen_photos, enrolled_means, plan_trials
 
 DEFAULT_LEVEL = "fmr-1e-3"
@@ -274,7 +274,7 @@ def _protocol_pairs(
         Pair(first, second, bool(plan.person_of[first] == plan.person_of[second]), fold)
         for first, second, fold in staying
     )
-    require_folds(placed)
+    require_folds(pair_arrays(placed)[1])
     return placed
 
 

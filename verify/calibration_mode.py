@@ -21,7 +21,7 @@ from verify.comparisons import (
     pair_similarities,
     point_trials,
 )
-from verify.tenfold import Pair, TenFold, ten_fold
+from verify.tenfold import Pair, TenFold, pair_arrays, ten_fold
 from verify.thresholds import (
     TARGETS,
     Genuine,
@@ -206,7 +206,7 @@ def _ten_fold(bench: Bench, probe_m: int) -> TenFold:
         metric=options.metric,
         steps=options.steps,
     )
-    return ten_fold(scores, bench.pairs)
+    return ten_fold(scores, *pair_arrays(bench.pairs))
 
 
 def _accuracy_level(

@@ -1,6 +1,6 @@
 """The ten-fold protocol of LFW: best accuracy on nine folds, applied to the tenth."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,6 +44,12 @@ class TenFold:
         return float(np.mean(self.thresholds))
 
 
+GRID = np.arange(0, 400) / 100
+"""The literature's thresholds for raw descriptors: squared L2 distances 0 … 3.99."""
+
+Search = Callable[[NDArray[np.float64], NDArray[np.bool_]], float]
+
+
 def best_threshold(similarities: ArrayLike, same: ArrayLike) -> float:
     """Threshold of best accuracy, by an exact sweep over the observed similarities.
 
@@ -68,7 +74,24 @@ def best_threshold(similarities: ArrayLike, same: ArrayLike) -> float:
     return float((ranked[cut] + ranked[cut - 1]) / 2)
 
 
-def require_folds(pairs: Sequence[Pair]) -> None:
+def best_grid_threshold(similarities: ArrayLike, same: ArrayLike) -> float:
+    """Threshold of best accuracy on the literature's grid; for raw descriptors only.
+
+    The grid is of squared L2 distances t = 0, 0.01 … 3.99; a pair matches where its distance is
+    *below* t; the first best t wins (InsightFace's ``verification.py``). The result is the lowest
+    similarity with a distance 2 − 2·similarity below t.
+    """
+    scores = np.asarray(similarities, dtype=np.float64)
+    truth = np.asarray(same, dtype=bool)
+    if scores.size == 0:
+        raise ValueError("a threshold needs at least one pair")
+    distances = 2 - 2 * scores
+    mated, non_mated = np.sort(distances[truth]), np.sort(distances[~truth])
+    right = np.searchsorted(mated, GRID) + non_mated.size - np.searchsorted(non_mated, GRID)
+    return float(np.nextafter(1 - GRID[np.argmax(right)] / 2, np.inf))
+
+
+def require_folds(folds: NDArray[np.int64]) -> None:
     """Check that every fold has a pair.
 
     Raises
@@ -76,35 +99,50 @@ def require_folds(pairs: Sequence[Pair]) -> None:
     ContractError
         Where a fold is empty or a fold number is outside 0 … 9.
     """
-    if {pair.fold for pair in pairs} != set(range(FOLDS)):
+    if set(np.unique(folds).tolist()) != set(range(FOLDS)):
         raise ContractError(
             f"the ten-fold protocol needs pairs in each of {FOLDS} folds, numbered from 0, and "
-            f"{len(pairs)} pairs are there: exclude fewer people, give other pairs, or calibrate "
+            f"{len(folds)} pairs are there: exclude fewer people, give other pairs, or calibrate "
             "under protocol fmr"
         )
 
 
-def ten_fold(similarities: ArrayLike, pairs: Sequence[Pair]) -> TenFold:
-    """Run the protocol on the similarities of ``pairs``.
+def ten_fold(
+    similarities: ArrayLike, same: ArrayLike, folds: ArrayLike, *, search: Search = best_threshold
+) -> TenFold:
+    """Run the protocol.
+
+    Parameters
+    ----------
+    similarities, same, folds : array_like, shape (P,)
+        Of every pair: its similarity, whether it shows one person, and its fold, 0 … 9.
+    search
+        Finds the threshold on nine folds: the exact sweep, or the literature's grid.
 
     Raises
     ------
     ContractError
         Where a fold is empty or a fold number is outside 0 … 9.
     """
-    require_folds(pairs)
     scores = np.asarray(similarities, dtype=np.float64)
-    same = np.array([pair.same for pair in pairs], dtype=bool)
-    folds = np.array([pair.fold for pair in pairs], dtype=np.int64)
-    if scores.shape != same.shape:
-        raise ValueError("the protocol needs one similarity for each pair")
+    truth = np.asarray(same, dtype=np.bool_)
+    numbers = np.asarray(folds, dtype=np.int64)
+    require_folds(numbers)
+    if not scores.shape == truth.shape == numbers.shape:
+        raise ValueError("the protocol needs one similarity, one truth and one fold for each pair")
     accuracies, thresholds = [], []
     for fold in range(FOLDS):
-        held = folds == fold
-        threshold = best_threshold(scores[~held], same[~held])
-        accuracies.append(float(np.mean((scores[held] >= threshold) == same[held])))
+        held = numbers == fold
+        threshold = search(scores[~held], truth[~held])
+        accuracies.append(float(np.mean((scores[held] >= threshold) == truth[held])))
         thresholds.append(threshold)
     return TenFold(accuracies=tuple(accuracies), thresholds=tuple(thresholds))
+
+
+def pair_arrays(pairs: Sequence[Pair]) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """Truths and folds of pairs, as :func:`ten_fold` takes them."""
+    same = np.array([pair.same for pair in pairs], dtype=np.bool_)
+    return same, np.array([pair.fold for pair in pairs], dtype=np.int64)
 
 
 def random_pairs(

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from templates.errors import ContractError
-from verify.tenfold import FOLDS, Pair, best_threshold, random_pairs, ten_fold
+from verify.tenfold import FOLDS, Pair, best_threshold, pair_arrays, random_pairs, ten_fold
 
 trials = st.lists(
     st.tuples(st.integers(-5, 5).map(lambda k: k / 4), st.booleans()), min_size=1, max_size=30
@@ -28,7 +28,7 @@ def test_ten_folds_choose_on_nine_and_apply_to_the_tenth() -> None:
         for same, score in ((True, 0.6), (True, 0.8), (False, 0.2), (False, 0.4)):
             pairs.append(Pair(0, 1, same, fold))
             scores.append(score + shift)
-    result = ten_fold(scores, pairs)
+    result = ten_fold(scores, *pair_arrays(pairs))
     assert result.accuracies[0] == 0.5
     assert result.accuracies[1:] == (1.0,) * 9 or min(result.accuracies[1:]) >= 0.75
     assert result.thresholds[0] == pytest.approx(0.5)
@@ -39,9 +39,9 @@ def test_ten_folds_choose_on_nine_and_apply_to_the_tenth() -> None:
 def test_a_missing_fold_is_refused() -> None:
     pairs = [Pair(0, 1, True, fold) for fold in range(9)]
     with pytest.raises(ContractError, match=r"each of 10 folds.*protocol fmr"):
-        ten_fold(np.zeros(9), pairs)
+        ten_fold(np.zeros(9), *pair_arrays(pairs))
     with pytest.raises(ContractError, match="0 pairs are there"):
-        ten_fold(np.zeros(0), [])
+        ten_fold(np.zeros(0), *pair_arrays([]))
 
 
 def test_random_pairs_are_balanced_true_and_distinct() -> None:

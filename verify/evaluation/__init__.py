@@ -1,0 +1,1 @@
+"""The paper's face-verification experiment: benchmark sets, protocol, baselines, tables, figures."""
