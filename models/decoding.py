@@ -175,6 +175,20 @@ def decode_image(data: bytes, *, limits: ImageLimits = DEFAULT_LIMITS) -> NDArra
         ) from None
 
 
+def image_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height that the header of an encoded picture states; None where it is none.
+
+    Nothing but the header is read, and turns by EXIF are not applied.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            with Image.open(io.BytesIO(data), formats=FORMATS) as image:
+                return image.size
+        except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+            return None
+
+
 def _decode(data: bytes, limits: ImageLimits) -> NDArray[np.uint8]:
     _check_webp_canvas(data, limits)
     data = _lean_png(data)

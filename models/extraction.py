@@ -29,8 +29,8 @@ from models.pack import FacePolicy, ModelPack
 from models.quality import QualityLimits
 from models.sessions import default_workers
 
-# Crops of one chunk are in memory at once (128 x 37 kB at 112 pixels), photos only one per worker.
-_CHUNK = 128
+CHUNK = 128
+"""Photos embedded together. Their crops are in memory at once, photos only one per thread."""
 _QUIET_SECONDS = 2.0
 
 Advance = Callable[[int], None]
@@ -166,8 +166,8 @@ class Extractor:
         bar = _Bar(len(files), progress)
         try:
             with bar, ThreadPoolExecutor(self._workers) as pool:
-                for start in range(0, len(files), _CHUNK):
-                    chunk = files[start : start + _CHUNK]
+                for start in range(0, len(files), CHUNK):
+                    chunk = files[start : start + CHUNK]
                     prepared = list(pool.map(self._prepare, chunk))
                     embedded = self._embed([item for item in prepared if item.crop is not None])
                     for source, item in zip(chunk, prepared, strict=True):

@@ -87,17 +87,25 @@ def labelled_folder(root: Path | str) -> LabelledFolder:
     if not paths and not faults:
         faults.append("there is no person's folder in it")
     if faults:
-        raise DatasetError(_listing(folder, "expected root/Person/photo.jpg", faults))
+        raise DatasetError(faults_in(folder, "expected root/Person/photo.jpg", faults))
     return LabelledFolder(folder, tuple(paths), tuple(identities), tuple(ignored))
+
+
+@dataclass(frozen=True)
+class NamedPair:
+    """One line of LFW's ``pairs.txt``: person and file stem of both photos."""
+
+    first: tuple[str, str]
+    second: tuple[str, str]
+    same: bool
+    fold: int
+    line: int
 
 
 def read_lfw_pairs(
     file: Path | str, paths: Sequence[Path], *, missing: Collection[Path] = ()
 ) -> list[Pair]:
     """Read LFW's ``pairs.txt`` into positions in ``paths``.
-
-    The header is ``folds<TAB>pairs per class and fold``; every fold then has that many lines
-    ``Name i j`` of one person and as many lines ``NameA i NameB j`` of two (FORMATS).
 
     Parameters
     ----------
@@ -116,35 +124,58 @@ def read_lfw_pairs(
     try:
         if path.stat().st_size > MAX_PAIRS_BYTES:
             raise DatasetError(f"{path.name} is larger than {MAX_PAIRS_BYTES} bytes")
-        lines = path.read_text(encoding="utf-8").splitlines()
+        text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError):
         raise DatasetError(f"{path.name} cannot be read as UTF-8 text") from None
     index = {(entry.parent.name, entry.stem): number for number, entry in enumerate(paths)}
     gone = {(entry.parent.name, entry.stem) for entry in missing}
-    folds, per_class = _header(path, lines)
-    body = lines[1 : 1 + 2 * folds * per_class]
-    if len(body) < 2 * folds * per_class:
-        raise DatasetError(
-            f"{path.name} promises {2 * folds * per_class} pairs and holds {len(body)}"
-        )
     pairs: list[Pair] = []
     faults: list[str] = []
-    for number, line in enumerate(body):
+    for named in parse_lfw_pairs(path, text):
+        keys = (named.first, named.second)
+        if any(key in gone for key in keys):
+            continue
+        if all(key in index for key in keys):
+            pairs.append(Pair(index[keys[0]], index[keys[1]], named.same, named.fold))
+        else:
+            absent = next(key for key in keys if key not in index)
+            faults.append(f"line {named.line} names {absent[0]}/{absent[1]}, which is not there")
+    if faults:
+        raise DatasetError(faults_in(path, "expected LFW's pairs format", faults))
+    return pairs
+
+
+def parse_lfw_pairs(path: Path, text: str) -> list[NamedPair]:
+    """Parse the text of LFW's ``pairs.txt``; ``path`` is for messages only.
+
+    The header is ``folds<TAB>pairs per class and fold``; every fold then has that many lines
+    ``Name i j`` of one person and as many lines ``NameA i NameB j`` of two (FORMATS).
+
+    Raises
+    ------
+    DatasetError
+        Listing every faulty line.
+    """
+    lines = text.splitlines()
+    folds, per_class = _header(path, lines)
+    promised = 2 * folds * per_class
+    while lines and not lines[-1].strip():
+        lines.pop()
+    if len(lines) - 1 != promised:
+        raise DatasetError(f"{path.name} promises {promised} pairs and holds {len(lines) - 1}")
+    pairs: list[NamedPair] = []
+    faults: list[str] = []
+    for number, line in enumerate(lines[1:]):
         fold, place = divmod(number, 2 * per_class)
         same = place < per_class
         keys = _photo_keys(line, same=same)
         if keys is None:
             form = "Name i j" if same else "NameA i NameB j"
             faults.append(f"line {number + 2} is not of the form {form}")
-        elif any(key in gone for key in keys):
-            continue
-        elif any(key not in index for key in keys):
-            absent = next(key for key in keys if key not in index)
-            faults.append(f"line {number + 2} names {absent[0]}/{absent[1]}, which is not there")
         else:
-            pairs.append(Pair(index[keys[0]], index[keys[1]], same, fold))
+            pairs.append(NamedPair(*keys, same=same, fold=fold, line=number + 2))
     if faults:
-        raise DatasetError(_listing(path, "expected LFW's pairs format", faults))
+        raise DatasetError(faults_in(path, "expected LFW's pairs format", faults))
     return pairs
 
 
@@ -170,7 +201,8 @@ def _photo_keys(line: str, *, same: bool) -> tuple[tuple[str, str], tuple[str, s
     return (first, f"{first}_{int(i):04d}"), (second, f"{second}_{int(j):04d}")
 
 
-def _listing(where: Path, expected: str, faults: Sequence[str], *, most: int = 20) -> str:
+def faults_in(where: Path, expected: str, faults: Sequence[str], *, most: int = 20) -> str:
+    """Word the message of a :class:`DatasetError`: the first ``most`` faults, and how many more."""
     shown = "; ".join(faults[:most])
     more = f"; and {len(faults) - most} more" if len(faults) > most else ""
     return f"{where} has {len(faults)} fault(s), {expected}: {shown}{more}"

@@ -21,8 +21,17 @@ RULE_OF_THREE = 3.0
 """With no error in N independent trials, the 95 % upper bound of the rate is 3 / N."""
 
 
-def wilson(errors: int, trials: int, *, confidence: float = 0.95) -> tuple[float, float]:
+def wilson(errors: float, trials: int, *, confidence: float = 0.95) -> tuple[float, float]:
     """Wilson score interval of a proportion.
+
+    Parameters
+    ----------
+    errors
+        Number of errors; a mean over repeats of the same trials need not be whole.
+    trials
+        Number of trials.
+    confidence
+        Of the two-sided interval.
 
     Returns
     -------

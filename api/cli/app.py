@@ -2,7 +2,7 @@
 
 import typer
 
-from api.cli import calibrate, db, decoys, demo, keys, lift, models, serve, subjects
+from api.cli import calibrate, db, decoys, demo, evaluate, keys, lift, models, serve, subjects
 from api.cli.errors import Commands
 
 app = typer.Typer(
@@ -21,6 +21,7 @@ serve.register(app)
 subjects.register(app)
 lift.register(app)
 calibrate.register(app)
+evaluate.register(app)
 app.add_typer(decoys.app, name="decoys")
 app.add_typer(keys.app, name="keys")
 app.add_typer(models.app, name="models")

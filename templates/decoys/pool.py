@@ -97,6 +97,45 @@ class DecoyPool:
         """Whether the entries have labels, as hybrid+ needs."""
         return self._labels is not None
 
+    @property
+    def entries(self) -> tuple[NDArray[np.float32], tuple[Attributes, ...] | None]:
+        """The descriptors, shape (N, n) and read-only, and their labels, None where unlabelled.
+
+        They are real people's descriptors, and a secret of the deployment: for experiments, such
+        as attributes predicted from the pool. They never leave memory: not to a file, a log or a
+        message.
+        """
+        view = self._descriptors.view()
+        view.flags.writeable = False
+        return view, self._labels
+
+    def subset(self, positions: NDArray[np.int64] | Sequence[int]) -> Self:
+        """Keep some entries, in the order given, with their labels and ``made_with``.
+
+        Parameters
+        ----------
+        positions
+            Distinct entry numbers, 0 … N − 1.
+
+        Raises
+        ------
+        DecoyError
+            No entry is named, one is named twice, or one is not there.
+        """
+        chosen = np.asarray(positions)
+        if chosen.ndim != 1 or not chosen.size:
+            raise DecoyError("a part of a decoy pool needs at least one entry; none was named")
+        if chosen.dtype.kind not in "iu" or chosen.min() < 0 or chosen.max() >= len(self):
+            raise DecoyError(f"entries of this pool are numbered from 0 to {len(self) - 1}")
+        if len(np.unique(chosen)) != len(chosen):
+            raise DecoyError("an entry of a decoy pool is named twice")
+        labels = self._labels
+        return type(self)(
+            self._descriptors[chosen],
+            labels=None if labels is None else [labels[i] for i in chosen.tolist()],
+            made_with=self.made_with,
+        )
+
     def draw(
         self,
         rows: int,

@@ -241,6 +241,50 @@ def test_the_id_names_descriptors_and_labels() -> None:
     assert DecoyPool(rows.astype(np.float64)).source_id in ids
 
 
+def test_the_entries_are_those_that_were_given_and_cannot_be_changed() -> None:
+    rows, labels = unit_rows(12, 8), cross_labels(12)
+    seen, names = DecoyPool(rows, labels=labels).entries
+    assert np.array_equal(seen, rows)
+    assert names == tuple(labels)
+    with pytest.raises(ValueError, match="read-only"):
+        seen[0, 0] = 1
+    with pytest.raises(ValueError, match="WRITEABLE"):
+        seen.flags.writeable = True
+    assert DecoyPool(rows).entries[1] is None
+
+
+@pytest.mark.parametrize("labelled", [True, False])
+def test_a_subset_keeps_rows_labels_and_what_made_them(labelled: bool) -> None:
+    rows, labels = unit_rows(30, 8), cross_labels(30)
+    pool = DecoyPool(rows, labels=labels if labelled else None, made_with="5a" * 32)
+    kept = np.array([29, 3, 7])
+    part = pool.subset(kept)
+    direct = DecoyPool(
+        rows[kept],
+        labels=[labels[i] for i in (29, 3, 7)] if labelled else None,
+        made_with="5a" * 32,
+    )
+    assert part.source_id == direct.source_id
+    assert part.entries[1] == direct.entries[1]
+    assert np.array_equal(part.entries[0], rows[kept])
+    assert pool.subset(range(30)).source_id == pool.source_id
+
+
+@pytest.mark.parametrize(
+    ("positions", "said"),
+    [
+        ([], "at least one entry"),
+        ([0, 12], "numbered from 0 to 11"),
+        ([-1], "numbered from 0 to 11"),
+        ([0.5], "numbered from 0 to 11"),
+        ([1, 2, 1], "named twice"),
+    ],
+)
+def test_a_subset_of_other_than_entries_is_refused(positions: list[int], said: str) -> None:
+    with pytest.raises(DecoyError, match=said):
+        DecoyPool(unit_rows(12, 8)).subset(positions)
+
+
 @pytest.mark.parametrize("labelled", [True, False])
 def test_save_and_load(tmp_path: Path, sealer: KeyringSealer, labelled: bool) -> None:
     labels = [*cross_labels(28), Attributes(None, "White"), Attributes("Male", None)]

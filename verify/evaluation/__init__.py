@@ -1,1 +1,1 @@
-"""The paper's face-verification experiment: benchmark sets, protocol, baselines, tables, figures."""
+"""The paper's face-verification experiment: benchmark sets, protocol, baselines, figures."""

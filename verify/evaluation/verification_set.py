@@ -32,10 +32,18 @@ class Picture(Protocol):
 
 @dataclass(frozen=True)
 class PictureFile:
-    """A photo in a folder."""
+    """A photo in a folder.
+
+    Parameters
+    ----------
+    landmarks
+        The file of landmarks that the set offers for it, if any; the pack's own detector is
+        preferred to it.
+    """
 
     name: str
     path: Path
+    landmarks: Path | None = None
 
     def read(self) -> EncodedImage:
         """Read the file."""

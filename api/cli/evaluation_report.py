@@ -1,0 +1,87 @@
+"""What ``veilface evaluate`` writes and shows."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from api.cli.console import table
+from api.cli.errors import CommandError
+from api.cli.files import read_bounded
+from verify.evaluation.rows import Json
+from verify.evaluation.tables import markdown, write_csv
+
+_MAX_AUDIT_BYTES = 64 * 2**20
+
+
+def read_audit(file: Path) -> Json:
+    """Read the report of an audit, and check that it has what the figure needs.
+
+    Raises
+    ------
+    CommandError, DatasetError
+        It is no such report.
+    """
+    from verify.evaluation.figures.frontier import strongest_attackers
+
+    try:
+        report = json.loads(read_bounded(file, _MAX_AUDIT_BYTES))
+    except (UnicodeDecodeError, json.JSONDecodeError):
+        raise CommandError(f"{file.name} is no JSON file") from None
+    strongest_attackers(report)
+    return dict(report)
+
+
+def write_results(results: Json, out: Path, *, audit: Json | None) -> list[Path]:
+    """Write the document, the tables and the figures; return their files."""
+    # Imported here: drawing loads a library that nothing else needs.
+    from verify.evaluation.figures import write_figures
+
+    files = [out / "results.json", out / "results.csv", out / "results.md"]
+    files[0].write_text(
+        json.dumps(results, indent=1, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8"
+    )
+    write_csv(results, files[1])
+    files[2].write_text(markdown(results), encoding="utf-8")
+    return [*files, *write_figures(results, out, audit=audit)]
+
+
+def summary(results: Json, dataset: str) -> Table:
+    """Show the rows of one set."""
+    rows = [row for row in results["rows"] if row["dataset"] == dataset]
+    targets = list(rows[0]["fnmr_at_fmr"])
+    listing = table(
+        f"{dataset}: {rows[0]['n_genuine']} genuine and {rows[0]['n_impostor']} impostor pairs",
+        "strategy",
+        "m",
+        "mode",
+        "metric",
+        "accuracy % ± folds ± seeds",
+        "EER %",
+        *(f"FNMR % at FMR {target}" for target in targets),
+    )
+    for row in rows:
+        listing.add_row(
+            _strategy(row),
+            str(row["dim"] or ""),
+            row["mode"],
+            row["metric"],
+            f"{100 * row['accuracy_mean']:.2f} ± {100 * row['accuracy_std']:.2f}"
+            + (f" ± {100 * row['accuracy_std_seeds']:.2f}" if row["runs"] > 1 else ""),
+            f"{100 * row['eer']:.2f}",
+            *(_rate(row["fnmr_at_fmr"][target]) for target in targets),
+        )
+    return listing
+
+
+def _strategy(row: Json) -> str:
+    if row["threshold_search"] == "grid":
+        return f"{row['strategy']} (grid)"
+    return (
+        f"{row['strategy']}, generated decoys" if row["decoys"] == "generator" else row["strategy"]
+    )
+
+
+def _rate(at: Any) -> str:
+    return f"{100 * at['value']:.2f} ({100 * at['ci_low']:.2f}-{100 * at['ci_high']:.2f})"

@@ -1,0 +1,110 @@
+"""Attributes predicted from a labelled pool, and pool entries that resemble faces of a set."""
+
+import csv
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from models.extraction import Extraction, Extractor
+from models.pack import ModelPack
+from templates.decoys import Attributes, DecoyPool
+from templates.errors import DecoyError
+from verify.evaluation import attributes
+from verify.evaluation.attributes import predict_attributes, resembling
+
+
+def unit_rows(count: int, n: int = 16, seed: int = 0) -> NDArray[np.float32]:
+    x = np.random.default_rng(seed).normal(size=(count, n))
+    return (x / np.linalg.norm(x, axis=1, keepdims=True)).astype(np.float32)
+
+
+def voted(cosines: NDArray[np.float64], labels: list[str | None], k: int) -> str:
+    """The vote by hand: nearest labelled entries, ties to the first in the alphabet."""
+    nearest = [i for i in np.argsort(-cosines) if labels[i] is not None][:k]
+    votes = Counter(labels[i] for i in nearest)
+    most = max(votes.values())
+    return min(str(label) for label, count in votes.items() if count == most)
+
+
+@pytest.mark.parametrize("k", [1, 4, 10])
+def test_the_vote_is_that_of_the_nearest_entries(k: int) -> None:
+    rng = np.random.default_rng(4)
+    genders = [str(g) for g in rng.choice(["Female", "Male"], 90)]
+    races: list[str | None] = [str(r) for r in rng.choice(["Black", "Indian", "White"], 90)]
+    races[:20] = [None] * 20
+    entries, faces = unit_rows(90), unit_rows(40, seed=1)
+    pool = DecoyPool(
+        entries, labels=[Attributes(g, r) for g, r in zip(genders, races, strict=True)]
+    )
+    cosines = faces.astype(np.float64) @ entries.astype(np.float64).T
+    assert predict_attributes(faces, pool, k=k) == [
+        Attributes(voted(row, list(genders), k), voted(row, races, k)) for row in cosines
+    ]
+
+
+def test_an_attribute_without_labels_is_not_guessed() -> None:
+    pool = DecoyPool(unit_rows(5), labels=[Attributes("Male", None)] * 5)
+    assert predict_attributes(unit_rows(2), pool) == [Attributes("Male", None)] * 2
+    assert predict_attributes(unit_rows(0), pool) == []
+
+
+def test_a_pool_without_labels_or_of_another_dimension_is_refused() -> None:
+    with pytest.raises(DecoyError, match="this one has no labels"):
+        predict_attributes(unit_rows(2), DecoyPool(unit_rows(5)))
+    labelled = DecoyPool(unit_rows(5), labels=[Attributes("Male", "White")] * 5)
+    with pytest.raises(DecoyError, match="descriptors of 16 numbers"):
+        predict_attributes(unit_rows(2, n=8), labelled)
+    with pytest.raises(DecoyError, match="descriptors of 16 numbers"):
+        resembling(labelled, unit_rows(2, n=8), cosine=0.5)
+
+
+def test_entries_that_resemble_a_face_are_found_in_every_tile(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(attributes, "_ROWS", 7)
+    entries, faces = unit_rows(50), unit_rows(30, seed=1)
+    cosines = (entries.astype(np.float64) @ faces.astype(np.float64).T).max(axis=1)
+    # Between two observed maxima, so that no rounding decides.
+    ordered = np.sort(cosines)
+    for rank in (10, 25, 40):
+        limit = float(ordered[rank - 1 : rank + 1].mean())
+        found = resembling(DecoyPool(entries), faces, cosine=limit)
+        assert found.dtype == np.int64
+        assert found.tolist() == np.flatnonzero(cosines >= limit).tolist()
+        assert len(found) == 50 - rank
+    assert resembling(DecoyPool(entries), faces[:0], cosine=-1).size == 0
+
+
+def labelled_faces(fairface: Path, part: str, count: int) -> dict[Path, Attributes]:
+    with (fairface / f"fairface_label_{part}.csv").open(newline="") as stream:
+        rows = [row for row in csv.DictReader(stream) if (fairface / row["file"]).exists()]
+    return {fairface / row["file"]: Attributes(row["gender"], row["race"]) for row in rows[:count]}
+
+
+def embedded(pack: ModelPack, photos: dict[Path, Attributes]) -> Extraction:
+    return Extractor(pack).extract(list(photos))
+
+
+def test_real_faces_are_predicted_better_than_by_the_majority(
+    mbf_pack_dir: Path, fairface: Path
+) -> None:
+    """100 faces against 299: gender of 67 and race of 37 right when written, majority 53 and 20."""
+    pack = ModelPack.load(mbf_pack_dir)
+    train, held = labelled_faces(fairface, "train", 300), labelled_faces(fairface, "val", 100)
+    known, new = embedded(pack, train), embedded(pack, held)
+    assert len(known.paths) >= 290
+    assert len(new.paths) >= 95
+    pool = DecoyPool(known.descriptors, labels=[train[path] for path in known.paths])
+    predicted = predict_attributes(new.descriptors, pool)
+    truth = [held[path] for path in new.paths]
+    for name, margin in (("gender", 10), ("race", 8)):
+        right = sum(
+            getattr(p, name) == getattr(t, name) for p, t in zip(predicted, truth, strict=True)
+        )
+        majority = Counter(getattr(t, name) for t in truth).most_common(1)[0][1]
+        assert right >= majority + margin, (name, right, majority)
+    # Nobody of the validation faces is in the pool, and everybody resembles themselves.
+    assert resembling(pool, known.descriptors, cosine=0.99).tolist() == list(range(len(pool)))

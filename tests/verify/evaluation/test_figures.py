@@ -1,0 +1,400 @@
+"""What the figures show, read from their artists and their files."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import matplotlib
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
+from matplotlib.container import BarContainer
+from matplotlib.figure import Figure
+from PIL import Image
+from scipy.special import ndtri
+
+from tests.verify.evaluation.sample_results import sample_audit, sample_results
+from verify.datasets import DatasetError
+from verify.evaluation.figures import (
+    det_figure,
+    frontier_figure,
+    roc_figure,
+    verification_figure,
+    write_figures,
+)
+from verify.evaluation.figures.curves import shown_curves
+from verify.evaluation.figures.style import GROUND, HUES, INK, QUIET, house_style
+
+PAPER = (("random", None), ("adversarial", "pool"), ("hybrid", "pool"))
+
+
+def drawn(figure: Figure | None) -> list[Axes]:
+    assert figure is not None
+    return [axes for axes in figure.axes if axes.axison]
+
+
+def bars(axes: Axes) -> dict[str, BarContainer]:
+    return {str(c.get_label()): c for c in axes.containers if isinstance(c, BarContainer)}
+
+
+def labelled(axes: Axes, label: str) -> Any:
+    return next(line for line in axes.get_lines() if line.get_label() == label)
+
+
+def texts(axes: Axes) -> list[str]:
+    return [text.get_text() for text in axes.texts]
+
+
+def legend(figure: Figure | None) -> list[str]:
+    assert figure is not None
+    return [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+def select(results: dict[str, Any], **keys: Any) -> list[dict[str, Any]]:
+    return [r for r in results["rows"] if all(r[k] == v for k, v in keys.items())]
+
+
+def test_bars_are_as_high_as_the_accuracies() -> None:
+    results = sample_results(datasets=("lfw", "cfp_fp"), liftings=PAPER)
+    axes = drawn(verification_figure(results))
+    places = [(name, mode) for mode in ("p2s", "s2s") for name in ("lfw", "cfp_fp")]
+    assert len(axes) == 4
+    for panel, (name, mode) in zip(axes, places, strict=True):
+        for metric, label in (("euclidean", "Euclidean"), ("spherical", "spherical")):
+            rows = select(results, dataset=name, mode=mode, metric=metric)
+            by_dim = {"random": 0, "adversarial": 1, "hybrid": 2}
+            rows.sort(key=lambda row: (by_dim[row["strategy"]], row["dim"]))
+            container = bars(panel)[label]
+            by_place = sorted(container.patches, key=lambda bar: bar.get_x())
+            assert [bar.get_height() for bar in by_place] == pytest.approx(
+                [100 * row["accuracy_mean"] for row in rows]
+            )
+            assert container.errorbar is not None
+            whiskers = container.errorbar.lines[2][0].get_segments()
+            lengths = sorted(float(end[1] - start[1]) for start, end in whiskers)
+            assert lengths == pytest.approx(sorted(200 * row["accuracy_std"] for row in rows))
+
+
+def test_each_pair_of_bars_stands_over_its_m_and_its_strategy() -> None:
+    results = sample_results(liftings=PAPER, dims=(4, 16))
+    panel = drawn(verification_figure(results))[0]
+    ticks = dict(zip(panel.get_xticks(), panel.get_xticklabels(), strict=True))
+    assert [tick.get_text() for tick in ticks.values()] == ["4", "16"] * 3
+    euclidean, spherical = (bars(panel)[name].patches for name in ("Euclidean", "spherical"))
+    for left, right, place in zip(euclidean, spherical, ticks, strict=True):
+        assert left.get_x() + left.get_width() == pytest.approx(place)
+        assert right.get_x() == pytest.approx(place)
+    names = [text for text in panel.texts if text.get_text() not in ("m =",)]
+    at = {text.get_text(): text.xy[0] for text in names if not text.get_text().startswith("raw")}
+    assert list(at) == ["random", "adversarial\npool", "hybrid\npool"]
+    assert list(at.values()) == pytest.approx(np.mean(np.reshape(list(ticks), (3, 2)), axis=1))
+
+
+def test_the_reference_is_raw_by_the_same_threshold_search() -> None:
+    results = sample_results(liftings=PAPER)
+    (raw,) = select(results, strategy="raw", threshold_search="exact")
+    for panel in drawn(verification_figure(results)):
+        assert labelled(panel, "raw").get_ydata()[0] == pytest.approx(100 * raw["accuracy_mean"])
+        assert f"raw\n{100 * raw['accuracy_mean']:.2f}" in texts(panel)
+    results["rows"].remove(raw)
+    (grid,) = select(results, strategy="raw")
+    panel = drawn(verification_figure(results))[0]
+    assert labelled(panel, "raw").get_ydata()[0] == pytest.approx(100 * grid["accuracy_mean"])
+    results["rows"].remove(grid)
+    panel = drawn(verification_figure(results))[0]
+    assert not [line for line in panel.get_lines() if line.get_label() == "raw"]
+
+
+def test_a_cut_axis_is_written_out_and_shared_by_the_data_sets() -> None:
+    results = sample_results(datasets=("lfw", "cfp_fp"), liftings=PAPER)
+    axes = drawn(verification_figure(results))
+    for row, mode in ((axes[:2], "p2s"), (axes[2:], "s2s")):
+        floor = row[0].get_ylim()[0]
+        assert row[1].get_ylim() == row[0].get_ylim()
+        lowest = 100 * min(r["accuracy_mean"] for r in select(results, mode=mode))
+        assert 0 < floor < lowest
+        for panel in row:
+            title = panel.get_title(loc="right")
+            assert title.startswith(f"axis starts at {floor:g} %")
+            assert ("chance" in title) == (floor == 50)
+    assert axes[0].get_ylim()[0] > axes[2].get_ylim()[0]
+
+
+def test_worse_than_chance_shows_the_whole_axis() -> None:
+    results = sample_results(liftings=PAPER, dims=(2,), modes=("s2s",))
+    select(results, mode="s2s")[0]["accuracy_mean"] = 0.31
+    (panel,) = drawn(verification_figure(results))
+    assert panel.get_ylim()[0] == 0
+    assert panel.get_title(loc="right") == ""
+
+
+def test_metrics_differ_without_colour() -> None:
+    (panel, _) = drawn(verification_figure(sample_results(liftings=PAPER)))
+    looks = {name: container.patches[0] for name, container in bars(panel).items()}
+    assert looks["Euclidean"].get_hatch()
+    assert not looks["spherical"].get_hatch()
+    grey = {name: contrast(bar.get_facecolor()[:3], "#000000") for name, bar in looks.items()}
+    assert grey["Euclidean"] > 3 * grey["spherical"]
+
+
+def test_pool_generator_and_shared_pool_are_groups_of_their_own() -> None:
+    liftings = (("adversarial", "pool"), ("adversarial", "generator"))
+    both = sample_results(liftings=liftings, dims=(2,), shared=(False, True))
+    top, bottom = drawn(verification_figure(both))
+    names = ["adversarial\ngenerator", "adversarial\npool", "adversarial\npool, shared"]
+    assert [text for text in texts(bottom) if text.startswith("adv")] == names
+    assert len(bars(bottom)["spherical"].patches) == 3
+    assert len(bars(top)["spherical"].patches) == 2
+    only = sample_results(liftings=liftings, dims=(2,), shared=(True,))
+    top, bottom = drawn(verification_figure(only))
+    assert [text for text in texts(bottom) if text.startswith("adv")] == names[:2]
+    assert "shared pool" in bottom.get_ylabel()
+    assert "shared pool" not in top.get_ylabel()
+
+
+@pytest.mark.parametrize("mode", ["p2s", "s2s"])
+@pytest.mark.parametrize("metric", ["euclidean", "spherical"])
+def test_one_mode_and_one_metric_are_enough(mode: str, metric: str) -> None:
+    results = sample_results(liftings=PAPER, modes=(mode,), metrics=(metric,), hashes=False)
+    figure = verification_figure(results)
+    (panel,) = drawn(figure)
+    assert len(bars(panel)) == 1
+    assert legend(figure)[1:] == ["raw", "± 1 std over folds"]
+
+
+def test_missing_cells_leave_their_place_empty() -> None:
+    results = sample_results(liftings=PAPER, dims=(2, 64))
+    gone = select(results, strategy="hybrid", mode="s2s", dim=64)
+    results["rows"] = [row for row in results["rows"] if row not in gone]
+    select(results, strategy="adversarial", mode="s2s", dim=2)[0]["accuracy_mean"] = None
+    top, bottom = drawn(verification_figure(results))
+    assert list(top.get_xticks()) == list(bottom.get_xticks())
+    assert len(bars(top)["spherical"].patches) == 6
+    assert sum(len(bars(bottom)[name].patches) for name in bars(bottom)) == 12 - 3
+
+
+@pytest.mark.parametrize("number", [1, 2, 3, 4])
+def test_up_to_four_data_sets_have_a_title_each(number: int) -> None:
+    names = ("lfw", "cfp_ff", "cfp_fp", "agedb_30")[:number]
+    figure = verification_figure(sample_results(datasets=names, liftings=PAPER, dims=(2, 4, 8, 16)))
+    titles = [panel.get_title(loc="left") for panel in drawn(figure)]
+    assert [title for title in titles if title] == list(names)
+    assert figure is not None
+    assert figure.get_figwidth() <= 15
+    assert len(titles) == 2 * number
+
+
+def test_nothing_of_the_largest_figure_lies_outside_it_or_overlaps() -> None:
+    results = sample_results(dims=(2, 4, 8, 16, 32, 64), shared=(False, True))
+    figure = verification_figure(results)
+    assert figure is not None
+    with house_style():
+        figure.draw_without_rendering()
+        renderer = figure._get_renderer()  # type: ignore[attr-defined]
+        for panel in drawn(figure):
+            boxes = [text.get_window_extent(renderer) for text in panel.texts]
+            boxes += [text.get_window_extent(renderer) for text in panel.get_xticklabels()]
+            for number, box in enumerate(boxes):
+                assert figure.bbox.x0 <= box.x0 < box.x1 <= figure.bbox.x1
+                assert figure.bbox.y0 <= box.y0 < box.y1 <= figure.bbox.y1
+                assert not any(box.overlaps(other) for other in boxes[number + 1 :])
+        box = figure.legends[0].get_window_extent(renderer)
+        assert figure.bbox.x0 <= box.x0 < box.x1 <= figure.bbox.x1
+        top = max(panel.get_tightbbox(renderer).y1 for panel in drawn(figure))
+        assert box.y0 >= top - 1
+
+
+def test_the_det_shows_the_curves_on_normal_deviates() -> None:
+    results = sample_results()
+    panel = drawn(det_figure(results))[0]
+    assert (panel.get_xlabel(), panel.get_ylabel()) == ("FMR %", "FNMR %")
+    (curve,) = (c for c in results["curves"] if c["strategy"] == "raw")
+    raw = panel.get_lines()[0]
+    assert raw.get_xdata() == pytest.approx(np.clip(curve["fmr"], 0, 1 - 1e-7))
+    assert raw.get_ydata() == pytest.approx(np.clip(curve["fnmr"], 1e-7, 1))
+    for axis in (panel.xaxis, panel.yaxis):
+        rates = np.array([0.01, 0.05, 0.2])
+        placed = axis.get_transform().transform(rates)
+        assert np.diff(placed) == pytest.approx(np.diff(ndtri(rates)))
+    ticks = dict(zip(panel.get_xticks(), panel.get_xticklabels(), strict=True))
+    assert all(float(text.get_text()) == pytest.approx(100 * at) for at, text in ticks.items())
+    low, high = (np.asarray(curve[name])[3] for name in ("low", "high"))
+    band = panel.collections[0].get_paths()[0].vertices
+    at_fourth = band[np.isclose(band[:, 0], curve["fmr"][3]), 1]
+    assert sorted(set(at_fourth.round(9))) == pytest.approx(sorted([low, high]))
+
+
+def test_the_roc_shows_the_true_match_rate_over_the_logarithm() -> None:
+    results = sample_results()
+    panel = drawn(roc_figure(results))[0]
+    assert panel.get_xscale() == "log"
+    (curve,) = (c for c in results["curves"] if c["strategy"] == "raw")
+    assert panel.get_lines()[0].get_ydata() == pytest.approx(100 - 100 * np.array(curve["fnmr"]))
+    assert panel.get_ylim()[0] <= 100 * (1 - max(curve["fnmr"]))
+
+
+def test_a_panel_has_the_ends_of_m_raw_and_the_hashes() -> None:
+    results = sample_results(liftings=PAPER)
+    results["curves"] = [
+        c for c in results["curves"] if (c["strategy"], c["dim"]) != ("hybrid", 16)
+    ]
+    shown = shown_curves(results["curves"], "s2s")
+    assert {c["metric"] for c in shown} == {"spherical", "hamming", "euclidean"}
+    assert {c["strategy"] for c in shown if c["metric"] == "euclidean"} == {"raw"}
+    lifted = {(c["strategy"], c["dim"]) for c in shown if c["mode"] == "s2s"}
+    assert lifted == {(s, m) for s in ("random", "adversarial", "hybrid") for m in (2, 8)}
+    assert sum(c["mode"] == "hash" for c in shown) == 4
+    assert not any(c["strategy"] == "raw+flip" for c in shown)
+    for figure in (det_figure(results), roc_figure(results)):
+        names = ["raw", "random", "adversarial (pool)", "hybrid (pool)"]
+        assert legend(figure)[:4] == names
+        assert any(label.startswith("solid: m = ") for label in legend(figure))
+
+
+def test_a_point_of_the_frontier_is_the_strongest_attacker_against_the_accuracy() -> None:
+    results = sample_results(liftings=PAPER, dims=(2, 16))
+    audit = sample_audit(results)
+    panels = drawn(frontier_figure(results, audit))
+    assert len(panels) == 4
+    for panel, (mode, attribute) in zip(
+        panels, [(m, a) for m in ("p2s", "s2s") for a in ("gender", "race")], strict=True
+    ):
+        assert panel.get_xlabel().startswith(attribute)
+        line = labelled(panel, "adversarial (pool)")
+        expected = []
+        for dim in (2, 16):
+            (row,) = select(results, strategy="adversarial", dim=dim, mode=mode, metric="spherical")
+            attacks = [
+                a["accuracy"]
+                for a in audit["rows"]
+                if (a["strategy"], a["dim"], a["attribute"]) == ("adversarial", dim, attribute)
+            ]
+            assert len(attacks) == 2
+            expected.append((100 * max(attacks), 100 * row["accuracy_mean"]))
+        assert np.column_stack(line.get_data()) == pytest.approx(np.array(expected))
+        chance = 53.3 if attribute == "gender" else 19.3
+        assert labelled(panel, "chance").get_xdata()[0] == pytest.approx(chance)
+    assert {"m = 2", "m = 16", "chance", "raw"} <= set(legend(frontier_figure(results, audit)))
+
+
+def test_an_audit_without_its_fields_is_refused() -> None:
+    results = sample_results(liftings=PAPER, dims=(2,))
+    audit = sample_audit(results)
+    del audit["rows"][0]["chance"], audit["rows"][0]["attacker"]
+    audit["rows"][2]["accuracy"] = 51.2
+    audit["rows"][3]["dim"] = "2"
+    with pytest.raises(
+        DatasetError,
+        match=r"row 0: lacks attacker, chance; row 2: accuracy is 51\.2.*; row 3: dim is str",
+    ):
+        frontier_figure(results, audit)
+    for wrong, reason in (
+        ({}, "not an audit report"),
+        ([], "not an audit report"),
+        ({"format": "veilface audit"}, "no rows"),
+        ({"format": "veilface audit", "rows": [1]}, "row 0: is not an object"),
+    ):
+        with pytest.raises(DatasetError, match=reason):
+            frontier_figure(results, wrong)  # type: ignore[arg-type]
+
+
+def test_files_are_complete_readable_and_the_same_each_time(tmp_path: Path) -> None:
+    results = sample_results(liftings=PAPER, dims=(2, 16))
+    audit = sample_audit(results)
+    matplotlib.rcParams["font.size"], before = 31.0, matplotlib.rcParams["font.size"]
+    try:
+        paths = []
+        for name in ("one", "two"):
+            (tmp_path / name).mkdir()
+            paths.append(write_figures(results, tmp_path / name, audit=audit))
+        assert matplotlib.rcParams["font.size"] == 31.0
+    finally:
+        matplotlib.rcParams["font.size"] = before
+    names = [f"{n}.{s}" for n in ("figure", "det", "roc", "frontier") for s in ("png", "svg")]
+    assert [path.name for path in paths[0]] == names
+    for first, second in zip(*paths, strict=True):
+        assert first.read_bytes() == second.read_bytes()
+        if first.suffix == ".png":
+            with Image.open(first) as image:
+                pixels = np.asarray(image.convert("RGBA"))
+                assert image.width >= 1000
+            assert pixels[..., 3].min() == 255, "the ground is opaque"
+            assert (pixels[0, 0, :3] == 255).all()
+            assert 0.01 < (pixels[..., :3] < 128).any(axis=2).mean() < 0.6
+        else:
+            text = first.read_text(encoding="utf-8")
+            assert "<dc:date>" not in text
+            assert not re.search(r"20\d\d-\d\d-\d\d", text)
+            root = ElementTree.fromstring(text)
+            words = {"".join(e.itertext()) for e in root.iter("{http://www.w3.org/2000/svg}text")}
+            assert {"adversarial (pool)", "adversarial"} & words
+            assert {"lfw", "lfw, p-to-s, spherical"} & words
+
+
+def test_a_figure_without_content_is_left_out(tmp_path: Path) -> None:
+    only_raw = sample_results(liftings=(), hashes=False)
+    names = [path.name for path in write_figures(only_raw, tmp_path)]
+    assert names == ["det.png", "det.svg", "roc.png", "roc.svg"]
+    only_raw["curves"] = []
+    assert write_figures(only_raw, tmp_path) == []
+    audit = sample_audit(sample_results(liftings=PAPER, dims=(2,)))
+    assert write_figures(only_raw, tmp_path, audit=audit) == []
+
+
+def test_text_is_legible_on_the_ground_and_on_no_common_ground() -> None:
+    for colour in (INK, QUIET, *HUES[:6]):
+        assert contrast(colour, GROUND) >= (4.5 if colour in (INK, QUIET) else 3)
+    # Why the ground is opaque: no grey reaches 4.5 on a white and on a dark page.
+    greys = [f"#{level:02x}{level:02x}{level:02x}" for level in range(256)]
+    assert max(min(contrast(g, "#ffffff"), contrast(g, "#0d1117")) for g in greys) < 4.5
+
+
+def contrast(one: Any, two: Any) -> float:
+    """WCAG 2 contrast of two colours."""
+    light = []
+    for colour in (one, two):
+        c = np.array(to_rgb(colour))
+        linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
+        light.append(float(linear @ [0.2126, 0.7152, 0.0722]))
+    return (max(light) + 0.05) / (min(light) + 0.05)
+
+
+def test_only_the_figures_import_matplotlib_and_never_pyplot() -> None:
+    code = (
+        "import sys; import verify.evaluation.tables, benchmarks.readme_results; "
+        "assert 'matplotlib' not in sys.modules; "
+        "import verify.evaluation.figures; assert 'matplotlib.pyplot' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_whiskers_above_100_are_seen_and_no_tick_is() -> None:
+    results = sample_results(liftings=PAPER, dims=(2,), modes=("p2s",))
+    row = select(results, mode="p2s")[0]
+    row |= {"accuracy_mean": 0.998, "accuracy_std": 0.005}
+    (panel,) = drawn(verification_figure(results))
+    assert panel.get_ylim()[1] > 100.3
+    assert max(panel.get_yticks()) == 100
+
+
+def test_hashes_do_not_set_the_scale_of_the_roc() -> None:
+    results = sample_results(liftings=PAPER, modes=("p2s",))
+    before = drawn(roc_figure(results))[0].get_ylim()
+    for curve in results["curves"]:
+        if curve["strategy"] == "mlp-hash-stolen":
+            curve["fnmr"] = np.linspace(1, 0, len(curve["fnmr"])).tolist()
+    assert drawn(roc_figure(results))[0].get_ylim() == before
+    results["curves"] = [curve for curve in results["curves"] if curve["mode"] == "hash"]
+    assert drawn(roc_figure(results))[0].get_ylim()[0] == 0
+
+
+def test_no_rate_that_was_seen_lies_below_the_det() -> None:
+    results = sample_results(liftings=PAPER)
+    for panel in drawn(det_figure(results)):
+        seen = np.concatenate([line.get_ydata() for line in panel.get_lines()[:-1]])
+        inside = np.concatenate([line.get_xdata() for line in panel.get_lines()[:-1]]) <= 0.5
+        assert panel.get_ylim()[0] <= seen[inside & (seen > 1e-6)].min()

@@ -1,0 +1,147 @@
+"""Label files: what they say about a picture, and what is wrong with a broken one."""
+
+import pytest
+
+from templates.decoys import Attributes
+from verify.datasets import DatasetError
+from verify.evaluation import labels_file
+from verify.evaluation.labels_file import read_labels
+from verify.fairface_labels import AGES, GENDERS, RACES
+
+
+def written(folder, text, *, encoding="utf-8"):
+    file = folder / "labels.csv"
+    file.write_text(text, encoding=encoding)
+    return file
+
+
+def test_photos_are_found_by_path_stem_and_person(tmp_path):
+    labels = read_labels(
+        written(
+            tmp_path,
+            "path,gender,race\n"
+            "Ann_Lee,Female,Indian\n"
+            "Ann_Lee/Ann_Lee_0002.jpg,Female,White\n"
+            "./Bo/1.png,Male,\n"
+            "Bo\\2,Male,Black\n"
+            "J._R._Smith,Male,White\n"
+            "lone,Male,Indian\n",
+            encoding="utf-8-sig",
+        )
+    )
+    assert labels.attributes == ("gender", "race")
+    assert labels.find("Ann_Lee/Ann_Lee_0001.jpg") == {"gender": "Female", "race": "Indian"}
+    assert labels.find("Ann_Lee/Ann_Lee_0002.jpg")["race"] == "White"
+    assert labels.find("Ann_Lee/Ann_Lee_0002.webp")["race"] == "White"
+    assert labels.find("set/Ann_Lee/x.jpg")["race"] == "Indian"
+    assert labels.find("Bo/1.png") == {"gender": "Male"}
+    assert labels.find("Bo/1.jpg") == {"gender": "Male"}
+    assert labels.find("Bo/2.jpg")["race"] == "Black"
+    assert labels.find("J._R._Smith/1.jpg")["race"] == "White"
+    assert labels.find("lone.jpg")["race"] == "Indian"
+    for stranger in ("Bo/3.jpg", "Ann/1.jpg", "Ann_Lee_0001.jpg", "J/1.jpg", "17", ""):
+        assert labels.find(stranger) == {}
+    pictures = ["Bo/1.png", "Bo/2.jpg", "nobody/1.jpg"]
+    assert labels.column("race", pictures) == [None, "Black", None]
+    assert labels.column("age", pictures) == [None, None, None]
+    assert labels.attributes_of(pictures) == [
+        Attributes("Male", None), Attributes("Male", "Black"), Attributes(None, None),
+    ]  # fmt: skip
+
+
+def test_rows_that_differ_in_their_suffix_speak_for_their_own_file(tmp_path):
+    file = written(tmp_path, "file,gender\na/1.jpg,Male\na/1.png,Female\nb,Male\nb/1,Female\n")
+    labels = read_labels(file)
+    assert labels.find("a/1.jpg") == {"gender": "Male"}
+    assert labels.find("a/1.png") == {"gender": "Female"}
+    assert labels.find("a/1.webp") == {}
+    assert labels.find("b/1.webp") == {"gender": "Female"}
+    assert labels.find("b/2.webp") == {"gender": "Male"}
+
+
+@pytest.mark.parametrize(
+    ("cell", "age"),
+    [("03-Sep", "3-9"), ("Oct-19", "10-19"), ("20-29", "20-29"), ("adult", "adult")],
+)
+def test_ages_are_repaired(tmp_path, cell, age):
+    labels = read_labels(written(tmp_path, f"file,Age,service_test\na.jpg,{cell},TRUE\n"))
+    assert labels.attributes == ("age",)
+    assert labels.find("a.jpg") == {"age": age}
+
+
+def test_cells_may_hold_commas_and_rows_may_repeat(tmp_path):
+    labels = read_labels(
+        written(tmp_path, 'path,race\n"Lee, Ann",Black\n\n"Lee, Ann",Black\n , \n')
+    )
+    assert labels.find("Lee, Ann/1.jpg") == {"race": "Black"}
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "is empty"),
+        ("name,gender\na,Male\n", "first column of labels.csv is not path or file"),
+        ("path\na\n", "one attribute at least"),
+        ("path,service_test\na,TRUE\n", "one attribute at least"),
+        ("path,gender,\na,Male,\n", "a name for each column"),
+        ("path,gender,Gender\na,Male,Male\n", "two columns of the same name"),
+        ("path,gender\n", "no row below the header"),
+        ("path,gender\na,Male,White\n", "line 2 has 3 cells, and the header 2"),
+        ("path,gender\n,Male\n", "line 2 has no path"),
+        ("path,gender\na,Male\n\na,Female\n", "line 4 labels a otherwise"),
+        ("path,age\na,12-Dec\n", "line 2: the age is a date that a spreadsheet made of none of"),
+        ('path,gender\n"a,Male\n', "cannot be read as a CSV"),
+    ],
+)
+def test_faults_are_named(tmp_path, text, said):
+    with pytest.raises(DatasetError, match=said):
+        read_labels(written(tmp_path, text))
+
+
+def test_all_faults_are_listed_with_their_lines(tmp_path):
+    with pytest.raises(DatasetError) as caught:
+        read_labels(written(tmp_path, "path,age\na\nb,12-Dec\n,3-9\nc,3-9\nc,10-19\n"))
+    message = str(caught.value)
+    assert "4 fault(s)" in message
+    assert all(f"line {number}" in message for number in (2, 3, 4, 6))
+    many = "path,gender\n" + ",Male\n" * 25
+    with pytest.raises(DatasetError, match=r"25 fault\(s\).*and 5 more"):
+        read_labels(written(tmp_path, many))
+
+
+def test_a_column_of_names_is_no_attribute(tmp_path):
+    rows = "".join(f"{i},{i},Male\n" for i in range(257))
+    with pytest.raises(DatasetError, match="the column name has 257 different labels"):
+        read_labels(written(tmp_path, "path,name,gender\n" + rows))
+    kept = "".join(f"{i},{i % 256},Male\n" for i in range(257))
+    assert len(read_labels(written(tmp_path, "path,name,gender\n" + kept)).of) == 257
+
+
+def test_files_that_are_no_label_files_are_refused(tmp_path, monkeypatch):
+    with pytest.raises(DatasetError, match=r"absent\.csv is not there"):
+        read_labels(tmp_path / "absent.csv")
+    with pytest.raises(DatasetError, match="cannot be read"):
+        read_labels(tmp_path)
+    file = tmp_path / "labels.csv"
+    file.write_bytes(b"path,gender\n\xff\xfe,Male\n")
+    with pytest.raises(DatasetError, match="cannot be read as a CSV file in UTF-8"):
+        read_labels(file)
+    monkeypatch.setattr(labels_file, "MAX_BYTES", 10)
+    with pytest.raises(DatasetError, match="larger than 10 bytes"):
+        read_labels(file)
+
+
+def test_no_label_is_in_a_representation(tmp_path):
+    labels = read_labels(written(tmp_path, "path,gender\nAnn,Female\n"))
+    assert repr(labels) == "Labels(1 rows of gender)"
+
+
+def test_fairface_files_are_read_as_they_are(fairface):
+    for part, count in (("train", 5000), ("val", 1500)):
+        labels = read_labels(fairface / f"fairface_label_{part}.csv")
+        assert labels.attributes == ("age", "gender", "race")
+        pictures = [f"{part}/{path.name}" for path in (fairface / part).iterdir()]
+        assert len(pictures) == count
+        assert set(labels.column("age", pictures)) == set(AGES)
+        assert set(labels.column("gender", pictures)) == set(GENDERS)
+        assert set(labels.column("race", pictures)) == set(RACES)

@@ -1,0 +1,320 @@
+"""LFW, CFP and AgeDB-30 folders, laid out as published."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io
+
+from tests.verify.evaluation.layouts import (
+    AGEDB_NAMES,
+    PEOPLE,
+    agedb_folder,
+    agedb_folds,
+    cfp_folder,
+    lfw_folder,
+    write,
+)
+from verify import DatasetError, labelled_folder, read_lfw_pairs
+from verify.evaluation.readers import notes, open_sets, read_pts
+from verify.evaluation.verification_set import PictureFile, VerificationSet
+from verify.tenfold import FOLDS
+
+
+def pairs_of(benchmark: VerificationSet) -> list[tuple[str, str, bool, int]]:
+    names = [picture.name for picture in benchmark.pictures]
+    return [
+        (names[first], names[second], bool(same), int(fold))
+        for first, second, same, fold in zip(
+            benchmark.first, benchmark.second, benchmark.same, benchmark.folds, strict=True
+        )
+    ]
+
+
+# LFW
+
+
+@pytest.mark.parametrize("inside", ["", "lfw"])
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".JPEG", ".webp"])
+def test_lfw(tmp_path: Path, inside: str, suffix: str) -> None:
+    (lfw,) = open_sets(lfw_folder(tmp_path, inside=inside, suffix=suffix))
+    one, two, bob = (
+        f"{who}/{who}_{n:04d}{suffix}" for who, n in (("Ann", 1), ("Ann", 2), ("Bob", 1))
+    )
+    expected = [pair for f in range(FOLDS) for pair in ((one, two, True, f), (two, bob, False, f))]
+    assert pairs_of(lfw) == expected
+    assert lfw.people == ("Ann", "Ann", "Bob")
+    assert (lfw.name, lfw.kind, lfw.aligned) == ("lfw", "lfw", None)
+    assert lfw.pictures[2].read().data == (tmp_path / inside / bob).read_bytes()
+    assert notes(lfw) == ["lfw has 20 pairs, the published set has 6,000"]
+
+
+def test_lfw_without_photos(tmp_path: Path) -> None:
+    lfw_folder(tmp_path, photos=False)
+    (lfw,) = open_sets(tmp_path, pictures=False)
+    assert [picture.name for picture in lfw.pictures][0] == "Ann/Ann_0001.jpg"
+    with pytest.raises(DatasetError, match=r"3 fault\(s\).*Ann/Ann_0001 is not there"):
+        open_sets(tmp_path)
+
+
+def test_lfw_lists_absent_and_doubled_photos(tmp_path: Path) -> None:
+    lfw_folder(tmp_path)
+    (tmp_path / "Ann/Ann_0002.jpg").unlink()
+    write(tmp_path / "Bob/Bob_0001.png", b"x")
+    with pytest.raises(DatasetError, match=r"Ann_0002 is not there; Bob/Bob_0001 is there 2 times"):
+        open_sets(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("10\t1", "10\t2", "promises 40 pairs and holds 20"),
+        ("10\t1", "9\t1", "has 9 folds"),
+        ("Ann\t1\t2", "Ann\t1", "line 2 is not of the form"),
+        ("Bob\t1", "../Bob\t1", "expected plain names"),
+    ],
+)
+def test_lfw_broken_protocols(tmp_path: Path, old: str, new: str, message: str) -> None:
+    file = lfw_folder(tmp_path) / "pairs.txt"
+    file.write_text(file.read_text().replace(old, new, 1))
+    with pytest.raises(DatasetError, match=message):
+        open_sets(tmp_path)
+
+
+def test_lfw_with_pairs_beyond_the_header(tmp_path: Path) -> None:
+    file = lfw_folder(tmp_path) / "pairs.txt"
+    file.write_text(file.read_text() + "Ann\t1\t2\n")
+    with pytest.raises(DatasetError, match="promises 20 pairs and holds 21"):
+        open_sets(tmp_path)
+
+
+def test_real_lfw(lfw_aligned: Path) -> None:
+    (lfw,) = open_sets(lfw_aligned)
+    folder = labelled_folder(lfw_aligned)
+    truth = read_lfw_pairs(lfw_aligned / "pairs.txt", folder.paths)
+    names = [path.relative_to(lfw_aligned).as_posix() for path in folder.paths]
+    assert pairs_of(lfw) == [(names[p.first], names[p.second], p.same, p.fold) for p in truth]
+    assert (len(lfw), len(lfw.pictures), lfw.genuine) == (6000, 7701, 3000)
+    # The published protocol compares one pair of photos twice.
+    assert all("the same two photos" in note for note in notes(lfw))
+
+
+# CFP
+
+
+def cfp_expected(base: list[str]) -> dict[str, list[tuple[str, str, bool]]]:
+    def path(pose: str, index: int) -> str:
+        who = (index - 1) // 2
+        folder = base[who % len(base)]
+        return f"{folder}/{who + 1:03d}/{pose}/{(index - 1) % 2 + 1:02d}.jpg"
+
+    pairs = [(1, 2, True), (3, 4, True), (1, 3, False), (2, 6, False)]
+    return {
+        "cfp_ff": [(path("frontal", i), path("frontal", j), same) for i, j, same in pairs],
+        "cfp_fp": [(path("frontal", i), path("profile", j), same) for i, j, same in pairs],
+    }
+
+
+@pytest.mark.parametrize(
+    "images",
+    [
+        ["Data/Images"],
+        ["Data/Images/train", "Data/Images/test"],
+        ["train", "test"],
+        ["Data/train", "Data/test"],
+    ],
+)
+def test_cfp(tmp_path: Path, images: list[str]) -> None:
+    cfp_folder(tmp_path, images=images)
+    # Landmarks lie in folders of the same names, and are no photos.
+    for who in ("001", "002", "003"):
+        write(tmp_path / f"Data/Fiducials/{who}/frontal/01.txt", "1,2")
+    sets = open_sets(tmp_path)
+    for benchmark, (name, fold) in zip(sets, cfp_expected(images).items(), strict=True):
+        assert (benchmark.name, benchmark.kind) == (name, "cfp")
+        assert pairs_of(benchmark) == [(*pair, f) for f in range(FOLDS) for pair in fold]
+        assert benchmark.people is not None
+        for picture, person in zip(benchmark.pictures, benchmark.people, strict=True):
+            assert picture.name.split("/")[-3] == person
+            assert picture.read().data == (tmp_path / picture.name).read_bytes()
+    assert sets[1].people == ("001", "001", "002", "002", "002", "003")[: len(sets[1].people or ())]
+    assert [file for file, _ in sets[0].protocol_files][:2] == [
+        "Protocol/Pair_list_F.txt",
+        "Protocol/Split/FF/01/same.txt",
+    ]
+
+
+def test_cfp_without_photos(tmp_path: Path) -> None:
+    cfp_folder(tmp_path, photos=False)
+    sets = open_sets(tmp_path, pictures=False)
+    assert sets[1].pictures[1].name == "Data/Images/001/profile/02.jpg"
+    with pytest.raises(DatasetError, match="nor any folder 001 of photos"):
+        open_sets(tmp_path)
+
+
+def test_cfp_in_a_folder_of_its_own(tmp_path: Path) -> None:
+    cfp_folder(tmp_path / "cfp-dataset")
+    assert [one.name for one in open_sets(tmp_path)] == ["cfp_ff", "cfp_fp"]
+
+
+def test_cfp_absent_and_ambiguous_photos(tmp_path: Path) -> None:
+    cfp_folder(tmp_path, images=["train"])
+    write(tmp_path / "test/001/frontal/01.jpg", b"x")
+    (tmp_path / "train/002/frontal/01.jpg").unlink()
+    with pytest.raises(DatasetError, match=r"2 fault\(s\)") as caught:
+        open_sets(tmp_path)
+    assert "may be test/001/frontal/01.jpg or train/001/frontal/01.jpg" in str(caught.value)
+    assert "Data/Images/002/frontal/01.jpg is not there" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "message"),
+    [
+        ("Split/FF/01/same.txt", "1,7\n3,4", r"FF/01/same.txt line 1 has the index 7; F has 1 to 6"),
+        ("Split/FF/01/same.txt", "0,1\n3,4", "has the index 0"),
+        ("Split/FF/01/same.txt", "1,3\n3,4", "pairs 001 and 002 as one person"),
+        ("Split/FP/10/diff.txt", "\n1,2", "FP/10/diff.txt line 2 pairs 001 and 001 as two people"),
+        ("Split/FP/10/diff.txt", "1;2", "is not of the form i,j"),
+        ("Pair_list_P.txt", "1 ../Data/Images/001/profile/01.jpg\n3 ../a/001/profile/2.jpg", "no index 2"),
+        ("Pair_list_P.txt", "1 ../a/001/profile/1.jpg\n1 ../a/001/profile/2.jpg", "repeats the index 1"),
+        ("Pair_list_P.txt", "1 ../a/001/frontal/1.jpg", "names no photo of the form"),
+        ("Pair_list_P.txt", "1 ../../../001/profile/1.jpg", "names no photo of the form"),
+        ("Pair_list_P.txt", "one two", "not of the form: index path"),
+        ("Pair_list_P.txt", "", "lists no photo"),
+    ],
+)
+def test_cfp_broken_protocols(tmp_path: Path, file: str, text: str, message: str) -> None:
+    write(cfp_folder(tmp_path) / "Protocol" / file, text)
+    with pytest.raises(DatasetError, match=message):
+        open_sets(tmp_path)
+
+
+def test_cfp_absent_splits_are_all_listed(tmp_path: Path) -> None:
+    cfp_folder(tmp_path)
+    for name in ("FF/03/same.txt", "FP/07/diff.txt"):
+        (tmp_path / "Protocol/Split" / name).unlink()
+    with pytest.raises(DatasetError, match=r"FF/03/same.txt is not there.*FP/07/diff.txt"):
+        open_sets(tmp_path)
+
+
+# AgeDB-30
+
+
+@pytest.mark.parametrize("layout", ["published", "columns", "two cells", "table", "pair of cells"])
+@pytest.mark.parametrize("compressed", [False, True])
+def test_agedb(tmp_path: Path, layout: str, compressed: bool) -> None:
+    (agedb,) = open_sets(agedb_folder(tmp_path, layout=layout, compressed=compressed))
+    expected = [
+        (f"{first}.jpg", f"{second}.jpg", label == 1, fold)
+        for fold, pairs in enumerate(agedb_folds())
+        for first, second, label in pairs
+    ]
+    assert pairs_of(agedb) == expected
+    assert (agedb.name, agedb.kind) == ("agedb_30", "agedb")
+    assert agedb.people == ("AnnBell", "AnnBell", "BobHay")
+    photo = agedb.pictures[0]
+    assert isinstance(photo, PictureFile)
+    assert photo.landmarks == tmp_path / "03_Protocol_Images" / f"{AGEDB_NAMES[0]}.pts"
+    assert notes(agedb)[0] == "agedb_30 has 30 pairs, the published set has 6,000"
+
+
+def test_agedb_names_with_an_index_per_photo(tmp_path: Path) -> None:
+    pairs = [("11_AnnBell_35_f", "12_AnnBell_70_f.jpg", 1), ("11_AnnBell_35_f", "3_BobHay_2_m", -1)]
+    agedb_folder(tmp_path, folds=[pairs] * FOLDS, photos=False)
+    (agedb,) = open_sets(tmp_path, pictures=False)
+    assert agedb.people == ("AnnBell", "AnnBell", "BobHay")
+    assert agedb.pictures[1].name == "12_AnnBell_70_f.jpg"
+
+
+def test_agedb_namesakes_are_told_apart_by_their_identity(tmp_path: Path) -> None:
+    pairs = [("1_Ann_1_20_f", "1_Ann_2_60_f", 1), ("1_Ann_1_20_f", "2_Ann_1_50_f", -1)]
+    agedb_folder(tmp_path, folds=[pairs] * FOLDS, photos=False)
+    (agedb,) = open_sets(tmp_path, pictures=False)
+    assert agedb.people == ("1", "1", "2")
+
+
+def test_agedb_shuffled_labels_are_refused(tmp_path: Path) -> None:
+    folds = agedb_folds()
+    folds[4] = [(first, second, -label) for first, second, label in folds[4]]
+    agedb_folder(tmp_path, folds=folds)
+    with pytest.raises(DatasetError, match=r"3 fault\(s\).*fold 5 has 7_AnnBell_3_21_f and"):
+        open_sets(tmp_path)
+
+
+def test_agedb_absent_photos_are_listed(tmp_path: Path) -> None:
+    agedb_folder(tmp_path)
+    for name in AGEDB_NAMES[1:]:
+        (tmp_path / "03_Protocol_Images" / f"{name}.jpg").unlink()
+    with pytest.raises(DatasetError, match=rf"{AGEDB_NAMES[1]} is not there; {AGEDB_NAMES[2]} is"):
+        open_sets(tmp_path)
+
+
+def test_agedb_wrong_protocols(tmp_path: Path) -> None:
+    folds = agedb_folds()
+    for broken, message in (
+        (folds[:9], "has 9 folds"),
+        ([*folds[:9], [("a", "b", 5)] * 3], "fold 10 has a label at pair 1"),
+        ([*folds[:9], [("a", "b", 0), ("a", "b", -1), ("a", "a", 1)]], "mixes the labels"),
+        ([*folds[:9], [("a/b", "c", 1)] * 3], "expected plain file names"),
+    ):
+        agedb_folder(tmp_path, folds=broken)
+        with pytest.raises(DatasetError, match=message):
+            open_sets(tmp_path)
+
+
+def test_agedb_broken_files(tmp_path: Path) -> None:
+    file = agedb_folder(tmp_path, compressed=True) / "04_FINAL_protocol_30_years.mat"
+    data = file.read_bytes()
+    for end in range(0, len(data), 41):
+        file.write_bytes(data[:end])
+        with pytest.raises(DatasetError):
+            open_sets(tmp_path)
+    file.write_bytes(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + bytes(600))
+    with pytest.raises(DatasetError, match="save it again"):
+        open_sets(tmp_path)
+    scipy.io.savemat(file, {"other": np.zeros(3)})
+    with pytest.raises(DatasetError, match="no variable named splits"):
+        open_sets(tmp_path)
+    scipy.io.savemat(file, {"splits": np.zeros(2**25)}, do_compression=True)
+    with pytest.raises(DatasetError, match="unpacks to more than"):
+        open_sets(tmp_path)
+
+
+def test_landmarks(tmp_path: Path) -> None:
+    agedb_folder(tmp_path)
+    file = tmp_path / "03_Protocol_Images" / f"{AGEDB_NAMES[0]}.pts"
+    points = read_pts(file)
+    # Point i is (i + 0.5, 2 i).
+    expected = [[38, 75], [44, 87], [33.5, 66], [48.5, 96], [54.5, 108]]
+    np.testing.assert_array_equal(points, expected)
+    for broken in ("", "{\n1 2\n}", file.read_text().replace("5.5 10", "nan 10", 1)):
+        with pytest.raises(DatasetError, match="68 points"):
+            read_pts(write(tmp_path / "broken.pts", broken))
+
+
+# Recognition
+
+
+def test_other_folders_and_files_are_described(tmp_path: Path) -> None:
+    for path, message in (
+        (tmp_path / "absent", "is not there. Understood are"),
+        (tmp_path, "a folder with nothing in it"),
+        (write(tmp_path / "notes.md", "x"), "file of another kind. Understood"),
+        (lfw_folder(tmp_path / "lfw") / "pairs.txt", "give its folder"),
+        (tmp_path, "a folder with lfw, notes.md, other in it|a folder with"),
+    ):
+        if path == tmp_path and (tmp_path / "lfw").exists():
+            write(tmp_path / "other" / "x", "")
+        with pytest.raises(DatasetError, match=message) as caught:
+            open_sets(path)
+        assert all(kind in str(caught.value) for kind in (".bin", "CSV", "LFW", "CFP", "AgeDB"))
+
+
+def test_two_protocols_in_one_folder(tmp_path: Path) -> None:
+    cfp_folder(lfw_folder(tmp_path))
+    with pytest.raises(DatasetError, match="which of LFW and CFP"):
+        open_sets(tmp_path)
+
+
+def test_people_of_the_builders_are_two() -> None:
+    assert len(PEOPLE) == 2

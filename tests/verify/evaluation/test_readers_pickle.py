@@ -1,0 +1,252 @@
+"""The restricted unpickler: equal to Python's on plain values, and deaf to everything else."""
+
+import os
+import pickle
+import pickletools
+import struct
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from verify.evaluation.readers.restricted_pickle import PickledArray, RefusedPickle, read_pickle
+
+PLAIN = st.recursive(
+    st.one_of(
+        st.none(),
+        st.booleans(),
+        st.integers(-(2**31), 2**62),
+        st.binary(min_size=1, max_size=20),
+        st.text(max_size=20),
+    ),
+    lambda inner: st.one_of(st.lists(inner, max_size=5), st.tuples(inner, inner)),
+    max_leaves=20,
+)
+
+
+@given(PLAIN, st.integers(0, 5))
+@settings(max_examples=200, deadline=None)
+def test_plain_values_are_read_as_python_reads_them(value: object, protocol: int) -> None:
+    data = pickle.dumps(value, protocol)
+    assert read_pickle(data) == pickle.loads(data)
+    assert read_pickle(pickletools.optimize(data)) == value
+
+
+@pytest.mark.parametrize("protocol", range(6))
+@pytest.mark.parametrize("numpy_1", [False, True])
+def test_arrays_and_numbers_of_numpy(protocol: int, numpy_1: bool) -> None:
+    photo = np.random.default_rng(0).integers(0, 256, 300).astype(np.uint8)
+    value = [photo, photo[:, None], np.array([True, False]), np.bool_(True), np.int64(-3)]
+    data = pickle.dumps(value, protocol)
+    if numpy_1:
+        # The shorter name shortens the length prefixes of protocols 4 and 5 by one.
+        for old in ("multiarray", "numeric"):
+            name = f"numpy._core.{old}".encode()
+            data = data.replace(
+                b"\x8c" + bytes([len(name)]) + name,
+                b"\x8c" + bytes([len(name) - 1]) + name.replace(b"_core", b"core"),
+            )
+            data = data.replace(b"c" + name, b"c" + name.replace(b"_core", b"core"))
+        assert b"_core" not in data
+    row, column, flags, yes, number = read_pickle(data)  # type: ignore[misc]
+    for array, shape in ((row, (300,)), (column, (300, 1))):
+        assert isinstance(array, PickledArray)
+        assert (array.shape, array.data) == (shape, photo.tobytes())
+        assert array.dtype is not None
+        assert array.dtype.code == "u1"
+    assert flags.data == b"\x01\x00"
+    assert (yes, number) == (True, -3)
+
+
+def python_2(protocol: int, raw: bytes) -> bytes:
+    """What Python 2's cPickle writes for ``[raw, numpy.array(bytearray(raw))]``."""
+    if protocol == 0:
+        quoted = "'" + "".join(f"\\x{byte:02x}" for byte in raw) + "'"
+        string = b"S" + quoted.encode() + b"\n"
+        dtype = b"cnumpy\ndtype\n(S'u1'\nI0\nI1\ntR(I3\nS'|'\nNNNI-1\nI-1\nI0\ntb"
+        start = b"cnumpy.core.multiarray\n_reconstruct\n(cnumpy\nndarray\n(I0\ntS'b'\ntR"
+        state = b"(I1\n(L%dL\nt" % len(raw) + dtype + b"I00\n" + string + b"tb"
+        return b"(lp1\n" + string + b"a" + start + state + b"a."
+    string = b"U" + bytes([len(raw)]) + raw
+    dtype = b"cnumpy\ndtype\nq\x05U\x02u1K\x00K\x01\x87R(K\x03U\x01|NNNJ\xff\xff\xff\xffJ\xff\xff\xff\xffK\x00tb"
+    start = b"cnumpy.core.multiarray\n_reconstruct\ncnumpy\nndarray\nK\x00\x85U\x01b\x87R"
+    state = b"(K\x01\x8a\x01" + bytes([len(raw)]) + b"\x85" + dtype + b"\x89" + string + b"tb"
+    return b"\x80\x02]q\x01(" + string + start + state + b"e."
+
+
+@pytest.mark.parametrize("protocol", [0, 2])
+def test_python_2(protocol: int) -> None:
+    raw = bytes(range(0, 250, 3)) + b"\\'\n"
+    data = python_2(protocol, raw)
+    truth = pickle.loads(data, encoding="bytes")
+    assert truth[0] == raw
+    assert truth[1].tobytes() == raw
+    text, array = read_pickle(data)  # type: ignore[misc]
+    assert (text, array.data, array.shape) == (raw, raw, (len(raw),))
+
+
+def test_escapes_of_python_2() -> None:
+    assert read_pickle(b"S'a\\\\b\\'\\n\\r\\t\\x00\"'\n.") == b"a\\b'\n\r\t\x00\""
+    with pytest.raises(RefusedPickle, match="escape"):
+        read_pickle(b"S'\\q'\n.")
+
+
+class Runs:
+    def __init__(self, target: object, *arguments: object) -> None:
+        self.made = (target, arguments)
+
+    def __reduce__(self) -> tuple[object, tuple[object, ...]]:
+        return self.made
+
+
+def hostile(marker: Path) -> dict[str, bytes]:
+    command = f"touch {marker}"
+    line = command.encode()
+    short = b"\x8c" + bytes([len(line)]) + line
+    system = b"c" + os.name.encode() + b"\nsystem\n"
+    cases = {
+        f"os.system, protocol {protocol}": pickle.dumps(Runs(os.system, command), protocol)
+        for protocol in range(6)
+    }
+    code = f"open({str(marker)!r}, 'w')"
+    return cases | {
+        "eval": pickle.dumps(Runs(eval, code)),
+        "exec": pickle.dumps(Runs(exec, code)),
+        "open": pickle.dumps(Runs(open, str(marker), "w")),
+        "array beside": pickle.dumps([np.zeros(3, np.uint8), Runs(os.system, command)]),
+        "INST": b"(S'" + line + b"'\ni" + os.name.encode() + b"\nsystem\n.",
+        "OBJ": b"(" + system + b"S'" + line + b"'\no.",
+        "NEWOBJ": b"\x80\x02" + system + short + b"\x85\x81.",
+        "NEWOBJ_EX": b"\x80\x04" + system + short + b"\x85}\x92.",
+        "BUILD": b"\x80\x02cnumpy\nndarray\n}" + short + b"K\x01sb.",
+        "STACK_GLOBAL": b"\x80\x04\x8c\x05posix\x8c\x06system\x93" + short + b"\x85R.",
+        "dotted": b"\x80\x04\x8c\x05numpy\x8c\x15ndarray.__class__.mro\x93)R.",
+        "extension": b"\x80\x02\x82\x01.",
+        "persistent": b"Pname\n.",
+        "persistent 1": b"K\x01Q.",
+        "buffer": b"\x80\x05\x97.",
+        "numpy name as callable": b"cnumpy\nndarray\n(K\x05tR.",
+        "reconstruct of another type": (
+            b"cnumpy.core.multiarray\n_reconstruct\n(cnumpy\ndtype\n(K\x00tS'b'\ntR."
+        ),
+        "codecs to a file": b"c_codecs\nencode\n(V61\nVhex\ntR.",
+        "objects": pickle.dumps(np.array([{}, None], dtype=object)),
+        "fields": pickle.dumps(np.zeros(2, dtype=[("a", "u1")])),
+        "float": pickle.dumps(np.zeros(2)),
+        "dict": pickle.dumps({}),
+        "set": pickle.dumps({1}),
+    }
+
+
+def test_nothing_of_a_hostile_pickle_runs(tmp_path: Path) -> None:
+    marker = tmp_path / "ran"
+    cases = hostile(marker)
+    for name, data in cases.items():
+        with pytest.raises(RefusedPickle):
+            pytest.fail(f"{name} was read as {read_pickle(data)!r}")
+        assert not marker.exists(), name
+    # The cases are real: Python's own unpickler falls for them.
+    pickle.loads(cases["open"]).close()
+    assert marker.exists()
+
+
+BOMBS = {
+    "memo position": b"K\x00r\xff\xff\xff\xff.",
+    "bytes beyond the file": b"\x80\x04\x8e" + struct.pack("<Q", 2**40) + b".",
+    "bytearray beyond the file": b"\x80\x05\x96" + struct.pack("<Q", 2**34) + b".",
+    "frame beyond the file": b"\x80\x04\x95" + struct.pack("<Q", 2**62) + b"K\x01.",
+    "negative length": b"T\xff\xff\xff\xff.",
+    "huge shape": (
+        b"cnumpy.core.multiarray\n_reconstruct\n(cnumpy\nndarray\n(I9999999999\ntS'b'\ntR."
+    ),
+    "shape beyond the bytes": (
+        b"cnumpy.core.numeric\n_frombuffer\n(S'a'\ncnumpy\ndtype\n(S'u1'\nI0\nI1\ntR"
+        b"(I4000000000\nI4000000000\ntS'C'\ntR."
+    ),
+    "encoding one string again and again": (
+        b"c_codecs\nencode\nq\x000X"
+        + struct.pack("<I", 2**20)
+        + b"a" * 2**20
+        + b"q\x01Vlatin1\nq\x02"
+        + b"h\x00h\x01h\x02\x86R" * 100_000
+        + b"."
+    ),
+    "long integer": b"\x8b" + struct.pack("<i", 2**30) + b".",
+    "digits": b"I" + b"9" * 5000 + b"\n.",
+}
+
+
+HARMLESS = {"memo position", "frame beyond the file"}
+
+
+@pytest.mark.parametrize("name", BOMBS)
+def test_bombs_are_refused_or_harmless(name: str) -> None:
+    if name in HARMLESS:
+        assert read_pickle(BOMBS[name]) == 1
+        return
+    with pytest.raises(RefusedPickle):
+        read_pickle(BOMBS[name])
+
+
+def test_bombs_take_no_memory() -> None:
+    """All of them in one process whose address space could not hold what they ask for."""
+    script = (
+        "import resource, sys\n"
+        "from tests.verify.evaluation.test_readers_pickle import BOMBS\n"
+        "from verify.evaluation.readers.restricted_pickle import RefusedPickle, read_pickle\n"
+        "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
+        "for data in BOMBS.values():\n"
+        "    try:\n"
+        "        read_pickle(data)\n"
+        "    except RefusedPickle:\n"
+        "        pass\n"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)\n"
+    )
+    root = Path(__file__).resolve().parents[3]
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=root, capture_output=True, text=True, check=True
+    )
+    assert int(done.stdout) < 32 * 1024
+
+
+def test_nesting_does_not_exhaust_the_stack() -> None:
+    deep = read_pickle(b"N" + b"\x85" * 300_000 + b".")
+    assert isinstance(deep, tuple)
+    with pytest.raises(RefusedPickle):
+        read_pickle(b"(" * 300_000)
+
+
+def test_a_pickle_cut_anywhere_is_refused() -> None:
+    for protocol in range(6):
+        data = pickle.dumps(([b"\xff\xd8abc", np.zeros(4, np.uint8)], [True]), protocol)
+        for end in range(len(data)):
+            with pytest.raises(RefusedPickle):
+                read_pickle(data[:end])
+        with pytest.raises(RefusedPickle, match="follow its end"):
+            read_pickle(data + b"\n")
+
+
+@given(st.binary(max_size=200))
+@settings(max_examples=300, deadline=None)
+def test_random_bytes_only_ever_raise_one_exception(data: bytes) -> None:
+    try:
+        read_pickle(data)
+    except RefusedPickle:
+        pass
+
+
+@given(st.data())
+@settings(max_examples=200, deadline=None)
+def test_a_mutated_pickle_only_ever_raises_one_exception(data: st.DataObject) -> None:
+    protocol = data.draw(st.integers(0, 5))
+    raw = bytearray(pickle.dumps(([b"abc", np.zeros(4, np.uint8)], [True, np.bool_(1)]), protocol))
+    for _ in range(data.draw(st.integers(1, 4))):
+        raw[data.draw(st.integers(0, len(raw) - 1))] = data.draw(st.integers(0, 255))
+    try:
+        read_pickle(bytes(raw))
+    except RefusedPickle:
+        pass

@@ -1,0 +1,109 @@
+"""The README's results table, made from a small document by the script that makes the real one."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmarks.readme_results import BEGIN, END, main, readme_table, written_into
+from tests.verify.evaluation.sample_results import sample_results
+from verify.datasets import DatasetError
+
+
+def document(tmp_path: Path, results: Any) -> Path:
+    path = tmp_path / "results.json"
+    path.write_text(json.dumps(results), encoding="utf-8")
+    return path
+
+
+def test_every_number_of_the_table_is_in_the_results() -> None:
+    results = sample_results(dims=(2, 16), seed=3)
+    block = readme_table(results)
+    lines = [line for line in block.splitlines() if line.startswith("|")]
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    assert rows[0] == ["lifting (decoys)", "matching", "m = 2", "m = 16"]
+    assert len(rows) - 2 == 5 * 2
+    modes = {"p-to-s": "p2s", "s-to-s": "s2s"}
+    for label, mode, *cells in rows[2:]:
+        strategy, _, decoys = label.rstrip(")").partition(" (")
+        for dim, cell in zip((2, 16), cells, strict=True):
+            (row,) = (
+                r
+                for r in results["rows"]
+                if (r["strategy"], r["decoys"] or "", r["dim"]) == (strategy, decoys, dim)
+                and (r["mode"], r["metric"]) == (modes[mode], "spherical")
+            )
+            assert cell == f"{100 * row['accuracy_mean']:.2f} ± 0.04"
+    raw = next(r for r in results["rows"] if r["strategy"] == "raw" and r["dim"] == 0)
+    assert raw["threshold_search"] == "exact"
+    assert f"Raw descriptors: {100 * raw['accuracy_mean']:.2f} %" in block
+    assert "6,000 pairs of LFW (3,000 genuine and 3,000 impostor compared)" in block
+    assert "mean of 3 seeds" in block
+
+
+def test_a_cell_that_was_not_run_is_a_dash() -> None:
+    results = sample_results(dims=(2, 16), liftings=(("random", None),))
+    results["rows"] = [r for r in results["rows"] if (r["mode"], r["dim"]) != ("s2s", 16)]
+    assert readme_table(results).splitlines()[-1].rstrip(" |").endswith("-")
+
+
+def test_the_table_is_written_between_the_markers_only(tmp_path: Path) -> None:
+    results = sample_results(dims=(2,))
+    readme = tmp_path / "README.md"
+    readme.write_text(f"# A\n\n{BEGIN}\nold\n{END}\n\nrest\n", encoding="utf-8")
+    arguments = [str(document(tmp_path, results)), "--write", str(readme)]
+    assert main(arguments) == 0
+    once = readme.read_text(encoding="utf-8")
+    assert once == f"# A\n\n{BEGIN}\n{readme_table(results)}\n{END}\n\nrest\n"
+    assert main(arguments) == 0
+    assert readme.read_text(encoding="utf-8") == once
+
+
+def test_without_write_the_table_is_printed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    results = sample_results(dims=(2,))
+    assert main([str(document(tmp_path, results))]) == 0
+    assert capsys.readouterr().out == readme_table(results) + "\n"
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"format": "something"}, "is no evaluation"),
+        ({"version": 2}, "is version 2 and this table is made from version 1"),
+        ({"rows": []}, "lacks rows"),
+        ({"rows": None, "datasets": None}, "lacks datasets, rows"),
+    ],
+)
+def test_another_document_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], change: dict[str, Any], reason: str
+) -> None:
+    path = document(tmp_path, sample_results(dims=(2,)) | change)
+    assert main([str(path)]) == 1
+    assert reason in capsys.readouterr().err
+
+
+def test_a_file_that_is_no_json_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "r.json").write_text("{", encoding="utf-8")
+    assert main([str(tmp_path / "r.json")]) == 1
+    assert "cannot be read as JSON" in capsys.readouterr().err
+    assert main([str(tmp_path / "absent.json")]) == 1
+
+
+def test_all_that_the_results_lack_is_said() -> None:
+    results = sample_results(dims=(2,), metrics=("euclidean",))
+    results["rows"] = [row for row in results["rows"] if row["strategy"] != "raw"]
+    with pytest.raises(DatasetError, match=r"no raw row .*; no spherical rows"):
+        readme_table(results)
+    with pytest.raises(DatasetError, match="about cfp_ff"):
+        readme_table(sample_results(datasets=("cfp_ff",), dims=(2,)))
+
+
+@pytest.mark.parametrize("text", ["none", f"{BEGIN} only", f"{END}{BEGIN}", f"{BEGIN}{END}{END}"])
+def test_a_readme_without_its_markers_is_left_alone(text: str) -> None:
+    with pytest.raises(DatasetError, match="each once"):
+        written_into(text, "table")

@@ -1,0 +1,153 @@
+import numpy as np
+import pytest
+
+from templates.decoys import DecoyGenerator
+from templates.distances import Metric, similarity
+from templates.lifting import Strategy, lift
+from templates.randomness import Keystream
+from tests.verify.evaluation.materials import N, material, pool
+from verify.evaluation.baselines import Hash
+from verify.evaluation.material import Material
+from verify.evaluation.scoring import score_unit, split_pool, unit_layout
+from verify.evaluation.units import HashUnit, LiftUnit, Mode, RawUnit
+
+BOTH = (Mode.POINT, Mode.SUBSPACE)
+
+
+def unit(strategy: Strategy = Strategy.ADVERSARIAL, **changes: object) -> LiftUnit:
+    given = {
+        "strategy": strategy,
+        "m": 4,
+        "source": None if strategy is Strategy.RANDOM else 0,
+        "shared": True,
+        "modes": BOTH,
+        "metrics": tuple(Metric),
+        "steps": 50,
+        "seed": 3,
+    }
+    return LiftUnit(**{**given, **changes})  # type: ignore[arg-type]
+
+
+def residual(point: np.ndarray, foot: np.ndarray, rows: np.ndarray) -> float:
+    """Distance of a point to foot + span(rows), by least squares."""
+    found, *_ = np.linalg.lstsq(rows.T, point - foot, rcond=None)
+    return float(np.linalg.norm(point - foot - rows.T @ found))
+
+
+def test_raw_similarities_are_cosines() -> None:
+    known = material()
+    (found,) = score_unit(known, RawUnit(flip=False))
+    one = known.descriptors[known.first].astype(float)
+    two = known.descriptors[known.second].astype(float)
+    cosines = (one * two).sum(axis=1)
+    cosines /= np.linalg.norm(one, axis=1) * np.linalg.norm(two, axis=1)
+    np.testing.assert_allclose(found.similarities, cosines, atol=1e-12)
+    assert (found.cell.dim, found.cell.mode, found.lifted) == (0, Mode.RAW, None)
+
+
+def test_each_side_is_lifted_and_the_other_compared_with_it() -> None:
+    known = material(pairs=40)
+    found = {
+        (s.cell.mode, s.cell.metric, s.lifted): s.similarities for s in score_unit(known, unit())
+    }
+    assert set(found) == {
+        (Mode.POINT, metric, side) for metric in Metric for side in ("first", "second")
+    } | {(Mode.SUBSPACE, metric, "both") for metric in Metric}
+    # Lift the sides again, from the streams of the unit, and measure by least squares.
+    sides = []
+    for name, photos in (("first", known.first), ("second", known.second)):
+        with Keystream.seeded("evaluation", name, Strategy.ADVERSARIAL, 4, 3) as stream:
+            sides.append(
+                lift(
+                    known.descriptors[photos],
+                    strategy="adversarial",
+                    m=4,
+                    source=known.sources[0],
+                    stream=stream,
+                )
+            )
+    for row in range(40):
+        a, b = known.descriptors[known.first[row]], known.descriptors[known.second[row]]
+        first, second = sides[0][row], sides[1][row]
+        for probe, template, side in ((b, first, "first"), (a, second, "second")):
+            distance = residual(probe, template.foot, template.basis)
+            assert found[Mode.POINT, "euclidean", side][row] == pytest.approx(
+                similarity(distance), abs=1e-5
+            )
+        rows = np.concatenate([first.basis, second.basis])
+        assert found[Mode.SUBSPACE, "euclidean", "both"][row] == pytest.approx(
+            similarity(residual(second.foot, first.foot, rows)), abs=1e-4
+        )
+
+
+def test_seeds_change_lifts_and_one_seed_repeats_them() -> None:
+    known = material(pairs=20)
+    one, again, other = (score_unit(known, unit(seed=seed)) for seed in (1, 1, 2))
+    for left, right, different in zip(one, again, other, strict=True):
+        np.testing.assert_array_equal(left.similarities, right.similarities)
+        assert (left.similarities != different.similarities).any()
+
+
+def test_halves_are_disjoint_and_cover_the_pool() -> None:
+    whole = pool(121)
+    one, two = split_pool(whole, seed=7)
+    rows = {row.tobytes() for row in whole.entries[0]}
+    mine, theirs = ({row.tobytes() for row in half.entries[0]} for half in (one, two))
+    assert (len(mine), len(theirs)) == (60, 61)
+    assert not mine & theirs
+    assert mine | theirs == rows
+    assert split_pool(whole, seed=8)[0].source_id != one.source_id
+
+
+def test_shared_decoys_make_strangers_meet_and_halves_do_not() -> None:
+    # 12 entries, 4 decoys on each side: nearly every pair shares one.
+    few = Material(**{**vars(material(pairs=60)), "sources": (pool(12),)})
+    shared = score_unit(few, unit(modes=(Mode.SUBSPACE,), metrics=(Metric.EUCLIDEAN,)))[0]
+    apart = score_unit(
+        few, unit(modes=(Mode.SUBSPACE,), metrics=(Metric.EUCLIDEAN,), shared=False)
+    )[0]
+    assert shared.cell.shared_decoys is True
+    assert apart.cell.shared_decoys is False
+    strangers = ~few.same
+    met = similarity(1e-3)
+    assert np.mean(shared.similarities[strangers] > met) > 0.7
+    assert not (apart.similarities[strangers] > met).any()
+
+
+def test_random_lifting_needs_no_decoys_and_generated_ones_are_not_halved() -> None:
+    generator = np.random.default_rng(0)
+    rows = generator.normal(size=(400, N))
+    made = DecoyGenerator.fit((rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype("f4"))
+    known = Material(**{**vars(material(pairs=20)), "sources": (made,)})
+    for cell, _ in unit_layout(unit(), known.sources):
+        assert (cell.decoys, cell.shared_decoys) == ("generator", None)
+    for cell, _ in unit_layout(unit(Strategy.RANDOM), known.sources):
+        assert (cell.decoys, cell.shared_decoys) == (None, None)
+    assert len(score_unit(known, unit(Strategy.RANDOM))) == 6
+
+
+def test_hybrid_plus_takes_the_attributes_of_each_photo() -> None:
+    known = material(pairs=30)
+    (found,) = score_unit(
+        known, unit(Strategy.HYBRID_PLUS, modes=(Mode.SUBSPACE,), metrics=(Metric.SPHERICAL,))
+    )
+    assert np.isfinite(found.similarities).all()
+    without = Material(**{**vars(known), "attributes": None})
+    with pytest.raises(ValueError, match="attributes"):
+        score_unit(without, unit(Strategy.HYBRID_PLUS))
+
+
+def test_codes_are_compared_in_both_scenarios() -> None:
+    known = material()
+    normal, stolen = (
+        score_unit(known, HashUnit(Hash.BIOHASHING, N, stolen, 0))[0] for stolen in (False, True)
+    )
+    assert normal.cell.strategy == "biohashing"
+    assert stolen.cell.strategy == "biohashing-stolen"
+    (raw,) = score_unit(known, RawUnit(flip=False))
+    # Under one token a bit of two vectors differs with the probability of their angle over pi.
+    expected = 1 - np.arccos(raw.similarities) / np.pi
+    assert abs((stolen.similarities - expected).mean()) < 0.03
+    assert abs((normal.similarities - expected)[known.same].mean()) < 0.03
+    # Under two tokens codes of strangers agree in half of their bits, however alike they are.
+    assert abs(normal.similarities[~known.same].mean() - 0.5) < 0.05

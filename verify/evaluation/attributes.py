@@ -1,0 +1,110 @@
+"""What a labelled decoy pool tells about the faces of a set that has no labels or shares people."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.neighbors import KNeighborsClassifier
+
+from templates.decoys.pool import DecoyPool
+from templates.decoys.source import Attributes
+from templates.errors import DecoyError
+
+_ROWS = 1024
+
+
+def predict_attributes(
+    descriptors: NDArray[np.float32], pool: DecoyPool, *, k: int = 10
+) -> list[Attributes]:
+    """Predict gender and race by the vote of the k nearest entries of a labelled pool.
+
+    hybrid+ needs the attributes of the faces it lifts; the paper predicts those of unlabelled
+    faces. The vote is taken for each attribute by itself, among the entries that have a label of
+    it; equal votes go to the label that comes first in the alphabet.
+
+    Parameters
+    ----------
+    descriptors : (N, n) float32
+        Unit rows.
+    k
+        Number of neighbours; all entries where fewer have a label.
+
+    Returns
+    -------
+    list of Attributes
+        One per row. An attribute that no entry has a label of is None.
+
+    Raises
+    ------
+    DecoyError
+        The pool has no labels, or its descriptors have another dimension.
+    """
+    entries, labels = pool.entries
+    _require_dimension(descriptors, pool)
+    if labels is None:
+        raise DecoyError(
+            "attributes are predicted from a labelled decoy pool, and this one has no labels; "
+            "build the pool from a folder with FairFace labels"
+        )
+    genders = _voted(descriptors, entries, [label.gender for label in labels], k)
+    races = _voted(descriptors, entries, [label.race for label in labels], k)
+    return [Attributes(gender, race) for gender, race in zip(genders, races, strict=True)]
+
+
+def _voted(
+    descriptors: NDArray[np.float32],
+    entries: NDArray[np.float32],
+    labels: Sequence[str | None],
+    k: int,
+) -> list[str | None]:
+    known = [i for i, label in enumerate(labels) if label is not None]
+    if not known or not len(descriptors):
+        return [None] * len(descriptors)
+    # Of unit rows, the nearest by Euclidean distance are the nearest by angle.
+    vote = KNeighborsClassifier(n_neighbors=min(k, len(known)), algorithm="brute")
+    vote.fit(entries[known], [labels[i] for i in known])
+    return [str(label) for label in vote.predict(descriptors)]
+
+
+def resembling(
+    pool: DecoyPool, descriptors: NDArray[np.float32], *, cosine: float
+) -> NDArray[np.int64]:
+    """Find the entries of a pool that may show people of a set.
+
+    A person in the pool lies in every template that their descriptor is a decoy of (METHOD §4.3):
+    people of the test set are excluded from the decoys before it is evaluated.
+
+    Parameters
+    ----------
+    descriptors : (N, n) float32
+        Unit rows, of the set.
+    cosine
+        An entry resembles a face where the cosine of the two is at least this.
+
+    Returns
+    -------
+    int64
+        Their numbers, ascending.
+
+    Raises
+    ------
+    DecoyError
+        The pool's descriptors have another dimension.
+    """
+    entries, _ = pool.entries
+    _require_dimension(descriptors, pool)
+    found = np.zeros(len(entries), dtype=np.bool_)
+    for start in range(0, len(entries), _ROWS):
+        tile = entries[start : start + _ROWS]
+        for other in range(0, len(descriptors), _ROWS):
+            cosines = tile @ descriptors[other : other + _ROWS].T
+            found[start : start + _ROWS] |= (cosines >= np.float64(cosine)).any(axis=1)
+    return np.flatnonzero(found).astype(np.int64)
+
+
+def _require_dimension(descriptors: NDArray[np.float32], pool: DecoyPool) -> None:
+    if descriptors.ndim != 2 or descriptors.shape[1] != pool.n:
+        raise DecoyError(
+            f"the decoy pool has descriptors of {pool.n} numbers, and the set has the shape "
+            f"{descriptors.shape}; use decoys that were made with the same pack"
+        )

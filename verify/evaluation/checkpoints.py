@@ -1,0 +1,73 @@
+"""Similarities that were computed before: an evaluation goes on where it was interrupted.
+
+Only similarities of pairs are kept: they are what the results are about, and tell no descriptor.
+"""
+
+import contextlib
+import hashlib
+import json
+import os
+import zipfile
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from verify.evaluation.runs import Run
+from verify.evaluation.units import Unit
+
+FOLDER = "units"
+
+
+class Checkpoints:
+    """Finished units in a folder.
+
+    Parameters
+    ----------
+    folder
+        Of the results; ``units/`` is made inside it.
+    base
+        All that similarities depend on besides the unit: photos, pairs, model, decoys, software.
+        A unit that was computed on another base is not found.
+    """
+
+    def __init__(self, folder: Path, base: dict[str, Any]) -> None:
+        self._folder = folder / FOLDER
+        self._folder.mkdir(parents=True, exist_ok=True)
+        self._base = base
+
+    def _file(self, unit: Unit) -> Path:
+        described = {"base": self._base, "kind": type(unit).__name__, "unit": asdict(unit)}
+        text = json.dumps(described, sort_keys=True)
+        return self._folder / f"{hashlib.sha256(text.encode()).hexdigest()[:40]}.npz"
+
+    def load(self, unit: Unit, *, columns: int, pairs: int) -> list[NDArray[np.float64]] | None:
+        """Return the similarities of a unit; None where they are not there or not whole."""
+        try:
+            # Opened here, because NumPy leaves a file open that is no archive.
+            with self._file(unit).open("rb") as file, np.load(file, allow_pickle=False) as saved:
+                found = [np.asarray(saved[f"column_{i}"]) for i in range(columns)]
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+            return None
+        whole = all(column.shape == (pairs,) and column.dtype == np.float64 for column in found)
+        return found if whole else None
+
+    def save(self, unit: Unit, runs: Sequence[Run]) -> None:
+        """Write the similarities of a unit, at once or not at all."""
+        exact = [run.similarities for run in runs if run.search == "exact"]
+        file = self._file(unit)
+        partial = file.with_suffix(f".{os.getpid()}.part")
+        try:
+            with partial.open("wb") as stream:
+                np.savez(
+                    stream,
+                    allow_pickle=False,
+                    **{f"column_{i}": column for i, column in enumerate(exact)},
+                )
+            partial.replace(file)
+        finally:
+            with contextlib.suppress(FileNotFoundError):
+                partial.unlink()

@@ -1,0 +1,183 @@
+"""The evaluation of one set: all units, wherever they run, put together in a fixed order."""
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from templates.decoys import Attributes
+from verify.evaluation.acquisition import Acquired
+from verify.evaluation.backends import SOFTWARE, Backend, spread
+from verify.evaluation.checkpoints import Checkpoints
+from verify.evaluation.material import Material, Source
+from verify.evaluation.plan import EvaluationError, Plan, units_of
+from verify.evaluation.rows import SetFacts
+from verify.evaluation.runs import Run, run_unit
+from verify.evaluation.scoring import unit_layout
+from verify.evaluation.units import LiftUnit, Unit
+from verify.evaluation.verification_set import VerificationSet, require_both_classes
+
+Advance = Callable[[int], None]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Evaluated:
+    """All runs of one set.
+
+    Parameters
+    ----------
+    facts
+        Counts of the set.
+    material
+        What was compared.
+    kept : (P,) int64
+        Pairs of the set that were compared, as positions in it.
+    runs
+        In the order of the plan.
+    source_of
+        Position of the decoy source of each lifted cell.
+    """
+
+    facts: SetFacts
+    material: Material
+    kept: NDArray[np.int64]
+    runs: list[Run]
+    source_of: dict[Any, int | None]
+
+
+def prepare(
+    pairs: VerificationSet,
+    acquired: Acquired,
+    *,
+    flipped: Acquired | None,
+    attributes: Sequence[Attributes] | None,
+    sources: Sequence[Source],
+) -> tuple[Material, SetFacts, NDArray[np.int64]]:
+    """Take the pairs of which both photos gave a descriptor; the others are counted.
+
+    Parameters
+    ----------
+    attributes
+        One for each acquired row.
+
+    Raises
+    ------
+    EvaluationError, DatasetError
+        Too few pairs are left.
+    """
+    first, second = acquired.rows[pairs.first], acquired.rows[pairs.second]
+    kept = np.flatnonzero((first >= 0) & (second >= 0))
+    same = pairs.same[kept]
+    if flipped is not None and not np.array_equal(flipped.rows, acquired.rows):
+        raise EvaluationError(
+            f"{pairs.name}: photos gave a descriptor with their mirror image and none without, or "
+            "the other way round"
+        )
+    require_both_classes(
+        f"{pairs.name}, without the {len(pairs) - len(kept)} pairs that lack a descriptor,",
+        same,
+        pairs.folds[kept],
+    )
+    facts = SetFacts(
+        name=pairs.name,
+        genuine=int(np.count_nonzero(same)),
+        impostor=int(np.count_nonzero(~same)),
+        failed_genuine=pairs.genuine - int(np.count_nonzero(same)),
+        failed_impostor=pairs.impostor - int(np.count_nonzero(~same)),
+        fta=len(acquired.failures) / len(acquired.rows),
+        names_people=pairs.people is not None,
+    )
+    people = None
+    if pairs.people is not None:
+        _, numbers = np.unique(np.asarray(pairs.people, dtype=np.str_), return_inverse=True)
+        people = np.zeros(len(acquired.descriptors), dtype=np.int64)
+        there = acquired.rows >= 0
+        people[acquired.rows[there]] = numbers[there]
+    material = Material(
+        descriptors=acquired.descriptors,
+        flipped=None if flipped is None else flipped.descriptors,
+        first=first[kept],
+        second=second[kept],
+        same=same,
+        folds=pairs.folds[kept],
+        people=people,
+        attributes=attributes,
+        sources=tuple(sources),
+    )
+    return material, facts, kept
+
+
+def evaluate_set(
+    material: Material,
+    facts: SetFacts,
+    kept: NDArray[np.int64],
+    *,
+    plan: Plan,
+    base: dict[str, Any],
+    out: Path,
+    backend: Backend,
+    progress: Advance,
+) -> Evaluated:
+    """Run all units of a plan on one set; those found in ``out`` are not computed again.
+
+    Parameters
+    ----------
+    base
+        What names photos, pairs and model (see :class:`Checkpoints`).
+    progress
+        Called with the number of units done since the last call.
+    """
+    units = units_of(plan, material.sources, n=material.n)
+    checkpoints = Checkpoints(
+        out,
+        {
+            **base,
+            "software": version(SOFTWARE),
+            "numpy": version("numpy"),
+            "sources": [source.source_id for source in material.sources],
+            "pairs": _digest(material),
+            "attributes": [] if material.attributes is None else _labels(material.attributes),
+        },
+    )
+    layouts = [unit_layout(unit, material.sources) for unit in units]
+    known = [
+        checkpoints.load(unit, columns=len(layout), pairs=len(material))
+        for unit, layout in zip(units, layouts, strict=True)
+    ]
+    shared = (material, plan.targets)
+    found: list[list[Run]] = [[] for _ in units]
+    for index, runs in spread(backend, _run, shared, list(zip(units, known, strict=True))):
+        if known[index] is None:
+            checkpoints.save(units[index], runs)
+        found[index] = runs
+        progress(1)
+    source_of = {
+        cell: unit.source if isinstance(unit, LiftUnit) else None
+        for unit, layout in zip(units, layouts, strict=True)
+        for cell, _ in layout
+    }
+    return Evaluated(facts, material, kept, [run for runs in found for run in runs], source_of)
+
+
+def _run(
+    shared: tuple[Material, Sequence[float]], item: tuple[Unit, list[NDArray[np.float64]] | None]
+) -> list[Run]:
+    material, targets = shared
+    unit, known = item
+    return run_unit(material, unit, targets=targets, known=known)
+
+
+def _digest(material: Material) -> str:
+    whole = hashlib.sha256()
+    for part in (material.first, material.second, material.same, material.folds):
+        whole.update(np.ascontiguousarray(part).tobytes())
+    return whole.hexdigest()
+
+
+def _labels(attributes: Sequence[Attributes]) -> list[list[str | None]]:
+    return [[each.gender, each.race] for each in attributes]

@@ -1,0 +1,136 @@
+"""How every figure looks, and how it is written without a date or a global state.
+
+Figures have an opaque white ground. Text that is legible on both a white and a dark page cannot
+exist: the contrasts of one colour against #ffffff and #0d1117 multiply to 18.9, whatever the
+colour, and 4.5 on both would need 20.25. So a figure brings its ground, and in print the ground is
+the paper.
+
+Hues are those of Okabe and Ito, which the colour-blind tell apart; nothing is told by hue alone:
+each has a hatch, a marker or a dash of its own, and they differ in lightness.
+"""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.lines import Line2D
+
+GROUND = "#ffffff"
+INK = "#1b1f24"
+QUIET = "#57606a"
+RULE = "#d8dee4"
+INK_SIZE, SMALL_SIZE = 11.0, 9.5
+PNG_DPI = 160
+
+HUES = ("#0072b2", "#d55e00", "#008f68", "#a2497c", "#8a6d00", "#3a3a3a", "#56a0d3", "#c98500")
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
+DASHES: tuple[Any, ...] = ("solid", (0, (5, 1.6)), (0, (1.2, 1.4)), (0, (5, 1.4, 1.2, 1.4)))
+
+_SETTINGS: Any = {
+    "axes.axisbelow": True,
+    "axes.edgecolor": QUIET,
+    "axes.labelcolor": INK,
+    "axes.labelsize": INK_SIZE,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.titlecolor": INK,
+    "axes.titlesize": INK_SIZE + 1,
+    "axes.titleweight": "bold",
+    "figure.edgecolor": GROUND,
+    "figure.facecolor": GROUND,
+    "font.family": "sans-serif",
+    "font.size": INK_SIZE,
+    "hatch.linewidth": 0.8,
+    "legend.fontsize": INK_SIZE,
+    "legend.frameon": False,
+    "savefig.facecolor": GROUND,
+    # Text stays text: it is searched, read aloud and small. Salted ids do not change with the run.
+    "svg.fonttype": "none",
+    "svg.hashsalt": "veilface",
+    "text.color": INK,
+    "xtick.color": QUIET,
+    "xtick.labelcolor": INK,
+    "xtick.labelsize": SMALL_SIZE,
+    "ytick.color": QUIET,
+    "ytick.labelcolor": INK,
+    "ytick.labelsize": SMALL_SIZE,
+}
+
+
+@contextmanager
+def house_style() -> Iterator[None]:
+    """Draw and write with these settings only; what the process has set returns afterwards."""
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        matplotlib.rcParams.update(_SETTINGS)
+        yield
+
+
+def write(figure: Figure, folder: Path, name: str) -> list[Path]:
+    """Write ``name.png`` and ``name.svg``, the same bytes for the same figure."""
+    paths = [folder / f"{name}.png", folder / f"{name}.svg"]
+    with house_style():
+        figure.savefig(paths[0], dpi=PNG_DPI, metadata={"Software": None})
+        figure.savefig(paths[1], metadata={"Date": None, "Creator": None})
+    return paths
+
+
+def panels(
+    rows: int,
+    columns: int,
+    *,
+    widths: Sequence[float],
+    heights: Sequence[float],
+    header: float = 0.0,
+    side: float = 0.0,
+) -> tuple[Figure, list[list[Axes]]]:
+    """Return a figure of panels, sizes in inches, with room for the legend above or right."""
+    width, height = sum(widths), sum(heights)
+    engine = ConstrainedLayoutEngine(
+        rect=(0, 0, width / (width + side), height / (height + header)), w_pad=0.06, h_pad=0.06
+    )
+    figure = Figure(figsize=(width + side, height + header), layout=engine)
+    axes = figure.subplots(
+        rows,
+        columns,
+        squeeze=False,
+        gridspec_kw={"width_ratios": list(widths), "height_ratios": list(heights)},
+    )
+    return figure, [list(line) for line in axes]
+
+
+def side_legend(figure: Figure, handles: Sequence[Line2D], side: float) -> None:
+    """Put the legend into the band right of the panels."""
+    left = 1 - side / figure.get_figwidth()
+    figure.legend(
+        handles=handles,
+        loc="center left",
+        bbox_to_anchor=(left + 0.1 / figure.get_figwidth(), 0.5),
+        fontsize=SMALL_SIZE + 0.5,
+        handlelength=2.8,
+        labelspacing=0.6,
+        borderaxespad=0,
+    )
+
+
+def mark_cut(axes: Axes) -> None:
+    """Draw the two strokes across the foot of the vertical axis that say it does not start at 0."""
+    stroke = [(-1.0, -0.6), (1.0, 0.6)]
+    for height in (0.018, 0.042):
+        axes.plot(
+            [0],
+            [height],
+            transform=axes.transAxes,
+            marker=stroke,
+            markersize=11,
+            markeredgecolor=INK,
+            color=INK,
+            linestyle="none",
+            clip_on=False,
+            zorder=6,
+        )

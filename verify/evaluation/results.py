@@ -1,0 +1,228 @@
+"""The document of an evaluation: every figure with what it came from (docs/evaluation.md)."""
+
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from typing import Any
+
+from models.extraction import Failure
+from templates.binding import Binding
+from templates.decoys import DecoyPool
+from templates.lifting import Strategy
+from templates.rotation import ROTATION_VERSION
+from verify.evaluation.backends import SOFTWARE
+from verify.evaluation.evaluation import Evaluated
+from verify.evaluation.material import Source
+from verify.evaluation.plan import Plan
+from verify.evaluation.rows import (
+    Json,
+    curve_json,
+    grouped,
+    refused_targets,
+    row_json,
+    run_json,
+)
+from verify.evaluation.scoring import decoy_kind
+from verify.evaluation.units import Cell, Mode
+from verify.evaluation.verification_set import VerificationSet
+from verify.tenfold import FOLDS
+
+FORMAT = "veilface evaluation"
+VERSION = 1
+_LIBRARIES = ("numpy", "scipy", "scikit-learn", "onnxruntime", "opencv-python-headless")
+
+
+@dataclass(frozen=True)
+class Model:
+    """Where descriptors came from.
+
+    Parameters
+    ----------
+    n
+        Their dimension.
+    facts
+        For the reader: pack, detector, or file of embeddings with its SHA-256.
+    embedder_sha256, preprocessing
+        As in a contract; None where descriptors came from a file.
+    """
+
+    n: int
+    facts: Json
+    embedder_sha256: str | None = None
+    preprocessing: Mapping[str, Any] | None = None
+
+    def json(self) -> Json:
+        """Everything as JSON."""
+        known: Json = {"n": self.n, **self.facts}
+        if self.embedder_sha256 is not None:
+            known["embedder_sha256"] = self.embedder_sha256
+            known["preprocessing"] = dict(self.preprocessing or {})
+        return known
+
+
+@dataclass(frozen=True, eq=False)
+class SourceFacts:
+    """A decoy source as it was used, and the file it came from."""
+
+    source: Source
+    file: str
+    sha256: str
+    file_source_id: str
+    left_out: int
+
+    def json(self) -> Json:
+        """Everything as JSON."""
+        pool = self.source if isinstance(self.source, DecoyPool) else None
+        return {
+            "kind": decoy_kind(self.source),
+            "source_id": self.source.source_id,
+            "entries": None if pool is None else len(pool),
+            "labelled": pool is not None and pool.labelled,
+            "left_out": self.left_out,
+            "file": self.file,
+            "sha256": self.sha256,
+            "file_source_id": self.file_source_id,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class SetResult:
+    """One set and what was found on it."""
+
+    pairs: VerificationSet
+    evaluated: Evaluated
+    failures: tuple[Failure, ...]
+    aligned: bool | None
+    pictures_sha256: str
+    notes: tuple[str, ...]
+
+    def json(self) -> Json:
+        """Counts, hashes and failures to acquire."""
+        facts = self.evaluated.facts
+        return {
+            "name": self.pairs.name,
+            "kind": self.pairs.kind,
+            "images": len(self.pairs.pictures),
+            "pairs": len(self.pairs),
+            "genuine": self.pairs.genuine,
+            "impostor": self.pairs.impostor,
+            "people": None if self.pairs.people is None else len(set(self.pairs.people)),
+            "aligned": self.aligned,
+            "pictures_sha256": self.pictures_sha256,
+            "protocol_files": [list(entry) for entry in self.pairs.protocol_files],
+            "failures": [
+                {"image": failure.path.as_posix(), "code": failure.code, "reason": failure.reason}
+                for failure in self.failures
+            ],
+            "failed_genuine": facts.failed_genuine,
+            "failed_impostor": facts.failed_impostor,
+            "fta": facts.fta,
+            "notes": list(self.notes),
+        }
+
+
+def software() -> Json:
+    """Versions that figures depend on."""
+    return {
+        SOFTWARE: version(SOFTWARE),
+        "python": platform.python_version(),
+        **{name: version(name) for name in _LIBRARIES},
+    }
+
+
+def document(
+    plan: Plan,
+    model: Model,
+    sources: Sequence[SourceFacts],
+    sets: Sequence[SetResult],
+    *,
+    options: Json,
+    timings: Sequence[Json],
+    groups: Sequence[Json],
+    group_summaries: Sequence[Json],
+) -> Json:
+    """Put everything together; ``rows`` and ``runs`` depend on seeds and inputs only.
+
+    Times of comparisons are apart, in ``timings``: they differ from run to run.
+    """
+    rows: list[Json] = []
+    runs: list[Json] = []
+    curves: list[Json] = []
+    for each in sets:
+        evaluated = each.evaluated
+        for (cell, search), found in sorted(
+            grouped(evaluated.runs).items(), key=lambda entry: _order(plan, *entry[0])
+        ):
+            place = evaluated.source_of[cell]
+            source = None if place is None else evaluated.material.sources[place]
+            rows.append(
+                row_json(
+                    cell,
+                    search,
+                    found,
+                    evaluated.facts,
+                    seed=plan.seed,
+                    n=model.n,
+                    source=source,
+                    contract_id=contract_id(model, cell, source),
+                )
+            )
+            runs += [run_json(run, each.pairs.name) for run in found]
+            if search == "exact":
+                curves.append(curve_json(cell, found, evaluated.facts))
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "software": software(),
+        "seed": plan.seed,
+        "repeats": plan.repeats,
+        "options": {**asdict(plan), **options},
+        "model": model.json(),
+        "decoys": [source.json() for source in sources],
+        "datasets": [each.json() for each in sets],
+        "rows": rows,
+        "groups": list(groups),
+        "group_summaries": list(group_summaries),
+        "timings": list(timings),
+        "refused": refused_targets(
+            plan.targets, {each.pairs.name: each.evaluated.facts.impostor for each in sets}
+        ),
+        "runs": runs,
+        "curves": curves,
+        "folds": FOLDS,
+    }
+
+
+def contract_id(model: Model, cell: Cell, source: Source | None) -> str | None:
+    """Contract that templates of a cell belong to; None where none can be made.
+
+    A contract binds an embedder and a decoy source, so raw descriptors, codes, random lifting and
+    descriptors from a file have none.
+    """
+    if source is None or model.embedder_sha256 is None or model.preprocessing is None:
+        return None
+    return Binding(
+        embedder_sha256=model.embedder_sha256,
+        preprocessing=model.preprocessing,
+        n=model.n,
+        strategy=Strategy(cell.strategy),
+        m=cell.dim,
+        decoy_source_id=source.source_id,
+        rotation_version=ROTATION_VERSION,
+    ).contract_id
+
+
+def _order(plan: Plan, cell: Cell, search: str) -> tuple[Any, ...]:
+    """Rows as the plan names them; raw first, stolen tokens after the others."""
+    modes = list(Mode)
+    plain = cell.strategy.removesuffix("-stolen")
+    return (
+        modes.index(cell.mode),
+        plan.strategies.index(plain),
+        cell.strategy != plain,
+        cell.decoys or "",
+        cell.dim,
+        cell.metric,
+        search != "grid",
+    )

@@ -1,0 +1,116 @@
+"""One unit from start to end: similarities, figures, and the replicates of its intervals."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from verify.evaluation.material import Material
+from verify.evaluation.measures import Measures, measure
+from verify.evaluation.resampling import (
+    Weights,
+    draw_weights,
+    fmr_grid,
+    fnmr_curve,
+    fnmr_replicates,
+)
+from verify.evaluation.scoring import Scores, score_unit, unit_layout
+from verify.evaluation.units import Cell, Lifted, RawUnit, Search, Unit
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Run:
+    """One run of one cell.
+
+    Parameters
+    ----------
+    cell, lifted, seed
+        What was run.
+    search
+        How the folds chose their thresholds.
+    measures
+        Its figures.
+    similarities : (P,) float64
+    curve : (F,) float64
+        FNMR at FMR ≤ each point of ``fmr_grid``.
+    replicates : (R, T + F) float32
+        FNMR at the resolvable targets and at the grid, in every replicate.
+    """
+
+    cell: Cell
+    lifted: Lifted | None
+    seed: int | None
+    search: Search
+    measures: Measures
+    similarities: Floats
+    curve: Floats
+    replicates: NDArray[np.float32]
+
+
+def run_unit(
+    material: Material,
+    unit: Unit,
+    *,
+    targets: Sequence[float],
+    known: Sequence[Floats] | None = None,
+) -> list[Run]:
+    """Compute the runs of a unit.
+
+    Parameters
+    ----------
+    targets
+        FMR targets.
+    known
+        Similarities of an earlier run of this unit, in the order of ``unit_layout``.
+
+    Notes
+    -----
+    Products run on one thread: results do not depend on how many processors a worker has.
+    """
+    with threadpool_limits(1):
+        if known is None:
+            scores = score_unit(material, unit)
+        else:
+            layout = unit_layout(unit, material.sources)
+            scores = [
+                Scores(cell, lifted, column)
+                for (cell, lifted), column in zip(layout, known, strict=True)
+            ]
+        weights = draw_weights(material, seed=0)
+        searches: tuple[Search, ...] = (
+            ("grid", "exact") if isinstance(unit, RawUnit) else ("exact",)
+        )
+        return [
+            _run(material, unit, each, search, targets, weights)
+            for each in scores
+            for search in searches
+        ]
+
+
+def _run(
+    material: Material,
+    unit: Unit,
+    scores: Scores,
+    search: Search,
+    targets: Sequence[float],
+    weights: Weights,
+) -> Run:
+    same = material.same
+    measures = measure(scores.similarities, same, material.folds, targets=targets, search=search)
+    mated, non_mated = scores.similarities[same], scores.similarities[~same]
+    grid = fmr_grid(non_mated.size)
+    resolved = np.array([errors.target for errors in measures.at])
+    return Run(
+        cell=scores.cell,
+        lifted=scores.lifted,
+        seed=unit.seed,
+        search=search,
+        measures=measures,
+        similarities=scores.similarities,
+        curve=fnmr_curve(mated, non_mated, grid),
+        replicates=fnmr_replicates(mated, non_mated, weights, np.concatenate([resolved, grid])),
+    )
