@@ -25,8 +25,9 @@ from verify.evaluation.acquisition import (
     PackSource,
     acquire,
     are_aligned,
+    digest_of_pictures,
+    digests,
     from_file,
-    read_pictures,
 )
 from verify.evaluation.attributes import predict_attributes, resembling
 from verify.evaluation.backends import Backend
@@ -156,18 +157,18 @@ def acquire_faces(
         faces = Faces(pairs, from_file(pairs, descriptors.file), None, None, "")
     else:
         assert descriptors.pack is not None  # noqa: S101 - one of both is there
-        pictures, digest = read_pictures(pairs)
+        contents = digests(pairs)
         size = int(descriptors.pack.info.preprocessing["size"])
         crops = pairs.aligned if aligned is None else aligned
         if crops is None:
-            crops = descriptors.pack.info.detector is None or are_aligned(pictures, size)
+            crops = descriptors.pack.info.detector is None or are_aligned(pairs, size)
         found: list[Acquired | None] = []
         for pack in (descriptors.pack, descriptors.flip_pack):
             if pack is None:
                 found.append(None)
                 continue
             source = PackSource(
-                folder=Path(str(settings.pack)),
+                folder=Path(str(settings.pack)).expanduser().resolve(),
                 embedder_sha256=pack.info.embedder_sha256,
                 providers=settings.providers,
                 threads=None if backend.scheduler is None else 1,
@@ -175,15 +176,23 @@ def acquire_faces(
                 aligned=crops,
             )
             what = " with the mirror image" if pack is descriptors.flip_pack else ""
-            with progress(f"embedding {pairs.name}{what}", len(pictures)) as advance:
+            with progress(f"embedding {pairs.name}{what}", len(pairs.pictures)) as advance:
                 found.append(
-                    acquire(pictures, pack, source, cache=cache, backend=backend, progress=advance)
+                    acquire(
+                        pairs,
+                        contents,
+                        pack,
+                        source,
+                        cache=cache,
+                        backend=backend,
+                        progress=advance,
+                    )
                 )
             if cache is not None:
                 cache.flush()
         first = found[0]
         assert first is not None  # noqa: S101 - the pack is there
-        faces = Faces(pairs, first, found[1], crops, digest)
+        faces = Faces(pairs, first, found[1], crops, digest_of_pictures(contents))
     if not len(faces.acquired.descriptors):
         raise CommandError(
             f"{pairs.name}: no photo gave a descriptor, the first because of "

@@ -15,7 +15,7 @@ from models.extraction import CHUNK, EncodedImage, Extraction, Extractor, Failur
 from models.pack import ModelPack
 from verify.evaluation.backends import Backend, BackendError, spread
 from verify.evaluation.embeddings_file import EmbeddingsFile, match
-from verify.evaluation.verification_set import Indices, VerificationSet
+from verify.evaluation.verification_set import Indices, Picture, VerificationSet
 
 Advance = Callable[[int], None]
 
@@ -63,26 +63,28 @@ class Acquired:
     failures: tuple[Failure, ...]
 
 
-def read_pictures(pairs: VerificationSet) -> tuple[list[EncodedImage], str]:
-    """Read all pictures.
+def digests(pairs: VerificationSet) -> list[str]:
+    """SHA-256 of every picture, in the order of the set; a picture that cannot be read has none.
 
-    Returns
-    -------
-    pictures
-        In the order of the set.
-    digest
-        SHA-256 over the SHA-256 of each picture in order: equal for equal photos, whatever holds
-        them.
+    One picture is in memory at a time.
     """
-    pictures = [picture.read() for picture in pairs.pictures]
-    whole = hashlib.sha256()
-    for picture in pictures:
-        whole.update(hashlib.sha256(picture.data).digest())
-    return pictures, whole.hexdigest()
+    found = []
+    for picture in pairs.pictures:
+        try:
+            found.append(hashlib.sha256(picture.read()).hexdigest())
+        except OSError:
+            found.append("")
+    return found
+
+
+def digest_of_pictures(contents: Sequence[str]) -> str:
+    """Name the pictures of a set: equal for equal photos in equal order, whatever holds them."""
+    return hashlib.sha256("".join(contents).encode()).hexdigest()
 
 
 def acquire(
-    pictures: Sequence[EncodedImage],
+    pairs: VerificationSet,
+    contents: Sequence[str],
     pack: ModelPack,
     source: PackSource,
     *,
@@ -90,7 +92,12 @@ def acquire(
     backend: Backend,
     progress: Advance,
 ) -> Acquired:
-    """Embed pictures, ``CHUNK`` different ones at a time, here as there: the same descriptors.
+    """Embed the pictures of a set, ``CHUNK`` different ones at a time, here as there.
+
+    Parameters
+    ----------
+    contents
+        What :func:`digests` says of the set; equal pictures are embedded once.
 
     Raises
     ------
@@ -98,52 +105,56 @@ def acquire(
         The cluster cannot be used, or lacks the pack.
     """
     place: dict[str, int] = {}
-    unique: list[EncodedImage] = []
-    content = [hashlib.sha256(picture.data).hexdigest() for picture in pictures]
-    for picture, digest in zip(pictures, content, strict=True):
-        if digest not in place:
-            place[digest] = len(unique)
+    unique: list[Picture] = []
+    for picture, content in zip(pairs.pictures, contents, strict=True):
+        # Two pictures that cannot be read are not equal.
+        if place.setdefault(content or picture.name, len(unique)) == len(unique):
             unique.append(picture)
-    done: list[Extraction] = []
+    done: list[Extraction]
     if backend.scheduler is None:
         extractor = Extractor(pack, aligned=source.aligned, cache=cache)
-        done.append(extractor.extract(unique, progress=progress))
+        sources = [picture.source for picture in unique]
+        done = [extractor.extract(sources, progress=progress)]
+        keys = [str(each.name if isinstance(each, EncodedImage) else each) for each in sources]
     else:
+        keys = [picture.name for picture in unique]
         chunks = [unique[start : start + CHUNK] for start in range(0, len(unique), CHUNK)]
         ready = {}
-        for index, extraction in spread(backend, _extract, source, chunks):
+        for index, extraction in spread(backend, _extract, source, map(_loaded_chunk, chunks)):
             ready[index] = extraction
             progress(len(chunks[index]))
-        done += [ready[index] for index in range(len(chunks))]
-    return _gathered(pictures, unique, content, place, done, pack)
-
-
-def _gathered(
-    pictures: Sequence[EncodedImage],
-    unique: Sequence[EncodedImage],
-    content: Sequence[str],
-    place: dict[str, int],
-    done: Sequence[Extraction],
-    pack: ModelPack,
-) -> Acquired:
+        done = [ready[index] for index in range(len(chunks))]
     row_of: dict[str, int] = {}
     reason_of: dict[str, Failure] = {}
-    rows: list[NDArray[np.float32]] = []
     for extraction in done:
-        rows.append(extraction.descriptors)
         for path in extraction.paths:
             row_of[str(path)] = len(row_of)
         reason_of |= {str(failure.path): failure for failure in extraction.failures}
-    names = [str(Path(unique[place[digest]].name)) for digest in content]
+    names = [
+        str(Path(keys[place[content or picture.name]]))
+        for picture, content in zip(pairs.pictures, contents, strict=True)
+    ]
+    rows = [extraction.descriptors for extraction in done]
     return Acquired(
         np.concatenate([np.empty((0, pack.info.n), np.float32), *rows]),
         np.array([row_of.get(name, -1) for name in names], dtype=np.int64),
         tuple(
             Failure(Path(picture.name), reason_of[name].code, reason_of[name].reason)
-            for picture, name in zip(pictures, names, strict=True)
+            for picture, name in zip(pairs.pictures, names, strict=True)
             if name not in row_of
         ),
     )
+
+
+def _loaded_chunk(chunk: Sequence[Picture]) -> list[EncodedImage]:
+    """Read the pictures of a chunk; one that cannot be read is left empty, and fails to decode."""
+    images = []
+    for picture in chunk:
+        try:
+            images.append(EncodedImage(picture.name, picture.read()))
+        except OSError:
+            images.append(EncodedImage(picture.name, b""))
+    return images
 
 
 @lru_cache(maxsize=2)
@@ -181,10 +192,18 @@ def from_file(pairs: VerificationSet, embeddings: EmbeddingsFile) -> Acquired:
     )
 
 
-def are_aligned(pictures: Sequence[EncodedImage], size: int) -> bool:
-    """Whether the pictures, as far as they are any, have exactly the embedder's input size.
+def are_aligned(pairs: VerificationSet, size: int) -> bool:
+    """Whether all pictures, as far as they are any, have exactly the embedder's input size.
 
     Photos out of a camera, and those of LFW (250 × 250), are larger.
     """
-    sizes = {image_size(picture.data) for picture in pictures} - {None}
-    return sizes == {(size, size)}
+    found = False
+    for picture in pairs.pictures:
+        try:
+            seen = image_size(picture.read())
+        except OSError:
+            continue
+        if seen not in (None, (size, size)):
+            return False
+        found = found or seen is not None
+    return found

@@ -3,7 +3,7 @@
 Both go through joblib. What a worker needs travels in sealed parcels (``material.Parcel``).
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -64,9 +64,14 @@ class Backend:
 
 
 def spread(
-    backend: Backend, function: Callable[[Any, T], R], shared: object, items: Sequence[T]
+    backend: Backend, function: Callable[[Any, T], R], shared: object, items: Iterable[T]
 ) -> Iterator[tuple[int, R]]:
     """Call ``function(shared, item)`` for every item, wherever the backend works.
+
+    Parameters
+    ----------
+    items
+        Taken as workers get free, so that a few of them are in memory at once.
 
     Yields
     ------
@@ -78,7 +83,7 @@ def spread(
     BackendError
         The cluster cannot be used, or its workers have another version.
     """
-    if backend.scheduler is None and min(backend.jobs, len(items)) <= 1:
+    if backend.scheduler is None and backend.jobs == 1:
         yield from ((index, function(shared, item)) for index, item in enumerate(items))
         return
     key = fresh_key()

@@ -193,7 +193,7 @@ def _array(file: Path, archive: zipfile.ZipFile, name: str, *, most: int) -> NDA
         raise DatasetError(f"{file}: {name} unpacks to more than {most} bytes")
     with archive.open(entry) as stream:
         shape, fortran, dtype = _header(stream)
-        if dtype.kind != "U" if name == "paths" else dtype not in _FLOATS:
+        if dtype.kind != "U" if name == "paths" else dtype.newbyteorder("=") not in _FLOATS:
             raise DatasetError(f"{file}: {name} is of type {dtype.kind}{dtype.itemsize}; {_KEYS}")
         count = math.prod(shape)
         if min(shape, default=0) < 0 or count * dtype.itemsize > most:

@@ -25,7 +25,12 @@ class Picture(Protocol):
         """Path of the photo relative to its set, or its place in the file; unique in the set."""
         ...
 
-    def read(self) -> EncodedImage:
+    @property
+    def source(self) -> Path | EncodedImage:
+        """The photo as bulk extraction takes it: a file that is not read yet, or bytes."""
+        ...
+
+    def read(self) -> bytes:
         """Return the encoded photo."""
         ...
 
@@ -45,9 +50,14 @@ class PictureFile:
     path: Path
     landmarks: Path | None = None
 
-    def read(self) -> EncodedImage:
+    @property
+    def source(self) -> Path:
+        """The file."""
+        return self.path
+
+    def read(self) -> bytes:
         """Read the file."""
-        return EncodedImage(self.name, self.path.read_bytes())
+        return self.path.read_bytes()
 
 
 @dataclass(frozen=True)
@@ -57,9 +67,14 @@ class PictureBytes:
     name: str
     data: bytes = field(repr=False)
 
-    def read(self) -> EncodedImage:
-        """Return the bytes."""
+    @property
+    def source(self) -> EncodedImage:
+        """The bytes under the photo's name."""
         return EncodedImage(self.name, self.data)
+
+    def read(self) -> bytes:
+        """Return the bytes."""
+        return self.data
 
 
 @dataclass(frozen=True, eq=False, repr=False)

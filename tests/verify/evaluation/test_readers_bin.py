@@ -33,7 +33,7 @@ def test_photos_pairs_and_folds(tmp_path: Path) -> None:
     assert names[:8] == ["00000", "00001", "00002", "00003", "00004", "00005", "00008", "00009"]
     for pair in range(len(same)):
         for side, positions in enumerate((benchmark.first, benchmark.second)):
-            assert benchmark.pictures[positions[pair]].read().data == bins[2 * pair + side]
+            assert benchmark.pictures[positions[pair]].read() == bins[2 * pair + side]
     np.testing.assert_array_equal(benchmark.same, same)
     np.testing.assert_array_equal(benchmark.folds, np.arange(len(same)) // 2)
     assert benchmark.protocol_files[0][0] == "CFP_FP.bin"
@@ -48,7 +48,7 @@ def test_elements_and_protocols(tmp_path: Path, protocol: int, form: str) -> Non
     arrays = [np.frombuffer(photo, np.uint8) for photo in bins]
     elements = {"row": arrays, "column": [one[:, None] for one in arrays]}.get(form, bins)
     benchmark = read(tmp_path / "lfw.bin", (elements, same), protocol)
-    assert [picture.read().data for picture in benchmark.pictures] == bins
+    assert [picture.read() for picture in benchmark.pictures] == bins
 
 
 @pytest.mark.parametrize(
@@ -155,7 +155,7 @@ def test_real_crops_give_the_pairs_of_the_folder(lfw_aligned: Path, tmp_path: Pa
     assert len(benchmark.pictures) == len(set(bins))
     for pair, one in enumerate(chosen):
         photo = benchmark.pictures[benchmark.first[pair]].read()
-        assert photo.data == folder.paths[one.first].read_bytes()
+        assert photo == folder.paths[one.first].read_bytes()
         assert benchmark.same[pair] == one.same
         assert benchmark.folds[pair] == one.fold
     assert notes(benchmark) == ["lfw has 20 pairs, the published set has 6,000"]

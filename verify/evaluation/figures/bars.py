@@ -104,7 +104,8 @@ def verification_figure(results: Mapping[str, Any]) -> Figure | None:
                     if place == 0:
                         axes.set_ylabel(f"{_title(mode, cells)}\naccuracy %")
         figure.align_ylabels([line[0] for line in grid])
-        _legend(figure, metrics)
+        raws = [raw_row(results["rows"], name) for name in datasets]
+        _legend(figure, metrics, raw=any(raw and _measured(raw) for raw in raws))
     return figure
 
 
@@ -253,11 +254,12 @@ def _title(mode: str, rows: Sequence[Row]) -> str:
     return MODE_TITLES[mode]
 
 
-def _legend(figure: Figure, metrics: Sequence[str]) -> None:
+def _legend(figure: Figure, metrics: Sequence[str], *, raw: bool) -> None:
     handles: list[Patch | Line2D] = [
         Patch(label=METRIC_NAMES[metric], linewidth=0.8, **LOOKS[metric]) for metric in metrics
     ]
-    handles.append(Line2D([], [], color=INK, linewidth=1.4, linestyle=(0, (6, 2)), label="raw"))
+    if raw:
+        handles.append(Line2D([], [], color=INK, linewidth=1.4, linestyle=(0, (6, 2)), label="raw"))
     handles.append(
         Line2D(
             [],

@@ -37,7 +37,6 @@ MODE_TITLES = {"p2s": "p-to-s", "s2s": "s-to-s", "p2p": "raw", "hash": "hashes"}
 RATE_TICKS = (1e-6, 1e-5, 1e-4, 1e-3, 0.01, 0.05, 0.2, 0.5, 0.8, 0.95, 0.99, 0.999)
 SMALLEST = 1e-7
 BAND_ALPHA = 0.11
-HASH_GID = "hash"
 PANEL_INCHES = (4.6, 4.3)
 SIDE_INCHES = 2.75
 HASH_HUES = dict(zip(HASHES, ("#8c8c8c", "#8c8c8c", "#5e5e5e", "#5e5e5e"), strict=True))
@@ -133,7 +132,7 @@ def _look(curve: Row, shown: Sequence[Row], looks: dict[str, dict[str, Any]]) ->
         stolen = str(curve["strategy"]).endswith("-stolen")
         looks.setdefault(
             label,
-            {"color": HASH_HUES.get(curve["strategy"], QUIET), "linewidth": 1.5, "gid": HASH_GID}
+            {"color": HASH_HUES.get(curve["strategy"], QUIET), "linewidth": 1.5}
             | {"linestyle": DASHES[2] if stolen else DASHES[3]},
         )
     else:
@@ -211,7 +210,7 @@ def _dress_roc(axes: Axes) -> None:
     axes.set_xscale("log")
     axes.set_xlim(min(float(np.min(np.asarray(line.get_xdata()))) for line in lines), 1)
     # A hash far below the others leaves through the foot: it would flatten them all.
-    scaled = [line for line in lines if line.get_gid() != HASH_GID] or lines
+    scaled = [line for line in lines if line.get_color() not in HASH_HUES.values()] or lines
     lowest = min(float(np.min(np.asarray(line.get_ydata()))) for line in scaled)
     floor = next((f for f in (98.0, 95.0, 90.0, 80.0, 50.0) if lowest >= f), 0.0)
     axes.set_ylim(floor, 100 + (100 - floor) * 0.02)

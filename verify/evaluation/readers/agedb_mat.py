@@ -1,23 +1,20 @@
 """The pairs of AgeDB's protocols, which are MATLAB files of nested cells and structs."""
 
-import zlib
+from collections.abc import Iterator
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
-import scipy.io
 from numpy.typing import NDArray
 
 from verify.datasets import DatasetError, faults_in
+from verify.evaluation.readers.mat5 import RefusedMat, read_variable
 from verify.evaluation.readers.protocol_files import read_whole
 from verify.evaluation.verification_set import digest_of
 from verify.tenfold import FOLDS
 
 _MAX_BYTES = 16 * 2**20
-_MAX_UNPACKED = 128 * 2**20
 _DEEPEST = 8
-_COMPRESSED = 15
 
 Cells = NDArray[np.object_]
 
@@ -49,21 +46,13 @@ def read_splits(file: Path) -> MatProtocol:
         The file is not of version 5 to 7, holds no ``splits``, or another layout.
     """
     data = read_whole(file, most=_MAX_BYTES)
-    _check_container(file, data)
     try:
-        content = scipy.io.loadmat(
-            BytesIO(data),  # type: ignore[arg-type]
-            variable_names=["splits"],
-            struct_as_record=True,
-            chars_as_strings=True,
-        )
-    except Exception as error:  # SciPy raises whatever a broken file happens to cause
-        raise DatasetError(
-            f"{file} is a broken MATLAB file ({type(error).__name__}); fetch it again"
-        ) from None
-    if "splits" not in content:
+        content = read_variable(data, "splits")
+    except RefusedMat as error:
+        raise DatasetError(f"{file} is not readable: {error}") from None
+    if content is None:
         raise DatasetError(f"{file} holds no variable named splits")
-    parts = _elements(_unwrap(content["splits"]))
+    parts = _elements(_unwrap(content))
     if len(parts) != FOLDS:
         raise DatasetError(f"{file}: splits has {len(parts)} folds; the protocol has {FOLDS}")
     folds: list[tuple[tuple[str, str, bool], ...]] = []
@@ -80,33 +69,6 @@ def read_splits(file: Path) -> MatProtocol:
 
 class _Layout(Exception):
     """A part of the file that is laid out otherwise; the message says how."""
-
-
-def _check_container(file: Path, data: bytes) -> None:
-    """Check version and unpacked size, so that SciPy sees nothing that explodes."""
-    order = {b"IM": "little", b"MI": "big"}.get(data[126:128])
-    version = None if order is None else int.from_bytes(data[124:126], order)  # type: ignore[arg-type]
-    if data[:8] == b"\x89HDF\r\n\x1a\n" or data[:10] == b"MATLAB 7.3" or version == 0x0200:
-        raise DatasetError(f"{file} is of MATLAB 7.3; save it again with save(…, '-v7')")
-    if order is None or version != 0x0100:
-        raise DatasetError(f"{file} is no MATLAB file of version 5 to 7")
-    at, budget = 128, _MAX_UNPACKED
-    while at + 8 <= len(data):
-        kind = int.from_bytes(data[at : at + 4], order)  # type: ignore[arg-type]
-        size = int.from_bytes(data[at + 4 : at + 8], order)  # type: ignore[arg-type]
-        if at + 8 + size > len(data):
-            raise DatasetError(f"{file} is truncated")
-        if kind == _COMPRESSED:
-            try:
-                stream = zlib.decompressobj()
-                budget -= len(stream.decompress(data[at + 8 : at + 8 + size], budget))
-            except zlib.error:
-                raise DatasetError(f"{file} is a broken MATLAB file (zlib)") from None
-            if budget <= 0 or stream.unconsumed_tail:
-                raise DatasetError(f"{file} unpacks to more than {_MAX_UNPACKED} bytes")
-        at += 8 + size
-    if at != len(data):
-        raise DatasetError(f"{file} is truncated")
 
 
 def _unwrap(value: object) -> object:
@@ -129,9 +91,10 @@ def _elements(value: object) -> list[object]:
 def _fold(value: object) -> tuple[tuple[str, str, bool], ...]:
     value = _unwrap(value)
     if isinstance(value, np.ndarray) and value.ndim == 2 and value.dtype.kind == "O":
-        table = _columns(value, 3)
-        if table is not None and _is_name(table[0][0]):
-            return _trials(_names(table[0]), _names(table[1]), _labels(table[2]))
+        for first, second, last in _columns(value, 3):
+            # A 3 × 3 cell could be either way round: the labels are no names.
+            if _is_name(first[-1]) and _is_name(second[-1]) and not any(map(_is_name, last)):
+                return _trials(_names(first), _names(second), _labels(last))
     if isinstance(value, np.void) and value.dtype.names:
         parts: list[object] = [value[name] for name in value.dtype.names]
     else:
@@ -150,22 +113,17 @@ def _fold(value: object) -> tuple[tuple[str, str, bool], ...]:
 
 def _photo_columns(part: NDArray[np.generic]) -> list[list[str]]:
     """Two columns of names, or one; none where the cell holds something else."""
-    one: list[list[object]] = [list(part.reshape(-1))]
-    columns = _columns(part, 2) or one
+    columns: list[list[object]] = next(_columns(part, 2), [list(part.reshape(-1))])
     if all(_is_name(column[0]) for column in columns):
         return [_names(column) for column in columns]
     return []
 
 
-def _columns(cell: NDArray[np.generic], count: int) -> list[list[object]] | None:
-    """Rows of a ``count`` × P cell, or columns of a P × ``count`` cell."""
-    if cell.ndim != 2:
-        return None
-    if cell.shape[0] == count:
-        return [list(cell[row]) for row in range(count)]
-    if cell.shape[1] == count:
-        return [list(cell[:, column]) for column in range(count)]
-    return None
+def _columns(cell: NDArray[np.generic], count: int) -> Iterator[list[list[object]]]:
+    """Rows of a ``count`` × P cell, then columns of a P × ``count`` cell."""
+    for table in (cell, cell.T):
+        if cell.ndim == 2 and table.shape[0] == count:
+            yield [list(row) for row in table]
 
 
 def _name_of(value: object) -> str | None:

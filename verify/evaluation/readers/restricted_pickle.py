@@ -13,56 +13,11 @@ NumPy, ``ndarray.__reduce__``, ``ndarray.__reduce_ex__`` and ``dtype.__reduce__`
 """
 
 import enum
+import pickle
 import re
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
-from pickle import (
-    APPEND,
-    APPENDS,
-    BINBYTES,
-    BINBYTES8,
-    BINGET,
-    BININT,
-    BININT1,
-    BININT2,
-    BINPUT,
-    BINSTRING,
-    BINUNICODE,
-    BINUNICODE8,
-    BUILD,
-    BYTEARRAY8,
-    EMPTY_LIST,
-    EMPTY_TUPLE,
-    FRAME,
-    GET,
-    GLOBAL,
-    INT,
-    LIST,
-    LONG,
-    LONG1,
-    LONG_BINGET,
-    LONG_BINPUT,
-    MARK,
-    MEMOIZE,
-    NEWFALSE,
-    NEWTRUE,
-    NONE,
-    PROTO,
-    PUT,
-    REDUCE,
-    SHORT_BINBYTES,
-    SHORT_BINSTRING,
-    SHORT_BINUNICODE,
-    STACK_GLOBAL,
-    STOP,
-    STRING,
-    TUPLE,
-    TUPLE1,
-    TUPLE2,
-    TUPLE3,
-    UNICODE,
-)
 from typing import cast
 
 MAX_STEPS = 6_000_000
@@ -94,7 +49,7 @@ class PickledDtype:
         return int(self.code[1])
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class PickledArray:
     """An array as it lies in the file; ``data`` is None until its contents were seen."""
 
@@ -163,7 +118,7 @@ class _Machine:
         steps = 0
         while True:
             opcode = self.take(1)
-            if opcode == STOP:
+            if opcode == pickle.STOP:
                 break
             steps += 1
             if steps > MAX_STEPS:
@@ -408,47 +363,47 @@ def _skip_frame(machine: _Machine) -> None:
 
 
 _ACTIONS: dict[bytes, _Action] = {
-    PROTO: _refuse_protocol,
-    FRAME: _skip_frame,
-    MARK: lambda m: m.push(_MARK),
-    NONE: lambda m: m.push(None),
-    NEWTRUE: lambda m: m.push(True),
-    NEWFALSE: lambda m: m.push(False),
-    INT: _Machine.integer,
-    BININT: lambda m: m.push(m.number("<i")),
-    BININT1: lambda m: m.push(m.number("<B")),
-    BININT2: lambda m: m.push(m.number("<H")),
-    LONG: _Machine.long_line,
-    LONG1: _Machine.long_bytes,
-    STRING: _Machine.quoted,
-    BINSTRING: lambda m: m.push(m.payload("<i")),
-    SHORT_BINSTRING: lambda m: m.push(m.payload("<B")),
-    BINBYTES: lambda m: m.push(m.payload("<I")),
-    SHORT_BINBYTES: lambda m: m.push(m.payload("<B")),
-    BINBYTES8: lambda m: m.push(m.payload("<Q")),
-    BYTEARRAY8: lambda m: m.push(m.payload("<Q")),
-    UNICODE: lambda m: m.text(m.line(2 * MAX_PAYLOAD), "raw-unicode-escape"),
-    BINUNICODE: lambda m: m.text(m.payload("<I")),
-    SHORT_BINUNICODE: lambda m: m.text(m.payload("<B")),
-    BINUNICODE8: lambda m: m.text(m.payload("<Q")),
-    EMPTY_LIST: lambda m: m.push([]),
-    LIST: lambda m: m.push(m.pop_to_mark()),
-    APPEND: lambda m: m.append([m.pop()]),
-    APPENDS: lambda m: m.append(m.pop_to_mark()),
-    EMPTY_TUPLE: lambda m: m.push(()),
-    TUPLE: lambda m: m.push(tuple(m.pop_to_mark())),
-    TUPLE1: lambda m: m.pop_tuple(1),
-    TUPLE2: lambda m: m.pop_tuple(2),
-    TUPLE3: lambda m: m.pop_tuple(3),
-    PUT: lambda m: m.put(m.decimal(m.line())),
-    BINPUT: lambda m: m.put(m.number("<B")),
-    LONG_BINPUT: lambda m: m.put(m.number("<I")),
-    MEMOIZE: lambda m: m.put(len(m.memo)),
-    GET: lambda m: m.get(m.decimal(m.line())),
-    BINGET: lambda m: m.get(m.number("<B")),
-    LONG_BINGET: lambda m: m.get(m.number("<I")),
-    GLOBAL: _Machine.name_of_lines,
-    STACK_GLOBAL: _Machine.name_of_stack,
-    REDUCE: _Machine.reduce,
-    BUILD: _Machine.build,
+    pickle.PROTO: _refuse_protocol,
+    pickle.FRAME: _skip_frame,
+    pickle.MARK: lambda m: m.push(_MARK),
+    pickle.NONE: lambda m: m.push(None),
+    pickle.NEWTRUE: lambda m: m.push(True),
+    pickle.NEWFALSE: lambda m: m.push(False),
+    pickle.INT: _Machine.integer,
+    pickle.BININT: lambda m: m.push(m.number("<i")),
+    pickle.BININT1: lambda m: m.push(m.number("<B")),
+    pickle.BININT2: lambda m: m.push(m.number("<H")),
+    pickle.LONG: _Machine.long_line,
+    pickle.LONG1: _Machine.long_bytes,
+    pickle.STRING: _Machine.quoted,
+    pickle.BINSTRING: lambda m: m.push(m.payload("<i")),
+    pickle.SHORT_BINSTRING: lambda m: m.push(m.payload("<B")),
+    pickle.BINBYTES: lambda m: m.push(m.payload("<I")),
+    pickle.SHORT_BINBYTES: lambda m: m.push(m.payload("<B")),
+    pickle.BINBYTES8: lambda m: m.push(m.payload("<Q")),
+    pickle.BYTEARRAY8: lambda m: m.push(m.payload("<Q")),
+    pickle.UNICODE: lambda m: m.text(m.line(2 * MAX_PAYLOAD), "raw-unicode-escape"),
+    pickle.BINUNICODE: lambda m: m.text(m.payload("<I")),
+    pickle.SHORT_BINUNICODE: lambda m: m.text(m.payload("<B")),
+    pickle.BINUNICODE8: lambda m: m.text(m.payload("<Q")),
+    pickle.EMPTY_LIST: lambda m: m.push([]),
+    pickle.LIST: lambda m: m.push(m.pop_to_mark()),
+    pickle.APPEND: lambda m: m.append([m.pop()]),
+    pickle.APPENDS: lambda m: m.append(m.pop_to_mark()),
+    pickle.EMPTY_TUPLE: lambda m: m.push(()),
+    pickle.TUPLE: lambda m: m.push(tuple(m.pop_to_mark())),
+    pickle.TUPLE1: lambda m: m.pop_tuple(1),
+    pickle.TUPLE2: lambda m: m.pop_tuple(2),
+    pickle.TUPLE3: lambda m: m.pop_tuple(3),
+    pickle.PUT: lambda m: m.put(m.decimal(m.line())),
+    pickle.BINPUT: lambda m: m.put(m.number("<B")),
+    pickle.LONG_BINPUT: lambda m: m.put(m.number("<I")),
+    pickle.MEMOIZE: lambda m: m.put(len(m.memo)),
+    pickle.GET: lambda m: m.get(m.decimal(m.line())),
+    pickle.BINGET: lambda m: m.get(m.number("<B")),
+    pickle.LONG_BINGET: lambda m: m.get(m.number("<I")),
+    pickle.GLOBAL: _Machine.name_of_lines,
+    pickle.STACK_GLOBAL: _Machine.name_of_stack,
+    pickle.REDUCE: _Machine.reduce,
+    pickle.BUILD: _Machine.build,
 }

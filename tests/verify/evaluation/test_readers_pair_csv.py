@@ -1,0 +1,135 @@
+"""A user's own pairs as CSV."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.verify.evaluation.layouts import drawn, write
+from verify import DatasetError
+from verify.evaluation.readers import notes, open_sets
+from verify.evaluation.verification_set import VerificationSet
+from verify.tenfold import FOLDS
+
+
+def read(root: Path, text: str, *, pictures: bool = True) -> VerificationSet:
+    for number, name in enumerate(("a1", "a2", "b1")):
+        write(root / "photos" / f"{name}.png", drawn(number))
+    (benchmark,) = open_sets(write(root / "Mine.csv", text), pictures=pictures)
+    return benchmark
+
+
+def table(header: str, same: str, other: str, *, folds: list[str] | None = None) -> str:
+    rows = []
+    for fold in folds if folds is not None else [""] * FOLDS:
+        rows += [f"{same}{fold}", f"{other}{fold}"]
+    return "\n".join([header, *rows]) + "\n"
+
+
+HEADER = "path_a,path_b,same"
+SAME = "photos/a1.png,photos/a2.png,1"
+OTHER = "photos/a1.png,photos/b1.png,0"
+
+
+def test_pairs(tmp_path: Path) -> None:
+    mine = read(tmp_path, table(HEADER, SAME, OTHER))
+    assert (mine.name, mine.kind, mine.people) == ("Mine", "pairs", None)
+    assert [one.name for one in mine.pictures] == [
+        "photos/a1.png",
+        "photos/a2.png",
+        "photos/b1.png",
+    ]
+    assert [one.read() for one in mine.pictures] == [drawn(0), drawn(1), drawn(2)]
+    np.testing.assert_array_equal(mine.first, 0)
+    np.testing.assert_array_equal(mine.second, [1, 2] * FOLDS)
+    np.testing.assert_array_equal(mine.same, [True, False] * FOLDS)
+    np.testing.assert_array_equal(mine.folds, np.arange(2 * FOLDS) // 2)
+    assert notes(mine) == ["Mine: 18 pairs compare the same two photos as another pair"]
+
+
+def test_what_spreadsheets_write(tmp_path: Path) -> None:
+    text = table(
+        'Path_A, "path_b",SAME',
+        '"photos/a1.png", photos/../photos/a2.png ,Yes',
+        f"{tmp_path}/photos/a1.png,photos/b1.png,FALSE",
+    )
+    mine = read(tmp_path, "\ufeff" + text.replace("\n", "\r\n").replace(', "', ',"') + "\r\n,,\r\n")
+    assert len(mine) == 2 * FOLDS
+    # The absolute path is the same photo as the relative one.
+    assert [one.name for one in mine.pictures] == [
+        "photos/a1.png",
+        "photos/../photos/a2.png",
+        "photos/b1.png",
+    ]
+
+
+@pytest.mark.parametrize("start", [0, 1])
+def test_folds(tmp_path: Path, start: int) -> None:
+    folds = [f",{fold}" for fold in reversed(range(start, start + FOLDS))]
+    mine = read(tmp_path, table(f"{HEADER},fold", SAME, OTHER, folds=folds))
+    np.testing.assert_array_equal(mine.folds, np.repeat(np.arange(FOLDS)[::-1], 2))
+
+
+@pytest.mark.parametrize(
+    ("folds", "message"),
+    [
+        (range(11), "both 0 and 10"),
+        (range(1, 10), "neither 0 nor 10"),
+        ([*range(5), 9, 0], "fold 6 has no genuine and no impostor pair"),
+        ([11, 0], "line 2 has no fold of 1 to 10"),
+        (["x", 0], "line 2 has no fold"),
+    ],
+)
+def test_wrong_folds(tmp_path: Path, folds: list[object], message: str) -> None:
+    text = table(f"{HEADER},fold", SAME, OTHER, folds=[f",{fold}" for fold in folds])
+    with pytest.raises(DatasetError, match=message):
+        read(tmp_path, text)
+
+
+def test_people(tmp_path: Path) -> None:
+    header = f"{HEADER},person_a,person_b"
+    mine = read(tmp_path, table(header, f"{SAME},Ann,Ann", f"{OTHER},Ann,Bob"))
+    assert mine.people == ("Ann", "Ann", "Bob")
+    for same, other, message in (
+        (f"{SAME},Ann,Bob", f"{OTHER},Ann,Bob", "line 2 contradicts itself"),
+        (f"{SAME},Ann,Ann", f"{OTHER},Eve,Bob", "line 3 has another person on photos/a1.png"),
+        (f"{SAME},Ann,", f"{OTHER},Ann,Bob", "line 2 has no name in person_b"),
+    ):
+        with pytest.raises(DatasetError, match=message):
+            read(tmp_path, table(header, same, other))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (table(HEADER, "a,b,perhaps", OTHER), r"10 fault\(s\).*line 2 has neither 1/true/yes"),
+        (table(HEADER, "https://x.org/a.png,b,1", OTHER), "line 2 has a URL in path_a"),
+        (table(HEADER, "a,file:///b,1", OTHER), "line 2 has a URL in path_b"),
+        (table(HEADER, ",b,1", OTHER), "line 2 has no path in path_a"),
+        (table(HEADER, "a\0,b,1", OTHER), "line 2 has no path in path_a"),
+        (table(HEADER, "a,b", OTHER), "line 2 has 2 cells, not 3"),
+        (table(HEADER, '"a"x,b,1', OTHER), "line 2 is no CSV"),
+        (table("path_a,path_b", SAME, OTHER), "no column same"),
+        (table(f"{HEADER},score", SAME, OTHER), "unknown column 'score'"),
+        (table(f"{HEADER},same", SAME, OTHER), "names a column twice"),
+        (table(f"{HEADER},person_a", SAME, OTHER), "only one of person_a"),
+        (table(HEADER, SAME, OTHER).replace(",", ";"), "save it with commas"),
+        (HEADER, "holds no pair"),
+        ("", "no column path_a"),
+        (table(HEADER, SAME, SAME), "fold 1 has no impostor pair"),
+        (table(HEADER, "x.png,y.png,1", OTHER), r"2 fault\(s\).*x.png is not there; y.png is"),
+    ],
+)
+def test_faults_are_listed_by_line(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(DatasetError, match=message):
+        read(tmp_path, text)
+
+
+def test_photos_need_not_be_there(tmp_path: Path) -> None:
+    mine = read(tmp_path, table(HEADER, "x.png,y.png,1", OTHER), pictures=False)
+    assert [one.name for one in mine.pictures][:2] == ["x.png", "y.png"]
+
+
+def test_a_file_that_is_not_utf_8(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="not UTF-8"):
+        open_sets(write(tmp_path / "mine.csv", b"path_a,path_b,same\n\xff,b,1\n"))
