@@ -7,7 +7,7 @@ Example
 -------
 ::
 
-    python -m benchmarks.readme_results results.json --write README.md
+    python -m benchmarks.readme_results results.json --write README.md --keep docs/results/lfw.json
 """
 
 import argparse
@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from verify.datasets import DatasetError
-from verify.evaluation.cells import MISSING, count, fixed, table
+from verify.evaluation.markdown_cells import MISSING, count, fixed, table
 from verify.evaluation.row_labels import LIFTINGS, Row, order_of, raw_row, strategy_label
 
 FORMAT, VERSION = "veilface evaluation", 1
@@ -137,6 +137,20 @@ def _caption(results: Row, dataset: Row, raw: Row, rows: Sequence[Row]) -> str:
     )
 
 
+def kept(results: Mapping[str, Any]) -> str:
+    """Return the results as they are kept in the repository: rows without single runs."""
+    parts = []
+    for name, value in results.items():
+        if name in ("runs", "curves"):
+            continue
+        text = json.dumps(value, ensure_ascii=False)
+        if isinstance(value, list):
+            entries = ",\n  ".join(json.dumps(entry, ensure_ascii=False) for entry in value)
+            text = f"[\n  {entries}\n ]"
+        parts.append(f" {json.dumps(name)}: {text}")
+    return "{\n" + ",\n".join(parts) + "\n}\n"
+
+
 def written_into(text: str, block: str) -> str:
     """Return a text whose part between the markers is the block.
 
@@ -156,9 +170,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description="Make the README's results table.")
     parser.add_argument("results", type=Path, metavar="RESULTS.json")
     parser.add_argument("--write", type=Path, metavar="README.md")
+    parser.add_argument("--keep", type=Path, metavar="COPY.json", help="without runs and curves")
     options = parser.parse_args(arguments)
     try:
-        block = readme_table(read_results(options.results))
+        results = read_results(options.results)
+        block = readme_table(results)
+        if options.keep is not None:
+            options.keep.write_text(kept(results), encoding="utf-8")
         if options.write is None:
             print(block)
             return 0

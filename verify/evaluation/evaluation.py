@@ -1,6 +1,7 @@
 """The evaluation of one set: all units, wherever they run, put together in a fixed order."""
 
 import hashlib
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -41,6 +42,8 @@ class Evaluated:
         In the order of the plan.
     source_of
         Position of the decoy source of each lifted cell.
+    work
+        What each unit took, in the order of the plan.
     """
 
     facts: SetFacts
@@ -48,6 +51,26 @@ class Evaluated:
     kept: NDArray[np.int64]
     runs: list[Run]
     source_of: dict[Any, int | None]
+    work: list["Work"]
+
+
+@dataclass(frozen=True)
+class Work:
+    """What a unit took.
+
+    Parameters
+    ----------
+    unit
+        What was done.
+    seconds
+        Of one thread, from the descriptors to the figures.
+    resumed
+        Whether its similarities were there already.
+    """
+
+    unit: Unit
+    seconds: float
+    resumed: bool
 
 
 def prepare(
@@ -151,25 +174,33 @@ def evaluate_set(
     ]
     shared = (material, plan.targets)
     found: list[list[Run]] = [[] for _ in units]
-    for index, runs in spread(backend, _run, shared, list(zip(units, known, strict=True))):
+    seconds = [0.0 for _ in units]
+    for index, (runs, taken) in spread(backend, _run, shared, zip(units, known, strict=True)):
         if known[index] is None:
             checkpoints.save(units[index], runs)
-        found[index] = runs
+        found[index], seconds[index] = runs, taken
         progress(1)
     source_of = {
         cell: unit.source if isinstance(unit, LiftUnit) else None
         for unit, layout in zip(units, layouts, strict=True)
         for cell, _ in layout
     }
-    return Evaluated(facts, material, kept, [run for runs in found for run in runs], source_of)
+    work = [
+        Work(unit, taken, resumed=column is not None)
+        for unit, taken, column in zip(units, seconds, known, strict=True)
+    ]
+    runs = [run for each in found for run in each]
+    return Evaluated(facts, material, kept, runs, source_of, work)
 
 
 def _run(
     shared: tuple[Material, Sequence[float]], item: tuple[Unit, list[NDArray[np.float64]] | None]
-) -> list[Run]:
+) -> tuple[list[Run], float]:
     material, targets = shared
     unit, known = item
-    return run_unit(material, unit, targets=targets, known=known)
+    start = time.perf_counter()
+    runs = run_unit(material, unit, targets=targets, known=known)
+    return runs, time.perf_counter() - start
 
 
 def _digest(material: Material) -> str:

@@ -3,7 +3,15 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from verify.evaluation.cells import MISSING, fixed, interval_cell, percent, plain, power, table
+from verify.evaluation.markdown_cells import (
+    MISSING,
+    fixed,
+    interval_cell,
+    percent,
+    plain,
+    power,
+    table,
+)
 from verify.evaluation.row_labels import METRIC_NAMES, MODE_NAMES, Row, order_of, strategy_label
 
 FEW = "*"

@@ -1,10 +1,13 @@
 """The document of an evaluation: every figure with what it came from (docs/evaluation.md)."""
 
 import platform
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from typing import Any
+
+import numpy as np
 
 from models.extraction import Failure
 from templates.binding import Binding
@@ -12,7 +15,7 @@ from templates.decoys import DecoyPool
 from templates.lifting import Strategy
 from templates.rotation import ROTATION_VERSION
 from verify.evaluation.backends import SOFTWARE
-from verify.evaluation.evaluation import Evaluated
+from verify.evaluation.evaluation import Evaluated, Work
 from verify.evaluation.material import Source
 from verify.evaluation.plan import Plan
 from verify.evaluation.rows import (
@@ -23,7 +26,7 @@ from verify.evaluation.rows import (
     row_json,
     run_json,
 )
-from verify.evaluation.scoring import decoy_kind
+from verify.evaluation.scoring import decoy_kind, unit_layout
 from verify.evaluation.units import Cell, Mode
 from verify.evaluation.verification_set import VerificationSet
 from verify.tenfold import FOLDS
@@ -144,7 +147,7 @@ def document(
 ) -> Json:
     """Put everything together; ``rows`` and ``runs`` depend on seeds and inputs only.
 
-    Times of comparisons are apart, in ``timings``: they differ from run to run.
+    Times are apart, in ``timings`` and ``work``: they differ from run to run.
     """
     rows: list[Json] = []
     runs: list[Json] = []
@@ -185,6 +188,11 @@ def document(
         "groups": list(groups),
         "group_summaries": list(group_summaries),
         "timings": list(timings),
+        "work": [
+            {"dataset": each.pairs.name, **entry}
+            for each in sets
+            for entry in _work(each.evaluated)
+        ],
         "refused": refused_targets(
             plan.targets, {each.pairs.name: each.evaluated.facts.impostor for each in sets}
         ),
@@ -192,6 +200,25 @@ def document(
         "curves": curves,
         "folds": FOLDS,
     }
+
+
+def _work(evaluated: Evaluated) -> list[Json]:
+    """Seconds of a thread for each kind of unit: the mean over its seeds."""
+    kinds: defaultdict[tuple[Any, ...], list[Work]] = defaultdict(list)
+    for work in evaluated.work:
+        cell, _ = unit_layout(work.unit, evaluated.material.sources)[0]
+        kinds[cell.strategy, cell.decoys, cell.dim].append(work)
+    return [
+        {
+            "strategy": strategy,
+            "decoys": decoys,
+            "dim": dim,
+            "units": len(works),
+            "resumed": sum(work.resumed for work in works),
+            "seconds_mean": float(np.mean([work.seconds for work in works])),
+        }
+        for (strategy, decoys, dim), works in kinds.items()
+    ]
 
 
 def contract_id(model: Model, cell: Cell, source: Source | None) -> str | None:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from verify.evaluation import group_tables
-from verify.evaluation.cells import (
+from verify.evaluation.markdown_cells import (
     MISSING,
     accuracy,
     code,

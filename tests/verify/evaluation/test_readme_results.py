@@ -107,3 +107,12 @@ def test_all_that_the_results_lack_is_said() -> None:
 def test_a_readme_without_its_markers_is_left_alone(text: str) -> None:
     with pytest.raises(DatasetError, match="each once"):
         written_into(text, "table")
+
+
+def test_the_kept_copy_has_everything_but_single_runs(tmp_path: Path) -> None:
+    results = sample_results(dims=(2,))
+    copy = tmp_path / "kept.json"
+    assert main([str(document(tmp_path, results)), "--keep", str(copy)]) == 0
+    kept = json.loads(copy.read_text(encoding="utf-8"))
+    assert kept == {k: v for k, v in results.items() if k not in ("runs", "curves")}
+    assert readme_table(kept) == readme_table(results)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.verify.evaluation.sample_results import sample_results
-from verify.evaluation import cells
+from verify.evaluation import markdown_cells as cells
 from verify.evaluation.groups import by_group
 from verify.evaluation.tables import markdown, write_csv
 
