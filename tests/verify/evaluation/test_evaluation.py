@@ -129,12 +129,14 @@ def test_a_run_goes_on_where_it_was_interrupted(
     monkeypatch.setattr(evaluation, "run_unit", counted)
     again = document_of(run(tmp_path / "cut"))
     assert len(computed) == 1 + 2 * 2 * 2 + 2 * 2 - 5
-    assert again == whole
+    for part in ("rows", "runs", "curves"):
+        assert again[part] == whole[part]
+    assert sum(entry["resumed"] for entry in again["work"]) == 5
     # A file that was cut off is computed again.
     damaged = sorted((tmp_path / "cut" / "units").iterdir())[0]
     damaged.write_bytes(damaged.read_bytes()[:100])
     computed.clear()
-    assert document_of(run(tmp_path / "cut")) == whole
+    assert document_of(run(tmp_path / "cut"))["rows"] == whole["rows"]
     assert len(computed) == 1
 
 
