@@ -88,18 +88,44 @@ class Embedder:
         ModelError
             If the crops have another shape or type, or an output is zero or not finite.
         """
-        size = self.preprocessing.size
-        if crops.dtype != np.uint8 or crops.ndim != 4 or crops.shape[1:] != (size, size, 3):
-            raise ModelError(
-                f"Aligned crops must be uint8 of shape (B, {size}, {size}, 3); got {crops.dtype}"
-                f" of shape {crops.shape}."
-            )
+        self._check(crops)
         raw = np.empty((len(crops), self.n), dtype=np.float32)
         for start in range(0, len(crops), MAX_BATCH):
             part = crops[start : start + MAX_BATCH]
             raw[start : start + MAX_BATCH] = self._raw(part)
             if flip:
                 raw[start : start + MAX_BATCH] += self._raw(part[:, :, ::-1])
+        return self._normalised(raw)
+
+    def embed_both(
+        self, crops: NDArray[np.uint8]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Embed aligned crops without and with the mirror image, at the cost of the latter.
+
+        Parameters and errors as in :meth:`embed`.
+
+        Returns
+        -------
+        two ndarrays of float32, shape (B, n)
+        """
+        self._check(crops)
+        plain = np.empty((len(crops), self.n), dtype=np.float32)
+        both = np.empty_like(plain)
+        for start in range(0, len(crops), MAX_BATCH):
+            rows = slice(start, start + MAX_BATCH)
+            plain[rows] = self._raw(crops[rows])
+            both[rows] = plain[rows] + self._raw(crops[rows][:, :, ::-1])
+        return self._normalised(plain), self._normalised(both)
+
+    def _check(self, crops: NDArray[np.uint8]) -> None:
+        size = self.preprocessing.size
+        if crops.dtype != np.uint8 or crops.ndim != 4 or crops.shape[1:] != (size, size, 3):
+            raise ModelError(
+                f"Aligned crops must be uint8 of shape (B, {size}, {size}, 3); got {crops.dtype}"
+                f" of shape {crops.shape}."
+            )
+
+    def _normalised(self, raw: NDArray[np.float32]) -> NDArray[np.float32]:
         # float64: squares of large activations overflow float32.
         norms = np.linalg.norm(raw.astype(np.float64), axis=1, keepdims=True)
         if not np.isfinite(norms).all() or (norms == 0).any():

@@ -5,7 +5,7 @@ import json
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -45,6 +45,8 @@ class EncodedImage:
 
 
 Source = str | Path | EncodedImage
+Embeddings = tuple[NDArray[np.float32], ...]
+"""What one file gave: its embedding, or the one without and the one with the mirror image."""
 
 
 @dataclass(frozen=True)
@@ -70,12 +72,15 @@ class Extraction:
         All others, in the order in which they were given.
     cached
         How many of ``paths`` came from the cache.
+    mirrored
+        The descriptors with the mirror image added, where they were asked for.
     """
 
     descriptors: NDArray[np.float32] = field(repr=False)
     paths: list[Path]
     failures: list[Failure]
     cached: int
+    mirrored: NDArray[np.float32] | None = field(default=None, repr=False)
 
     @property
     def attempts(self) -> int:
@@ -111,6 +116,14 @@ class Extractor:
         Threads that decode, detect and align; ``None`` for one per core.
     limits
         Of the decoder.
+    mirrored
+        Embed every face with the mirror image added too, beside the embedding without it; the
+        pack must be one without.
+
+    Raises
+    ------
+    ValueError
+        If ``mirrored`` is asked of a pack that adds the mirror image anyway.
     """
 
     def __init__(
@@ -123,7 +136,10 @@ class Extractor:
         aligned: bool = False,
         workers: int | None = None,
         limits: ImageLimits = DEFAULT_LIMITS,
+        mirrored: bool = False,
     ) -> None:
+        if mirrored and pack.info.preprocessing["flip"]:
+            raise ValueError("the pack adds the mirror image already")
         self._pack = pack
         self._cache = cache
         self._policy = policy
@@ -131,7 +147,11 @@ class Extractor:
         self._aligned = aligned or pack.info.detector is None
         self._workers = workers or default_workers()
         self._limits = limits
-        self._key_prefix = self._settings_digest()
+        # One kind of embedding, or the two kinds that are made together.
+        self._kinds = tuple(
+            self._settings_digest({**pack.info.preprocessing, "flip": flip})
+            for flip in ([False, True] if mirrored else [pack.info.preprocessing["flip"]])
+        )
 
     def extract(
         self, paths: Iterable[Source], *, progress: bool | Advance | None = None
@@ -159,7 +179,7 @@ class Extractor:
             If inference itself fails, which is not the fault of a file.
         """
         files = [path if isinstance(path, EncodedImage) else Path(path) for path in paths]
-        rows: list[NDArray[np.float32]] = []
+        rows: list[Embeddings] = []
         done: list[Path] = []
         failures: list[Failure] = []
         cached = 0
@@ -184,10 +204,16 @@ class Extractor:
         finally:
             if self._cache is not None:
                 self._cache.flush()
-        descriptors = np.stack(rows) if rows else np.empty((0, self._pack.info.n), np.float32)
-        return Extraction(np.ascontiguousarray(descriptors), done, failures, cached)
+        kinds = [
+            np.stack([row[kind] for row in rows])
+            if rows
+            else np.empty((0, self._pack.info.n), np.float32)
+            for kind in range(len(self._kinds))
+        ]
+        mirrored = kinds[1] if len(kinds) == 2 else None
+        return Extraction(kinds[0], done, failures, cached, mirrored)
 
-    def _settings_digest(self) -> bytes:
+    def _settings_digest(self, preprocessing: Mapping[str, object]) -> bytes:
         """Everything besides the picture that an embedding depends on."""
         info = self._pack.info
         detector = None
@@ -195,7 +221,7 @@ class Extractor:
             detector = [info.detector.sha256, list(info.detector.input_size), self._policy.value]
         settings = {
             "embedder": info.embedder_sha256,
-            "preprocessing": info.preprocessing,
+            "preprocessing": preprocessing,
             "detector": detector,
             # A cached embedding must not outlive a stricter gate.
             "quality": None if self._quality is None else repr(self._quality),
@@ -207,10 +233,12 @@ class Extractor:
         path = _named(source)
         try:
             data = _read(source, self._limits.max_bytes)
-            key = hashlib.sha256(self._key_prefix + hashlib.sha256(data).digest()).digest()
-            known = None if self._cache is None else self._cache.get(key)
-            if known is not None:
-                return _Prepared(key, embedding=known)
+            content = hashlib.sha256(data).digest()
+            key = tuple(hashlib.sha256(kind + content).digest() for kind in self._kinds)
+            known = () if self._cache is None else tuple(self._cache.get(each) for each in key)
+            found = tuple(each for each in known if each is not None)
+            if len(found) == len(key):
+                return _Prepared(key, embedding=found)
             if self._aligned:
                 crop = self._pack.as_aligned(decode_image(data, limits=self._limits))
             else:
@@ -219,21 +247,25 @@ class Extractor:
                 )
             return _Prepared(key, crop=crop)
         except (ImageError, FaceError) as error:
-            return _Prepared(b"", failure=Failure(path, error.code, str(error)))
+            return _Prepared((), failure=Failure(path, error.code, str(error)))
         except OSError as error:
             reason = f"The file cannot be read: {error.strerror}."
-            return _Prepared(b"", failure=Failure(path, "unreadable_file", reason))
+            return _Prepared((), failure=Failure(path, "unreadable_file", reason))
 
-    def _embed(self, items: Sequence["_Prepared"]) -> dict[bytes, NDArray[np.float32]]:
+    def _embed(self, items: Sequence["_Prepared"]) -> dict[tuple[bytes, ...], Embeddings]:
         """Embed the crops of a chunk in batches; copies of one file are computed once."""
         unique = {item.key: item.crop for item in items if item.crop is not None}
         if not unique:
             return {}
-        embeddings = self._pack.embed(np.stack(list(unique.values())))
-        result = dict(zip(unique, embeddings, strict=True))
+        crops = np.stack(list(unique.values()))
+        kinds: tuple[NDArray[np.float32], ...] = (
+            self._pack.embed_both(crops) if len(self._kinds) == 2 else (self._pack.embed(crops),)
+        )
+        result = dict(zip(unique, zip(*kinds, strict=True), strict=True))
         if self._cache is not None:
-            for key, embedding in result.items():
-                self._cache.put(key, embedding)
+            for key, embeddings in result.items():
+                for each, embedding in zip(key, embeddings, strict=True):
+                    self._cache.put(each, embedding)
         return result
 
 
@@ -241,9 +273,9 @@ class Extractor:
 class _Prepared:
     """One file before embedding: exactly one of the last three is set."""
 
-    key: bytes = field(repr=False)
+    key: tuple[bytes, ...] = field(repr=False)
     crop: NDArray[np.uint8] | None = field(default=None, repr=False)
-    embedding: NDArray[np.float32] | None = field(default=None, repr=False)
+    embedding: Embeddings | None = field(default=None, repr=False)
     failure: Failure | None = None
 
 

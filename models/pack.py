@@ -231,6 +231,12 @@ class ModelPack:
         chosen = self._embedder.preprocessing.flip if flip is None else flip
         return self._embedder.embed(aligned, flip=chosen)
 
+    def embed_both(
+        self, aligned: NDArray[np.uint8]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Embed aligned crops without and with the mirror image; see :meth:`embed`."""
+        return self._embedder.embed_both(aligned)
+
     def crop_photo(
         self,
         data: bytes,

@@ -1,5 +1,6 @@
 """Every command of the README is run: here with real weights, or by CI."""
 
+import json
 import os
 import re
 import subprocess
@@ -10,6 +11,7 @@ from pathlib import Path
 import httpx
 import pytest
 
+from benchmarks.readme_results import read_results, readme_table, written_into
 from models.errors import FaceError
 from models.pack import ModelPack
 from models.quality import QualityLimits
@@ -97,6 +99,39 @@ def test_the_real_path_from_weights_to_a_receipt(
         server.terminate()
         server.wait(timeout=30)
     assert '"decision":"accept"' in answers.replace(": ", ":")
+
+
+def test_the_evaluation_on_a_part_of_lfw(
+    newcomer: tuple[Path, dict[str, str]], mbf_pack_dir: Path, fairface: Path, lfw_aligned: Path
+) -> None:
+    folder, env = newcomer
+    faces, lfw = folder / "faces", folder / "lfw"
+    faces.mkdir()
+    lfw.mkdir()
+    for photo in sorted((fairface / "train").glob("*.jpg"))[:150]:
+        (faces / photo.name).symlink_to(photo)
+    header, *lines = (lfw_aligned / "pairs.txt").read_text().splitlines()
+    assert header == "10\t300"
+    starts = range(0, len(lines), 300)
+    kept = [line for start in starts for line in lines[start : start + 6]]
+    (lfw / "pairs.txt").write_text("\n".join(["10\t6", *kept, ""]))
+    for name in {part for line in kept for part in line.split("\t") if not part.isdecimal()}:
+        (lfw / name).symlink_to(lfw_aligned / name)
+
+    activate = f". .venv/bin/activate\nPACK={mbf_pack_dir}"
+    shell(f"{activate}\nveilface decoys build {faces} --pack $PACK", folder, env)
+    shell(with_values(BLOCKS[3], {"PACK": str(mbf_pack_dir), "LFW": str(lfw)}), folder, env)
+    results = json.loads((folder / "lfw-results" / "results.json").read_text())
+    assert results["datasets"][0]["pairs"] == 120
+    table = readme_table(results)
+    assert "120 pairs of LFW" in table
+    assert "| adversarial (generator)" in table
+
+
+def test_the_results_table_is_that_of_the_results_in_the_repository() -> None:
+    results = read_results(ROOT / "docs" / "results" / "lfw.json")
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert written_into(text, readme_table(results)) == text
 
 
 def somebody_alone(people: list[Path], pack: ModelPack) -> tuple[Path, list[Path]]:

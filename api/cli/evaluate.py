@@ -313,7 +313,6 @@ def _evaluate(
         material, facts, kept = prepare(
             each.pairs,
             each.acquired,
-            flipped=each.flipped,
             attributes=attributes,
             sources=decoys,
         )

@@ -67,14 +67,16 @@ class Descriptors:
 
     Parameters
     ----------
-    pack, flip_pack
-        The pack as it is named, and the same with the mirror image where that is wanted beside.
+    pack
+        The pack as it is named.
+    mirrored
+        Whether descriptors with the mirror image are wanted beside those without.
     file
         Descriptors that were computed elsewhere.
     """
 
     pack: ModelPack | None
-    flip_pack: ModelPack | None
+    mirrored: bool
     file: EmbeddingsFile | None
     file_name: str = ""
 
@@ -119,12 +121,12 @@ def open_descriptors(
         if no_pack:
             raise UsageError(why)
         pack = bulk_pack(settings, flip=flip, why=why)
-        return Descriptors(pack, bulk_pack(settings, flip=True, why=why) if both else None, None)
+        return Descriptors(pack, both, None)
     if not no_pack:
         raise UsageError("give a pack, or --pack none and --embeddings, not both")
     if flip:
         raise UsageError("--flip needs a pack: descriptors in a file are as they are")
-    return Descriptors(None, None, read_embeddings(embeddings), embeddings.name)
+    return Descriptors(None, False, read_embeddings(embeddings), embeddings.name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +135,6 @@ class Faces:
 
     pairs: VerificationSet
     acquired: Acquired
-    flipped: Acquired | None
     aligned: bool | None
     pictures_sha256: str
 
@@ -155,7 +156,7 @@ def acquire_faces(
         No photo gave one.
     """
     if descriptors.file is not None:
-        faces = Faces(pairs, from_file(pairs, descriptors.file), None, None, "")
+        faces = Faces(pairs, from_file(pairs, descriptors.file), None, "")
     else:
         assert descriptors.pack is not None  # noqa: S101 - one of both is there
         contents = digests(pairs)
@@ -163,37 +164,26 @@ def acquire_faces(
         crops = pairs.aligned if aligned is None else aligned
         if crops is None:
             crops = descriptors.pack.info.detector is None or are_aligned(pairs, size)
-        found: list[Acquired | None] = []
-        for pack in (descriptors.pack, descriptors.flip_pack):
-            if pack is None:
-                found.append(None)
-                continue
-            source = PackSource(
-                folder=Path(str(settings.pack)).expanduser().resolve(),
-                embedder_sha256=pack.info.embedder_sha256,
-                providers=settings.providers,
-                threads=None if backend.scheduler is None else 1,
-                flip=bool(pack.info.preprocessing["flip"]),
-                aligned=crops,
+        source = PackSource(
+            folder=Path(str(settings.pack)).expanduser().resolve(),
+            embedder_sha256=descriptors.pack.info.embedder_sha256,
+            providers=settings.providers,
+            threads=None if backend.scheduler is None else 1,
+            flip=bool(descriptors.pack.info.preprocessing["flip"]),
+            aligned=crops,
+            mirrored=descriptors.mirrored,
+        )
+        with progress(f"embedding {pairs.name}", len(pairs.pictures)) as advance:
+            acquired = acquire(
+                pairs,
+                contents,
+                descriptors.pack,
+                source,
+                cache=cache,
+                backend=backend,
+                progress=advance,
             )
-            what = " with the mirror image" if pack is descriptors.flip_pack else ""
-            with progress(f"embedding {pairs.name}{what}", len(pairs.pictures)) as advance:
-                found.append(
-                    acquire(
-                        pairs,
-                        contents,
-                        pack,
-                        source,
-                        cache=cache,
-                        backend=backend,
-                        progress=advance,
-                    )
-                )
-            if cache is not None:
-                cache.flush()
-        first = found[0]
-        assert first is not None  # noqa: S101 - the pack is there
-        faces = Faces(pairs, first, found[1], crops, digest_of_pictures(contents))
+        faces = Faces(pairs, acquired, crops, digest_of_pictures(contents))
     if not len(faces.acquired.descriptors):
         raise CommandError(
             f"{pairs.name}: no photo gave a descriptor, the first because of "

@@ -36,7 +36,7 @@ def expected(seeds) -> np.ndarray:
 
 
 def test_rows_follow_the_order_of_the_paths(pack, files, monkeypatch):
-    monkeypatch.setattr(extraction, "_CHUNK", 3)
+    monkeypatch.setattr(extraction, "CHUNK", 3)
     order = [4, 0, 6, 2, 1, 5, 3]
     result = Extractor(pack, workers=3).extract([files[i] for i in order])
     np.testing.assert_allclose(result.descriptors, expected(order), atol=2e-5)
@@ -135,7 +135,7 @@ def test_the_cache_file_is_written_even_when_inference_breaks(pack, files, monke
 
 
 def test_a_function_is_told_how_many_are_done(pack, files, monkeypatch):
-    monkeypatch.setattr(extraction, "_CHUNK", 3)
+    monkeypatch.setattr(extraction, "CHUNK", 3)
     told = []
     Extractor(pack).extract(files, progress=told.append)
     assert told == [3, 3, 1]
@@ -183,3 +183,33 @@ def test_aligned_crops_skip_detection(mbf_pack_dir, lfw_aligned, monkeypatch):
     result = Extractor(pack, aligned=True).extract(paths)
     crops = np.stack([np.asarray(Image.open(io.BytesIO(p.read_bytes()))) for p in paths])
     np.testing.assert_allclose(result.descriptors, pack.embed(crops), atol=1e-5)
+
+
+def test_both_kinds_at_once_are_those_of_two_packs(tmp_path, files, monkeypatch):
+    monkeypatch.setattr(extraction, "CHUNK", 3)
+    folder = write_pack(tmp_path / "p", e=pooling_embedder())
+    plain, flipped = (ModelPack.load(folder, threads=1, flip=flip) for flip in (False, True))
+    cache = EmbeddingCache()
+    both = Extractor(plain, mirrored=True, cache=cache).extract(files)
+    np.testing.assert_array_equal(both.descriptors, Extractor(plain).extract(files).descriptors)
+    np.testing.assert_array_equal(both.mirrored, Extractor(flipped).extract(files).descriptors)
+    # What one of the packs has embedded alone is known to both, and the other way round.
+    assert len(cache) == 2 * len(files)
+    assert Extractor(flipped, cache=cache).extract(files).cached == len(files)
+    again = Extractor(plain, mirrored=True, cache=cache).extract(files)
+    assert again.cached == len(files)
+    np.testing.assert_array_equal(again.mirrored, both.mirrored)
+    with pytest.raises(ValueError, match="adds the mirror image already"):
+        Extractor(flipped, mirrored=True)
+    assert Extractor(plain).extract(files).mirrored is None
+
+
+def test_encoded_photos_stand_under_their_names(pack, files):
+    photos = [
+        extraction.EncodedImage(f"{i:03d}", path.read_bytes()) for i, path in enumerate(files)
+    ]
+    result = Extractor(pack).extract([*photos, extraction.EncodedImage("bad", b"x")])
+    assert [str(path) for path in result.paths] == [photo.name for photo in photos]
+    assert [(str(f.path), f.code) for f in result.failures] == [("bad", "unsupported_image")]
+    np.testing.assert_array_equal(result.descriptors, Extractor(pack).extract(files).descriptors)
+    assert "data" not in repr(photos[0])

@@ -34,6 +34,8 @@ class PackSource:
         As in :meth:`models.pack.ModelPack.load`.
     aligned
         Whether the photos are aligned crops.
+    mirrored
+        Whether descriptors with the mirror image are wanted beside those without.
     """
 
     folder: Path
@@ -42,6 +44,7 @@ class PackSource:
     threads: int | None
     flip: bool
     aligned: bool
+    mirrored: bool = False
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -56,11 +59,14 @@ class Acquired:
         Row of each picture; -1 where it failed.
     failures
         The others, with the reason; ``path`` is the picture's name.
+    mirrored : (k, n) float32, optional
+        The same rows with the mirror image added.
     """
 
     descriptors: NDArray[np.float32]
     rows: Indices
     failures: tuple[Failure, ...]
+    mirrored: NDArray[np.float32] | None = None
 
 
 def digests(pairs: VerificationSet) -> list[str]:
@@ -112,7 +118,7 @@ def acquire(
             unique.append(picture)
     done: list[Extraction]
     if backend.scheduler is None:
-        extractor = Extractor(pack, aligned=source.aligned, cache=cache)
+        extractor = Extractor(pack, aligned=source.aligned, cache=cache, mirrored=source.mirrored)
         sources = [picture.source for picture in unique]
         done = [extractor.extract(sources, progress=progress)]
         keys = [str(each.name if isinstance(each, EncodedImage) else each) for each in sources]
@@ -135,6 +141,7 @@ def acquire(
         for picture, content in zip(pairs.pictures, contents, strict=True)
     ]
     rows = [extraction.descriptors for extraction in done]
+    mirrored = [e.mirrored for e in done if e.mirrored is not None]
     return Acquired(
         np.concatenate([np.empty((0, pack.info.n), np.float32), *rows]),
         np.array([row_of.get(name, -1) for name in names], dtype=np.int64),
@@ -143,6 +150,7 @@ def acquire(
             for picture, name in zip(pairs.pictures, names, strict=True)
             if name not in row_of
         ),
+        np.concatenate(mirrored) if mirrored else None,
     )
 
 
@@ -172,7 +180,8 @@ def _loaded(source: PackSource) -> ModelPack:
 
 
 def _extract(source: PackSource, chunk: list[EncodedImage]) -> Extraction:
-    return Extractor(_loaded(source), aligned=source.aligned).extract(chunk, progress=False)
+    extractor = Extractor(_loaded(source), aligned=source.aligned, mirrored=source.mirrored)
+    return extractor.extract(chunk, progress=False)
 
 
 def from_file(pairs: VerificationSet, embeddings: EmbeddingsFile) -> Acquired:

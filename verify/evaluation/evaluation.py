@@ -16,7 +16,7 @@ from verify.evaluation.acquisition import Acquired
 from verify.evaluation.backends import SOFTWARE, Backend, spread
 from verify.evaluation.checkpoints import Checkpoints
 from verify.evaluation.material import Material, Source
-from verify.evaluation.plan import EvaluationError, Plan, units_of
+from verify.evaluation.plan import Plan, units_of
 from verify.evaluation.rows import SetFacts
 from verify.evaluation.runs import Run, run_unit
 from verify.evaluation.scoring import unit_layout
@@ -77,7 +77,6 @@ def prepare(
     pairs: VerificationSet,
     acquired: Acquired,
     *,
-    flipped: Acquired | None,
     attributes: Sequence[Attributes] | None,
     sources: Sequence[Source],
 ) -> tuple[Material, SetFacts, NDArray[np.int64]]:
@@ -90,17 +89,12 @@ def prepare(
 
     Raises
     ------
-    EvaluationError, DatasetError
+    DatasetError
         Too few pairs are left.
     """
     first, second = acquired.rows[pairs.first], acquired.rows[pairs.second]
     kept = np.flatnonzero((first >= 0) & (second >= 0))
     same = pairs.same[kept]
-    if flipped is not None and not np.array_equal(flipped.rows, acquired.rows):
-        raise EvaluationError(
-            f"{pairs.name}: photos gave a descriptor with their mirror image and none without, or "
-            "the other way round"
-        )
     require_both_classes(
         f"{pairs.name}, without the {len(pairs) - len(kept)} pairs that lack a descriptor,",
         same,
@@ -123,7 +117,7 @@ def prepare(
         people[acquired.rows[there]] = numbers[there]
     material = Material(
         descriptors=acquired.descriptors,
-        flipped=None if flipped is None else flipped.descriptors,
+        flipped=acquired.mirrored,
         first=first[kept],
         second=second[kept],
         same=same,

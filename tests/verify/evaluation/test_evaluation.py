@@ -164,7 +164,7 @@ def test_pairs_without_a_descriptor_are_counted(tmp_path: Path) -> None:
         rows,
         (Failure(Path(lost), "no_face", "No face was found."),),
     )
-    known, facts, kept = prepare(pairs, acquired, flipped=None, attributes=None, sources=())
+    known, facts, kept = prepare(pairs, acquired, attributes=None, sources=())
     touched = (pairs.first == int(lost)) | (pairs.second == int(lost))
     assert facts.failed_genuine == np.count_nonzero(touched & pairs.same) > 0
     assert facts.failed_impostor == np.count_nonzero(touched & ~pairs.same)
@@ -180,7 +180,7 @@ def test_pairs_without_a_descriptor_are_counted(tmp_path: Path) -> None:
     )
     everything = Acquired(acquired.descriptors[:0], np.full(60, -1), acquired.failures)
     with pytest.raises(DatasetError, match="without the 100 pairs that lack a descriptor"):
-        prepare(pairs, everything, flipped=None, attributes=None, sources=())
+        prepare(pairs, everything, attributes=None, sources=())
 
 
 def test_rates_with_failures_follow_the_standard(tmp_path: Path) -> None:
