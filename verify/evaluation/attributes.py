@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.neighbors import KNeighborsClassifier
 
 from templates.decoys.pool import DecoyPool
 from templates.decoys.source import Attributes
@@ -57,6 +56,9 @@ def _voted(
     labels: Sequence[str | None],
     k: int,
 ) -> list[str | None]:
+    # Imported here, because scikit-learn takes a second to load, and most commands need none.
+    from sklearn.neighbors import KNeighborsClassifier
+
     known = [i for i, label in enumerate(labels) if label is not None]
     if not known or not len(descriptors):
         return [None] * len(descriptors)

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import rankdata
 
 from verify.evaluation.units import Search
 from verify.metrics import equal_error_rate, resolvable, threshold_at_fmr
@@ -120,6 +119,9 @@ def errors_at(mated: Floats, non_mated: Floats, target: float) -> ErrorsAt:
 
 def area_under_roc(mated: Floats, non_mated: Floats) -> float:
     """Probability that a genuine pair is more alike than an impostor pair; ties count half."""
+    # Imported here, because it takes a second to load, and most commands need none.
+    from scipy.stats import rankdata
+
     ranks = rankdata(np.concatenate([mated, non_mated]))
     wins = ranks[: mated.size].sum() - mated.size * (mated.size + 1) / 2
     return float(wins / (mated.size * non_mated.size))

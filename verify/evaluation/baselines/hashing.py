@@ -10,7 +10,7 @@ from templates.randomness import Keystream
 from verify.evaluation.baselines import biohashing, mlp_hash
 from verify.evaluation.baselines.orthonormal import Flips, Matrix
 
-MATRICES = 16
+MATRICES = 4
 """Sets of orthonormal matrices per seed; the tokens of all pairs are made of them."""
 _TILE = 512
 _COMPARED = 1 << 18
