@@ -189,6 +189,8 @@ def evaluate(
     except EvaluationError as error:
         raise UsageError(str(error)) from None
     known = None if labels is None else read_labels(labels)
+    if cache is not None and where.scheduler is not None:
+        message("note: --cache is not used with a cluster; its workers keep no embeddings")
     kept = open_cache(cache, settings)
     out.mkdir(parents=True, exist_ok=True)
     faces = [
@@ -323,7 +325,6 @@ def _evaluate(
                 facts,
                 kept,
                 plan=plan,
-                base={"pictures": each.pictures_sha256, "model": descriptors.model.json()},
                 out=out,
                 backend=backend,
                 progress=advance,

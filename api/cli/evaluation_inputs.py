@@ -282,14 +282,30 @@ def attributes_of(
         for each in sources
         if isinstance(each.source, DecoyPool) and each.source.labelled
     )
+    vocabulary = _vocabulary(pool)
     found = predict_attributes(faces.acquired.descriptors, pool)
     predicted = len(found)
     for picture, row in zip(faces.pairs.pictures, faces.acquired.rows.tolist(), strict=True):
         own = {} if labels is None or row < 0 else labels.find(picture.name)
         if {"gender", "race"} <= own.keys():
+            for attribute in ("gender", "race"):
+                if own[attribute] not in vocabulary[attribute]:
+                    known = ", ".join(sorted(vocabulary[attribute]))
+                    raise CommandError(
+                        f"the label file says {attribute} {own[attribute]!r} of {picture.name}; "
+                        f"the decoy pool knows {known}: hybrid+ needs one vocabulary for both"
+                    )
             found[row] = Attributes(gender=own["gender"], race=own["race"])
             predicted -= 1
     return found, predicted
+
+
+def _vocabulary(pool: DecoyPool) -> dict[str, set[str]]:
+    labels = pool.entries[1] or ()
+    return {
+        "gender": {label.gender for label in labels if label.gender is not None},
+        "race": {label.race for label in labels if label.race is not None},
+    }
 
 
 def open_cache(cache: Path | None, settings: Settings) -> EmbeddingCache | None:

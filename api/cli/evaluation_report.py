@@ -68,7 +68,7 @@ def summary(results: Json, dataset: str) -> Table:
             row["mode"],
             row["metric"],
             f"{100 * row['accuracy_mean']:.2f} ± {100 * row['accuracy_std']:.2f}"
-            + (f" ± {100 * row['accuracy_std_seeds']:.2f}" if row["runs"] > 1 else ""),
+            + (f" ± {100 * row['accuracy_std_seeds']:.2f}" if row["accuracy_std_seeds"] else ""),
             f"{100 * row['eer']:.2f}",
             *(_rate(row["fnmr_at_fmr"][target]) for target in targets),
         )

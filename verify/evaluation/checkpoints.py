@@ -30,7 +30,7 @@ class Checkpoints:
     folder
         Of the results; ``units/`` is made inside it.
     base
-        All that similarities depend on besides the unit: photos, pairs, model, decoys, software.
+        All that similarities depend on besides the unit: descriptors, pairs, decoys, software.
         A unit that was computed on another base is not found.
     """
 

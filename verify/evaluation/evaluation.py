@@ -19,7 +19,7 @@ from verify.evaluation.material import Material, Source
 from verify.evaluation.plan import Plan, units_of
 from verify.evaluation.rows import SetFacts
 from verify.evaluation.runs import Run, run_unit
-from verify.evaluation.scoring import unit_layout
+from verify.evaluation.scoring import SCORING_VERSION, unit_layout
 from verify.evaluation.units import LiftUnit, Unit
 from verify.evaluation.verification_set import VerificationSet, require_both_classes
 
@@ -135,7 +135,6 @@ def evaluate_set(
     kept: NDArray[np.int64],
     *,
     plan: Plan,
-    base: dict[str, Any],
     out: Path,
     backend: Backend,
     progress: Advance,
@@ -144,8 +143,6 @@ def evaluate_set(
 
     Parameters
     ----------
-    base
-        What names photos, pairs and model (see :class:`Checkpoints`).
     progress
         Called with the number of units done since the last call.
     """
@@ -153,11 +150,11 @@ def evaluate_set(
     checkpoints = Checkpoints(
         out,
         {
-            **base,
             "software": version(SOFTWARE),
             "numpy": version("numpy"),
             "sources": [source.source_id for source in material.sources],
-            "pairs": _digest(material),
+            "scoring": SCORING_VERSION,
+            "material": _digest(material),
             "attributes": [] if material.attributes is None else _labels(material.attributes),
         },
     )
@@ -198,9 +195,12 @@ def _run(
 
 
 def _digest(material: Material) -> str:
+    """Name what is compared, descriptors included: whatever changes them, changes it."""
     whole = hashlib.sha256()
-    for part in (material.first, material.second, material.same, material.folds):
-        whole.update(np.ascontiguousarray(part).tobytes())
+    rows = [material.descriptors, material.flipped]
+    for part in (*rows, material.first, material.second, material.same, material.folds):
+        data = b"" if part is None else np.ascontiguousarray(part).tobytes()
+        whole.update(len(data).to_bytes(8, "big") + data)
     return whole.hexdigest()
 
 

@@ -107,7 +107,7 @@ def row_json(
         "accuracy_std_seeds": float(np.std(seeds, ddof=1)) if len(seeds) > 1 else 0.0,
         "eer": _mean(run.measures.eer for run in runs),
         "auc": _mean(run.measures.auc for run in runs),
-        "d_prime": _mean(run.measures.d_prime for run in runs),
+        "d_prime": _finite(_mean(run.measures.d_prime for run in runs)),
         "fnmr_at_fmr": {
             target_name(errors.target): _at(runs, place, facts)
             for place, errors in enumerate(runs[0].measures.at)
@@ -134,6 +134,11 @@ def target_name(target: float) -> str:
 
 def _mean(values: Any) -> float:
     return float(np.mean(list(values)))
+
+
+def _finite(value: float) -> float | None:
+    """JSON has no infinity: two classes without any spread are infinitely far apart."""
+    return value if np.isfinite(value) else None
 
 
 def _at(runs: Sequence[Run], place: int, facts: SetFacts) -> Json:
@@ -203,7 +208,7 @@ def run_json(run: Run, dataset: str) -> Json:
         "thresholds": list(measures.ten_fold.thresholds),
         "eer": measures.eer,
         "auc": measures.auc,
-        "d_prime": measures.d_prime,
+        "d_prime": _finite(measures.d_prime),
         "collisions": measures.collisions if run.cell.mode is Mode.SUBSPACE else None,
         "fnmr_at_fmr": {
             target_name(errors.target): {

@@ -1,4 +1,6 @@
+import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ from verify.evaluation import evaluation
 from verify.evaluation.acquisition import Acquired
 from verify.evaluation.backends import Backend
 from verify.evaluation.evaluation import Evaluated, evaluate_set, prepare
+from verify.evaluation.measures import measure
 from verify.evaluation.plan import Plan
 from verify.evaluation.results import Model, SetResult, document
 from verify.evaluation.rows import SetFacts, collision_floor, row_json
@@ -48,7 +51,6 @@ def run(
         facts,
         np.arange(100),
         plan=plan,
-        base={"pictures": "a", "model": "b"},
         out=out,
         backend=Backend(None, jobs),
         progress=advance,
@@ -218,3 +220,42 @@ def test_the_collision_floor(strategy: str, dim: int, entries: int, expected: fl
 
 def test_folds_of_the_made_up_set_are_those_of_the_literature() -> None:
     np.testing.assert_array_equal(np.bincount(contiguous_folds(103)), [11, 11, 11] + [10] * 7)
+
+
+def test_what_was_computed_on_other_descriptors_is_not_found(tmp_path: Path) -> None:
+    plan = Plan(("raw", "random"), dims=(2,), repeats=1)
+    run(tmp_path, plan)
+    again = run(tmp_path, plan)
+    assert all(work.resumed for work in again.work)
+    facts = SetFacts("other", 50, 50, 0, 0, 0.0, names_people=True)
+    # Same pairs of rows, other faces: as another model, or other photos, would give.
+    other = evaluate_set(
+        material(seed=1),
+        facts,
+        np.arange(100),
+        plan=plan,
+        out=tmp_path,
+        backend=Backend(None, 1),
+        progress=lambda _: None,
+    )
+    assert not any(work.resumed for work in other.work)
+
+
+def test_classes_without_spread_give_a_document(tmp_path: Path) -> None:
+    evaluated = run(tmp_path, Plan(("raw",)))
+    first = evaluated.runs[0]
+    flat = np.where(evaluated.material.same, 1.0, 0.0)
+    folds = evaluated.material.folds
+    measures = measure(flat, evaluated.material.same, folds, targets=())
+    row = row_json(
+        first.cell,
+        "exact",
+        [replace(first, measures=measures)],
+        evaluated.facts,
+        seed=0,
+        n=N,
+        source=None,
+        contract_id=None,
+    )
+    assert row["d_prime"] is None
+    json.dumps(row, allow_nan=False)
