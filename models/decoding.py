@@ -178,15 +178,17 @@ def decode_image(data: bytes, *, limits: ImageLimits = DEFAULT_LIMITS) -> NDArra
 def image_size(data: bytes) -> tuple[int, int] | None:
     """Width and height that the header of an encoded picture states; None where it is none.
 
-    Nothing but the header is read, and turns by EXIF are not applied.
+    No pixel is decoded, and turns by EXIF are not applied.
     """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            with Image.open(io.BytesIO(data), formats=FORMATS) as image:
+    try:
+        _check_webp_canvas(data, DEFAULT_LIMITS)
+        lean = _lean_png(data)
+        with _metadata_lock, warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with Image.open(io.BytesIO(lean), formats=FORMATS) as image:
                 return image.size
-        except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
-            return None
+    except Exception:  # parsers of damaged files raise almost anything
+        return None
 
 
 def _decode(data: bytes, limits: ImageLimits) -> NDArray[np.uint8]:

@@ -16,9 +16,11 @@ from api.cli.evaluation_inputs import (
     attributes_of,
     default_jobs,
     listed,
+    named_file,
     open_cache,
     open_descriptors,
     open_sources,
+    resemblance,
     without_test_people,
 )
 from api.cli.evaluation_report import read_audit, summary, write_results
@@ -176,13 +178,13 @@ def evaluate(
         strategy=strategy,
         has_flip=wants_flip,
         sources=sources,
-        dims=listed(dim, int, "--dim"),
-        modes=tuple(Mode(text) for text in listed(mode, _mode, "--mode")),
-        metrics=listed(metric, Metric, "--metric"),
+        dims=listed(dim, int, "--dim", expected="whole numbers such as 2,4"),
+        modes=listed(mode, _mode, "--mode", expected=f"a list of {', '.join(LIFTED_MODES)}"),
+        metrics=listed(metric, Metric, "--metric", expected=f"a list of {', '.join(Metric)}"),
         shared=shared_decoys,
         repeats=repeats,
         seed=seed,
-        targets=listed(fmr, float, "--fmr"),
+        targets=listed(fmr, float, "--fmr", expected="rates such as 1e-2,1e-3"),
     )
     try:
         units_of(plan, [each.source for each in sources], n=descriptors.n)
@@ -197,7 +199,6 @@ def evaluate(
         acquire_faces(pairs, descriptors, settings, aligned=aligned, cache=kept, backend=where)
         for pairs in sets
     ]
-    sources = without_test_people(sources, faces)
     results = _evaluate(
         plan,
         descriptors,
@@ -206,7 +207,12 @@ def evaluate(
         known,
         out=out,
         backend=where,
-        options={"flip": flip, "backend": "local" if where.scheduler is None else "dask"},
+        options={
+            "flip": flip,
+            "backend": "local" if where.scheduler is None else "dask",
+            "labels": named_file(labels),
+            "audit": named_file(audit),
+        },
     )
     written = write_results(results, out, audit=report)
     info = None if descriptors.pack is None else descriptors.pack.info
@@ -224,7 +230,7 @@ def evaluate(
 def _mode(text: str) -> Mode:
     chosen = Mode(text)
     if chosen not in LIFTED_MODES:
-        raise ValueError(f"{text!r} is not a valid mode; choose of {', '.join(LIFTED_MODES)}")
+        raise ValueError(text)
     return chosen
 
 
@@ -233,8 +239,8 @@ def _open_all(datasets: Sequence[Path], *, pictures: bool) -> list[VerificationS
     names = [pairs.name for pairs in sets]
     if len(set(names)) < len(names):
         raise UsageError(
-            f"two sets have one name ({', '.join(sorted(names))}): rename a file or a folder, "
-            "since rows are told apart by it"
+            f"two sets have one name ({', '.join(sorted(names))}), and rows are told apart by it: "
+            "evaluate them one at a time, or rename a file"
         )
     for pairs in sets:
         for note in notes(pairs):
@@ -246,7 +252,7 @@ def _wants_flip(strategy: str | None, embeddings: Path | None, *, flip: bool) ->
     """Whether raw descriptors with the mirror image are compared beside the others."""
     if strategy is None:
         return embeddings is None and not flip
-    asked = RAW_FLIP in listed(strategy, str, "--strategy")
+    asked = RAW_FLIP in listed(strategy, str, "--strategy", expected="names of strategies")
     if asked and (embeddings is not None or flip):
         raise UsageError(
             f"{RAW_FLIP} is raw descriptors with the mirror image added, beside raw ones without: "
@@ -269,7 +275,7 @@ def _plan(
     targets: tuple[float, ...],
 ) -> Plan:
     if strategy is not None:
-        strategies = listed(strategy, str, "--strategy")
+        strategies = listed(strategy, str, "--strategy", expected="names of strategies")
     else:
         pools = [each.source for each in sources if isinstance(each.source, DecoyPool)]
         able = set(WITHOUT_DECOYS) - (set() if has_flip else {RAW_FLIP})
@@ -302,16 +308,18 @@ def _evaluate(
     backend: Backend,
     options: Json,
 ) -> Json:
-    decoys = [each.source for each in sources]
     predicted: dict[str, int] = {}
     sets: list[SetResult] = []
     groups: list[Json] = []
     summaries: list[Json] = []
     measured: list[Json] = []
+    alike: dict[str, Json] = {}
     for each in faces:
+        own = without_test_people(sources, each)
+        decoys = [source.source for source in own]
         attributes = None
         if Strategy.HYBRID_PLUS in plan.strategies:
-            attributes, predicted[each.pairs.name] = attributes_of(each, labels, sources)
+            attributes, predicted[each.pairs.name] = attributes_of(each, labels, own)
         material, facts, kept = prepare(
             each.pairs,
             each.acquired,
@@ -333,12 +341,15 @@ def _evaluate(
             SetResult(
                 each.pairs,
                 evaluated,
+                own,
                 each.acquired.failures,
                 each.aligned,
                 each.pictures_sha256,
                 tuple(notes(each.pairs)),
             )
         )
+        if any(isinstance(source, DecoyPool) for source in decoys):
+            alike[each.pairs.name] = resemblance(material)
         if labels is not None:
             entries, whole = group_rows(each.pairs, evaluated, labels, seed=plan.seed)
             groups += entries
@@ -350,7 +361,7 @@ def _evaluate(
         descriptors.model,
         sources,
         sets,
-        options={**options, "predicted_attributes": predicted},
+        options={**options, "predicted_attributes": predicted, "resemblance": alike},
         timings=measured,
         groups=groups,
         group_summaries=summaries,

@@ -38,10 +38,15 @@ def write_results(results: Json, out: Path, *, audit: Json | None) -> list[Path]
     # Imported here: drawing loads a library that nothing else needs.
     from verify.evaluation.figures import write_figures
 
+    text = json.dumps(results, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
     files = [out / "results.json", out / "results.csv", out / "results.md"]
-    files[0].write_text(
-        json.dumps(results, indent=1, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8"
-    )
+    # What an earlier run drew of other rows must not stand beside these.
+    for name in ("figure", "det", "roc", "frontier"):
+        for suffix in (".png", ".svg"):
+            (out / f"{name}{suffix}").unlink(missing_ok=True)
+    partial = out / ".results.json.part"
+    partial.write_text(text, encoding="utf-8")
+    partial.replace(files[0])
     write_csv(results, files[1])
     files[2].write_text(markdown(results), encoding="utf-8")
     return [*files, *write_figures(results, out, audit=audit)]
@@ -67,12 +72,17 @@ def summary(results: Json, dataset: str) -> Table:
             str(row["dim"] or ""),
             row["mode"],
             row["metric"],
-            f"{100 * row['accuracy_mean']:.2f} ± {100 * row['accuracy_std']:.2f}"
-            + (f" ± {100 * row['accuracy_std_seeds']:.2f}" if row["accuracy_std_seeds"] else ""),
+            _accuracy(row),
             f"{100 * row['eer']:.2f}",
             *(_rate(row["fnmr_at_fmr"][target]) for target in targets),
         )
     return listing
+
+
+def _accuracy(row: Json) -> str:
+    text = f"{100 * row['accuracy_mean']:.2f} ± {100 * row['accuracy_std']:.2f}"
+    seeds = row["accuracy_std_seeds"]
+    return text if seeds is None else f"{text} ± {100 * seeds:.2f}"
 
 
 def _strategy(row: Json) -> str:

@@ -77,7 +77,10 @@ def decode(
         raise DecoyError(f"the {what} is truncated: it has {len(data)} bytes")
     header_size = int.from_bytes(data[:_LENGTH_BYTES], "little")
     if header_size > min(MAX_HEADER, len(data) - _LENGTH_BYTES):
-        raise DecoyError(f"the {what} declares a header of {header_size} bytes, which cannot be")
+        raise DecoyError(
+            f"the {what} declares a header of {header_size} bytes, which cannot be; is it a file "
+            "of `veilface decoys build`?"
+        )
     try:
         header = json.loads(data[_LENGTH_BYTES : _LENGTH_BYTES + header_size])
         fields = json.loads(header.pop("__metadata__")[METADATA_KEY])

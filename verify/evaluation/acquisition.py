@@ -113,9 +113,9 @@ def acquire(
     place: dict[str, int] = {}
     unique: list[Picture] = []
     for picture, content in zip(pairs.pictures, contents, strict=True):
-        # Two pictures that cannot be read are not equal.
-        if place.setdefault(content or picture.name, len(unique)) == len(unique):
+        if content and place.setdefault(content, len(unique)) == len(unique):
             unique.append(picture)
+    progress(len(pairs.pictures) - len(unique))
     done: list[Extraction]
     if backend.scheduler is None:
         extractor = Extractor(pack, aligned=source.aligned, cache=cache, mirrored=source.mirrored)
@@ -136,10 +136,8 @@ def acquire(
         for path in extraction.paths:
             row_of[str(path)] = len(row_of)
         reason_of |= {str(failure.path): failure for failure in extraction.failures}
-    names = [
-        str(Path(keys[place[content or picture.name]]))
-        for picture, content in zip(pairs.pictures, contents, strict=True)
-    ]
+    names = [str(Path(keys[place[content]])) if content else "" for content in contents]
+    reason_of[""] = Failure(Path(), "unreadable_file", "The file cannot be read.")
     rows = [extraction.descriptors for extraction in done]
     mirrored = [e.mirrored for e in done if e.mirrored is not None]
     return Acquired(
@@ -155,14 +153,7 @@ def acquire(
 
 
 def _loaded_chunk(chunk: Sequence[Picture]) -> list[EncodedImage]:
-    """Read the pictures of a chunk; one that cannot be read is left empty, and fails to decode."""
-    images = []
-    for picture in chunk:
-        try:
-            images.append(EncodedImage(picture.name, picture.read()))
-        except OSError:
-            images.append(EncodedImage(picture.name, b""))
-    return images
+    return [EncodedImage(picture.name, picture.read()) for picture in chunk]
 
 
 @lru_cache(maxsize=2)

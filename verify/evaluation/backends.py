@@ -3,6 +3,7 @@
 Both go through joblib. What a worker needs travels in sealed parcels (``material.Parcel``).
 """
 
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -19,7 +20,7 @@ from verify.evaluation.material import Parcel, fresh_key
 T = TypeVar("T")
 R = TypeVar("R")
 SOFTWARE = "veilface"
-CONNECT_SECONDS = 20
+CONNECT_SECONDS = 10
 
 
 class BackendError(VeilfaceError):
@@ -95,7 +96,18 @@ def spread(
             joblib.delayed(_call)(function, here, parcel, index, Parcel.pack(item, key), key)
             for index, item in enumerate(items)
         )
-        for index, sealed in results:
+        while True:
+            try:
+                index, sealed = next(results)
+            except StopIteration:
+                return
+            except Exception as error:
+                if type(error).__name__ not in _LOST:
+                    raise
+                raise BackendError(
+                    "a worker ended in the middle of its work, most often because memory ran out: "
+                    "use fewer --jobs, or larger workers; the same command goes on where it stopped"
+                ) from None
             yield index, sealed.open(key)
 
 
@@ -114,10 +126,17 @@ def _call(
             f"a worker has veilface {here}, and this is {software}: install one version everywhere"
         )
     task: Any = item.open(key)
-    return index, Parcel.pack(function(_opened(shared, key), task), key)
+    # A cluster's worker may have several threads. The limit on the threads of products is one for
+    # the process, and memory is counted for one task, so tasks of a process take turns.
+    with _ALONE:
+        result = function(_opened(shared, key), task)
+    return index, Parcel.pack(result, key)
 
 
+# Of joblib's processes, and of Dask; the latter need not be installed.
+_LOST = ("TerminatedWorkerError", "BrokenProcessPool", "KilledWorker", "CommClosedError")
 _LAST: dict[str, object] = {}
+_ALONE = threading.Lock()
 
 
 def _opened(parcel: Parcel, key: bytes) -> object:
@@ -126,6 +145,11 @@ def _opened(parcel: Parcel, key: bytes) -> object:
         _LAST.clear()
         _LAST[parcel.digest] = parcel.open(key)
     return _LAST[parcel.digest]
+
+
+def _forget() -> None:
+    """Drop the parcel that a worker has open."""
+    _LAST.clear()
 
 
 @contextmanager
@@ -162,5 +186,9 @@ def _cluster(scheduler: str, parcel: Parcel) -> Iterator[None]:
                 f"the Dask scheduler at {scheduler} has no worker: start one, with veilface "
                 "installed where it runs"
             ) from None
-        with joblib.parallel_config(backend="dask", client=client, scatter=[parcel]):
-            yield
+        try:
+            with joblib.parallel_config(backend="dask", client=client, scatter=[parcel]):
+                yield
+        finally:
+            # The workers live on, and must not keep descriptors of this run.
+            client.run(_forget)

@@ -16,8 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from templates.decoys import Attributes
+from templates.lifting import Strategy
 from verify.evaluation.runs import Run
-from verify.evaluation.units import Unit
+from verify.evaluation.units import LiftUnit, RawUnit, Unit
 
 FOLDER = "units"
 
@@ -30,17 +32,39 @@ class Checkpoints:
     folder
         Of the results; ``units/`` is made inside it.
     base
-        All that similarities depend on besides the unit: descriptors, pairs, decoys, software.
-        A unit that was computed on another base is not found.
+        All that similarities of every unit depend on: descriptors, pairs, software. A unit that
+        was computed on another base is not found.
+    sources
+        Ids of the decoy sources, of which a unit depends on its own.
+    attributes, flipped
+        On which units of hybrid+, and raw descriptors with the mirror image, depend.
     """
 
-    def __init__(self, folder: Path, base: dict[str, Any]) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        base: dict[str, Any],
+        *,
+        sources: Sequence[str] = (),
+        attributes: Sequence[Attributes] = (),
+        flipped: NDArray[np.float32] | None = None,
+    ) -> None:
         self._folder = folder / FOLDER
         self._folder.mkdir(parents=True, exist_ok=True)
         self._base = base
+        self._sources = sources
+        self._attributes = [[each.gender, each.race] for each in attributes]
+        self._flipped = None if flipped is None else hashlib.sha256(flipped.tobytes()).hexdigest()
 
     def _file(self, unit: Unit) -> Path:
-        described = {"base": self._base, "kind": type(unit).__name__, "unit": asdict(unit)}
+        facts = asdict(unit)
+        if isinstance(unit, LiftUnit):
+            facts["source"] = None if unit.source is None else self._sources[unit.source]
+            if unit.strategy is Strategy.HYBRID_PLUS:
+                facts["attributes"] = self._attributes
+        if isinstance(unit, RawUnit) and unit.flip:
+            facts["flipped"] = self._flipped
+        described = {"base": self._base, "kind": type(unit).__name__, "unit": facts}
         text = json.dumps(described, sort_keys=True)
         return self._folder / f"{hashlib.sha256(text.encode()).hexdigest()[:40]}.npz"
 

@@ -112,9 +112,7 @@ def prepare(
     people = None
     if pairs.people is not None:
         _, numbers = np.unique(np.asarray(pairs.people, dtype=np.str_), return_inverse=True)
-        people = np.zeros(len(acquired.descriptors), dtype=np.int64)
-        there = acquired.rows >= 0
-        people[acquired.rows[there]] = numbers[there]
+        people = np.stack([numbers[pairs.first[kept]], numbers[pairs.second[kept]]])
     material = Material(
         descriptors=acquired.descriptors,
         flipped=acquired.mirrored,
@@ -152,11 +150,12 @@ def evaluate_set(
         {
             "software": version(SOFTWARE),
             "numpy": version("numpy"),
-            "sources": [source.source_id for source in material.sources],
             "scoring": SCORING_VERSION,
             "material": _digest(material),
-            "attributes": [] if material.attributes is None else _labels(material.attributes),
         },
+        sources=[source.source_id for source in material.sources],
+        attributes=material.attributes or (),
+        flipped=material.flipped,
     )
     layouts = [unit_layout(unit, material.sources) for unit in units]
     known = [
@@ -197,12 +196,8 @@ def _run(
 def _digest(material: Material) -> str:
     """Name what is compared, descriptors included: whatever changes them, changes it."""
     whole = hashlib.sha256()
-    rows = [material.descriptors, material.flipped]
-    for part in (*rows, material.first, material.second, material.same, material.folds):
-        data = b"" if part is None else np.ascontiguousarray(part).tobytes()
+    pairs = (material.first, material.second, material.same, material.folds)
+    for part in (material.descriptors, *pairs):
+        data = np.ascontiguousarray(part).tobytes()
         whole.update(len(data).to_bytes(8, "big") + data)
     return whole.hexdigest()
-
-
-def _labels(attributes: Sequence[Attributes]) -> list[list[str | None]]:
-    return [[each.gender, each.race] for each in attributes]

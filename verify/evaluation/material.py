@@ -32,8 +32,8 @@ class Material:
         Pairs of rows.
     same : (P,) bool
     folds : (P,) int64
-    people : (N,) int64, optional
-        Person of each row, where the set names people.
+    people : (2, P) int64, optional
+        People on the first and on the second photo of each pair, where the set names people.
     attributes
         One per row, where hybrid+ is evaluated.
     sources

@@ -46,7 +46,7 @@ class Measures:
     ten_fold
         Accuracies and thresholds of the folds.
     eer, auc, d_prime
-        Equal error rate; area under the ROC; |μ_g − μ_i| / √((σ_g² + σ_i²) / 2) of similarities.
+        Equal error rate; area under the ROC; (μ_g − μ_i) / √((σ_g² + σ_i²) / 2) of similarities.
     at
         One entry for each target that the impostor pairs resolve.
     collisions
@@ -130,5 +130,7 @@ def area_under_roc(mated: Floats, non_mated: Floats) -> float:
 def d_prime(mated: Floats, non_mated: Floats) -> float:
     """Separation of the two distributions in pooled standard deviations; 0 where both are one."""
     spread = np.sqrt((mated.var() + non_mated.var()) / 2)
-    gap = abs(float(mated.mean() - non_mated.mean()))
-    return 0.0 if gap == 0 else float(gap / spread) if spread > 0 else float("inf")
+    gap = float(mated.mean() - non_mated.mean())
+    if spread > 0:
+        return float(gap / spread)
+    return float(np.copysign(np.inf, gap)) if gap else 0.0

@@ -112,7 +112,7 @@ def units_of(plan: Plan, sources: Sequence[Source], *, n: int) -> list[Unit]:
                     steps=plan.steps,
                     seed=seed,
                 )
-                for source in _fitting(strategy, sources)
+                for source in _fitting(strategy, sources, plan)
                 for m in plan.dims
                 for seed in seeds
             ]
@@ -131,7 +131,7 @@ def _check_dims(strategy: Strategy, dims: Sequence[int], n: int) -> None:
         )
 
 
-def _fitting(strategy: Strategy, sources: Sequence[Source]) -> list[int | None]:
+def _fitting(strategy: Strategy, sources: Sequence[Source], plan: Plan) -> list[int | None]:
     """Positions of the sources that the strategy can draw from."""
     if strategy is Strategy.RANDOM:
         return [None]
@@ -157,4 +157,21 @@ def _fitting(strategy: Strategy, sources: Sequence[Source]) -> list[int | None]:
             f"{strategy} lifting needs {what}: make one with `veilface decoys build` and name it "
             "with --decoys, or leave the strategy out"
         )
+    for place in found:
+        if place is not None:
+            _check_size(strategy, sources[place], plan)
     return found
+
+
+def _check_size(strategy: Strategy, source: Source, plan: Plan) -> None:
+    if not isinstance(source, DecoyPool):
+        return
+    needed = strategy.decoys(max(plan.dims))
+    parts = (1 if plan.shared_decoys else 2) * (strategy.sub_databases or 1)
+    if len(source) // parts < needed:
+        where = "the pool" if parts == 1 else f"one of {parts} parts of the pool"
+        raise EvaluationError(
+            f"{strategy} lifting with m = {max(plan.dims)} draws {needed} decoys, and {where} has "
+            f"{len(source) // parts} entries: make a larger pool, take smaller dimensions"
+            + ("" if plan.shared_decoys else ", or give --shared-decoys")
+        )

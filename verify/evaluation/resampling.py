@@ -2,12 +2,12 @@
 
 Pairs of one benchmark share people, so the people are resampled: one drawn w times weighs w in
 its genuine pairs, and a pair of two people weighs the product of their weights (bootstrap by
-subject, ISO/IEC 19795-1). A replicate sets its own threshold, so the spread of the threshold is
-in the interval too. All runs of a set see the same draws of people, so that their mean can be
-taken replicate by replicate.
+subject, ISO/IEC 19795-1). Where a set names nobody, pairs are resampled. A replicate sets its own
+threshold, so the spread of the threshold is in the interval too. All runs of a set see the same
+draws, so that their mean can be taken replicate by replicate.
 """
 
-from dataclasses import dataclass
+from collections.abc import Iterator
 from typing import Literal
 
 import numpy as np
@@ -22,47 +22,36 @@ Floats = NDArray[np.float64]
 Interval = Literal["subject-bootstrap", "pair-bootstrap"]
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Weights:
-    """Weights of the pairs in every replicate.
-
-    Parameters
-    ----------
-    genuine : (R, G) float64
-    impostor : (R, I) float64
-    interval
-        What was resampled.
-    """
-
-    genuine: Floats
-    impostor: Floats
-    interval: Interval
-
-
-def draw_weights(material: Material, *, seed: int, replicates: int = REPLICATES) -> Weights:
+def replicate_weights(
+    material: Material, *, seed: int, replicates: int = REPLICATES
+) -> Iterator[tuple[Floats, Floats]]:
     """Draw people with replacement; pairs, where the set does not name people.
 
-    Replicates without any genuine or impostor pair are left out.
+    One replicate is in memory at a time.
+
+    Yields
+    ------
+    genuine : (G,) float64
+    impostor : (I,) float64
+        Weights of the pairs. A replicate without any genuine or impostor pair is drawn anew.
     """
+    same, people = material.same, material.people
     generator = np.random.default_rng(seed)
-    same = material.same
-    interval: Interval
-    if material.people is None:
-        interval = "pair-bootstrap"
-        total = len(same)
-        weights = generator.multinomial(total, np.full(total, 1 / total), replicates).astype(float)
-    else:
-        interval = "subject-bootstrap"
-        first = material.people[material.first]
-        second = material.people[material.second]
-        present, places = np.unique(np.concatenate([first, second]), return_inverse=True)
+    if people is not None:
+        present, places = np.unique(people, return_inverse=True)
+        one, two = places.reshape(2, -1)
         count = len(present)
-        drawn = generator.multinomial(count, np.full(count, 1 / count), replicates).astype(float)
-        one, two = np.split(places, 2)
-        weights = drawn[:, one] * np.where(one == two, 1.0, drawn[:, two])
-    genuine, impostor = weights[:, same], weights[:, ~same]
-    whole = (genuine.sum(axis=1) > 0) & (impostor.sum(axis=1) > 0)
-    return Weights(genuine[whole], impostor[whole], interval)
+    else:
+        count = len(same)
+    for _ in range(replicates):
+        while True:
+            drawn = np.bincount(generator.integers(count, size=count), minlength=count)
+            if people is not None:
+                drawn = drawn[one] * np.where(one == two, 1, drawn[two])
+            weights = drawn.astype(np.float64)
+            if weights[same].any() and weights[~same].any():
+                break
+        yield weights[same], weights[~same]
 
 
 def fmr_grid(impostor_pairs: int) -> Floats:
@@ -70,37 +59,19 @@ def fmr_grid(impostor_pairs: int) -> Floats:
     return np.geomspace(min(1.0, 3 / impostor_pairs), 1.0, GRID_POINTS)
 
 
-def fnmr_replicates(
-    mated: Floats, non_mated: Floats, weights: Weights, fmrs: Floats
-) -> NDArray[np.float32]:
-    """FNMR at FMR ≤ each of ``fmrs`` in every replicate.
+class OperatingPoints:
+    """FNMR at FMR targets, for the trials as they are or weighted.
 
-    Returns
-    -------
-    ndarray of float32, shape (R, len(fmrs))
+    Parameters
+    ----------
+    mated, non_mated : (G,), (I,) float64
+        Similarities of genuine and impostor trials.
     """
-    curve = _Operating(mated, non_mated)
-    out = np.empty((len(weights.genuine), len(fmrs)), dtype=np.float32)
-    genuine = weights.genuine[:, curve.genuine_order]
-    impostor = weights.impostor[:, curve.impostor_order]
-    for row, (mine, theirs) in enumerate(zip(genuine, impostor, strict=True)):
-        out[row] = curve.fnmr(mine, theirs, fmrs)
-    return out
-
-
-def fnmr_curve(mated: Floats, non_mated: Floats, fmrs: Floats) -> Floats:
-    """FNMR at FMR ≤ each of ``fmrs`` on the trials as they are."""
-    curve = _Operating(mated, non_mated)
-    return curve.fnmr(np.ones(mated.size), np.ones(non_mated.size), fmrs)
-
-
-class _Operating:
-    """Trials in order, with the threshold that accepts the k most alike impostor pairs, all k."""
 
     def __init__(self, mated: Floats, non_mated: Floats) -> None:
-        self.genuine_order = np.argsort(mated, kind="stable")
-        self.impostor_order = np.argsort(-non_mated, kind="stable")
-        ranked = non_mated[self.impostor_order]
+        self._genuine_order = np.argsort(mated, kind="stable")
+        self._impostor_order = np.argsort(-non_mated, kind="stable")
+        ranked = non_mated[self._impostor_order]
         # To accept k impostor pairs and reject the next, cut halfway between the two.
         cuts = np.empty(ranked.size + 1)
         cuts[0] = np.nextafter(ranked[0], np.inf)
@@ -111,13 +82,28 @@ class _Operating:
         # A cut inside a run of equal similarities cannot be made: take the one before the run.
         tied = np.concatenate([[False], ranked[1:] == ranked[:-1], [False]])
         self._possible = np.maximum.accumulate(np.where(tied, 0, np.arange(tied.size)))
-        self._missed = np.searchsorted(mated[self.genuine_order], cuts, side="left")
+        self._missed = np.searchsorted(mated[self._genuine_order], cuts, side="left")
 
-    def fnmr(self, genuine: Floats, impostor: Floats, fmrs: Floats) -> Floats:
-        """FNMR under weights that are given in the two orders."""
-        accepted = np.concatenate([[0.0], np.cumsum(impostor)])
+    def fnmr(
+        self, fmrs: Floats, *, genuine: Floats | None = None, impostor: Floats | None = None
+    ) -> Floats:
+        """FNMR at the lowest threshold whose FMR is at most each of ``fmrs``.
+
+        Parameters
+        ----------
+        fmrs : (F,) float64
+        genuine, impostor : (G,), (I,) float64, optional
+            Whole-numbered weights of the trials; 1 each by default.
+
+        Returns
+        -------
+        ndarray of float64, shape (F,)
+        """
+        mine = np.ones(self._genuine_order.size) if genuine is None else genuine
+        theirs = np.ones(self._impostor_order.size) if impostor is None else impostor
+        accepted = np.concatenate([[0.0], np.cumsum(theirs[self._impostor_order])])
         # Sums of weights are exact; only the product with a target needs room for rounding.
         allowed = fmrs * accepted[-1] * (1 + 1e-12)
         k = np.searchsorted(accepted, allowed, side="right") - 1
-        below = np.concatenate([[0.0], np.cumsum(genuine)])
+        below = np.concatenate([[0.0], np.cumsum(mine[self._genuine_order])])
         return np.asarray(below[self._missed[self._possible[k]]] / below[-1])

@@ -66,35 +66,41 @@ class Model:
 
 @dataclass(frozen=True, eq=False)
 class SourceFacts:
-    """A decoy source as it was used, and the file it came from."""
+    """A decoy source and the file it came from.
+
+    Parameters
+    ----------
+    source
+        As it is in the file; for a set, without the entries that resemble its people.
+    file, sha256
+        Name and SHA-256 of the file.
+    left_out
+        Number of those entries.
+    """
 
     source: Source
     file: str
     sha256: str
-    file_source_id: str
-    left_out: int
+    left_out: int = 0
 
     def json(self) -> Json:
-        """Everything as JSON."""
+        """Kind, id and size of the source."""
         pool = self.source if isinstance(self.source, DecoyPool) else None
         return {
             "kind": decoy_kind(self.source),
             "source_id": self.source.source_id,
             "entries": None if pool is None else len(pool),
             "labelled": pool is not None and pool.labelled,
-            "left_out": self.left_out,
-            "file": self.file,
-            "sha256": self.sha256,
-            "file_source_id": self.file_source_id,
         }
 
 
 @dataclass(frozen=True, eq=False)
 class SetResult:
-    """One set and what was found on it."""
+    """One set and what was found on it; ``sources`` are the decoys as they were used on it."""
 
     pairs: VerificationSet
     evaluated: Evaluated
+    sources: Sequence[SourceFacts]
     failures: tuple[Failure, ...]
     aligned: bool | None
     pictures_sha256: str
@@ -121,6 +127,7 @@ class SetResult:
             "failed_genuine": facts.failed_genuine,
             "failed_impostor": facts.failed_impostor,
             "fta": facts.fta,
+            "decoys": [{**each.json(), "left_out": each.left_out} for each in self.sources],
             "notes": list(self.notes),
         }
 
@@ -182,7 +189,9 @@ def document(
         "repeats": plan.repeats,
         "options": {**asdict(plan), **options},
         "model": model.json(),
-        "decoys": [source.json() for source in sources],
+        "decoys": [
+            {**source.json(), "file": source.file, "sha256": source.sha256} for source in sources
+        ],
         "datasets": [each.json() for each in sets],
         "rows": rows,
         "groups": list(groups),

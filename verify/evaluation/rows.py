@@ -88,8 +88,8 @@ def row_json(
     """Summarise the runs of one row.
 
     ``accuracy_std`` is the spread over folds inside a run, ``accuracy_std_seeds`` that of the
-    mean accuracy over seeds. Of the two sides of point-to-subspace comparisons every figure is
-    the mean.
+    mean accuracy over seeds, None where there are not two. Of the two sides of point-to-subspace
+    comparisons every figure is the mean.
     """
     accuracies = np.array([run.measures.ten_fold.accuracies for run in runs])
     thresholds = np.array([run.measures.ten_fold.thresholds for run in runs])
@@ -104,7 +104,7 @@ def row_json(
         "threshold_search": search,
         "accuracy_mean": float(accuracies.mean()),
         "accuracy_std": float(accuracies.std(axis=1).mean()),
-        "accuracy_std_seeds": float(np.std(seeds, ddof=1)) if len(seeds) > 1 else 0.0,
+        "accuracy_std_seeds": float(np.std(seeds, ddof=1)) if len(seeds) > 1 else None,
         "eer": _mean(run.measures.eer for run in runs),
         "auc": _mean(run.measures.auc for run in runs),
         "d_prime": _finite(_mean(run.measures.d_prime for run in runs)),
@@ -146,15 +146,14 @@ def _at(runs: Sequence[Run], place: int, facts: SetFacts) -> Json:
     errors, fmr_errors = _mean(e.errors for e in each), _mean(e.fmr_errors for e in each)
     value, fmr = errors / facts.genuine, fmr_errors / facts.impostor
     low, high = wilson(errors, facts.genuine)
-    if facts.names_people:
-        # With few errors, resampling what was seen knows nothing of what was not.
-        lower, upper = _percentiles(np.stack([run.replicates[:, place] for run in runs])[..., None])
-        low, high = min(low, float(lower[0])), max(high, float(upper[0]))
+    # With few errors, resampling what was seen knows nothing of what was not: hence both.
+    lower, upper = _percentiles(np.stack([run.replicates[:, place] for run in runs])[..., None])
+    low, high = min(low, float(lower[0])), max(high, float(upper[0]))
     return {
         "value": value,
         "ci_low": low,
         "ci_high": high,
-        "interval": facts.interval if facts.names_people else "wilson",
+        "interval": facts.interval,
         "trials": facts.genuine,
         "errors_mean": errors,
         "threshold_mean": _mean(e.threshold for e in each),

@@ -10,11 +10,10 @@ from threadpoolctl import threadpool_limits
 from verify.evaluation.material import Material
 from verify.evaluation.measures import Measures, measure
 from verify.evaluation.resampling import (
-    Weights,
-    draw_weights,
+    REPLICATES,
+    OperatingPoints,
     fmr_grid,
-    fnmr_curve,
-    fnmr_replicates,
+    replicate_weights,
 )
 from verify.evaluation.scoring import Scores, score_unit, unit_layout
 from verify.evaluation.units import Cell, Lifted, RawUnit, Search, Unit
@@ -80,15 +79,14 @@ def run_unit(
                 Scores(cell, lifted, column)
                 for (cell, lifted), column in zip(layout, known, strict=True)
             ]
-        weights = draw_weights(material, seed=0)
         searches: tuple[Search, ...] = (
             ("grid", "exact") if isinstance(unit, RawUnit) else ("exact",)
         )
-        return [
-            _run(material, unit, each, search, targets, weights)
-            for each in scores
-            for search in searches
+        runs = [
+            _run(material, unit, each, search, targets) for each in scores for search in searches
         ]
+        _add_replicates(material, runs)
+    return runs
 
 
 def _run(
@@ -97,13 +95,11 @@ def _run(
     scores: Scores,
     search: Search,
     targets: Sequence[float],
-    weights: Weights,
 ) -> Run:
     same = material.same
     measures = measure(scores.similarities, same, material.folds, targets=targets, search=search)
-    mated, non_mated = scores.similarities[same], scores.similarities[~same]
-    grid = fmr_grid(non_mated.size)
-    resolved = np.array([errors.target for errors in measures.at])
+    points = OperatingPoints(scores.similarities[same], scores.similarities[~same])
+    grid = fmr_grid(int(np.count_nonzero(~same)))
     return Run(
         cell=scores.cell,
         lifted=scores.lifted,
@@ -111,6 +107,17 @@ def _run(
         search=search,
         measures=measures,
         similarities=scores.similarities,
-        curve=fnmr_curve(mated, non_mated, grid),
-        replicates=fnmr_replicates(mated, non_mated, weights, np.concatenate([resolved, grid])),
+        curve=points.fnmr(grid),
+        replicates=np.empty((REPLICATES, len(measures.at) + len(grid)), dtype=np.float32),
     )
+
+
+def _add_replicates(material: Material, runs: Sequence[Run]) -> None:
+    """Fill in the replicates: the same draws of people for all runs."""
+    same = material.same
+    points = [OperatingPoints(run.similarities[same], run.similarities[~same]) for run in runs]
+    grid = fmr_grid(int(np.count_nonzero(~same)))
+    wanted = [np.concatenate([[errors.target for errors in run.measures.at], grid]) for run in runs]
+    for row, (genuine, impostor) in enumerate(replicate_weights(material, seed=0)):
+        for run, each, fmrs in zip(runs, points, wanted, strict=True):
+            run.replicates[row] = each.fnmr(fmrs, genuine=genuine, impostor=impostor)

@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from models.decoding import DEFAULT_LIMITS
 from models.extraction import EncodedImage
 from verify.datasets import DatasetError
 from verify.tenfold import FOLDS
@@ -31,7 +32,7 @@ class Picture(Protocol):
         ...
 
     def read(self) -> bytes:
-        """Return the encoded photo."""
+        """Return the encoded photo; of one that is too large, enough to tell."""
         ...
 
 
@@ -56,8 +57,9 @@ class PictureFile:
         return self.path
 
     def read(self) -> bytes:
-        """Read the file."""
-        return self.path.read_bytes()
+        """Read the file, and one byte more than the decoder accepts where it is larger."""
+        with self.path.open("rb") as file:
+            return file.read(DEFAULT_LIMITS.max_bytes + 1)
 
 
 @dataclass(frozen=True)

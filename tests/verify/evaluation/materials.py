@@ -41,7 +41,7 @@ def material(
         second=(2 * second + 1).astype(np.int64),
         same=same,
         folds=contiguous_folds(pairs),
-        people=np.repeat(np.arange(people), 2) if named else None,
+        people=np.stack([first, second]).astype(np.int64) if named else None,
         attributes=[
             Attributes("Male" if k % 4 < 2 else "Female", "White") for k in range(2 * people)
         ],

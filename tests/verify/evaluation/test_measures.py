@@ -53,7 +53,7 @@ def test_figures_equal_those_of_independent_code(seed: int) -> None:
     assert found.auc == pytest.approx(roc_auc_score(same, similarities))
     mated, other = similarities[same], similarities[~same]
     spread = np.sqrt((np.var(mated) + np.var(other)) / 2)
-    assert found.d_prime == pytest.approx(abs(mated.mean() - other.mean()) / spread)
+    assert found.d_prime == pytest.approx((mated.mean() - other.mean()) / spread)
     assert [errors.target for errors in found.at] == [0.5, 0.05]
     for errors in found.at:
         assert errors.fmr_errors == np.count_nonzero(other >= errors.threshold)
@@ -73,4 +73,5 @@ def test_pairs_that_meet_are_collisions() -> None:
 
 def test_separation_without_spread() -> None:
     assert d_prime(np.ones(3), np.zeros(3)) == np.inf
+    assert d_prime(np.zeros(3), np.ones(3)) == -np.inf
     assert d_prime(np.ones(3), np.ones(3)) == 0

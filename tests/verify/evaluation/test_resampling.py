@@ -2,77 +2,72 @@ import numpy as np
 import pytest
 
 from tests.verify.evaluation.materials import material
-from verify.evaluation.resampling import (
-    Weights,
-    draw_weights,
-    fmr_grid,
-    fnmr_curve,
-    fnmr_replicates,
-)
+from verify.evaluation.resampling import OperatingPoints, fmr_grid, replicate_weights
 from verify.metrics import fnmr_at_fmr
 
 
 def test_replicates_weigh_people_as_often_as_they_are_drawn() -> None:
     known = material(people=20, pairs=60)
-    weights = draw_weights(known, seed=1, replicates=200)
-    assert weights.interval == "subject-bootstrap"
+    drawn = list(replicate_weights(known, seed=1, replicates=200))
     people = known.people
     assert people is not None
-    genuine = people[known.first[known.same]]
-    # Two genuine pairs of one person always weigh the same.
-    for person in np.unique(genuine):
-        columns = weights.genuine[:, genuine == person]
-        assert (columns == columns[:, :1]).all()
-    # Where a person was not drawn, their impostor pairs weigh nothing.
-    one, two = people[known.first[~known.same]], people[known.second[~known.same]]
-    for row in range(5):
-        absent = {p for p in np.unique(genuine) if not weights.genuine[row, genuine == p].any()}
-        touched = np.array([a in absent or b in absent for a, b in zip(one, two, strict=True)])
-        assert not weights.impostor[row, touched].any()
-    assert weights.genuine.mean() == pytest.approx(1, abs=0.1)
+    person = people[0, known.same]
+    one, two = people[:, ~known.same]
+    for genuine, impostor in drawn:
+        # All genuine pairs of one person weigh the same: how often the person was drawn.
+        times = {p: genuine[person == p] for p in np.unique(person)}
+        assert all((weights == weights[0]).all() for weights in times.values())
+        both = [k for k in range(len(one)) if one[k] in times and two[k] in times]
+        expected = [times[one[k]][0] * times[two[k]][0] for k in both]
+        np.testing.assert_array_equal(impostor[both], expected)
+    assert np.mean([genuine.mean() for genuine, _ in drawn]) == pytest.approx(1, abs=0.1)
 
 
 def test_pairs_are_drawn_where_people_have_no_names() -> None:
     nameless = material(people=20, pairs=60, named=False)
-    weights = draw_weights(nameless, seed=1, replicates=50)
-    assert weights.interval == "pair-bootstrap"
-    total = weights.genuine.sum(axis=1) + weights.impostor.sum(axis=1)
-    assert (total == len(nameless)).all()
+    for genuine, impostor in replicate_weights(nameless, seed=1, replicates=50):
+        assert genuine.sum() + impostor.sum() == len(nameless)
+        assert genuine.any()
+        assert impostor.any()
+
+
+def test_one_seed_gives_one_sequence_of_draws() -> None:
+    known = material()
+    once, again = (list(replicate_weights(known, seed=3, replicates=5)) for _ in range(2))
+    for left, right in zip(once, again, strict=True):
+        np.testing.assert_array_equal(left[0], right[0])
+        np.testing.assert_array_equal(left[1], right[1])
 
 
 @pytest.mark.parametrize("decimals", [1, 3])
-def test_the_curve_is_that_of_the_metrics(decimals: int) -> None:
+def test_unweighted_points_are_those_of_the_metrics(decimals: int) -> None:
     generator = np.random.default_rng(decimals)
     mated = np.round(generator.normal(0.6, 0.2, 300), decimals)
     other = np.round(generator.normal(0, 0.2, 400), decimals)
     fmrs = np.array([3 / 400, 0.01, 0.1, 0.5])
     expected = [fnmr_at_fmr(mated, other, fmr)[1].value for fmr in fmrs]
-    np.testing.assert_allclose(fnmr_curve(mated, other, fmrs), expected, atol=1e-12)
+    np.testing.assert_allclose(OperatingPoints(mated, other).fnmr(fmrs), expected, atol=1e-12)
 
 
-def test_a_replicate_is_the_curve_of_the_trials_it_repeats() -> None:
+def test_weights_stand_for_trials_that_are_repeated() -> None:
     generator = np.random.default_rng(5)
     mated, other = generator.normal(0.6, 0.3, 50), generator.normal(0, 0.3, 80)
-    weights = Weights(
-        generator.integers(0, 3, (6, 50)).astype(float),
-        generator.integers(0, 3, (6, 80)).astype(float),
-        "pair-bootstrap",
-    )
+    points = OperatingPoints(mated, other)
     fmrs = np.array([0.05, 0.2, 1.0])
-    found = fnmr_replicates(mated, other, weights, fmrs)
-    for row in range(6):
-        repeated = np.repeat(other, weights.impostor[row].astype(int))
-        genuine = np.repeat(mated, weights.genuine[row].astype(int))
+    for _ in range(6):
+        genuine, impostor = generator.integers(0, 3, 50), generator.integers(0, 3, 80)
+        found = points.fnmr(fmrs, genuine=genuine.astype(float), impostor=impostor.astype(float))
+        ranked = np.sort(np.repeat(other, impostor))[::-1]
+        repeated = np.repeat(mated, genuine)
         for place, fmr in enumerate(fmrs):
-            ranked = np.sort(repeated)[::-1]
             allowed = int(np.floor(fmr * len(ranked) + 1e-9))
             least = ranked[allowed] if allowed < len(ranked) else -np.inf
             # The cut lies above the first that is rejected, and accepts all above that one.
             above = ranked[ranked > least]
             most = above.min() if above.size else np.inf
-            low = np.count_nonzero(genuine <= least) / len(genuine)
-            high = np.count_nonzero(genuine < most) / len(genuine)
-            assert low - 1e-6 <= found[row, place] <= high + 1e-6
+            low = np.count_nonzero(repeated <= least) / len(repeated)
+            high = np.count_nonzero(repeated < most) / len(repeated)
+            assert low - 1e-9 <= found[place] <= high + 1e-9
 
 
 def test_the_grid_begins_where_the_data_can_speak() -> None:

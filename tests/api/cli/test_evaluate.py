@@ -1,0 +1,669 @@
+"""`veilface evaluate` end to end on drawn faces and the demo model, and on a Dask cluster."""
+
+import csv
+import io
+import json
+import os
+import pickle
+import shutil
+import tempfile
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+from distributed import LocalCluster
+from PIL import Image
+from sklearn.model_selection import KFold
+
+from api.cli import evaluate, evaluation_inputs
+from models.decoding import decode_image
+from models.demo import DEMO_NOTICE, build_demo_pack
+from models.pack import ModelPack
+from models.synthetic import draw_face, encode_photo
+from templates.subspace import SubspaceBatch
+from tests.api.cli.conftest import Ran, run
+from verify.evaluation import evaluation, scoring
+
+PEOPLE, PHOTOS, FOLDS, PER_CLASS = 12, 4, 10, 3
+PAIRS = 2 * FOLDS * PER_CLASS
+STRATEGIES = ("raw", "raw+flip", "random", "adversarial", "hybrid+", "biohashing")
+CONTRACT = {
+    *("dataset", "strategy", "dim", "mode", "metric", "accuracy_mean", "accuracy_std", "eer"),
+    *("fnmr_at_fmr", "threshold_mean", "n_genuine", "n_impostor", "seed"),
+}
+FILES = [
+    *("results.json", "results.csv", "results.md"),
+    *("figure.png", "figure.svg", "det.png", "det.svg", "roc.png", "roc.svg"),
+]
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A set of drawn people, a pack, decoys, and what a full run on them said."""
+
+    root: Path
+    first: Ran
+
+    lfw = property(lambda self: self.root / "lfw")
+    pack = property(lambda self: self.root / "pack")
+    labels = property(lambda self: self.root / "labels.csv")
+    base = property(
+        lambda self: ("--pack", self.pack, "--data-dir", self.root / "data", "--jobs", "1")
+    )
+    decoys = property(
+        lambda self: (
+            *("--decoys", self.root / "pool.veil"),
+            *("--decoys", self.root / "generator.veil"),
+        )
+    )
+    plan = property(
+        lambda self: ("--dim", "2", "--repeats", "2", "--seed", "7", "--fmr", "0.2,0.001")
+    )
+
+    @property
+    def full(self) -> tuple[str | Path, ...]:
+        return (
+            *("evaluate", self.lfw, *self.base, *self.decoys, *self.plan),
+            *("--strategy", ",".join(STRATEGIES), "--labels", self.labels),
+        )
+
+
+def pair_lines() -> list[str]:
+    """The lines of ``pairs.txt`` after its header."""
+    rng = np.random.default_rng(0)
+    lines = []
+    for fold in range(FOLDS):
+        for number in range(PER_CLASS):
+            one, two = rng.choice(PHOTOS, 2, replace=False) + 1
+            lines.append(f"Person_{(PER_CLASS * fold + number) % PEOPLE}\t{one}\t{two}")
+        for _ in range(PER_CLASS):
+            (p, q), (i, j) = rng.choice(PEOPLE, 2, replace=False), rng.integers(PHOTOS, size=2) + 1
+            lines.append(f"Person_{p}\t{i}\tPerson_{q}\t{j}")
+    return lines
+
+
+def pairs_of(folder: Path) -> list[tuple[Path, Path, bool]]:
+    found = []
+    for line in (folder / "pairs.txt").read_text().splitlines()[1:]:
+        cells = line.split("\t")
+        a, i, b, j = cells if len(cells) == 4 else (cells[0], cells[1], cells[0], cells[2])
+        photos = (folder / who / f"{who}_{int(n):04d}.png" for who, n in ((a, i), (b, j)))
+        found.append((*photos, a == b))
+    return found
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
+    root = tmp_path_factory.mktemp("bench")
+    build_demo_pack(root / "pack")
+    labels = ["path,gender,race"]
+    for person in range(PEOPLE):
+        folder = root / "lfw" / f"Person_{person}"
+        folder.mkdir(parents=True)
+        for photo in range(PHOTOS):
+            data = encode_photo(draw_face(100 + person, photo))
+            (folder / f"Person_{person}_{photo + 1:04d}.png").write_bytes(data)
+        labels.append(f"Person_{person},{'Female' if person % 2 else 'Male'},White")
+    (root / "lfw" / "pairs.txt").write_text("\n".join([f"{FOLDS}\t{PER_CLASS}", *pair_lines()]))
+    (root / "labels.csv").write_text("\n".join(labels))
+    lines = ["file,age,gender,race,service_test"]
+    (root / "decoys" / "train").mkdir(parents=True)
+    for number in range(110):
+        (root / f"decoys/train/{number}.png").write_bytes(encode_photo(draw_face(5000 + number)))
+        gender, race = ("Male", "Female")[number % 2], ("White", "Black", "Indian")[number % 3]
+        lines.append(f"train/{number}.png,20-29,{gender},{race},FALSE")
+    (root / "decoys" / "fairface_label_train.csv").write_text("\n".join(lines))
+    for kind in ("pool", "generator"):
+        ran = run(
+            *("decoys", "build", root / "decoys" / "train", "--pack", root / "pack"),
+            *("--kind", kind, "--data-dir", root / "data", "--out", root / f"{kind}.veil"),
+        )
+        assert ran.status == 0, ran.stderr
+    unfinished = Bench(root, Ran(0, "", ""))
+    first = run(*unfinished.full, "--out", root / "out", "--json")
+    assert first.status == 0, first.stderr
+    return Bench(root, first)
+
+
+@pytest.fixture(scope="module")
+def results(bench: Bench) -> Any:
+    return json.loads((bench.root / "out" / "results.json").read_text())
+
+
+def embedded(bench: Bench, *, flip: bool = False) -> dict[Path, np.ndarray]:
+    pack = ModelPack.load(bench.pack, threads=1, flip=flip)
+    photos = sorted(bench.lfw.rglob("*.png"))
+    return dict(
+        zip(photos, pack.embed(np.stack([decode_image(p.read_bytes()) for p in photos])))  # noqa: B905
+    )
+
+
+def numbers(rows: list[Any]) -> list[Any]:
+    """Rows without the name of their set and without what depends on the names of people."""
+    kept = []
+    for row in rows:
+        own = {key: value for key, value in row.items() if key not in ("dataset", "interval")}
+        for part in ("low", "high"):
+            own.pop(part, None)
+        if "fnmr_at_fmr" in own:
+            own["fnmr_at_fmr"] = {
+                target: {
+                    key: value
+                    for key, value in at.items()
+                    if key not in ("ci_low", "ci_high", "interval")
+                }
+                for target, at in own["fnmr_at_fmr"].items()
+            }
+        kept.append(own)
+    return kept
+
+
+def test_everything_is_written(bench, results):
+    out = bench.root / "out"
+    assert sorted(p.name for p in out.iterdir()) == sorted([*FILES, "units"])
+    assert bench.first.json["files"] == FILES
+    for name in ("figure", "det", "roc"):
+        with Image.open(out / f"{name}.png") as picture:
+            assert min(picture.size) > 300
+            assert len(set(np.asarray(picture.convert("L")).ravel().tolist())) > 10
+        assert ET.parse(out / f"{name}.svg").getroot().tag.endswith("svg")
+    lines = list(csv.DictReader(io.StringIO((out / "results.csv").read_text(encoding="utf-8"))))
+    assert len(lines) == len(results["rows"])
+    for line, row in zip(lines, results["rows"], strict=True):
+        assert line["strategy"] == row["strategy"]
+        assert float(line["accuracy_mean"]) == row["accuracy_mean"]
+        assert float(line["fnmr_at_fmr_0.2_ci_high"]) == row["fnmr_at_fmr"]["0.2"]["ci_high"]
+    report = (out / "results.md").read_text(encoding="utf-8")
+    raw = next(row for row in results["rows"] if row["strategy"] == "raw")
+    assert f"{100 * raw['accuracy_mean']:.2f} ± {100 * raw['accuracy_std']:.2f}" in report
+    assert "Failures to acquire: none." in report
+
+
+def test_only_json_is_on_stdout_and_it_is_the_document(bench, results):
+    said = bench.first.json
+    assert said.pop("notice") == DEMO_NOTICE
+    assert said.pop("out") == str(bench.root / "out")
+    assert said.pop("files") == FILES
+    assert said == results
+    assert f"note: {DEMO_NOTICE}" in bench.first.stderr
+    assert "note: lfw has 60 pairs, the published set has 6,000" in bench.first.stderr
+
+
+def test_every_row_has_the_fields_of_the_contract(results):
+    for row in results["rows"]:
+        assert row.keys() >= CONTRACT
+        assert (row["dataset"], row["seed"]) == ("lfw", 7)
+        assert row["n_genuine"] == row["n_impostor"] == PAIRS // 2
+        assert 0.5 <= row["accuracy_mean"] <= 1
+        assert set(row["fnmr_at_fmr"]) == {"0.2"}
+        at = row["fnmr_at_fmr"]["0.2"]
+        assert 0 <= at["ci_low"] <= at["value"] <= at["ci_high"] <= 1
+        assert at["ci_high"] > 0.1  # 30 trials say little, with no error too
+        assert at["fmr"] <= 0.2
+    (refused,) = results["refused"]
+    assert "FMR 0.001 is not reported" in refused
+    seeds = {each["seed"] for each in results["runs"]}
+    assert seeds == {None, 7, 8}
+
+
+def test_rows_are_what_was_asked_for(results):
+    kinds = [None, "generator", "pool"]
+    expected = [("raw", None, 0, "p2p", "euclidean", search) for search in ("grid", "exact")]
+    expected += [("raw+flip", *rest) for _, *rest in expected]
+    for mode in ("p2s", "s2s"):
+        for strategy, decoys in (
+            ("random", kinds[:1]),
+            ("adversarial", kinds[1:]),
+            ("hybrid+", kinds[2:]),
+        ):
+            expected += [
+                (strategy, kind, 2, mode, metric, "exact")
+                for kind in decoys
+                for metric in ("euclidean", "spherical")
+            ]
+    expected += [
+        (f"biohashing{end}", None, 256, "hash", "hamming", "exact") for end in ("", "-stolen")
+    ]
+    keys = ("strategy", "decoys", "dim", "mode", "metric", "threshold_search")
+    assert [tuple(row[key] for key in keys) for row in results["rows"]] == expected
+
+
+@pytest.mark.parametrize(("strategy", "flip"), [("raw", False), ("raw+flip", True)])
+def test_raw_rows_are_those_of_the_literature(bench, results, strategy, flip):
+    """InsightFace's ``calculate_accuracy`` written anew, with scikit-learn's folds."""
+    known = embedded(bench, flip=flip)
+    pairs = pairs_of(bench.lfw)
+    same = np.array([one for *_, one in pairs])
+    gaps = np.array([known[a].astype(float) - known[b].astype(float) for a, b, _ in pairs])
+    distances = np.square(gaps).sum(axis=1)
+    accuracies = []
+    for train, test in KFold(n_splits=10, shuffle=False).split(np.arange(len(pairs))):
+        right = [np.mean((distances[train] < t) == same[train]) for t in np.arange(0, 4, 0.01)]
+        threshold = np.arange(0, 4, 0.01)[np.argmax(right)]
+        accuracies.append(np.mean((distances[test] < threshold) == same[test]))
+    (row,) = (
+        row
+        for row in results["rows"]
+        if (row["strategy"], row["threshold_search"]) == (strategy, "grid")
+    )
+    assert row["accuracy_mean"] == pytest.approx(np.mean(accuracies), abs=1e-12)
+    assert row["accuracy_std"] == pytest.approx(np.std(accuracies), abs=1e-12)
+
+
+def test_groups_are_reported(results, bench):
+    genuine = [one for one in pairs_of(bench.lfw) if one[2]]
+    female = sum(int(a.parent.name.split("_")[1]) % 2 for a, *_ in genuine)
+    rows = [
+        entry
+        for entry in results["groups"]
+        if (entry["strategy"], entry["attribute"]) == ("raw", "gender")
+    ]
+    trials = {entry["group"]: entry["fnmr"]["trials"] for entry in rows}
+    assert trials == {"Female": female, "Male": PAIRS // 2 - female}
+    attributes = {entry["attribute"] for entry in results["group_summaries"]}
+    assert attributes == {"gender", "race"}
+    assert "gender" in (bench.root / "out" / "results.md").read_text()
+    # The people are labelled, so hybrid+ predicts nobody.
+    assert results["options"]["predicted_attributes"] == {"lfw": 0}
+
+
+def test_a_second_run_goes_on_and_says_the_same(bench, results):
+    units = bench.root / "out" / "units"
+    before = {file.name: file.stat().st_mtime_ns for file in units.iterdir()}
+    again = run(*bench.full, "--out", bench.root / "out", "--json")
+    assert again.status == 0
+    assert {file.name: file.stat().st_mtime_ns for file in units.iterdir()} == before
+    assert len(before) == 2 + 2 * (1 + 2 + 1) + 2 * 2
+    said = again.json
+    for part in ("notice", "out", "files"):
+        said.pop(part)
+    # Nothing but times differs.
+    assert len(said.pop("timings")) == len(results["timings"])
+    for mine, theirs in zip(said.pop("work"), results["work"], strict=True):
+        assert (mine["resumed"], theirs["resumed"]) == (mine["units"], 0)
+    assert said == {key: value for key, value in results.items() if key in said}
+    assert set(results) - set(said) == {"timings", "work"}
+
+
+def test_more_repeats_only_add_units(bench, tmp_path):
+    base = ("evaluate", bench.lfw, *bench.base, "--strategy", "random", "--dim", "2")
+    base = (*base, "--mode", "p2s", "--metric", "spherical", "--fmr", "0.2", "--out", tmp_path)
+    assert run(*base, "--repeats", "1").status == 0
+    (first,) = (tmp_path / "units").iterdir()
+    before = first.stat().st_mtime_ns
+    more = run(*base, "--repeats", "2", "--json")
+    assert len(list((tmp_path / "units").iterdir())) == 2
+    assert first.stat().st_mtime_ns == before
+    assert {each["seed"] for each in more.json["runs"]} == {0, 1}
+
+
+def test_no_face_is_left_in_what_was_written(bench, tmp_path, monkeypatch):
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    monkeypatch.setenv("TMPDIR", str(temporary))
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    lifted: list[SubspaceBatch] = []
+    plain = scoring.lift
+
+    def recorded(*given: Any, **named: Any) -> SubspaceBatch:
+        lifted.append(plain(*given, **named))
+        return lifted[-1]
+
+    monkeypatch.setattr(scoring, "lift", recorded)
+    out = tmp_path / "out"
+    ran = run(*bench.full, "--out", out)
+    assert ran.status == 0, ran.stderr
+    assert list(temporary.iterdir()) == []
+    written = [file.read_bytes() for file in out.rglob("*") if file.is_file()]
+    assert len(written) > len(FILES)
+    needles = secrets(bench) + secret_bytes(
+        row for batch in lifted for row in (*batch.feet, *batch.bases[:, 0])
+    )
+    assert len(needles) > 4 * 2 * PAIRS
+    whole = b"\n".join(written)
+    assert not [needle for needle in needles if needle in whole]
+
+
+def secret_bytes(rows: Any) -> list[bytes]:
+    """How a row may stand in a file: three widths of floats, or as text."""
+    found = []
+    for row in rows:
+        piece = row[100:108]
+        found += [piece.astype(kind).tobytes() for kind in ("<f2", "<f4", "<f8")]
+        found.append(repr(float(piece[0])).encode())
+    return found
+
+
+def secrets(bench: Bench) -> list[bytes]:
+    """Descriptors and photos, as files could have them."""
+    known = [row for flip in (False, True) for row in embedded(bench, flip=flip).values()]
+    photos = [file.read_bytes() for file in bench.lfw.rglob("*.png")]
+    pixels = [decode_image(data)[56, 40:60].tobytes() for data in photos]
+    return secret_bytes(known) + [data[200:232] for data in photos] + pixels
+
+
+def test_local_processes_give_the_same_rows_and_keep_no_file(bench, results, tmp_path, monkeypatch):
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    monkeypatch.setenv("JOBLIB_TEMP_FOLDER", str(temporary))
+    asked = ("raw", "adversarial", "biohashing")
+    given = ("--strategy", ",".join(asked), "--jobs", "2", "--out", tmp_path / "out", "--json")
+    ran = run(*bench.full, *given)
+    assert ran.status == 0, ran.stderr
+    for part in ("rows", "runs", "curves", "groups"):
+        wanted = [row for row in results[part] if row["strategy"].removesuffix("-stolen") in asked]
+        assert ran.json[part] == wanted
+    left = [file.read_bytes() for file in temporary.rglob("*") if file.is_file()]
+    assert not [needle for needle in secrets(bench) if needle in b"\n".join(left)]
+
+
+WITHOUT_FLIP = ",".join(name for name in STRATEGIES if name != "raw+flip")
+
+
+def without_flip(results: Any, part: str) -> list[Any]:
+    return [row for row in results[part] if row["strategy"] != "raw+flip"]
+
+
+def test_descriptors_from_a_file_give_the_rows_of_the_pack(bench, results, tmp_path):
+    known = embedded(bench)
+    paths = np.array([file.relative_to(bench.lfw).as_posix() for file in known])
+    np.savez(tmp_path / "own.npz", paths=paths, descriptors=np.stack(list(known.values())))
+    ran = run(
+        *("evaluate", bench.lfw, "--pack", "none", "--embeddings", tmp_path / "own.npz"),
+        *(*bench.decoys, *bench.plan, "--strategy", WITHOUT_FLIP, "--labels", bench.labels),
+        *("--data-dir", bench.root / "data", "--jobs", "1", "--out", tmp_path / "out", "--json"),
+    )
+    assert ran.status == 0, ran.stderr
+    assert "notice" not in ran.json
+    assert ran.json["model"]["embeddings"] == "own.npz"
+    for theirs, mine in zip(ran.json["rows"], without_flip(results, "rows"), strict=True):
+        assert theirs["contract_id"] is None
+        wanted = mine | {"contract_id": None}
+        for key in ("auc", "d_prime", "threshold_mean"):
+            assert theirs.pop(key) == pytest.approx(wanted.pop(key), abs=1e-5)
+        assert theirs.pop("thresholds") == pytest.approx(wanted.pop("thresholds"), abs=1e-5)
+        for row in (theirs, wanted):
+            row["fnmr_at_fmr"] = {
+                target: {key: value for key, value in at.items() if key != "threshold_mean"}
+                for target, at in row["fnmr_at_fmr"].items()
+            }
+        assert theirs == wanted
+
+
+def test_a_bin_of_the_same_photos_gives_the_same_numbers(bench, results, tmp_path):
+    photos = [photo.read_bytes() for a, b, _ in pairs_of(bench.lfw) for photo in (a, b)]
+    same = [one for *_, one in pairs_of(bench.lfw)]
+    (tmp_path / "drawn.bin").write_bytes(pickle.dumps((photos, same)))
+    ran = run(
+        *("evaluate", tmp_path / "drawn.bin", *bench.base, *bench.decoys, *bench.plan),
+        # hybrid+ by predicted attributes: photos of a .bin have no names to be labelled by.
+        *("--strategy", ",".join(name for name in STRATEGIES if name != "hybrid+")),
+        *("--out", tmp_path / "out", "--json"),
+    )
+    assert ran.status == 0, ran.stderr
+    (dataset,), (folder,) = ran.json["datasets"], results["datasets"]
+    assert (dataset["kind"], dataset["aligned"], dataset["people"]) == ("bin", True, None)
+    assert dataset["pictures_sha256"] == folder["pictures_sha256"]
+    for part in ("rows", "runs", "curves"):
+        wanted = [row for row in results[part] if row["strategy"] != "hybrid+"]
+        assert numbers(ran.json[part]) == numbers(wanted)
+        assert {row["dataset"] for row in ran.json[part]} == {"drawn"}
+    assert {row["fnmr_at_fmr"]["0.2"]["interval"] for row in ran.json["rows"]} == {"wilson"}
+
+
+class Hostile:
+    """Creates a file when it is unpickled by Python's own unpickler."""
+
+    def __init__(self, marker: Path) -> None:
+        self.marker = marker
+
+    def __reduce__(self) -> Any:
+        return os.system, (f"touch '{self.marker}'",)
+
+
+@pytest.mark.parametrize("kind", ["hostile", "hidden", "truncated", "counts", "empty"])
+def test_a_bin_that_is_none_is_refused_and_nothing_runs(bench, tmp_path, kind):
+    marker = tmp_path / "marker"
+    photos = [photo.read_bytes() for a, b, _ in pairs_of(bench.lfw) for photo in (a, b)]
+    same: list[Any] = [one for *_, one in pairs_of(bench.lfw)]
+    content: Any = {
+        "hostile": Hostile(marker),
+        "hidden": ([*photos[:-1], Hostile(marker)], same),
+        "counts": (photos[:-2], same),
+    }.get(kind, (photos, same))
+    data = pickle.dumps(content)
+    if kind == "hostile":
+        pickle.loads(data)
+        assert marker.exists()  # the file does what it is made for
+        marker.unlink()
+    file = tmp_path / "bad.bin"
+    file.write_bytes({"truncated": data[: len(data) // 2], "empty": b""}.get(kind, data))
+    ran = run("evaluate", file, *bench.base, "--out", tmp_path / "out")
+    assert (ran.status, ran.stdout) == (1, "")
+    assert ran.stderr.startswith(f"error: {file} ")
+    assert "Traceback" not in ran.stderr
+    assert not marker.exists()
+    assert not (tmp_path / "out").exists()
+
+
+def test_photos_that_are_not_there_are_listed(bench, tmp_path):
+    folder = tmp_path / "lfw"
+    shutil.copytree(bench.lfw, folder)
+    lost = sorted({pairs_of(folder)[0][0], pairs_of(folder)[9][1]})
+    for photo in lost:
+        photo.unlink()
+    ran = run("evaluate", folder, *bench.base, "--out", tmp_path / "out")
+    assert (ran.status, ran.stdout) == (1, "")
+    assert f"has {len(lost)} fault(s)" in ran.stderr
+    for photo in lost:
+        assert f"{photo.parent.name}/{photo.stem} is not there" in ran.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_photo_without_a_face_is_a_failure_to_acquire(bench, tmp_path):
+    folder = tmp_path / "lfw"
+    shutil.copytree(bench.lfw, folder)
+    broken = pairs_of(folder)[0][0]
+    broken.write_bytes(b"not a photo")
+    pairs = [(broken in (a, b), same) for a, b, same in pairs_of(folder)]
+    lost = [sum(hit and same is kind for hit, same in pairs) for kind in (True, False)]
+    ran = run(
+        *("evaluate", folder, *bench.base, "--strategy", "raw", "--fmr", "0.2"),
+        *("--out", tmp_path / "out"),
+    )
+    assert ran.status == 0, ran.stderr
+    images = len({photo for a, b, _ in pairs_of(folder) for photo in (a, b)})
+    assert f"note: lfw: 1 of {images} photos failed to acquire" in ran.stderr
+    assert DEMO_NOTICE in ran.stderr
+    assert "lfw: " in ran.stdout
+    written = json.loads((tmp_path / "out" / "results.json").read_text())
+    (dataset,) = written["datasets"]
+    (failure,) = dataset["failures"]
+    name = broken.relative_to(folder).as_posix()
+    assert (failure["image"], failure["code"]) == (name, "unsupported_image")
+    assert dataset["fta"] == 1 / images
+    for row in written["rows"]:
+        assert [row["failed_genuine"], row["failed_impostor"]] == lost
+        assert [row["n_genuine"], row["n_impostor"]] == [PAIRS // 2 - count for count in lost]
+    assert name in (tmp_path / "out" / "results.md").read_text()
+
+
+def test_attributes_are_predicted_from_a_labelled_pool(bench, tmp_path):
+    ran = run(
+        *("evaluate", bench.lfw, *bench.base, "--decoys", bench.root / "pool.veil"),
+        *("--strategy", "hybrid+", "--dim", "2", "--mode", "s2s", "--metric", "spherical"),
+        *("--repeats", "1", "--fmr", "0.2", "--shared-decoys", "--out", tmp_path, "--json"),
+    )
+    assert ran.status == 0, ran.stderr
+    images = ran.json["datasets"][0]["images"]
+    assert ran.json["options"]["predicted_attributes"] == {"lfw": images}
+    (row,) = ran.json["rows"]
+    assert (row["strategy"], row["decoys"], row["shared_decoys"]) == ("hybrid+", "pool", True)
+
+
+def test_an_audit_adds_the_frontier(bench, tmp_path):
+    rows = [
+        {
+            **{"strategy": "random", "decoys": None, "dim": 2, "attribute": "gender"},
+            **{"attacker": "knn", "accuracy": 0.7, "chance": 0.5},
+        }
+    ]
+    audit = tmp_path / "report.json"
+    audit.write_text(json.dumps({"format": "veilface audit", "rows": rows}))
+    ran = run(
+        *("evaluate", bench.lfw, *bench.base, "--strategy", "raw,random", "--dim", "2"),
+        *("--repeats", "1", "--fmr", "0.2", "--audit", audit, "--out", tmp_path / "out", "--json"),
+    )
+    assert ran.status == 0, ran.stderr
+    assert ran.json["files"] == [*FILES, "frontier.png", "frontier.svg"]
+
+
+USAGE: list[tuple[list[str], str]] = [
+    (["--strategy", "homomorphic"], "choose of raw, raw+flip, random"),
+    (["--strategy", "raw,raw"], "named twice"),
+    (["--strategy", ","], "--strategy is empty"),
+    (["--strategy", "adversarial"], "make one with `veilface decoys build`"),
+    (["--strategy", "hybrid+", "--decoys", "GENERATOR"], "a pool with gender and race labels"),
+    (["--strategy", "sub-hybrid", "--decoys", "GENERATOR"], "sub-hybrid lifting needs a pool"),
+    (["--dim", "two"], "--dim: "),
+    (["--dim", ""], "--dim is empty"),
+    (["--dim", "0"], "takes dimensions from 1 to 128, not 0"),
+    (["--dim", "2,256", "--strategy", "random"], "takes dimensions from 1 to 128, not 256"),
+    (["--mode", "p2p"], "choose of p2s, s2s"),
+    (["--mode", "both"], "--mode: "),
+    (["--metric", "cosine"], "--metric: "),
+    (["--fmr", "low"], "--fmr: "),
+    (["--fmr", "1"], "FMR targets lie between 0 and 1, such as 1e-2"),
+    (["--fmr", "nan"], "FMR targets lie between 0 and 1, such as 1e-2"),
+    (["--backend", "ray://head:1"], "use local, or dask://HOST:PORT"),
+    (["--backend", "dask://head"], "use local, or dask://HOST:PORT"),
+    (["--strategy", "raw,raw+flip", "--flip"], "it needs a pack, and no --flip"),
+    (["--pack", "none"], "give --pack none --embeddings FILE"),
+    (["--embeddings", "EMBEDDINGS"], "give a pack, or --pack none and --embeddings, not both"),
+    (["--pack", "none", "--embeddings", "EMBEDDINGS", "--flip"], "--flip needs a pack"),
+    (
+        ["--pack", "none", "--embeddings", "EMBEDDINGS", "--strategy", "raw+flip"],
+        "it needs a pack, and no --flip",
+    ),
+    (["LFW"], "two sets have one name (lfw, lfw)"),
+]
+FAILED: list[tuple[list[str], str]] = [
+    (["--decoys", "POOL", "--decoys", "POOL"], "give one pool and one generator at most"),
+    (["--decoys", "POOL", "--flip"], "build the decoys with this pack and the same --flip"),
+    (
+        ["--pack", "none", "--embeddings", "EMBEDDINGS", "--decoys", "POOL"],
+        "decoys of 256 numbers each, the descriptors have 32; build the decoys with this pack",
+    ),
+    (["--decoys", "ABSENT"], "absent: No such file or directory"),
+    (["--labels", "ABSENT"], "the label file absent is not there"),
+    (["--labels", "AUDIT"], "the first column of audit.json is not path or file"),
+    (["--audit", "LABELS"], "labels.csv is no JSON file"),
+    (["--audit", "AUDIT"], "row 0: "),
+]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason", "status"),
+    [(*one, 2) for one in USAGE] + [(*one, 1) for one in FAILED],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_what_cannot_be_done_is_said_before_any_face_is_embedded(
+    bench, tmp_path, monkeypatch, arguments, reason, status
+):
+    monkeypatch.setattr(evaluate, "acquire_faces", None)
+    monkeypatch.setattr(ModelPack, "embed", None)
+    rows = np.eye(32, dtype=np.float32)
+    paths = np.array([f"{i}.png" for i in range(32)])
+    np.savez(tmp_path / "embeddings.npz", paths=paths, descriptors=rows)
+    (tmp_path / "audit.json").write_text(
+        json.dumps({"format": "veilface audit", "rows": [{"strategy": "random"}]})
+    )
+    files = {
+        **{"LFW": bench.lfw, "LABELS": bench.labels, "ABSENT": tmp_path / "absent"},
+        **{"POOL": bench.root / "pool.veil", "GENERATOR": bench.root / "generator.veil"},
+        **{"EMBEDDINGS": tmp_path / "embeddings.npz", "AUDIT": tmp_path / "audit.json"},
+    }
+    given = [files.get(argument, argument) for argument in arguments]
+    ran = run("evaluate", bench.lfw, *bench.base, *given, "--out", tmp_path / "out")
+    assert (ran.status, ran.stdout) == (status, "")
+    (sentence,) = [line for line in ran.stderr.splitlines() if not line.startswith("note: lfw")]
+    assert sentence.startswith("error: ")
+    assert reason in sentence
+    assert "defect" not in sentence
+    assert not (tmp_path / "out").exists()
+
+
+def test_options_of_a_wrong_kind_are_refused(bench, tmp_path):
+    for wrong in (["--repeats", "0"], ["--seed", "-1"], ["--jobs", "0"], ["--no-such-option"]):
+        ran = run("evaluate", bench.lfw, *bench.base, *wrong, "--out", tmp_path / "out")
+        assert (ran.status, ran.stdout) == (2, "")
+        assert wrong[0] in ran.stderr
+        assert "Traceback" not in ran.stderr
+    assert run("evaluate", tmp_path / "absent", *bench.base).status == 1
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LocalCluster]:
+    with LocalCluster(
+        n_workers=2,
+        threads_per_worker=1,
+        processes=True,
+        dashboard_address=None,
+        local_directory=str(tmp_path_factory.mktemp("workers")),
+    ) as running:
+        yield running
+
+
+def address(cluster: LocalCluster) -> str:
+    return str(cluster.scheduler_address).replace("tcp", "dask")
+
+
+def refused(*given: Any, **named: Any) -> Any:
+    raise AssertionError("this work belongs to the cluster")
+
+
+def test_a_cluster_gives_the_same_bits(bench, results, cluster, tmp_path, monkeypatch):
+    before = {process.pid for process in psutil.Process().children(recursive=True)}
+    # Workers are processes of their own: this one must neither embed nor compare.
+    monkeypatch.setattr(ModelPack, "embed", refused)
+    monkeypatch.setattr(evaluation, "run_unit", refused)
+    out = tmp_path / "out"
+    ran = run(*bench.full, "--backend", address(cluster), "--out", out, "--json")
+    assert ran.status == 0, ran.stderr
+    monkeypatch.undo()
+    for part in ("rows", "runs", "curves", "groups", "datasets", "decoys", "model"):
+        assert ran.json[part] == results[part]
+    assert ran.json["options"] == results["options"] | {"backend": "dask"}
+    after = {process.pid for process in psutil.Process().children(recursive=True)}
+    assert after <= before
+    # Workers may write what they hold to files when memory is short.
+    folders = (out, Path(cluster.workers[0].local_directory).parent)
+    held = [file.read_bytes() for root in folders for file in root.rglob("*") if file.is_file()]
+    assert not [needle for needle in secrets(bench) if needle in b"\n".join(held)]
+
+
+def test_a_worker_without_the_pack_is_said_in_one_sentence(bench, cluster, tmp_path, monkeypatch):
+    plain: Callable[..., Any] = evaluation_inputs.PackSource
+    absent = tmp_path / "elsewhere"
+    monkeypatch.setattr(
+        evaluation_inputs, "PackSource", lambda **named: plain(**(named | {"folder": absent}))
+    )
+    ran = run(*bench.full, "--backend", address(cluster), "--out", tmp_path / "out")
+    assert (ran.status, ran.stdout) == (1, "")
+    assert ran.stderr.splitlines()[-1] == (
+        f"error: a worker does not find the pack {absent}: it must lie at the same path there"
+    )
+    assert "Traceback" not in ran.stderr
+
+
+def test_a_cluster_that_is_not_there_is_said_in_one_sentence(bench, tmp_path, monkeypatch):
+    monkeypatch.setattr("verify.evaluation.backends.CONNECT_SECONDS", 0.5)
+    ran = run(*bench.full, "--backend", "dask://127.0.0.1:1", "--out", tmp_path / "out")
+    assert (ran.status, ran.stdout) == (1, "")
+    assert "error: no Dask scheduler answers at tcp://127.0.0.1:1" in ran.stderr
+    assert "Traceback" not in ran.stderr

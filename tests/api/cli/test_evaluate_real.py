@@ -1,0 +1,245 @@
+"""`veilface evaluate` on a part of LFW with real weights, where they are present."""
+
+import pickle
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sklearn.model_selection import KFold
+
+from benchmarks.readme_results import BEGIN, END, main, read_results, readme_table
+from models.decoding import decode_image
+from models.pack import ModelPack
+from models.synthetic import encode_photo
+from tests.api.cli.conftest import Ran, run
+from tests.api.cli.test_evaluate import numbers
+
+FOLDS, PER_CLASS, PUBLISHED = 10, 4, 300
+DIMS = (2, 8)
+PLAN = (
+    *("--strategy", "raw,raw+flip,random,adversarial", "--dim", ",".join(map(str, DIMS))),
+    *("--repeats", "2", "--fmr", "0.1,0.001", "--jobs", "1", "--json"),
+)
+
+
+@dataclass(frozen=True)
+class Part:
+    """The first pairs of each fold of LFW, as a folder of links."""
+
+    folder: Path
+    pack: Path
+    decoys: Path
+    data: Path
+    pairs: list[tuple[Path, Path, bool]]
+    ran: Ran
+    out: Path
+
+
+@pytest.fixture(scope="module")
+def part(
+    lfw_aligned: Path, mbf_pack_dir: Path, fairface: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Part:
+    root = tmp_path_factory.mktemp("part")
+    lines = (lfw_aligned / "pairs.txt").read_text(encoding="utf-8").splitlines()[1:]
+    chosen = [
+        line
+        for fold in range(FOLDS)
+        for kind in range(2)
+        for line in lines[(2 * fold + kind) * PUBLISHED :][:PER_CLASS]
+    ]
+    pairs = []
+    for line in chosen:
+        cells = line.split("\t")
+        a, i, b, j = cells if len(cells) == 4 else (cells[0], cells[1], cells[0], cells[2])
+        names = [f"{who}/{who}_{int(number):04d}.jpg" for who, number in ((a, i), (b, j))]
+        for name in names:
+            link = root / "lfw" / name
+            link.parent.mkdir(parents=True, exist_ok=True)
+            if not link.exists():
+                link.symlink_to(lfw_aligned / name)
+        pairs.append((lfw_aligned / names[0], lfw_aligned / names[1], a == b))
+    text = "\n".join([f"{FOLDS}\t{PER_CLASS}", *chosen])
+    (root / "lfw" / "pairs.txt").write_text(text, encoding="utf-8")
+    decoys, data = root / "decoys.veil", root / "data"
+    built = run(
+        *("decoys", "build", fairface / "train", "--pack", mbf_pack_dir, "--kind", "pool"),
+        *("--aligned", "--limit", "40", "--data-dir", data, "--out", decoys),
+    )
+    assert built.status == 0, built.stderr
+    # The cache goes by content: what another run reads differently is not found in it.
+    given = (
+        *("--pack", mbf_pack_dir, "--decoys", decoys),
+        *("--data-dir", data, "--cache", data / "cache.veil"),
+    )
+    ran = run("evaluate", root / "lfw", *given, *PLAN, "--out", root / "out")
+    assert ran.status == 0, ran.stderr
+    return Part(root / "lfw", mbf_pack_dir, decoys, data, pairs, ran, root / "out")
+
+
+@pytest.fixture(scope="module")
+def crops(part: Part) -> dict[Path, np.ndarray]:
+    photos = sorted({photo for a, b, _ in part.pairs for photo in (a, b)})
+    return {photo: decode_image(photo.read_bytes()) for photo in photos}
+
+
+def literature(distances: np.ndarray, same: np.ndarray) -> tuple[list[float], list[float]]:
+    """InsightFace's ``calculate_roc`` and ``calculate_accuracy``, written anew."""
+    grid = np.arange(0, 4, 0.01)
+    accuracies, thresholds = [], []
+    for train, test in KFold(n_splits=FOLDS, shuffle=False).split(np.arange(len(same))):
+        right = np.zeros(len(grid))
+        for place, threshold in enumerate(grid):
+            predicted = np.less(distances[train], threshold)
+            tp = np.sum(np.logical_and(predicted, same[train]))
+            tn = np.sum(np.logical_and(~predicted, ~same[train]))
+            right[place] = (tp + tn) / train.size
+        best = grid[np.argmax(right)]
+        predicted = np.less(distances[test], best)
+        accuracies.append(float(np.mean(predicted == same[test])))
+        thresholds.append(float(best))
+    return accuracies, thresholds
+
+
+@pytest.mark.parametrize("strategy", ["raw", "raw+flip"])
+def test_raw_numbers_are_those_of_the_literature(
+    part: Part, crops: dict[Path, np.ndarray], strategy: str
+) -> None:
+    # With flip, the sum of both before either is normalised, as InsightFace's script has it.
+    pack = ModelPack.load(part.pack, flip=strategy == "raw+flip")
+    rows = pack.embed(np.stack(list(crops.values()))).astype(np.float64)
+    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+    known = dict(zip(crops, rows, strict=True))
+    same = np.array([one for *_, one in part.pairs])
+    distances = np.array([np.sum((known[a] - known[b]) ** 2) for a, b, _ in part.pairs])
+    accuracies, thresholds = literature(distances, same)
+    (row,) = (
+        each
+        for each in part.ran.json["rows"]
+        if (each["strategy"], each["threshold_search"]) == (strategy, "grid")
+    )
+    (single,) = (
+        each
+        for each in part.ran.json["runs"]
+        if (each["strategy"], each["threshold_search"]) == (strategy, "grid")
+    )
+    assert single["accuracies"] == accuracies
+    assert row["accuracy_mean"] == pytest.approx(np.mean(accuracies), abs=1e-12)
+    assert row["accuracy_std"] == pytest.approx(np.std(accuracies), abs=1e-12)
+    # A squared distance t is the similarity 1 - t / 2.
+    np.testing.assert_allclose(single["thresholds"], 1 - np.array(thresholds) / 2, atol=1e-9)
+    assert row["accuracy_mean"] > 0.98
+
+
+def test_crops_are_recognised_as_aligned(part: Part) -> None:
+    (dataset,) = part.ran.json["datasets"]
+    assert dataset["aligned"] is True
+    assert dataset["failures"] == []
+    assert "notice" not in part.ran.json
+    assert "demo" not in part.ran.stderr
+    assert all(row["n_genuine"] == FOLDS * PER_CLASS for row in part.ran.json["rows"])
+
+
+def test_lifted_rows_have_the_order_of_the_paper(part: Part) -> None:
+    """More decoys cost accuracy, and most of it where both sides are lifted (METHOD, section 3)."""
+    auc = {
+        (row["strategy"], row["dim"], row["mode"], row["metric"]): row["auc"]
+        for row in part.ran.json["rows"]
+    }
+    for metric in ("euclidean", "spherical"):
+        for mode in ("p2s", "s2s"):
+            assert auc["random", 8, mode, metric] > 0.98
+        assert auc["adversarial", 8, "p2s", metric] > 0.95
+        assert auc["adversarial", 8, "s2s", metric] < auc["adversarial", 2, "s2s", metric]
+        assert auc["adversarial", 8, "s2s", metric] < auc["adversarial", 8, "p2s", metric]
+    assert auc["adversarial", 8, "s2s", "euclidean"] < auc["adversarial", 8, "s2s", "spherical"]
+
+
+def test_a_bin_of_the_crops_gives_identical_numbers(part: Part, tmp_path: Path) -> None:
+    photos = [photo.read_bytes() for a, b, _ in part.pairs for photo in (a, b)]
+    same = [one for *_, one in part.pairs]
+    # As the published files are: arrays of bytes, by a Python 2 protocol.
+    arrays = [np.frombuffer(photo, np.uint8) for photo in photos]
+    (tmp_path / "part.bin").write_bytes(pickle.dumps((arrays, same), protocol=2))
+    ran = run(
+        *("evaluate", tmp_path / "part.bin", "--pack", part.pack, "--decoys", part.decoys),
+        *("--data-dir", part.data, "--cache", part.data / "cache.veil", *PLAN),
+        *("--strategy", "raw,random,adversarial", "--out", tmp_path / "out"),
+    )
+    assert ran.status == 0, ran.stderr
+    for block in ("rows", "runs", "curves"):
+        wanted = [row for row in part.ran.json[block] if row["strategy"] != "raw+flip"]
+        assert numbers(ran.json[block]) == numbers(wanted)
+
+
+def test_the_readme_table_has_the_numbers_of_the_results(part: Part, tmp_path: Path) -> None:
+    results = read_results(part.out / "results.json")
+    block = readme_table(results)
+    lines = [
+        [cell.strip() for cell in line.strip("|").split("|")]
+        for line in block.splitlines()
+        if line.startswith("|")
+    ]
+    assert lines[0] == ["lifting (decoys)", "matching", *(f"m = {dim}" for dim in DIMS)]
+    labels = {"random": ("random", None), "adversarial (pool)": ("adversarial", "pool")}
+    assert [tuple(line[:2]) for line in lines[2:]] == [
+        (label, mode) for mode in ("p-to-s", "s-to-s") for label in labels
+    ]
+    for label, mode, *cells in lines[2:]:
+        for dim, cell in zip(DIMS, cells, strict=True):
+            (row,) = (
+                each
+                for each in results["rows"]
+                if (each["strategy"], each["decoys"]) == labels[label]
+                and (each["dim"], each["metric"]) == (dim, "spherical")
+                and each["mode"] == mode.replace("-to-", "2")
+            )
+            spread = row["accuracy_std_seeds"]
+            wanted = f"{100 * row['accuracy_mean']:.2f}"
+            assert cell == (f"{wanted} ± {100 * spread:.2f}" if spread else wanted)
+    (raw,) = (
+        each
+        for each in results["rows"]
+        if (each["strategy"], each["threshold_search"]) == ("raw", "exact")
+    )
+    half = FOLDS * PER_CLASS
+    assert f"Raw descriptors: {100 * raw['accuracy_mean']:.2f} %" in block
+    assert (
+        f"on the {2 * half} pairs of LFW ({half} genuine and {half} impostor compared), w600k_mbf"
+        in block
+    )
+    assert "mean of 2 seeds" in block
+    readme = tmp_path / "README.md"
+    readme.write_text(f"before\n{BEGIN}\n{END}\nafter\n", encoding="utf-8")
+    assert main([str(part.out / "results.json"), "--write", str(readme)]) == 0
+    assert readme.read_text(encoding="utf-8") == f"before\n{BEGIN}\n{block}\n{END}\nafter\n"
+
+
+def test_photos_are_detected_and_one_without_a_face_is_listed(
+    part: Part, lfw_photos: Path, tmp_path: Path
+) -> None:
+    people = sorted(one for one in lfw_photos.iterdir() if one.is_dir())[:FOLDS]
+    photos = [sorted(person.glob("*.jpg"))[:2] for person in people]
+    blank = tmp_path / "blank.png"
+    blank.write_bytes(encode_photo(np.full((250, 250, 3), 127, np.uint8)))
+    lines = ["path_a,path_b,same,fold"]
+    for fold, (one, two) in enumerate(photos):
+        lines.append(f"{one},{two},1,{fold}")
+        lines.append(f"{one},{photos[fold - 1][1]},0,{fold}")
+    lines.append(f"{photos[0][0]},blank.png,0,0")
+    (tmp_path / "own.csv").write_text("\n".join(lines), encoding="utf-8")
+    ran = run(
+        *("evaluate", tmp_path / "own.csv", "--pack", part.pack, "--strategy", "raw"),
+        *("--fmr", "0.5", "--jobs", "1", "--out", tmp_path / "out", "--json"),
+    )
+    assert ran.status == 0, ran.stderr
+    (dataset,) = ran.json["datasets"]
+    assert dataset["aligned"] is False
+    assert [(one["image"], one["code"]) for one in dataset["failures"]] == [
+        ("blank.png", "no_face")
+    ]
+    assert (dataset["failed_genuine"], dataset["failed_impostor"]) == (0, 1)
+    assert "own: 1 of 21 photos failed to acquire" in ran.stderr
+    for row in ran.json["rows"]:
+        assert (row["n_genuine"], row["n_impostor"]) == (FOLDS, FOLDS)
+        assert row["auc"] > 0.95
