@@ -413,7 +413,7 @@ def test_a_bin_of_the_same_photos_gives_the_same_numbers(bench, results, tmp_pat
         wanted = [row for row in results[part] if row["strategy"] != "hybrid+"]
         assert numbers(ran.json[part]) == numbers(wanted)
         assert {row["dataset"] for row in ran.json[part]} == {"drawn"}
-    assert {row["fnmr_at_fmr"]["0.2"]["interval"] for row in ran.json["rows"]} == {"wilson"}
+    assert {row["fnmr_at_fmr"]["0.2"]["interval"] for row in ran.json["rows"]} == {"pair-bootstrap"}
 
 
 class Hostile:
@@ -526,18 +526,18 @@ def test_an_audit_adds_the_frontier(bench, tmp_path):
 USAGE: list[tuple[list[str], str]] = [
     (["--strategy", "homomorphic"], "choose of raw, raw+flip, random"),
     (["--strategy", "raw,raw"], "named twice"),
-    (["--strategy", ","], "--strategy is empty"),
+    (["--strategy", ","], "--strategy takes names of strategies, and is empty"),
     (["--strategy", "adversarial"], "make one with `veilface decoys build`"),
     (["--strategy", "hybrid+", "--decoys", "GENERATOR"], "a pool with gender and race labels"),
     (["--strategy", "sub-hybrid", "--decoys", "GENERATOR"], "sub-hybrid lifting needs a pool"),
-    (["--dim", "two"], "--dim: "),
-    (["--dim", ""], "--dim is empty"),
+    (["--dim", "two"], "--dim takes whole numbers such as 2,4, not 'two'"),
+    (["--dim", ""], "--dim takes whole numbers such as 2,4, and is empty"),
     (["--dim", "0"], "takes dimensions from 1 to 128, not 0"),
     (["--dim", "2,256", "--strategy", "random"], "takes dimensions from 1 to 128, not 256"),
-    (["--mode", "p2p"], "choose of p2s, s2s"),
-    (["--mode", "both"], "--mode: "),
-    (["--metric", "cosine"], "--metric: "),
-    (["--fmr", "low"], "--fmr: "),
+    (["--mode", "p2p"], "--mode takes a list of p2s, s2s, not 'p2p'"),
+    (["--mode", "both"], "--mode takes a list of p2s, s2s"),
+    (["--metric", "cosine"], "--metric takes a list of euclidean, spherical"),
+    (["--fmr", "low"], "--fmr takes rates such as 1e-2,1e-3, not 'low'"),
     (["--fmr", "1"], "FMR targets lie between 0 and 1, such as 1e-2"),
     (["--fmr", "nan"], "FMR targets lie between 0 and 1, such as 1e-2"),
     (["--backend", "ray://head:1"], "use local, or dask://HOST:PORT"),
@@ -551,9 +551,10 @@ USAGE: list[tuple[list[str], str]] = [
         "it needs a pack, and no --flip",
     ),
     (["LFW"], "two sets have one name (lfw, lfw)"),
+    (["--decoys", "POOL", "--decoys", "POOL"], "give one pool and one generator at most"),
+    (["--decoys", "POOL", "--dim", "100"], "draws 100 decoys, and one of 2 parts of the pool has"),
 ]
 FAILED: list[tuple[list[str], str]] = [
-    (["--decoys", "POOL", "--decoys", "POOL"], "give one pool and one generator at most"),
     (["--decoys", "POOL", "--flip"], "build the decoys with this pack and the same --flip"),
     (
         ["--pack", "none", "--embeddings", "EMBEDDINGS", "--decoys", "POOL"],
