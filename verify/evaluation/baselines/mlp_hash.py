@@ -7,7 +7,8 @@ The token seeds the weights of all layers, pseudo-random and orthonormalised; th
 the hidden layers, each followed by a nonlinear function, and the output layer; the output is
 binarised at a threshold. Nothing is trained.
 
-The scheme leaves these open; ours, which are those that later studies state for 512 numbers:
+Only the abstract of the paper was at hand. What it leaves open is set here, the first as another
+reimplementation of the scheme has it for 512 numbers:
 
 - three hidden layers (``HIDDEN_LAYERS``) of twice the descriptor's numbers, 1,024 for 512; for
   larger n they keep 1,024, or n where that is more, as orthonormalising costs the cube;
