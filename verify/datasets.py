@@ -121,12 +121,7 @@ def read_lfw_pairs(
         Listing every faulty line.
     """
     path = Path(file)
-    try:
-        if path.stat().st_size > MAX_PAIRS_BYTES:
-            raise DatasetError(f"{path.name} is larger than {MAX_PAIRS_BYTES} bytes")
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError):
-        raise DatasetError(f"{path.name} cannot be read as UTF-8 text") from None
+    text = decoded(read_whole(path, most=MAX_PAIRS_BYTES), file=path)
     index = {(entry.parent.name, entry.stem): number for number, entry in enumerate(paths)}
     gone = {(entry.parent.name, entry.stem) for entry in missing}
     pairs: list[Pair] = []
@@ -199,6 +194,42 @@ def _photo_keys(line: str, *, same: bool) -> tuple[tuple[str, str], tuple[str, s
     if not all(number.isdecimal() and len(number) < 7 for number in (i, j)):
         return None
     return (first, f"{first}_{int(i):04d}"), (second, f"{second}_{int(j):04d}")
+
+
+def read_whole(file: Path, *, most: int) -> bytes:
+    """Read a file of at most ``most`` bytes.
+
+    Raises
+    ------
+    DatasetError
+        The file is larger, or cannot be read.
+    """
+    try:
+        if not file.is_file():
+            raise DatasetError(f"{file} is not there")
+        with file.open("rb") as stream:
+            data = stream.read(most + 1)
+    except OSError as error:
+        raise DatasetError(f"{file} cannot be read: {error.strerror}") from None
+    except MemoryError:
+        raise DatasetError(f"{file} is larger than the memory of this machine") from None
+    if len(data) > most:
+        raise DatasetError(f"{file} is larger than {most} bytes")
+    return data
+
+
+def decoded(data: bytes, *, file: Path) -> str:
+    """Decode UTF-8, with or without a byte-order mark; ``file`` is for messages only.
+
+    Raises
+    ------
+    DatasetError
+        It is other text, or none.
+    """
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise DatasetError(f"{file} is not UTF-8 text; save it as UTF-8") from None
 
 
 def faults_in(where: Path, expected: str, faults: Sequence[str], *, most: int = 20) -> str:

@@ -67,6 +67,8 @@ def read_labels(file: Path) -> dict[Path, Label]:
 def _label(row: dict[str, str], *, where: str) -> Label:
     if any(not row.get(name) for name in _NEEDED):
         raise CommandError(f"{where}: a cell is empty")
+    if not row["file"].isprintable():
+        raise CommandError(f"{where}: the file has a name with characters that are not printable")
     age = repaired_age(row["age"])
     if age is None:
         raise CommandError(

@@ -10,19 +10,28 @@ import re
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path, PurePosixPath
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from templates.decoys import Attributes
-from verify.datasets import SUFFIXES, DatasetError
+from verify.datasets import SUFFIXES, DatasetError, faults_in
 from verify.fairface_labels import AGES, repaired_age
 
-MAX_BYTES = 64 * 2**20
+if TYPE_CHECKING:
+    import _csv
+
+MAX_BYTES = 16 * 2**20
 MAX_GROUPS = 256
 """Different labels of one attribute; a column with more holds names or numbers, not groups."""
 # FairFace's mark of the photos of its own service test; it says nothing about a person.
 _NO_ATTRIBUTE = "service_test"
-_DATE = re.compile(r"\d{1,4}-[A-Za-z]{3}|[A-Za-z]{3}-\d{1,4}")
-_MOST_FAULTS = 20
+# A month, as spreadsheets write it in English or German, or two equal separators between numbers.
+_DATE = re.compile(
+    r"(?<![a-zäöü])(jan|feb|mar|mrz|mär|apr|may|mai|jun|jul|aug|sep|oct|okt|nov|dec|dez)"
+    r"(uary|uar|ruary|ruar|ch|z|il|e|i|y|ust|t|tember|ober|ember)?(?![a-zäöü])"
+    r"|\d([-/.])\s*\d+\3\s*\d",
+    re.IGNORECASE,
+)
 
 
 @dataclass(frozen=True, repr=False)
@@ -65,10 +74,13 @@ class Labels:
             return self.of[name]
         if _stem(name) in self._stems:
             return self._stems[_stem(name)]
-        for folder in PurePosixPath(name).parents:
-            for key in (str(folder), folder.name):
+        folder = name.rpartition("/")[0]
+        while folder:
+            above, _, alone = folder.rpartition("/")
+            for key in (folder, alone):
                 if key in self.of:
                     return self.of[key]
+            folder = above
         return {}
 
     def column(self, attribute: str, pictures: Iterable[str]) -> list[str | None]:
@@ -88,52 +100,94 @@ def read_labels(file: Path | str) -> Labels:
     ------
     DatasetError
         Listing every fault with its line: no such columns, wrong numbers of cells, a row without
-        a path, two rows of one path that differ, an age that is a date of no known meaning.
+        a path, two rows of one path that differ, an attribute with too many labels, an age that
+        is none of FairFace's beside others that are, or that is a date.
     """
     path = Path(file)
-    lines = _lines(path)
-    if not lines:
-        raise DatasetError(f"{path.name} is empty; expected the columns path,gender,race …")
-    attributes = _attributes(path, lines[0][1])
-    faults: list[str] = []
-    of: dict[str, dict[str, str]] = {}
-    for number, cells in lines[1:]:
-        name, row = _row(attributes, cells, number=number, faults=faults)
-        if name and of.setdefault(name, row) != row:
-            faults.append(f"line {number} labels {name} otherwise than a line before it")
-    kept = tuple(name for name in attributes if name != _NO_ATTRIBUTE)
-    for attribute in kept:
-        count = len({row[attribute] for row in of.values() if attribute in row})
-        if count > MAX_GROUPS:
-            faults.append(
-                f"the column {attribute} has {count} different labels, and {MAX_GROUPS} groups are "
-                "the most: remove the column, or put its values into ranges"
-            )
-    if not of and not faults:
-        faults.append("there is no row below the header")
-    if faults:
-        shown = "; ".join(faults[:_MOST_FAULTS])
-        more = f"; and {len(faults) - _MOST_FAULTS} more" if len(faults) > _MOST_FAULTS else ""
-        raise DatasetError(f"{path.name} has {len(faults)} fault(s): {shown}{more}")
-    return Labels(attributes=kept, of=of)
-
-
-def _lines(path: Path) -> list[tuple[int, list[str]]]:
-    """Line number and cells of each line that is not blank."""
     try:
         if path.stat().st_size > MAX_BYTES:
             raise DatasetError(f"{path.name} is larger than {MAX_BYTES} bytes; is it a label file?")
         with path.open(encoding="utf-8-sig", newline="") as stream:
-            reader = csv.reader(stream, strict=True)
-            return [
-                (reader.line_num, [cell.strip() for cell in cells])
-                for cells in reader
-                if any(cell.strip() for cell in cells)
-            ]
+            return _read(path, csv.reader(stream, strict=True))
     except FileNotFoundError:
         raise DatasetError(f"the label file {path.name} is not there") from None
     except (OSError, UnicodeDecodeError, csv.Error):
         raise DatasetError(f"{path.name} cannot be read as a CSV file in UTF-8") from None
+
+
+def _read(path: Path, reader: "_csv.Reader") -> Labels:
+    lines = (
+        (reader.line_num, cells)
+        for cells in ([cell.strip() for cell in line] for line in reader)
+        if any(cells)
+    )
+    header = next(lines, None)
+    if header is None:
+        raise DatasetError(f"{path.name} is empty; expected the columns path,gender,race …")
+    attributes = _attributes(path, header[1])
+    kept = tuple(name for name in attributes if name != _NO_ATTRIBUTE)
+    groups: dict[str, dict[str, int]] = {attribute: {} for attribute in kept}
+    made: dict[tuple[str, ...], dict[str, str]] = {}
+    of: dict[str, dict[str, str]] = {}
+    faults: list[str] = []
+    for number, cells in lines:
+        if len(cells) != len(attributes) + 1:
+            faults.append(
+                f"line {number} has {len(cells)} cells, and the header {len(attributes) + 1}"
+            )
+            continue
+        name = _normal(cells[0])
+        if not name:
+            faults.append(f"line {number} has no path")
+            continue
+        key = tuple(cells[1:])
+        if key not in made:
+            # Rows of the same labels share them: there are far fewer of these than rows.
+            made[key] = _labels(attributes, key)
+            for attribute, label in made[key].items():
+                groups[attribute].setdefault(label, number)
+            if crowded := [name for name in kept if len(groups[name]) > MAX_GROUPS]:
+                faults.append(
+                    f"the column {crowded[0]} has more than {MAX_GROUPS} different labels, which "
+                    "are names or numbers and no groups: remove the column, or put its values "
+                    "into ranges"
+                )
+                break
+        if of.setdefault(name, made[key]) != made[key]:
+            faults.append(f"line {number} labels {name} otherwise than a line before it")
+    faults += _faults_of_ages(groups.get("age", {}))
+    if not of and not faults:
+        faults.append("there is no row below the header")
+    if faults:
+        raise DatasetError(faults_in(Path(path.name), "expected labels as in its header", faults))
+    return Labels(attributes=kept, of=of)
+
+
+def _labels(attributes: Sequence[str], cells: Sequence[str]) -> dict[str, str]:
+    labels = {
+        attribute: cell
+        for attribute, cell in zip(attributes, cells, strict=True)
+        if cell and attribute != _NO_ATTRIBUTE
+    }
+    if "age" in labels:
+        labels["age"] = repaired_age(labels["age"]) or labels["age"]
+    return labels
+
+
+def _faults_of_ages(ages: Mapping[str, int]) -> list[str]:
+    """Name what is wrong with the ages, given the line on which each comes first."""
+    if not ages.keys().isdisjoint(AGES):
+        return [
+            f"line {number}: the age is none of {', '.join(AGES)}, which others are, and no date "
+            "that a spreadsheet makes of one"
+            for age, number in ages.items()
+            if age not in AGES
+        ]
+    return [
+        f"line {number}: the age is a date; write it as a range, such as 3-9, in a column of text"
+        for age, number in ages.items()
+        if _DATE.search(age)
+    ]
 
 
 def _attributes(path: Path, header: Sequence[str]) -> list[str]:
@@ -154,39 +208,15 @@ def _attributes(path: Path, header: Sequence[str]) -> list[str]:
     return attributes
 
 
-def _row(
-    attributes: Sequence[str], cells: Sequence[str], *, number: int, faults: list[str]
-) -> tuple[str, dict[str, str]]:
-    """Name and labels of a line; the name is empty where the line has a fault."""
-    if len(cells) != len(attributes) + 1:
-        faults.append(f"line {number} has {len(cells)} cells, and the header {len(attributes) + 1}")
-        return "", {}
-    name = _normal(cells[0])
-    if name in ("", "."):
-        faults.append(f"line {number} has no path")
-        return "", {}
-    row = {
-        attribute: cell
-        for attribute, cell in zip(attributes, cells[1:], strict=True)
-        if cell and attribute != _NO_ATTRIBUTE
-    }
-    if "age" in row:
-        repaired = repaired_age(row["age"])
-        if repaired is None and _DATE.fullmatch(row["age"]):
-            faults.append(
-                f"line {number}: the age is a date that a spreadsheet made of none of "
-                f"{', '.join(AGES)}"
-            )
-            return "", {}
-        row["age"] = repaired or row["age"]
-    return name, row
-
-
 def _normal(name: str) -> str:
-    return str(PurePosixPath(name.strip().replace("\\", "/")))
+    """Path with single slashes, without ``.``; empty where nothing is left."""
+    path = name.strip().replace("\\", "/")
+    plain = "/".join([part for part in path.split("/") if part not in ("", ".")])
+    return f"/{plain}" if plain and path[0] == "/" else plain
 
 
 def _stem(name: str) -> str:
     """Path without the suffix of a photo; names of people may hold dots."""
-    path = PurePosixPath(name)
-    return str(path.with_suffix("")) if path.suffix.lower() in SUFFIXES else name
+    stem, dot, suffix = name.rpartition(".")
+    is_photo = stem and stem[-1] != "/" and f"{dot}{suffix.lower()}" in SUFFIXES
+    return stem if is_photo else name

@@ -27,6 +27,8 @@ def test_labels_are_found_by_the_path_of_the_photo(tmp_path):
         ("train/1.jpg,3-9,Female,Martian,FALSE", "line 2: the race is none of"),
         ("train/1.jpg,3-9,,Black,FALSE", "line 2: a cell is empty"),
         ("train/1.jpg", "line 2: a cell is empty"),
+        ("train/\0.jpg,3-9,Female,Black,FALSE", "line 2: the file has a name with characters"),
+        ("train/\u202e.jpg,3-9,Female,Black,FALSE", "line 2: the file has a name with"),
     ],
 )
 def test_a_wrong_line_is_named(tmp_path, line, said):

@@ -1,11 +1,14 @@
 import os
 import pickle
+import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import pytest
 from cryptography.exceptions import InvalidTag
-from distributed import LocalCluster
+from distributed import Client, LocalCluster
 
 from tests.verify.evaluation.materials import material
 from verify.evaluation import backends
@@ -59,6 +62,50 @@ def test_a_cluster_does_the_same_work(cluster: str) -> None:
     backend = Backend.parse(cluster.replace("tcp", "dask"), jobs=1)
     assert sorted(spread(backend, add, 100, range(5))) == [(i, 100 + i) for i in range(5)]
     assert os.getpid() not in {pid for _, pid in spread(backend, process, None, range(4))}
+
+
+def kept_open() -> int:
+    return len(backends._LAST)
+
+
+def test_workers_of_a_cluster_keep_nothing(cluster: str) -> None:
+    list(spread(Backend(cluster, 1), add, 100, range(4)))
+    with Client(cluster, set_as_default=False) as client:  # type: ignore[no-untyped-call]
+        assert set(client.run(kept_open).values()) == {0}
+
+
+def die(shared: object, item: object) -> None:
+    os._exit(1)
+
+
+@pytest.mark.filterwarnings("ignore:A worker stopped:UserWarning")
+def test_a_worker_that_ends_in_the_middle_is_said(tmp_path: Path) -> None:
+    with pytest.raises(BackendError, match="most often because memory ran out: use fewer --jobs"):
+        list(spread(Backend(None, 2), die, None, range(2)))
+
+
+def rivals(shared: object, item: float) -> int:
+    """How many tasks run in this process while this one does."""
+    backends_running.append(item)
+    time.sleep(0.05)
+    seen = len(backends_running)
+    backends_running.remove(item)
+    return seen
+
+
+backends_running: list[float] = []
+
+
+def test_tasks_of_one_process_take_turns() -> None:
+    key = fresh_key()
+    shared = Parcel.pack(None, key)
+    here = backends.version("veilface")
+    with ThreadPoolExecutor(4) as threads:
+        calls = [
+            threads.submit(backends._call, rivals, here, shared, i, Parcel.pack(i, key), key)
+            for i in range(4)
+        ]
+        assert [call.result()[1].open(key) for call in calls] == [1, 1, 1, 1]
 
 
 def test_a_scheduler_that_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from tests.verify.evaluation.layouts import cfp_folder, lfw_folder, write
 from verify import DatasetError
+from verify.evaluation import embeddings_file
 from verify.evaluation.embeddings_file import EmbeddingsFile, match, read_embeddings
 from verify.evaluation.readers import open_sets
 from verify.evaluation.verification_set import PictureBytes, VerificationSet
@@ -89,11 +90,11 @@ def npy(header: str, data: bytes = b"") -> bytes:
 @pytest.mark.parametrize(
     ("descriptors", "message"),
     [
-        (npy("{'descr': '<f4', 'fortran_order': False, 'shape': (1, 100000000)}"), "not as long"),
+        (npy("{'descr': '<f4', 'fortran_order': False, 'shape': (3, 10000000)}"), "not as long"),
         (npy("{'descr': '<f4', 'fortran_order': False, 'shape': (9999999, 99999)}"), "beyond"),
         (npy("{'descr': '<f4', 'fortran_order': False, 'shape': (-1, 4)}", bytes(64)), "beyond"),
         (
-            npy("{'descr': '<f4', 'fortran_order': False, 'shape': (1, 4)}", bytes(17)),
+            npy("{'descr': '<f4', 'fortran_order': False, 'shape': (3, 4)}", bytes(49)),
             "not as long",
         ),
         (npy("__import__('os').system('true')"), "no readable"),
@@ -113,6 +114,65 @@ def test_hostile_arrays_take_no_memory(tmp_path: Path, descriptors: bytes, messa
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 8 * 2**20
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+@pytest.mark.parametrize("name", ["paths", "descriptors"])
+def test_an_entry_whose_size_zipfile_does_not_bound_is_not_unpacked(
+    tmp_path: Path, method: int, name: str
+) -> None:
+    with zipfile.ZipFile(tmp_path / "e.npz", "w") as archive:
+        for key, value in (("paths", PATHS), ("descriptors", ROWS)):
+            stream = io.BytesIO()
+            np.save(stream, value)
+            data = stream.getvalue() + (bytes(2**24) if key == name else b"")
+            archive.writestr(f"{key}.npy", data, method if key == name else zipfile.ZIP_STORED)
+    tracemalloc.start()
+    with pytest.raises(DatasetError, match=f"{name} is compressed otherwise"):
+        read_embeddings(tmp_path / "e.npz")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2**20
+
+
+def test_the_number_of_rows_is_compared_and_capped_before_anything_is_unpacked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(embeddings_file, "_blocks", None)
+    np.savez_compressed(tmp_path / "e.npz", paths=PATHS, descriptors=ROWS[:2])
+    with pytest.raises(DatasetError, match=r"expected \(N,\) and \(N, n\)"):
+        read_embeddings(tmp_path / "e.npz")
+    many = np.zeros(1_000_001, dtype="U1")
+    np.savez_compressed(tmp_path / "e.npz", paths=many, descriptors=np.zeros((len(many), 1), "f2"))
+    with pytest.raises(DatasetError, match="at most 1000000 of"):
+        read_embeddings(tmp_path / "e.npz")
+    wide = np.zeros((1, 2**16 + 1), "f2")
+    np.savez_compressed(tmp_path / "e.npz", paths=PATHS[:1], descriptors=wide)
+    with pytest.raises(DatasetError, match="1 descriptors of 65537 numbers"):
+        read_embeddings(tmp_path / "e.npz")
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_rows_are_unpacked_a_block_at_a_time(tmp_path: Path, order: str) -> None:
+    rows = rows_of(100_000, 128)
+    paths = np.arange(len(rows)).astype("U6")
+    np.savez(tmp_path / "e.npz", paths=paths, descriptors=np.asarray(rows, order=order))
+    expected = rows / np.linalg.norm(rows, axis=1, keepdims=True)
+    tracemalloc.start()
+    read = read_embeddings(tmp_path / "e.npz")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2.5 * read.descriptors.nbytes
+    assert read.paths[::99_999] == ("0", "99999")
+    np.testing.assert_allclose(read.descriptors, expected, atol=1e-7)
+
+
+def test_rows_beyond_float32_become_unit(tmp_path: Path) -> None:
+    for order in ("C", "F"):
+        rows = np.asarray(np.array([[3e100, 4e100], [3e-100, 4e-100]]), order=order)
+        np.savez(tmp_path / "e.npz", paths=PATHS[:2], descriptors=rows)
+        read = read_embeddings(tmp_path / "e.npz")
+        np.testing.assert_allclose(read.descriptors, [[0.6, 0.8], [0.6, 0.8]], atol=1e-7)
 
 
 @given(st.binary(max_size=200))
@@ -165,6 +225,66 @@ def test_lfw_names(paths: list[str], expected: list[int]) -> None:
 def test_ambiguous_names(kind: str, names: list[str], paths: list[str], message: str) -> None:
     with pytest.raises(DatasetError, match=message):
         match(embeddings(paths), benchmark(kind, names))
+
+
+def slow_longest(wanted: str, paths: Sequence[str], telling: int | None) -> list[int]:
+    """By comparing every path from its end, component by component."""
+    mine, best = wanted.removesuffix(".jpg").split("/"), {}
+    for row, path in enumerate(paths):
+        theirs = path.removesuffix(".jpg").split("/")
+        if theirs == mine:
+            best.setdefault(99, []).append(row)
+        shared = 0
+        while shared < min(len(mine), len(theirs)) and mine[-1 - shared] == theirs[-1 - shared]:
+            shared += 1
+        if shared and (
+            shared in (len(mine), len(theirs)) or (telling is not None and shared >= telling)
+        ):
+            best.setdefault(shared, []).append(row)
+    return best[max(best)] if best else []
+
+
+@pytest.mark.parametrize(("kind", "telling"), [("lfw", 1), ("cfp", 3), ("pairs", None)])
+@given(
+    st.lists(st.lists(st.sampled_from("abc"), min_size=1, max_size=5), max_size=6, unique_by=tuple),
+    st.lists(st.sampled_from("abc"), min_size=1, max_size=4),
+)
+@settings(max_examples=60, deadline=None)
+def test_the_longest_end_is_that_of_a_slow_search(
+    kind: str, telling: int | None, paths: list[list[str]], wanted: list[str]
+) -> None:
+    names = [f"{'/'.join(path)}.jpg" for path in paths]
+    name = "/".join(wanted) + ".jpg"
+    expected = [names.index(name)] if name in names else slow_longest(name, names, telling)
+    one = benchmark(kind, [name])
+    if len(expected) > 1:
+        with pytest.raises(DatasetError, match="may be"):
+            match(embeddings(names), one)
+    else:
+        np.testing.assert_array_equal(match(embeddings(names), one), expected or [-1])
+
+
+def test_many_photos_of_one_file_name_are_compared_along_their_own_path_only() -> None:
+    """A search over all photos of one name reads each of them for each: 10 ** 8 components."""
+    names = [f"{person}/front.jpg" for person in range(5000)]
+    read = 0
+
+    class Piece(str):
+        __slots__ = ()
+
+        def __eq__(self, other: object) -> bool:
+            nonlocal read
+            read += 1
+            return str.__eq__(self, other) is True
+
+        __hash__ = str.__hash__
+
+    ends = embeddings_file._Ends(
+        [(Piece("x"), Piece(name.split("/")[0]), Piece("front")) for name in names], {("front",)}
+    )
+    for row, name in enumerate(names):
+        assert ends.longest((Piece(name.split("/")[0]), Piece("front")), None) == [row]
+    assert read < 40 * len(names)
 
 
 def test_a_photo_of_another_person_is_never_taken() -> None:

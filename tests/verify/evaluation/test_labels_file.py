@@ -1,9 +1,12 @@
 """Label files: what they say about a picture, and what is wrong with a broken one."""
 
+import tracemalloc
+from pathlib import PurePosixPath
+
 import pytest
 
 from templates.decoys import Attributes
-from verify.datasets import DatasetError
+from verify.datasets import SUFFIXES, DatasetError
 from verify.evaluation import labels_file
 from verify.evaluation.labels_file import read_labels
 from verify.fairface_labels import AGES, GENDERS, RACES
@@ -69,6 +72,46 @@ def test_ages_are_repaired(tmp_path, cell, age):
     assert labels.find("a.jpg") == {"age": age}
 
 
+@pytest.mark.parametrize(
+    "age",
+    ["03. Sep", "2024-09-03", "9/3/2024", "3-Sep-24", "3. März", "Okt 19", "September 3",
+     "03.09.2024", "2024-09-03 00:00:00", "12-DEC", "May-20", "3 . 9.2024"],
+)  # fmt: skip
+def test_ages_that_are_dates_are_refused(tmp_path, age):
+    with pytest.raises(DatasetError, match="line 3: the age is a date"):
+        read_labels(written(tmp_path, f"path,age\na,adult\nb,{age}\n"))
+
+
+@pytest.mark.parametrize("age", ["18-30", "2.5-3.5", "married", "senior", "31", "70+", "mature"])
+def test_other_ages_are_labels(tmp_path, age):
+    labels = read_labels(written(tmp_path, f"path,age\na,adult\nb,{age}\n"))
+    assert labels.find("b") == {"age": age}
+
+
+@pytest.mark.parametrize(
+    "name", ["a/b.jpg", "./a//b.png", "a/./b/", "/a/b", "a.b", "a/.jpg", "a.jpg/b", ".jpg", "a.JPG"]
+)
+def test_paths_are_taken_as_pathlib_takes_them(name):
+    path = PurePosixPath(name)
+    assert labels_file._normal(name) == str(path)
+    stem = str(path.with_suffix("")) if path.suffix.lower() in SUFFIXES else str(path)
+    assert labels_file._stem(str(path)) == stem
+
+
+def test_large_files_are_read_row_by_row(tmp_path):
+    text = "path,gender\n" + "".join(f"{i:06d},Male\n" for i in range(40_000))
+    file = written(tmp_path, text)
+    tracemalloc.start()
+    labels = read_labels(file)
+    kept, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert len(labels.of) == 40_000
+    # Rows of the same labels share one mapping; beside what is kept, one row at a time is in
+    # memory, and the paths without suffix while they are sorted out.
+    assert len({id(row) for row in labels.of.values()}) == 1
+    assert peak < 40_000 * 1000
+
+
 def test_cells_may_hold_commas_and_rows_may_repeat(tmp_path):
     labels = read_labels(
         written(tmp_path, 'path,race\n"Lee, Ann",Black\n\n"Lee, Ann",Black\n , \n')
@@ -89,7 +132,10 @@ def test_cells_may_hold_commas_and_rows_may_repeat(tmp_path):
         ("path,gender\na,Male,White\n", "line 2 has 3 cells, and the header 2"),
         ("path,gender\n,Male\n", "line 2 has no path"),
         ("path,gender\na,Male\n\na,Female\n", "line 4 labels a otherwise"),
-        ("path,age\na,12-Dec\n", "line 2: the age is a date that a spreadsheet made of none of"),
+        ("path,age\na,adult\nb,12-Dec\n", "line 3: the age is a date"),
+        ("path,age\na,12-Dec\nb,0-2\n", "line 2: the age is none of 0-2, 3-9"),
+        ("path,age\na,20-29\nb,adult\n", "line 3: the age is none of 0-2, 3-9"),
+        ("path,age\na,19-Oct\nb,03. Sep\n", "line 3: the age is none of 0-2, 3-9"),
         ('path,gender\n"a,Male\n', "cannot be read as a CSV"),
     ],
 )
@@ -110,8 +156,10 @@ def test_all_faults_are_listed_with_their_lines(tmp_path):
 
 
 def test_a_column_of_names_is_no_attribute(tmp_path):
-    rows = "".join(f"{i},{i},Male\n" for i in range(257))
-    with pytest.raises(DatasetError, match="the column name has 257 different labels"):
+    # What follows the label too many is not read, whatever it is.
+    rows = "".join(f"{i},{i},Male\n" for i in range(257)) + "x\n"
+    said = r"1 fault\(s\).*the column name has more than 256 different labels"
+    with pytest.raises(DatasetError, match=said):
         read_labels(written(tmp_path, "path,name,gender\n" + rows))
     kept = "".join(f"{i},{i % 256},Male\n" for i in range(257))
     assert len(read_labels(written(tmp_path, "path,name,gender\n" + kept)).of) == 257

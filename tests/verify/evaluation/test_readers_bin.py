@@ -51,6 +51,24 @@ def test_elements_and_protocols(tmp_path: Path, protocol: int, form: str) -> Non
     assert [picture.read() for picture in benchmark.pictures] == bins
 
 
+@pytest.mark.parametrize("protocol", range(6))
+@pytest.mark.parametrize("kind", [bytearray, bytes])
+@pytest.mark.parametrize("in_array", [False, True])
+def test_byte_arrays_and_arrays_of_objects(
+    tmp_path: Path, protocol: int, kind: type[bytes], in_array: bool
+) -> None:
+    bins, same = bin_content()
+    photos: object = [kind(photo) for photo in bins]
+    answers: object = same
+    if in_array:
+        array = np.empty(len(bins), dtype=object)
+        array[:] = photos
+        photos, answers = array, np.array(same, dtype=object)
+    benchmark = read(tmp_path / "lfw.bin", (photos, answers), protocol)
+    assert [picture.read() for picture in benchmark.pictures] == bins
+    np.testing.assert_array_equal(benchmark.same, same)
+
+
 @pytest.mark.parametrize(
     "answers",
     [
@@ -93,6 +111,8 @@ BINS, SAME = bin_content()
         (([np.zeros((8, 8), np.uint8), *BINS[1:]], SAME), "photo 0 is an array"),
         (([np.zeros(8, np.int8), *BINS[1:]], SAME), "photo 0 is an array"),
         (([np.zeros(8), *BINS[1:]], SAME), "other elements than integers"),
+        (([np.array(["a"], object), *BINS[1:]], SAME), "photo 0 is an array"),
+        ((np.array([*BINS[:-1], None], object), SAME), "photo 39 is neither bytes"),
         (({"bins": BINS}, SAME), "not one that plain values need"),
     ],
 )

@@ -1,15 +1,19 @@
 """LFW, CFP and AgeDB-30 folders, laid out as published."""
 
+import contextlib
 from pathlib import Path
 
 import numpy as np
 import pytest
 import scipy.io
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from tests.verify.evaluation.layouts import (
     AGEDB_NAMES,
     agedb_folder,
     agedb_folds,
+    agedb_splits,
     cfp_folder,
     lfw_folder,
     write,
@@ -267,10 +271,50 @@ def test_agedb_wrong_protocols(tmp_path: Path) -> None:
         ([*folds[:9], [("a", "b", 5)] * 3], "fold 10 has a label at pair 1"),
         ([*folds[:9], [("a", "b", 0), ("a", "b", -1), ("a", "a", 1)]], "mixes the labels"),
         ([*folds[:9], [("a/b", "c", 1)] * 3], "expected plain file names"),
+        ([*folds[:9], []], "fold 10 "),
     ):
         agedb_folder(tmp_path, folds=broken)
         with pytest.raises(DatasetError, match=message):
             open_sets(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "part",
+    [
+        np.empty((3, 0), dtype=object),
+        np.empty((2, 0), dtype=object),
+        {"pairs": np.empty((2, 0), dtype=object), "labels": np.empty((1, 0))},
+    ],
+)
+def test_agedb_an_empty_fold_is_refused(tmp_path: Path, part: object) -> None:
+    splits = agedb_splits("published", agedb_folds())
+    splits[4, 0] = part
+    agedb_folder(tmp_path)
+    scipy.io.savemat(tmp_path / "04_FINAL_protocol_30_years.mat", {"splits": splits})
+    with pytest.raises(DatasetError, match="fold 5 "):
+        open_sets(tmp_path)
+
+
+@given(st.data())
+@settings(max_examples=150, deadline=None)
+def test_agedb_an_altered_protocol_only_ever_raises_one_exception(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    layout = data.draw(st.sampled_from(["published", "columns", "two cells", "table"]))
+    folder = agedb_folder(
+        tmp_path_factory.getbasetemp() / f"altered {layout}",
+        layout=layout,
+        compressed=False,
+        photos=False,
+    )
+    file = folder / "04_FINAL_protocol_30_years.mat"
+    raw = bytearray(file.read_bytes())
+    # The first fold alone: what fails in it is found by each alteration.
+    for _ in range(data.draw(st.integers(1, 4))):
+        raw[data.draw(st.integers(128, 1500))] = data.draw(st.sampled_from([*range(20), 127, 255]))
+    file.write_bytes(raw)
+    with contextlib.suppress(DatasetError):
+        open_sets(folder, pictures=False)
 
 
 def test_agedb_broken_files(tmp_path: Path) -> None:
@@ -287,7 +331,7 @@ def test_agedb_broken_files(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="no variable named splits"):
         open_sets(tmp_path)
     scipy.io.savemat(file, {"splits": np.zeros(2**25)}, do_compression=True)
-    with pytest.raises(DatasetError, match="unpacks to more than"):
+    with pytest.raises(DatasetError, match="unpack to more than"):
         open_sets(tmp_path)
 
 
@@ -301,6 +345,22 @@ def test_landmarks(tmp_path: Path) -> None:
     for broken in ("", "{\n1 2\n}", file.read_text().replace("5.5 10", "nan 10", 1)):
         with pytest.raises(DatasetError, match="68 points"):
             read_pts(write(tmp_path / "broken.pts", broken))
+
+
+def test_cfp_lists_may_separate_by_any_white_space(tmp_path: Path) -> None:
+    cfp_folder(tmp_path)
+    before = open_sets(tmp_path)
+    file = tmp_path / "Protocol" / "Pair_list_F.txt"
+    lines = file.read_text(encoding="utf-8").splitlines()
+    separators = ["\t", "   ", " \t "] * 2
+    tabs = [line.replace(" ", one) for line, one in zip(lines, separators, strict=True)]
+    file.write_text("\ufeff" + "\n".join(tabs), encoding="utf-8")
+    for one, other in zip(before, open_sets(tmp_path), strict=True):
+        assert one.pictures == other.pictures
+    lines[2] = "3"
+    file.write_text("\n".join(lines), encoding="utf-8")
+    with pytest.raises(DatasetError, match="line 3 is not of the form: index path"):
+        open_sets(tmp_path)
 
 
 # Recognition

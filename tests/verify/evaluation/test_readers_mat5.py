@@ -89,6 +89,42 @@ def test_declared_sizes_are_not_believed() -> None:
         read_variable(data[:at] + huge + data[at + 8 :], "splits")
 
 
+@pytest.mark.parametrize(
+    ("dims", "kind"),
+    [
+        (np.array([1.0, 3.0], "<f8"), 9),
+        (np.array([0, 2**31 - 1, 2**31 - 1, 2**31 - 1], "<i4"), 5),
+        (np.array([0, 2**63], "<u8"), 13),
+        (np.array([2**63, 2**63], "<u8"), 13),
+    ],
+)
+def test_sides_are_whole_numbers_of_a_plausible_size(dims: np.ndarray, kind: int) -> None:
+    def element(kind: int, data: bytes) -> bytes:
+        tag = np.array([kind, len(data)], "<u4").tobytes()
+        return tag + data + bytes(-len(data) % 8)
+
+    flags = element(6, np.array([6, 0], "<u4").tobytes())
+    inner = flags + element(kind, dims.tobytes()) + element(1, b"splits") + element(9, b"")
+    data = saved(0)[:128] + element(14, inner)
+    with pytest.raises(RefusedMat, match=r"plain header|more elements"):
+        read_variable(data, "splits")
+
+
+def test_a_struct_has_so_many_fields_and_no_more() -> None:
+    assert read_variable(saved({f"f{i}": 1 for i in range(64)}), "splits") is not None
+    with pytest.raises(RefusedMat, match="more than 64 fields"):
+        read_variable(saved({f"f{i}": 1 for i in range(65)}), "splits")
+
+
+def test_all_variables_share_one_budget_of_unpacked_bytes() -> None:
+    stream = io.BytesIO()
+    content = {name: np.zeros(2**22) for name in ("one", "two")} | {"splits": np.eye(2)}
+    scipy.io.savemat(stream, content, do_compression=True)
+    with pytest.raises(RefusedMat, match="all unpack to more than 67108864 bytes"):
+        read_variable(stream.getvalue(), "splits")
+    assert read_variable(stream.getvalue(), "one") is not None
+
+
 def test_deep_nesting_is_refused() -> None:
     value: object = np.eye(1)
     for _ in range(40):

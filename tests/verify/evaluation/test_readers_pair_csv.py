@@ -133,3 +133,30 @@ def test_photos_need_not_be_there(tmp_path: Path) -> None:
 def test_a_file_that_is_not_utf_8(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="not UTF-8"):
         open_sets(write(tmp_path / "mine.csv", b"path_a,path_b,same\n\xff,b,1\n"))
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("=SUM(A1)", "+1", "-1", "@x", "a[1]", "a]b", "$x$", "a|b", "a`b"),
+        *("a\nb", "a\x1b[31m", "a\u202eb", "a\udcff", "x" * 101),
+    ],
+)
+def test_a_name_that_means_something_elsewhere_is_refused(tmp_path: Path, name: str) -> None:
+    file = write(tmp_path / f"{name}.csv", table(HEADER, "a,b,1", "a,c,0"))
+    with pytest.raises(DatasetError, match="rename the file") as caught:
+        open_sets(file, pictures=False)
+    assert str(caught.value).isprintable()
+
+
+def test_other_names_are_kept(tmp_path: Path) -> None:
+    for name in ("Gesichter für (alle) #1, neu=alt", "x" * 100):
+        file = write(tmp_path / f"{name}.csv", table(HEADER, "a,b,1", "a,c,0"))
+        (one,) = open_sets(file, pictures=False)
+        assert one.name == name
+
+
+def test_a_suffix_that_is_not_printable_is_refused(tmp_path: Path) -> None:
+    file = write(tmp_path / "mine.\udcff", table(HEADER, "a,b,1", "a,c,0"))
+    with pytest.raises(DatasetError, match="rename the file"):
+        open_sets(file, pictures=False)

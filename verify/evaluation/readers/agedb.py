@@ -6,11 +6,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from verify.datasets import SUFFIXES, DatasetError, faults_in
+from verify.datasets import SUFFIXES, DatasetError, faults_in, read_whole
 from verify.evaluation.readers.agedb_mat import read_splits
 from verify.evaluation.readers.assembly import Trial, assemble, photos_of
 from verify.evaluation.readers.lfw import photos_in, suffixes
-from verify.evaluation.readers.protocol_files import read_whole
 from verify.evaluation.verification_set import PictureFile, VerificationSet
 
 PROTOCOL = "04_FINAL_protocol_30_years.mat"

@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from verify.datasets import DatasetError, faults_in
+from verify.datasets import DatasetError, faults_in, read_whole
 from verify.evaluation.readers.mat5 import RefusedMat, read_variable
-from verify.evaluation.readers.protocol_files import read_whole
 from verify.evaluation.verification_set import digest_of
 from verify.tenfold import FOLDS
 
@@ -91,7 +90,7 @@ def _elements(value: object) -> list[object]:
 def _fold(value: object) -> tuple[tuple[str, str, bool], ...]:
     value = _unwrap(value)
     if isinstance(value, np.ndarray) and value.ndim == 2 and value.dtype.kind == "O":
-        for first, second, last in _columns(value, 3):
+        for first, second, last in _columns(value, 3) if value.size else ():
             # A 3 × 3 cell could be either way round: the labels are no names.
             if _is_name(first[-1]) and _is_name(second[-1]) and not any(map(_is_name, last)):
                 return _trials(_names(first), _names(second), _labels(last))
@@ -164,4 +163,6 @@ def _trials(
 ) -> tuple[tuple[str, str, bool], ...]:
     if not len(first) == len(second) == len(labels):
         raise _Layout(f"has {len(first)} and {len(second)} names and {len(labels)} labels")
+    if not labels:
+        raise _Layout("is empty")
     return tuple(zip(first, second, (label == 1 for label in labels), strict=True))

@@ -5,11 +5,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from verify.datasets import DatasetError
 from verify.evaluation.verification_set import (
     Picture,
     VerificationSet,
     require_both_classes,
 )
+
+_LONGEST_NAME = 100
+# A spreadsheet runs a cell that begins so; Markdown, tables and figures have meanings for the rest.
+_FORMULAS = ("=", "+", "-", "@")
+_MARKUP = frozenset("[]$|`")
 
 
 @dataclass(frozen=True)
@@ -47,8 +53,10 @@ def assemble(
     Raises
     ------
     DatasetError
-        A fold lacks genuine or impostor pairs.
+        A fold lacks genuine or impostor pairs, or a name cannot stand in tables and figures.
     """
+    protocol_files = tuple(protocol_files)
+    _require_plain(name, [file for file, _ in protocol_files])
     keys = photos_of(trials)
     position = {key: place for place, key in enumerate(keys)}
     same = np.array([trial.same for trial in trials], dtype=np.bool_)
@@ -63,6 +71,27 @@ def assemble(
         same=same,
         folds=folds,
         people=None if person is None else tuple(person(key) for key in keys),
-        protocol_files=tuple(protocol_files),
+        protocol_files=protocol_files,
         aligned=aligned,
     )
+
+
+def _require_plain(name: str, files: Sequence[str]) -> None:
+    """Refuse a name that would mean something in CSV, Markdown, a figure or the terminal."""
+    if len(name) > _LONGEST_NAME:
+        raise DatasetError(
+            f"the set {name[:_LONGEST_NAME]!a} … has a name of more than {_LONGEST_NAME} "
+            "characters; rename the file"
+        )
+    for text in (name, *files):
+        # What is printable can be encoded: halves of surrogate pairs are not.
+        if not text.isprintable():
+            raise DatasetError(
+                f"the set {text!a} has a name with characters that are not printable; rename the "
+                "file"
+            )
+    if name.startswith(_FORMULAS) or _MARKUP & set(name):
+        raise DatasetError(
+            f"the set {name!a} has a name that begins with one of {' '.join(_FORMULAS)}, or holds "
+            f"one of {' '.join(sorted(_MARKUP))}; rename the file"
+        )

@@ -87,11 +87,12 @@ def _photo_list(text: ProtocolText, letter: str, faults: list[str]) -> _List:
     for number, line in enumerate(text.text.splitlines(), start=1):
         if not line.strip():
             continue
-        index, _, written = line.strip().partition(" ")
-        path = posixpath.normpath(posixpath.join("Protocol", written.strip().replace("\\", "/")))
+        index, written = [*line.split(None, 1), ""][:2]
+        written = written.strip()
+        path = posixpath.normpath(posixpath.join("Protocol", written.replace("\\", "/")))
         parts = path.split("/")
         where = f"{text.name} line {number}"
-        if not _is_index(index) or not written.strip() or not path.isprintable():
+        if not _is_index(index) or not written or not path.isprintable():
             faults.append(f"{where} is not of the form: index path")
         elif len(parts) < 3 or parts[-2] != _POSES[letter] or path[0] == "/" or parts[0] == "..":
             faults.append(f"{where} names no photo of the form identity/{_POSES[letter]}/photo")

@@ -4,9 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from verify.datasets import DatasetError, faults_in
+from verify.datasets import DatasetError, faults_in, read_whole
 from verify.evaluation.readers.assembly import Trial, assemble
-from verify.evaluation.readers.protocol_files import read_whole
 from verify.evaluation.readers.restricted_pickle import PickledArray, RefusedPickle, read_pickle
 from verify.evaluation.verification_set import (
     PictureBytes,
@@ -23,9 +22,10 @@ _SIGNATURES = (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n")
 def read_bin(path: Path) -> VerificationSet:
     """Read ``(bins, issame_list)``; pair i is ``bins[2 i]`` and ``bins[2 i + 1]`` (FORMATS).
 
-    Elements are encoded JPEG or PNG, as bytes or as arrays of uint8 with one side that is not 1:
-    ``cv2.imencode`` returned a column before OpenCV 4.5.1. Photos are neither decoded nor
-    counted twice: equal contents are one photo, named by the place of its first use in ``bins``.
+    Elements are encoded JPEG or PNG, as bytes, as byte arrays, or as arrays of uint8 with one side
+    that is not 1: ``cv2.imencode`` returned a column before OpenCV 4.5.1. Either part may be an
+    array of objects instead of a list. Photos are neither decoded nor counted twice: equal
+    contents are one photo, named by the place of its first use in ``bins``.
 
     Raises
     ------
@@ -43,7 +43,7 @@ def read_bin(path: Path) -> VerificationSet:
     del data
     if not isinstance(content, tuple | list) or len(content) != 2:
         raise DatasetError(f"{path} does not hold the two parts (bins, issame_list)")
-    bins, answers = content
+    bins, answers = map(_listed, content)
     if not isinstance(bins, tuple | list):
         raise DatasetError(f"{path}: its first part, bins, is not a list of photos")
     same = _answers(path, answers)
@@ -76,6 +76,11 @@ def read_bin(path: Path) -> VerificationSet:
         protocol_files=[(path.name, sha256)],
         aligned=True,
     )
+
+
+def _listed(part: object) -> object:
+    """Look through an array of objects, as ``np.array(photos, dtype=object)`` is."""
+    return part.items if isinstance(part, PickledArray) and part.items is not None else part
 
 
 def _photos(path: Path, bins: tuple[object, ...] | list[object]) -> list[bytes]:

@@ -16,8 +16,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-MAX_UNPACKED = 32 * 2**20
-"""Bytes of one unpacked variable; AgeDB's protocol has a few million."""
+MAX_UNPACKED = 64 * 2**20
+"""Bytes of all unpacked variables together; AgeDB's protocol has a few million."""
+_MAX_FIELDS = 64
+_MAX_EMPTY = 2**15
+_MAX_TEXT = 2**20
 
 _DEEPEST = 16
 _MATRIX, _COMPRESSED = 14, 15
@@ -56,9 +59,12 @@ def read_variable(data: bytes, name: str) -> Array | None:
         raise RefusedMat("it is of MATLAB 7.3; save it again with save(…, '-v7')")
     if order is None or version != 0x0100:
         raise RefusedMat("it is no MATLAB file of version 5 to 7")
+    room = MAX_UNPACKED
     for kind, body in _elements(data[128:], order, padded=False):
         if kind == _COMPRESSED:
-            kind, body = _unpacked(body, order)
+            unpacked = _unpacked(body, most=room)
+            room -= len(unpacked)
+            kind, body = next(_elements(unpacked, order, padded=False), (0, b""))
         if kind == _MATRIX:
             found, array = _matrix(body, order, 0, wanted=name)
             if found == name:
@@ -66,15 +72,16 @@ def read_variable(data: bytes, name: str) -> Array | None:
     return None
 
 
-def _unpacked(body: bytes, order: Order) -> tuple[int, bytes]:
+def _unpacked(body: bytes, *, most: int) -> bytes:
     stream = zlib.decompressobj()
     try:
-        data = stream.decompress(body, MAX_UNPACKED)
+        # A limit of 0 would be none.
+        data = stream.decompress(body, most + 1)
     except zlib.error:
         raise RefusedMat("a compressed variable is broken") from None
-    if stream.unconsumed_tail or not stream.eof:
-        raise RefusedMat(f"a variable is cut off, or unpacks to more than {MAX_UNPACKED} bytes")
-    return next(_elements(data, order, padded=False), (0, b""))
+    if len(data) > most or not stream.eof:
+        raise RefusedMat(f"a variable is cut off, or all unpack to more than {MAX_UNPACKED} bytes")
+    return data
 
 
 def _elements(data: bytes, order: Order, *, padded: bool = True) -> Iterator[tuple[int, bytes]]:
@@ -108,16 +115,18 @@ def _matrix(body: bytes, order: Order, depth: int, *, wanted: str = "") -> tuple
     take = _taker(parts)
     flags, sides = _numbers(*take(), order), _numbers(*take(), order)
     name = take()[1].decode("latin-1")
-    if flags.size < 1 or not 2 <= sides.size <= 4 or flags.dtype.kind == "f":
+    if flags.size < 1 or not 2 <= sides.size <= 4 or {flags.dtype.kind, sides.dtype.kind} - {*"iu"}:
         raise RefusedMat("a variable has no plain header")
     if depth == 0 and name != wanted:
         return name, _EMPTY
     shape = tuple(int(side) for side in sides)
     count = math.prod(shape)
-    # Even an empty element takes eight bytes, a number at least one.
-    if min(shape) < 0 or count > len(body):
-        raise RefusedMat("a variable declares more elements than it holds")
     kind = int(flags[0]) & 0xFF
+    # Even an empty cell takes eight bytes, a number at least one. No side may be absurd beside a
+    # side of 0 either.
+    least = 8 if kind == _CELL else 1
+    if min(shape) < 0 or count * least > len(body) or max(shape) > max(len(body), _MAX_EMPTY):
+        raise RefusedMat("a variable declares more elements than it holds")
     if kind == _CELL:
         return name, _filled(np.empty(count, object), shape, lambda: _inner(take, order, depth))
     if kind == _STRUCT:
@@ -161,9 +170,11 @@ def _filled(target: Array, shape: tuple[int, ...], make: Callable[[], object]) -
 def _struct(take: _Take, order: Order, depth: int, shape: tuple[int, ...], limit: int) -> Array:
     lengths = _numbers(*take(), order)
     raw = take()[1]
-    length = int(lengths[0]) if lengths.size == 1 else 0
+    length = int(lengths[0]) if lengths.size == 1 and lengths.dtype.kind in "iu" else 0
     if not 0 < length <= 64 or len(raw) % length:
         raise RefusedMat("a struct has no plain field names")
+    if len(raw) > _MAX_FIELDS * length:
+        raise RefusedMat(f"a struct has more than {_MAX_FIELDS} fields")
     fields = [
         raw[at : at + length].split(b"\0")[0].decode("latin-1") for at in range(0, len(raw), length)
     ]
@@ -190,6 +201,8 @@ def _text(kind: int, body: bytes, order: Order) -> str:
     encoding = _TEXTS.get(kind)
     if encoding is None:
         raise RefusedMat("text is of no known encoding")
+    if len(body) > _MAX_TEXT:
+        raise RefusedMat(f"text is longer than {_MAX_TEXT} bytes")
     if encoding in ("utf-16", "utf-32"):
         encoding += "-le" if order == "little" else "-be"
     try:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from verify.datasets import MAX_PAIRS_BYTES, DatasetError
+from verify.datasets import MAX_PAIRS_BYTES, decoded, read_whole
 from verify.evaluation.verification_set import digest_of
 
 
@@ -21,28 +21,6 @@ class ProtocolText:
         return self.name, self.sha256
 
 
-def read_whole(file: Path, *, most: int) -> bytes:
-    """Read a file of at most ``most`` bytes.
-
-    Raises
-    ------
-    DatasetError
-        The file is larger, or cannot be read.
-    """
-    try:
-        if not file.is_file():
-            raise DatasetError(f"{file} is not there")
-        with file.open("rb") as stream:
-            data = stream.read(most + 1)
-    except OSError as error:
-        raise DatasetError(f"{file} cannot be read: {error.strerror}") from None
-    except MemoryError:
-        raise DatasetError(f"{file} is larger than the memory of this machine") from None
-    if len(data) > most:
-        raise DatasetError(f"{file} is larger than {most} bytes")
-    return data
-
-
 def read_text(file: Path, *, root: Path) -> ProtocolText:
     """Read UTF-8 text, with or without a byte-order mark.
 
@@ -52,8 +30,6 @@ def read_text(file: Path, *, root: Path) -> ProtocolText:
         The file is absent, too large or not UTF-8.
     """
     data = read_whole(file, most=MAX_PAIRS_BYTES)
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise DatasetError(f"{file} is not UTF-8 text; save it as UTF-8") from None
-    return ProtocolText(file.relative_to(root).as_posix(), digest_of(data), text)
+    return ProtocolText(
+        file.relative_to(root).as_posix(), digest_of(data), decoded(data, file=file)
+    )

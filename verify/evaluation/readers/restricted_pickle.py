@@ -13,6 +13,7 @@ NumPy, ``ndarray.__reduce__``, ``ndarray.__reduce_ex__`` and ``dtype.__reduce__`
 """
 
 import enum
+import math
 import pickle
 import re
 import struct
@@ -29,7 +30,7 @@ _MAX_MEMO = 2**32
 
 _ESCAPE = re.compile(rb"\\(x[0-9a-fA-F]{2}|[\\'\"nrt])?")
 _ESCAPED = {b"\\": b"\\", b"'": b"'", b'"': b'"', b"n": b"\n", b"r": b"\r", b"t": b"\t"}
-_DTYPES = re.compile(r"b1|[iu][1248]")
+_DTYPES = re.compile(r"b1|[iu][1248]|O[48]")
 
 
 class RefusedPickle(ValueError):
@@ -38,7 +39,7 @@ class RefusedPickle(ValueError):
 
 @dataclass(eq=False)
 class PickledDtype:
-    """Type of array elements: ``b1``, ``u1``, ``i8`` …, and their byte order."""
+    """Type of array elements: ``b1``, ``u1``, ``i8`` …, and their byte order; ``O8`` is objects."""
 
     code: str
     order: str = "|"
@@ -48,14 +49,24 @@ class PickledDtype:
         """Bytes of an element."""
         return int(self.code[1])
 
+    @property
+    def is_object(self) -> bool:
+        """Whether elements are values of the pickle and no numbers."""
+        return self.code[0] == "O"
+
 
 @dataclass(eq=False, repr=False)
 class PickledArray:
-    """An array as it lies in the file; ``data`` is None until its contents were seen."""
+    """An array as it lies in the file: ``data``, or ``items`` where it is of objects.
+
+    Both are None until its contents were seen. ``items`` is the list of the pickle, which may
+    change it later: its own length counts, not the shape.
+    """
 
     shape: tuple[int, ...] = (0,)
     dtype: PickledDtype | None = None
     data: bytes | None = None
+    items: list[object] | None = None
 
 
 class _Name(enum.Enum):
@@ -65,12 +76,15 @@ class _Name(enum.Enum):
     NDARRAY = enum.auto()
     DTYPE = enum.auto()
     ENCODE = enum.auto()
+    BYTEARRAY = enum.auto()
 
 
 _NAMES = {
     ("numpy", "ndarray"): _Name.NDARRAY,
     ("numpy", "dtype"): _Name.DTYPE,
     ("_codecs", "encode"): _Name.ENCODE,
+    ("__builtin__", "bytearray"): _Name.BYTEARRAY,
+    ("builtins", "bytearray"): _Name.BYTEARRAY,
     # NumPy 2 moved numpy.core to numpy._core.
     **{
         (f"numpy.{core}.{module}", name): meaning
@@ -270,11 +284,17 @@ class _Machine:
         match name, arguments:
             case _Name.ENCODE, (str() as text, encoding) if _text(encoding) == "latin1":
                 self.push(self.encode(text))
+            case _Name.BYTEARRAY, (str() as text, encoding) if _text(encoding) == "latin-1":
+                self.push(self.encode(text))
+            case _Name.BYTEARRAY, (bytes() as raw,):
+                self.push(raw)
+            case _Name.BYTEARRAY, ():
+                self.push(b"")
             case _Name.RECONSTRUCT, (_Name.NDARRAY, (0,), _):
                 self.push(PickledArray())
             case _Name.DTYPE, (code, bool() | int(), bool() | int()):
                 if not _DTYPES.fullmatch(_text(code)):
-                    raise RefusedPickle("an array holds other elements than integers")
+                    raise RefusedPickle("an array holds other elements than integers or objects")
                 self.push(PickledDtype(_text(code)))
             case _Name.FROMBUFFER, (bytes() as raw, PickledDtype() as dtype, tuple() as shape, _):
                 self.push(_filled(PickledArray(), shape, dtype, raw))
@@ -307,6 +327,14 @@ class _Machine:
                 bytes() as raw,
             ):
                 _filled(target, shape, dtype, raw)
+            case PickledArray(data=None, items=None), (
+                1,
+                tuple() as shape,
+                PickledDtype() as dtype,
+                bool() | int(),
+                list() as items,
+            ):
+                _listed(target, shape, dtype, items)
             case PickledDtype(), (int(), order, None, None, None, -1, -1, int()):
                 if _text(order) not in ("|", "<", ">", "="):
                     raise RefusedPickle("an array has no known byte order")
@@ -324,23 +352,33 @@ def _text(value: object) -> str:
     return value if isinstance(value, str) else ""
 
 
+def _sides(shape: tuple[object, ...]) -> tuple[int, ...]:
+    if len(shape) > 4 or not all(type(side) is int and 0 <= side < 2**40 for side in shape):
+        raise RefusedPickle("an array has no plain shape")
+    return cast(tuple[int, ...], shape)
+
+
 def _filled(
     array: PickledArray, shape: tuple[object, ...], dtype: PickledDtype, raw: bytes
 ) -> PickledArray:
-    if len(shape) > 4 or not all(type(side) is int and 0 <= side < 2**40 for side in shape):
-        raise RefusedPickle("an array has no plain shape")
-    sides = cast(tuple[int, ...], shape)
-    count = 1
-    for side in sides:
-        count *= side
-    if count * dtype.itemsize != len(raw):
+    sides = _sides(shape)
+    if dtype.is_object or math.prod(sides) * dtype.itemsize != len(raw):
         raise RefusedPickle(f"an array of shape {sides} is stored in {len(raw)} bytes")
     array.shape, array.dtype, array.data = sides, dtype, raw
     return array
 
 
+def _listed(
+    array: PickledArray, shape: tuple[object, ...], dtype: PickledDtype, items: list[object]
+) -> None:
+    sides = _sides(shape)
+    if not dtype.is_object or math.prod(sides) != len(items):
+        raise RefusedPickle(f"an array of shape {sides} is stored as {len(items)} objects")
+    array.shape, array.dtype, array.items = sides, dtype, items
+
+
 def _scalar(dtype: PickledDtype, raw: bytes) -> int | bool:
-    if len(raw) != dtype.itemsize:
+    if dtype.is_object or len(raw) != dtype.itemsize:
         raise RefusedPickle("a number has the wrong length")
     if dtype.code == "b1":
         return raw != b"\0"
