@@ -1,13 +1,14 @@
-"""The results table of the README, made from an evaluation's ``results.json``.
+"""The results table of the README, made from the ``results.json`` of one or more evaluations.
 
-Every number in it comes from the file; the table stands between two markers, so that it can be
+Every number in it comes from the files; the table stands between two markers, so that it can be
 made anew without touching the text around it.
 
 Example
 -------
 ::
 
-    python -m benchmarks.readme_results results.json --write README.md --keep docs/results/lfw.json
+    python -m benchmarks.readme_results one/results.json two/results.json --write README.md
+    python -m benchmarks.readme_results results.json --keep docs/results/lfw.json
 """
 
 import argparse
@@ -17,15 +18,26 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from verify.datasets import DatasetError
+from verify.datasets import DatasetError, faults_in
 from verify.evaluation.markdown_cells import MISSING, count, fixed, table
-from verify.evaluation.row_labels import LIFTINGS, Row, order_of, raw_row, strategy_label
+from verify.evaluation.results import FORMAT, VERSION
+from verify.evaluation.row_labels import (
+    LIFTED_MODES,
+    LIFTINGS,
+    MODE_NAMES,
+    Row,
+    order_of,
+    raw_row,
+    strategy_label,
+)
 
-FORMAT, VERSION = "veilface evaluation", 1
 BEGIN, END = "<!-- evaluation:begin -->", "<!-- evaluation:end -->"
 NEEDED = ("model", "datasets", "rows")
 METRIC = "spherical"
-MODES = {"p2s": "p-to-s", "s2s": "s-to-s"}
+ROW_KEY = (
+    *("dataset", "strategy", "decoys", "shared_decoys"),
+    *("dim", "mode", "metric", "threshold_search"),
+)
 
 
 def read_results(path: Path | str) -> Mapping[str, Any]:
@@ -55,6 +67,55 @@ def read_results(path: Path | str) -> Mapping[str, Any]:
     return results
 
 
+def merged(several: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
+    """Put the rows of evaluations together that differ in the strategies only.
+
+    Returns
+    -------
+    The first, with the data sets, rows and runs of all. Other parts are those of the first.
+
+    Raises
+    ------
+    DatasetError
+        Listing what differs: the model, the seeds, the name of LFW, photos or pairs of a data
+        set, or the numbers of a row that occurs twice.
+    """
+    first, *others = several
+    datasets = {dataset["name"]: dataset for dataset in first["datasets"]}
+    rows = {_row_key(row): row for row in first["rows"]}
+    faults = []
+    for place, results in enumerate(others, start=2):
+        if results["model"] != first["model"]:
+            faults.append(f"results {place} are of another model")
+        if any(results.get(name) != first.get(name) for name in ("seed", "repeats")):
+            faults.append(f"results {place} have other seeds")
+        if _lfw(results)["name"] != _lfw(first)["name"]:
+            faults.append(f"results {place} give LFW another name")
+        for dataset in results["datasets"]:
+            known = datasets.setdefault(dataset["name"], dataset)
+            if any(known.get(n) != dataset.get(n) for n in ("pictures_sha256", "protocol_files")):
+                faults.append(f"results {place} have other photos or pairs of {dataset['name']}")
+        for row in results["rows"]:
+            if rows.setdefault(_row_key(row), row) != row:
+                name = f"{strategy_label(row)}, m = {row['dim']}, {row['mode']}, {row['metric']}"
+                faults.append(f"results {place} have other numbers of {row['dataset']}: {name}")
+    if faults:
+        raise DatasetError(
+            faults_in(Path("the list of results"), "expected those of one set-up", faults)
+        )
+    runs = [run for results in several for run in results.get("runs") or ()]
+    return {
+        **first,
+        "datasets": list(datasets.values()),
+        "rows": list(rows.values()),
+        **({"runs": runs} if runs else {}),
+    }
+
+
+def _row_key(row: Row) -> tuple[Any, ...]:
+    return tuple(row.get(name) for name in ROW_KEY)
+
+
 def readme_table(results: Mapping[str, Any]) -> str:
     """Return the table: a line for each strategy and mode, a column for each m.
 
@@ -74,7 +135,7 @@ def readme_table(results: Mapping[str, Any]) -> str:
         if row["dataset"] == name
         and row["strategy"] in LIFTINGS
         and row["metric"] == METRIC
-        and row["mode"] in MODES
+        and row["mode"] in LIFTED_MODES
     ]
     raw = raw_row(results["rows"], name)
     faults = []
@@ -86,10 +147,10 @@ def readme_table(results: Mapping[str, Any]) -> str:
         raise DatasetError(f"the README's table cannot be made, {name} has {'; '.join(faults)}")
     dims = sorted({int(row["dim"]) for row in rows})
     lines: dict[tuple[str, str], dict[int, Row]] = {}
-    for row in sorted(rows, key=lambda row: (tuple(MODES).index(row["mode"]), order_of(row))):
+    for row in sorted(rows, key=lambda row: (LIFTED_MODES.index(row["mode"]), order_of(row))):
         lines.setdefault((strategy_label(row), str(row["mode"])), {})[int(row["dim"])] = row
     cells = [
-        [label, MODES[mode], *(_accuracy(by_dim.get(dim)) for dim in dims)]
+        [label, MODE_NAMES[mode], *(_accuracy(by_dim.get(dim)) for dim in dims)]
         for (label, mode), by_dim in lines.items()
     ]
     titles = ["lifting (decoys)", "matching", *(f"m = {dim}" for dim in dims)]
@@ -114,17 +175,20 @@ def _accuracy(row: Row | None) -> str:
         return MISSING
     text = fixed(100 * row["accuracy_mean"], 2)
     seeds = row.get("accuracy_std_seeds")
-    return f"{text} ± {fixed(100 * seeds, 2)}" if seeds else text
+    return text if seeds is None else f"{text} ± {fixed(100 * seeds, 2)}"
 
 
 def _caption(results: Row, dataset: Row, raw: Row, rows: Sequence[Row]) -> str:
     model = results["model"]
     runs = results.get("runs") or ()
     seeds = {
-        run["seed"] for run in runs if run.get("mode") in MODES and run.get("seed") is not None
+        run["seed"]
+        for run in runs
+        if run.get("mode") in LIFTED_MODES and run.get("seed") is not None
     }
     number = len(seeds) or int(results.get("repeats") or 1)
-    spread = "± their standard deviation" if any(r.get("accuracy_std_seeds") for r in rows) else ""
+    several = any(row.get("accuracy_std_seeds") is not None for row in rows)
+    spread = "± their standard deviation" if several else ""
     mean = f"mean of {number} seeds {spread}".rstrip() if number > 1 else "one seed"
     reference = f"{fixed(100 * raw['accuracy_mean'], 2)} %"
     if raw.get("accuracy_std") is not None:
@@ -168,15 +232,26 @@ def written_into(text: str, block: str) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print the table, or write it into a README; 0, or 1 with the reason on stderr."""
     parser = argparse.ArgumentParser(description="Make the README's results table.")
-    parser.add_argument("results", type=Path, metavar="RESULTS.json")
+    parser.add_argument(
+        "results", type=Path, nargs="+", metavar="RESULTS.json", help="of one model and one LFW"
+    )
     parser.add_argument("--write", type=Path, metavar="README.md")
-    parser.add_argument("--keep", type=Path, metavar="COPY.json", help="without runs and curves")
+    parser.add_argument(
+        "--keep",
+        type=Path,
+        nargs="+",
+        metavar="COPY.json",
+        help="one copy of each RESULTS.json, without runs and curves",
+    )
     options = parser.parse_args(arguments)
+    copies = options.keep or []
+    if copies and len(copies) != len(options.results):
+        parser.error(f"--keep needs {len(options.results)} paths, one for each RESULTS.json")
     try:
-        results = read_results(options.results)
-        block = readme_table(results)
-        if options.keep is not None:
-            options.keep.write_text(kept(results), encoding="utf-8")
+        several = [read_results(path) for path in options.results]
+        block = readme_table(merged(several))
+        for results, copy in zip(several, copies, strict=False):
+            copy.write_text(kept(results), encoding="utf-8")
         if options.write is None:
             print(block)
             return 0

@@ -27,7 +27,7 @@ def read_audit(file: Path) -> Json:
 
     try:
         report = json.loads(read_bounded(file, _MAX_AUDIT_BYTES))
-    except (UnicodeDecodeError, json.JSONDecodeError):
+    except (ValueError, RecursionError):
         raise CommandError(f"{file.name} is no JSON file") from None
     strongest_attackers(report)
     return dict(report)

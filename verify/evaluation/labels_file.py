@@ -29,7 +29,7 @@ _NO_ATTRIBUTE = "service_test"
 _DATE = re.compile(
     r"(?<![a-zäöü])(jan|feb|mar|mrz|mär|apr|may|mai|jun|jul|aug|sep|oct|okt|nov|dec|dez)"
     r"(uary|uar|ruary|ruar|ch|z|il|e|i|y|ust|t|tember|ober|ember)?(?![a-zäöü])"
-    r"|\d([-/.])\s*\d+\3\s*\d",
+    r"|\d\s*([-/.])\s*\d+\s*\3\s*\d",
     re.IGNORECASE,
 )
 
@@ -146,7 +146,7 @@ def _read(path: Path, reader: "_csv.Reader") -> Labels:
             made[key] = _labels(attributes, key)
             for attribute, label in made[key].items():
                 groups[attribute].setdefault(label, number)
-            if crowded := [name for name in kept if len(groups[name]) > MAX_GROUPS]:
+            if crowded := [each for each in kept if len(groups[each]) > MAX_GROUPS]:
                 faults.append(
                     f"the column {crowded[0]} has more than {MAX_GROUPS} different labels, which "
                     "are names or numbers and no groups: remove the column, or put its values "

@@ -32,11 +32,17 @@ def fixed(value: float | None, digits: int) -> str:
 
 
 def percent(fraction: float | None) -> str:
-    """Return a fraction in per cent: two decimals, two significant digits below 0.1 %."""
+    """Return a fraction in per cent: two decimals, two significant digits below 0.1 %.
+
+    What is above 0 and below 1e-4 % is given as that bound.
+    """
     if fraction is None or not math.isfinite(fraction):
         return MISSING
     value = 100 * fraction
-    return f"{value:.2g}" if 0.0001 <= abs(value) < 0.1 else f"{value:.2f}"
+    # The fraction is compared: a hundredfold 1e-6 is not quite 1e-4.
+    if 0 < fraction < 1e-6:
+        return "<0.0001"
+    return f"{value:.2g}" if 0 < value < 0.1 else f"{value:.2f}"
 
 
 def significant(value: float | None, digits: int = 3) -> str:
@@ -69,7 +75,7 @@ def accuracy(row: Mapping[str, Any]) -> str:
     text = fixed(100 * mean, 2)
     if row.get("accuracy_std") is not None:
         text += f" ± {fixed(100 * row['accuracy_std'], 2)}"
-    if row.get("accuracy_std_seeds"):
+    if row.get("accuracy_std_seeds") is not None:
         text += f" (± {fixed(100 * row['accuracy_std_seeds'], 2)})"
     return text
 

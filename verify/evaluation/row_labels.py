@@ -11,6 +11,7 @@ HASHES = ("biohashing", "biohashing-stolen", "mlp-hash", "mlp-hash-stolen")
 ORDER = RAW + LIFTINGS + HASHES
 METRIC_NAMES = {"spherical": "spherical", "euclidean": "Euclidean", "hamming": "Hamming"}
 MODE_NAMES = {"p2p": "raw", "p2s": "p-to-s", "s2s": "s-to-s", "hash": "hash"}
+LIFTED_MODES = ("p2s", "s2s")
 PREFERRED_METRICS = ("spherical", "euclidean")
 
 
@@ -69,13 +70,8 @@ def preferred_metric(rows: Iterable[Row]) -> str | None:
 
 
 def timings_by_key(results: Row) -> dict[tuple[Any, ...], Row]:
-    """Return the timing of each (strategy, decoys, dim, mode, metric).
-
-    Where several descriptor lengths were timed, that of the evaluated model wins.
-    """
-    n = results.get("model", {}).get("n")
-    timings = sorted(results.get("timings", ()), key=lambda timing: timing.get("n") == n)
-    return {timing_key(timing): timing for timing in timings}
+    """Return the timing of each (strategy, decoys, dim, mode, metric)."""
+    return {timing_key(timing): timing for timing in results.get("timings", ())}
 
 
 def timing_key(row: Row) -> tuple[Any, ...]:

@@ -34,7 +34,9 @@ from verify.evaluation.row_labels import (
 
 LISTED_FAILURES = 20
 HASH_DIGITS = 12
-INTERVALS = {"wilson": "Wilson", "subject-bootstrap": "bootstrap by subject"}
+INTERVALS = {"subject-bootstrap": "bootstrap by subject", "pair-bootstrap": "bootstrap of pairs"}
+# A spreadsheet runs what begins so; after an apostrophe it is text.
+_FORMULAS = ("=", "+", "-", "@", "\t", "\r")
 
 
 def write_csv(results: Mapping[str, Any], path: Path | str) -> None:
@@ -42,8 +44,9 @@ def write_csv(results: Mapping[str, Any], path: Path | str) -> None:
 
     Nested values become columns of their own: ``fnmr_at_fmr_0.01`` is the rate and
     ``fnmr_at_fmr_0.01_ci_low`` a field beside it; ``thresholds_1`` is that of the first fold. The
-    timing of a row follows as ``timing_n``, ``microseconds_per_comparison`` and ``ratio_to_raw``.
-    Rates are fractions, in full precision; what is missing is empty.
+    timing of a row follows as ``microseconds_per_comparison`` and ``ratio_to_raw``. Rates are
+    fractions, in full precision; what is missing is empty. Text that a spreadsheet would run as a
+    formula has an apostrophe before it.
     """
     timings = timings_by_key(results)
     lines = [_flat(row) | _flat_timing(timings.get(timing_key(row), {})) for row in results["rows"]]
@@ -51,7 +54,11 @@ def write_csv(results: Mapping[str, Any], path: Path | str) -> None:
     with Path(path).open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, columns, restval="", lineterminator="\r\n")
         writer.writeheader()
-        writer.writerows(lines)
+        writer.writerows({name: _inert(value) for name, value in line.items()} for line in lines)
+
+
+def _inert(value: Any) -> Any:
+    return f"'{value}" if isinstance(value, str) and value.startswith(_FORMULAS) else value
 
 
 def _flat(value: Any, name: str = "") -> dict[str, Any]:
@@ -70,12 +77,8 @@ def _flat(value: Any, name: str = "") -> dict[str, Any]:
 
 
 def _flat_timing(timing: Row) -> dict[str, Any]:
-    columns = {
-        "n": "timing_n",
-        "microseconds_per_comparison": "microseconds_per_comparison",
-        "ratio_to_raw": "ratio_to_raw",
-    }
-    return {columns[key]: value for key, value in timing.items() if key in columns}
+    columns = ("microseconds_per_comparison", "ratio_to_raw")
+    return {name: timing[name] for name in columns if name in timing}
 
 
 def markdown(results: Mapping[str, Any]) -> str:
@@ -111,9 +114,10 @@ def markdown(results: Mapping[str, Any]) -> str:
 HOW_TO_READ = """## How to read this
 
 - Accuracy: the threshold is chosen on nine folds and applied to the tenth; ± is the standard deviation over the ten folds, (±) that over seeds of the lifting. A lifted row is compared with raw by the exact search; the grid is the literature's.
-- FNMR at FMR: the threshold lets at most that share of impostor pairs through on all folds together; in brackets the 95 % interval (resampling people where their names are known, and then never narrower than Wilson's), in parentheses errors (mean over runs) of trials.
+- FNMR at FMR: the threshold lets at most that share of impostor pairs through on all folds together; in brackets the 95 % interval (bootstrap by subject where the people are known, else bootstrap of pairs, both never narrower than Wilson's), in parentheses errors (mean over runs) of trials.
 - p-to-s compares a raw probe with a lifted template, s-to-s two lifted ones; p-to-s rows average the metrics of lifting either side. m is the dimension of the subspace; the spherical distance uses that descriptors have norm 1.
 - Collision floor: the share of impostor pairs expected to share decoys and so to be at distance 0; no threshold brings the FMR below it. Collisions are impostor pairs seen closer than 1e-3.
+- Rows of mlp-hash are of a reconstruction from the published description (docs/evaluation.md).
 - Failures to acquire are in none of these rates; FAR and FRR, which count them, thresholds per fold and full precision are in results.csv, single runs in results.json. "-" means not measured."""  # noqa: E501
 
 
@@ -130,8 +134,6 @@ def _provenance(results: Row) -> str:
         facts = [plain(decoys.get("kind")), code(decoys.get("file"))]
         if decoys.get("entries") is not None:
             facts.append(f"{count(decoys['entries'])} entries")
-        if decoys.get("left_out"):
-            facts.append(f"{count(decoys['left_out'])} left out as people of the test sets")
         if decoys.get("labelled") is not None:
             facts.append("labelled" if decoys["labelled"] else "not labelled")
         lines.append(f"Decoys: {', '.join(facts)}, SHA-256 {_short(decoys.get('sha256'))}")
@@ -170,6 +172,7 @@ def _dataset(dataset: Row) -> list[str]:
     hashed += [(code(name), sha256) for name, sha256 in dataset.get("protocol_files") or ()]
     sums = ", ".join(f"{name} {_short(sha256)}" for name, sha256 in hashed if sha256)
     lines = [", ".join(facts) + (f"; SHA-256: {sums}." if sums else ".")]
+    lines += [_decoys(decoys) for decoys in dataset.get("decoys") or ()]
     lines += [f"Note: {plain(note)}" for note in dataset.get("notes") or ()]
     failures = dataset.get("failures") or []
     if not failures:
@@ -189,6 +192,18 @@ def _dataset(dataset: Row) -> list[str]:
     if len(failures) > LISTED_FAILURES:
         listed.append(f"- and {count(len(failures) - LISTED_FAILURES)} more, in results.json")
     return [*lines, "\n".join(listed)]
+
+
+def _decoys(decoys: Row) -> str:
+    """Say what was used of a source on this data set."""
+    facts = [plain(decoys.get("kind"))]
+    if decoys.get("entries") is not None:
+        facts.append(f"{count(decoys['entries'])} entries used")
+    if decoys.get("left_out"):
+        facts.append(
+            f"{count(decoys['left_out'])} left out because they resemble people of this set"
+        )
+    return f"Decoys: {', '.join(facts)}; source {_short(decoys.get('source_id'))}."
 
 
 Column = tuple[str, Callable[[Row], str]]

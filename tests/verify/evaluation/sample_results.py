@@ -73,7 +73,7 @@ def sample_results(
         "options": {},
         "model": {"pack": "made_up", "embedder_sha256": "ab" * 32, "preprocessing": {}, "n": 512},
         "decoys": [
-            {"kind": "pool", "source_id": "made up", "entries": 5000, "left_out": 3}
+            {"kind": "pool", "source_id": "made up", "entries": 5000}
             | {"labelled": True, "file": "pool.veil", "sha256": "cd" * 32}
         ],
         "datasets": [_dataset(name, failures) for name in datasets],
@@ -137,7 +137,7 @@ def _row(
         "threshold_search": search,
         "accuracy_mean": accuracy,
         "accuracy_std": float(rng.uniform(0.002, 0.004)) * (1 + 10 * (1 - accuracy)),
-        "accuracy_std_seeds": 0.0004 if dim else 0.0,
+        "accuracy_std_seeds": 0.0004 if dim else None,
         "eer": 1 - accuracy,
         "auc": 1 - (1 - accuracy) ** 2,
         "d_prime": 5.1,
@@ -179,6 +179,7 @@ def _dataset(name: str, failures: int) -> dict[str, Any]:
             {"image": f"Nobody_{i}/Nobody_{i}_0001.jpg", "code": "no_face", "reason": "no | face"}
             for i in range(failures)
         ],
+        "decoys": [{"kind": "pool", "source_id": "made up", "entries": 4997, "left_out": 3}],
         "failed_genuine": failures,
         "failed_impostor": 0,
         "fta": failures / 7701,

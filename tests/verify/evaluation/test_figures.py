@@ -27,6 +27,7 @@ from verify.evaluation.figures import (
     write_figures,
 )
 from verify.evaluation.figures.curves import shown_curves
+from verify.evaluation.figures.frontier import strongest_attackers
 from verify.evaluation.figures.style import GROUND, HUES, INK, QUIET, house_style
 
 PAPER = (("random", None), ("adversarial", "pool"), ("hybrid", "pool"))
@@ -287,10 +288,8 @@ def test_an_audit_without_its_fields_is_refused() -> None:
     del audit["rows"][0]["chance"], audit["rows"][0]["attacker"]
     audit["rows"][2]["accuracy"] = 51.2
     audit["rows"][3]["dim"] = "2"
-    with pytest.raises(
-        DatasetError,
-        match=r"row 0: lacks attacker, chance; row 2: accuracy is 51\.2.*; row 3: dim is str",
-    ):
+    said = r"row 0: lacks attacker, chance; row 2: accuracy is 51\.2.*; row 3: dim is str"
+    with pytest.raises(DatasetError, match=said):
         frontier_figure(results, audit)
     for wrong, reason in (
         ({}, "not an audit report"),
@@ -300,6 +299,50 @@ def test_an_audit_without_its_fields_is_refused() -> None:
     ):
         with pytest.raises(DatasetError, match=reason):
             frontier_figure(results, wrong)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        *((name, "x" * 65) for name in ("strategy", "decoys", "attribute", "attacker")),
+        *((name, "a\x1b[2J") for name in ("strategy", "decoys", "attribute", "attacker")),
+        *(("accuracy", value) for value in (float("nan"), float("inf"), -1e-9, 10**400)),
+        *(("chance", value) for value in (float("nan"), float("-inf"), 1.01)),
+        *(("dim", value) for value in (-1, 2**16 + 1, 10**400)),
+    ],
+)
+def test_an_audit_with_values_out_of_range_is_refused(field: str, value: object) -> None:
+    results = sample_results(liftings=PAPER, dims=(2,))
+    audit = sample_audit(results)
+    audit["rows"][1][field] = value
+    with pytest.raises(DatasetError, match=f"row 1: {field} is ") as caught:
+        strongest_attackers(audit)
+    assert len(str(caught.value)) < 200
+    assert str(caught.value).isprintable()
+
+
+def test_an_audit_of_more_attributes_than_a_figure_has_columns_is_refused() -> None:
+    results = sample_results(liftings=PAPER, dims=(2,))
+    row = sample_audit(results)["rows"][0]
+    rows = [row | {"attribute": f"a{number}"} for number in range(17)]
+    assert len(strongest_attackers({"format": "veilface audit", "rows": rows[:16]})) == 16
+    with pytest.raises(DatasetError, match="17 attributes, and 16 are the most"):
+        strongest_attackers({"format": "veilface audit", "rows": rows})
+
+
+def test_a_name_is_no_formula(tmp_path: Path) -> None:
+    results = sample_results(liftings=PAPER, dims=(2, 16))
+    for part in ("rows", "datasets", "curves"):
+        for entry in results[part]:
+            entry["name" if part == "datasets" else "dataset"] = r"$\frac{1}{$ & $x$"
+    audit = sample_audit(results)
+    for row in audit["rows"]:
+        row["attribute"] = "$x^2$"
+    for path in write_figures(results, tmp_path, audit=audit):
+        if path.suffix == ".svg":
+            root = ElementTree.fromstring(path.read_text(encoding="utf-8"))
+            words = ["".join(e.itertext()) for e in root.iter("{http://www.w3.org/2000/svg}text")]
+            assert any(word.startswith(r"$\frac{1}{$ & $x$") for word in words)
 
 
 def test_files_are_complete_readable_and_the_same_each_time(tmp_path: Path) -> None:

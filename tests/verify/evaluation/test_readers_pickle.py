@@ -14,7 +14,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from verify.evaluation.readers.restricted_pickle import PickledArray, RefusedPickle, read_pickle
+from verify.evaluation.readers.pickled_arrays import PickledArray, RefusedPickle
+from verify.evaluation.readers.restricted_pickle import read_pickle
 
 PLAIN = st.recursive(
     st.one_of(
@@ -199,7 +200,8 @@ def test_bombs_take_no_memory() -> None:
     script = (
         "import resource, sys\n"
         "from tests.verify.evaluation.test_readers_pickle import BOMBS\n"
-        "from verify.evaluation.readers.restricted_pickle import RefusedPickle, read_pickle\n"
+        "from verify.evaluation.readers.pickled_arrays import RefusedPickle\n"
+        "from verify.evaluation.readers.restricted_pickle import read_pickle\n"
         "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
         "for data in BOMBS.values():\n"
         "    try:\n"

@@ -1,12 +1,13 @@
 """The README's results table, made from a small document by the script that makes the real one."""
 
+import copy
 import json
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from benchmarks.readme_results import BEGIN, END, main, readme_table, written_into
+from benchmarks.readme_results import BEGIN, END, main, merged, readme_table, written_into
 from tests.verify.evaluation.sample_results import sample_results
 from verify.datasets import DatasetError
 
@@ -111,8 +112,98 @@ def test_a_readme_without_its_markers_is_left_alone(text: str) -> None:
 
 def test_the_kept_copy_has_everything_but_single_runs(tmp_path: Path) -> None:
     results = sample_results(dims=(2,))
-    copy = tmp_path / "kept.json"
-    assert main([str(document(tmp_path, results)), "--keep", str(copy)]) == 0
-    kept = json.loads(copy.read_text(encoding="utf-8"))
+    target = tmp_path / "kept.json"
+    assert main([str(document(tmp_path, results)), "--keep", str(target)]) == 0
+    kept = json.loads(target.read_text(encoding="utf-8"))
     assert kept == {k: v for k, v in results.items() if k not in ("runs", "curves")}
     assert readme_table(kept) == readme_table(results)
+
+
+def parts_of(results: dict[str, Any]) -> list[dict[str, Any]]:
+    """The same evaluation as two: raw and random lifting, raw and all others."""
+    parts = []
+    for belongs in (lambda s: s == "random", lambda s: s != "random"):
+        part = copy.deepcopy(results)
+        part["rows"] = [
+            row for row in part["rows"] if row["strategy"] == "raw" or belongs(row["strategy"])
+        ]
+        parts.append(part)
+    return parts
+
+
+def test_rows_of_several_evaluations_make_one_table() -> None:
+    results = sample_results(dims=(2, 16), datasets=("lfw", "cfp_fp"))
+    one, two = parts_of(results)
+    two["datasets"] = two["datasets"][:1]
+    two["rows"] = [row for row in two["rows"] if row["dataset"] == "lfw"]
+    both = merged([one, two])
+    assert [dataset["name"] for dataset in both["datasets"]] == ["lfw", "cfp_fp"]
+    keys = [json.dumps(row, sort_keys=True) for row in both["rows"]]
+    assert len(set(keys)) == len(keys) == len(one["rows"]) + len(two["rows"]) - 2
+    assert readme_table(both) == readme_table(results)
+    assert merged([results]) == results
+    # Kept copies have no single runs.
+    del one["runs"], two["runs"]
+    assert "mean of 3 seeds" in readme_table(merged([one, two]))
+
+
+def shared_row(results: dict[str, Any]) -> dict[str, Any]:
+    return next(row for row in results["rows"] if row["strategy"] == "raw")
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda r: r["model"].update(embedder_sha256="0"), "results 2 are of another model"),
+        (lambda r: r.update(seed=7), "results 2 have other seeds"),
+        (lambda r: r.update(repeats=5), "results 2 have other seeds"),
+        (
+            lambda r: r["datasets"][0].update(pictures_sha256="0"),
+            "results 2 have other photos or pairs of lfw",
+        ),
+        (
+            lambda r: r["datasets"][0].update(protocol_files=[]),
+            "results 2 have other photos or pairs of lfw",
+        ),
+        (lambda r: r["datasets"][0].update(name="mine"), "results 2 give LFW another name"),
+        (
+            lambda r: shared_row(r).update(eer=0.5),
+            "results 2 have other numbers of lfw: raw, m = 0, p2p, euclidean",
+        ),
+    ],
+)
+def test_evaluations_of_another_set_up_are_not_put_together(change: Any, reason: str) -> None:
+    one, two = parts_of(sample_results(dims=(2,)))
+    change(two)
+    with pytest.raises(DatasetError, match=reason):
+        merged([one, two])
+
+
+def test_several_files_are_read_and_each_is_kept(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    results = sample_results(dims=(2,))
+    files, copies = [], []
+    for number, part in enumerate(parts_of(results)):
+        files.append(tmp_path / f"{number}.json")
+        copies.append(tmp_path / f"kept {number}.json")
+        files[-1].write_text(json.dumps(part), encoding="utf-8")
+    names = [str(file) for file in files]
+    assert main([*names, "--keep", *map(str, copies)]) == 0
+    assert capsys.readouterr().out == readme_table(results) + "\n"
+    for part, kept in zip(parts_of(results), copies, strict=True):
+        expected = {k: v for k, v in part.items() if k not in ("runs", "curves")}
+        assert json.loads(kept.read_text(encoding="utf-8")) == expected
+    with pytest.raises(SystemExit):
+        main([*names, "--keep", str(tmp_path / "one.json")])
+    assert not (tmp_path / "one.json").exists()
+
+
+def test_a_single_seed_has_no_spread() -> None:
+    results = sample_results(dims=(2,))
+    for row in results["rows"]:
+        row["accuracy_std_seeds"] = None
+    results["runs"] = [run for run in results["runs"] if run["seed"] == 0]
+    block = readme_table(results)
+    assert "one seed" in block
+    assert "±" not in block.split("Raw descriptors")[1].split("\n", 1)[1]

@@ -24,7 +24,9 @@ from verify.evaluation.figures.style import (
 )
 from verify.evaluation.row_labels import (
     HASHES,
+    LIFTED_MODES,
     METRIC_NAMES,
+    MODE_NAMES,
     Row,
     datasets_of,
     order_of,
@@ -33,7 +35,6 @@ from verify.evaluation.row_labels import (
 )
 
 Array = npt.NDArray[np.float64]
-MODE_TITLES = {"p2s": "p-to-s", "s2s": "s-to-s", "p2p": "raw", "hash": "hashes"}
 RATE_TICKS = (1e-6, 1e-5, 1e-4, 1e-3, 0.01, 0.05, 0.2, 0.5, 0.8, 0.95, 0.99, 0.999)
 SMALLEST = 1e-7
 BAND_ALPHA = 0.11
@@ -61,7 +62,7 @@ def roc_figure(results: Mapping[str, Any]) -> Figure | None:
 
 def shown_curves(curves: Sequence[Row], mode: str) -> list[Row]:
     """Return the curves of one panel, out of those of one data set, in the order of the tables."""
-    lifted = [curve for curve in curves if curve["mode"] == mode and mode in ("p2s", "s2s")]
+    lifted = [curve for curve in curves if curve["mode"] == mode and mode in LIFTED_MODES]
     metric = preferred_metric(lifted)
     lifted = [curve for curve in lifted if curve["metric"] == metric]
     by_group: dict[str, set[int]] = {}
@@ -85,7 +86,7 @@ def _figure(results: Row, draw: Draw, dress: Callable[[Axes], None]) -> Figure |
     curves = [curve for curve in results.get("curves", ()) if len(curve["fmr"]) > 1]
     names = [name for name in datasets_of(results) if any(c["dataset"] == name for c in curves)]
     present = {curve["mode"] for curve in curves}
-    modes = [mode for mode in ("p2s", "s2s") if mode in present]
+    modes = [mode for mode in LIFTED_MODES if mode in present]
     # Without lifting the references alone make one panel.
     modes = modes or [mode for mode in ("p2p", "hash") if mode in present][:1]
     if not names or not modes:
@@ -119,8 +120,8 @@ def _figure(results: Row, draw: Draw, dress: Callable[[Axes], None]) -> Figure |
 
 def _title(mode: str, shown: Sequence[Row]) -> str:
     metrics = [curve["metric"] for curve in shown if curve["mode"] == mode]
-    title = MODE_TITLES[mode]
-    return f"{title}, {METRIC_NAMES[metrics[0]]}" if mode in ("p2s", "s2s") else title
+    title = MODE_NAMES[mode]
+    return f"{title}, {METRIC_NAMES[metrics[0]]}" if mode in LIFTED_MODES else title
 
 
 def _look(curve: Row, shown: Sequence[Row], looks: dict[str, dict[str, Any]]) -> dict[str, Any]:
@@ -229,7 +230,7 @@ def _legend(
     handles = [Line2D([], [], **looks[label], label=label) for label in labels]
     by_mode: dict[str, set[int]] = {}
     for curve in drawn:
-        if curve["mode"] in ("p2s", "s2s"):
+        if curve["mode"] in LIFTED_MODES:
             by_mode.setdefault(curve["mode"], set()).add(int(curve["dim"]))
     for dash, pick, word in ((DASHES[0], max, "solid"), (DASHES[1], min, "dashed")):
         dims = {
@@ -237,7 +238,7 @@ def _legend(
         }
         if dims:
             same = len(set(dims.values())) == 1
-            text = ", ".join(f"{dim} {MODE_TITLES[mode]}" for mode, dim in dims.items())
+            text = ", ".join(f"{dim} {MODE_NAMES[mode]}" for mode, dim in dims.items())
             text = str(next(iter(dims.values()))) if same else text
             handles.append(
                 Line2D(

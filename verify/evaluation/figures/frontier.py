@@ -1,13 +1,14 @@
 """Privacy against accuracy: what an attacker learns from a template, and what that costs."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from verify.datasets import DatasetError
+from verify.datasets import DatasetError, faults_in
 from verify.evaluation.figures.style import (
     HUES,
     INK,
@@ -19,7 +20,9 @@ from verify.evaluation.figures.style import (
     side_legend,
 )
 from verify.evaluation.row_labels import (
+    LIFTED_MODES,
     METRIC_NAMES,
+    MODE_NAMES,
     Row,
     datasets_of,
     order_of,
@@ -38,8 +41,9 @@ FIELDS: Mapping[str, type | tuple[type, ...]] = {
     "accuracy": (int, float),
     "chance": (int, float),
 }
-LISTED_FAULTS = 20
-MODE_TITLES = {"p2s": "p-to-s", "s2s": "s-to-s"}
+MAX_TEXT = 64
+MAX_ATTRIBUTES = 16
+MAX_DIM = 2**16
 PANEL_INCHES = (4.6, 3.7)
 SIDE_INCHES = 2.6
 Key = tuple[str, str | None, int]
@@ -61,7 +65,8 @@ def strongest_attackers(audit: Mapping[str, Any]) -> dict[tuple[Key, str], Row]:
     Raises
     ------
     DatasetError
-        Listing every row that lacks a field or has a value of another kind.
+        Listing every row that lacks a field or has a value of another kind or range, and where
+        there are too many attributes for a figure.
     """
     _validate(audit)
     strongest: dict[tuple[Key, str], Row] = {}
@@ -82,10 +87,14 @@ def _validate(audit: Any) -> None:
     if not isinstance(rows, list) or not rows:
         raise DatasetError("the audit report has no rows; run veilface audit fairface again")
     faults = [f"row {place}: {fault}" for place, row in enumerate(rows) for fault in _faults(row)]
+    if not faults:
+        attributes = {row["attribute"] for row in rows}
+        if len(attributes) > MAX_ATTRIBUTES:
+            faults = [f"{len(attributes)} attributes, and {MAX_ATTRIBUTES} are the most"]
     if faults:
-        more = len(faults) - LISTED_FAULTS
-        listed = "; ".join(faults[:LISTED_FAULTS]) + (f"; and {more} more" if more > 0 else "")
-        raise DatasetError(f"the audit report cannot be drawn: {listed}")
+        raise DatasetError(
+            faults_in(Path("the audit report"), "expected rows that can be drawn", faults)
+        )
 
 
 def _faults(row: Any) -> list[str]:
@@ -96,9 +105,23 @@ def _faults(row: Any) -> list[str]:
     for name, kind in FIELDS.items():
         if name in row and (not isinstance(row[name], kind) or isinstance(row[name], bool)):
             faults.append(f"{name} is {type(row[name]).__name__}")
-        elif name in ("accuracy", "chance") and name in row and not 0 <= row[name] <= 1:
-            faults.append(f"{name} is {row[name]}, expected a fraction from 0 to 1")
+        elif name in row and (fault := _fault_of(name, row[name])):
+            faults.append(fault)
     return faults
+
+
+def _fault_of(name: str, value: Any) -> str:
+    """Return what is wrong with a value of the right kind, empty where nothing is."""
+    if isinstance(value, str):
+        if len(value) > MAX_TEXT or not value.isprintable():
+            return f"{name} is no printable text of at most {MAX_TEXT} characters"
+    elif name in ("accuracy", "chance"):
+        # What is no number compares false.
+        if not 0 <= value <= 1:
+            return f"{name} is {str(value)[:20]}, expected a fraction from 0 to 1"
+    elif name == "dim" and not 0 <= value <= MAX_DIM:
+        return f"dim is {str(value)[:20]}, expected 0 to {MAX_DIM}"
+    return ""
 
 
 def _key(row: Row) -> Key:
@@ -122,7 +145,7 @@ def frontier_figure(results: Mapping[str, Any], audit: Mapping[str, Any]) -> Fig
     attributes = list(dict.fromkeys(attribute for _, attribute in strongest))
     lines: list[tuple[str, str, list[Row]]] = []
     for name in datasets_of(results):
-        for mode in MODE_TITLES:
+        for mode in LIFTED_MODES:
             rows = [
                 row
                 for row in results["rows"]
@@ -157,7 +180,7 @@ def frontier_figure(results: Mapping[str, Any], audit: Mapping[str, Any]) -> Fig
                 _panel(axes, rows, attribute, strongest, looks, sizes)
                 _references(axes, raw_row(results["rows"], name), attribute, strongest)
                 metric_name = METRIC_NAMES[rows[0]["metric"]]
-                axes.set_title(f"{name}, {MODE_TITLES[mode]}, {metric_name}", loc="left")
+                axes.set_title(f"{name}, {MODE_NAMES[mode]}, {metric_name}", loc="left")
                 axes.set_xlabel(f"{attribute}: accuracy of the strongest attacker %")
                 axes.grid(color=RULE, linewidth=0.8)
                 axes.margins(0.1, 0.12)

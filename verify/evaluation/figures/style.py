@@ -53,6 +53,8 @@ _SETTINGS: Any = {
     "svg.fonttype": "none",
     "svg.hashsalt": "veilface",
     "text.color": INK,
+    # Names are foreign text: a dollar is a dollar.
+    "text.parse_math": False,
     "xtick.color": QUIET,
     "xtick.labelcolor": INK,
     "xtick.labelsize": SMALL_SIZE,

@@ -6,7 +6,8 @@ import numpy as np
 
 from verify.datasets import DatasetError, faults_in, read_whole
 from verify.evaluation.readers.assembly import Trial, assemble
-from verify.evaluation.readers.restricted_pickle import PickledArray, RefusedPickle, read_pickle
+from verify.evaluation.readers.pickled_arrays import PickledArray, RefusedPickle
+from verify.evaluation.readers.restricted_pickle import read_pickle
 from verify.evaluation.verification_set import (
     PictureBytes,
     VerificationSet,

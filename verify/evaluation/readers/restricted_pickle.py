@@ -13,13 +13,20 @@ NumPy, ``ndarray.__reduce__``, ``ndarray.__reduce_ex__`` and ``dtype.__reduce__`
 """
 
 import enum
-import math
 import pickle
 import re
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import cast
+
+from verify.evaluation.readers.pickled_arrays import (
+    DTYPES,
+    PickledArray,
+    PickledDtype,
+    RefusedPickle,
+    filled,
+    listed,
+    scalar,
+)
 
 MAX_STEPS = 6_000_000
 """Instructions in a file: a hundred thousand photos saved as arrays need about four million."""
@@ -30,43 +37,6 @@ _MAX_MEMO = 2**32
 
 _ESCAPE = re.compile(rb"\\(x[0-9a-fA-F]{2}|[\\'\"nrt])?")
 _ESCAPED = {b"\\": b"\\", b"'": b"'", b'"': b'"', b"n": b"\n", b"r": b"\r", b"t": b"\t"}
-_DTYPES = re.compile(r"b1|[iu][1248]|O[48]")
-
-
-class RefusedPickle(ValueError):
-    """A pickle that is broken or holds anything but plain values; the message says what."""
-
-
-@dataclass(eq=False)
-class PickledDtype:
-    """Type of array elements: ``b1``, ``u1``, ``i8`` …, and their byte order; ``O8`` is objects."""
-
-    code: str
-    order: str = "|"
-
-    @property
-    def itemsize(self) -> int:
-        """Bytes of an element."""
-        return int(self.code[1])
-
-    @property
-    def is_object(self) -> bool:
-        """Whether elements are values of the pickle and no numbers."""
-        return self.code[0] == "O"
-
-
-@dataclass(eq=False, repr=False)
-class PickledArray:
-    """An array as it lies in the file: ``data``, or ``items`` where it is of objects.
-
-    Both are None until its contents were seen. ``items`` is the list of the pickle, which may
-    change it later: its own length counts, not the shape.
-    """
-
-    shape: tuple[int, ...] = (0,)
-    dtype: PickledDtype | None = None
-    data: bytes | None = None
-    items: list[object] | None = None
 
 
 class _Name(enum.Enum):
@@ -293,13 +263,13 @@ class _Machine:
             case _Name.RECONSTRUCT, (_Name.NDARRAY, (0,), _):
                 self.push(PickledArray())
             case _Name.DTYPE, (code, bool() | int(), bool() | int()):
-                if not _DTYPES.fullmatch(_text(code)):
+                if not DTYPES.fullmatch(_text(code)):
                     raise RefusedPickle("an array holds other elements than integers or objects")
                 self.push(PickledDtype(_text(code)))
             case _Name.FROMBUFFER, (bytes() as raw, PickledDtype() as dtype, tuple() as shape, _):
-                self.push(_filled(PickledArray(), shape, dtype, raw))
+                self.push(filled(PickledArray(), shape, dtype, raw))
             case _Name.SCALAR, (PickledDtype() as dtype, bytes() as raw):
-                self.push(_scalar(dtype, raw))
+                self.push(scalar(dtype, raw))
             case _:
                 raise RefusedPickle(
                     f"the value before byte {self.at} is not made as plain values and arrays are; "
@@ -326,7 +296,7 @@ class _Machine:
                 bool() | int(),
                 bytes() as raw,
             ):
-                _filled(target, shape, dtype, raw)
+                filled(target, shape, dtype, raw)
             case PickledArray(data=None, items=None), (
                 1,
                 tuple() as shape,
@@ -334,7 +304,7 @@ class _Machine:
                 bool() | int(),
                 list() as items,
             ):
-                _listed(target, shape, dtype, items)
+                listed(target, shape, dtype, items)
             case PickledDtype(), (int(), order, None, None, None, -1, -1, int()):
                 if _text(order) not in ("|", "<", ">", "="):
                     raise RefusedPickle("an array has no known byte order")
@@ -350,40 +320,6 @@ def _text(value: object) -> str:
     if isinstance(value, bytes):
         return value[:16].decode("latin-1")
     return value if isinstance(value, str) else ""
-
-
-def _sides(shape: tuple[object, ...]) -> tuple[int, ...]:
-    if len(shape) > 4 or not all(type(side) is int and 0 <= side < 2**40 for side in shape):
-        raise RefusedPickle("an array has no plain shape")
-    return cast(tuple[int, ...], shape)
-
-
-def _filled(
-    array: PickledArray, shape: tuple[object, ...], dtype: PickledDtype, raw: bytes
-) -> PickledArray:
-    sides = _sides(shape)
-    if dtype.is_object or math.prod(sides) * dtype.itemsize != len(raw):
-        raise RefusedPickle(f"an array of shape {sides} is stored in {len(raw)} bytes")
-    array.shape, array.dtype, array.data = sides, dtype, raw
-    return array
-
-
-def _listed(
-    array: PickledArray, shape: tuple[object, ...], dtype: PickledDtype, items: list[object]
-) -> None:
-    sides = _sides(shape)
-    if not dtype.is_object or math.prod(sides) != len(items):
-        raise RefusedPickle(f"an array of shape {sides} is stored as {len(items)} objects")
-    array.shape, array.dtype, array.items = sides, dtype, items
-
-
-def _scalar(dtype: PickledDtype, raw: bytes) -> int | bool:
-    if dtype.is_object or len(raw) != dtype.itemsize:
-        raise RefusedPickle("a number has the wrong length")
-    if dtype.code == "b1":
-        return raw != b"\0"
-    order = "big" if dtype.order == ">" else "little"
-    return int.from_bytes(raw, order, signed=dtype.code[0] == "i")  # type: ignore[arg-type]
 
 
 _Action = Callable[[_Machine], None]
