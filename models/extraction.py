@@ -22,6 +22,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from models.alignment import align
 from models.cache import EmbeddingCache
 from models.decoding import DEFAULT_LIMITS, ImageLimits, decode_image
 from models.errors import FaceError, ImageError
@@ -44,7 +45,23 @@ class EncodedImage:
     data: bytes = field(repr=False)
 
 
-Source = str | Path | EncodedImage
+@dataclass(frozen=True, eq=False)
+class MarkedPhoto:
+    """A photo whose face somebody marked: it is aligned by that where the pack has no detector.
+
+    Parameters
+    ----------
+    photo
+        The file, or the encoded photo.
+    keypoints : (5, 2) float64
+        Left eye, right eye, nose, left and right mouth corner, in pixels, as seen in the picture.
+    """
+
+    photo: "Path | EncodedImage"
+    keypoints: NDArray[np.float64] = field(repr=False)
+
+
+Source = str | Path | EncodedImage | MarkedPhoto
 Embeddings = tuple[NDArray[np.float32], ...]
 """What one file gave: its embedding, or the one without and the one with the mirror image."""
 
@@ -145,6 +162,7 @@ class Extractor:
         self._policy = policy
         self._quality = quality
         self._aligned = aligned or pack.info.detector is None
+        self._trusts_marks = not aligned and pack.info.detector is None
         self._workers = workers or default_workers()
         self._limits = limits
         # One kind of embedding, or the two kinds that are made together.
@@ -178,7 +196,7 @@ class Extractor:
         ModelError
             If inference itself fails, which is not the fault of a file.
         """
-        files = [path if isinstance(path, EncodedImage) else Path(path) for path in paths]
+        files = [Path(path) if isinstance(path, str) else path for path in paths]
         rows: list[Embeddings] = []
         done: list[Path] = []
         failures: list[Failure] = []
@@ -191,7 +209,7 @@ class Extractor:
                     prepared = list(pool.map(self._prepare, chunk))
                     embedded = self._embed([item for item in prepared if item.crop is not None])
                     for source, item in zip(chunk, prepared, strict=True):
-                        path = _named(source)
+                        path = named(source)
                         if item.failure is not None:
                             failures.append(item.failure)
                             continue
@@ -228,18 +246,25 @@ class Extractor:
         }
         return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).digest()
 
-    def _prepare(self, source: Path | EncodedImage) -> "_Prepared":
+    def _prepare(self, source: Path | EncodedImage | MarkedPhoto) -> "_Prepared":
         """Read, look up, decode, find the face; whatever is wrong with the file is an answer."""
-        path = _named(source)
+        path = named(source)
         try:
             data = _read(source, self._limits.max_bytes)
             content = hashlib.sha256(data).digest()
+            marks = None
+            if isinstance(source, MarkedPhoto) and self._trusts_marks:
+                marks = source.keypoints
+                content = hashlib.sha256(content + marks.tobytes()).digest()
             key = tuple(hashlib.sha256(kind + content).digest() for kind in self._kinds)
             known = () if self._cache is None else tuple(self._cache.get(each) for each in key)
             found = tuple(each for each in known if each is not None)
             if len(found) == len(key):
                 return _Prepared(key, embedding=found)
-            if self._aligned:
+            if marks is not None:
+                image = decode_image(data, limits=self._limits)
+                crop = align(image, marks, size=self._pack.crop_size)
+            elif self._aligned:
                 crop = self._pack.as_aligned(decode_image(data, limits=self._limits))
             else:
                 crop, _, _ = self._pack.crop_photo(
@@ -279,11 +304,15 @@ class _Prepared:
     failure: Failure | None = None
 
 
-def _named(source: Path | EncodedImage) -> Path:
-    return Path(source.name) if isinstance(source, EncodedImage) else source
+def named(source: Source) -> Path:
+    """Path under which a source stands in an :class:`Extraction`."""
+    photo = source.photo if isinstance(source, MarkedPhoto) else source
+    return Path(photo.name if isinstance(photo, EncodedImage) else photo)
 
 
-def _read(source: Path | EncodedImage, max_bytes: int) -> bytes:
+def _read(source: Path | EncodedImage | MarkedPhoto, max_bytes: int) -> bytes:
+    if isinstance(source, MarkedPhoto):
+        return _read(source.photo, max_bytes)
     if isinstance(source, EncodedImage):
         return source.data
     with source.open("rb") as file:

@@ -170,7 +170,9 @@ def acquire_faces(
         size = int(descriptors.pack.info.preprocessing["size"])
         crops = pairs.aligned if aligned is None else aligned
         if crops is None:
-            crops = descriptors.pack.info.detector is None or are_aligned(pairs, size)
+            marked = any(picture.keypoints is not None for picture in pairs.pictures)
+            alone = descriptors.pack.info.detector is None and not marked
+            crops = alone or are_aligned(pairs, size)
         source = PackSource(
             folder=Path(str(settings.pack)).expanduser().resolve(),
             embedder_sha256=descriptors.pack.info.embedder_sha256,

@@ -5,6 +5,7 @@ import pytest
 from PIL import Image
 
 from models import extraction
+from models.alignment import align, template
 from models.cache import EmbeddingCache
 from models.decoding import ImageLimits
 from models.extraction import Extractor
@@ -213,3 +214,25 @@ def test_encoded_photos_stand_under_their_names(pack, files):
     assert [(str(f.path), f.code) for f in result.failures] == [("bad", "unsupported_image")]
     np.testing.assert_array_equal(result.descriptors, Extractor(pack).extract(files).descriptors)
     assert "data" not in repr(photos[0])
+
+
+def test_a_marked_face_is_aligned_by_its_marks_where_there_is_no_detector(pack, tmp_path):
+    photo = np.random.default_rng(9).integers(0, 256, (150, 200, 3), dtype=np.uint8)
+    path = tmp_path / "photo.png"
+    Image.fromarray(photo).save(path)
+    marks = template(112) * 0.9 + [40.0, 20.0]
+    alone = pack.embed(align(photo, marks, size=112)[None])
+    for source in (path, extraction.EncodedImage("photo", path.read_bytes())):
+        cache = EmbeddingCache()
+        marked = extraction.MarkedPhoto(source, marks)
+        found = Extractor(pack, cache=cache).extract([marked])
+        np.testing.assert_allclose(found.descriptors, alone, atol=1e-6)
+        assert [path.stem for path in found.paths] == ["photo"]
+        # Other marks are another face, for the cache too.
+        moved = extraction.MarkedPhoto(source, marks + 5)
+        again = Extractor(pack, cache=cache).extract([moved])
+        assert again.cached == 0
+        assert not np.allclose(again.descriptors, alone, atol=1e-3)
+    # Said to be an aligned crop, it is taken as one: this one is not square.
+    told = Extractor(pack, aligned=True).extract([extraction.MarkedPhoto(path, marks)])
+    assert [failure.code for failure in told.failures] == ["unsupported_image"]

@@ -11,7 +11,15 @@ from numpy.typing import NDArray
 
 from models.cache import EmbeddingCache
 from models.decoding import image_size
-from models.extraction import CHUNK, EncodedImage, Extraction, Extractor, Failure
+from models.extraction import (
+    CHUNK,
+    EncodedImage,
+    Extraction,
+    Extractor,
+    Failure,
+    MarkedPhoto,
+    named,
+)
 from models.pack import ModelPack
 from verify.evaluation.backends import Backend, BackendError, spread
 from verify.evaluation.embeddings_file import EmbeddingsFile, match
@@ -121,7 +129,7 @@ def acquire(
         extractor = Extractor(pack, aligned=source.aligned, cache=cache, mirrored=source.mirrored)
         sources = [picture.source for picture in unique]
         done = [extractor.extract(sources, progress=progress)]
-        keys = [str(each.name if isinstance(each, EncodedImage) else each) for each in sources]
+        keys = [str(named(each)) for each in sources]
     else:
         keys = [picture.name for picture in unique]
         chunks = [unique[start : start + CHUNK] for start in range(0, len(unique), CHUNK)]
@@ -152,8 +160,9 @@ def acquire(
     )
 
 
-def _loaded_chunk(chunk: Sequence[Picture]) -> list[EncodedImage]:
-    return [EncodedImage(picture.name, picture.read()) for picture in chunk]
+def _loaded_chunk(chunk: Sequence[Picture]) -> list[EncodedImage | MarkedPhoto]:
+    photos = [(EncodedImage(picture.name, picture.read()), picture.keypoints) for picture in chunk]
+    return [photo if marks is None else MarkedPhoto(photo, marks) for photo, marks in photos]
 
 
 @lru_cache(maxsize=2)
@@ -170,7 +179,7 @@ def _loaded(source: PackSource) -> ModelPack:
     return pack
 
 
-def _extract(source: PackSource, chunk: list[EncodedImage]) -> Extraction:
+def _extract(source: PackSource, chunk: list[EncodedImage | MarkedPhoto]) -> Extraction:
     extractor = Extractor(_loaded(source), aligned=source.aligned, mirrored=source.mirrored)
     return extractor.extract(chunk, progress=False)
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.decoding import DEFAULT_LIMITS
-from models.extraction import EncodedImage
+from models.extraction import EncodedImage, MarkedPhoto
 from verify.datasets import DatasetError
 from verify.tenfold import FOLDS
 
@@ -27,8 +27,13 @@ class Picture(Protocol):
         ...
 
     @property
-    def source(self) -> Path | EncodedImage:
-        """The photo as bulk extraction takes it: a file that is not read yet, or bytes."""
+    def source(self) -> Path | EncodedImage | MarkedPhoto:
+        """The photo as bulk extraction takes it; a file is not read yet."""
+        ...
+
+    @property
+    def keypoints(self) -> NDArray[np.float64] | None:
+        """Five points of the face that the set offers, (5, 2); None where it offers none."""
         ...
 
     def read(self) -> bytes:
@@ -42,19 +47,18 @@ class PictureFile:
 
     Parameters
     ----------
-    landmarks
-        The file of landmarks that the set offers for it, if any; the pack's own detector is
-        preferred to it.
+    keypoints : (5, 2) float64, optional
+        What the set offers, for packs without a detector.
     """
 
     name: str
     path: Path
-    landmarks: Path | None = None
+    keypoints: NDArray[np.float64] | None = field(default=None, repr=False, compare=False)
 
     @property
-    def source(self) -> Path:
-        """The file."""
-        return self.path
+    def source(self) -> Path | MarkedPhoto:
+        """The file, with its points where it has them."""
+        return self.path if self.keypoints is None else MarkedPhoto(self.path, self.keypoints)
 
     def read(self) -> bytes:
         """Read the file, and one byte more than the decoder accepts where it is larger."""
@@ -73,6 +77,11 @@ class PictureBytes:
     def source(self) -> EncodedImage:
         """The bytes under the photo's name."""
         return EncodedImage(self.name, self.data)
+
+    @property
+    def keypoints(self) -> None:
+        """None: it is an aligned crop."""
+        return
 
     def read(self) -> bytes:
         """Return the bytes."""

@@ -82,8 +82,8 @@ def read_pts(file: Path) -> NDArray[np.float64]:
         points = np.array([line.split() for line in body.splitlines() if line.strip()], np.float64)
     except ValueError:
         points = np.empty((0, 2))
-    if points.shape != (_POINTS, 2) or not np.isfinite(points).all():
-        raise DatasetError(f"{file} does not hold {_POINTS} points of two numbers in braces")
+    if points.shape != (_POINTS, 2) or not np.isfinite(points).all() or not np.ptp(points):
+        raise DatasetError(f"{file} does not hold {_POINTS} different points in braces")
     return np.stack(
         [
             (points[36] + points[39]) / 2,
@@ -137,7 +137,8 @@ def _files(root: Path, keys: Sequence[str]) -> dict[str, PictureFile]:
         if len(candidates) == 1:
             photo = candidates[0]
             points = photo.with_suffix(".pts")
-            files[key] = PictureFile(photo.name, photo, points if points.is_file() else None)
+            marks = read_pts(points) if points.is_file() else None
+            files[key] = PictureFile(photo.name, photo, marks)
         else:
             state = "is not there" if not candidates else "is there with different suffixes"
             faults.append(f"{key} {state}")
