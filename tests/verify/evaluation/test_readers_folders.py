@@ -344,7 +344,7 @@ def test_landmarks(tmp_path: Path) -> None:
     expected = [[38, 75], [44, 87], [33.5, 66], [48.5, 96], [54.5, 108]]
     np.testing.assert_array_equal(points, expected)
     for broken in ("", "{\n1 2\n}", file.read_text().replace("5.5 10", "nan 10", 1)):
-        with pytest.raises(DatasetError, match="68 points"):
+        with pytest.raises(DatasetError, match="68 points in braces"):
             read_pts(write(tmp_path / "broken.pts", broken))
 
 

@@ -83,7 +83,7 @@ def read_pts(file: Path) -> NDArray[np.float64]:
     except ValueError:
         points = np.empty((0, 2))
     if points.shape != (_POINTS, 2) or not np.isfinite(points).all() or not np.ptp(points):
-        raise DatasetError(f"{file} does not hold {_POINTS} different points in braces")
+        raise DatasetError(f"{file} does not hold {_POINTS} points in braces, not all equal")
     return np.stack(
         [
             (points[36] + points[39]) / 2,
