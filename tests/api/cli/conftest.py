@@ -98,3 +98,7 @@ def veilface(world: World, data: Path) -> Callable[..., Ran]:
         return run(*arguments, "--data-dir", data)
 
     return call
+
+
+# Defined beside what they make; known to all tests of the commands from here.
+from tests.api.cli.evaluation_bench import bench, results  # noqa: E402, F401

@@ -1,4 +1,4 @@
-"""`veilface evaluate` end to end on drawn faces and the demo model, and on a Dask cluster."""
+"""`veilface evaluate` end to end on drawn faces and the demo model."""
 
 import csv
 import io
@@ -8,159 +8,29 @@ import pickle
 import shutil
 import tempfile
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import psutil
 import pytest
-from distributed import LocalCluster
 from PIL import Image
 from sklearn.model_selection import KFold
 
-from api.cli import evaluate, evaluation_inputs
-from models.decoding import decode_image
-from models.demo import DEMO_NOTICE, build_demo_pack
-from models.pack import ModelPack
-from models.synthetic import draw_face, encode_photo
+from models.demo import DEMO_NOTICE
 from templates.subspace import SubspaceBatch
-from tests.api.cli.conftest import Ran, run
-from verify.evaluation import evaluation, scoring
-
-PEOPLE, PHOTOS, FOLDS, PER_CLASS = 12, 4, 10, 3
-PAIRS = 2 * FOLDS * PER_CLASS
-STRATEGIES = ("raw", "raw+flip", "random", "adversarial", "hybrid+", "biohashing")
-CONTRACT = {
-    *("dataset", "strategy", "dim", "mode", "metric", "accuracy_mean", "accuracy_std", "eer"),
-    *("fnmr_at_fmr", "threshold_mean", "n_genuine", "n_impostor", "seed"),
-}
-FILES = [
-    *("results.json", "results.csv", "results.md"),
-    *("figure.png", "figure.svg", "det.png", "det.svg", "roc.png", "roc.svg"),
-]
-
-
-@dataclass(frozen=True)
-class Bench:
-    """A set of drawn people, a pack, decoys, and what a full run on them said."""
-
-    root: Path
-    first: Ran
-
-    lfw = property(lambda self: self.root / "lfw")
-    pack = property(lambda self: self.root / "pack")
-    labels = property(lambda self: self.root / "labels.csv")
-    base = property(
-        lambda self: ("--pack", self.pack, "--data-dir", self.root / "data", "--jobs", "1")
-    )
-    decoys = property(
-        lambda self: (
-            *("--decoys", self.root / "pool.veil"),
-            *("--decoys", self.root / "generator.veil"),
-        )
-    )
-    plan = property(
-        lambda self: ("--dim", "2", "--repeats", "2", "--seed", "7", "--fmr", "0.2,0.001")
-    )
-
-    @property
-    def full(self) -> tuple[str | Path, ...]:
-        return (
-            *("evaluate", self.lfw, *self.base, *self.decoys, *self.plan),
-            *("--strategy", ",".join(STRATEGIES), "--labels", self.labels),
-        )
-
-
-def pair_lines() -> list[str]:
-    """The lines of ``pairs.txt`` after its header."""
-    rng = np.random.default_rng(0)
-    lines = []
-    for fold in range(FOLDS):
-        for number in range(PER_CLASS):
-            one, two = rng.choice(PHOTOS, 2, replace=False) + 1
-            lines.append(f"Person_{(PER_CLASS * fold + number) % PEOPLE}\t{one}\t{two}")
-        for _ in range(PER_CLASS):
-            (p, q), (i, j) = rng.choice(PEOPLE, 2, replace=False), rng.integers(PHOTOS, size=2) + 1
-            lines.append(f"Person_{p}\t{i}\tPerson_{q}\t{j}")
-    return lines
-
-
-def pairs_of(folder: Path) -> list[tuple[Path, Path, bool]]:
-    found = []
-    for line in (folder / "pairs.txt").read_text().splitlines()[1:]:
-        cells = line.split("\t")
-        a, i, b, j = cells if len(cells) == 4 else (cells[0], cells[1], cells[0], cells[2])
-        photos = (folder / who / f"{who}_{int(n):04d}.png" for who, n in ((a, i), (b, j)))
-        found.append((*photos, a == b))
-    return found
-
-
-@pytest.fixture(scope="module")
-def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
-    root = tmp_path_factory.mktemp("bench")
-    build_demo_pack(root / "pack")
-    labels = ["path,gender,race"]
-    for person in range(PEOPLE):
-        folder = root / "lfw" / f"Person_{person}"
-        folder.mkdir(parents=True)
-        for photo in range(PHOTOS):
-            data = encode_photo(draw_face(100 + person, photo))
-            (folder / f"Person_{person}_{photo + 1:04d}.png").write_bytes(data)
-        labels.append(f"Person_{person},{'Female' if person % 2 else 'Male'},White")
-    (root / "lfw" / "pairs.txt").write_text("\n".join([f"{FOLDS}\t{PER_CLASS}", *pair_lines()]))
-    (root / "labels.csv").write_text("\n".join(labels))
-    lines = ["file,age,gender,race,service_test"]
-    (root / "decoys" / "train").mkdir(parents=True)
-    for number in range(110):
-        (root / f"decoys/train/{number}.png").write_bytes(encode_photo(draw_face(5000 + number)))
-        gender, race = ("Male", "Female")[number % 2], ("White", "Black", "Indian")[number % 3]
-        lines.append(f"train/{number}.png,20-29,{gender},{race},FALSE")
-    (root / "decoys" / "fairface_label_train.csv").write_text("\n".join(lines))
-    for kind in ("pool", "generator"):
-        ran = run(
-            *("decoys", "build", root / "decoys" / "train", "--pack", root / "pack"),
-            *("--kind", kind, "--data-dir", root / "data", "--out", root / f"{kind}.veil"),
-        )
-        assert ran.status == 0, ran.stderr
-    unfinished = Bench(root, Ran(0, "", ""))
-    first = run(*unfinished.full, "--out", root / "out", "--json")
-    assert first.status == 0, first.stderr
-    return Bench(root, first)
-
-
-@pytest.fixture(scope="module")
-def results(bench: Bench) -> Any:
-    return json.loads((bench.root / "out" / "results.json").read_text())
-
-
-def embedded(bench: Bench, *, flip: bool = False) -> dict[Path, np.ndarray]:
-    pack = ModelPack.load(bench.pack, threads=1, flip=flip)
-    photos = sorted(bench.lfw.rglob("*.png"))
-    return dict(
-        zip(photos, pack.embed(np.stack([decode_image(p.read_bytes()) for p in photos])))  # noqa: B905
-    )
-
-
-def numbers(rows: list[Any]) -> list[Any]:
-    """Rows without the name of their set and without what depends on the names of people."""
-    kept = []
-    for row in rows:
-        own = {key: value for key, value in row.items() if key not in ("dataset", "interval")}
-        for part in ("low", "high"):
-            own.pop(part, None)
-        if "fnmr_at_fmr" in own:
-            own["fnmr_at_fmr"] = {
-                target: {
-                    key: value
-                    for key, value in at.items()
-                    if key not in ("ci_low", "ci_high", "interval")
-                }
-                for target, at in own["fnmr_at_fmr"].items()
-            }
-        kept.append(own)
-    return kept
+from tests.api.cli.conftest import run
+from tests.api.cli.evaluation_bench import (
+    CONTRACT,
+    FILES,
+    PAIRS,
+    STRATEGIES,
+    embedded,
+    numbers,
+    pairs_of,
+    secret_bytes,
+    secrets,
+)
+from verify.evaluation import scoring
 
 
 def test_everything_is_written(bench, results):
@@ -327,24 +197,6 @@ def test_no_face_is_left_in_what_was_written(bench, tmp_path, monkeypatch):
     assert len(needles) > 4 * 2 * PAIRS
     whole = b"\n".join(written)
     assert not [needle for needle in needles if needle in whole]
-
-
-def secret_bytes(rows: Any) -> list[bytes]:
-    """How a row may stand in a file: three widths of floats, or as text."""
-    found = []
-    for row in rows:
-        piece = row[100:108]
-        found += [piece.astype(kind).tobytes() for kind in ("<f2", "<f4", "<f8")]
-        found.append(repr(float(piece[0])).encode())
-    return found
-
-
-def secrets(bench: Bench) -> list[bytes]:
-    """Descriptors and photos, as files could have them."""
-    known = [row for flip in (False, True) for row in embedded(bench, flip=flip).values()]
-    photos = [file.read_bytes() for file in bench.lfw.rglob("*.png")]
-    pixels = [decode_image(data)[56, 40:60].tobytes() for data in photos]
-    return secret_bytes(known) + [data[200:232] for data in photos] + pixels
 
 
 def test_local_processes_give_the_same_rows_and_keep_no_file(bench, results, tmp_path, monkeypatch):
@@ -521,150 +373,3 @@ def test_an_audit_adds_the_frontier(bench, tmp_path):
     )
     assert ran.status == 0, ran.stderr
     assert ran.json["files"] == [*FILES, "frontier.png", "frontier.svg"]
-
-
-USAGE: list[tuple[list[str], str]] = [
-    (["--strategy", "homomorphic"], "choose of raw, raw+flip, random"),
-    (["--strategy", "raw,raw"], "named twice"),
-    (["--strategy", ","], "--strategy takes names of strategies, and is empty"),
-    (["--strategy", "adversarial"], "make one with `veilface decoys build`"),
-    (["--strategy", "hybrid+", "--decoys", "GENERATOR"], "a pool with gender and race labels"),
-    (["--strategy", "sub-hybrid", "--decoys", "GENERATOR"], "sub-hybrid lifting needs a pool"),
-    (["--dim", "two"], "--dim takes whole numbers such as 2,4, not 'two'"),
-    (["--dim", ""], "--dim takes whole numbers such as 2,4, and is empty"),
-    (["--dim", "0"], "takes dimensions from 1 to 128, not 0"),
-    (["--dim", "2,256", "--strategy", "random"], "takes dimensions from 1 to 128, not 256"),
-    (["--mode", "p2p"], "--mode takes a list of p2s, s2s, not 'p2p'"),
-    (["--mode", "both"], "--mode takes a list of p2s, s2s"),
-    (["--metric", "cosine"], "--metric takes a list of euclidean, spherical"),
-    (["--fmr", "low"], "--fmr takes rates such as 1e-2,1e-3, not 'low'"),
-    (["--fmr", "1"], "FMR targets lie between 0 and 1, such as 1e-2"),
-    (["--fmr", "nan"], "FMR targets lie between 0 and 1, such as 1e-2"),
-    (["--backend", "ray://head:1"], "use local, or dask://HOST:PORT"),
-    (["--backend", "dask://head"], "use local, or dask://HOST:PORT"),
-    (["--strategy", "raw,raw+flip", "--flip"], "it needs a pack, and no --flip"),
-    (["--pack", "none"], "give --pack none --embeddings FILE"),
-    (["--embeddings", "EMBEDDINGS"], "give a pack, or --pack none and --embeddings, not both"),
-    (["--pack", "none", "--embeddings", "EMBEDDINGS", "--flip"], "--flip needs a pack"),
-    (
-        ["--pack", "none", "--embeddings", "EMBEDDINGS", "--strategy", "raw+flip"],
-        "it needs a pack, and no --flip",
-    ),
-    (["LFW"], "two sets have one name (lfw, lfw)"),
-    (["--decoys", "POOL", "--decoys", "POOL"], "give one pool and one generator at most"),
-    (["--decoys", "POOL", "--dim", "100"], "draws 100 decoys, and one of 2 parts of the pool has"),
-]
-FAILED: list[tuple[list[str], str]] = [
-    (["--decoys", "POOL", "--flip"], "build the decoys with this pack and the same --flip"),
-    (
-        ["--pack", "none", "--embeddings", "EMBEDDINGS", "--decoys", "POOL"],
-        "decoys of 256 numbers each, the descriptors have 32; build the decoys with this pack",
-    ),
-    (["--decoys", "ABSENT"], "absent: No such file or directory"),
-    (["--labels", "ABSENT"], "the label file absent is not there"),
-    (["--labels", "AUDIT"], "the first column of audit.json is not path or file"),
-    (["--audit", "LABELS"], "labels.csv is no JSON file"),
-    (["--audit", "AUDIT"], "row 0: "),
-]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "reason", "status"),
-    [(*one, 2) for one in USAGE] + [(*one, 1) for one in FAILED],
-    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
-)
-def test_what_cannot_be_done_is_said_before_any_face_is_embedded(
-    bench, tmp_path, monkeypatch, arguments, reason, status
-):
-    monkeypatch.setattr(evaluate, "acquire_faces", None)
-    monkeypatch.setattr(ModelPack, "embed", None)
-    rows = np.eye(32, dtype=np.float32)
-    paths = np.array([f"{i}.png" for i in range(32)])
-    np.savez(tmp_path / "embeddings.npz", paths=paths, descriptors=rows)
-    (tmp_path / "audit.json").write_text(
-        json.dumps({"format": "veilface audit", "rows": [{"strategy": "random"}]})
-    )
-    files = {
-        **{"LFW": bench.lfw, "LABELS": bench.labels, "ABSENT": tmp_path / "absent"},
-        **{"POOL": bench.root / "pool.veil", "GENERATOR": bench.root / "generator.veil"},
-        **{"EMBEDDINGS": tmp_path / "embeddings.npz", "AUDIT": tmp_path / "audit.json"},
-    }
-    given = [files.get(argument, argument) for argument in arguments]
-    ran = run("evaluate", bench.lfw, *bench.base, *given, "--out", tmp_path / "out")
-    assert (ran.status, ran.stdout) == (status, "")
-    (sentence,) = [line for line in ran.stderr.splitlines() if not line.startswith("note: lfw")]
-    assert sentence.startswith("error: ")
-    assert reason in sentence
-    assert "defect" not in sentence
-    assert not (tmp_path / "out").exists()
-
-
-def test_options_of_a_wrong_kind_are_refused(bench, tmp_path):
-    for wrong in (["--repeats", "0"], ["--seed", "-1"], ["--jobs", "0"], ["--no-such-option"]):
-        ran = run("evaluate", bench.lfw, *bench.base, *wrong, "--out", tmp_path / "out")
-        assert (ran.status, ran.stdout) == (2, "")
-        assert wrong[0] in ran.stderr
-        assert "Traceback" not in ran.stderr
-    assert run("evaluate", tmp_path / "absent", *bench.base).status == 1
-
-
-@pytest.fixture(scope="module")
-def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LocalCluster]:
-    with LocalCluster(
-        n_workers=2,
-        threads_per_worker=1,
-        processes=True,
-        dashboard_address=None,
-        local_directory=str(tmp_path_factory.mktemp("workers")),
-    ) as running:
-        yield running
-
-
-def address(cluster: LocalCluster) -> str:
-    return str(cluster.scheduler_address).replace("tcp", "dask")
-
-
-def refused(*given: Any, **named: Any) -> Any:
-    raise AssertionError("this work belongs to the cluster")
-
-
-def test_a_cluster_gives_the_same_bits(bench, results, cluster, tmp_path, monkeypatch):
-    before = {process.pid for process in psutil.Process().children(recursive=True)}
-    # Workers are processes of their own: this one must neither embed nor compare.
-    monkeypatch.setattr(ModelPack, "embed", refused)
-    monkeypatch.setattr(evaluation, "run_unit", refused)
-    out = tmp_path / "out"
-    ran = run(*bench.full, "--backend", address(cluster), "--out", out, "--json")
-    assert ran.status == 0, ran.stderr
-    monkeypatch.undo()
-    for part in ("rows", "runs", "curves", "groups", "datasets", "decoys", "model"):
-        assert ran.json[part] == results[part]
-    assert ran.json["options"] == results["options"] | {"backend": "dask"}
-    after = {process.pid for process in psutil.Process().children(recursive=True)}
-    assert after <= before
-    # Workers may write what they hold to files when memory is short.
-    folders = (out, Path(cluster.workers[0].local_directory).parent)
-    held = [file.read_bytes() for root in folders for file in root.rglob("*") if file.is_file()]
-    assert not [needle for needle in secrets(bench) if needle in b"\n".join(held)]
-
-
-def test_a_worker_without_the_pack_is_said_in_one_sentence(bench, cluster, tmp_path, monkeypatch):
-    plain: Callable[..., Any] = evaluation_inputs.PackSource
-    absent = tmp_path / "elsewhere"
-    monkeypatch.setattr(
-        evaluation_inputs, "PackSource", lambda **named: plain(**(named | {"folder": absent}))
-    )
-    ran = run(*bench.full, "--backend", address(cluster), "--out", tmp_path / "out")
-    assert (ran.status, ran.stdout) == (1, "")
-    assert ran.stderr.splitlines()[-1] == (
-        f"error: a worker does not find the pack {absent}: it must lie at the same path there"
-    )
-    assert "Traceback" not in ran.stderr
-
-
-def test_a_cluster_that_is_not_there_is_said_in_one_sentence(bench, tmp_path, monkeypatch):
-    monkeypatch.setattr("verify.evaluation.backends.CONNECT_SECONDS", 0.5)
-    ran = run(*bench.full, "--backend", "dask://127.0.0.1:1", "--out", tmp_path / "out")
-    assert (ran.status, ran.stdout) == (1, "")
-    assert "error: no Dask scheduler answers at tcp://127.0.0.1:1" in ran.stderr
-    assert "Traceback" not in ran.stderr

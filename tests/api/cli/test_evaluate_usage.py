@@ -1,0 +1,95 @@
+"""What `veilface evaluate` refuses, before any face is embedded."""
+
+import json
+
+import numpy as np
+import pytest
+
+from api.cli import evaluate
+from models.pack import ModelPack
+from tests.api.cli.conftest import run
+
+USAGE: list[tuple[list[str], str]] = [
+    (["--strategy", "homomorphic"], "choose of raw, raw+flip, random"),
+    (["--strategy", "raw,raw"], "named twice"),
+    (["--strategy", ","], "--strategy takes names of strategies, and is empty"),
+    (["--strategy", "adversarial"], "make one with `veilface decoys build`"),
+    (["--strategy", "hybrid+", "--decoys", "GENERATOR"], "a pool with gender and race labels"),
+    (["--strategy", "sub-hybrid", "--decoys", "GENERATOR"], "sub-hybrid lifting needs a pool"),
+    (["--dim", "two"], "--dim takes whole numbers such as 2,4, not 'two'"),
+    (["--dim", ""], "--dim takes whole numbers such as 2,4, and is empty"),
+    (["--dim", "0"], "takes dimensions from 1 to 128, not 0"),
+    (["--dim", "2,256", "--strategy", "random"], "takes dimensions from 1 to 128, not 256"),
+    (["--mode", "p2p"], "--mode takes a list of p2s, s2s, not 'p2p'"),
+    (["--mode", "both"], "--mode takes a list of p2s, s2s"),
+    (["--metric", "cosine"], "--metric takes a list of euclidean, spherical"),
+    (["--fmr", "low"], "--fmr takes rates such as 1e-2,1e-3, not 'low'"),
+    (["--fmr", "1"], "FMR targets lie between 0 and 1, such as 1e-2"),
+    (["--fmr", "nan"], "FMR targets lie between 0 and 1, such as 1e-2"),
+    (["--backend", "ray://head:1"], "use local, or dask://HOST:PORT"),
+    (["--backend", "dask://head"], "use local, or dask://HOST:PORT"),
+    (["--strategy", "raw,raw+flip", "--flip"], "it needs a pack, and no --flip"),
+    (["--pack", "none"], "give --pack none --embeddings FILE"),
+    (["--embeddings", "EMBEDDINGS"], "give a pack, or --pack none and --embeddings, not both"),
+    (["--pack", "none", "--embeddings", "EMBEDDINGS", "--flip"], "--flip needs a pack"),
+    (
+        ["--pack", "none", "--embeddings", "EMBEDDINGS", "--strategy", "raw+flip"],
+        "it needs a pack, and no --flip",
+    ),
+    (["LFW"], "two sets have one name (lfw, lfw)"),
+    (["--decoys", "POOL", "--decoys", "POOL"], "give one pool and one generator at most"),
+    (["--decoys", "POOL", "--dim", "100"], "draws 100 decoys, and one of 2 parts of the pool has"),
+]
+FAILED: list[tuple[list[str], str]] = [
+    (["--decoys", "POOL", "--flip"], "build the decoys with this pack and the same --flip"),
+    (
+        ["--pack", "none", "--embeddings", "EMBEDDINGS", "--decoys", "POOL"],
+        "decoys of 256 numbers each, the descriptors have 32; build the decoys with this pack",
+    ),
+    (["--decoys", "ABSENT"], "absent: No such file or directory"),
+    (["--labels", "ABSENT"], "the label file absent is not there"),
+    (["--labels", "AUDIT"], "the first column of audit.json is not path or file"),
+    (["--audit", "LABELS"], "labels.csv is no JSON file"),
+    (["--audit", "AUDIT"], "row 0: "),
+]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason", "status"),
+    [(*one, 2) for one in USAGE] + [(*one, 1) for one in FAILED],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_what_cannot_be_done_is_said_before_any_face_is_embedded(
+    bench, tmp_path, monkeypatch, arguments, reason, status
+):
+    monkeypatch.setattr(evaluate, "acquire_faces", None)
+    for name in ("embed", "embed_both"):
+        monkeypatch.setattr(ModelPack, name, None)
+    rows = np.eye(32, dtype=np.float32)
+    paths = np.array([f"{i}.png" for i in range(32)])
+    np.savez(tmp_path / "embeddings.npz", paths=paths, descriptors=rows)
+    (tmp_path / "audit.json").write_text(
+        json.dumps({"format": "veilface audit", "rows": [{"strategy": "random"}]})
+    )
+    files = {
+        **{"LFW": bench.lfw, "LABELS": bench.labels, "ABSENT": tmp_path / "absent"},
+        **{"POOL": bench.root / "pool.veil", "GENERATOR": bench.root / "generator.veil"},
+        **{"EMBEDDINGS": tmp_path / "embeddings.npz", "AUDIT": tmp_path / "audit.json"},
+    }
+    given = [files.get(argument, argument) for argument in arguments]
+    ran = run("evaluate", bench.lfw, *bench.base, *given, "--out", tmp_path / "out")
+    assert (ran.status, ran.stdout) == (status, "")
+    (sentence,) = [line for line in ran.stderr.splitlines() if not line.startswith("note: lfw")]
+    assert sentence.startswith("error: ")
+    assert reason in sentence
+    assert "defect" not in sentence
+    assert not (tmp_path / "out").exists()
+
+
+def test_options_of_a_wrong_kind_are_refused(bench, tmp_path):
+    for wrong in (["--repeats", "0"], ["--seed", "-1"], ["--jobs", "0"], ["--no-such-option"]):
+        ran = run("evaluate", bench.lfw, *bench.base, *wrong, "--out", tmp_path / "out")
+        assert (ran.status, ran.stdout) == (2, "")
+        assert wrong[0] in ran.stderr
+        assert "Traceback" not in ran.stderr
+    assert run("evaluate", tmp_path / "absent", *bench.base).status == 1
