@@ -194,7 +194,7 @@ def _repeated(names: list[str]) -> list[str]:
     return [name for name in names if name in seen or seen.add(name)]  # type: ignore[func-returns-value]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class _Declared:
     """An array of an archive, as its header has it; ``start`` is where the numbers begin."""
 

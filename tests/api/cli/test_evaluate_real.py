@@ -196,7 +196,7 @@ def test_the_readme_table_has_the_numbers_of_the_results(part: Part, tmp_path: P
             )
             spread = row["accuracy_std_seeds"]
             wanted = f"{100 * row['accuracy_mean']:.2f}"
-            assert cell == (f"{wanted} ± {100 * spread:.2f}" if spread else wanted)
+            assert cell == (f"{wanted} ± {100 * spread:.2f}" if spread is not None else wanted)
     (raw,) = (
         each
         for each in results["rows"]
