@@ -160,7 +160,7 @@ def acquire_faces(
     Raises
     ------
     CommandError
-        No photo gave one.
+        No photo gave one, or nothing can align the photos.
     """
     if descriptors.file is not None:
         faces = Faces(pairs, from_file(pairs, descriptors.file), None, "")
@@ -170,9 +170,14 @@ def acquire_faces(
         size = int(descriptors.pack.info.preprocessing["size"])
         crops = pairs.aligned if aligned is None else aligned
         if crops is None:
-            marked = any(picture.keypoints is not None for picture in pairs.pictures)
-            alone = descriptors.pack.info.detector is None and not marked
-            crops = alone or are_aligned(pairs, size)
+            crops = are_aligned(pairs, size)
+        marked = all(picture.keypoints is not None for picture in pairs.pictures)
+        if not crops and not marked and descriptors.pack.info.detector is None:
+            raise CommandError(
+                f"the pack has no detector, and the photos of {pairs.name} are not all crops of "
+                f"{size} x {size}: use a pack with a detector, or say --aligned if they are "
+                "aligned crops of another size"
+            )
         source = PackSource(
             folder=Path(str(settings.pack)).expanduser().resolve(),
             embedder_sha256=descriptors.pack.info.embedder_sha256,

@@ -1,7 +1,9 @@
+from typing import Any
+
 import numpy as np
 import pytest
 
-from templates.decoys import DecoyGenerator
+from templates.decoys import Attributes, DecoyGenerator, DecoyPool
 from templates.distances import Metric, similarity
 from templates.lifting import Strategy, lift
 from templates.randomness import Keystream
@@ -126,12 +128,24 @@ def test_random_lifting_needs_no_decoys_and_generated_ones_are_not_halved() -> N
     assert len(score_unit(known, unit(Strategy.RANDOM))) == 6
 
 
-def test_hybrid_plus_takes_the_attributes_of_each_photo() -> None:
+def test_hybrid_plus_takes_the_attributes_of_each_photo(monkeypatch: pytest.MonkeyPatch) -> None:
     known = material(pairs=30)
-    (found,) = score_unit(
+    asked: list[list[Attributes]] = []
+    plain = DecoyPool.draw
+
+    def watched(self: DecoyPool, rows: int, k: int, **given: Any) -> Any:
+        asked.append(list(given["unlike"]))
+        return plain(self, rows, k, **given)
+
+    monkeypatch.setattr(DecoyPool, "draw", watched)
+    score_unit(
         known, unit(Strategy.HYBRID_PLUS, modes=(Mode.SUBSPACE,), metrics=(Metric.SPHERICAL,))
     )
-    assert np.isfinite(found.similarities).all()
+    assert known.attributes is not None
+    # The decoys of each photo are unlike its own attributes, those of the first side first.
+    assert asked == [
+        [known.attributes[photo] for photo in side] for side in (known.first, known.second)
+    ]
     without = Material(**{**vars(known), "attributes": None})
     with pytest.raises(ValueError, match="attributes"):
         score_unit(without, unit(Strategy.HYBRID_PLUS))
