@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from templates.decoys import Attributes
 from verify.datasets import SUFFIXES, DatasetError, faults_in
 from verify.fairface_labels import AGES, repaired_age
 
@@ -86,11 +85,6 @@ class Labels:
     def column(self, attribute: str, pictures: Iterable[str]) -> list[str | None]:
         """One attribute of each picture; None where it has no label."""
         return [self.find(picture).get(attribute) for picture in pictures]
-
-    def attributes_of(self, pictures: Iterable[str]) -> list[Attributes]:
-        """Gender and race of each picture, as hybrid+ takes them."""
-        rows = [self.find(picture) for picture in pictures]
-        return [Attributes(gender=row.get("gender"), race=row.get("race")) for row in rows]
 
 
 def read_labels(file: Path | str) -> Labels:
