@@ -5,7 +5,6 @@ from pathlib import PurePosixPath
 
 import pytest
 
-from templates.decoys import Attributes
 from verify.datasets import SUFFIXES, DatasetError
 from verify.evaluation import labels_file
 from verify.evaluation.labels_file import read_labels
@@ -47,9 +46,6 @@ def test_photos_are_found_by_path_stem_and_person(tmp_path):
     pictures = ["Bo/1.png", "Bo/2.jpg", "nobody/1.jpg"]
     assert labels.column("race", pictures) == [None, "Black", None]
     assert labels.column("age", pictures) == [None, None, None]
-    assert labels.attributes_of(pictures) == [
-        Attributes("Male", None), Attributes("Male", "Black"), Attributes(None, None),
-    ]  # fmt: skip
 
 
 def test_rows_that_differ_in_their_suffix_speak_for_their_own_file(tmp_path):
