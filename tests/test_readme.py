@@ -53,6 +53,15 @@ def newcomer(tmp_path: Path) -> tuple[Path, dict[str, str]]:
     return tmp_path, {k: v for k, v in os.environ.items() if not k.startswith("VEILFACE_")}
 
 
+def some_faces(folder: Path, fairface: Path, count: int) -> Path:
+    """The first training faces of FairFace in a folder of their own."""
+    faces = folder / "faces"
+    faces.mkdir()
+    for photo in sorted((fairface / "train").glob("*.jpg"))[:count]:
+        (faces / photo.name).symlink_to(photo)
+    return faces
+
+
 def test_the_first_block_is_what_ci_runs() -> None:
     commands = BLOCKS[0].split("\n")[:-1]
     assert commands == ["make demo", "make test"]
@@ -65,11 +74,9 @@ def test_the_real_path_from_weights_to_a_receipt(
     newcomer: tuple[Path, dict[str, str]], mbf_pack_dir: Path, fairface: Path, lfw_photos: Path
 ) -> None:
     folder, env = newcomer
-    faces, people = folder / "faces", folder / "people"
-    faces.mkdir()
+    people = folder / "people"
     people.mkdir()
-    for photo in sorted((fairface / "train").glob("*.jpg"))[:200]:
-        (faces / photo.name).symlink_to(photo)
+    faces = some_faces(folder, fairface, 200)
     names = sorted(person for person in lfw_photos.iterdir() if person.is_dir())
     enrolled, photos = somebody_alone(names, ModelPack.load(mbf_pack_dir))
     for person in names:
@@ -106,11 +113,9 @@ def test_the_evaluation_on_a_part_of_lfw(
     newcomer: tuple[Path, dict[str, str]], mbf_pack_dir: Path, fairface: Path, lfw_aligned: Path
 ) -> None:
     folder, env = newcomer
-    faces, lfw = folder / "faces", folder / "lfw"
-    faces.mkdir()
+    lfw = folder / "lfw"
     lfw.mkdir()
-    for photo in sorted((fairface / "train").glob("*.jpg"))[:150]:
-        (faces / photo.name).symlink_to(photo)
+    faces = some_faces(folder, fairface, 150)
     header, *lines = (lfw_aligned / "pairs.txt").read_text().splitlines()
     assert header == "10\t300"
     starts = range(0, len(lines), 300)

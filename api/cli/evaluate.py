@@ -171,11 +171,14 @@ def evaluate(
         raise UsageError(str(error)) from None
     sets = _open_all(datasets, pictures=embeddings is None)
     report = None if audit is None else read_audit(audit)
-    wants_flip = _wants_flip(strategy, embeddings, flip=flip)
+    asked = None
+    if strategy is not None:
+        asked = listed(strategy, str, "--strategy", expected="names of strategies")
+    wants_flip = _wants_flip(asked, embeddings, flip=flip)
     descriptors = open_descriptors(settings, embeddings, flip=flip, both=wants_flip)
     sources = open_sources(decoys or [], settings, descriptors)
     plan = _plan(
-        strategy=strategy,
+        asked=asked,
         has_flip=wants_flip,
         sources=sources,
         dims=listed(dim, int, "--dim", expected="whole numbers such as 2,4"),
@@ -248,22 +251,21 @@ def _open_all(datasets: Sequence[Path], *, pictures: bool) -> list[VerificationS
     return sets
 
 
-def _wants_flip(strategy: str | None, embeddings: Path | None, *, flip: bool) -> bool:
+def _wants_flip(asked: tuple[str, ...] | None, embeddings: Path | None, *, flip: bool) -> bool:
     """Whether raw descriptors with the mirror image are compared beside the others."""
-    if strategy is None:
+    if asked is None:
         return embeddings is None and not flip
-    asked = RAW_FLIP in listed(strategy, str, "--strategy", expected="names of strategies")
-    if asked and (embeddings is not None or flip):
+    if RAW_FLIP in asked and (embeddings is not None or flip):
         raise UsageError(
             f"{RAW_FLIP} is raw descriptors with the mirror image added, beside raw ones without: "
             "it needs a pack, and no --flip"
         )
-    return asked
+    return RAW_FLIP in asked
 
 
 def _plan(
     *,
-    strategy: str | None,
+    asked: tuple[str, ...] | None,
     has_flip: bool,
     sources: Sequence[SourceFacts],
     dims: tuple[int, ...],
@@ -274,9 +276,8 @@ def _plan(
     seed: int,
     targets: tuple[float, ...],
 ) -> Plan:
-    if strategy is not None:
-        strategies = listed(strategy, str, "--strategy", expected="names of strategies")
-    else:
+    strategies = asked
+    if strategies is None:
         pools = [each.source for each in sources if isinstance(each.source, DecoyPool)]
         able = set(WITHOUT_DECOYS) - (set() if has_flip else {RAW_FLIP})
         able |= {Strategy.ADVERSARIAL, Strategy.HYBRID} if sources else set()

@@ -100,12 +100,14 @@ def prepare(
         same,
         pairs.folds[kept],
     )
+    genuine = int(np.count_nonzero(same))
+    impostor = len(same) - genuine
     facts = SetFacts(
         name=pairs.name,
-        genuine=int(np.count_nonzero(same)),
-        impostor=int(np.count_nonzero(~same)),
-        failed_genuine=pairs.genuine - int(np.count_nonzero(same)),
-        failed_impostor=pairs.impostor - int(np.count_nonzero(~same)),
+        genuine=genuine,
+        impostor=impostor,
+        failed_genuine=pairs.genuine - genuine,
+        failed_impostor=pairs.impostor - impostor,
         fta=len(acquired.failures) / len(acquired.rows),
         names_people=pairs.people is not None,
     )

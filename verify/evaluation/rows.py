@@ -17,7 +17,7 @@ from verify.evaluation.material import Source
 from verify.evaluation.resampling import Interval, fmr_grid
 from verify.evaluation.runs import Run
 from verify.evaluation.units import Cell, Mode, Search
-from verify.metrics import wilson
+from verify.metrics import resolvable, wilson
 
 Json = dict[str, Any]
 
@@ -250,7 +250,7 @@ def refused_targets(targets: Sequence[float], facts: Mapping[str, int]) -> list[
     """Say which FMR targets the impostor pairs of which sets cannot resolve, and why."""
     sentences = []
     for name, impostor in facts.items():
-        unresolved = [target for target in targets if target * impostor < 3 * (1 - 1e-9)]
+        unresolved = [target for target in targets if not resolvable(target, impostor)]
         if unresolved:
             listed = ", ".join(target_name(target) for target in unresolved)
             sentences.append(
