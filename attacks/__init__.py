@@ -1,1 +1,1 @@
-"""What an adversary can do: the audit's attacks."""
+"""What an adversary can do to private templates, and the report that tells an operator."""

@@ -23,15 +23,16 @@
     ├── DatasetError [4]         a dataset that cannot be read
     ├── EvaluationError [5]      an evaluation that cannot be made as it was asked for
     ├── BackendError [6]         a place to work, such as a cluster, that cannot be used
-    ├── StartError [7]           the service or a command cannot start
-    ├── PreparationError [8]     decoys or a contract that cannot be made
-    └── CommandError [9]         a command that cannot be done
+    ├── AuditError [7]           an attack or an audit that cannot be made as it was asked for
+    ├── StartError [8]           the service or a command cannot start
+    ├── PreparationError [9]     decoys or a contract that cannot be made
+    └── CommandError [10]        a command that cannot be done
         └── UsageError           wrong usage of a command
 
 Each is defined here, or next to what raises it: [1] ``templates.store.identifiers``,
 [2] ``templates.store.idempotency``, [3] ``enroll.errors``, [4] ``verify.datasets``,
-[5] ``verify.evaluation.plan``, [6] ``verify.evaluation.backends``, [7] ``api.errors``,
-[8] ``api.preparation``, [9] ``api.cli.errors``.
+[5] ``verify.evaluation.plan``, [6] ``verify.evaluation.backends``, [7] ``attacks.errors``,
+[8] ``api.errors``, [9] ``api.preparation``, [10] ``api.cli.errors``.
 
 Messages name the cause and the remedy. They never hold a number of a descriptor, a template or
 an image, nor a key.

@@ -75,7 +75,7 @@ def test_every_exception_of_the_rooms_has_a_code() -> None:
     # Raised before there is a server, or by rooms that requests do not reach.
     elsewhere = {
         *("StartError", "DatasetError", "CacheError", "AlignmentError", "PreparationError"),
-        *("EvaluationError", "BackendError"),
+        *("EvaluationError", "BackendError", "AuditError"),
     }
     for root in (template_errors.VeilfaceError, model_errors.ModelError):
         for kind in leaves(root):

@@ -8,7 +8,7 @@ import api.preparation  # noqa: F401
 import verify.datasets  # noqa: F401
 from templates import errors
 
-ROOMS = ("templates", "enroll", "verify", "api")
+ROOMS = ("templates", "enroll", "verify", "attacks", "api")
 
 
 def drawn(text: str) -> Iterator[tuple[str, str | None]]:

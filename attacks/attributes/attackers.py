@@ -1,0 +1,220 @@
+"""Classifiers that an attacker trains on faces that it lifted itself.
+
+Each is given the features of templates with the labels of the faces in them, and gives a score to
+every class of a template that it has not seen.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from attacks.attributes.features import Features
+
+Codes = NDArray[np.int64]
+Scores = NDArray[np.float64]
+
+# Of the logistic regression on standardised features: little for few faces, as many of the
+# features say the same, more for many.
+_LOGISTIC_CS = (1e-3, 1e-2, 1e-1)
+_KERNEL_WIDTHS = (0.1, 0.3, 1.0)
+_RIDGE = 1.0
+_BOOSTING_ROUNDS = 40
+_KERNEL_ROWS = 2048
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Lesson:
+    """What an attacker learns from, and what it chooses by.
+
+    Parameters
+    ----------
+    features, labels
+        Of templates that the attacker lifted itself; labels (P,) int64 by attribute.
+    held_features, held_labels
+        Of others that it lifted, and did not learn from: what it chooses its settings by.
+    classes
+        Number of classes of every attribute.
+    seed
+        Of whatever is random in the training.
+    """
+
+    features: Features
+    labels: Mapping[str, Codes]
+    held_features: Features
+    held_labels: Mapping[str, Codes]
+    classes: Mapping[str, int]
+    seed: int
+
+
+class Attacker(Protocol):
+    """A trained attacker."""
+
+    def scores(self, features: Features) -> dict[str, Scores]:
+        """Score every class, by attribute (P, classes); the highest is the prediction."""
+        ...
+
+
+class Logistic:
+    """Multinomial logistic regression on the derived features.
+
+    Its regularisation is chosen for each attribute by the held-out templates.
+    """
+
+    def __init__(self, lesson: Lesson) -> None:
+        from sklearn.linear_model import LogisticRegression
+
+        self._scale = _Scale(lesson.features.derived)
+        rows = self._scale(lesson.features.derived)
+        held = self._scale(lesson.held_features.derived)
+        self._classes = lesson.classes
+        self._models: dict[str, Any] = {}
+        for name, codes in lesson.labels.items():
+            if len(np.unique(codes)) < 2:
+                continue
+            best = -1.0
+            for c in _LOGISTIC_CS:
+                model = LogisticRegression(C=c, max_iter=1000).fit(rows, codes)
+                score = float(model.score(held, lesson.held_labels[name]))
+                if score > best:  # of equals the more regularised
+                    best, self._models[name] = score, model
+
+    def scores(self, features: Features) -> dict[str, Scores]:
+        """See `Attacker.scores`."""
+        return _probabilities(self._models, self._scale(features.derived), self._classes)
+
+
+class Boosting:
+    """Gradient-boosted trees on the derived features."""
+
+    def __init__(self, lesson: Lesson) -> None:
+        from sklearn.ensemble import HistGradientBoostingClassifier
+
+        self._classes = lesson.classes
+        self._models = {
+            name: HistGradientBoostingClassifier(
+                max_iter=_BOOSTING_ROUNDS,
+                learning_rate=0.08,
+                max_leaf_nodes=8,
+                max_bins=63,
+                early_stopping=False,
+                random_state=lesson.seed,
+            ).fit(lesson.features.derived, codes)
+            for name, codes in lesson.labels.items()
+            if len(np.unique(codes)) > 1
+        }
+
+    def scores(self, features: Features) -> dict[str, Scores]:
+        """See `Attacker.scores`."""
+        return _probabilities(self._models, features.derived, self._classes)
+
+
+class KernelMachine:
+    """Least-squares support vector machine with a Gaussian kernel on all features.
+
+    Notes
+    -----
+    The foot point and the derived features each have a mean square of 1 in the kernel's distance.
+    One factorisation serves all attributes, and the width is chosen for each by the held-out
+    templates.
+
+    References
+    ----------
+    J. A. K. Suykens & J. Vandewalle, "Least squares support vector machine classifiers", Neural
+    Processing Letters 9 (1999).
+    """
+
+    def __init__(self, lesson: Lesson) -> None:
+        from scipy.linalg import cho_factor, cho_solve
+
+        self._scale = _Scale(lesson.features.derived)
+        self._length = float(np.sqrt(np.mean(np.sum(lesson.features.foot**2, axis=1)))) or 1.0
+        self._rows = self._joined(lesson.features)
+        self._targets = np.hstack(
+            [np.eye(count)[lesson.labels[name]] for name, count in lesson.classes.items()]
+        )
+        self._mean = self._targets.mean(axis=0)
+        self._columns: dict[str, slice] = {}
+        for name, count in lesson.classes.items():
+            start = sum(part.stop - part.start for part in self._columns.values())
+            self._columns[name] = slice(start, start + count)
+        squares = _squared_distances(self._rows, self._rows)
+        held = _squared_distances(self._joined(lesson.held_features), self._rows)
+        best: dict[str, tuple[float, float]] = {}
+        weights: dict[float, NDArray[np.float32]] = {}
+        for width in _KERNEL_WIDTHS:
+            # The ridge of 1 keeps the condition number below the number of rows: enough digits.
+            kernel = np.exp(np.float32(-width) * squares)
+            kernel[np.diag_indices(len(kernel))] += _RIDGE
+            factor = cho_factor(kernel, overwrite_a=True, check_finite=False)
+            centred = (self._targets - self._mean).astype(np.float32)
+            weights[width] = cho_solve(factor, centred, check_finite=False)
+            scores = np.exp(np.float32(-width) * held) @ weights[width] + self._mean
+            for name, columns in self._columns.items():
+                predicted = np.argmax(scores[:, columns], axis=1)
+                found = float(np.mean(predicted == lesson.held_labels[name]))
+                if name not in best or found > best[name][0]:
+                    best[name] = (found, width)
+        self._widths = {name: width for name, (_, width) in best.items()}
+        self._weights = {width: weights[width] for width in set(self._widths.values())}
+
+    def scores(self, features: Features) -> dict[str, Scores]:
+        """See `Attacker.scores`."""
+        rows = self._joined(features)
+        out = {
+            name: np.empty((len(rows), part.stop - part.start))
+            for name, part in self._columns.items()
+        }
+        for start in range(0, len(rows), _KERNEL_ROWS):
+            tile = slice(start, start + _KERNEL_ROWS)
+            squares = _squared_distances(rows[tile], self._rows)
+            for width, weights in self._weights.items():
+                kernel = np.exp(np.float32(-width) * squares)
+                for name, columns in self._columns.items():
+                    if self._widths[name] == width:
+                        out[name][tile] = kernel @ weights[:, columns] + self._mean[columns]
+        return out
+
+    def _joined(self, features: Features) -> NDArray[np.float32]:
+        derived = self._scale(features.derived) / np.sqrt(features.derived.shape[1])
+        return np.hstack([features.foot / np.float32(self._length), derived]).astype(np.float32)
+
+
+TRAINED: Mapping[str, type[Logistic | Boosting | KernelMachine]] = {
+    "logistic": Logistic,
+    "svm": KernelMachine,
+    "boosting": Boosting,
+}
+"""Attackers by their names in the report."""
+
+
+class _Scale:
+    """Standardisation learnt from some rows."""
+
+    def __init__(self, rows: NDArray[np.float32]) -> None:
+        self._mean = rows.mean(axis=0, dtype=np.float64).astype(np.float32)
+        spread = rows.std(axis=0, dtype=np.float64)
+        # A feature that is the same on all rows says nothing, and divided by itself would be noise.
+        self._spread = np.where(spread > 1e-6, spread, np.inf).astype(np.float32)
+
+    def __call__(self, rows: NDArray[np.float32]) -> NDArray[np.float32]:
+        return np.asarray((rows - self._mean) / self._spread, dtype=np.float32)
+
+
+def _probabilities(
+    models: Mapping[str, Any], rows: NDArray[np.float32], classes: Mapping[str, int]
+) -> dict[str, Scores]:
+    """Class probabilities; 0 of a class that was not among the training labels."""
+    out = {name: np.zeros((len(rows), count)) for name, count in classes.items()}
+    for name, model in models.items():
+        out[name][:, model.classes_] = model.predict_proba(rows)
+    return out
+
+
+def _squared_distances(
+    left: NDArray[np.float32], right: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    squares = np.einsum("ij,ij->i", left, left)[:, None] + np.einsum("ij,ij->i", right, right)
+    return np.asarray(np.maximum(squares - 2 * (left @ right.T), 0), dtype=np.float32)

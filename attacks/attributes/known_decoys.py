@@ -1,0 +1,106 @@
+"""What an attacker infers who holds the decoy pool (METHOD §4.2 and §4.5)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from attacks.attributes.neighbours import Advance, nearest_neighbours
+from templates.distances import Metric
+from templates.subspace import SubspaceBatch
+
+Floats = NDArray[np.float32]
+Codes = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+TOUCH = 0.01
+"""An entry nearer than this lies in the template: its decoys are at 1e-3 or less even in half
+precision, and the next entry is 0.8 away (METHOD §4.2)."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Decoys:
+    """Which entries of the pool lie in which template.
+
+    Parameters
+    ----------
+    entries : (P, k) int64
+        Positions in the pool.
+    found : (P, k) bool
+        Which of them are there; the others are padding.
+    """
+
+    entries: Codes
+    found: Flags
+
+
+def find_decoys(
+    templates: SubspaceBatch,
+    pool: Floats,
+    *,
+    most: int,
+    skip: Codes | None = None,
+    progress: Advance | None = None,
+) -> Decoys:
+    """Find the entries of the pool that lie in each template.
+
+    Parameters
+    ----------
+    pool : (W, n) float32
+    most
+        At most so many: the decoys that the strategy takes.
+    skip : (P,) int64, optional
+        Entry that is the face itself, where the attacker lifted entries of its own pool.
+    progress
+        See `nearest_neighbours`.
+    """
+    nearest = nearest_neighbours(
+        templates,
+        pool,
+        k=min(most, len(pool) - (skip is not None)),
+        metrics=(Metric.EUCLIDEAN,),
+        skip=skip,
+        progress=progress,
+    )[Metric.EUCLIDEAN]
+    return Decoys(nearest.indices, nearest.distances < TOUCH)
+
+
+def strip(templates: SubspaceBatch, pool: Floats, decoys: Decoys) -> Floats:
+    """Remove the known decoys from the templates' foot points.
+
+    The foot point is an affine combination of the descriptor, the decoys and random directions;
+    what is left of it outside the decoys' span points along the descriptor's own part there.
+
+    Returns
+    -------
+    float32, shape (P, n)
+        Unit rows, close to the descriptors in direction; the foot point's direction where no decoy
+        is known.
+    """
+    spans = pool[decoys.entries].astype(np.float64) * decoys.found[:, :, None]
+    left, singular, _ = np.linalg.svd(spans.transpose(0, 2, 1), full_matrices=False)
+    left = left * (singular > 1e-6)[:, None, :]
+    feet = templates.feet.astype(np.float64)
+    for _ in range(2):  # once more removes what rounding left
+        feet -= (left @ (left.transpose(0, 2, 1) @ feet[:, :, None]))[:, :, 0]
+    norms = np.linalg.norm(feet, axis=1, keepdims=True)
+    return np.asarray(feet / np.maximum(norms, 1e-12), dtype=np.float32)
+
+
+def never_seen(decoys: Decoys, labels: Codes, classes: int) -> Flags:
+    """Classes that no decoy of a template has: hybrid+ leaves the person's own out.
+
+    Parameters
+    ----------
+    labels : (W,) int64
+        Class numbers of the pool's entries.
+
+    Returns
+    -------
+    bool, shape (P, classes)
+        All true where the decoys have all classes, and the rule says nothing.
+    """
+    of = np.where(decoys.found, labels[decoys.entries], -1)
+    absent = np.stack([(of != code).all(axis=1) for code in range(classes)], axis=1)
+    absent[~absent.any(axis=1)] = True
+    return np.asarray(absent)

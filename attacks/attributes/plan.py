@@ -1,0 +1,285 @@
+"""What an attribute audit runs: its settings, the schemes, and what all of them share."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from attacks.attributes.attackers import TRAINED
+from attacks.attributes.faces import LabelledFaces, Split
+from attacks.attributes.features import Axes
+from attacks.attributes.likely_points import Form, contrast, decoy_precision
+from attacks.errors import AuditError
+from attacks.outcomes import GENERATED, POOLED, RAW_SCHEME, Scheme
+from templates.decoys import DecoyGenerator, DecoyPool
+from templates.decoys.source import DecoySource
+from templates.lifting import Strategy
+
+Codes = NDArray[np.int64]
+
+PAPER_DIMS = (2, 4, 8, 16)
+OUR_DIMS = (2, 4, 8, 16, 32, 64)
+_MOST_LIFTS = 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class AttributePlan:
+    """Settings of the attackers.
+
+    Parameters
+    ----------
+    k
+        Neighbours of the paper's attacker.
+    feature_ks
+        Neighbours whose votes the trained attackers see.
+    attackers
+        Of `TRAINED`. Boosting is left out by default: on FairFace it finds as much as the other
+        two, in ten times their time.
+    lifts
+        Times that the attacker lifts each of its own faces to train on. None for as many as
+        ``training_most`` allows, 1 to 3: labels are scarce, and lifting is free.
+    training_most
+        At most so many own faces are lifted, chosen at random.
+    gallery_most
+        Trained attackers see the neighbours among at most so many random faces of the gallery, of
+        their own templates and of the attacked ones alike. The paper's attacker searches all of the
+        attacker's faces for an attacked template.
+    kernel_most
+        At most so many lifted faces train the kernel machine, whose time grows with the cube.
+    folds
+        Parts of the attacker's faces; a face is lifted with decoys of its own part and judged by
+        axes and neighbours of the other parts.
+    held_out
+        Share of the lifted faces that the attacker chooses settings and attackers by.
+    threads
+        Templates are searched on so many cores; the figures do not depend on it.
+
+    Raises
+    ------
+    AuditError
+        A setting is out of its range.
+    """
+
+    k: int = 10
+    feature_ks: tuple[int, ...] = (10, 50)
+    attackers: tuple[str, ...] = ("logistic", "svm")
+    lifts: int | None = None
+    training_most: int = 10_000
+    gallery_most: int = 10_000
+    kernel_most: int = 5_000
+    folds: int = 4
+    held_out: float = 0.2
+    threads: int = 2
+
+    def __post_init__(self) -> None:
+        unknown = [name for name in self.attackers if name not in TRAINED]
+        if unknown:
+            raise AuditError(f"no attacker is called {unknown[0]}; there are {', '.join(TRAINED)}")
+        counts = (
+            self.k,
+            *self.feature_ks,
+            1 if self.lifts is None else self.lifts,
+            self.training_most,
+            self.gallery_most,
+            self.kernel_most,
+            self.threads,
+        )
+        if min(counts) < 1 or self.folds < 2 or not 0 < self.held_out < 1:
+            raise AuditError(
+                "an attribute audit needs numbers of 1 or more, two or more folds, and a "
+                "held-out share between 0 and 1"
+            )
+        if self.gallery_most < self.neighbours:
+            raise AuditError(f"{self.neighbours} neighbours need a gallery of as many faces")
+
+    @property
+    def neighbours(self) -> int:
+        """How many are searched for."""
+        return max(self.k, *self.feature_ks)
+
+    def lifts_of(self, faces: int) -> int:
+        """Times that each of so many own faces is lifted."""
+        if self.lifts is not None:
+            return self.lifts
+        return min(max(self.training_most // max(faces, 1), 1), _MOST_LIFTS)
+
+
+@dataclass(frozen=True, eq=False)
+class Side:
+    """What some faces are lifted with, and judged by.
+
+    Parameters
+    ----------
+    entries
+        The faces of the pool.
+    pool
+        The same as decoys, labelled where they have gender and race.
+    gallery
+        Labelled faces to search for neighbours, in random order.
+    nearby
+        The first of them, at most as many as the plan says.
+    axes
+        Found on the gallery.
+    form
+        What tells the gallery's faces from generated decoys; None without a generator.
+    """
+
+    entries: LabelledFaces
+    pool: DecoyPool
+    gallery: LabelledFaces
+    nearby: LabelledFaces
+    axes: Axes
+    form: Form | None
+
+    @classmethod
+    def of(
+        cls,
+        entries: LabelledFaces,
+        gallery: LabelledFaces,
+        *,
+        nearby: int,
+        against: Form | None,
+    ) -> "Side":
+        """Make the pool, and find the axes and the form; ``against`` is the decoys' precision."""
+        labelled = {"gender", "race"} <= set(entries.attributes)
+        labels = entries.decoy_attributes() if labelled else None
+        pool = DecoyPool(entries.descriptors, labels=labels)
+        form = None if against is None else contrast(against, gallery.descriptors)
+        near = gallery.take(np.arange(min(nearby, len(gallery))))
+        return cls(entries, pool, gallery, near, Axes.fit(gallery), form)
+
+
+@dataclass(frozen=True, eq=False)
+class Fold:
+    """One part of the attacker's faces.
+
+    Parameters
+    ----------
+    own
+        Faces that the attacker lifts.
+    entries : (faces,) int64
+        Their positions in the side's pool.
+    held : (faces,) bool
+        Those of them that it chooses by, and does not learn from.
+    side
+        The faces of the part as a pool; the faces of all other parts as gallery.
+    """
+
+    own: LabelledFaces
+    entries: Codes
+    held: NDArray[np.bool_]
+    side: Side
+
+
+@dataclass(frozen=True, eq=False)
+class Bench:
+    """What all schemes share; made once by :func:`prepare`.
+
+    Parameters
+    ----------
+    split, plan, seed
+        As they were given.
+    side
+        Of the attacked faces: the lifting database as pool, all of the attacker's as gallery.
+    generator
+        Of generated decoys.
+    folds
+        Of the attacker's faces.
+    """
+
+    split: Split
+    plan: AttributePlan
+    seed: int
+    side: Side
+    generator: DecoyGenerator | None
+    folds: tuple[Fold, ...]
+
+    def source(self, scheme: Scheme, side: Side) -> DecoySource | None:
+        """Return where the decoys of a scheme come from on one side."""
+        if scheme.decoys is None:
+            return None
+        if scheme.decoys == POOLED:
+            return side.pool
+        if self.generator is None:
+            raise AuditError("schemes with generated decoys need a decoy generator")
+        return self.generator
+
+
+def prepare(
+    parts: Split,
+    *,
+    plan: AttributePlan,
+    seed: int,
+    generator: DecoyGenerator | None = None,
+) -> Bench:
+    """Find what all schemes share.
+
+    Parameters
+    ----------
+    generator
+        The one of the deployment that is audited, which clients have. Without one it is fitted to
+        the lifting faces, of which there must be 100 or more; where there are fewer, schemes with
+        generated decoys cannot be run.
+
+    Raises
+    ------
+    AuditError
+        The attacker has too few faces for the plan.
+    """
+    if generator is None and len(parts.lifting) >= 100:
+        generator = DecoyGenerator.fit(parts.lifting.descriptors)
+    against = None if generator is None else decoy_precision(generator, seed=seed)
+    side_of = partial(Side.of, nearby=plan.gallery_most, against=against)
+    chance = np.random.default_rng([seed, 1])
+    order = chance.permutation(len(parts.attack))
+    number = np.empty(len(order), dtype=np.int64)
+    number[order] = np.arange(len(order)) % plan.folds
+    chosen = np.zeros(len(order), dtype=np.bool_)
+    chosen[order[: plan.training_most]] = True
+    least = len(order) - int(np.bincount(number, minlength=plan.folds).max())
+    wanted = plan.neighbours
+    if least < wanted:
+        raise AuditError(
+            f"the attacker's {len(order)} faces leave {least} in the gallery of a fold, and "
+            f"{wanted} neighbours are asked for: give the attacker more faces"
+        )
+    folds = []
+    for fold in range(plan.folds):
+        part = parts.attack.take(np.flatnonzero(number == fold))
+        gallery = parts.attack.take(order[number[order] != fold])
+        entries = np.flatnonzero(chosen[number == fold])
+        own = part.take(entries)
+        held = np.zeros(len(own), dtype=np.bool_)
+        held[chance.permutation(len(own))[: round(plan.held_out * len(own))]] = True
+        if not held.any() or held.all():
+            raise AuditError(
+                f"a fold of {len(own)} faces is too small to hold some of them out: give the "
+                "attacker more faces"
+            )
+        folds.append(Fold(own, entries, held, side_of(part, gallery)))
+    side = side_of(parts.lifting, parts.attack.take(order))
+    return Bench(parts, plan, seed, side, generator, tuple(folds))
+
+
+def schemes_of(
+    *, dims: Sequence[int] = PAPER_DIMS, generated_dims: Sequence[int] = OUR_DIMS
+) -> list[Scheme]:
+    """Return the default grid: raw, the paper's strategies with a pool, ours with a generator.
+
+    hybrid+ needs labels of gender and race, and m ≥ 2 as hybrid does.
+    """
+    schemes = [RAW_SCHEME]
+    for strategy in (
+        Strategy.RANDOM,
+        Strategy.ADVERSARIAL,
+        Strategy.HYBRID,
+        Strategy.HYBRID_PLUS,
+    ):
+        for m in dims:
+            if strategy is Strategy.RANDOM or strategy.decoys(m):
+                source = None if strategy is Strategy.RANDOM else POOLED
+                schemes.append(Scheme(str(strategy), source, m))
+    schemes += [Scheme(str(Strategy.ADVERSARIAL), GENERATED, m) for m in generated_dims]
+    return schemes

@@ -1,0 +1,294 @@
+"""What attackers compute from the templates of faces: lifted, searched, guessed, tile by tile.
+
+A tile's templates live no longer than the tile; as many tiles are in memory as cores work, and one
+that waits. Every tile is worked on by one core, so that figures do not depend on their number.
+"""
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from attacks.attributes.faces import LabelledFaces
+from attacks.attributes.features import Features, features_of
+from attacks.attributes.known_decoys import Flags, find_decoys, never_seen, strip
+from attacks.attributes.likely_points import guesses
+from attacks.attributes.neighbours import METRICS, Attacked, merged, nearest_neighbours, vote
+from attacks.attributes.plan import Bench, Side
+from attacks.errors import AuditError
+from attacks.outcomes import GENERATED, POOLED, RAW_SCHEME, Scheme
+from templates.distances import Metric
+from templates.lifting import Strategy, lift
+from templates.randomness import Keystream
+from templates.subspace import SubspaceBatch
+
+Codes = NDArray[np.int64]
+ByAttribute = dict[str, Codes]
+Progress = Callable[[int], None]
+
+_TILE_BYTES = 64 << 20
+_TILE_ROWS = 256
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Seen:
+    """What the attackers compute from the templates of some faces, and the truth of these."""
+
+    features: Features
+    votes: dict[Metric, ByAttribute]
+    """Predictions of the paper's attacker."""
+    guessed: Features | None
+    """Features of the guesses at the descriptors, of attackers who know the decoys: the foot points
+    without the pool's, or the points least like the generator's; None where there are none."""
+    absent: dict[str, Flags]
+    """Classes that no decoy has (hybrid+)."""
+    truth: ByAttribute
+
+    def take(self, rows: Codes) -> "Seen":
+        """Return some of the rows."""
+        return Seen(
+            self.features.take(rows),
+            {m: {a: codes[rows] for a, codes in by.items()} for m, by in self.votes.items()},
+            None if self.guessed is None else self.guessed.take(rows),
+            {a: flags[rows] for a, flags in self.absent.items()},
+            {a: codes[rows] for a, codes in self.truth.items()},
+        )
+
+    @classmethod
+    def stack(cls, parts: "list[Seen]") -> "Seen":
+        """Put the rows of all parts under each other."""
+        first = parts[0]
+        guessed = [part.guessed for part in parts if part.guessed is not None]
+        return cls(
+            Features.stack([part.features for part in parts]),
+            {
+                m: {a: np.concatenate([part.votes[m][a] for part in parts]) for a in by}
+                for m, by in first.votes.items()
+            },
+            Features.stack(guessed) if guessed else None,
+            {a: np.concatenate([part.absent[a] for part in parts]) for a in first.absent},
+            {a: np.concatenate([part.truth[a] for part in parts]) for a in first.truth},
+        )
+
+
+def see_victims(bench: Bench, scheme: Scheme, progress: Progress | None) -> Seen:
+    """Lift the attacked faces with the deployment's decoys, and look at their templates.
+
+    ``progress`` is called with the work that was just done; see `search_work`.
+    """
+    stream = Keystream.seeded("attributes", bench.seed, "attacked", *_parts(scheme))
+    look = _Look(bench, scheme, bench.side, True, progress)
+    return _see(look, bench.split.attacked, stream)
+
+
+def see_own(
+    bench: Bench, scheme: Scheme, progress: Progress | None
+) -> tuple[Seen, NDArray[np.bool_]]:
+    """Lift the attacker's own faces, fold by fold; which of them are held out.
+
+    They are searched among the nearby faces only.
+    """
+    parts, held = [], []
+    for number, fold in enumerate(bench.folds):
+        look = _Look(bench, scheme, fold.side, False, progress)
+        for turn in range(_lifts(bench, scheme)):
+            stream = Keystream.seeded(
+                "attributes", bench.seed, "own", number, turn, *_parts(scheme)
+            )
+            parts.append(_see(look, fold.own, stream, entries=fold.entries))
+            held.append(fold.held)
+    return Seen.stack(parts), np.concatenate(held)
+
+
+def search_work(bench: Bench, scheme: Scheme) -> int:
+    """Work of the searches for one scheme: (template, face) pairs, each as often as rows meet.
+
+    A pair of a face and a template of dimension m is m + 1 products of two descriptors; of two
+    points, one.
+    """
+    victims = len(bench.split.attacked) * _work_of_one(scheme, bench.side, len(bench.side.gallery))
+    own = sum(
+        len(fold.own) * _work_of_one(scheme, fold.side, len(fold.side.nearby))
+        for fold in bench.folds
+    )
+    return victims + _lifts(bench, scheme) * own
+
+
+def own_templates(bench: Bench, scheme: Scheme) -> int:
+    """Number of templates that the attacker lifts."""
+    return _lifts(bench, scheme) * sum(len(fold.own) for fold in bench.folds)
+
+
+def _lifts(bench: Bench, scheme: Scheme) -> int:
+    return 1 if scheme == RAW_SCHEME else bench.plan.lifts_of(len(bench.split.attack))
+
+
+def _work_of_one(scheme: Scheme, side: Side, gallery: int) -> int:
+    """Work on one template."""
+    work = (scheme.dim + 1) * gallery
+    if scheme.decoys is not None:
+        work += len(side.nearby)
+    if scheme.decoys == POOLED:
+        work += (scheme.dim + 1) * len(side.entries)
+    return work
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class _Look:
+    """How templates of one side are looked at; ``whole`` is whether all of the gallery votes."""
+
+    bench: Bench
+    scheme: Scheme
+    side: Side
+    whole: bool
+    progress: Progress | None
+
+    def advance(self, each: int) -> Progress | None:
+        """Return a callback that counts a pair as so many products."""
+        report = self.progress
+        return None if report is None else lambda pairs: report(each * pairs)
+
+
+def _see(
+    look: _Look, faces: LabelledFaces, stream: Keystream, *, entries: Codes | None = None
+) -> Seen:
+    """Lift faces and compute all that attackers need of the templates.
+
+    ``entries`` are the faces' own positions in the side's pool, where they are in it.
+    """
+    tiles = (
+        (attacked, faces.take(rows), None if entries is None else entries[rows])
+        for rows, attacked in _lifted(look.bench, look.scheme, faces, look.side, stream)
+    )
+    work = (partial(_see_tile, look, *tile) for tile in tiles)
+    return Seen.stack(list(_in_order(work, look.bench.plan.threads)))
+
+
+def _in_order(work: Iterable[Callable[[], Seen]], threads: int) -> Iterator[Seen]:
+    """Do the work on so many cores; one piece more than there are cores is made ahead."""
+    waiting: deque[Future[Seen]] = deque()
+    with threadpool_limits(1), ThreadPoolExecutor(threads) as pool:
+        for piece in work:
+            waiting.append(pool.submit(piece))
+            if len(waiting) > threads:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+
+
+def _see_tile(look: _Look, attacked: Attacked, faces: LabelledFaces, own: Codes | None) -> Seen:
+    plan, side = look.bench.plan, look.side
+    metrics = METRICS if look.scheme != RAW_SCHEME else METRICS[:1]
+    advance = look.advance(look.scheme.dim + 1)
+    near = nearest_neighbours(
+        attacked,
+        side.nearby.descriptors,
+        k=plan.neighbours,
+        metrics=metrics,
+        progress=advance,
+    )
+    features = features_of(attacked, side.axes, near, side.nearby, ks=plan.feature_ks)
+    after = len(side.nearby)
+    if look.whole and after < len(side.gallery):
+        beyond = nearest_neighbours(
+            attacked,
+            side.gallery.descriptors[after:],
+            k=min(plan.k, len(side.gallery) - after),
+            metrics=metrics,
+            progress=advance,
+        )
+        near = {m: merged(near[m], beyond[m], after=after, k=plan.k) for m in metrics}
+    votes = {
+        metric: {
+            name: vote(found, side.gallery.labels[name], len(classes), k=plan.k)
+            for name, classes in side.gallery.classes.items()
+        }
+        for metric, found in near.items()
+    }
+    guessed, absent = _guessed(look, attacked, features, own)
+    return Seen(features, votes, guessed, absent, dict(faces.labels))
+
+
+def _lifted(
+    bench: Bench, scheme: Scheme, faces: LabelledFaces, side: Side, stream: Keystream
+) -> Iterator[tuple[Codes, Attacked]]:
+    """Yield positions of faces and their templates, a tile at a time."""
+    rows = _TILE_BYTES // (4 * faces.n * max(1, scheme.dim))
+    step = int(np.clip(rows, 1, _TILE_ROWS))
+    for start in range(0, len(faces), step):
+        chosen = np.arange(start, min(start + step, len(faces)))
+        tile = faces.take(chosen)
+        if scheme == RAW_SCHEME:
+            yield chosen, tile.descriptors
+            continue
+        plus = scheme.strategy == Strategy.HYBRID_PLUS
+        if plus and not {"gender", "race"} <= set(faces.attributes):
+            raise AuditError("hybrid+ chooses decoys by gender and race: give labels of both")
+        yield (
+            chosen,
+            lift(
+                tile.descriptors,
+                strategy=scheme.strategy,
+                m=scheme.dim,
+                source=bench.source(scheme, side),
+                stream=stream,
+                attributes=tile.decoy_attributes() if plus else None,
+            ),
+        )
+
+
+def _guessed(
+    look: _Look, attacked: Attacked, features: Features, own: Codes | None
+) -> tuple[Features | None, dict[str, Flags]]:
+    """Guess the descriptors of whoever knows the pool or the generator.
+
+    Of the pool's decoys also which classes they leave out (hybrid+).
+    """
+    scheme, side = look.scheme, look.side
+    if scheme.decoys is None or not isinstance(attacked, SubspaceBatch):
+        return None, {}
+    if scheme.decoys == GENERATED:
+        if side.form is None:
+            raise AuditError("schemes with generated decoys need a decoy generator")
+        points = guesses(attacked, side.form)
+        found = _features_of_points(look, points)
+        return Features(points, np.hstack([found.derived, features.derived])), {}
+    strategy = Strategy(scheme.strategy)
+    entries = side.entries
+    decoys = find_decoys(
+        attacked,
+        entries.descriptors,
+        most=strategy.decoys(scheme.dim),
+        skip=own,
+        progress=look.advance(scheme.dim + 1),
+    )
+    found = _features_of_points(look, strip(attacked, entries.descriptors, decoys))
+    if strategy is not Strategy.HYBRID_PLUS:
+        return found, {}
+    absent = {
+        name: never_seen(decoys, entries.labels[name], len(entries.classes[name]))
+        for name in ("gender", "race")
+    }
+    return found, absent
+
+
+def _features_of_points(look: _Look, points: NDArray[np.float32]) -> Features:
+    ks, side = look.bench.plan.feature_ks, look.side
+    near = nearest_neighbours(
+        points,
+        side.nearby.descriptors,
+        k=max(ks),
+        metrics=METRICS[:1],
+        progress=look.advance(1),
+    )
+    return features_of(points, side.axes, near, side.nearby, ks=ks)
+
+
+def _parts(scheme: Scheme) -> tuple[str | int, ...]:
+    """Name a scheme in a seed, so that each has randomness of its own."""
+    return scheme.strategy, scheme.decoys or "", scheme.dim

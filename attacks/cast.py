@@ -1,0 +1,176 @@
+"""Who plays which part in an audit of templates.
+
+An audit needs people with two photos or more: victims, whose fresh photo tells whether an attack
+succeeded; and decoy owners, who try to log in where they are a decoy. The others calibrate, or
+belong to the attacker. Nobody plays two parts.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from attacks.errors import AuditError
+from templates.lifting import unit_descriptors
+
+ENROLLED_PHOTOS = 3
+"""Most photos that are averaged into a victim's template."""
+LEAST_ALBUM = 3
+LEAST_CALIBRATION = 200
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Person:
+    """Two descriptors of each of some people, rows in one order.
+
+    Parameters
+    ----------
+    enrolled : (P, n) float32
+        What is lifted: the mean of some photos, renormalised.
+    fresh : (P, n) float32
+        A photo that is not among them.
+    photos : (P,) int64
+        Number of photos in ``enrolled``.
+    shown : (P,) int64
+        Row of the folder's descriptors that is one of them.
+    """
+
+    enrolled: NDArray[np.float32]
+    fresh: NDArray[np.float32]
+    photos: NDArray[np.int64]
+    shown: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.enrolled)
+
+    def first(self, count: int) -> "Person":
+        """Return the first of them."""
+        return Person(
+            self.enrolled[:count], self.fresh[:count], self.photos[:count], self.shown[:count]
+        )
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Cast:
+    """The parts.
+
+    Parameters
+    ----------
+    victims
+        Their templates are attacked.
+    owners
+        Their ``enrolled`` descriptor, of one photo, makes up the pool of real decoys; ``fresh`` is
+        the photo that they come to log in with.
+    attacker : (A, n) float32
+        One photo of each of the people whom the attacker has faces of.
+    calibration : (C, n) float32
+        All photos of the people who calibrate.
+    names
+        Their C names.
+    rows : (C,) int64
+        Their rows of the folder's descriptors.
+    albums
+        Descriptors of all photos, (k, n), of each victim who has three or more.
+    """
+
+    victims: Person
+    owners: Person
+    attacker: NDArray[np.float32]
+    calibration: NDArray[np.float32]
+    names: tuple[str, ...]
+    rows: NDArray[np.int64]
+    albums: tuple[NDArray[np.float32], ...]
+
+
+def make_cast(
+    descriptors: NDArray[np.float32],
+    identities: Sequence[str],
+    *,
+    victims: int,
+    owners: int,
+    seed: int,
+) -> Cast:
+    """Give everybody of a labelled folder a part, at random.
+
+    Parameters
+    ----------
+    descriptors : (N, n) floating
+        Unit rows.
+    identities
+        N names.
+    victims, owners
+        How many; of people with two photos or more. Of the people who are left a third belong to
+        the attacker and the others calibrate.
+
+    Raises
+    ------
+    AuditError
+        There are too few people, or too few with two photos.
+    """
+    rows = unit_descriptors(descriptors)
+    people, person_of = np.unique(np.asarray(identities, dtype=np.str_), return_inverse=True)
+    if len(person_of) != len(rows):
+        raise AuditError(f"{len(identities)} names do not fit {len(rows)} descriptors")
+    rng = np.random.default_rng(seed)
+    photos = np.split(np.argsort(person_of, kind="stable"), np.bincount(person_of).cumsum()[:-1])
+    several = rng.permutation([i for i, mine in enumerate(photos) if len(mine) > 1])
+    if len(several) < victims + owners:
+        raise AuditError(
+            f"{victims} victims and {owners} decoy owners need {victims + owners} people with two "
+            f"photos or more, and {len(several)} are there: ask for fewer with --victims and "
+            "--owners, or give a larger folder"
+        )
+    attacked, owning = several[:victims], several[victims : victims + owners]
+    others = rng.permutation(np.setdiff1d(np.arange(len(people)), several[: victims + owners]))
+    known = others[: len(others) // 3]
+    calibrating = others[len(known) :]
+    if len(calibrating) < LEAST_CALIBRATION:
+        raise AuditError(
+            f"{len(calibrating)} people are left to calibrate on, and {LEAST_CALIBRATION} are the "
+            "least: ask for fewer victims and decoy owners, or give a larger folder"
+        )
+    chosen = np.concatenate([photos[person] for person in calibrating])
+    return Cast(
+        victims=_people(rows, [rng.permutation(photos[i]) for i in attacked], ENROLLED_PHOTOS),
+        owners=_people(rows, [rng.permutation(photos[i]) for i in owning], 1),
+        attacker=rows[[rng.choice(photos[i]) for i in known]].astype(np.float32),
+        calibration=rows[chosen].astype(np.float32),
+        names=tuple(str(people[person]) for person in person_of[chosen]),
+        rows=chosen.astype(np.int64),
+        albums=tuple(
+            rows[photos[i]].astype(np.float32) for i in attacked if len(photos[i]) >= LEAST_ALBUM
+        ),
+    )
+
+
+def without_decoy_people(cast: Cast, *, seed: int) -> tuple[NDArray[np.float32], Cast]:
+    """Set half of the calibrating people aside, and the decoy owners, to fit decoys to.
+
+    Returns
+    -------
+    descriptors : (D, n) float32
+        Their photos.
+    cast
+        Without them among those who calibrate.
+    """
+    people = np.random.default_rng([seed, 1]).permutation(np.unique(cast.names))
+    fitted = np.isin(cast.names, people[: len(people) // 2])
+    kept = replace(
+        cast,
+        calibration=cast.calibration[~fitted],
+        names=tuple(np.asarray(cast.names)[~fitted].tolist()),
+        rows=cast.rows[~fitted],
+    )
+    return np.concatenate([cast.calibration[fitted], cast.owners.enrolled, cast.owners.fresh]), kept
+
+
+def _people(rows: NDArray[np.float64], photos: Sequence[NDArray[np.int64]], most: int) -> Person:
+    taken = [mine[: min(most, len(mine) - 1)] for mine in photos]
+    means = np.stack([rows[mine].mean(axis=0) for mine in taken])
+    return Person(
+        enrolled=(means / np.linalg.norm(means, axis=1, keepdims=True)).astype(np.float32),
+        fresh=rows[[mine[-1] for mine in photos]].astype(np.float32),
+        photos=np.array([len(mine) for mine in taken], dtype=np.int64),
+        shown=np.array([mine[0] for mine in taken], dtype=np.int64),
+    )

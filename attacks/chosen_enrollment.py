@@ -1,0 +1,234 @@
+"""A tenant's rotation from accounts whose templates the attacker sent itself.
+
+Who may send templates knows what it enrolled: not the descriptor only, as of an account that was
+enrolled from photos (``attacks.databases``), but the whole set. The service stores the set's image
+under R in a basis of its own drawing, so no row of it is known to be the image of another. What no
+basis changes is the foot point, and the orthogonal projection on the directions: so every product
+of projections, applied to a foot point, gives a pair (x, R x), and some N² pairs of N accounts fix
+R. Not in the paper, which has no rotation; METHOD §4.9 has the measure without accounts.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import svd
+
+from attacks.decisions import decide
+from attacks.errors import AuditError
+from attacks.linkage import secret_rotation
+from attacks.outcomes import Knowledge, Outcome, Property
+from attacks.recovery import fmr_of
+from attacks.scene import Scene
+from attacks.stored.nearest_neighbour import nearest_points
+from attacks.stored.presentation import honest_embedding, points_inside
+from templates.randomness import Keystream
+from templates.subspace import SubspaceBatch
+from verify.comparisons import through_wire
+from verify.metrics import rate
+
+ACCOUNTS = (2, 5, 10, 20, 80)
+"""Accounts that the attacker enrolls: n / (m + 1) fix the rotation, and half of them open most."""
+ALIGNMENTS = 30
+"""Most steps of the estimate; with enough accounts it is settled after two."""
+_ENOUGH_PAIRS = 2
+"""Pairs for each dimension, where longer products of projections are left out."""
+_LEAST = 1e-3
+"""Of a unit vector, how much a projection must leave, and take, to count."""
+_SPANNED = 0.02
+"""Singular values below this share of the largest are the rounding of float16, or as unsure."""
+_CLIMB = 30
+
+Floats = NDArray[np.float64]
+
+
+class Sides(NamedTuple):
+    """The attacker's own templates: as it sent them, and as they were stolen."""
+
+    sent: SubspaceBatch
+    stolen: SubspaceBatch
+
+
+def estimate_from_sets(sides: Sides, *, steps: int = ALIGNMENTS) -> Floats:
+    """Estimate R from S sets and their images under R.
+
+    Parameters
+    ----------
+    sides
+        Template i of ``stolen`` is the image of template i of ``sent``, in another basis.
+    steps
+        Most steps of the refinement.
+
+    Returns
+    -------
+    ndarray of float64, shape (n, n)
+        Orthogonal; x of the tenant is taken back by ``estimate.T @ x``.
+
+    Notes
+    -----
+    First Procrustes' solution for the pairs that need no basis: P_k … P_i p_j and their images,
+    scaled to length 1. Then the bases themselves: given R, the basis E_i that was stolen is U_i
+    D_i Rᵀ with an orthogonal U_i, which is Procrustes' problem of size m; given all U_i, R is
+    Procrustes' problem with S (m + 1) pairs, which use all that is known. The two alternate,
+    and none ever lowers the fit.
+    """
+    sent, stolen = (_Stacked.of(side) for side in sides)
+    estimate = polar_factor(_product_pairs(sent, stolen))
+    settled = 0.0
+    for _ in range(steps):
+        turned = sent.bases @ estimate.T
+        left, values, right = np.linalg.svd(stolen.bases @ turned.transpose(0, 2, 1))
+        fit = float(values.sum())
+        matched = (left @ right) @ sent.bases
+        rows = stolen.bases.reshape(-1, stolen.bases.shape[2])
+        estimate = polar_factor(rows.T @ matched.reshape(rows.shape) + stolen.feet.T @ sent.feet)
+        if fit - settled <= 1e-6 * values.size:
+            break
+        settled = fit
+    return estimate
+
+
+class _Stacked(NamedTuple):
+    """Templates in float64, their foot points scaled to length 1."""
+
+    feet: Floats
+    bases: Floats
+
+    @classmethod
+    def of(cls, batch: SubspaceBatch) -> "_Stacked":
+        feet = batch.feet.astype(np.float64)
+        return cls(_unit(feet), batch.bases.astype(np.float64))
+
+    def project(self, number: int, points: Floats) -> Floats:
+        """Orthogonal projection of (K, n) points on the directions of one template."""
+        basis = self.bases[number]
+        return np.asarray((points @ basis.T) @ basis)
+
+
+def _product_pairs(sent: _Stacked, stolen: _Stacked) -> Floats:
+    """Σ y xᵀ over pairs y = R x of products of projections of foot points, (n, n).
+
+    Products of two projections are taken only where those of one are too few: they are shorter,
+    and rounding counts more in them.
+    """
+    count, n = sent.feet.shape
+    points, images = sent.feet, stolen.feet
+    moment = images.T @ points
+    pairs = count
+    for _ in range(2):
+        if count < 2 or pairs >= _ENOUGH_PAIRS * n:
+            break
+        found: tuple[list[Floats], list[Floats]] = [], []
+        for number in range(count):
+            here, there = sent.project(number, points), stolen.project(number, images)
+            # A foot point is orthogonal to its own directions, and P P = P: both give no new pair.
+            lengths = np.linalg.norm(here, axis=1)
+            new = (lengths > _LEAST) & (lengths < 1 - _LEAST)
+            found[0].append(_unit(here[new]))
+            found[1].append(there[new] / lengths[new, None])
+        points, images = np.concatenate(found[0]), np.concatenate(found[1])
+        moment += images.T @ points
+        pairs += len(points)
+    return np.asarray(moment)
+
+
+def polar_factor(moment: Floats) -> Floats:
+    """Return the orthogonal matrix that is nearest to a square one; of several, any."""
+    try:
+        left, _values, right = np.linalg.svd(moment)
+    except np.linalg.LinAlgError:
+        # With few accounts the moment has hundreds of zero singular values, at which LAPACK's
+        # divide and conquer may not converge; QR iteration does, several times slower.
+        left, _values, right = svd(moment, lapack_driver="gesvd")
+    return np.asarray(left @ right)
+
+
+def _unit(rows: Floats) -> Floats:
+    return np.asarray(rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-300))
+
+
+def best_known_points(stolen: SubspaceBatch, accounts: SubspaceBatch, *, seed: int) -> Floats:
+    """Unit point of each stolen template that lies most in the span of the accounts' sets, (V, n).
+
+    Where the accounts do not span everything, R is known on their span only. ‖P x‖² is convex, so
+    going to the unit point nearest P x never lowers it.
+    """
+    rows = np.concatenate([_Stacked.of(accounts).feet, *accounts.bases.astype(np.float64)])
+    _left, values, right = np.linalg.svd(rows, full_matrices=False)
+    span = right[values > _SPANNED * values[0]]
+    points = points_inside(stolen, seed=seed).astype(np.float64)
+    if len(span) < stolen.n:
+        for _ in range(_CLIMB):
+            points = nearest_points((points @ span.T) @ span, stolen)
+    return points
+
+
+def chosen_enrollment(scene: Scene, *, accounts: tuple[int, ...] = ACCOUNTS) -> list[Outcome]:
+    """Steal a tenant's database in which the attacker has accounts that it sent as templates.
+
+    Parameters
+    ----------
+    accounts
+        Numbers of accounts; those beyond the attacker's faces are left out.
+
+    Returns
+    -------
+    list of Outcome
+        Named ``chosen-enrollment``, one for each number of accounts; ``alignment`` in ``details``
+        is tr(R̂ᵀR) / n, 1 where the rotation is known.
+
+    Raises
+    ------
+    AuditError
+        The attacker has fewer faces than the least number of accounts.
+    """
+    kept = [number for number in sorted(set(accounts)) if 1 <= number <= len(scene.attacker)]
+    if not kept:
+        raise AuditError("an attacker that enrolls templates of its own needs faces to lift")
+    rotation = secret_rotation(scene, "chosen enrollment")
+    sent = scene.lift(scene.attacker[: max(kept)], "templates that the attacker enrolls")
+    held = _as_stored(scene, sent, rotation)
+    victims = through_wire(
+        scene.templates.rotated(rotation), contract_id=scene.contract.contract_id
+    )
+    outcomes = []
+    for number in kept:
+        mine = Sides(sent[:number], held[:number])
+        estimate = estimate_from_sets(mine)
+        points = best_known_points(victims, mine.stolen, seed=scene.seed) @ estimate
+        probes = np.ascontiguousarray(points, dtype=np.float32)
+        decided = decide(
+            probes, scene.templates, scene.contract, scene.points, scene.level, paired=True
+        )
+        accepted = decided.accepted & honest_embedding(probes)
+        outcomes.append(
+            Outcome(
+                attack="chosen-enrollment",
+                variant=f"{number} accounts",
+                breaks=Property.IMPERSONATION,
+                knowledge=Knowledge.TEMPLATES,
+                assumption=f"The right to send templates and embeddings, with which the attacker "
+                f"has enrolled {number} templates of its own lifting, and the tenant's whole "
+                "stolen database, whose key is secret; it estimates the rotation from the "
+                "templates that it sent and what became of them, and sends a unit point of every "
+                "victim's template, turned back, as an embedding; success is acceptance by "
+                "threshold and cohort test",
+                scheme=scene.scheme,
+                level=scene.level.name,
+                measured=rate(int(np.count_nonzero(accepted)), len(accepted)),
+                chance=fmr_of(scene.level),
+                details={
+                    "accounts": number,
+                    "alignment": float(np.einsum("ij,ij->", estimate, rotation) / sent.n),
+                    "accepted_without_cohort_test": float(decided.near.mean()),
+                },
+            )
+        )
+    return outcomes
+
+
+def _as_stored(scene: Scene, sent: SubspaceBatch, rotation: Floats) -> SubspaceBatch:
+    """Rotate and store templates as the service does: in a fresh basis, and in float16."""
+    with Keystream.seeded("audit", scene.seed, "bases of the service") as stream:
+        spanned = SubspaceBatch.through(sent.feet, sent.bases, stream=stream)
+    return through_wire(spanned.rotated(rotation), contract_id=scene.contract.contract_id)

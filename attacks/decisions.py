@@ -1,0 +1,84 @@
+"""The decision of the service, on arrays: threshold alone, and with the cohort test."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from templates.contract import Calibration, Contract, Level
+from templates.distances import paired_distances, pairwise_distances, similarity
+from templates.subspace import SubspaceBatch
+from verify.cohort import Probes, cohort_statistics
+
+
+class Decisions(NamedTuple):
+    """What was accepted; bool of shape (P, T), or (P,) where probes and templates are paired."""
+
+    near: NDArray[np.bool_]
+    """By the similarity threshold alone."""
+    accepted: NDArray[np.bool_]
+    """By the threshold and the cohort test, as the service does."""
+
+
+class Scores(NamedTuple):
+    """What decisions rest on; float64 of shape (P, T), or (P,) where paired."""
+
+    similarities: NDArray[np.float64]
+    cohort_scores: NDArray[np.float64]
+
+    def at(self, level: Level) -> Decisions:
+        """Decide at a level."""
+        near = self.similarities >= level.similarity_threshold
+        return Decisions(near, near & (self.cohort_scores >= level.cohort_threshold))
+
+
+def score(
+    probes: Probes,
+    templates: SubspaceBatch,
+    contract: Contract,
+    calibration: Calibration,
+    *,
+    paired: bool = False,
+    cohort: SubspaceBatch | None = None,
+) -> Scores:
+    """Score as ``verify.Verifier`` does, for many probes and templates.
+
+    What the service refuses before it decides, such as a probe that is not of unit length, is not
+    refused here. Neither probes nor templates are rotated: a rotation of both changes nothing.
+
+    Parameters
+    ----------
+    probes : (P, n) float32, or SubspaceBatch of P
+    templates : SubspaceBatch of T
+    paired
+        Probe i meets template i only.
+    cohort
+        Instead of the contract's, which is secret: an attacker tries with one of their own.
+    """
+    compare = paired_distances if paired else pairwise_distances
+    distances = compare(probes, templates, metric=calibration.metric, steps=calibration.steps)
+    similarities = np.asarray(similarity(distances), dtype=np.float64)
+    means, spreads = cohort_statistics(
+        probes,
+        contract.cohort if cohort is None else cohort,
+        metric=calibration.metric,
+        steps=calibration.steps,
+    )
+    if not paired:
+        means, spreads = means[:, None], spreads[:, None]
+    return Scores(similarities, (similarities - means) / spreads)
+
+
+def decide(
+    probes: Probes,
+    templates: SubspaceBatch,
+    contract: Contract,
+    calibration: Calibration,
+    level: Level,
+    *,
+    paired: bool = False,
+    cohort: SubspaceBatch | None = None,
+) -> Decisions:
+    """Decide at one level; see :func:`score`."""
+    scores = score(probes, templates, contract, calibration, paired=paired, cohort=cohort)
+    return scores.at(level)

@@ -1,0 +1,300 @@
+"""Getting accepted by asking the service again and again, with its scores or its decisions only.
+
+Every climber starts from a rehearsal (``attacks.rehearsal``), so that every answer counts. No
+other template than the one that is asked about is used.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from attacks.decisions import decide
+from attacks.errors import AuditError
+from attacks.outcomes import Knowledge, Outcome, Property, Scheme
+from attacks.recovery import fmr_of
+from attacks.rehearsal import Floats, Prior
+from attacks.scene import Scene
+from templates.contract import Level
+from templates.distances import pairwise_distances, similarity
+from templates.subspace import SubspaceBatch
+from verify.metrics import rate
+
+LOCKOUTS = (5, 50)
+"""Consecutive failures after which a service delays, and locks (NIST SP 800-63B)."""
+_ASCENT_STEPS = 40
+
+
+class Answer(NamedTuple):
+    """What a service says to one probe."""
+
+    accepted: bool
+    score: float | None = None
+    """Similarity; None without the right to scores."""
+
+
+Ask = Callable[[NDArray[np.float32]], Answer]
+
+
+class Climber(StrEnum):
+    """How the next probe is chosen."""
+
+    DICTIONARY = "dictionary"
+    """Decisions only: faces, in the order in which they open the most rehearsed templates that
+    none before them opened."""
+    GRADIENT = "gradient"
+    """Scores: estimates the gradient from random steps along the principal axes of faces."""
+    REGRESSION = "regression"
+    """Scores: the most probable template given all scores so far; asks where that is highest."""
+
+
+@dataclass(frozen=True)
+class Climb:
+    """One attack on one template.
+
+    Parameters
+    ----------
+    climber
+        Which.
+    attempts
+        Probes sent: up to the first that was accepted, or all.
+    accepted_at
+        Number of the attempt that was accepted, from 1; None where none was. All before it
+        failed, so a lockout after k consecutive failures ends the attack where it is above k.
+    """
+
+    climber: Climber
+    attempts: int
+    accepted_at: int | None
+
+
+class _Asked:
+    """Counts attempts, and stops at the first that is accepted or when there are no more."""
+
+    def __init__(self, ask: Ask, most: int) -> None:
+        self._ask = ask
+        self._most = most
+        self.attempts = 0
+        self.accepted_at: int | None = None
+
+    def over(self) -> bool:
+        return self.accepted_at is not None or self.attempts >= self._most
+
+    def __call__(self, probe: Floats) -> float:
+        """Score of the direction of a probe."""
+        unit = probe / np.linalg.norm(probe)
+        answer = self._ask(np.ascontiguousarray(unit, dtype=np.float32))
+        self.attempts += 1
+        if answer.accepted:
+            self.accepted_at = self.attempts
+        return np.nan if answer.score is None else answer.score
+
+
+def _dictionary(prior: Prior, asked: _Asked, rng: np.random.Generator) -> None:
+    del rng
+    for face in prior.faces:
+        if asked.over():
+            return
+        asked(face)
+
+
+def _gradient(prior: Prior, asked: _Asked, rng: np.random.Generator) -> None:
+    """Evolution strategy along the faces' axes: least squares on a few steps, then a step."""
+    place = prior.faces[0]
+    best = asked(place)
+    reach = 0.6
+    while not asked.over():
+        steps: list[Floats] = []
+        gains: list[float] = []
+        for _ in range(4):
+            step = prior.axes @ rng.normal(size=len(place))
+            for sign in (1.0, -1.0):
+                if asked.over():
+                    return
+                trial = place + sign * reach * step / np.linalg.norm(step)
+                trial /= np.linalg.norm(trial)
+                gains.append(asked(trial) - best)
+                steps.append(trial - place)
+        moves = np.stack(steps)
+        slope = moves.T @ np.linalg.lstsq(moves @ moves.T, np.asarray(gains), rcond=1e-6)[0]
+        if asked.over():
+            return
+        trial = place + reach * slope / max(float(np.linalg.norm(slope)), 1e-12)
+        trial /= np.linalg.norm(trial)
+        score = asked(trial)
+        index = int(np.argmax(gains))
+        if gains[index] + best > max(score, best):
+            place, best = place + moves[index], best + gains[index]
+        elif score > best:
+            place, best = trial, score
+        else:
+            reach *= 0.7
+
+
+def _regression(prior: Prior, asked: _Asked, rng: np.random.Generator) -> None:
+    """Gaussian-process regression with the rehearsed kernel, asked where it is highest.
+
+    It climbs what the scores add to the mean over all templates, and not the sum: what every
+    template is near to is a wolf, which the cohort test rejects.
+    """
+    linear, square = prior.kernel
+    moment = prior.axes @ prior.axes
+    probes = [prior.faces[0]]
+    scores = [asked(probes[0])]
+    while not asked.over():
+        seen = np.stack(probes)
+        turned = seen @ moment
+        gram = seen @ turned.T
+        trend = prior.trend[0] + prior.trend[1] * seen @ prior.mean
+        trend = trend + prior.trend[2] * np.diagonal(gram)
+        covariance = linear * gram + square * gram**2
+        covariance[np.diag_indices_from(covariance)] += prior.noise
+        weights = np.linalg.solve(covariance, np.asarray(scores) - trend)
+        place = seen[int(np.argmax(scores))]
+        for step in np.geomspace(0.5, 0.02, _ASCENT_STEPS):
+            slope = turned.T @ (weights * (linear + 2 * square * (turned @ place)))
+            slope -= (slope @ place) * place
+            place = place + step * slope / max(float(np.linalg.norm(slope)), 1e-12)
+            place /= np.linalg.norm(place)
+        if np.max(seen @ place) > _SAME:
+            aside = prior.axes @ rng.normal(size=len(place))
+            place = place + 0.3 * aside / np.linalg.norm(aside)
+            place /= np.linalg.norm(place)
+        scores.append(asked(place))
+        probes.append(place)
+
+
+_SAME = 0.999
+_CLIMBERS: Mapping[Climber, Callable[[Prior, _Asked, np.random.Generator], None]] = {
+    Climber.DICTIONARY: _dictionary,
+    Climber.GRADIENT: _gradient,
+    Climber.REGRESSION: _regression,
+}
+
+
+def climb(
+    victims: Mapping[int, Ask],
+    prior: Prior,
+    climber: Climber,
+    *,
+    most_attempts: int,
+    seed: int,
+) -> list[Climb]:
+    """Attack each victim on its own.
+
+    Parameters
+    ----------
+    victims
+        By number of the victim, what answers a unit probe, (n,) float32.
+    prior
+        Of ``attacks.rehearsal.rehearse``.
+    most_attempts
+        Where to give up.
+
+    Raises
+    ------
+    AuditError
+        The climber needs scores, and the answers hold none.
+    """
+    climbs = []
+    for number, ask in victims.items():
+        asked = _Asked(_scored(ask) if climber is not Climber.DICTIONARY else ask, most_attempts)
+        _CLIMBERS[climber](prior, asked, np.random.default_rng((seed, number)))
+        climbs.append(Climb(climber, asked.attempts, asked.accepted_at))
+    return climbs
+
+
+def _scored(ask: Ask) -> Ask:
+    def wrapped(probe: NDArray[np.float32]) -> Answer:
+        answer = ask(probe)
+        if answer.score is None:
+            raise AuditError("this climber needs scores: give it a key with the score right")
+        return answer
+
+    return wrapped
+
+
+def climbing_outcomes(
+    climbs: Sequence[Climb],
+    scheme: Scheme,
+    level: Level,
+    *,
+    most_attempts: int,
+    lockouts: Sequence[int] = LOCKOUTS,
+) -> list[Outcome]:
+    """Report climbs of one kind, against lockouts that are simulated here.
+
+    Parameters
+    ----------
+    climbs
+        All of one climber, one a victim.
+    level
+        That the service decided at.
+    most_attempts
+        As :func:`climb` was given.
+    lockouts
+        Consecutive failures after which an attack ends. All attempts before the first that is
+        accepted have failed, so an attack is over by then or not at all.
+
+    Raises
+    ------
+    AuditError
+        No climbs, or of two climbers.
+    """
+    if len({each.climber for each in climbs}) != 1:
+        raise AuditError("an outcome is of the climbs of one climber")
+    climber = climbs[0].climber
+    scored = climber is not Climber.DICTIONARY
+    reached = np.array(
+        [np.inf if each.accepted_at is None else each.accepted_at for each in climbs]
+    )
+    median = float(np.median(reached))
+    fmr = fmr_of(level)
+    return [
+        Outcome(
+            attack="hill-climbing",
+            variant=f"{climber}, {'scores' if scored else 'decisions only'}, {limit} attempts",
+            breaks=Property.IMPERSONATION,
+            knowledge=Knowledge.KEY if scored else Knowledge.ALGORITHM,
+            assumption="How templates are lifted, faces of other people, and "
+            + (
+                "the rights to send embeddings and to see scores"
+                if scored
+                else "decisions on those faces, which it sends as photos, or as embeddings where "
+                "it has that right"
+            )
+            + f"; success is acceptance within {limit} attempts, none of which was accepted before",
+            scheme=scheme,
+            level=level.name,
+            measured=rate(int(np.count_nonzero(reached <= limit)), len(reached)),
+            chance=1 - (1 - fmr) ** limit,
+            details={
+                "limit": limit,
+                "median_attempts": median if np.isfinite(median) else None,
+                "attempts": sum(each.attempts for each in climbs),
+            },
+        )
+        for limit in sorted({*(each for each in lockouts if each <= most_attempts), most_attempts})
+    ]
+
+
+def in_process(scene: Scene, victims: Sequence[int], *, scores: bool) -> dict[int, Ask]:
+    """Return the scene's own decisions on some victims, as a service would answer."""
+
+    def answers(template: SubspaceBatch) -> Ask:
+        def ask(probe: NDArray[np.float32]) -> Answer:
+            points = scene.points
+            yes = decide(probe[None], template, scene.contract, points, scene.level).accepted
+            if not scores:
+                return Answer(bool(yes[0, 0]))
+            distance = pairwise_distances(
+                probe[None], template, metric=points.metric, steps=points.steps
+            )
+            return Answer(bool(yes[0, 0]), float(similarity(distance)[0, 0]))
+
+        return ask
+
+    return {number: answers(scene.templates[number : number + 1]) for number in victims}

@@ -1,0 +1,186 @@
+"""What every attack reports: who was assumed to know what, and how often it succeeded."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any, TypeAlias
+
+from templates.canonical import Json
+from templates.levels import Rate
+
+
+class Property(StrEnum):
+    """What an attack breaks: the properties of ISO/IEC 24745, and one beside them."""
+
+    IRREVERSIBILITY = "irreversibility"
+    """Nobody gets the descriptor, or a face, out of a template."""
+    UNLINKABILITY = "unlinkability"
+    """Nobody tells whether two templates, of two tenants, are of one person."""
+    RENEWABILITY = "renewability"
+    """A template that was stolen is of no use once another has replaced it."""
+    CONFIDENTIALITY = "confidentiality"
+    """Nobody learns gender, race or age from a template."""
+    IMPERSONATION = "impersonation"
+    """Nobody is accepted but the person. Not of ISO/IEC 24745, and what the service exists for."""
+
+
+class Knowledge(StrEnum):
+    """What the attacker has. Each but the last includes the ones before it.
+
+    Attacks on irreversibility and confidentiality are granted the un-rotated template in every
+    column: whoever has the master key has the rotation too. Unlinkability, renewability and
+    impersonation are what the rotation is for, and there it is secret up to ``KEY``.
+    """
+
+    TEMPLATE = "template"
+    """One template, and that descriptors are of unit length."""
+    ALGORITHM = "algorithm"
+    """How templates are lifted, the model, the decoy generator (clients have it), other faces."""
+    DECOYS = "decoys"
+    """The decoy pool, which is a secret of the deployment."""
+    KEY = "key"
+    """The tenant's rotation, or a right that the service gives."""
+    TEMPLATES = "templates"
+    """The algorithm, and several templates: of the victim, or of a whole tenant."""
+
+
+GENERATED, POOLED = "generator", "pool"
+RAW = "raw"
+
+
+@dataclass(frozen=True)
+class Scheme:
+    """A way of protecting descriptors.
+
+    Parameters
+    ----------
+    strategy
+        A ``templates.lifting.Strategy``, or ``raw``.
+    decoys
+        ``pool`` or ``generator``; None where the strategy takes none.
+    dim
+        m; 0 for raw descriptors.
+    """
+
+    strategy: str
+    decoys: str | None
+    dim: int
+
+    @property
+    def order(self) -> tuple[str, str, int]:
+        """Sort key."""
+        return self.strategy, self.decoys or "", self.dim
+
+    def __str__(self) -> str:
+        if self.strategy == RAW:
+            return "raw descriptors"
+        source = {GENERATED: ", generated decoys", POOLED: ", decoys of a pool"}
+        return f"{self.strategy}, m = {self.dim}{source.get(self.decoys or '', '')}"
+
+    @classmethod
+    def of(cls, row: Mapping[str, Any]) -> "Scheme":
+        """Return the scheme of a row that has the three fields."""
+        return cls(str(row["strategy"]), row["decoys"], int(row["dim"]))
+
+    def to_json(self) -> dict[str, Json]:
+        """Return the three fields."""
+        return {"strategy": self.strategy, "decoys": self.decoys, "dim": self.dim}
+
+
+RAW_SCHEME = Scheme(RAW, None, 0)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A measure that is no count, with its 95 % interval.
+
+    Parameters
+    ----------
+    value, ci_low, ci_high
+        The measure and its bounds.
+    trials
+        Number of scores that it rests on.
+    interval
+        How the bounds were computed.
+    """
+
+    value: float
+    ci_low: float
+    ci_high: float
+    trials: int
+    interval: str
+
+    def to_json(self) -> dict[str, Json]:
+        """JSON form."""
+        return {
+            "value": self.value,
+            "ci_low": self.ci_low,
+            "ci_high": self.ci_high,
+            "trials": self.trials,
+            "interval": self.interval,
+        }
+
+
+Measured: TypeAlias = Rate | Estimate
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """One attack on one scheme.
+
+    Parameters
+    ----------
+    attack
+        Its name, such as ``foot-point``; one name has one meaning in all reports.
+    variant
+        What distinguishes it from the other outcomes of this attack on this scheme; may be empty.
+    breaks
+        The property that its success breaks.
+    knowledge
+        What the attacker has.
+    assumption
+        One sentence: what the attacker has and does, and what counts as success.
+    scheme
+        What was attacked.
+    level
+        The security level that success is judged at, such as ``fmr-1e-3``; None where none is.
+    measured
+        How often it succeeded.
+    chance
+        How often guessing would have: the level's FMR, or the majority class.
+    judged
+        Whether the verdict counts it. An attack on what a service refuses in any case, or a
+        control, is reported and not judged; ``assumption`` says why.
+    details
+        Further figures, JSON values. Never a number of a descriptor or a template.
+    """
+
+    attack: str
+    variant: str = ""
+    breaks: Property
+    knowledge: Knowledge
+    assumption: str
+    scheme: Scheme
+    level: str | None = None
+    measured: Measured
+    chance: float
+    judged: bool = True
+    details: Mapping[str, Json] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Json]:
+        """Return a row of ``outcomes`` of the report."""
+        rate = self.measured.to_json()
+        rate["value"] = self.measured.value
+        return {
+            "attack": self.attack,
+            "variant": self.variant,
+            "property": str(self.breaks),
+            "knowledge": str(self.knowledge),
+            "assumption": self.assumption,
+            **self.scheme.to_json(),
+            "level": self.level,
+            "measured": rate,
+            "chance": self.chance,
+            "judged": self.judged,
+            "details": dict(self.details),
+        }

@@ -1,0 +1,119 @@
+"""How good a guess of the hidden descriptor is: against a fresh photo, and against the truth."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from attacks.cast import Person
+from attacks.decisions import score
+from attacks.outcomes import Knowledge, Outcome, Property
+from attacks.scene import Scene
+from templates.canonical import Json
+from templates.contract import Level, Rate
+from verify.metrics import rate
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Recovery:
+    """Guesses of the descriptors that templates hide, scored.
+
+    Parameters
+    ----------
+    to_truth, to_fresh : (V,) float64
+        Cosines to the descriptor that was lifted, and to a fresh photo of the victim.
+    matched
+        By level: guesses that reach the raw threshold on the fresh photo. In any system without
+        protection, the guess is then taken for the person.
+    accepted
+        By level: guesses that the service accepts against a template lifted anew from the fresh
+        photo, with the cohort test: a service that has replaced the stolen template.
+    """
+
+    to_truth: NDArray[np.float64]
+    to_fresh: NDArray[np.float64]
+    matched: Mapping[str, Rate]
+    accepted: Mapping[str, Rate]
+
+    def details(self) -> dict[str, Json]:
+        """Return the figures beside the success rate."""
+        return {
+            "cosine_to_truth_mean": float(self.to_truth.mean()),
+            "cosine_to_truth_5_percent": float(np.quantile(self.to_truth, 0.05)),
+            "cosine_to_truth_95_percent": float(np.quantile(self.to_truth, 0.95)),
+            "cosine_to_fresh_mean": float(self.to_fresh.mean()),
+            "matched_by_level": {name: each.to_json() for name, each in self.matched.items()},
+            "accepted_when_renewed": {name: each.to_json() for name, each in self.accepted.items()},
+        }
+
+
+def score_guesses(
+    scene: Scene, guesses: NDArray[np.floating], *, people: Person | None = None
+) -> Recovery:
+    """Score one guess a victim.
+
+    Parameters
+    ----------
+    guesses : (V, n) floating
+        In the order of ``scene.victims``; their length does not matter. A zero row is a failure.
+    people
+        Who was attacked instead of ``scene.victims``.
+    """
+    attacked = people or scene.victims
+    lengths = np.linalg.norm(guesses.astype(np.float64), axis=1, keepdims=True)
+    unit = guesses / np.maximum(lengths, np.finfo(np.float64).tiny)
+    truth = attacked.enrolled.astype(np.float64)
+    fresh = attacked.fresh.astype(np.float64)
+    to_fresh = np.einsum("ij,ij->i", unit, fresh)
+    renewed = scene.lift(attacked.fresh, "renewed from the fresh photo")
+    probes = np.ascontiguousarray(unit, dtype=np.float32)
+    matched: dict[str, Rate] = {}
+    accepted: dict[str, Rate] = {}
+    scores = score(probes, renewed, scene.contract, scene.points, paired=True)
+    for level in scene.levels:
+        hits = to_fresh >= scene.raw_thresholds[level.name]
+        matched[level.name] = rate(int(np.count_nonzero(hits)), len(hits))
+        yes = scores.at(level).accepted & (lengths[:, 0] > 0)
+        accepted[level.name] = rate(int(np.count_nonzero(yes)), len(yes))
+    return Recovery(
+        to_truth=np.einsum("ij,ij->i", unit, truth),
+        to_fresh=to_fresh,
+        matched=matched,
+        accepted=accepted,
+    )
+
+
+def fmr_of(level: Level) -> float:
+    """Return what a stranger reaches at a level: its FMR."""
+    return level.fmr.value if level.target_fmr is None else level.target_fmr
+
+
+def recovery_outcome(
+    scene: Scene,
+    guesses: NDArray[np.floating],
+    *,
+    attack: str,
+    knowledge: Knowledge,
+    assumption: str,
+    variant: str = "",
+    breaks: Property = Property.IRREVERSIBILITY,
+    judged: bool = True,
+    people: Person | None = None,
+    details: Mapping[str, Json] | None = None,
+) -> Outcome:
+    """Report guesses: success is a match with the fresh photo at the default level, raw."""
+    recovery = score_guesses(scene, guesses, people=people)
+    return Outcome(
+        attack=attack,
+        variant=variant,
+        breaks=breaks,
+        knowledge=knowledge,
+        assumption=assumption,
+        scheme=scene.scheme,
+        level=scene.level.name,
+        measured=recovery.matched[scene.level.name],
+        chance=fmr_of(scene.level),
+        judged=judged,
+        details={**recovery.details(), **(details or {})},
+    )

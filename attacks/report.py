@@ -1,0 +1,66 @@
+"""The report of an audit, as one document; docs/formats.md describes it field by field."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from attacks.outcomes import Outcome
+from attacks.verdict import LIMITS, headlines, judge
+
+FORMAT = "veilface audit"
+VERSION = 1
+Document = dict[str, Any]
+
+
+def document(
+    kind: str,
+    *,
+    outcomes: Sequence[Outcome],
+    rows: Sequence[Mapping[str, Any]] = (),
+    limits: Mapping[str, float],
+    comparisons: Sequence[str] = (),
+    model: Mapping[str, Any],
+    settings: Mapping[str, Any],
+    **more: Any,
+) -> Document:
+    """Put a report together.
+
+    Parameters
+    ----------
+    kind
+        ``fairface`` or ``templates``.
+    outcomes
+        Of all attacks.
+    rows
+        Of attribute inference, one for each scheme, attribute, attacker and seed.
+    limits
+        What the operator accepts, by name.
+    comparisons
+        Schemes, as text, that are there to compare with: they are judged, and do not decide
+        whether the audit passes.
+    model
+        The embedder.
+    settings
+        Sizes, seeds and options.
+    more
+        Further parts.
+    """
+    verdicts = judge(outcomes, limits=limits)
+    audited = [each for each in verdicts if str(each.scheme) not in comparisons]
+    compared = [each for each in verdicts if str(each.scheme) in comparisons]
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "kind": kind,
+        "passed": bool(audited) and all(each.passed for each in audited),
+        "headlines": headlines(audited),
+        "comparison_headlines": headlines(compared),
+        "limits": {limit.name: limits.get(limit.name, limit.default) for limit in LIMITS},
+        "verdicts": [
+            {**each.to_json(), "comparison": str(each.scheme) in comparisons} for each in verdicts
+        ],
+        "model": dict(model),
+        "settings": dict(settings),
+        "rows": [dict(row) for row in rows],
+        "outcomes": [outcome.to_json() for outcome in outcomes],
+        **more,
+    }

@@ -1,0 +1,304 @@
+"""The report of an audit in Markdown; reads nothing but the document."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from attacks.outcomes import Knowledge, Property, Scheme
+from attacks.verdict import LIMITS
+from verify.evaluation.markdown_cells import (
+    MISSING,
+    count,
+    fixed,
+    interval_cell,
+    percent,
+    plain,
+    significant,
+    table,
+)
+
+Row = Mapping[str, Any]
+_KNOWLEDGE = {
+    Knowledge.TEMPLATE: "template only",
+    Knowledge.ALGORITHM: "+ algorithm",
+    Knowledge.DECOYS: "+ decoys",
+    Knowledge.KEY: "+ key or right",
+    Knowledge.TEMPLATES: "k templates",
+}
+
+
+def markdown(report: Mapping[str, Any]) -> str:
+    """Return the whole report."""
+    parts = [
+        f"# Privacy audit: {plain(report['kind'])}",
+        _result(report),
+        *_verdicts(report),
+        *_attributes(report["rows"]),
+        *_frontier(report),
+        *_operating(report),
+        *_outcomes(report["outcomes"]),
+        *_cost(report),
+        _settings(report),
+    ]
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def _result(report: Row) -> str:
+    lines = [f"**{'PASSED' if report['passed'] else 'FAILED'}** by the limits below."]
+    lines += [f"- {plain(sentence)}" for sentence in report["headlines"]]
+    if report["comparison_headlines"]:
+        lines += ["", "For comparison only:", ""]
+        lines += [f"- {plain(sentence)}" for sentence in report["comparison_headlines"]]
+    return "\n".join([lines[0], "", *lines[1:]])
+
+
+def _verdicts(report: Row) -> Iterable[str]:
+    yield "## Verdict"
+    yield (
+        "Each cell is the strongest attack that was made: its measure with the 95 % interval, what "
+        "guessing would reach, and how it stands against the limit. *Unresolved*: only the upper "
+        "bound exceeds the limit. What an empty cell would need is named in docs/privacy.md."
+    )
+    for verdict in report["verdicts"]:
+        cells: dict[tuple[str, str], list[str]] = {}
+        for cell in verdict["cells"]:
+            cells.setdefault((cell["property"], cell["knowledge"]), []).append(_verdict_cell(cell))
+        lines = [
+            [str(each), *("<br>".join(cells.get((each, known), [MISSING])) for known in Knowledge)]
+            for each in Property
+        ]
+        title = f"### {plain(str(Scheme.of(verdict)))}"
+        if verdict["comparison"]:
+            title += " (comparison)"
+        yield title
+        yield table(
+            ["property", *(_KNOWLEDGE[known] for known in Knowledge)],
+            lines,
+            [True] * (1 + len(Knowledge)),
+        )
+    yield "### Limits"
+    yield table(
+        ["limit", "most", "on"],
+        [
+            [f"`--max-{limit.name}`", significant(report["limits"][limit.name]), limit.meaning]
+            for limit in LIMITS
+        ],
+        [True, False, True],
+    )
+
+
+def _verdict_cell(cell: Row) -> str:
+    name = plain(cell["attack"]) + (f" ({plain(cell['variant'])})" if cell["variant"] else "")
+    status = cell["status"]
+    shown = f"**{status}**" if status == "fail" else status
+    return (
+        f"{significant(cell['value'])} [{significant(cell['ci_low'])}, "
+        f"{significant(cell['ci_high'])}], chance {significant(cell['chance'])}: {name}: {shown}"
+    )
+
+
+def _attributes(rows: Sequence[Row]) -> Iterable[str]:
+    if not rows:
+        return
+    yield "## Attribute inference"
+    yield (
+        "Accuracy in % over all attacked faces, with the 95 % Wilson interval; `balanced` is the "
+        "mean over classes; chance is the share of the largest class. Leakage is a difference, up "
+        "or down, from what the same predictions would score if they were dealt out at random."
+    )
+    for attribute in dict.fromkeys(str(row["attribute"]) for row in rows):
+        mine = [row for row in rows if row["attribute"] == attribute]
+        yield f"### {plain(attribute)}"
+        first = mine[0]
+        stated = ", ".join(
+            f"{plain(name)} {percent(value)}"
+            for name, value in first["baselines"].items()
+            if name != "same_predictions"  # of this row's attacker only
+        )
+        yield f"Baselines in %: {stated}."
+        yield table(
+            [
+                "scheme",
+                "attacker",
+                "knows",
+                "accuracy %",
+                "balanced %",
+                "chance %",
+                "bits (null)",
+                "leakage",
+            ],
+            [
+                [
+                    plain(str(Scheme.of(row))),
+                    plain(row["attacker"] + (f", {row['metric']}" if row.get("metric") else "")),
+                    plain(row["knowledge"]),
+                    interval_cell({**row, "value": row["accuracy"], "errors": row["correct"]}),
+                    percent(row["balanced_accuracy"]),
+                    percent(row["chance"]),
+                    f"{fixed(row['mutual_information_bits'], 3)} "
+                    f"({fixed(_null(row['mutual_information_null']), 3)})",
+                    plain(row["leakage"]),
+                ]
+                for row in mine
+            ],
+            [True, True, True, False, False, False, False, True],
+        )
+
+
+def _null(null: Any) -> float | None:
+    return null.get("mean") if isinstance(null, Mapping) else null
+
+
+def _frontier(report: Row) -> Iterable[str]:
+    frontier = report.get("frontier")
+    if not frontier:
+        return
+    yield "## Accuracy against privacy"
+    yield plain(frontier["statement"])
+    attributes = list(
+        dict.fromkeys(name for point in frontier["points"] for name in point["leaks"])
+    )
+    yield table(
+        [
+            "scheme",
+            f"accuracy % ({frontier['mode']}, {frontier['metric']})",
+            *(f"{name}: strongest %" for name in attributes),
+            "recommended",
+        ],
+        [
+            [
+                plain(str(Scheme.of(point))),
+                percent(point["accuracy"]),
+                *(_leak(point["leaks"].get(name)) for name in attributes),
+                "yes" if point["recommended"] else "",
+            ]
+            for point in frontier["points"]
+        ],
+        [True, False, *([False] * len(attributes)), True],
+    )
+
+
+def _leak(leak: Row | None) -> str:
+    if leak is None:
+        return MISSING
+    return (
+        f"{percent(leak['accuracy'])} ({plain(leak['attacker'])}; chance {percent(leak['chance'])})"
+    )
+
+
+def _operating(report: Row) -> Iterable[str]:
+    schemes = report.get("schemes")
+    if not schemes:
+        return
+    yield "## What each scheme costs"
+    yield (
+        "Error rates of the calibration at each level, both tests together, in % with the 95 % "
+        "interval; a raw photo is compared with a template of one or more averaged photos."
+    )
+    yield table(
+        ["scheme", "level", "FMR %", "FNMR %", "template, bytes"],
+        [
+            [
+                plain(str(Scheme.of(each))),
+                plain(level["name"])
+                + (" (default)" if level["name"] == each["default_level"] else ""),
+                interval_cell({**level["fmr"], "value": _share(level["fmr"])}),
+                interval_cell({**level["fnmr"], "value": _share(level["fnmr"])}),
+                count(each["template_bytes"]),
+            ]
+            for each in schemes
+            for level in each["levels"]
+        ],
+        [True, True, False, False, False],
+    )
+
+
+def _share(rate: Row) -> float:
+    return float(rate["errors"]) / rate["trials"] if rate["trials"] else 0.0
+
+
+def _outcomes(outcomes: Sequence[Row]) -> Iterable[str]:
+    if not outcomes:
+        return
+    shown = [row for row in outcomes if row["property"] != Property.CONFIDENTIALITY]
+    if not shown:
+        return
+    yield "## Attacks on templates"
+    yield (
+        "Success in % with its interval and counts, at the level named; D_sys is no share, and is "
+        "given as it is. Attacks that are not judged assume what no attacker has, or what the "
+        "service refuses beforehand."
+    )
+    for scheme in dict.fromkeys(Scheme.of(row) for row in shown):
+        yield f"### {plain(str(scheme))}: attacks"
+        yield table(
+            ["attack", "knows", "level", "success", "chance", "cosine to truth", "judged"],
+            [
+                [
+                    plain(row["attack"] + (f": {row['variant']}" if row["variant"] else "")),
+                    plain(row["knowledge"]),
+                    plain(row["level"]),
+                    _measured(row),
+                    significant(row["chance"]),
+                    fixed(row["details"].get("cosine_to_truth_mean"), 3),
+                    "yes" if row["judged"] else "no",
+                ]
+                for row in shown
+                if Scheme.of(row) == scheme
+            ],
+            [True, True, True, False, False, False, True],
+        )
+    yield "### What each attacker has and does"
+    said = dict.fromkeys((row["attack"], row["variant"], row["assumption"]) for row in shown)
+    yield "\n".join(
+        f"- **{plain(name)}{': ' + plain(variant) if variant else ''}**: {plain(text)}"
+        for name, variant, text in said
+    )
+
+
+def _measured(row: Row) -> str:
+    measured = row["measured"]
+    if "errors" in measured:
+        return interval_cell(measured)
+    return (
+        f"{fixed(measured['value'], 3)} [{fixed(measured['ci_low'], 3)}, "
+        f"{fixed(measured['ci_high'], 3)}]"
+    )
+
+
+def _cost(report: Row) -> Iterable[str]:
+    costs = report.get("cost")
+    if not costs:
+        return
+    yield "## Cost"
+    yield (
+        "Nearest-neighbour search of templates among the attacker's faces, seconds as measured "
+        "here, and the estimate for the paper's full size (76,744 faces, 10,954 templates)."
+    )
+    yield table(
+        ["scheme", "pairs searched", "seconds", "paper's size, minutes"],
+        [
+            [
+                plain(str(Scheme.of(each))),
+                count(each["pairs"]),
+                fixed(each["seconds"], 2),
+                fixed(each["full_size_seconds"] / 60, 1),
+            ]
+            for each in costs
+        ],
+        [True, False, False, False],
+    )
+
+
+def _acquired(failed: Row) -> str:
+    if "photos" in failed:
+        return f"{failed['failed']} of {failed['photos']} photos"
+    return ", ".join(f"{name} {_acquired(part)}" for name, part in failed.items())
+
+
+def _settings(report: Row) -> str:
+    lines = ["## Settings", ""]
+    if "failure_to_acquire" in report:
+        lines.append(f"- failure to acquire: {plain(_acquired(report['failure_to_acquire']))}")
+    for part in ("model", "settings"):
+        lines += [f"- {plain(name)}: {plain(value)}" for name, value in report[part].items()]
+    return "\n".join(lines)

@@ -1,0 +1,38 @@
+"""The foot point: for a unit descriptor d, cos(d, p) = ‖p‖ exactly (METHOD §4.1)."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from attacks.outcomes import Knowledge, Outcome
+from attacks.recovery import recovery_outcome
+from attacks.scene import Scene
+from templates.subspace import SubspaceBatch
+
+
+def foot_points(templates: SubspaceBatch) -> NDArray[np.float64]:
+    """Return p / ‖p‖ of every template, shape (T, n)."""
+    feet = templates.feet.astype(np.float64)
+    return np.asarray(feet / np.linalg.norm(feet, axis=1, keepdims=True))
+
+
+def foot_point_attack(scene: Scene) -> list[Outcome]:
+    """Guess p / ‖p‖, from one template and nothing else."""
+    guesses = foot_points(scene.templates)
+    cosines = np.einsum("ij,ij->i", guesses, scene.victims.enrolled.astype(np.float64))
+    norms = scene.templates.foot_norms
+    return [
+        recovery_outcome(
+            scene,
+            guesses,
+            attack="foot-point",
+            knowledge=Knowledge.TEMPLATE,
+            assumption=(
+                "The attacker has one template and nothing else, and guesses the direction of its "
+                "foot point; success is a match with a fresh photo of the victim."
+            ),
+            details={
+                "foot_norm_mean": float(norms.mean()),
+                "largest_gap_of_cosine_to_foot_norm": float(np.abs(cosines - norms).max()),
+            },
+        )
+    ]

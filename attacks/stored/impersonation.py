@@ -1,0 +1,159 @@
+"""Decoy impersonation: a decoy's owner tries to log in where they are a decoy (METHOD §4.3)."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from attacks.decisions import Scores, score
+from attacks.outcomes import POOLED, Knowledge, Outcome, Property
+from attacks.recovery import fmr_of
+from attacks.scene import Scene
+from attacks.stored.recording import decoy_count, recorded_lift
+from templates.canonical import Json
+from templates.contract import Rate
+from templates.decoys import DecoyGenerator, DecoyPool
+from templates.subspace import SubspaceBatch
+from verify.metrics import rate, subject_bootstrap
+
+Pairs = NDArray[np.int64]
+"""(P, 2): person who comes, template they come to."""
+
+
+def impersonation_attack(
+    scene: Scene, *, faces: NDArray[np.float32] | None = None
+) -> list[Outcome]:
+    """Owners of decoys against the templates that hold them.
+
+    With a pool they come with another photo of themselves, where there is one, else with the photo
+    in the pool. With a generator they are the people that a generator is fitted to here, and come
+    to every template that was lifted with it. Empty for a scheme without decoys.
+
+    Parameters
+    ----------
+    faces : (N, n)
+        One photo of each of some people: a generator is fitted to the first half of them, and the
+        others are strangers to it. The attacker's where None. A generator that is fitted to few
+        people lets them in more often; a service's is fitted to thousands.
+    """
+    if not decoy_count(scene.scheme) or scene.source is None:
+        return []
+    if scene.scheme.decoys == POOLED and isinstance(scene.source, DecoyPool):
+        return [_pooled(scene, scene.source)]
+    return [_generated(scene, scene.attacker if faces is None else faces)]
+
+
+def _pooled(scene: Scene, pool: DecoyPool) -> Outcome:
+    entries = pool.entries[0]
+    lift = recorded_lift(scene, scene.victims.enrolled, "templates that hold owners")
+    drawn = lift.decoys.reshape(-1, pool.n)
+    owners = np.argmax(drawn @ entries.T, axis=1)
+    pairs = np.stack([owners, np.arange(len(drawn)) // lift.decoys.shape[1]], axis=1)
+    photo = entries if scene.owners is None else scene.owners.fresh
+    same = "the photo of the pool" if scene.owners is None else "another photo of themselves"
+    return _outcome(
+        scene,
+        photo,
+        lift.templates,
+        pairs,
+        variant="",
+        chance=fmr_of(scene.level),
+        assumption=(
+            f"The owner of a decoy comes with {same} to a template that holds their decoy; "
+            "success is acceptance by threshold and cohort test."
+        ),
+        details={"with_the_photo_of_the_pool": _rate(scene, entries, lift.templates, pairs)},
+    )
+
+
+def _generated(scene: Scene, faces: NDArray[np.float32]) -> Outcome:
+    half = len(faces) // 2
+    fitted, strangers = faces[:half], faces[half:]
+    generator = DecoyGenerator.fit(fitted)
+    lift = recorded_lift(
+        scene, scene.victims.enrolled, "decoys of a fitted generator", source=generator
+    )
+    scores = score(strangers, lift.templates, scene.contract, scene.points)
+    accepted = scores.at(scene.level).accepted
+    control = rate(int(np.count_nonzero(accepted)), accepted.size)
+    pairs = np.argwhere(np.ones((len(fitted), len(lift.templates)), dtype=np.bool_))
+    return _outcome(
+        scene,
+        fitted,
+        lift.templates,
+        pairs,
+        variant="people of the generator",
+        chance=control.value,
+        assumption=(
+            "A generator is fitted to half of some people, who come with the very photos "
+            "of the fit to every template that was lifted with it; success is acceptance by "
+            "threshold and cohort test, and chance is how often the other half is accepted there: "
+            "the contract was calibrated with the scheme's own generator."
+        ),
+        details={"strangers": control.to_json(), "fitted_to": half},
+    )
+
+
+def _outcome(
+    scene: Scene,
+    photos: NDArray[np.float32],
+    templates: SubspaceBatch,
+    pairs: Pairs,
+    *,
+    variant: str,
+    chance: float,
+    assumption: str,
+    details: dict[str, Json],
+) -> Outcome:
+    by_level: dict[str, Json] = {}
+    scores = _scored(scene, photos, templates, pairs)
+    for level in scene.levels:
+        near, accepted = scores.at(level)
+        by_level[level.name] = {
+            "threshold_alone": _counted(near, pairs, len(photos), len(templates)).to_json(),
+            "with_cohort_test": _counted(accepted, pairs, len(photos), len(templates)).to_json(),
+        }
+    accepted = scores.at(scene.level).accepted
+    return Outcome(
+        attack="impersonation",
+        variant=variant,
+        breaks=Property.IMPERSONATION,
+        knowledge=Knowledge.ALGORITHM,
+        assumption=assumption,
+        scheme=scene.scheme,
+        level=scene.level.name,
+        measured=_counted(accepted, pairs, len(photos), len(templates)),
+        chance=chance,
+        details={"people": len(np.unique(pairs[:, 0])), "by_level": by_level, **details},
+    )
+
+
+def _rate(
+    scene: Scene, photos: NDArray[np.float32], templates: SubspaceBatch, pairs: Pairs
+) -> dict[str, Json]:
+    accepted = _scored(scene, photos, templates, pairs).at(scene.level).accepted
+    return rate(int(np.count_nonzero(accepted)), len(accepted)).to_json()
+
+
+def _scored(
+    scene: Scene, photos: NDArray[np.float32], templates: SubspaceBatch, pairs: Pairs
+) -> Scores:
+    """Scores of the pairs, (P,)."""
+    every = score(photos, templates, scene.contract, scene.points)
+    row, column = pairs.T
+    return Scores(every.similarities[row, column], every.cohort_scores[row, column])
+
+
+def _counted(accepted: NDArray[np.bool_], pairs: Pairs, owners: int, victims: int) -> Rate:
+    """Count acceptances, with an interval that resamples people: trials share them."""
+    people = pairs + np.array([0, owners])
+    met = np.zeros((owners, victims))
+    np.add.at(met, (pairs[:, 0], pairs[:, 1]), 1)
+
+    def weighted_trials(weights: NDArray[np.float64]) -> float:
+        return float(weights[:owners] @ met @ weights[owners:])
+
+    return subject_bootstrap(
+        people[accepted],
+        people=owners + victims,
+        trials=len(pairs),
+        weighted_trials=weighted_trials,
+    )

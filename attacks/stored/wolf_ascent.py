@@ -1,0 +1,203 @@
+"""Wolves by gradient ascent on the decision itself, against templates that the attacker lifts.
+
+The attacker knows the algorithm and the thresholds, and lifts faces of their own (targets) and
+descriptors of nobody (a cohort like the service's). A probe climbs the mean over the targets of
+σ(a) σ(b), where a is how far the similarity exceeds its threshold, in standard deviations of the
+cohort's similarities, and b how far the cohort score exceeds its own: a smooth form of the share
+of templates that accept.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from templates.contract import Level
+from templates.subspace import SubspaceBatch
+
+Floats = NDArray[np.float32]
+
+ROUNDS = 60
+_FIRST_STEP, _LAST_STEP = 0.3, 0.01
+"""Length of a step, in radians for a point; directions of steps are normalised."""
+_ALTERNATIONS = 12
+_ALTERNATIONS_ON = 4
+_SEARCH_EVERY = 10
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Ground:
+    """What a probe climbs on: K subspaces stacked, targets first, the rest is the cohort.
+
+    Parameters
+    ----------
+    feet : (K, n) float32
+    rows : (K m, n) float32
+        Bases.
+    radii : (K,) float32
+    targets
+        How many of the K are targets.
+    similarity_threshold, cohort_threshold
+        Of the level that the wolf is made for.
+    """
+
+    feet: Floats
+    rows: Floats
+    radii: Floats
+    targets: int
+    similarity_threshold: float
+    cohort_threshold: float
+
+    @classmethod
+    def of(cls, targets: SubspaceBatch, cohort: SubspaceBatch, level: Level) -> "Ground":
+        """Stack templates of one dimension."""
+        bases = np.concatenate([targets.bases, cohort.bases])
+        return cls(
+            feet=np.concatenate([targets.feet, cohort.feet]),
+            rows=bases.reshape(-1, targets.n),
+            radii=np.concatenate([targets.radii, cohort.radii]).astype(np.float32),
+            targets=len(targets),
+            similarity_threshold=level.similarity_threshold,
+            cohort_threshold=level.cohort_threshold,
+        )
+
+    def slopes(self, similarities: Floats) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Objective, shape (S,), and its slope by every similarity, shape (S, K).
+
+        Parameters
+        ----------
+        similarities : (S, K)
+            Of S probes to the K subspaces.
+        """
+        values = similarities.astype(np.float64)
+        mine, cohort = values[:, : self.targets], values[:, self.targets :]
+        mean = cohort.mean(axis=1, keepdims=True)
+        spread = np.maximum(cohort.std(axis=1, ddof=1, keepdims=True), 1e-6)
+        score = (mine - mean) / spread
+        near = _logistic((mine - self.similarity_threshold) / spread)
+        singular = _logistic(score - self.cohort_threshold)
+        product = near * singular / self.targets
+        # The cohort's spread is a mere unit of length in `near`, and constant there.
+        by_similarity = product * (1 - near) / spread
+        by_score = product * (1 - singular)
+        slopes = np.empty_like(values)
+        slopes[:, : self.targets] = by_similarity + by_score / spread
+        by_mean = -by_score.sum(axis=1, keepdims=True) / spread
+        by_spread = -(by_score * score).sum(axis=1, keepdims=True) / spread
+        count = cohort.shape[1]
+        slopes[:, self.targets :] = by_mean / count + by_spread * (cohort - mean) / (
+            (count - 1) * spread
+        )
+        return product.sum(axis=1), slopes
+
+
+def ascend_points(starts: Floats, ground: Ground, *, rounds: int = ROUNDS) -> Floats:
+    """Climb with raw probes: unit rows (S, n) to unit rows (S, n)."""
+    points = _unit(starts.astype(np.float32))
+    best, best_value = points, np.full(len(points), -np.inf)
+    for step in _steps(rounds):
+        inside = (points @ ground.rows.T).reshape(len(points), len(ground.feet), -1)
+        lengths = np.maximum(np.linalg.norm(inside, axis=2), 1e-6)
+        similarities = points @ ground.feet.T + ground.radii * lengths
+        value, slopes = ground.slopes(similarities)
+        best = np.where((value > best_value)[:, None], points, best)
+        best_value = np.maximum(value, best_value)
+        weights = slopes.astype(np.float32)
+        inside *= (weights * ground.radii / lengths)[:, :, None]
+        gradient = weights @ ground.feet + inside.reshape(len(points), -1) @ ground.rows
+        gradient -= np.einsum("si,si->s", gradient, points)[:, None] * points
+        points = _unit(points + step * _unit(gradient))
+    return np.ascontiguousarray(best, dtype=np.float32)
+
+
+def ascend_subspaces(
+    starts: SubspaceBatch, ground: Ground, *, rounds: int = ROUNDS
+) -> SubspaceBatch:
+    """Climb with lifted probes, whose foot points keep their norm."""
+    ends = [
+        _ascend(starts.feet[row], starts.bases[row], ground, rounds) for row in range(len(starts))
+    ]
+    return SubspaceBatch(np.stack([foot for foot, _ in ends]), np.stack([e for _, e in ends]))
+
+
+def _ascend(foot: Floats, basis: Floats, ground: Ground, rounds: int) -> tuple[Floats, Floats]:
+    norm = float(np.linalg.norm(foot))
+    radius = np.float32(np.sqrt(max(0.0, 1 - norm**2)))
+    best_foot, best_basis, best_value = foot, basis, -np.inf
+    v: Floats | None = None
+    for number, step in enumerate(_steps(rounds)):
+        # The best v moves little in a step: it is searched for anew now and then only.
+        again = None if number % _SEARCH_EVERY == 0 else v
+        similarities, v, nearest = _closest(foot, basis, radius, ground, again)
+        values, slopes = ground.slopes(similarities[None])
+        if values[0] > best_value:
+            best_foot, best_basis, best_value = foot, basis, float(values[0])
+        weighted = slopes[0].astype(np.float32)[:, None] * nearest
+        by_foot, by_basis = weighted.sum(axis=0), radius * (v.T @ weighted)
+        pace = step * len(basis) ** 0.5 / max(float(np.linalg.norm(by_basis)), 1e-12)
+        moved = np.linalg.qr((basis + np.float32(pace) * by_basis).T)[0].T
+        basis = moved.astype(np.float32)
+        if norm:
+            pace = step * norm / max(float(np.linalg.norm(by_foot)), 1e-12)
+            foot = foot + np.float32(pace) * by_foot
+        across = foot - (basis @ foot) @ basis
+        length = max(float(np.linalg.norm(across)), 1e-12)
+        foot = np.asarray(across * (norm / length), dtype=np.float32)
+    return best_foot, np.ascontiguousarray(best_basis)
+
+
+def _closest(
+    foot: Floats, basis: Floats, radius: np.float32, ground: Ground, known: Floats | None
+) -> tuple[Floats, Floats, Floats]:
+    """Similarities (K,), the best v (K, m_E) and the nearest points (K, n) of the subspaces.
+
+    Found as METHOD §3 says, from both signs of the leading singular vector; or, where a v is
+    known, from there.
+    """
+    count = len(ground.feet)
+    g = ground.radii[:, None] * (ground.rows @ foot).reshape(count, -1)
+    h = radius * (ground.feet @ basis.T)
+    b = ground.radii[:, None, None] * radius * (ground.rows @ basis.T).reshape(*g.shape, -1)
+    transposed = np.ascontiguousarray(b.transpose(0, 2, 1))
+    if known is None:
+        leading = _leading(transposed @ b)
+        starts, alternations = [leading, -leading], _ALTERNATIONS
+    else:
+        starts, alternations = [known], _ALTERNATIONS_ON
+    best_value = np.full(count, -np.inf, dtype=np.float32)
+    best_u, best_v = np.zeros_like(g), np.zeros_like(h)
+    for v in starts:
+        for _ in range(alternations):
+            u = _unit(g + (v[:, None, :] @ transposed)[:, 0, :])
+            v = _unit(h + (u[:, None, :] @ b)[:, 0, :])
+        value = np.einsum("ki,ki->k", u, g + (v[:, None, :] @ transposed)[:, 0, :])
+        value += np.einsum("ki,ki->k", v, h)
+        better = value > best_value
+        best_value = np.where(better, value, best_value)
+        best_u[better], best_v[better] = u[better], v[better]
+    inside = (ground.radii[:, None] * best_u)[:, None, :]
+    nearest = ground.feet + (inside @ ground.rows.reshape(count, -1, len(foot)))[:, 0, :]
+    return ground.feet @ foot + best_value, best_v, nearest
+
+
+def _leading(square: Floats) -> Floats:
+    """Leading eigenvectors of positive matrices (K, m, m): a column of a power, normalised."""
+    power = square
+    for _ in range(3):
+        power = power / np.maximum(np.einsum("kii->k", power), 1e-12)[:, None, None]
+        power = power @ power
+    largest = np.argmax(np.einsum("kii->ki", power), axis=1)
+    return _unit(power[np.arange(len(power)), :, largest])
+
+
+def _steps(rounds: int) -> list[float]:
+    return [float(step) for step in np.geomspace(_FIRST_STEP, _LAST_STEP, rounds)]
+
+
+def _logistic(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(1 / (1 + np.exp(-np.clip(x, -60, 60))))
+
+
+def _unit(rows: NDArray[np.floating]) -> Floats:
+    lengths = np.linalg.norm(rows, axis=-1, keepdims=True)
+    return np.asarray(rows / np.maximum(lengths, 1e-12), dtype=np.float32)

@@ -1,0 +1,287 @@
+"""The verdict: what an attacker achieves at best, by property and knowledge, against limits.
+
+Every cell of the table holds the strongest attack that was made: the one that exceeds chance most.
+A cell fails where its measure exceeds the limit that the operator set, and is *unresolved* where
+only the upper bound of its interval does: the sample is too small to show that the limit holds.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+from attacks.outcomes import Knowledge, Outcome, Property, Scheme
+from templates.canonical import Json
+
+
+class Status(StrEnum):
+    """How a cell stands against its limit; ``unresolved`` does not fail an audit, and is said."""
+
+    PASS = "pass"  # noqa: S105 - a word of the report
+    FAIL = "fail"
+    UNRESOLVED = "unresolved"
+    UNLIMITED = "no limit"
+
+
+_GRAVITY = (Status.UNLIMITED, Status.PASS, Status.UNRESOLVED, Status.FAIL)
+
+
+@dataclass(frozen=True)
+class Limit:
+    """What an operator accepts.
+
+    Parameters
+    ----------
+    name
+        Of the option, ``--max-<name>``, and of the field in the report.
+    default
+        The most that passes; 1 limits nothing.
+    meaning
+        What is limited, for ``--help`` and the report.
+    """
+
+    name: str
+    default: float
+    meaning: str
+
+
+FOOT_POINT = "foot-point-success"
+CLIMBING = "climbing-success"
+LIMITS: tuple[Limit, ...] = (
+    Limit(
+        FOOT_POINT,
+        0.1,
+        "share of templates whose foot point matches a fresh photo of the victim",
+    ),
+    Limit(
+        "recovery-success",
+        0.1,
+        "share of templates from which any other attack recovers a match for a fresh photo",
+    ),
+    Limit(
+        "linkability",
+        0.1,
+        "D_sys between two tenants, less the mean of its permutation null",
+    ),
+    Limit(
+        "renewed-success",
+        0.05,
+        "share of renewed templates that what was stolen before opens",
+    ),
+    Limit(
+        "attribute-leakage",
+        0.1,
+        "distance of the strongest attacker's accuracy from chance, in either direction",
+    ),
+    Limit(
+        "false-acceptance",
+        0.02,
+        "share of templates that accept a probe made without the victim, checks included",
+    ),
+    Limit(
+        CLIMBING,
+        0.1,
+        "share of templates opened by trying faces within a lockout's 5 or 50 attempts",
+    ),
+    Limit(
+        "success-with-key",
+        1.0,
+        "any of these for an attacker who also has the tenant's key, or a right to scores",
+    ),
+    Limit(
+        "success-with-templates",
+        0.1,
+        "recovery or acceptance for an attacker with several templates, or whole databases",
+    ),
+)
+_BY_PROPERTY = {
+    Property.IRREVERSIBILITY: "recovery-success",
+    Property.UNLINKABILITY: "linkability",
+    Property.RENEWABILITY: "renewed-success",
+    Property.CONFIDENTIALITY: "attribute-leakage",
+    Property.IMPERSONATION: "false-acceptance",
+}
+_OF_ONE_TEMPLATE = (Property.IRREVERSIBILITY, Property.IMPERSONATION)
+"""Properties that a single template should have: with several, another limit counts."""
+_BY_ATTACK = {"foot-point": FOOT_POINT, "hill-climbing": CLIMBING}
+"""Attacks with a limit of their own, and so a cell of their own."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """The strongest attack on one property with one knowledge, and how it stands.
+
+    Parameters
+    ----------
+    outcome
+        The attack.
+    limit
+        Name of the limit.
+    most
+        Its value.
+    excess, low, high
+        What is compared with the limit, and its interval.
+    """
+
+    outcome: Outcome
+    limit: str
+    most: float
+    excess: float
+    low: float
+    high: float
+
+    @property
+    def status(self) -> Status:
+        """Pass, fail, unresolved, or no limit."""
+        if self.most >= 1:
+            return Status.UNLIMITED
+        if self.excess > self.most:
+            return Status.FAIL
+        return Status.UNRESOLVED if self.high > self.most else Status.PASS
+
+    @property
+    def rank(self) -> tuple[int, float]:
+        """What the strongest attack is chosen by: a doubt counts more than a small success."""
+        return _GRAVITY.index(self.status), self.excess
+
+    def to_json(self) -> dict[str, Json]:
+        """Return a cell of ``verdict`` of the report."""
+        return {
+            "property": str(self.outcome.breaks),
+            "knowledge": str(self.outcome.knowledge),
+            "attack": self.outcome.attack,
+            "variant": self.outcome.variant,
+            "value": self.outcome.measured.value,
+            "ci_low": self.outcome.measured.ci_low,
+            "ci_high": self.outcome.measured.ci_high,
+            "chance": self.outcome.chance,
+            "compared": self.excess,
+            "compared_low": self.low,
+            "compared_high": self.high,
+            "limit": self.limit,
+            "most": self.most,
+            "status": str(self.status),
+        }
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The cells of one scheme, in the order of properties and knowledge."""
+
+    scheme: Scheme
+    cells: tuple[Cell, ...]
+
+    @property
+    def failed(self) -> tuple[Cell, ...]:
+        """The cells that exceed their limit."""
+        return tuple(cell for cell in self.cells if cell.status is Status.FAIL)
+
+    @property
+    def passed(self) -> bool:
+        """Whether something was judged, and no cell exceeds its limit."""
+        return bool(self.cells) and not self.failed
+
+    def to_json(self) -> dict[str, Json]:
+        """Return an entry of ``verdicts`` of the report."""
+        return {
+            **self.scheme.to_json(),
+            "passed": self.passed,
+            "cells": [cell.to_json() for cell in self.cells],
+        }
+
+
+def judge(
+    outcomes: Iterable[Outcome], *, limits: Mapping[str, float] | None = None
+) -> list[Verdict]:
+    """Judge every scheme by the strongest attack on each property with each knowledge.
+
+    Parameters
+    ----------
+    outcomes
+        Of any number of schemes; those that are not ``judged`` are passed over.
+    limits
+        By name; the defaults of :data:`LIMITS` where absent.
+
+    Returns
+    -------
+    list of Verdict
+        One a scheme, in the order of their first outcome.
+    """
+    most = {limit.name: limit.default for limit in LIMITS} | dict(limits or {})
+    found: dict[Scheme, dict[tuple[Property, Knowledge, str], Cell]] = {}
+    for outcome in outcomes:
+        if not outcome.judged:
+            continue
+        cell = cell_of(outcome, most)
+        cells = found.setdefault(outcome.scheme, {})
+        key = (outcome.breaks, outcome.knowledge, cell.limit)
+        if key not in cells or cell.rank > cells[key].rank:
+            cells[key] = cell
+    properties, knowledge = list(Property), list(Knowledge)
+    return [
+        Verdict(
+            scheme,
+            tuple(
+                cells[key]
+                for key in sorted(
+                    cells,
+                    key=lambda key: (properties.index(key[0]), knowledge.index(key[1]), key[2]),
+                )
+            ),
+        )
+        for scheme, cells in found.items()
+    ]
+
+
+def cell_of(outcome: Outcome, most: Mapping[str, float]) -> Cell:
+    """Compare one outcome with its limit."""
+    name = _BY_ATTACK.get(outcome.attack, _BY_PROPERTY[outcome.breaks])
+    if outcome.knowledge is Knowledge.KEY:
+        name = "success-with-key"
+    elif outcome.knowledge is Knowledge.TEMPLATES and outcome.breaks in _OF_ONE_TEMPLATE:
+        name = "success-with-templates"
+    measured = outcome.measured
+    value, low, high = measured.value, measured.ci_low, measured.ci_high
+    if outcome.breaks is Property.CONFIDENTIALITY:
+        value, low, high = _distance(outcome.chance, value, low, high)
+    elif outcome.breaks is Property.UNLINKABILITY:
+        # D_sys below its null is chance, and tells nothing.
+        value, low, high = (max(0.0, each - outcome.chance) for each in (value, low, high))
+    return Cell(outcome, name, most[name], value, low, high)
+
+
+def _distance(chance: float, value: float, low: float, high: float) -> tuple[float, float, float]:
+    """Distance from chance, in either direction, and its interval."""
+    far = max(abs(low - chance), abs(high - chance))
+    near = 0.0 if low <= chance <= high else min(abs(low - chance), abs(high - chance))
+    return abs(value - chance), near, far
+
+
+def headlines(verdicts: Sequence[Verdict]) -> list[str]:
+    """Say first what fails, then what succeeds without a limit, then what is not resolved."""
+    lines: list[str] = []
+    for verdict in verdicts:
+        for status in (Status.FAIL, Status.UNLIMITED, Status.UNRESOLVED):
+            chosen = [cell for cell in verdict.cells if cell.status is status]
+            if status is Status.UNLIMITED:
+                chosen = [cell for cell in chosen if cell.excess > 0.1]
+            lines += [f"{verdict.scheme}: {_sentence(cell)}" for cell in chosen]
+        if all(cell.status in (Status.PASS, Status.UNLIMITED) for cell in verdict.cells):
+            lines.append(f"{verdict.scheme}: no attack that was made exceeds its limit.")
+    return lines
+
+
+_SAID = {
+    Status.FAIL: "fails",
+    Status.UNLIMITED: "is broken, and no limit is set on it",
+    Status.UNRESOLVED: "is not shown to hold: the sample is too small",
+}
+
+
+def _sentence(cell: Cell) -> str:
+    outcome = cell.outcome
+    name = outcome.attack + (f" ({outcome.variant})" if outcome.variant else "")
+    bound = "" if cell.status is Status.UNLIMITED else f", limit {cell.most:.3g}"
+    return (
+        f"{outcome.breaks} {_SAID[cell.status]}: {name}, attacker with {outcome.knowledge}: "
+        f"{cell.excess:.3g} [{cell.low:.3g}, {cell.high:.3g}]{bound}."
+    )

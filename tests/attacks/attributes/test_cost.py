@@ -1,0 +1,47 @@
+"""The estimate is the measured slice, scaled to all that one scheme searches."""
+
+import pytest
+
+from attacks.attributes.cost import SearchCost, full_pairs, measure_cost
+from attacks.attributes.experiment import run_scheme
+from attacks.attributes.faces import Split
+from attacks.attributes.plan import AttributePlan, prepare
+from attacks.errors import AuditError
+from attacks.outcomes import Scheme
+from tests.attacks.attributes.people import faces
+
+
+def test_the_estimate_scales_with_the_pairs() -> None:
+    cost = SearchCost(n=512, m=16, k=50, threads=2, pairs=2_000_000, seconds=1.0)
+    assert cost.per_million == 0.5
+    assert cost.estimate(3_000_000) == pytest.approx(1.5)
+    # Victims among all faces; 10,000 own templates among 10,000 faces.
+    assert cost.estimate() == pytest.approx(0.5 * (76_744 * 10_954 + 10_000 * 10_000) / 1e6)
+
+
+@pytest.mark.parametrize("most", [60, 10_000])
+def test_the_pairs_are_those_that_one_scheme_searches(most: int) -> None:
+    plan = AttributePlan(
+        attackers=(), feature_ks=(10,), gallery_most=most, training_most=100, lifts=2
+    )
+    bench = prepare(
+        Split(faces(20, seed=1), faces(120, seed=2), faces(30, seed=3)), plan=plan, seed=1
+    )
+    done: list[int] = []
+    run_scheme(bench, Scheme("random", None, 4), progress=done.append)
+    assert sum(done) == (4 + 1) * full_pairs(plan, faces=120, templates=30)
+
+
+def test_a_slice_is_timed() -> None:
+    plan = AttributePlan(threads=3)
+    cost = measure_cost(n=32, m=2, faces=200, templates=20, repeats=1, plan=plan)
+    assert (cost.pairs, cost.k, cost.threads) == (4000, 50, 3)
+    assert cost.seconds > 0
+    document = cost.to_json()
+    assert document["full_size_seconds"] == cost.estimate()
+    assert document["full_size_pairs"] == full_pairs()
+
+
+def test_nothing_cannot_be_timed() -> None:
+    with pytest.raises(AuditError, match="50 or more faces"):
+        measure_cost(faces=5)

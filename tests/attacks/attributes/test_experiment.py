@@ -1,0 +1,248 @@
+"""Every attacker has a template on which it succeeds, and noise on which it does not."""
+
+import functools
+
+import numpy as np
+import pytest
+
+from attacks.attributes import seen
+from attacks.attributes.experiment import run_scheme, work_of
+from attacks.attributes.faces import Split
+from attacks.attributes.measures import Leakage
+from attacks.attributes.plan import AttributePlan, Bench, prepare, schemes_of
+from attacks.attributes.rows import AttributeRow, strongest
+from attacks.errors import AuditError
+from attacks.outcomes import GENERATED, POOLED, RAW_SCHEME, Knowledge, Scheme
+from templates.decoys import DecoyGenerator
+from tests.attacks.attributes.people import faces
+from verify.evaluation.figures.frontier import FIELDS
+
+PLAN = AttributePlan(feature_ks=(10,))
+Found = dict[tuple[str, str], AttributeRow]
+
+
+@functools.cache
+def bench(strength: float = 0.28) -> Bench:
+    lifting, attack, attacked = (
+        faces(count, seed=seed, strength=strength) for count, seed in ((240, 1), (500, 2), (400, 3))
+    )
+    return prepare(Split(lifting, attack, attacked), plan=PLAN, seed=5)
+
+
+@functools.cache
+def attacked(scheme: Scheme, strength: float = 0.28) -> tuple[AttributeRow, ...]:
+    return tuple(run_scheme(bench(strength), scheme))
+
+
+def by_attacker(scheme: Scheme, strength: float = 0.28) -> Found:
+    return {(row.attacker, row.attribute): row for row in attacked(scheme, strength)}
+
+
+ADVERSARIAL = Scheme("adversarial", POOLED, 4)
+PLUS = Scheme("hybrid+", POOLED, 4)
+OURS = Scheme("adversarial", GENERATED, 4)
+RANDOM = Scheme("random", None, 4)
+
+
+@pytest.mark.parametrize(("attacker", "least"), [("knn", 0.75), ("logistic", 0.85), ("svm", 0.85)])
+def test_raw_descriptors_and_random_lifting_conceal_nothing(attacker: str, least: float) -> None:
+    for scheme in (RAW_SCHEME, RANDOM):
+        row = by_attacker(scheme)[attacker, "gender"]
+        assert row.measures.leakage is Leakage.ABOVE
+        assert row.accuracy > least
+
+
+@pytest.mark.parametrize("scheme", [RAW_SCHEME, ADVERSARIAL, PLUS, OURS], ids=str)
+def test_noise_is_at_chance(scheme: Scheme) -> None:
+    for row in attacked(scheme, 0.0):
+        if row.attacker == "rule":
+            # hybrid+ chooses decoys by the label, so that it tells even a label of noise.
+            continue
+        share = row.measures.baselines.same_predictions
+        assert abs(row.accuracy - share) < 4 * np.sqrt(share * (1 - share) / 400), row.attacker
+        # At home the attacker does no better: no own face, or decoy of it, is in what judges it.
+        tried = 500 if row.attacker == "knn" else 100
+        assert row.held_out < 4 * np.sqrt(share * (1 - share) / tried), row.attacker
+
+
+def test_trained_attackers_beat_the_papers_on_adversarial_lifting() -> None:
+    for scheme in (ADVERSARIAL, OURS):
+        found = by_attacker(scheme)
+        for name in ("logistic", "svm"):
+            assert found[name, "gender"].accuracy > found["knn", "gender"].accuracy
+            assert found[name, "gender"].measures.leakage is Leakage.ABOVE
+
+
+def test_who_holds_the_pool_sees_through_adversarial_lifting() -> None:
+    found, raw = by_attacker(ADVERSARIAL), by_attacker(RAW_SCHEME)
+    for attribute in ("gender", "race"):
+        assert found["strip", attribute].accuracy > raw["svm", attribute].accuracy - 0.05
+        assert found["strip", attribute].accuracy > found["svm", attribute].accuracy + 0.1
+    assert found["strip", "gender"].knowledge is Knowledge.DECOYS
+
+
+def test_the_rule_of_hybrid_plus_gives_it_away() -> None:
+    found = by_attacker(PLUS)
+    assert found["rule", "gender"].accuracy == 1.0
+    assert found["rule", "race"].accuracy >= found["strip", "race"].accuracy
+    for attribute in ("gender", "race"):
+        assert found["rule", attribute].accuracy > found["knn", attribute].accuracy + 0.2
+
+
+def test_without_the_pool_the_rule_is_learnt_from_votes_below_chance() -> None:
+    found = by_attacker(PLUS)
+    assert found["knn", "gender"].measures.leakage is Leakage.BELOW
+    for name in ("logistic", "svm"):
+        assert found[name, "gender"].measures.leakage is Leakage.ABOVE
+        assert found[name, "gender"].accuracy > 1 - found["knn", "gender"].accuracy - 0.05
+
+
+def test_the_rule_alone_tells_a_label_of_noise() -> None:
+    found = by_attacker(PLUS, 0.0)
+    assert found["rule", "gender"].accuracy == 1.0
+
+
+def test_decoys_that_are_spread_unlike_faces_point_at_the_descriptor() -> None:
+    # Decoys as of a generator that was fitted to people of another part, flat along half the axes.
+    other = faces(1000, seed=7, strength=0.0).descriptors
+    other[:, ::2] *= 0.3
+    other /= np.linalg.norm(other, axis=1, keepdims=True)
+    parts = bench().split
+    flat = prepare(parts, plan=PLAN, seed=5, generator=DecoyGenerator.fit(other))
+    for scheme, more in ((OURS, 0.0), (Scheme("adversarial", GENERATED, 12), 0.05)):
+        found = {(row.attacker, row.attribute): row for row in run_scheme(flat, scheme)}
+        for attribute in ("gender", "race"):
+            likely, machine = (found[name, attribute] for name in ("likelihood", "svm"))
+            assert likely.accuracy > machine.accuracy + more
+            assert likely.measures.leakage is Leakage.ABOVE
+            assert likely.knowledge is Knowledge.ALGORITHM
+
+
+def test_only_pools_have_attackers_who_hold_them() -> None:
+    for scheme, wanted in ((OURS, False), (RANDOM, False), (ADVERSARIAL, True)):
+        assert any(row.knowledge is Knowledge.DECOYS for row in attacked(scheme)) is wanted
+    assert not any(row.attacker == "rule" for row in attacked(ADVERSARIAL))
+
+
+def test_tiles_change_nothing_but_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = AttributePlan(attackers=(), feature_ks=(10,))
+    small = Split(faces(60, seed=1), faces(80, seed=2), faces(30, seed=3))
+    some = prepare(small, plan=plan, seed=1)
+    whole = run_scheme(some, RAW_SCHEME)
+    monkeypatch.setattr(seen, "_TILE_ROWS", 7)
+    assert [row.measures for row in run_scheme(some, RAW_SCHEME)] == [r.measures for r in whole]
+
+
+def test_cores_change_nothing_but_the_time() -> None:
+    runs = []
+    for threads in (1, 3):
+        plan = AttributePlan(feature_ks=(10,), threads=threads)
+        rows = run_scheme(prepare(SMALL, plan=plan, seed=1), OURS)
+        runs.append([(row.measures, row.held_out) for row in rows])
+    assert runs[0] == runs[1]
+
+
+def test_a_seed_gives_the_same_figures() -> None:
+    parts = Split(faces(60, seed=1), faces(80, seed=2), faces(30, seed=3))
+    plan = AttributePlan(attackers=("logistic", "svm"), feature_ks=(10,), lifts=2)
+    runs = []
+    for seed in (4, 4, 5):
+        rows = run_scheme(prepare(parts, plan=plan, seed=seed), PLUS)
+        runs.append([(row.attacker, row.measures.confusion, row.held_out) for row in rows])
+    assert runs[0] == runs[1] != runs[2]
+
+
+KINDS = [RAW_SCHEME, RANDOM, ADVERSARIAL, OURS, Scheme("hybrid", POOLED, 4), PLUS]
+SMALL = Split(faces(110, seed=1), faces(120, seed=2), faces(30, seed=3))
+
+
+@pytest.mark.parametrize("scheme", KINDS, ids=str)
+@pytest.mark.parametrize("gallery_most", [40, 10_000])
+def test_progress_comes_to_the_work_that_was_announced(scheme: Scheme, gallery_most: int) -> None:
+    plan = AttributePlan(feature_ks=(10,), lifts=2, gallery_most=gallery_most)
+    some = prepare(SMALL, plan=plan, seed=1)
+    done: list[int] = []
+    run_scheme(some, scheme, progress=done.append)
+    assert sum(done) == work_of(some, scheme)
+
+
+def test_no_part_of_the_attackers_faces_meets_itself() -> None:
+    some = prepare(SMALL, plan=AttributePlan(feature_ks=(10,), training_most=70), seed=6)
+    lifted: set[bytes] = set()
+    for fold in some.folds:
+        own, gallery, pool = (
+            {row.tobytes() for row in part.descriptors}
+            for part in (fold.own, fold.side.gallery, fold.side.entries)
+        )
+        assert own <= pool
+        assert not own & gallery
+        assert not pool & gallery
+        assert len(pool | gallery) == len(SMALL.attack)
+        np.testing.assert_array_equal(
+            fold.side.entries.descriptors[fold.entries], fold.own.descriptors
+        )
+        assert not own & lifted
+        lifted |= own
+    assert len(lifted) == 70
+    for part in (some.side.entries, some.side.gallery):
+        assert not {r.tobytes() for r in part.descriptors} & {
+            r.tobytes() for r in SMALL.attacked.descriptors
+        }
+
+
+def test_own_faces_are_lifted_as_often_as_training_allows() -> None:
+    plan = AttributePlan(training_most=1000)
+    assert [plan.lifts_of(faces) for faces in (100, 400, 501, 4000)] == [3, 2, 1, 1]
+    assert AttributePlan(training_most=1000, lifts=5).lifts_of(4000) == 5
+
+
+def test_a_part_of_the_gallery_teaches_and_all_of_it_votes() -> None:
+    whole, part = (
+        prepare(SMALL, plan=AttributePlan(feature_ks=(10,), gallery_most=most), seed=1)
+        for most in (10_000, 40)
+    )
+    for scheme in (RAW_SCHEME, OURS):
+        one, other = (
+            [row for row in run_scheme(some, scheme) if row.attacker == "knn"]
+            for some in (whole, part)
+        )
+        assert [row.measures for row in one] == [row.measures for row in other]
+        assert [row.held_out for row in one] != [row.held_out for row in other]
+
+
+def test_rows_have_what_the_frontier_reads_and_the_best_is_chosen_before_the_victims() -> None:
+    rows = attacked(PLUS)
+    for row in rows:
+        document = row.to_json()
+        for name, kind in FIELDS.items():
+            assert isinstance(document[name], kind), name
+        assert np.sum(document["confusion"]) == document["trials"] == 400
+    chosen = strongest(rows)
+    assert set(chosen) == {
+        (PLUS, attribute, known)
+        for attribute in ("gender", "race")
+        for known in (Knowledge.ALGORITHM, Knowledge.DECOYS)
+    }
+    for (_, attribute, known), best in chosen.items():
+        among = [r for r in rows if r.attribute == attribute and r.knowledge == known]
+        assert best.held_out == max(row.held_out for row in among)
+    assert chosen[PLUS, "gender", Knowledge.DECOYS].attacker == "rule"
+
+
+def test_the_default_grid_is_the_papers_and_ours() -> None:
+    schemes = schemes_of()
+    assert len(schemes) == len(set(schemes)) == 1 + 4 * 4 + 6
+    assert [s.dim for s in schemes if s.decoys == GENERATED] == [2, 4, 8, 16, 32, 64]
+
+
+def test_what_cannot_be_run_is_refused() -> None:
+    with pytest.raises(AuditError, match="no attacker is called oracle"):
+        AttributePlan(attackers=("oracle",))
+    small = Split(faces(60, seed=1), faces(40, seed=2), faces(30, seed=3))
+    with pytest.raises(AuditError, match="neighbours are asked for"):
+        prepare(small, plan=AttributePlan(), seed=0)
+    few = prepare(small, plan=AttributePlan(attackers=(), feature_ks=(10,)), seed=0)
+    with pytest.raises(AuditError, match="need a decoy generator"):
+        run_scheme(few, OURS)
+    with pytest.raises(AuditError, match="50 neighbours need a gallery"):
+        AttributePlan(gallery_most=40)

@@ -1,0 +1,130 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from attacks.attribute_outcomes import ATTACK, attribute_outcomes
+from attacks.attributes.measures import Leakage, measure
+from attacks.attributes.rows import AttributeRow
+from attacks.outcomes import RAW_SCHEME, Knowledge, Outcome, Property, Scheme
+from attacks.verdict import judge
+from verify.metrics import wilson
+
+SERVICE = Scheme("adversarial", "generator", 32)
+POOL = Scheme("adversarial", "pool", 32)
+FACES = 200
+
+
+def row(
+    scheme: Scheme,
+    attacker: str,
+    right: int,
+    *,
+    held_out: float,
+    knowledge: Knowledge = Knowledge.ALGORITHM,
+    attribute: str = "gender",
+) -> AttributeRow:
+    """``right`` of 200 faces, half of each class, are told; the others are mistaken."""
+    truth = np.arange(FACES) % 2
+    predicted = np.where(np.arange(FACES) < right, truth, 1 - truth)
+    return AttributeRow(
+        scheme=scheme,
+        attribute=attribute,
+        attacker=attacker,
+        metric=None,
+        knowledge=knowledge,
+        classes=("Male", "Female"),
+        measures=measure(predicted, truth, training=truth, classes=2, seed=0, permutations=20),
+        held_out=held_out,
+        seed=0,
+        seconds=0.0,
+    )
+
+
+def only(rows: list[AttributeRow]) -> Outcome:
+    (outcome,) = attribute_outcomes(rows, audited=SERVICE)
+    return outcome
+
+
+def test_the_attacker_who_was_strongest_at_home_is_quoted_and_not_the_luckiest() -> None:
+    outcome = only(
+        [
+            row(SERVICE, "knn", 110, held_out=0.02),
+            row(SERVICE, "svm", 120, held_out=0.2),
+            row(SERVICE, "logistic", 150, held_out=0.1),
+        ]
+    )
+    assert (outcome.attack, outcome.variant) == (ATTACK, "gender by svm")
+    assert (outcome.measured.value, outcome.chance) == (0.6, 0.5)
+    assert (outcome.measured.ci_low, outcome.measured.ci_high) == wilson(120, FACES)
+    assert outcome.measured.trials == FACES
+    assert outcome.breaks is Property.CONFIDENTIALITY
+    assert outcome.level is None
+    assert outcome.details["leakage"] == str(Leakage.ABOVE)
+    assert "success is the right gender" in outcome.assumption
+
+
+def test_who_holds_the_pool_is_quoted_apart_and_says_so() -> None:
+    outcomes = attribute_outcomes(
+        [
+            row(POOL, "knn", 100, held_out=0.0),
+            row(POOL, "strip", 180, held_out=0.4, knowledge=Knowledge.DECOYS),
+        ],
+        audited=SERVICE,
+    )
+    by_knowledge = {outcome.knowledge: outcome for outcome in outcomes}
+    assert by_knowledge[Knowledge.ALGORITHM].measured.value == 0.5
+    assert by_knowledge[Knowledge.DECOYS].measured.value == 0.9
+    assert "the pool that the decoys were drawn from" in by_knowledge[Knowledge.DECOYS].assumption
+    assert "pool" not in by_knowledge[Knowledge.ALGORITHM].assumption
+
+
+def test_only_the_audited_scheme_is_judged() -> None:
+    outcomes = attribute_outcomes(
+        [
+            row(scheme, "knn", 190, held_out=0.4, attribute=attribute)
+            for scheme in (RAW_SCHEME, POOL, SERVICE)
+            for attribute in ("gender", "race")
+        ],
+        audited=SERVICE,
+    )
+    assert len(outcomes) == 6
+    assert {outcome.scheme for outcome in outcomes if outcome.judged} == {SERVICE}
+    (verdict,) = judge(outcomes)
+    assert verdict.scheme == SERVICE
+    assert not verdict.passed
+
+
+@pytest.mark.parametrize(("right", "passed"), [(40, False), (100, True), (160, False)])
+def test_leakage_on_either_side_of_chance_fails(right: int, passed: bool) -> None:
+    (verdict,) = judge([only([row(SERVICE, "knn", right, held_out=0.3)])])
+    assert verdict.passed is passed
+
+
+# Shares of the nine classes of age in FairFace's validation part, in thousandths.
+AGES = np.array([18, 124, 108, 301, 213, 124, 73, 29, 10]) / 1000
+
+
+@pytest.mark.parametrize("deal", [AGES, np.sqrt(AGES) / np.sqrt(AGES).sum(), np.full(9, 1 / 9)])
+def test_predictions_that_know_nothing_are_no_leakage(deal: np.ndarray) -> None:
+    chance = np.random.default_rng(11)
+    truth = chance.choice(9, p=AGES, size=1500)
+    guesses = chance.choice(9, p=deal, size=1500)
+    found = measure(guesses, truth, training=truth, classes=9, seed=0)
+    blind = replace(row(SERVICE, "svm", 100, held_out=0.1, attribute="age"), measures=found)
+    outcome = only([blind])
+    # The majority of 0.30 is far above what such predictions find.
+    assert found.advantage < -0.08
+    assert abs(outcome.measured.value - outcome.chance) < 0.03
+    assert found.strength < 0.03
+    assert outcome.details["leakage"] == "none"
+    (verdict,) = judge([outcome])
+    assert verdict.passed
+    document = blind.to_json()
+    p, q = np.bincount(truth) / 1500, np.bincount(guesses, minlength=9) / 1500
+    assert document["chance_of_predictions"] == pytest.approx(p @ q) == outcome.chance
+    assert document["chance"] == p.max()
+
+
+def test_no_rows_are_no_outcomes() -> None:
+    assert attribute_outcomes([], audited=SERVICE) == []

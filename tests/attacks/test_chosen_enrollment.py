@@ -1,0 +1,98 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from attacks.chosen_enrollment import (
+    Sides,
+    best_known_points,
+    chosen_enrollment,
+    estimate_from_sets,
+    polar_factor,
+)
+from attacks.errors import AuditError
+from attacks.outcomes import Knowledge, Property
+from attacks.scene import Scene
+from templates.randomness import Keystream
+from templates.subspace import SubspaceBatch
+from tests.verify.synthetic import N, random_rotation, unit
+
+
+def in_another_basis(batch: SubspaceBatch) -> SubspaceBatch:
+    with Keystream.seeded("another basis") as stream:
+        return SubspaceBatch.through(batch.feet, batch.bases, stream=stream)
+
+
+def alignment(estimate: np.ndarray, rotation: np.ndarray) -> float:
+    return float(np.trace(estimate.T @ rotation) / len(rotation))
+
+
+def test_enough_accounts_fix_the_rotation(scene: Scene) -> None:
+    rotation = random_rotation()
+    sent = scene.lift(scene.attacker[:20], "test of chosen enrollment")
+    stolen = in_another_basis(sent).rotated(rotation)
+    assert np.abs(stolen.bases - sent.rotated(rotation).bases).max() > 0.1  # no row is its image
+    estimate = estimate_from_sets(Sides(sent, stolen))
+    np.testing.assert_allclose(estimate @ estimate.T, np.eye(N), atol=1e-9)
+    assert alignment(estimate, rotation) > 0.999
+
+
+def test_the_pairs_alone_fix_it_too(scene: Scene) -> None:
+    """Without the refinement: foot points, and projections of those of others."""
+    rotation = random_rotation(seed=6)
+    sent = scene.lift(scene.attacker[:20], "test of chosen enrollment")
+    stolen = in_another_basis(sent).rotated(rotation)
+    assert alignment(estimate_from_sets(Sides(sent, stolen), steps=0), rotation) > 0.999
+
+
+def test_the_polar_factor_is_found_where_lapack_gives_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    moment = np.random.default_rng(0).normal(size=(20, 20))
+
+    def give_up(_moment: np.ndarray) -> None:
+        raise np.linalg.LinAlgError("SVD did not converge")
+
+    usual = polar_factor(moment)
+    values, vectors = np.linalg.eigh(moment.T @ moment)
+    np.testing.assert_allclose(usual, moment @ (vectors / np.sqrt(values)) @ vectors.T, atol=1e-8)
+    monkeypatch.setattr(np.linalg, "svd", give_up)
+    np.testing.assert_allclose(polar_factor(moment), usual, atol=1e-10)
+
+
+def test_templates_of_others_fix_nothing(scene: Scene) -> None:
+    rotation = random_rotation()
+    sent = scene.lift(scene.attacker[:20], "test of chosen enrollment")
+    others = scene.lift(scene.attacker[20:40], "others").rotated(rotation)
+    assert abs(alignment(estimate_from_sets(Sides(sent, others)), rotation)) < 0.1
+
+
+def test_best_known_points_lie_in_their_templates_and_in_the_span(scene: Scene) -> None:
+    accounts = scene.lift(scene.attacker[:5], "accounts")
+    points = best_known_points(scene.templates, accounts, seed=0)
+    rows = np.concatenate([accounts.feet, accounts.bases.reshape(-1, N)])
+    span = np.linalg.qr(rows.T)[0]
+    reached = np.linalg.norm(points @ span, axis=1)
+    rng = np.random.default_rng(0)
+    for index in range(3):
+        template = scene.templates[index]
+        assert template.contains(points[index : index + 1].astype(np.float32), tol=1e-4).all()
+        inside = unit(rng.normal(size=(5000, template.m))) @ template.basis
+        drawn = template.foot + template.radius * inside
+        assert np.linalg.norm(drawn @ span, axis=1).max() <= reached[index] + 1e-4
+
+
+def test_victims_are_opened_with_enough_accounts_and_not_with_one(scene: Scene) -> None:
+    one, enough = chosen_enrollment(scene, accounts=(1, 20, 10_000))
+    assert [each.details["accounts"] for each in (one, enough)] == [1, 20]
+    assert float(str(enough.details["alignment"])) > 0.999
+    assert enough.measured.value == 1.0
+    assert abs(float(str(one.details["alignment"]))) < 0.15
+    assert one.measured.value <= 2 / 40  # chance is 1 in 100 or less
+    assert enough.judged
+    assert enough.knowledge is Knowledge.TEMPLATES
+    assert enough.breaks is Property.IMPERSONATION
+    assert [one, enough] == chosen_enrollment(scene, accounts=(1, 20))
+
+
+def test_an_attacker_without_faces_is_refused(scene: Scene) -> None:
+    with pytest.raises(AuditError, match="faces"):
+        chosen_enrollment(replace(scene, attacker=scene.attacker[:0]))

@@ -1,0 +1,143 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from attacks.databases import (
+    Moments,
+    estimate_rotation,
+    link_databases,
+    signature_cosines,
+    whitened_cosines,
+)
+from attacks.errors import AuditError
+from attacks.scene import Scene
+from templates.decoys import DecoyGenerator
+from templates.randomness import Keystream
+from templates.subspace import SubspaceBatch
+from tests.verify.synthetic import random_rotation, unit
+
+N, M = 16, 2
+
+
+def templates(spread: np.ndarray, count: int, *, seed: int) -> tuple[SubspaceBatch, np.ndarray]:
+    """Lift people who are spread like this, with decoys that are too."""
+    rng = np.random.default_rng(seed)
+    people = unit(rng.normal(size=(count, N)) * spread + 0.3 * spread)
+    decoys = unit(rng.normal(size=(count, M, N)) * spread + 0.3 * spread)
+    with Keystream.seeded("test", seed) as stream:
+        batch = SubspaceBatch.through(people, decoys - people[:, None], stream=stream)
+    return batch, people
+
+
+def alignment(estimate: np.ndarray, rotation: np.ndarray) -> float:
+    return float(np.trace(estimate.T @ rotation) / N)
+
+
+def test_a_database_of_uneven_axes_gives_its_rotation_away() -> None:
+    spread = np.geomspace(1.0, 0.1, N)
+    rotation = random_rotation(N)
+    stolen, people = templates(spread, 3000, seed=1)
+    lifted, _ = templates(spread, 3000, seed=2)
+    turned = stolen.rotated(rotation)
+    estimate = estimate_rotation(
+        Moments.of(turned), Moments.of(lifted), turned.feet[:100], people[:100]
+    )
+    np.testing.assert_allclose(estimate @ estimate.T, np.eye(N), atol=1e-9)
+    assert alignment(estimate, rotation) > 0.9
+
+
+def test_even_axes_and_no_accounts_give_nothing_away() -> None:
+    rng = np.random.default_rng(0)
+    feet = rng.normal(size=(500, N))
+
+    def noise(seed: int) -> SubspaceBatch:
+        with Keystream.seeded("noise", seed) as stream:
+            draws = np.random.default_rng(seed).normal(size=(500, M + 1, N))
+            return SubspaceBatch.through(unit(draws[:, 0]), draws[:, 1:], stream=stream)
+
+    none = feet[:0]
+    aligned = [
+        alignment(
+            estimate_rotation(
+                Moments.of(noise(seed).rotated(random_rotation(N, seed))),
+                Moments.of(noise(seed + 100)),
+                none,
+                none,
+            ),
+            random_rotation(N, seed),
+        )
+        for seed in range(6)
+    ]
+    assert abs(np.mean(aligned)) < 0.2
+
+
+def test_the_true_rotation_links_by_whitened_feet() -> None:
+    spread = np.geomspace(1.0, 0.1, N)
+    batch, _ = templates(spread, 60, seed=1)
+    lifted, _ = templates(spread, 500, seed=2)
+    scores = whitened_cosines(batch, batch, Moments.of(lifted))
+    assert (scores.argmax(axis=1) == np.arange(60)).all()
+
+
+def test_signatures_are_invariant_and_link_where_nothing_is_hidden() -> None:
+    spread = np.ones(N)
+    batch, _ = templates(spread, 80, seed=1)
+    turned = batch.rotated(random_rotation(N))
+    same = signature_cosines(batch[:50], turned[:50], batch[50:], turned[50:])
+    assert (same.argmax(axis=1) == np.arange(50)).all()
+    other, _ = templates(spread, 80, seed=2)
+    apart = signature_cosines(batch[:50], other[:50], batch[50:], other[50:])
+    assert (apart.argmax(axis=1) == np.arange(50)).mean() < 0.15
+
+
+def test_outcomes_name_the_accounts_and_leave_out_those_beyond_the_faces(scene: Scene) -> None:
+    outcomes = link_databases(scene, accounts=(0, 5, 10_000), strangers=150, permutations=200)
+    assert {each.details["accounts"] for each in outcomes} == {0, 5}
+    assert len(outcomes) == 2 + 3
+    assert all(0 <= each.measured.value <= 1 and each.judged for each in outcomes)
+
+
+def of_axes(scene: Scene, spread: np.ndarray, seed: int) -> Scene:
+    """The scene with victims, attacker and decoys that are spread like this along the axes."""
+    n = scene.templates.n
+    rng = np.random.default_rng(seed)
+
+    def draw(count: int) -> np.ndarray:
+        return unit(rng.normal(size=(count, n)) * spread)
+
+    enrolled, source = draw(40), DecoyGenerator.fit(draw(2000))
+    return replace(
+        scene,
+        lifter=replace(scene.lifter, source=source),
+        source=source,
+        attacker=draw(300),
+        victims=replace(
+            scene.victims,
+            enrolled=enrolled,
+            fresh=unit(enrolled + 0.3 * draw(40)),
+        ),
+    )
+
+
+def test_two_databases_of_uneven_axes_are_linked_with_many_accounts(scene: Scene) -> None:
+    people = of_axes(scene, np.geomspace(1.0, 0.05, scene.templates.n), seed=1)
+    rows = link_databases(people, accounts=(300,), strangers=1000, permutations=200)
+    feet, nearest, _signatures = rows  # signatures have a control of their own above
+    assert nearest.variant == "300 accounts, estimated rotations, nearest points"
+    assert nearest.measured.value > 0.5
+    assert feet.measured.value > float(str(feet.details["null_95_percent"]))
+
+
+def test_databases_of_even_axes_without_accounts_are_not_linked(scene: Scene) -> None:
+    noise = of_axes(scene, np.ones(scene.templates.n), seed=2)
+    nobody = replace(noise, victims=replace(noise.victims, fresh=noise.victims.enrolled[::-1]))
+    for people, accounts in ((noise, (0,)), (nobody, (0, 300))):
+        rows = link_databases(people, accounts=accounts, strangers=500, permutations=200)
+        for row in rows:
+            assert row.measured.value <= float(str(row.details["null_95_percent"])), row.variant
+
+
+def test_no_strangers_are_refused(scene: Scene) -> None:
+    with pytest.raises(AuditError, match="strangers"):
+        link_databases(replace(scene), strangers=0)

@@ -1,0 +1,123 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from attacks.cast import Cast
+from attacks.errors import AuditError
+from attacks.likelihood import (
+    face_precision,
+    find_least_decoy_like,
+    likeliest_guesses,
+    likeliest_points,
+    precision,
+)
+from attacks.outcomes import GENERATED, Scheme
+from attacks.scene import Scene
+from templates.decoys import DecoyGenerator
+from templates.randomness import Keystream
+from templates.subspace import SubspaceBatch
+from tests.attacks.conftest import staged
+from tests.verify.synthetic import unit
+
+N, M = 32, 5
+
+
+def lifted(
+    faces: np.ndarray, decoys: np.ndarray, *, count: int = 80
+) -> tuple[SubspaceBatch, np.ndarray, np.ndarray]:
+    """People spread as ``faces`` along the axes, decoys as ``decoys``."""
+    rng = np.random.default_rng(2)
+    people = unit(rng.normal(size=(count, N)) * faces)
+    others = unit(rng.normal(size=(count, M, N)) * decoys)
+    with Keystream.seeded("likelihood") as stream:
+        batch = SubspaceBatch.through(people, others - people[:, None], stream=stream)
+    return batch, people, others
+
+
+def cosines(rows: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    return np.asarray(np.einsum("ij,ij->i", rows, truth))
+
+
+def test_decoys_of_another_kind_give_the_descriptor_away() -> None:
+    """Along half of the axes only the descriptor has a part, so its coefficient is maximised."""
+    narrow = np.where(np.arange(N) < N // 2, 1.0, 1e-3)
+    templates, people, decoys = lifted(np.ones(N), narrow)
+    form = precision(np.random.default_rng(0).normal(size=(4000, N)) * narrow, shrinkage=1e-7)
+    guesses = likeliest_points(templates, form)
+    np.testing.assert_allclose(np.linalg.norm(guesses, axis=1), 1.0, atol=1e-5)
+    for index in range(len(templates)):
+        points = np.concatenate([people[index : index + 1], decoys[index]]).astype(float)
+        part = np.linalg.pinv(points)[:, 0]  # x @ part: how much of x is the descriptor
+        best = points.T @ np.linalg.lstsq(points.T, part, rcond=None)[0]
+        assert abs(guesses[index] @ best) / np.linalg.norm(best) > 0.95
+    assert cosines(guesses, people).mean() > templates.foot_norms.mean() + 0.3
+
+
+def test_decoys_of_the_same_kind_do_not() -> None:
+    templates, people, _ = lifted(np.ones(N), np.ones(N))
+    rows = np.random.default_rng(0).normal(size=(2, 4000, N))
+    guesses = likeliest_points(templates, precision(rows[0]) - precision(rows[1]))
+    assert cosines(guesses, people).mean() < templates.foot_norms.mean()
+
+
+def test_no_unit_point_of_the_span_is_likelier() -> None:
+    templates, _, _ = lifted(np.ones(N), np.ones(N), count=3)
+    form = precision(np.random.default_rng(1).normal(size=(500, N)) * np.linspace(0.2, 1, N))
+    best = likeliest_points(templates, form)
+    reached = np.einsum("tn,nk,tk->t", best, form, best)
+    rng = np.random.default_rng(3)
+    for index, template in enumerate(templates):
+        span = np.concatenate([template.foot[None], template.basis]).astype(np.float64)
+        rows = unit(rng.normal(size=(20_000, M + 1)) @ span).astype(np.float64)
+        assert np.einsum("tn,nk,tk->t", rows, form, rows).max() <= reached[index] + 1e-6
+        assert np.linalg.norm(best[index]) == pytest.approx(1.0)
+        outside = best[index] - span.T @ np.linalg.lstsq(span.T, best[index], rcond=None)[0]
+        assert np.linalg.norm(outside) < 1e-6
+
+
+def test_a_generator_of_another_kind_than_the_victims_is_seen_through(small_cast: Cast) -> None:
+    """Decoys vary along half of the axes, people along all: the same, as an audit reports it."""
+    n = small_cast.attacker.shape[1]
+    rng = np.random.default_rng(4)
+    narrow = np.where(np.arange(n) < n // 2, 1.0, 0.02)
+    other = DecoyGenerator.fit(unit(rng.normal(size=(600, n)) * narrow))
+    scene = staged(small_cast, Scheme("adversarial", GENERATED, 6), other)
+    for row in find_least_decoy_like(scene, draws=2000):
+        assert row.measured.value > 0.9, row.variant
+        assert float(str(row.details["cosine_to_truth_mean"])) > 0.8
+        assert row.judged
+
+
+def test_few_faces_have_a_precision_too() -> None:
+    few = np.random.default_rng(0).normal(size=(20, N)) * np.linspace(0.2, 1, N)
+    values = np.linalg.eigvalsh(face_precision(few))
+    assert values.min() > 0
+    assert values.max() / values.min() < 1e3  # the plain covariance is singular
+    many = np.random.default_rng(0).normal(size=(200, N))
+    np.testing.assert_array_equal(face_precision(many), precision(many))
+
+
+def test_guesses_are_what_the_outcomes_report(scene: Scene) -> None:
+    guesses = likeliest_guesses(scene, draws=1000)
+    for row in find_least_decoy_like(scene, draws=1000):
+        mine = cosines(guesses[row.variant], scene.victims.enrolled).mean()
+        assert float(str(row.details["cosine_to_truth_mean"])) == pytest.approx(mine, abs=1e-6)
+
+
+def test_outcomes_with_and_without_faces(scene: Scene, strangers: np.ndarray) -> None:
+    outcomes = find_least_decoy_like(scene, draws=1000)
+    assert [each.variant for each in outcomes] == ["generator", "generator and faces"]
+    noise = replace(scene, templates=scene.lift(strangers, "noise"))
+    for row in find_least_decoy_like(noise, draws=1000):
+        assert row.measured.value <= 0.1
+
+
+def test_random_lifting_has_no_decoys_to_be_unlike(weak_scene: Scene) -> None:
+    assert find_least_decoy_like(weak_scene) == []
+    assert likeliest_guesses(weak_scene) == {}
+
+
+def test_a_covariance_needs_more_draws_than_dimensions(scene: Scene) -> None:
+    with pytest.raises(AuditError, match="draws"):
+        find_least_decoy_like(scene, draws=64)

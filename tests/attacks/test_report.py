@@ -1,0 +1,143 @@
+import json
+from typing import Any
+
+from attacks.outcomes import Estimate, Knowledge, Outcome, Property, Scheme
+from attacks.report import document
+from attacks.report_tables import markdown
+from verify.metrics import rate
+
+SCHEME = Scheme("adversarial", "generator", 16)
+OTHER = Scheme("adversarial", "pool", 16)
+
+
+def outcomes(scheme: Scheme, hits: int) -> list[Outcome]:
+    return [
+        Outcome(
+            attack="foot-point",
+            breaks=Property.IRREVERSIBILITY,
+            knowledge=Knowledge.TEMPLATE,
+            assumption="One template; guesses its foot point.",
+            scheme=scheme,
+            level="fmr-1e-3",
+            measured=rate(hits, 200),
+            chance=0.001,
+            details={"cosine_to_truth_mean": 0.2875},
+        ),
+        Outcome(
+            attack="linkage",
+            variant="secret rotations, nearest points",
+            breaks=Property.UNLINKABILITY,
+            knowledge=Knowledge.ALGORITHM,
+            assumption="Two rotated templates | of two tenants.",
+            scheme=scheme,
+            measured=Estimate(0.09, 0.06, 0.12, 400, "bootstrap"),
+            chance=0.085,
+        ),
+    ]
+
+
+def row(attacker: str, accuracy: float) -> dict[str, Any]:
+    return {
+        **SCHEME.to_json(),
+        "attribute": "gender",
+        "attacker": attacker,
+        "metric": "spherical" if attacker == "knn" else None,
+        "knowledge": "algorithm",
+        "accuracy": accuracy,
+        "correct": round(1000 * accuracy),
+        "trials": 1000,
+        "ci_low": accuracy - 0.03,
+        "ci_high": accuracy + 0.03,
+        "balanced_accuracy": accuracy,
+        "chance": 0.529,
+        "mutual_information_bits": 0.012,
+        "mutual_information_null": {"mean": 0.001, "percentile_95": 0.003},
+        "baselines": {"uniform": 0.5, "majority": 0.529, "prior": 0.502},
+        "leakage": "above",
+    }
+
+
+def made(**more: Any) -> dict[str, Any]:
+    return document(
+        "templates",
+        outcomes=[*outcomes(SCHEME, 10), *outcomes(OTHER, 150)],
+        limits={"foot-point-success": 0.1},
+        comparisons=[str(OTHER)],
+        model={"pack": "a | pack"},
+        settings={"seed": 0},
+        **more,
+    )
+
+
+def test_a_comparison_does_not_decide_and_is_said_apart() -> None:
+    report = made()
+    assert report["passed"] is True
+    assert [each["passed"] for each in report["verdicts"]] == [True, False]
+    assert [each["comparison"] for each in report["verdicts"]] == [False, True]
+    assert not any("pool" in line for line in report["headlines"])
+    assert "irreversibility fails: foot-point" in report["comparison_headlines"][0]
+    assert json.loads(json.dumps(report, allow_nan=False)) == report
+
+
+def test_nothing_judged_is_not_passed() -> None:
+    report = document("fairface", outcomes=[], limits={}, model={}, settings={})
+    assert report["passed"] is False
+
+
+def test_the_limits_of_the_report_are_those_that_judged() -> None:
+    report = made()
+    assert report["limits"]["foot-point-success"] == 0.1
+    cells = report["verdicts"][0]["cells"]
+    assert {cell["limit"]: cell["most"] for cell in cells}["linkability"] == report["limits"][
+        "linkability"
+    ]
+
+
+def test_the_markdown_begins_with_the_result_and_shows_every_attack() -> None:
+    text = markdown(made(rows=[row("knn", 0.56), row("logistic", 0.61)]))
+    lines = text.splitlines()
+    assert lines[0] == "# Privacy audit: templates"
+    assert lines[2].startswith("**PASSED**")
+    assert "5.00 [2.74, 8.96] (10/200)" in text
+    assert "0.090 [0.060, 0.120]" in text
+    assert "61.00 [58.00, 64.00] (610/1000)" in text
+    assert "Two rotated templates &#124; of two tenants." in text
+    assert "(comparison)" in text
+    assert "Baselines in %: uniform 50.00, majority 52.90, prior 50.20." in text
+
+
+def test_every_line_of_a_table_has_its_columns() -> None:
+    text = markdown(made(rows=[row("knn", 0.56)]))
+    width: int | None = None
+    for line in text.splitlines():
+        if not line.startswith("|"):
+            width = None
+            continue
+        width = width or line.count("|")
+        assert line.count("|") == width, line
+
+
+def test_cost_and_frontier_are_shown_where_they_are_there() -> None:
+    text = markdown(
+        made(
+            cost=[{**SCHEME.to_json(), "pairs": 1000, "seconds": 0.5, "full_size_seconds": 600}],
+            frontier={
+                "dataset": "lfw",
+                "mode": "p2s",
+                "metric": "spherical",
+                "statement": "lfw: raw descriptors reach 99.52 %.",
+                "points": [
+                    {
+                        **SCHEME.to_json(),
+                        "accuracy": 0.992,
+                        "leakage": 0.08,
+                        "recommended": True,
+                        "leaks": {"gender": {"attacker": "svm", "accuracy": 0.61, "chance": 0.529}},
+                    }
+                ],
+            },
+        )
+    )
+    assert "lfw: raw descriptors reach 99.52 %." in text
+    assert "61.00 (svm; chance 52.90)" in text
+    assert "10.0" in text
