@@ -18,6 +18,9 @@ from templates.lifting import Strategy
 from templates.rotation import ROTATION_VERSION
 from verify import Calibrated, CalibrationOptions, LabelledFolder, calibrate, read_lfw_pairs
 
+DEFAULT_DIM = 64
+"""Dimension of stored templates: the operating point that docs/privacy.md arrives at."""
+
 
 class PreparationError(VeilfaceError):
     """The photos do not suffice for what is to be made of them."""

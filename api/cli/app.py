@@ -2,7 +2,19 @@
 
 import typer
 
-from api.cli import calibrate, db, decoys, demo, evaluate, keys, lift, models, serve, subjects
+from api.cli import (
+    audit,
+    calibrate,
+    db,
+    decoys,
+    demo,
+    evaluate,
+    keys,
+    lift,
+    models,
+    serve,
+    subjects,
+)
 from api.cli.errors import Commands
 
 app = typer.Typer(
@@ -22,6 +34,7 @@ subjects.register(app)
 lift.register(app)
 calibrate.register(app)
 evaluate.register(app)
+app.add_typer(audit.app, name="audit")
 app.add_typer(decoys.app, name="decoys")
 app.add_typer(keys.app, name="keys")
 app.add_typer(models.app, name="models")

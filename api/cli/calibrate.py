@@ -12,8 +12,15 @@ from api.cli.errors import CommandError, UsageError
 from api.cli.files import read_bounded, read_names
 from api.cli.options import AsJson, takes_settings
 from api.opening import file_sealer, open_keyring
-from api.preparation import acquired, acquired_json, calibrate_folder, require_made_with
+from api.preparation import (
+    DEFAULT_DIM,
+    acquired,
+    acquired_json,
+    calibrate_folder,
+    require_made_with,
+)
 from api.settings import Settings
+from attacks.likelihood import share_found
 from templates.contract import Calibration, Contract, Rate
 from templates.decoys import load_source
 from templates.distances import Metric
@@ -21,8 +28,14 @@ from templates.lifting import Strategy
 from verify import CalibrationOptions, CalibrationReport, labelled_folder
 
 MOST_SHOWN = 20
-LEAST_DECOYS = 8
-"""Fewer decoys in a template are noted: its foot point resembles the face (METHOD §4.1)."""
+LEAST_DECOYS = 24
+"""Fewer decoys in a template are noted: its foot point, taken for a descriptor, matches a fresh
+photo of the person too often. At raw FMR 1e-3 on LFW: 20 % at 16 decoys, 8 % at 24, 4 % at 32.
+Even where decoys are spread just as the people are, other attacks need more (docs/privacy.md)."""
+
+
+MOST_FOUND = 0.1
+"""Share of descriptors found by the decoys' statistics from which on it is noted."""
 
 
 class Protocol(StrEnum):
@@ -65,7 +78,9 @@ def calibrate(
     strategy: Annotated[
         Strategy, typer.Option(help="How templates are lifted.")
     ] = Strategy.ADVERSARIAL,
-    dim: Annotated[int, typer.Option(min=1, max=128, help="Dimension m of stored templates.")] = 16,
+    dim: Annotated[
+        int, typer.Option(min=1, max=128, help="Dimension m of stored templates.")
+    ] = DEFAULT_DIM,
     probe_dims: Annotated[
         str,
         typer.Option(
@@ -110,13 +125,14 @@ def calibrate(
     cannot resolve are refused. The contract file belongs to the master key that is in force.
 
     Example: `veilface calibrate lfw --pack buffalo_l --decoys decoys.veil --out contract.json
-    --strategy adversarial --dim 16`
+    --strategy adversarial --dim 32`
     """
     dims = parse_dims(probe_dims)
     pack = bulk_pack(settings, flip=flip, why="a contract is bound to a model pack")
     if dim >= pack.info.n:
         raise UsageError(f"--dim must be below the {pack.info.n} numbers of a descriptor")
     labelled = labelled_folder(folder)
+    name_of = dict(zip(labelled.paths, labelled.identities, strict=True))
     keyring = open_keyring(settings)
     sealer = file_sealer(keyring)
     source = load_source(decoys or settings.resolved_decoys_file, sealer)
@@ -158,8 +174,20 @@ def calibrate(
     path = out or settings.resolved_contract_file
     path.parent.mkdir(parents=True, exist_ok=True)
     done.contract.save(path, sealer)
-    if note := concealment_note(strategy, dim):
-        message(f"note: {note}")
+    found = None
+    if strategy is not Strategy.RANDOM:
+        found = share_found(
+            extraction.descriptors,
+            [name_of[path] for path in extraction.paths],
+            source,
+            strategy=strategy,
+            m=dim,
+            cosine=done.contract.photo_consistency,
+            seed=seed,
+        )
+    for note in (concealment_note(strategy, dim), likeness_note(found)):
+        if note:
+            message(f"note: {note}")
     notice = demo_notice(pack.info.embedder_sha256, n=pack.info.n)
     if as_json:
         emit(
@@ -168,6 +196,7 @@ def calibrate(
                 **notice,
                 "contract": done.contract.public(),
                 "failure_to_acquire": acquired_json(extraction),
+                "found_by_decoy_likelihood": None if found is None else found.to_json(),
                 **_report_json(done.report),
             }
         )
@@ -185,8 +214,20 @@ def concealment_note(strategy: Strategy, m: int) -> str | None:
         return None
     return (
         f"templates of strategy {strategy} and dimension {m} conceal little: the point of each "
-        "template nearest to the origin shows the face; use --strategy adversarial and --dim 16 "
-        "or more"
+        "template nearest to the origin shows the face; use --strategy adversarial and "
+        f"--dim {DEFAULT_DIM} or more"
+    )
+
+
+def likeness_note(found: Rate | None) -> str | None:
+    """Say that the decoys are spread unlike the people, where their statistics give faces away."""
+    if found is None or found.value <= MOST_FOUND:
+        return None
+    return (
+        f"from {100 * found.value:.0f} % of the templates of these people, who has the decoy "
+        "generator finds the descriptor: the decoys are spread unlike these people. Build the "
+        "decoys from other people's photos of the same kind (thousands of them), or take "
+        "a larger --dim (docs/privacy.md)"
     )
 
 

@@ -95,11 +95,29 @@ def resembling(
     """
     entries, _ = pool.entries
     _require_dimension(descriptors, pool)
-    found = np.zeros(len(entries), dtype=np.bool_)
-    for start in range(0, len(entries), _ROWS):
-        tile = entries[start : start + _ROWS]
-        for other in range(0, len(descriptors), _ROWS):
-            cosines = tile @ descriptors[other : other + _ROWS].T
+    return resembling_rows(entries, descriptors, cosine=cosine)
+
+
+def resembling_rows(
+    rows: NDArray[np.float32], others: NDArray[np.float32], *, cosine: float
+) -> NDArray[np.int64]:
+    """Find the rows that have a cosine of at least ``cosine`` with any of the others.
+
+    Parameters
+    ----------
+    rows, others : (N, n) and (M, n) float32
+        Unit rows; the cosines are made a tile at a time.
+
+    Returns
+    -------
+    int64
+        Their numbers, ascending.
+    """
+    found = np.zeros(len(rows), dtype=np.bool_)
+    for start in range(0, len(rows), _ROWS):
+        tile = rows[start : start + _ROWS]
+        for other in range(0, len(others), _ROWS):
+            cosines = tile @ others[other : other + _ROWS].T
             found[start : start + _ROWS] |= (cosines >= np.float64(cosine)).any(axis=1)
     return np.flatnonzero(found).astype(np.int64)
 

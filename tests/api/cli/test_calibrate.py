@@ -103,18 +103,18 @@ def test_a_dimension_that_the_descriptor_does_not_have_is_refused(world, data):
     ("strategy", "m", "noted"),
     [
         ("random", 64, True),
-        ("adversarial", 7, True),
-        ("adversarial", 8, False),
-        ("sub-adversarial", 16, False),
-        ("hybrid", 15, True),
-        ("hybrid+", 16, False),
+        ("adversarial", 23, True),
+        ("adversarial", 24, False),
+        ("sub-adversarial", 32, False),
+        ("hybrid", 47, True),
+        ("hybrid+", 48, False),
     ],
 )
 def test_templates_that_conceal_little_are_noted(strategy, m, noted):
     note = concealment_note(Strategy(strategy), m)
     assert (note is not None) == noted
     if note is not None:
-        assert "use --strategy adversarial and --dim 16 or more" in note
+        assert "use --strategy adversarial and --dim 64 or more" in note
 
 
 @pytest.mark.parametrize(("text", "dims"), [("", ()), ("2,4, 8", (2, 4, 8)), ("16", (16,))])

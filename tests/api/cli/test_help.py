@@ -13,6 +13,7 @@ from tests.api.cli.conftest import run
 DOCS = Path(__file__).resolve().parents[3] / "docs" / "cli.md"
 PROMISED = {
     *("demo", "serve", "enroll", "verify", "lift", "calibrate", "evaluate"),
+    *("audit fairface", "audit templates"),
     *("decoys build", "models inspect", "db upgrade", "db check", "db compact", "db current"),
     *("keys create", "keys list", "keys revoke", "keys master", "keys rotate", "keys rewrap"),
     "keys verify-receipt",

@@ -41,6 +41,9 @@ FIELDS: Mapping[str, type | tuple[type, ...]] = {
     "accuracy": (int, float),
     "chance": (int, float),
 }
+KNOWLEDGE = ("algorithm", "template")
+"""Of the attackers that count, where a row says what its attacker has: a pool is a secret, and who
+holds it strips every decoy."""
 MAX_TEXT = 64
 MAX_ATTRIBUTES = 16
 MAX_DIM = 2**16
@@ -50,13 +53,14 @@ Key = tuple[str, str | None, int]
 
 
 def strongest_attackers(audit: Mapping[str, Any]) -> dict[tuple[Key, str], Row]:
-    """Return the most accurate attacker of each configuration and attribute.
+    """Return the strongest attacker of each configuration and attribute.
 
     Parameters
     ----------
     audit
         The report of `veilface audit fairface`: ``format`` and ``rows``, each with the strategy,
-        decoys, dim, attribute, attacker, accuracy and chance (fractions).
+        decoys, dim, attribute, attacker, accuracy and chance (fractions); attackers whose
+        ``knowledge`` includes the secret decoys do not count.
 
     Returns
     -------
@@ -71,10 +75,17 @@ def strongest_attackers(audit: Mapping[str, Any]) -> dict[tuple[Key, str], Row]:
     _validate(audit)
     strongest: dict[tuple[Key, str], Row] = {}
     for row in audit["rows"]:
+        if row.get("knowledge", KNOWLEDGE[0]) not in KNOWLEDGE:
+            continue
         key = (_key(row), str(row["attribute"]))
-        if key not in strongest or row["accuracy"] > strongest[key]["accuracy"]:
+        if key not in strongest or _strength(row) > _strength(strongest[key]):
             strongest[key] = row
     return strongest
+
+
+def _strength(row: Row) -> float:
+    """What the strongest is chosen by: on faces of the attacker's own, where the row has that."""
+    return float(row.get("held_out_strength", row["accuracy"]))
 
 
 def _validate(audit: Any) -> None:

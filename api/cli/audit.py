@@ -1,0 +1,16 @@
+"""``veilface audit``: what an adversary learns from templates, held against limits."""
+
+import typer
+
+from api.cli import audit_fairface, audit_templates
+
+app = typer.Typer(no_args_is_help=True)
+
+
+@app.callback()
+def audit() -> None:
+    """Attack private templates, and judge what an attacker achieves against your limits."""
+
+
+audit_fairface.register(app)
+audit_templates.register(app)

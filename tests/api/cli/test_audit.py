@@ -1,0 +1,224 @@
+"""`veilface audit fairface` end to end on drawn faces and the demo model."""
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from api.cli import audit_fairface, descriptors
+from models.demo import DEMO_NOTICE
+from tests.api.cli.audit_bench import (
+    TRAIN,
+    VALIDATION,
+    are_pictures,
+    both,
+    documented,
+    draw_fairface,
+    named_in,
+    write_photo,
+)
+from tests.api.cli.conftest import Ran, World, run
+from tests.leaks import LeakSearch
+
+BOTH = {
+    *("format", "version", "kind", "passed", "headlines", "comparison_headlines", "limits"),
+    *("verdicts", "model", "settings", "rows", "outcomes", "failure_to_acquire"),
+}
+
+
+def untimed(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    return [{key: value for key, value in row.items() if key != "seconds"} for row in rows]
+
+
+@dataclass(frozen=True)
+class FaceAudit:
+    """A folder, its report, and every descriptor that was in memory."""
+
+    root: Path
+    asked: tuple[str | Path, ...]
+    first: Ran
+    evaluation: Path
+    descriptors: list[np.ndarray] = field(default_factory=list)
+
+    @property
+    def out(self) -> Path:
+        return self.root / "out"
+
+
+def evaluated(strategy: str, decoys: str | None, dim: int, accuracy: float) -> dict[str, Any]:
+    raw = strategy == "raw"
+    return {
+        **{"dataset": "lfw", "strategy": strategy, "decoys": decoys, "dim": dim},
+        **{"mode": "p2p" if raw else "p2s", "metric": "euclidean" if raw else "spherical"},
+        **{"threshold_search": "exact", "accuracy_mean": accuracy},
+    }
+
+
+@pytest.fixture(scope="module")
+def faces(world: World, tmp_path_factory: pytest.TempPathFactory) -> FaceAudit:
+    root = tmp_path_factory.mktemp("audited-faces")
+    draw_fairface(root / "fairface")
+    # A face of both parts, and a photo that is none.
+    write_photo(root / "fairface" / "val" / "0.png", 9000)
+    (root / "fairface" / "train" / "7.png").write_bytes(b"not a picture")
+    evaluation = root / "results.json"
+    rows = [evaluated("raw", None, 0, 0.99), evaluated("adversarial", "generator", 4, 0.985)]
+    evaluation.write_text(json.dumps({"format": "veilface evaluation", "rows": rows}))
+    asked: tuple[str | Path, ...] = (
+        *("audit", "fairface", root / "fairface", "--pack", world.pack, "--aligned"),
+        *("--data-dir", world.data, "--cache", root / "faces.cache", "--lifting", "100"),
+        *("--strategy", "raw,adversarial", "--dim", "2", "--generated-dim", "4"),
+        *("--service-dim", "4", "--attackers", "knn,logistic", "--drop-duplicates", "0.99999"),
+    )
+    found: list[np.ndarray] = []
+    plain = descriptors.extract
+    with pytest.MonkeyPatch.context() as patch:
+
+        def recorded(*given: Any, **named: Any) -> Any:
+            extraction = plain(*given, **named)
+            found.append(extraction.descriptors)
+            return extraction
+
+        patch.setattr(audit_fairface, "extract", recorded)
+        first = run(
+            *asked, "--evaluation", evaluation, "--max-attribute-leakage", "0",
+            "--out", root / "out", "--json",
+        )  # fmt: skip
+    assert first.status in (0, 1), first.stderr
+    assert "error: " not in first.stderr, first.stderr
+    return FaceAudit(root, asked, first, evaluation, found)
+
+
+@pytest.fixture(scope="module")
+def face_report(faces: FaceAudit) -> Any:
+    return json.loads((faces.out / "report.json").read_text(encoding="utf-8"))
+
+
+def test_an_audit_of_faces_writes_report_and_figures(faces: FaceAudit, face_report: Any) -> None:
+    files = ["report.json", "report.md", *both(["figure", "frontier"])]
+    assert sorted(file.name for file in faces.out.iterdir()) == sorted(files)
+    are_pictures(faces.out, ["figure", "frontier"])
+    said = faces.first.json
+    assert said.pop("notice") == DEMO_NOTICE
+    assert said.pop("out") == str(faces.out)
+    assert said.pop("files") == files
+    assert said == face_report
+    text = (faces.out / "report.md").read_text(encoding="utf-8").replace("&#91;", "[")
+    for sentence in face_report["headlines"]:
+        assert sentence in text
+
+
+def test_the_report_of_faces_is_the_one_that_is_documented(face_report: Any) -> None:
+    members = documented()
+    assert members.keys() >= BOTH
+    missing = members.keys() - face_report.keys()
+    assert missing <= {name for name in members if "`templates`" in members[name]}
+    assert face_report.keys() <= members.keys()
+    assert (face_report["format"], face_report["version"]) == ("veilface audit", 1)
+    assert face_report["kind"] == "fairface"
+    scheme = {"strategy", "decoys", "dim"}
+    row_names = named_in("A row of attribute inference has")
+    for row in face_report["rows"]:
+        assert row.keys() >= row_names | scheme
+        assert row.keys() <= row_names | scheme | {"mutual_information_null"}
+    outcome_names = named_in("An outcome has")
+    for outcome in face_report["outcomes"]:
+        assert outcome_names <= outcome.keys() | outcome["measured"].keys()
+        assert outcome.keys() <= outcome_names | scheme
+    for entry in face_report["cost"]:
+        assert entry.keys() >= {*scheme, "pairs", "seconds", "full_size_seconds"}
+    assert face_report["frontier"].keys() >= {"points", "statement"}
+
+
+def test_sizes_and_failures_are_told(faces: FaceAudit, face_report: Any) -> None:
+    settings = face_report["settings"]
+    assert (settings["lifting"], settings["attack"]) == (100, TRAIN - 1 - 100)
+    assert (settings["attacked"], settings["duplicates_dropped"]) == (VALIDATION - 1, 1)
+    assert settings["root"] == "fairface"
+    assert "results.json" in settings["evaluation"].values()
+    failed = face_report["failure_to_acquire"]
+    assert failed["train"] == {"photos": TRAIN, "failed": 1, "reasons": {"unsupported_image": 1}}
+    assert failed["val"]["failed"] == 0
+    assert "note: 1 faces resemble a training face and are not attacked" in faces.first.stderr
+
+
+def test_ages_of_spreadsheets_are_ages(face_report: Any) -> None:
+    row = next(row for row in face_report["rows"] if row["attribute"] == "age")
+    seen = [sum(line) for line in row["confusion"]]
+    ages = {name for name, count in zip(row["classes"], seen, strict=True) if count}
+    assert ages == {"3-9", "20-29", "10-19", "more than 70"}
+
+
+def test_raw_descriptors_tell_what_the_pictures_show_and_nothing_else(face_report: Any) -> None:
+    rows = [row for row in face_report["rows"] if row["strategy"] == "raw"]
+    by_attribute = {
+        (row["attribute"], row["attacker"]): row["accuracy"] - row["chance"] for row in rows
+    }
+    assert by_attribute["gender", "knn"] > 0.25
+    assert by_attribute["gender", "logistic"] > 0.25
+    assert by_attribute["race", "knn"] < 0.2
+    assert {row["attacker"] for row in face_report["rows"]} >= {"knn", "logistic", "strip"}
+
+
+def test_a_limit_that_is_exceeded_is_status_1(faces: FaceAudit, face_report: Any) -> None:
+    assert faces.first.status == 1
+    assert not face_report["passed"]
+    assert face_report["limits"]["attribute-leakage"] == 0
+    (verdict,) = face_report["verdicts"]
+    assert (verdict["strategy"], verdict["decoys"], verdict["dim"]) == (
+        *("adversarial", "generator", 4),
+    )
+    (cell,) = verdict["cells"]
+    assert (cell["status"], cell["limit"], cell["property"]) == (
+        *("fail", "attribute-leakage", "confidentiality"),
+    )
+    judged = [each for each in face_report["outcomes"] if each["judged"]]
+    far = max(abs(each["measured"]["value"] - each["chance"]) for each in judged)
+    assert cell["compared"] == far > 0
+
+
+def test_an_evaluation_adds_the_frontier(face_report: Any) -> None:
+    (point,) = face_report["frontier"]["points"]
+    assert (point["strategy"], point["decoys"], point["dim"]) == ("adversarial", "generator", 4)
+    assert (point["accuracy"], point["recommended"]) == (0.985, True)
+    rows = [row for row in face_report["rows"] if row["decoys"] == "generator"]
+    far = []
+    for attribute, leak in point["leaks"].items():
+        mine = [row for row in rows if row["attribute"] == attribute]
+        row = max(mine, key=lambda row: row["held_out_strength"])
+        assert (row["attacker"], row["accuracy"]) == (leak["attacker"], leak["accuracy"])
+        far.append(abs(row["accuracy"] - row["chance_of_predictions"]))
+    assert point["leakage"] == max(far)
+
+
+def test_the_seed_gives_the_rows_and_a_kept_limit_is_status_0(
+    faces: FaceAudit, face_report: Any
+) -> None:
+    """The figure of an earlier run's evaluation, which is not given now, goes."""
+    more = ("--max-attribute-leakage", "0.99", "--out", faces.root / "again")
+    (faces.root / "again").mkdir()
+    (faces.root / "again" / "frontier.png").write_bytes(b"of an earlier run")
+    again = run(*faces.asked, *more)
+    assert (again.status, again.stderr.count("error")) == (0, 0)
+    assert again.stdout.strip().endswith("PASSED")
+    assert "no attack that was made exceeds its limit" in again.stdout
+    report = json.loads((faces.root / "again" / "report.json").read_text())
+    assert untimed(report["rows"]) == untimed(face_report["rows"])
+    assert report["outcomes"] == face_report["outcomes"]
+    assert "frontier" not in report
+    written = {file.name for file in (faces.root / "again").iterdir()}
+    assert written == {"report.json", "report.md", *both(["figure"])}
+
+
+def test_no_descriptor_stands_in_the_report_of_faces(faces: FaceAudit) -> None:
+    rows = np.concatenate(faces.descriptors)
+    assert len(rows) == TRAIN - 1 + VALIDATION
+    search = LeakSearch(vectors={f"face {i}": row for i, row in enumerate(rows)})
+    written = b"\n".join(file.read_bytes() for file in sorted(faces.out.iterdir()))
+    said = (faces.first.stdout + faces.first.stderr).encode()
+    assert search.find(written + said) == []
+    assert search.find(said + json.dumps(rows[5].tolist()).encode()) != []
+    assert str(faces.root).encode() not in written

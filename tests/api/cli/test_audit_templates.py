@@ -1,0 +1,237 @@
+"""`veilface audit templates` end to end on drawn people and the demo model."""
+
+import json
+import re
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import attacks.cast
+import attacks.scene
+from api.cli import audit_attacks, audit_templates
+from attacks.cast import Cast
+from attacks.databases import link_databases
+from attacks.outcomes import Knowledge, Property
+from attacks.scene import Scene
+from attacks.stored import presentation
+from attacks.verdict import LIMITS, Status
+from models.demo import DEMO_NOTICE
+from tests.api.cli.audit_bench import are_pictures, both, documented, draw_people, named_in
+from tests.api.cli.conftest import Ran, World, run
+from tests.leaks import LeakSearch
+from verify import calibrate
+
+
+@dataclass(frozen=True)
+class TemplateAudit:
+    """A folder of people, what audits of it were asked, and what they held in memory."""
+
+    root: Path
+    asked: tuple[str | Path, ...]
+    first: Ran
+    casts: list[Cast]
+    scenes: list[Scene]
+    left: list[Path]
+
+    @property
+    def out(self) -> Path:
+        return self.root / "out"
+
+
+def on_small_material(patch: pytest.MonkeyPatch) -> None:
+    """Fewer comparisons of each kind, for the tests' time; the attacks are the audit's own."""
+
+    def fewer(*given: Any, **named: Any) -> Any:
+        few = replace(named["options"], lifted_probes=100, lifted_impostor_pairs=6_000, steps=10)
+        return calibrate(*given, **{**named, "options": few})
+
+    patch.setattr(attacks.scene, "calibrate", fewer)
+    patch.setattr(presentation, "TARGETS", 40)
+    patch.setattr(presentation, "STARTS", 2)
+    patch.setattr(
+        audit_attacks,
+        "link_databases",
+        partial(link_databases, accounts=(30,), strangers=150, permutations=200),
+    )
+
+
+@pytest.fixture(scope="module")
+def people(world: World, tmp_path_factory: pytest.TempPathFactory) -> Iterator[TemplateAudit]:
+    root = tmp_path_factory.mktemp("audited-people")
+    # 20 victims, 100 owners of decoys, 200 faces of the attacker and 400 people to calibrate on.
+    draw_people(root / "people", world.labelled, several=75, single=600)
+    (root / "temporary").mkdir()
+    asked: tuple[str | Path, ...] = (
+        *("audit", "templates", root / "people", "--pack", world.pack, "--data-dir", world.data),
+        *("--aligned", "--cache", root / "people.cache", "--victims", "20", "--owners", "100"),
+        *("--contract", world.data / "contract.json", "--no-learned"),
+    )
+    casts: list[Cast] = []
+    scenes: list[Scene] = []
+    with pytest.MonkeyPatch.context() as patch:
+        on_small_material(patch)
+        patch.setattr(tempfile, "tempdir", str(root / "temporary"))
+        make_cast, stage = attacks.cast.make_cast, attacks.scene.stage
+
+        def recorded_cast(*given: Any, **named: Any) -> Cast:
+            casts.append(make_cast(*given, **named))
+            return casts[-1]
+
+        def recorded_stage(*given: Any, **named: Any) -> Scene:
+            scenes.append(stage(*given, **named))
+            return scenes[-1]
+
+        patch.setattr(audit_templates, "make_cast", recorded_cast)
+        patch.setattr(audit_templates, "stage", recorded_stage)
+        first = run(
+            *asked, "--no-comparison", "--climbed", "1", "--attempts", "50",
+            "--max-success-with-key", "0", "--out", root / "out", "--json",
+        )  # fmt: skip
+        assert "error: " not in first.stderr, first.stderr
+        left = list((root / "temporary").iterdir())
+        yield TemplateAudit(root, asked, first, casts[:], scenes[:], left)
+
+
+@pytest.fixture(scope="module")
+def people_report(people: TemplateAudit) -> Any:
+    return json.loads((people.out / "report.json").read_text(encoding="utf-8"))
+
+
+def test_an_audit_of_templates_writes_report_and_figures(
+    people: TemplateAudit, people_report: Any
+) -> None:
+    files = ["report.json", "report.md", *both(["linkage", "oracle"])]
+    assert sorted(file.name for file in people.out.iterdir()) == sorted(files)
+    are_pictures(people.out, ["linkage", "oracle"])
+    said = people.first.json
+    assert said.pop("notice") == DEMO_NOTICE
+    assert said.pop("out") == str(people.out)
+    assert said.pop("files") == files
+    assert said == people_report
+    assert people.left == []
+
+
+def test_the_report_of_templates_is_the_one_that_is_documented(people_report: Any) -> None:
+    members = documented()
+    missing = members.keys() - people_report.keys()
+    assert missing <= {
+        name for name in members if re.match("`fairface`|with `--evaluation`", members[name])
+    }
+    assert people_report.keys() <= members.keys()
+    assert (people_report["kind"], people_report["rows"]) == ("templates", [])
+    assert people_report["limits"].keys() == {limit.name for limit in LIMITS}
+    scheme = {"strategy", "decoys", "dim"}
+    outcome_names = named_in("An outcome has") - {"errors"}
+    for outcome in people_report["outcomes"]:
+        assert outcome_names <= outcome.keys() | outcome["measured"].keys()
+        assert outcome.keys() <= outcome_names | scheme
+        assert outcome["measured"]["ci_low"] <= outcome["measured"]["value"]
+        assert outcome["measured"]["value"] <= outcome["measured"]["ci_high"]
+    values = {*map(str, Property), *map(str, Knowledge), *map(str, Status)}
+    cell_names = named_in("A cell of a verdict is") - values
+    for verdict in people_report["verdicts"]:
+        assert verdict.keys() == scheme | {"passed", "comparison", "cells"}
+        for cell in verdict["cells"]:
+            assert cell.keys() >= cell_names
+            assert cell["status"] in set(map(str, Status))
+
+
+def test_every_property_is_attacked_and_the_service_was_climbed(people_report: Any) -> None:
+    mine = [row for row in people_report["outcomes"] if row["decoys"] == "generator"]
+    properties = {row["property"] for row in mine}
+    assert properties == set(map(str, Property)) - {str(Property.CONFIDENTIALITY)}
+    over_rest = [row for row in mine if row["variant"].endswith("over REST")]
+    assert {row["variant"].split(",")[0] for row in over_rest} == {
+        *("dictionary", "gradient", "regression"),
+    }
+    assert all(row["measured"]["trials"] == 1 for row in over_rest)
+    assert not any(row["judged"] for row in over_rest if row["variant"].startswith("dictionary"))
+
+
+def test_an_attack_that_exceeds_its_limit_is_status_1(
+    people: TemplateAudit, people_report: Any
+) -> None:
+    assert people.first.status == 1
+    (audited,) = people_report["verdicts"]
+    failed = {cell["limit"] for cell in audited["cells"] if cell["status"] == "fail"}
+    assert "success-with-key" in failed
+    assert not people_report["passed"]
+
+
+@pytest.fixture(scope="module")
+def compared(people: TemplateAudit) -> Ran:
+    """The same without the service, beside decoys of real people, and with no limit."""
+    most = [f"--max-{limit.name}=1" for limit in LIMITS if limit.name != "attribute-leakage"]
+    return run(*people.asked, "--no-service", *most, "--out", people.root / "compared")
+
+
+@pytest.fixture(scope="module")
+def compared_report(people: TemplateAudit, compared: Ran) -> Any:
+    assert "error: " not in compared.stderr, compared.stderr
+    return json.loads((people.root / "compared" / "report.json").read_text(encoding="utf-8"))
+
+
+def test_the_seed_gives_the_outcomes_and_kept_limits_are_status_0(
+    people: TemplateAudit, people_report: Any, compared: Ran, compared_report: Any
+) -> None:
+    assert compared.status == 0
+    assert compared.stdout.strip().endswith("PASSED")
+    assert f"{people.root / 'compared'}: report.json, report.md, linkage.png" in compared.stdout
+    expected = [
+        row for row in people_report["outcomes"] if not row["variant"].endswith("over REST")
+    ]
+    found = [row for row in compared_report["outcomes"] if row["decoys"] == "generator"]
+    assert found == expected
+    assert len(found) < len(people_report["outcomes"])
+
+
+def test_pools_are_compared_with_and_do_not_decide(compared: Ran, compared_report: Any) -> None:
+    audited, other = compared_report["verdicts"]
+    assert (audited["decoys"], audited["comparison"]) == ("generator", False)
+    assert (other["decoys"], other["comparison"]) == ("pool", True)
+    found: dict[str, list[float]] = {"generator": [], "pool": []}
+    for row in compared_report["outcomes"]:
+        if row["attack"] == "known-database" and (row["judged"] or "draws" in row["variant"]):
+            found[row["decoys"]].append(row["measured"]["value"])
+    assert max(found["pool"]) > 0.9
+    assert max(found["generator"]) < 0.2
+    assert "For comparison: " in compared.stdout
+
+
+def test_the_service_of_the_contract_is_audited(people_report: Any, world: World) -> None:
+    settings, known = people_report["settings"], world.calibrated["contract"]
+    assert settings["contract_id"] == known["contract_id"]
+    assert settings["calibration"] == "of the contract"
+    binding = known["binding"]
+    schemes = {(row["strategy"], row["decoys"], row["dim"]) for row in people_report["outcomes"]}
+    assert schemes == {(binding["strategy"], "generator", binding["m"])}
+    levels = {level["name"] for each in known["calibrations"] for level in each["levels"]}
+    assert {row["level"] for row in people_report["outcomes"]} - {None} <= levels
+
+
+def test_nothing_of_people_and_templates_stands_in_the_report(people: TemplateAudit) -> None:
+    (cast,) = people.casts
+    rows = np.concatenate(
+        [
+            *(cast.victims.enrolled, cast.victims.fresh, cast.owners.enrolled, cast.owners.fresh),
+            *(cast.attacker, cast.calibration),
+        ]
+    )
+    vectors = {f"face {i}": row for i, row in enumerate(rows)}
+    for scene in people.scenes:
+        for number, template in enumerate(scene.templates.bases):
+            vectors[f"{scene.scheme}, basis {number}"] = template
+            vectors[f"{scene.scheme}, foot {number}"] = scene.templates.feet[number]
+    search = LeakSearch(vectors=vectors)
+    written = b"\n".join(file.read_bytes() for file in sorted(people.out.iterdir()))
+    said = (people.first.stdout + people.first.stderr).encode()
+    assert search.find(written + said) == []
+    assert search.find(said + people.scenes[0].templates.feet[3].tobytes()) != []
+    assert b"drawn-0" not in written + said
+    assert b"person-6" not in written + said

@@ -1,0 +1,314 @@
+"""What `veilface audit` refuses: one sentence that names the cause and the remedy."""
+
+import importlib
+import json
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from api.cli import audit_fairface, audit_templates
+from attacks.learned import extra
+from models.pack import ModelPack
+from templates.decoys import DecoyGenerator
+from templates.decoys.fitting import MIN_DESCRIPTORS
+from templates.randomness import Keystream
+from tests.api.cli.audit_bench import draw_fairface
+from tests.api.cli.conftest import Ran, World, run
+
+SMALL = ("--lifting", "100", "--strategy", "raw", "--generated-dim", "4", "--service-dim", "4")
+FAIRFACE_USAGE: list[tuple[list[str], str]] = [
+    (["--attributes", "gender,height"], "--attributes takes of gender, race, age, not"),
+    (["--attributes", ","], "--attributes takes of gender, race, age, and is empty"),
+    (["--strategy", "raw,homomorphic"], "--strategy takes of raw, random, adversarial, hybrid"),
+    (["--attackers", "knn,oracle"], "--attackers takes of knn, logistic, svm"),
+    (["--dim", "two"], "--dim takes whole numbers such as 2,4, not 'two'"),
+    (["--dim", "2,256"], "dimensions go from 1 to 255 with this pack, not 256"),
+    (["--dim", "0"], "dimensions go from 1 to 255 with this pack, not 0"),
+    (["--generated-dim", "300"], "dimensions go from 1 to 255 with this pack, not 300"),
+    (["--generated-dim", "x"], "--generated-dim takes whole numbers such as 16,32, not 'x'"),
+    (["--service-dim", "32", "--generated-dim", "2,4"], "--generated-dim"),
+    (["--service-dim", "32", "--generated-dim", ""], "--generated-dim"),
+    (
+        ["--strategy", "raw,hybrid+", "--attributes", "gender"],
+        "add both to --attributes, or leave hybrid+ out of --strategy",
+    ),
+]
+TEMPLATES_USAGE: list[tuple[list[str], str]] = [
+    (["--dim", "many"], "--dim takes whole numbers such as 16,32, not 'many'"),
+    (["--dim", "16,256"], "--dim takes dimensions from 1 to 255, not 256"),
+    (["--dim", "0"], "--dim takes dimensions from 1 to 255, not 0"),
+    (["--fit-decoys", "--decoys", "DECOYS"], "give no --decoys and no --contract"),
+    (["--fit-decoys", "--contract", "CONTRACT"], "give no --decoys and no --contract"),
+    (["--contract", "CONTRACT", "--dim", "16"], "leave out --strategy and --dim"),
+]
+TEMPLATES_FAILED: list[tuple[list[str], str]] = [
+    (["--decoys", "ABSENT"], "absent"),
+    (["--decoys", "OTHER"], "build the decoys with this pack and the same --flip"),
+    (["--decoys", "NARROW"], "the decoys have 32 numbers each, the pack gives 256"),
+    (["--decoys", "UNSAID"], "build the decoys with this pack and the same --flip"),
+    (["--contract", "ABSENT"], "cannot be read (No such file or directory)"),
+    (["--flip"], "build the decoys with this pack and the same --flip"),
+]
+
+
+def refused(ran: Ran, reason: str, status: int) -> None:
+    """One sentence on stderr says why, and nothing else is said."""
+    assert (ran.status, ran.stdout) == (status, "")
+    (sentence,) = [line for line in ran.stderr.splitlines() if not line.startswith("note: ")]
+    assert sentence.startswith("error: ")
+    assert reason in sentence
+    assert "defect" not in sentence
+
+
+@pytest.fixture(scope="module")
+def fairface_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return draw_fairface(tmp_path_factory.mktemp("few-faces"), train=150, validation=12)
+
+
+@pytest.fixture
+def before_any_face(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fail where a face is embedded."""
+    for name in ("embed", "embed_both"):
+        monkeypatch.setattr(ModelPack, name, None)
+
+
+def fairface(world: World, root: Path, *more: str | Path) -> Ran:
+    """Run on aligned faces; the report would be written beside the data folder."""
+    given = ("--pack", world.pack, "--data-dir", world.data, "--aligned")
+    return run("audit", "fairface", root, *given, *more)
+
+
+def templates(world: World, root: Path, *more: str | Path) -> Ran:
+    given = ("--pack", world.pack, "--data-dir", world.data, "--aligned", "--no-learned")
+    return run("audit", "templates", root, *given, *more)
+
+
+@pytest.mark.parametrize(("arguments", "reason"), FAIRFACE_USAGE)
+@pytest.mark.usefixtures("before_any_face")
+def test_a_wrong_audit_of_faces_is_refused_before_any_face_is_embedded(
+    world: World, fairface_root: Path, tmp_path: Path, arguments: list[str], reason: str
+) -> None:
+    ran = fairface(world, fairface_root, *SMALL, *arguments, "--out", tmp_path / "out")
+    refused(ran, reason, 2)
+    assert not (tmp_path / "out").exists()
+
+
+def paths(world: World, folder: Path, arguments: Sequence[str]) -> list[str | Path]:
+    files = {
+        "DECOYS": world.data / "decoys.veil",
+        "CONTRACT": world.data / "contract.json",
+        **{name: folder / name.lower() for name in ("ABSENT", "OTHER", "NARROW", "UNSAID")},
+    }
+    return [files.get(argument, argument) for argument in arguments]
+
+
+def write_decoys(world: World, folder: Path) -> None:
+    """Decoys of another model, of another dimension, and of no model that they name."""
+    known = DecoyGenerator.load(world.data / "decoys.veil")
+    with Keystream.seeded("decoys of a test") as stream:
+        drawn = known.draw(150, 1, stream=stream)[:, 0]
+    DecoyGenerator.fit(drawn, made_with="ab" * 32).save(folder / "other")
+    DecoyGenerator.fit(drawn).save(folder / "unsaid")
+    narrow = drawn[:, :32] / (drawn[:, :32] ** 2).sum(axis=1, keepdims=True) ** 0.5
+    DecoyGenerator.fit(narrow, made_with=known.made_with).save(folder / "narrow")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason", "status"),
+    [(*one, 2) for one in TEMPLATES_USAGE] + [(*one, 1) for one in TEMPLATES_FAILED],
+)
+@pytest.mark.usefixtures("before_any_face")
+def test_a_wrong_audit_of_templates_is_refused_before_any_face_is_embedded(
+    world: World, tmp_path: Path, arguments: list[str], reason: str, status: int
+) -> None:
+    write_decoys(world, tmp_path)
+    given = paths(world, tmp_path, arguments)
+    sizes = ("--victims", "20", "--owners", "100", "--dim", "4")
+    ran = templates(world, world.labelled, *sizes, *given, "--out", tmp_path / "out")
+    refused(ran, reason, status)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_pack_must_be_named(fairface_root: Path, world: World, tmp_path: Path) -> None:
+    for command, root in (("fairface", fairface_root), ("templates", world.labelled)):
+        ran = run("audit", command, root, "--data-dir", tmp_path, "--out", tmp_path / "out")
+        refused(ran, "name the pack with --pack", 2)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        *(["fairface", *each] for each in (["--lifting", "99"], ["--attack", "1"], ["--k", "0"])),
+        *(["fairface", *each] for each in (["--attacked", "1"], ["--seed", "-1"])),
+        *(["fairface", "--max-attribute-leakage", each] for each in ("-0.1", "1.5", "low")),
+        *(["templates", *each] for each in (["--victims", "19"], ["--owners", "99"])),
+        *(["templates", *each] for each in (["--climbed", "0"], ["--attempts", "49"])),
+        *(["templates", *each] for each in (["--training-seconds", "0"], ["--strategy", "magic"])),
+        *(["templates", f"--max-{name}", "2"] for name in ("linkability", "success-with-key")),
+    ],
+    ids=" ".join,
+)
+def test_options_of_a_wrong_kind_are_refused(
+    world: World, fairface_root: Path, tmp_path: Path, wrong: list[str]
+) -> None:
+    command, option, value = wrong
+    root = fairface_root if command == "fairface" else world.labelled
+    ran = run("audit", command, root, "--pack", world.pack, option, value, "--out", tmp_path / "o")
+    assert (ran.status, ran.stdout) == (2, "")
+    assert option in ran.stderr
+    assert "Traceback" not in ran.stderr
+
+
+def test_the_least_pool_is_what_a_generator_is_fitted_to() -> None:
+    assert audit_templates.FITTED_FACES == audit_fairface.LEAST_LIFTING == MIN_DESCRIPTORS
+
+
+def test_a_folder_without_label_files_is_refused(
+    world: World, fairface_root: Path, tmp_path: Path
+) -> None:
+    refused(fairface(world, tmp_path, *SMALL), "has no fairface_label_train.csv; give the", 1)
+    half = tmp_path / "half"
+    half.mkdir()
+    (half / "train").symlink_to(fairface_root / "train")
+    shutil.copy(fairface_root / "fairface_label_train.csv", half)
+    refused(fairface(world, half, *SMALL), "has no fairface_label_val.csv; give the", 1)
+
+
+def test_a_wrong_label_is_named(world: World, fairface_root: Path, tmp_path: Path) -> None:
+    text = (fairface_root / "fairface_label_train.csv").read_text()
+    wrong = text.replace("20-29", "adult", 1)
+    (tmp_path / "fairface_label_train.csv").write_text(wrong)
+    ran = fairface(world, tmp_path, *SMALL)
+    refused(ran, "fairface_label_train.csv, line 3: the age is none of", 1)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "reason"),
+    [
+        (["--lifting", "150"], "cannot be taken from 150 training faces"),
+        (["--lifting", "1000"], "choose smaller sizes"),
+        (["--lifting", "100"], "give the attacker more faces"),
+        ([], "give the attacker more faces"),
+    ],
+)
+def test_sizes_that_do_not_fit_are_refused(
+    world: World, fairface_root: Path, tmp_path: Path, sizes: list[str], reason: str
+) -> None:
+    asked = ("--strategy", "raw", "--generated-dim", "4", "--service-dim", "4", *sizes)
+    cache = fairface_root / "faces.cache"
+    ran = fairface(world, fairface_root, *asked, "--cache", cache, "--out", tmp_path / "out")
+    refused(ran, reason, 1)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        (b"strategy,accuracy\n", "is no JSON file"),
+        (b"\xff\xfe\x00", "is no JSON file"),
+        (b"[" * 100_000, "is no JSON file"),
+        (b"[1]", "is no results.json of `veilface evaluate`"),
+        (json.dumps({"format": "veilface audit"}).encode(), "is no results.json of `veilface"),
+    ],
+    ids=["csv", "binary", "deep", "list", "audit"],
+)
+@pytest.mark.usefixtures("before_any_face")
+def test_an_evaluation_that_is_none_is_refused(
+    world: World, fairface_root: Path, tmp_path: Path, content: bytes, reason: str
+) -> None:
+    (tmp_path / "other.json").write_bytes(content)
+    ran = fairface(world, fairface_root, *SMALL, "--evaluation", tmp_path / "other.json")
+    refused(ran, f"other.json {reason}", 1)
+
+
+@pytest.mark.usefixtures("before_any_face")
+def test_an_absent_evaluation_is_said(world: World, fairface_root: Path, tmp_path: Path) -> None:
+    ran = fairface(world, fairface_root, *SMALL, "--evaluation", tmp_path / "absent.json")
+    refused(ran, "absent.json: No such file or directory", 1)
+
+
+def test_too_few_people_are_refused(world: World, tmp_path: Path) -> None:
+    cache = tmp_path / "faces.cache"
+    for sizes, reason in (
+        (("--victims", "20", "--owners", "100"), "ask for fewer with --victims and --owners"),
+        (("--victims", "51", "--owners", "100"), "need 151 people with two photos or more, and 50"),
+    ):
+        ran = templates(world, world.labelled, *sizes, "--dim", "4", "--cache", cache)
+        refused(ran, reason, 1)
+
+
+def test_a_folder_that_is_too_small_is_refused(world: World, tmp_path: Path) -> None:
+    """Parts are dealt out before anybody is compared: one photo may stand for many people."""
+    (photo, other, *_) = sorted(world.decoy_faces.rglob("*.png"))
+    for number in range(420):
+        person = tmp_path / "people" / f"person-{number}"
+        person.mkdir(parents=True)
+        (person / "0.png").symlink_to(photo)
+        if number < 120:
+            (person / "1.png").symlink_to(other)
+    asked = ("--victims", "20", "--owners", "100", "--dim", "4", "--cache", tmp_path / "cache")
+    refused(
+        templates(world, tmp_path / "people", *asked),
+        "the attacker has 100 faces, a third of the people who are neither victims nor decoy "
+        "owners, and needs 200: ask for fewer with --victims and --owners",
+        1,
+    )
+    for number in range(400, 420):
+        shutil.rmtree(tmp_path / "people" / f"person-{number}")
+    refused(
+        templates(world, tmp_path / "people", *asked),
+        "187 people are left to calibrate on, and 200 are the least",
+        1,
+    )
+
+
+def test_people_without_folders_are_refused(world: World, tmp_path: Path) -> None:
+    ran = templates(world, tmp_path, "--dim", "4")
+    assert (ran.status, ran.stdout) == (1, "")
+    assert "defect" not in ran.stderr
+    assert "error: " in ran.stderr
+
+
+@pytest.mark.usefixtures("before_any_face")
+def test_a_contract_of_other_decoys_is_refused(world: World, tmp_path: Path) -> None:
+    known = DecoyGenerator.load(world.data / "decoys.veil")
+    with Keystream.seeded("other decoys of a test") as stream:
+        drawn = known.draw(150, 1, stream=stream)[:, 0]
+    DecoyGenerator.fit(drawn, made_with=known.made_with).save(tmp_path / "other")
+    contract = ("--contract", world.data / "contract.json")
+    ran = templates(world, world.labelled, *contract, "--decoys", tmp_path / "other")
+    refused(ran, "use the file that the contract was calibrated with", 1)
+
+
+@pytest.mark.parametrize("option", ["--learned", "--reconstruct"])
+@pytest.mark.usefixtures("before_any_face")
+def test_a_trained_attack_without_torch_names_the_extra(
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, option: str
+) -> None:
+    found = importlib.import_module
+
+    def without_torch(name: str, package: str | None = None) -> Any:
+        if name.split(".")[0] == "torch":
+            raise ModuleNotFoundError("No module named 'torch'", name="torch")
+        return found(name, package)
+
+    monkeypatch.setattr(importlib, "import_module", without_torch)
+    monkeypatch.setattr(extra, "import_module", without_torch)
+    given = ("--pack", world.pack, "--data-dir", world.data, option)
+    ran = run("audit", "templates", world.labelled, *given, "--out", tmp_path / "out")
+    refused(
+        ran, 'needs the package torch, which is not installed: pip install "veilface[torch]"', 1
+    )
+
+
+def test_without_torch_no_inverter_is_trained_and_it_is_said(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(audit_templates, "find_spec", lambda _: None)
+    given = ("--pack", world.pack, "--data-dir", world.data, "--dim", "0")
+    ran = run("audit", "templates", world.labelled, *given)
+    assert ran.status == 2
+    assert "note: no inverter is trained: torch is not installed" in ran.stderr
