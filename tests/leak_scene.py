@@ -34,7 +34,14 @@ from templates.sealing import MasterKeyring
 from templates.store import TemplateStore
 from templates.wire import decode, encode
 from tests.leak_material import PEOPLE, PROBE_M, Material, Photo
-from tests.leak_places import copied_tables, files_of, open_files, relation_files, written_log
+from tests.leak_places import (
+    copied_tables,
+    files_of,
+    log_position,
+    open_files,
+    relation_files,
+    written_log,
+)
 from verify.cohort import client_source
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -446,7 +453,7 @@ def _look(scene: Scene, moment: str) -> None:
     scene.values[moment] = _values(scene)
 
 
-def _compact(scene: Scene, start: str | None) -> None:
+def _compact(scene: Scene, start: int | None) -> None:
     store = TemplateStore(
         scene.database_url, MasterKeyring.load(scene.folder / "data" / "master.key")
     )
@@ -475,9 +482,8 @@ def _values(scene: Scene) -> dict[str, list[list[bytes]]]:
     return tables
 
 
-def _log_position(scene: Scene) -> str | None:
+def _log_position(scene: Scene) -> int | None:
     if scene.kind == "sqlite":
         return None
     with psycopg.connect(scene.database_url, autocommit=True) as connection:
-        row = connection.execute("SELECT pg_current_wal_insert_lsn()").fetchone()
-        return None if row is None else str(row[0])
+        return log_position(connection)
