@@ -20,12 +20,12 @@ types: .venv/dev
 
 .venv/core: requirements.lock pyproject.toml | $(UV)
 	test -x $(VENV)/python || $(UV) venv --quiet --python '>=3.11' .venv
-	$(UV) pip install --quiet --require-hashes -r requirements.lock
-	$(UV) pip install --quiet --no-deps -e .
+	$(UV) pip install --quiet --python $(VENV)/python --require-hashes -r requirements.lock
+	$(UV) pip install --quiet --python $(VENV)/python --no-deps -e .
 	touch $@
 
 .venv/dev: requirements-dev.lock .venv/core | $(UV)
-	$(UV) pip install --quiet --require-hashes -r requirements-dev.lock
+	$(UV) pip install --quiet --python $(VENV)/python --require-hashes -r requirements-dev.lock
 	touch $@
 
 .bootstrap/bin/uv:

@@ -15,38 +15,28 @@ Example
 
 import argparse
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
+from attacks.decisions import decide
+from attacks.stored.wolves import axis_wolves
 from models.cache import EmbeddingCache
 from models.extraction import Extractor
 from models.pack import ModelPack
-from templates.contract import Binding, Calibration, Contract, Level
+from templates.contract import Binding, Contract
 from templates.decoys import DecoyGenerator
-from templates.distances import paired_distances, pairwise_distances, similarity
 from templates.lifting import Strategy, lift
 from templates.randomness import Keystream
 from templates.rotation import ROTATION_VERSION, tenant_rotation
 from templates.sealing import KeyringSealer, MasterKeyring
-from templates.subspace import AffineSubspace, SubspaceBatch
+from templates.subspace import SubspaceBatch
 from verify import CalibrationOptions, calibrate, labelled_folder
-from verify.cohort import cohort_statistics
 
-Array = npt.NDArray[np.float64]
-AXES = 64
 ATTACKED = 700
-
-
-@dataclass(frozen=True)
-class Wolf:
-    """A lifted probe that is built to lie near everybody."""
-
-    family: str
-    subspace: AffineSubspace
 
 
 @dataclass(frozen=True)
@@ -59,63 +49,6 @@ class Faces:
     def only(self, keep: npt.NDArray[np.bool_]) -> "Faces":
         """Rows where ``keep`` holds."""
         return Faces(self.descriptors[keep], self.names[keep])
-
-
-def wolves(faces: npt.NDArray[np.float32], m: int, foot_norm: float, seed: int) -> list[Wolf]:
-    """Wolf probes of dimension m that are learnt from (N, n) unit descriptors."""
-    rng = np.random.default_rng(seed)
-    mean = faces.mean(axis=0, dtype=np.float64)
-    axes = np.linalg.svd(faces - mean, full_matrices=False)[2][:AXES].astype(np.float64)
-    uncentred = np.linalg.svd(faces.astype(np.float64), full_matrices=False)[2][:AXES]
-
-    def bases() -> Iterator[Array]:
-        yield axes[:m]
-        yield uncentred[:m]
-        yield axes[m : 2 * m]
-        for width in (2, 4):
-            for _ in range(4):
-                mix = np.linalg.qr(rng.standard_normal((width * m, m)))[0]
-                yield mix.T @ axes[: width * m]
-
-    found = []
-    for basis in bases():
-        found.append(Wolf("axes through the origin", subspace(np.zeros_like(mean), basis)))
-        for factor in (0.8, 1.0, 1.2):
-            direction = mean - basis.T @ (basis @ mean)
-            foot = factor * foot_norm * direction / np.linalg.norm(direction)
-            found.append(Wolf("foot point along the mean face", subspace(foot, basis)))
-    return found
-
-
-def subspace(foot: Array, basis: Array) -> AffineSubspace:
-    """Canonical subspace; the basis is orthonormalised, the foot point made orthogonal to it."""
-    orthonormal = np.linalg.qr(basis.T)[0].T
-    return AffineSubspace(
-        foot=(foot - orthonormal.T @ (orthonormal @ foot)).astype(np.float32),
-        basis=np.ascontiguousarray(orthonormal, dtype=np.float32),
-    )
-
-
-def decisions(
-    probes: SubspaceBatch | npt.NDArray[np.float32],
-    templates: SubspaceBatch,
-    contract: Contract,
-    calibration: Calibration,
-    level: Level,
-    *,
-    paired: bool = False,
-) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
-    """Accepted by the threshold alone, and by threshold and cohort test; (P, T), or (P,) paired."""
-    compare = paired_distances if paired else pairwise_distances
-    distances = compare(probes, templates, metric=calibration.metric, steps=calibration.steps)
-    scores = np.asarray(similarity(distances), dtype=np.float64)
-    means, spreads = cohort_statistics(
-        probes, contract.cohort, metric=calibration.metric, steps=calibration.steps
-    )
-    if not paired:
-        means, spreads = means[:, None], spreads[:, None]
-    near = scores >= level.similarity_threshold
-    return near, near & ((scores - means) / spreads >= level.cohort_threshold)
 
 
 def percent(accepted: npt.NDArray[np.bool_]) -> dict[str, object]:
@@ -161,8 +94,8 @@ def wolf_table(
     calibration = contract.calibration("s2s", probe_m=m)
     level = calibration.level(level_name)
     low, high = calibration.foot_point_norm or (0.0, 1.0)
-    pack = wolves(attacker_faces, m, foot_norm=(low + high) / 2, seed=m)
-    near, accepted = decisions(
+    pack = axis_wolves(attacker_faces, m, foot_norm=(low + high) / 2, seed=m)
+    near, accepted = decide(
         SubspaceBatch.of([wolf.subspace for wolf in pack]), attacked, contract, calibration, level
     )
     table: dict[str, object] = {"wolves": len(pack), "templates": len(attacked)}
@@ -201,7 +134,7 @@ def genuine_table(
             faces.descriptors[second], strategy=Strategy.ADVERSARIAL, m=m,
             source=source, stream=stream,
         )  # fmt: skip
-    near, accepted = decisions(probes, templates, contract, calibration, level, paired=True)
+    near, accepted = decide(probes, templates, contract, calibration, level, paired=True)
     return {"threshold_only_rejected": percent(~near), "with_cohort_rejected": percent(~accepted)}
 
 
@@ -220,9 +153,9 @@ def thief_table(
     foot_points = feet / norms
     turned = inside @ tenant_rotation(bytes(range(32)), templates.n).T
 
-    def tried(probes: Array) -> dict[str, object]:
+    def tried(probes: npt.NDArray[np.float64]) -> dict[str, object]:
         rows = np.ascontiguousarray(probes, dtype=np.float32)
-        return percent(decisions(rows, templates, contract, calibration, level, paired=True)[1])
+        return percent(decide(rows, templates, contract, calibration, level, paired=True).accepted)
 
     return {
         "level": level_name,
