@@ -69,17 +69,22 @@ def test_templates_of_the_attacker_s_own_faces_are_opened(scene: Scene) -> None:
 
 
 def test_templates_of_noise_are_opened_as_often_as_by_any_face(scene: Scene) -> None:
-    """The negative control: no face, and no decoy, is in these subspaces."""
+    """The negative control: no face, and no decoy, is in these subspaces.
+
+    Some 75 of 15,000 are opened by the first five faces, so chance does not double them; the
+    attacker's order must not either.
+    """
     rng = np.random.default_rng(5)
-    axes = np.linalg.qr(rng.normal(size=(1500, N, 1 + scene.scheme.dim)))[0]
+    axes = np.linalg.qr(rng.normal(size=(15_000, N, 1 + scene.scheme.dim)))[0]
     axes = axes.transpose(0, 2, 1).astype(np.float32)
     length = np.float32(scene.templates.foot_norms.mean())
     noise = SubspaceBatch(length * axes[:, 0], np.ascontiguousarray(axes[:, 1:]))
     closed = replace(scene, templates=noise)
     faces = rehearse_scene(scene).faces.astype(np.float32)
     one = decide(faces, noise, scene.contract, scene.points, scene.level).accepted.mean()
+    assert one > 0
     for limit, outcome in by_limit(dictionary_outcomes(closed)).items():
-        assert outcome.measured.ci_low <= 1 - (1 - one) ** limit
+        assert outcome.measured.value <= 2 * (1 - (1 - one) ** limit)
 
 
 def test_a_scene_gives_the_same_counts_twice(scene: Scene) -> None:
