@@ -1,22 +1,34 @@
 """Distances of probes to templates: the one entrance to both metrics and both modes.
 
 A probe is a raw descriptor (point to subspace) or itself lifted (subspace to subspace). Probes
-and templates may have different subspace dimensions.
+and templates may have different subspace dimensions. Float32 runs on compiled kernels
+(``templates.tiles``) or, on a device, on torch (``templates.tensors``); float64 on the plain NumPy
+of ``templates.euclidean`` and ``templates.spherical``, which is their specification.
 """
 
+from collections.abc import Callable
 from enum import StrEnum
-from typing import overload
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, NamedTuple, overload
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from templates import euclidean, spherical
 from templates.crossgram import Floats, Kind
 from templates.errors import InvalidEmbedding, InvalidTemplate, TemplateError
 from templates.subspace import SubspaceBatch
 
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from templates.tensors import SubspaceTensors
+
 DEFAULT_STEPS = 50
 """Steps of the spherical subspace-to-subspace iteration; part of a calibration."""
+
+Labels = tuple[NDArray[np.int64], NDArray[np.int64]]
+Progress = Callable[[int], None]
 
 Probes = NDArray[np.float32] | NDArray[np.float64] | SubspaceBatch
 
@@ -30,14 +42,49 @@ class Metric(StrEnum):
     """Those of unit length, as every descriptor is: what the product decides with."""
 
 
+class Neighbours(NamedTuple):
+    """The K nearest of each, nearest first; of equally near ones the lowest index first.
+
+    Where fewer than K could be found, index −1 at an infinite distance.
+    """
+
+    indices: NDArray[np.int64]
+    distances: NDArray[np.float32]
+
+
+@overload
 def pairwise_distances(
     probes: Probes,
     templates: SubspaceBatch,
     *,
     metric: Metric | str,
+    steps: int = ...,
+    dtype: DTypeLike = ...,
+    threads: int | None = ...,
+    device: str | None = ...,
+) -> Floats: ...
+
+
+@overload
+def pairwise_distances(
+    probes: "Tensor | SubspaceTensors",
+    templates: "SubspaceTensors",
+    *,
+    metric: Metric | str,
+    steps: int = ...,
+) -> "Tensor": ...
+
+
+def pairwise_distances(
+    probes: "Probes | Tensor | SubspaceTensors",
+    templates: "SubspaceBatch | SubspaceTensors",
+    *,
+    metric: Metric | str,
     steps: int = DEFAULT_STEPS,
     dtype: DTypeLike = np.float32,
-) -> Floats:
+    threads: int | None = None,
+    device: str | None = None,
+) -> "Floats | Tensor":
     """Distances of every probe to every template.
 
     Parameters
@@ -46,39 +93,173 @@ def pairwise_distances(
         Raw descriptors or lifted probes. The spherical metric sees only the direction of a raw
         descriptor; a zero vector has similarity 0.
     templates : SubspaceBatch of T
+        Or SubspaceTensors, with probes that are tensors: all stays on their device.
     metric : Metric
     steps : int
         Of the spherical subspace-to-subspace iteration; unused otherwise.
     dtype : float32 or float64
         Precision of the bulk work. Distances below 0.1 and nearly singular pairs are computed in
         float64 in any case.
+    threads : int, optional
+        At most; by default as many as the matrix library would use. Their number does not change
+        the result. Float64 uses the library's.
+    device : str, optional
+        Of torch, such as "cuda": the float32 work is done there, and the result copied back.
 
     Returns
     -------
     ndarray of ``dtype``, shape (P, T)
-        Never NaN and never negative. Memory beyond the result is bounded.
+        Never NaN and never negative. Memory beyond the result is bounded. A Tensor where
+        templates are tensors.
 
     Raises
     ------
     InvalidEmbedding, InvalidTemplate
         Probes or templates of wrong shape, or with a number that is not finite.
+    TemplateError
+        A parameter out of range, or a device that torch cannot use.
 
     References
     ----------
-    Paper eq. 1 to 9; METHOD §3.
+    Paper eq. 1 to 9; METHOD §3 and §5.
     """
-    metric, kind = Metric(metric), _checked(probes, templates, steps, dtype)
-    shape = (len(probes), len(templates))
-    if 0 in shape:
-        return np.empty(shape, dtype=kind)
-    if isinstance(probes, SubspaceBatch):
-        if metric is Metric.EUCLIDEAN:
-            return euclidean.subspaces_pairwise(probes, templates, kind)
-        return spherical.subspaces_pairwise(probes, templates, steps, kind)
-    points = np.ascontiguousarray(probes, dtype=kind)
-    if metric is Metric.EUCLIDEAN:
-        return euclidean.points_pairwise(points, templates, kind)
-    return spherical.points_pairwise(points, templates, kind)
+    metric = Metric(metric)
+    if device is not None or not isinstance(templates, SubspaceBatch):
+        found = _tensors().pairwise(probes, templates, metric=metric, steps=steps, device=device)
+        result: Floats = found.cpu().numpy() if isinstance(templates, SubspaceBatch) else found
+        return result
+    probes, kind = _checked(probes, templates, steps, dtype)
+    out = np.empty((len(probes), len(templates)), dtype=kind)
+    if out.size and kind == np.float64:
+        return _reference(probes, templates, metric, steps)
+    if out.size:
+        _tiles().matrix(probes, templates, out, metric=metric, steps=steps, threads=threads)
+    return out
+
+
+def nearest(
+    probes: "Probes | Tensor | SubspaceTensors",
+    templates: "SubspaceBatch | SubspaceTensors",
+    *,
+    k: int,
+    metric: Metric | str,
+    steps: int = DEFAULT_STEPS,
+    of_templates: bool = False,
+    labels: Labels | None = None,
+    threads: int | None = None,
+    device: str | None = None,
+    progress: Progress | None = None,
+) -> Neighbours:
+    """Find the K nearest templates of every probe, without the matrix of all distances.
+
+    Parameters
+    ----------
+    probes, templates, metric, steps, threads, device
+        As of `pairwise_distances`, in float32.
+    k : int
+        At least 1.
+    of_templates
+        Find the K nearest probes of every template instead.
+    labels : pair of ndarray of int64, shapes (P,) and (T,), optional
+        Pairs with equal labels are passed over.
+    progress
+        Called with numbers of pairs that are done; not called on a device.
+
+    Returns
+    -------
+    Neighbours
+        Of shape (P, K), or (T, K) with ``of_templates``; the distances are those of
+        `pairwise_distances`. Tensors where templates are tensors.
+
+    Raises
+    ------
+    InvalidEmbedding, InvalidTemplate, TemplateError
+        As of `pairwise_distances`.
+    """
+    metric = Metric(metric)
+    if k < 1:
+        raise TemplateError(f"{k} neighbours cannot be found; k is at least 1")
+    if device is not None or not isinstance(templates, SubspaceBatch):
+        options: dict[str, Any] = {"k": k, "metric": metric, "steps": steps, "device": device}
+        found = _tensors().nearest(
+            probes, templates, of_templates=of_templates, labels=labels, **options
+        )
+        if isinstance(templates, SubspaceBatch):
+            return Neighbours(*(part.cpu().numpy() for part in found))
+        return Neighbours(*found)
+    probes, _ = _checked(probes, templates, steps, np.float32)
+    return Neighbours(
+        *_tiles().nearest(
+            probes,
+            templates,
+            k,
+            of_templates=of_templates,
+            labels=_labels(labels, probes, templates),
+            metric=metric,
+            steps=steps,
+            threads=threads,
+            progress=progress,
+        )
+    )
+
+
+def count_within(
+    probes: "Probes | Tensor | SubspaceTensors",
+    templates: "SubspaceBatch | SubspaceTensors",
+    thresholds: ArrayLike,
+    *,
+    metric: Metric | str,
+    steps: int = DEFAULT_STEPS,
+    labels: Labels | None = None,
+    threads: int | None = None,
+    device: str | None = None,
+    progress: Progress | None = None,
+) -> NDArray[np.int64]:
+    """Count the pairs up to every threshold, without the matrix of all distances.
+
+    With the labels of people, the counts over the number of pairs of different people are the
+    FMR at every threshold.
+
+    Parameters
+    ----------
+    probes, templates, metric, steps, labels, threads, device, progress
+        As of `nearest`.
+    thresholds : array_like of float, shape (S,)
+        In any order.
+
+    Returns
+    -------
+    ndarray of int64, shape (S,)
+        Number of pairs with distance <= threshold, of different labels where there are labels.
+
+    Raises
+    ------
+    InvalidEmbedding, InvalidTemplate, TemplateError
+        As of `pairwise_distances`; a threshold that is not a number.
+    """
+    metric = Metric(metric)
+    limits = np.atleast_1d(np.asarray(thresholds, dtype=np.float64))
+    if limits.ndim != 1 or np.isnan(limits).any():
+        raise TemplateError("thresholds are a row of numbers")
+    order = np.argsort(limits)
+    counts = np.empty(len(limits), dtype=np.int64)
+    if device is not None or not isinstance(templates, SubspaceBatch):
+        options: dict[str, Any] = {"metric": metric, "steps": steps, "device": device}
+        found = _tensors().counts_within(probes, templates, limits[order], labels=labels, **options)
+        counts[order] = found.cpu().numpy()
+        return counts
+    probes, _ = _checked(probes, templates, steps, np.float32)
+    counts[order] = _tiles().counts(
+        probes,
+        templates,
+        limits[order],
+        labels=_labels(labels, probes, templates),
+        metric=metric,
+        steps=steps,
+        threads=threads,
+        progress=progress,
+    )
+    return counts
 
 
 def paired_distances(
@@ -95,12 +276,16 @@ def paired_distances(
     -------
     ndarray of ``dtype``, shape (P,)
     """
-    metric, kind = Metric(metric), _checked(probes, templates, steps, dtype)
+    metric = Metric(metric)
+    probes, kind = _checked(probes, templates, steps, dtype)
     if len(probes) != len(templates):
         raise TemplateError(f"{len(probes)} probes do not pair with {len(templates)} templates")
     if not len(probes):
         return np.empty(0, dtype=kind)
     if isinstance(probes, SubspaceBatch):
+        if kind == np.float32:
+            found: Floats = _tiles().paired(probes, templates, metric=metric, steps=steps)
+            return found
         if metric is Metric.EUCLIDEAN:
             return euclidean.subspaces_paired(probes, templates, kind)
         return spherical.subspaces_paired(probes, templates, steps, kind)
@@ -108,6 +293,11 @@ def paired_distances(
     if metric is Metric.EUCLIDEAN:
         return euclidean.points_paired(points, templates, kind)
     return spherical.points_paired(points, templates, kind)
+
+
+def warm_up() -> None:
+    """Compile the kernels, or load them from their cache, so that no request has to wait."""
+    _tiles().warm_up()
 
 
 @overload
@@ -123,7 +313,9 @@ def similarity(distance: float | NDArray[np.floating]) -> float | NDArray[np.flo
     return 1 - distance**2 / 2
 
 
-def _checked(probes: Probes, templates: SubspaceBatch, steps: int, dtype: DTypeLike) -> Kind:
+def _checked(
+    probes: Any, templates: SubspaceBatch, steps: int, dtype: DTypeLike
+) -> tuple[Probes, Kind]:
     kind: Kind = np.dtype(np.float64 if np.dtype(dtype) == np.float64 else np.float32)
     if np.dtype(dtype) != kind:
         raise TemplateError(f"distances are computed in float32 or float64, not {np.dtype(dtype)}")
@@ -136,15 +328,58 @@ def _checked(probes: Probes, templates: SubspaceBatch, steps: int, dtype: DTypeL
                 f"a probe in R^{probes.n} does not fit templates in R^{templates.n}"
             )
         _check_finite(probes)
-        return kind
+        return probes, kind
+    if not isinstance(probes, np.ndarray):
+        raise TemplateError("probes are arrays or a batch where templates are a batch")
     if probes.ndim != 2 or probes.shape[1] != templates.n:
         raise InvalidEmbedding(f"expected probes of shape (P, {templates.n}), seen {probes.shape}")
     if not np.isfinite(probes).all():
         raise InvalidEmbedding("a probe holds a number that is not finite")
-    return kind
+    return probes, kind
 
 
 def _check_finite(batch: SubspaceBatch) -> None:
     # A sum is not finite if any of its terms is not, and needs no temporary of the batch's size.
     if not np.isfinite(batch.feet.sum()) or not np.isfinite(batch.bases.sum()):
         raise InvalidTemplate("a template holds a number that is not finite")
+
+
+def _tiles() -> ModuleType:
+    """The compiled kernels, imported when they are needed: the compiler takes a while to load."""
+    from templates import bulk
+
+    return bulk
+
+
+def _tensors() -> ModuleType:
+    try:
+        from templates import tensors
+    except ImportError as error:
+        raise TemplateError(
+            f"a device needs the extra 'torch' of veilface ({error.name} is not installed)"
+        ) from None
+    return tensors
+
+
+def _reference(probes: Probes, templates: SubspaceBatch, metric: Metric, steps: int) -> Floats:
+    kind: Kind = np.dtype(np.float64)
+    if isinstance(probes, SubspaceBatch):
+        if metric is Metric.EUCLIDEAN:
+            return euclidean.subspaces_pairwise(probes, templates, kind)
+        return spherical.subspaces_pairwise(probes, templates, steps, kind)
+    points = np.ascontiguousarray(probes, dtype=kind)
+    if metric is Metric.EUCLIDEAN:
+        return euclidean.points_pairwise(points, templates, kind)
+    return spherical.points_pairwise(points, templates, kind)
+
+
+def _labels(labels: Labels | None, probes: Probes, templates: SubspaceBatch) -> Labels | None:
+    if labels is None:
+        return None
+    mine, theirs = (np.ascontiguousarray(side, dtype=np.int64) for side in labels)
+    if mine.shape != (len(probes),) or theirs.shape != (len(templates),):
+        raise TemplateError(
+            f"labels of shapes {mine.shape} and {theirs.shape} do not fit {len(probes)} probes "
+            f"and {len(templates)} templates"
+        )
+    return mine, theirs

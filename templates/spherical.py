@@ -32,7 +32,7 @@ _LONGEST = 1e3
 _ITERATION_BYTES = 2 << 20
 
 
-class _Spheres(NamedTuple):
+class Spheres(NamedTuple):
     """Intersections with the unit sphere.
 
     A set that misses the sphere (‖p‖ > 1) holds no descriptor. It is replaced by its foot point's
@@ -44,15 +44,21 @@ class _Spheres(NamedTuple):
     radii: NDArray[np.float64]
 
 
-def _spheres(batch: SubspaceBatch) -> _Spheres:
+def spheres(batch: SubspaceBatch) -> Spheres:
+    """Return where the sets of a batch meet the unit sphere."""
     norms = batch.foot_norms
-    return _Spheres(1 / np.maximum(norms, 1), np.sqrt(np.maximum(1 - norms**2, 0)))
+    return Spheres(1 / np.maximum(norms, 1), np.sqrt(np.maximum(1 - norms**2, 0)))
 
 
 def _normalised(rows: Floats) -> Floats:
     """Unit rows along the last axis; a zero row stays zero."""
     norms = np.sqrt(np.einsum("...i,...i->...", rows, rows))[..., None]
     return np.asarray(rows / np.maximum(norms, np.finfo(rows.dtype).tiny))
+
+
+def directions(points: Floats) -> NDArray[np.float32]:
+    """Unit rows, rounded once; a zero row stays zero."""
+    return _normalised(points.astype(np.float64)).astype(np.float32)
 
 
 def _distances(similarities: Floats) -> Floats:
@@ -63,7 +69,7 @@ def points_pairwise(points: Floats, templates: SubspaceBatch, dtype: Kind) -> Fl
     """Distances of the directions of points (P, n) to templates, shape (P, T)."""
     out = np.empty((len(points), len(templates)), dtype=dtype)
     directions = _normalised(points.astype(np.float64)).astype(dtype)
-    scales, radii = (part.astype(dtype) for part in _spheres(templates))
+    scales, radii = (part.astype(dtype) for part in spheres(templates))
     for rows, columns, dots, spreads in point_tiles(directions, templates, dtype):
         dots *= scales[columns, None]
         np.sqrt(spreads, out=spreads)
@@ -87,7 +93,7 @@ def points_exact(
 ) -> NDArray[np.float64]:
     """Distances of points ``i`` to templates ``j`` from explicit differences in float64."""
     out = np.empty(len(i))
-    scales, radii = _spheres(templates)
+    scales, radii = spheres(templates)
     for part in chunks(len(i), templates.m * templates.n):
         mine, theirs = i[part], j[part]
         bases = templates.bases[theirs].astype(np.float64)
@@ -106,9 +112,9 @@ def subspaces_pairwise(
 ) -> Floats:
     """Distances of all probes to all templates, shape (P, T)."""
     out = np.empty((len(probes), len(templates)), dtype=dtype)
-    spheres = _spheres(probes), _spheres(templates)
+    both = spheres(probes), spheres(templates)
     for tile in pair_tiles(probes, templates, dtype):
-        distances = _tile(probes, templates, tile, *spheres, steps)
+        distances = _tile(probes, templates, tile, *both, steps)
         out[tile.first, tile.second] = distances
     return out
 
@@ -118,9 +124,9 @@ def subspaces_paired(
 ) -> Floats:
     """Distances of probe i to template i, shape (P,)."""
     out = np.empty(len(probes), dtype=dtype)
-    spheres = _spheres(probes), _spheres(templates)
+    both = spheres(probes), spheres(templates)
     for tile in matched_tiles(probes, templates, dtype):
-        out[tile.first] = _tile(probes, templates, tile, *spheres, steps)
+        out[tile.first] = _tile(probes, templates, tile, *both, steps)
     return out
 
 
@@ -148,29 +154,28 @@ def _tile(
     probes: SubspaceBatch,
     templates: SubspaceBatch,
     tile: PairTile,
-    mine: _Spheres,
-    theirs: _Spheres,
+    mine: Spheres,
+    theirs: Spheres,
     steps: int,
 ) -> Floats:
     dots, problem = _problem(tile, mine, theirs)
     count, m_d, m_e = problem.b.shape
     gains = np.empty_like(dots)
-    v = np.empty((count, m_e), dtype=dots.dtype)
     step = max(1, _ITERATION_BYTES // ((m_d + 8) * (m_e + 8) * dots.dtype.itemsize))
     for start in range(0, count, step):
         part = slice(start, min(start + step, count))
         some = problem.take(part)
-        gains[part], v[part] = _maximise(some, _starts(some), steps)
+        gains[part], _ = _maximise(some, _starts(some), steps)
     distances = _distances(dots + gains)
     near = np.flatnonzero(distances < NEAR)
     if near.size:
-        distances[near] = _near(
-            probes, templates, tile.first[near], tile.second[near], v[near], steps
+        distances[near] = subspaces_exact(
+            probes, templates, tile.first[near], tile.second[near], steps
         )
     return distances
 
 
-def _problem(tile: PairTile, mine: _Spheres, theirs: _Spheres) -> tuple[Floats, _Problem]:
+def _problem(tile: PairTile, mine: Spheres, theirs: Spheres) -> tuple[Floats, _Problem]:
     dtype = tile.dots.dtype
     i, j = tile.first, tile.second
     s, t = mine.radii[i].astype(dtype), theirs.radii[j].astype(dtype)
@@ -264,17 +269,12 @@ def _step(problem: _Problem, v: Floats) -> tuple[Floats, Floats]:
     return norms, _normalised(following)
 
 
-def _near(
-    probes: SubspaceBatch,
-    templates: SubspaceBatch,
-    i: Indices,
-    j: Indices,
-    v: Floats,
-    steps: int,
+def subspaces_exact(
+    probes: SubspaceBatch, templates: SubspaceBatch, i: Indices, j: Indices, steps: int
 ) -> NDArray[np.float64]:
-    """Distances of close pairs: iterate on in float64 and subtract the closest points."""
+    """Distances of close pairs: iterate in float64 and subtract the closest points."""
     out = np.empty(len(i))
-    mine, theirs = _spheres(probes), _spheres(templates)
+    mine, theirs = spheres(probes), spheres(templates)
     for part in chunks(len(i), 2 * (probes.m + templates.m) * probes.n):
         a, b = i[part], j[part]
         d, e = probes.bases[a].astype(np.float64), templates.bases[b].astype(np.float64)
@@ -287,8 +287,7 @@ def _near(
             t * (p[:, None, :] @ columns)[:, 0, :],
             (s * t)[:, :, None] * (d @ columns),
         )
-        starts = np.concatenate([v[part, None, :], _starts(problem)], axis=1)
-        _, best = _maximise(problem, starts, steps)
+        _, best = _maximise(problem, _starts(problem), steps)
         u = _normalised(problem.g + (problem.b @ best[:, :, None])[:, :, 0])
         best = _normalised(problem.h + (u[:, None, :] @ problem.b)[:, 0, :])
         x = p + s * _normalised((u[:, None, :] @ d)[:, 0, :])

@@ -1,0 +1,307 @@
+"""Distances of all probes to all templates, a tile at a time, on compiled kernels and all cores.
+
+One tile is the product of the stacked rows [p; D] of some probes and some templates (METHOD §5),
+made by the matrix library and solved by a kernel while it is in the cache. Memory is bounded by the
+tiles of the threads. A distance depends neither on the number of threads nor on their order.
+"""
+
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from templates import euclidean, spherical
+from templates.blas import single_threaded
+from templates.crossgram import Indices
+from templates.distances import Metric
+from templates.kernels.euclidean import euclidean_subspaces
+from templates.kernels.euclidean import scratch_size as euclidean_scratch
+from templates.kernels.lanes import LANES
+from templates.kernels.points import euclidean_points, spherical_points
+from templates.kernels.spherical import scratch_size as spherical_scratch
+from templates.kernels.spherical import spherical_subspaces
+from templates.subspace import SubspaceBatch
+
+Floats = NDArray[np.float32]
+Probes = Floats | SubspaceBatch
+Progress = Callable[[int], None]
+"""Called with a number of pairs that are done."""
+
+_NEAR = np.float32(0.1)
+_ACCURACY = np.float32(5e-5)
+# Rows of the product of a tile, either way: 4 MiB.
+_TILE_SIDE = 1024
+_BLOCK_BYTES = 64 << 20
+_PAIRED_BYTES = 8 << 20
+
+_In = TypeVar("_In")
+_Out = TypeVar("_Out")
+
+
+class Collector(Protocol):
+    """Where one thread puts its tiles."""
+
+    def take(self, rows: slice, columns: slice, distances: Floats) -> None:
+        """Use a tile (R · C,); C is the number of columns rounded up to 16."""
+        ...
+
+
+_Kept = TypeVar("_Kept", bound=Collector)
+
+
+def traverse(
+    probes: Probes,
+    templates: SubspaceBatch,
+    collector: Callable[[], _Kept],
+    *,
+    metric: Metric,
+    steps: int,
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> list[_Kept]:
+    """Compute every distance once and hand it to a collector.
+
+    Parameters
+    ----------
+    probes : (P, n) float32, or SubspaceBatch of P
+    templates : SubspaceBatch of T
+    collector
+        Called once in every thread. Which tiles a thread gets varies from run to run.
+    threads
+        At most; by default as many as the matrix library has.
+    """
+    solver = _Solver(probes, templates, metric, steps)
+    spaces = threading.local()
+    collectors: list[_Kept] = []
+    if not len(probes) or not len(templates):
+        return collectors
+    lock = threading.Lock()
+
+    def solve(pair: tuple[_Tile, _Tile]) -> None:
+        rows, columns = pair
+        if not hasattr(spaces, "here"):
+            spaces.here = solver.space()
+            spaces.collector = collector()
+            with lock:
+                collectors.append(spaces.collector)
+        distances = solver.distances(rows, columns, spaces.here)
+        spaces.collector.take(rows.part, columns.part, distances)
+        if progress is not None:
+            with lock:
+                progress(len(rows) * len(columns))
+
+    with single_threaded() as available, _Crew(threads or available) as crew:
+        for some in solver.column_blocks():
+            columns = crew.map(solver.pack_templates, some)
+            for others in solver.row_blocks():
+                rows = crew.map(solver.pack_probes, others)
+                crew.map(solve, [(row, column) for column in columns for row in rows])
+    return collectors
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class _Tile:
+    """Stacked rows of some probes or templates."""
+
+    part: slice
+    stacked: Floats
+    """(R, m + 1, n) of probes, (m + 1, C, n) of templates; (R, n) of points."""
+    squares: Floats
+    """Squared lengths of the points or feet; unused by the spherical metric."""
+
+    def __len__(self) -> int:
+        return int(self.part.stop - self.part.start)
+
+
+class _Space(NamedTuple):
+    """Working space of one thread."""
+
+    product: Floats
+    work: Floats
+    distances: Floats
+
+
+class _Crew:
+    """Threads that share the items of a list; none where one is enough."""
+
+    def __init__(self, threads: int) -> None:
+        self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
+
+    def __enter__(self) -> "_Crew":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+
+    def map(self, function: Callable[[_In], _Out], items: Sequence[_In]) -> list[_Out]:
+        if self._pool is None or len(items) < 2:
+            return [function(item) for item in items]
+        return list(self._pool.map(function, items))
+
+
+class _Solver:
+    """One problem: its tiles, and a tile's distances."""
+
+    def __init__(
+        self, probes: Probes, templates: SubspaceBatch, metric: Metric, steps: int
+    ) -> None:
+        self._probes, self._templates = probes, templates
+        self._euclidean, self._steps = metric is Metric.EUCLIDEAN, steps
+        self._m = probes.m if isinstance(probes, SubspaceBatch) else 0
+        width = LANES * max(1, _TILE_SIDE // ((templates.m + 1) * LANES))
+        self._rows = _even(len(probes), max(1, _TILE_SIDE // (self._m + 1)))
+        self._columns = whole(_even(len(templates), width))
+
+    def row_blocks(self) -> Iterator[list[slice]]:
+        return _blocks(len(self._probes), self._rows, (self._m + 1) * self._templates.n)
+
+    def column_blocks(self) -> Iterator[list[slice]]:
+        numbers = (self._templates.m + 1) * self._templates.n
+        return _blocks(len(self._templates), self._columns, numbers)
+
+    def space(self) -> _Space:
+        """Allocate what a thread needs for the largest tile."""
+        m_d, m_e = self._m, self._templates.m
+        pairs = self._rows * self._columns
+        size = 0
+        if m_d:
+            size = (euclidean_scratch if self._euclidean else spherical_scratch)(m_d, m_e)
+        return _Space(
+            np.empty(pairs * (m_d + 1) * (m_e + 1), dtype=np.float32),
+            np.zeros(size, dtype=np.float32),
+            np.empty(pairs, dtype=np.float32),
+        )
+
+    def pack_probes(self, part: slice) -> _Tile:
+        """Stack the rows of some probes, probe after probe."""
+        if not isinstance(self._probes, SubspaceBatch):
+            points = self._probes[part]
+            squares = _squares(points)
+            return _Tile(part, points if self._euclidean else spherical.directions(points), squares)
+        some = self._probes[part]
+        stacked = np.empty((len(some), some.m + 1, some.n), dtype=np.float32)
+        self._fill(some, stacked[:, 0], stacked[:, 1:])
+        return _Tile(part, stacked, _squares(some.feet))
+
+    def pack_templates(self, part: slice) -> _Tile:
+        """Stack the rows of some templates, all feet first; the number is filled up with zeros."""
+        some = self._templates[part]
+        shape = (some.m + 1, whole(len(some)), some.n)
+        stacked = np.empty(shape, dtype=np.float32)
+        stacked[:, len(some) :] = 0
+        own = stacked[:, : len(some)]
+        squares = np.zeros(shape[1], dtype=np.float32)
+        squares[: len(some)] = _squares(some.feet)
+        self._fill(some, own[0], own[1:].transpose(1, 0, 2))
+        return _Tile(part, stacked, squares)
+
+    def _fill(self, batch: SubspaceBatch, feet: Floats, bases: Floats) -> None:
+        if self._euclidean:
+            feet[:], bases[:] = batch.feet, batch.bases
+            return
+        scales, radii = spherical.spheres(batch)
+        np.multiply(batch.feet, scales.astype(np.float32)[:, None], out=feet)
+        np.multiply(batch.bases, radii.astype(np.float32)[:, None, None], out=bases)
+
+    def distances(self, rows: _Tile, columns: _Tile, space: _Space) -> Floats:
+        """Distances of a tile, (R · C,); valid until the space is used again."""
+        n = self._templates.n
+        left, right = rows.stacked.reshape(-1, n), columns.stacked.reshape(-1, n)
+        product = space.product[: len(left) * len(right)]
+        np.matmul(left, right.T, out=product.reshape(len(left), len(right)))
+        wide = columns.stacked.shape[1]
+        out = space.distances[: len(rows) * wide]
+        if self._solve(product, rows.squares, columns.squares, len(rows), wide, space.work, out):
+            table = out.reshape(len(rows), wide)[:, : len(columns)]
+            i, j = np.nonzero(table < 0)
+            table[i, j] = self._exact(i + rows.part.start, j + columns.part.start)
+        return out
+
+    def paired(self, part: slice) -> Floats:
+        """Distances of probes to the templates of the same positions."""
+        mine, theirs = self.pack_probes(part), self.pack_templates(part)
+        count, wide = len(mine), theirs.stacked.shape[1]
+        m_d, m_e = self._m, self._templates.m
+        product = np.zeros((m_d + 1, m_e + 1, wide), dtype=np.float32)
+        columns = theirs.stacked[:, :count].transpose(1, 2, 0)
+        product[:, :, :count] = (mine.stacked @ columns).transpose(1, 2, 0)
+        squares = theirs.squares
+        squares[:count] += mine.squares
+        size = (euclidean_scratch if self._euclidean else spherical_scratch)(m_d, m_e)
+        work, out = np.zeros(size, dtype=np.float32), np.empty(wide, dtype=np.float32)
+        nothing = np.zeros(1, dtype=np.float32)
+        if self._solve(product.reshape(-1), nothing, squares, 1, wide, work, out):
+            again = np.flatnonzero(out[:count] < 0)
+            out[again] = self._exact(again + part.start, again + part.start)
+        return out[:count]
+
+    def _solve(
+        self,
+        product: Floats,
+        mine: Floats,
+        theirs: Floats,
+        rows: int,
+        columns: int,
+        work: Floats,
+        out: Floats,
+    ) -> int:
+        m_d, m_e = self._m, self._templates.m
+        if self._euclidean:
+            if not m_d:
+                return euclidean_points(product, mine, theirs, m_e, _NEAR, out)
+            return euclidean_subspaces(product, mine, theirs, m_d, m_e, _NEAR, _ACCURACY, work, out)
+        if not m_d:
+            return spherical_points(product, m_e, columns, _NEAR, out)
+        return spherical_subspaces(product, rows, columns, m_d, m_e, self._steps, _NEAR, work, out)
+
+    def _exact(self, i: Indices, j: Indices) -> NDArray[np.float64]:
+        probes, templates = self._probes, self._templates
+        if not isinstance(probes, SubspaceBatch):
+            exact = euclidean.points_exact if self._euclidean else spherical.points_exact
+            return exact(probes, templates, i, j)
+        if self._euclidean:
+            return euclidean.subspaces_exact(probes, templates, i, j)
+        return spherical.subspaces_exact(probes, templates, i, j, self._steps)
+
+
+def _squares(rows: Floats) -> Floats:
+    return np.asarray(np.einsum("ij,ij->i", rows, rows, dtype=np.float64), dtype=np.float32)
+
+
+def whole(count: int) -> int:
+    """Round up to whole vectors."""
+    return count + -count % LANES
+
+
+def _even(count: int, most: int) -> int:
+    """Size of the parts of ``count`` that are equal, at most ``most``, and even in number."""
+    parts = -(-count // most)
+    return -(-count // (parts + parts % 2 if parts > 1 else 1))
+
+
+def _blocks(count: int, step: int, numbers: int) -> Iterator[list[slice]]:
+    """Tiles in blocks whose stacked rows, of ``numbers`` each, fit the memory meant for them."""
+    tiles = [slice(start, min(start + step, count)) for start in range(0, count, step)]
+    several = max(1, _BLOCK_BYTES // (4 * step * numbers))
+    for first in range(0, len(tiles), several):
+        yield tiles[first : first + several]
+
+
+def paired_tile(
+    probes: SubspaceBatch, templates: SubspaceBatch, *, metric: Metric, steps: int
+) -> Floats:
+    """Distances of probe i to template i, (P,)."""
+    out = np.empty(len(probes), dtype=np.float32)
+    solver = _Solver(probes, templates, metric, steps)
+    numbers = (probes.m + templates.m + 2) * probes.n + (probes.m + 1) * (templates.m + 1)
+    step = max(1, _PAIRED_BYTES // (4 * numbers))
+    with single_threaded():
+        for start in range(0, len(probes), step):
+            part = slice(start, min(start + step, len(probes)))
+            out[part] = solver.paired(part)
+    return out
