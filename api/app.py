@@ -24,6 +24,7 @@ from api.routes import contract, enrollment, health, subjects, transfer, verific
 from api.runtime import Runtime
 from api.settings import ENV_PREFIX, Settings, load_settings
 from models.errors import ModelError
+from templates.distances import warm_up
 from templates.errors import VeilfaceError
 
 VERSION = "0.1.0"
@@ -44,6 +45,8 @@ def create_app(
             # Its sentence is written for the operator and holds no secret.
             log("start failed: " + str(error), severity=logging.ERROR)
             raise
+        # No request is answered before this is done, so none waits for the compiler.
+        await anyio.to_thread.run_sync(warm_up)
         app.state.runtime = runtime
         app.state.gate = Gate(slots=settings.resolved_compute_slots, waiting=settings.queue_limit)
         log(

@@ -14,7 +14,8 @@ import httpx
 
 from api.errors import StartError
 
-START_TIMEOUT_S = 40.0
+# A first start compiles the distance kernels.
+START_TIMEOUT_S = 120.0
 
 
 @contextlib.contextmanager

@@ -7,7 +7,7 @@ tiles of the threads. A distance depends neither on the number of threads nor on
 
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol, TypeVar
 
@@ -35,7 +35,7 @@ _NEAR = np.float32(0.1)
 _ACCURACY = np.float32(5e-5)
 # Rows of the product of a tile, either way: 4 MiB.
 _TILE_SIDE = 1024
-_BLOCK_BYTES = 64 << 20
+_BLOCK_BYTES = 32 << 20
 _PAIRED_BYTES = 8 << 20
 
 _In = TypeVar("_In")
@@ -130,6 +130,7 @@ class _Crew:
 
     def __init__(self, threads: int) -> None:
         self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
+        self._error: BaseException | None = None
 
     def __enter__(self) -> "_Crew":
         return self
@@ -141,7 +142,22 @@ class _Crew:
     def map(self, function: Callable[[_In], _Out], items: Sequence[_In]) -> list[_Out]:
         if self._pool is None or len(items) < 2:
             return [function(item) for item in items]
-        return list(self._pool.map(function, items))
+
+        def one(item: _In) -> _Out:
+            if self._error is not None:
+                raise CancelledError
+            try:
+                return function(item)
+            except BaseException as error:
+                self._error = self._error or error
+                raise
+
+        try:
+            return list(self._pool.map(one, items))
+        except CancelledError:
+            if self._error is None:
+                raise
+            raise self._error from None
 
 
 class _Solver:
@@ -213,7 +229,8 @@ class _Solver:
         n = self._templates.n
         left, right = rows.stacked.reshape(-1, n), columns.stacked.reshape(-1, n)
         product = space.product[: len(left) * len(right)]
-        np.matmul(left, right.T, out=product.reshape(len(left), len(right)))
+        with np.errstate(over="ignore", invalid="ignore"):  # such pairs are computed again
+            np.matmul(left, right.T, out=product.reshape(len(left), len(right)))
         wide = columns.stacked.shape[1]
         out = space.distances[: len(rows) * wide]
         if self._solve(product, rows.squares, columns.squares, len(rows), wide, space.work, out):
@@ -229,7 +246,8 @@ class _Solver:
         m_d, m_e = self._m, self._templates.m
         product = np.zeros((m_d + 1, m_e + 1, wide), dtype=np.float32)
         columns = theirs.stacked[:, :count].transpose(1, 2, 0)
-        product[:, :, :count] = (mine.stacked @ columns).transpose(1, 2, 0)
+        with np.errstate(over="ignore", invalid="ignore"):  # such pairs are computed again
+            product[:, :, :count] = (mine.stacked @ columns).transpose(1, 2, 0)
         squares = theirs.squares
         squares[:count] += mine.squares
         size = (euclidean_scratch if self._euclidean else spherical_scratch)(m_d, m_e)
@@ -270,7 +288,8 @@ class _Solver:
 
 
 def _squares(rows: Floats) -> Floats:
-    return np.asarray(np.einsum("ij,ij->i", rows, rows, dtype=np.float64), dtype=np.float32)
+    squares = np.einsum("ij,ij->i", rows, rows, dtype=np.float64)
+    return np.asarray(np.minimum(squares, np.finfo(np.float32).max), dtype=np.float32)
 
 
 def whole(count: int) -> int:

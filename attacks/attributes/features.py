@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attacks.attributes.faces import LabelledFaces
-from attacks.attributes.neighbours import Attacked, Neighbours, votes
-from templates.distances import Metric
+from attacks.attributes.neighbours import Attacked, votes
+from templates.distances import Metric, Neighbours
 from templates.subspace import SubspaceBatch
 
 Floats = NDArray[np.float32]

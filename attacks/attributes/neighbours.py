@@ -1,19 +1,16 @@
 """The nearest of the attacker's faces to a template: the paper's attack (its §4.3).
 
-A template and a face are compared by the point-to-subspace distance. Both metrics come from the
-same products, so they are searched together. Gallery and templates are taken a tile at a time, and
-only the K best of every template are kept: memory does not grow with the number of pairs.
+A template and a face are compared by the point-to-subspace distance, as
+``templates.distances.nearest`` does it: memory does not grow with the number of pairs.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from attacks.errors import AuditError
-from templates.crossgram import point_tiles
-from templates.distances import Metric, paired_distances
+from templates.distances import Metric, Neighbours, nearest
 from templates.subspace import SubspaceBatch
 
 Floats = NDArray[np.float32]
@@ -24,28 +21,10 @@ Advance = Callable[[int], None]
 """Called with a number of (template, face) pairs that are done."""
 
 METRICS = (Metric.EUCLIDEAN, Metric.SPHERICAL)
-# Below this, squared distances in float32 have lost digits to cancellation.
-_NEAR = 0.1
-_GALLERY_ROWS = 4096
-_ATTACKED_ROWS = 512
+_ROWS = 512
 # Enough to settle ties of the vote, too little to outweigh a neighbour (K is at most _MOST).
 _MOST = 1000
 _TIE = 1e-4
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Neighbours:
-    """The K nearest faces of every template, nearest first.
-
-    Parameters
-    ----------
-    indices : (P, K) int64
-        Positions in the gallery.
-    distances : (P, K) float32
-    """
-
-    indices: Codes
-    distances: Floats
 
 
 def nearest_neighbours(
@@ -73,12 +52,12 @@ def nearest_neighbours(
         Position in the gallery that each template does not find: that of the face in it, where the
         attacker lifted faces of the gallery. The gallery must have more than ``k`` faces then.
     progress
-        Called after every tile with the number of pairs that it held.
+        Called with numbers of pairs that were compared by all metrics; they add up to P · G.
 
     Returns
     -------
-    By metric. Of equally near faces the first of the gallery comes first. Distances below 0.1 are
-    computed again in float64.
+    By metric, of shape (P, K). Of equally near faces the first of the gallery comes first.
+    Distances below 0.1 are computed in float64.
 
     Raises
     ------
@@ -96,18 +75,57 @@ def nearest_neighbours(
             f"{k} neighbours of templates of {n} numbers cannot be found among {len(gallery)} "
             f"faces of {gallery.shape[1]} numbers; K must be 1 to {_MOST}"
         )
-    best = {metric: _Best.empty(len(attacked), k) for metric in metrics}
-    for first in range(0, len(attacked), _ATTACKED_ROWS):
-        mine = slice(first, min(first + _ATTACKED_ROWS, len(attacked)))
-        for start in range(0, len(gallery), _GALLERY_ROWS):
-            tile = gallery[start : start + _GALLERY_ROWS]
-            for metric, keys in _keys(attacked[mine], tile, metrics).items():
-                if skip is not None:
-                    _forget(keys, skip[mine] - start)
-                best[metric].merge(mine, keys, start)
-            if progress is not None:
-                progress((mine.stop - mine.start) * len(tile))
-    return {metric: _exact(found, attacked, gallery, metric) for metric, found in best.items()}
+    if not isinstance(attacked, SubspaceBatch):
+        found = _nearest_points(attacked, gallery, k, skip, progress)
+        return dict.fromkeys(metrics, found)
+    labels = None if skip is None else (np.arange(len(gallery), dtype=np.int64), skip)
+    advance = None if progress is None else _in_parts(progress, len(metrics))
+    return {
+        metric: nearest(
+            gallery,
+            attacked,
+            k=k,
+            metric=metric,
+            of_templates=True,
+            labels=labels,
+            progress=advance,
+        )
+        for metric in metrics
+    }
+
+
+def _in_parts(progress: Advance, parts: int) -> Advance:
+    """Pass on what every part reports so that all parts together make the whole."""
+    done = 0
+
+    def advance(count: int) -> None:
+        nonlocal done
+        before = done // parts
+        done += count
+        progress(done // parts - before)
+
+    return advance
+
+
+def _nearest_points(
+    attacked: Floats, gallery: Floats, k: int, skip: Codes | None, progress: Advance | None
+) -> Neighbours:
+    indices = np.empty((len(attacked), k), dtype=np.int64)
+    distances = np.empty((len(attacked), k), dtype=np.float32)
+    for start in range(0, len(attacked), _ROWS):
+        rows = slice(start, min(start + _ROWS, len(attacked)))
+        far = 1 - attacked[rows] @ gallery.T
+        if skip is not None:
+            far[np.arange(len(far)), skip[rows]] = np.inf
+        some = np.argpartition(far, k - 1, axis=1)[:, :k]
+        gaps = attacked[rows, None].astype(np.float64) - gallery[some]
+        near = np.sqrt(np.einsum("pki,pki->pk", gaps, gaps))
+        order = np.lexsort((some, near), axis=1)
+        indices[rows] = np.take_along_axis(some, order, 1)
+        distances[rows] = np.take_along_axis(near, order, 1)
+        if progress is not None:
+            progress(far.size)
+    return Neighbours(indices, distances)
 
 
 def merged(first: Neighbours, second: Neighbours, *, after: int, k: int) -> Neighbours:
@@ -150,72 +168,3 @@ def vote(neighbours: Neighbours, labels: Codes, classes: int, *, k: int) -> Code
     weights = 1 + _TIE * 2.0 ** -np.arange(of.shape[1])
     scores = np.stack([(of == code) @ weights for code in range(classes)], axis=1)
     return np.asarray(np.argmax(scores, axis=1), dtype=np.int64)
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class _Best:
-    """The K least keys of every template so far, in order; updated in place."""
-
-    keys: Floats
-    indices: Codes
-
-    @classmethod
-    def empty(cls, count: int, k: int) -> "_Best":
-        return cls(
-            np.full((count, k), np.inf, dtype=np.float32), np.full((count, k), -1, dtype=np.int64)
-        )
-
-    def merge(self, rows: slice, keys: Floats, offset: int) -> None:
-        k = self.keys.shape[1]
-        place = np.tile(np.arange(keys.shape[1], dtype=np.int64), (len(keys), 1))
-        if keys.shape[1] > k:
-            place = np.argpartition(keys, k - 1, axis=1)[:, :k]
-        all_keys = np.concatenate([self.keys[rows], np.take_along_axis(keys, place, 1)], axis=1)
-        all_places = np.concatenate([self.indices[rows], place + offset], axis=1)
-        order = np.lexsort((all_places, all_keys), axis=1)[:, :k]
-        self.keys[rows] = np.take_along_axis(all_keys, order, 1)
-        self.indices[rows] = np.take_along_axis(all_places, order, 1)
-
-
-def _forget(keys: Floats, columns: Codes) -> None:
-    """Make one column of every row the last, where it lies in this tile."""
-    rows = np.flatnonzero((columns >= 0) & (columns < keys.shape[1]))
-    keys[rows, columns[rows]] = np.inf
-
-
-def _keys(attacked: Attacked, tile: Floats, metrics: Sequence[Metric]) -> dict[Metric, Floats]:
-    """Numbers that order the tile's faces as their distances do, shape (P, faces)."""
-    if not isinstance(attacked, SubspaceBatch):
-        squared = np.asarray(2 - 2 * (attacked @ tile.T), dtype=np.float32)
-        return {metric: squared.copy() for metric in metrics}
-    out = {m: np.empty((len(attacked), len(tile)), dtype=np.float32) for m in metrics}
-    squares = (attacked.foot_norms**2).astype(np.float32)
-    radii = attacked.radii.astype(np.float32)
-    for rows, columns, dots, spreads in point_tiles(tile, attacked, np.dtype(np.float32)):
-        if Metric.EUCLIDEAN in out:
-            out[Metric.EUCLIDEAN][columns, rows] = 1 + squares[columns, None] - 2 * dots - spreads
-        if Metric.SPHERICAL in out:
-            similar = dots + radii[columns, None] * np.sqrt(spreads)
-            out[Metric.SPHERICAL][columns, rows] = 2 - 2 * similar
-    return out
-
-
-def _exact(best: _Best, attacked: Attacked, gallery: Floats, metric: Metric) -> Neighbours:
-    """Distances of the squares found; the small ones anew, and the rows that have some in order."""
-    distances = np.sqrt(np.maximum(best.keys, 0))
-    indices = best.indices
-    i, j = np.nonzero(distances < _NEAR)
-    if i.size:
-        for start in range(0, i.size, _ATTACKED_ROWS):
-            rows, columns = i[start : start + _ATTACKED_ROWS], j[start : start + _ATTACKED_ROWS]
-            faces = gallery[indices[rows, columns]]
-            if isinstance(attacked, SubspaceBatch):
-                again = paired_distances(faces, attacked[rows], metric=metric, dtype=np.float64)
-            else:
-                gap = faces.astype(np.float64) - attacked[rows]
-                again = np.linalg.norm(gap, axis=1)
-            distances[rows, columns] = again
-        order = np.lexsort((indices, distances), axis=1)
-        distances = np.take_along_axis(distances, order, 1)
-        indices = np.take_along_axis(indices, order, 1)
-    return Neighbours(indices, distances)

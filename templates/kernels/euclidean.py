@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from templates.kernels.lanes import (
     LANES,
+    OVERFLOW,
     blend,
     compiled,
     every,
@@ -58,7 +59,7 @@ def euclidean_subspaces(
         ‖q‖².
     least
         Distances that are not above this are −1 in ``out``, and so are those of nearly singular
-        pairs.
+        pairs and those whose squares overflow.
     accuracy
         Largest relative error that a squared distance may have.
     work : float32
@@ -145,7 +146,7 @@ def euclidean_subspaces(
                 beta = beta * load(work, of_inverse + k * LANES)
                 store(work, of_beta + k * LANES, beta)
                 size = size + beta * (beta + beta)
-            sound &= less(limit, squared)
+            sound &= less(limit, squared) & less(squared, every(OVERFLOW))
             sound &= less(every(np.float32(4) * _EPS) * size, every(accuracy) * squared)
             found += sound != 0xFFFF
             store(

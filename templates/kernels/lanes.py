@@ -12,12 +12,15 @@ import operator
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
+import numpy as np
 from llvmlite import ir
 from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic, models, overload, register_model
 
 LANES = 16
+OVERFLOW = np.float32(1e38)
+"""A square that is not below this may be infinite."""
 
 Lanes = Any
 """Sixteen float32 numbers, in signatures of compiled functions."""

@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from templates.kernels.lanes import (
     LANES,
+    OVERFLOW,
     blend,
     compiled,
     every,
@@ -35,7 +36,8 @@ def euclidean_points(
     theirs : (C,) float32
         ‖p‖².
     least
-        A distance that is not above this is −1 in ``out``: its square has lost digits.
+        A distance that is not above this is −1 in ``out``: its square has lost digits. So is one
+        whose square overflows.
     out : (R · C,) float32
         Written.
 
@@ -61,7 +63,7 @@ def euclidean_points(
                 x = load(tile, place)
                 inside = fma(x, x, inside)
             squared = fma(two, dots, length + load(theirs, j)) - inside
-            known = less(limit, squared)
+            known = less(limit, squared) & less(squared, every(OVERFLOW))
             found += known != 0xFFFF
             store(out, i * columns + j, blend(known, root(squared), unknown))
     return found

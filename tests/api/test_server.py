@@ -32,7 +32,7 @@ def free_port() -> int:
 
 
 class Server:
-    def __init__(self, deployment: Deployment, folder: Path) -> None:
+    def __init__(self, deployment: Deployment, folder: Path, **environment: str) -> None:
         self.deployment = deployment
         self.log = folder / "stderr"
         self.url = f"http://127.0.0.1:{deployment.settings.port}"
@@ -40,12 +40,12 @@ class Server:
             self.process = subprocess.Popen(
                 [sys.executable, "-c", RUN],
                 cwd=Path(__file__).resolve().parents[2],
-                env={**environment_of(deployment.settings), "OMP_NUM_THREADS": "1"},
+                env={**environment_of(deployment.settings), "OMP_NUM_THREADS": "1", **environment},
                 stderr=stderr,
             )
 
     def wait(self) -> None:
-        for _ in range(600):
+        for _ in range(2400):
             if self.process.poll() is not None:
                 pytest.fail(self.log.read_text())
             try:
@@ -78,6 +78,32 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 def http(server: Server) -> Iterator[httpx.Client]:
     with httpx.Client(base_url=server.url, headers=bearer(server.deployment.token)) as client:
         yield client
+
+
+def test_the_kernels_are_compiled_before_the_server_is_ready(tmp_path: Path) -> None:
+    """A first start, with nothing in the compiler's cache."""
+    kernels = tmp_path / "kernels"
+    deployment = deploy(tmp_path, workers=1, port=free_port())
+    server = Server(deployment, tmp_path, NUMBA_CACHE_DIR=str(kernels))
+    try:
+        server.wait()
+        ready = sorted(path.name for path in kernels.rglob("*.nb[ci]"))
+        with httpx.Client(base_url=server.url, headers=bearer(deployment.token)) as client:
+            assert client.put("/v1/subjects/a/enrollment", files=images(photo(1))).is_success
+            answer = client.post("/v1/subjects/a/verify", files=images(photo(1, 2), name="image"))
+            assert answer.is_success
+    finally:
+        server.stop()
+    named = {name.split("-")[0].split(".")[1] for name in ready}
+    assert {
+        "euclidean_points",
+        "spherical_points",
+        "euclidean_subspaces",
+        "spherical_subspaces",
+        "keep_nearest",
+        "count_within",
+    } <= named
+    assert sorted(path.name for path in kernels.rglob("*.nb[ci]")) == ready
 
 
 def test_workers_share_the_database_and_nothing_else(server: Server, http: httpx.Client) -> None:

@@ -10,7 +10,7 @@ import scipy.optimize
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from templates import crossgram
+from templates import crossgram, tiles
 from templates.distances import (
     DEFAULT_STEPS,
     Metric,
@@ -336,18 +336,31 @@ def test_paired_is_the_diagonal_of_pairwise(metric: str, dtype: str):
         np.testing.assert_allclose(paired, expected, atol=2e-6)
 
 
+@pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("metric", METRICS)
-def test_tiles_bound_the_memory_and_do_not_show(metric: str, monkeypatch: pytest.MonkeyPatch):
+def test_tiles_bound_the_memory_and_do_not_show(
+    metric: str, dtype: str, monkeypatch: pytest.MonkeyPatch
+):
     a, b = randoms(150, 6, seed=11), randoms(150, 7, seed=12)
     points = units(Keystream.seeded(2), 900).astype(np.float32)
-    whole = [pairwise_distances(probes, b, metric=metric) for probes in (points, a)]
-    whole.append(paired_distances(a, b, metric=metric))
-    monkeypatch.setattr(crossgram, "_POINT_TILE_BYTES", 1 << 16)
-    monkeypatch.setattr(crossgram, "_PAIR_TILE_BYTES", 1 << 16)
-    monkeypatch.setattr(crossgram, "_GATHER_BYTES", 1 << 16)
+
+    def everything() -> list[np.ndarray]:
+        options = {"metric": metric, "dtype": dtype, "threads": 1}
+        found = [pairwise_distances(probes, b, **options) for probes in (points, a)]
+        return [*found, paired_distances(a, b, metric=metric, dtype=dtype)]
+
+    whole = everything()
+    for module, name, size in (
+        (crossgram, "_POINT_TILE_BYTES", 1 << 16),
+        (crossgram, "_PAIR_TILE_BYTES", 1 << 16),
+        (crossgram, "_GATHER_BYTES", 1 << 16),
+        (tiles, "_TILE_SIDE", 64),
+        (tiles, "_BLOCK_BYTES", 1 << 16),
+        (tiles, "_PAIRED_BYTES", 1 << 16),
+    ):
+        monkeypatch.setattr(module, name, size)
     tracemalloc.start()
-    tiled = [pairwise_distances(probes, b, metric=metric) for probes in (points, a)]
-    tiled.append(paired_distances(a, b, metric=metric))
+    tiled = everything()
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     for one, two in zip(whole, tiled, strict=True):

@@ -5,18 +5,17 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from attacks.attributes import neighbours
 from attacks.attributes.neighbours import (
     METRICS,
-    Neighbours,
     merged,
     nearest_neighbours,
     vote,
     votes,
 )
 from attacks.errors import AuditError
+from templates import tiles
 from templates.decoys import DecoyPool
-from templates.distances import Metric, pairwise_distances
+from templates.distances import Metric, Neighbours, pairwise_distances
 from templates.lifting import lift
 from templates.randomness import Keystream
 from tests.attacks.attributes.people import faces
@@ -33,12 +32,11 @@ TEMPLATES = lift(
 
 
 @pytest.mark.parametrize("metric", METRICS)
-@pytest.mark.parametrize("tiles", [(4096, 512), (37, 11), (300, 1)])
+@pytest.mark.parametrize("side", [1024, 200, 64])
 def test_finds_what_sorting_all_distances_finds(
-    metric: Metric, tiles: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+    metric: Metric, side: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(neighbours, "_GALLERY_ROWS", tiles[0])
-    monkeypatch.setattr(neighbours, "_ATTACKED_ROWS", tiles[1])
+    monkeypatch.setattr(tiles, "_TILE_SIDE", side)
     pairs: list[int] = []
     found = nearest_neighbours(TEMPLATES, GALLERY, k=12, progress=pairs.append)[metric]
     exact = pairwise_distances(GALLERY, TEMPLATES, metric=metric, dtype=np.float64).T
@@ -78,7 +76,9 @@ def test_two_searches_find_what_one_does() -> None:
         np.testing.assert_allclose(both.distances, whole.distances, atol=1e-6)
 
 
-def test_memory_does_not_grow_with_the_gallery() -> None:
+def test_memory_does_not_grow_with_the_gallery(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tiles, "_BLOCK_BYTES", 1 << 20)
+
     def peak(rows: int) -> int:
         gallery = np.resize(GALLERY, (rows, 64))
         tracemalloc.start()
