@@ -130,7 +130,7 @@ def subspaces_paired(
     return out
 
 
-class _Problem(NamedTuple):
+class Problem(NamedTuple):
     """Maximise g·u + h·v + uᵀBv over unit u and v, for K pairs."""
 
     g: Floats
@@ -144,9 +144,11 @@ class _Problem(NamedTuple):
 
     @classmethod
     def of(cls, g: Floats, h: Floats, b: Floats) -> Self:
+        """Keep the transposed matrix too."""
         return cls(g, h, b, np.ascontiguousarray(b.transpose(0, 2, 1)))
 
     def take(self, index: slice | Indices) -> Self:
+        """Return some of the pairs."""
         return type(self)(*(part[index] for part in self))
 
 
@@ -158,14 +160,14 @@ def _tile(
     theirs: Spheres,
     steps: int,
 ) -> Floats:
-    dots, problem = _problem(tile, mine, theirs)
+    dots, problem = problem_of(tile, mine, theirs)
     count, m_d, m_e = problem.b.shape
     gains = np.empty_like(dots)
     step = max(1, _ITERATION_BYTES // ((m_d + 8) * (m_e + 8) * dots.dtype.itemsize))
     for start in range(0, count, step):
         part = slice(start, min(start + step, count))
         some = problem.take(part)
-        gains[part], _ = _maximise(some, _starts(some), steps)
+        gains[part], _ = maximise(some, _starts(some), steps)
     distances = _distances(dots + gains)
     near = np.flatnonzero(distances < NEAR)
     if near.size:
@@ -175,12 +177,13 @@ def _tile(
     return distances
 
 
-def _problem(tile: PairTile, mine: Spheres, theirs: Spheres) -> tuple[Floats, _Problem]:
+def problem_of(tile: PairTile, mine: Spheres, theirs: Spheres) -> tuple[Floats, Problem]:
+    """Products p·q of the pairs of a tile, (K,), and the problems of the rest of the similarity."""
     dtype = tile.dots.dtype
     i, j = tile.first, tile.second
     s, t = mine.radii[i].astype(dtype), theirs.radii[j].astype(dtype)
     p, q = mine.scales[i].astype(dtype), theirs.scales[j].astype(dtype)
-    problem = _Problem.of(
+    problem = Problem.of(
         (s * q)[:, None] * tile.left,
         (t * p)[:, None] * tile.right,
         (s * t)[:, None, None] * tile.middle,
@@ -188,7 +191,7 @@ def _problem(tile: PairTile, mine: Spheres, theirs: Spheres) -> tuple[Floats, _P
     return p * q * tile.dots, problem
 
 
-def _starts(problem: _Problem) -> Floats:
+def _starts(problem: Problem) -> Floats:
     """Starts of v, shape (K, 2, m_E): the leading right singular vector of B with both signs.
 
     The objective has one or two local maxima, on either side of that vector, and its two signs
@@ -206,7 +209,7 @@ def _starts(problem: _Problem) -> Floats:
     return np.stack([leading, -leading], axis=1)
 
 
-def _maximise(problem: _Problem, starts: Floats, steps: int) -> tuple[Floats, Floats]:
+def maximise(problem: Problem, starts: Floats, steps: int) -> tuple[Floats, Floats]:
     """Best value over all starts, shape (K,), and its v, shape (K, m_E).
 
     One step is u ← normalise(g + B v), v ← normalise(h + Bᵀu), which never lowers the value. It
@@ -257,7 +260,7 @@ def _maximise(problem: _Problem, starts: Floats, steps: int) -> tuple[Floats, Fl
     return values[every, winner], best_v[every, winner]
 
 
-def _step(problem: _Problem, v: Floats) -> tuple[Floats, Floats]:
+def _step(problem: Problem, v: Floats) -> tuple[Floats, Floats]:
     """Value at v with the best u, shape (K, S), and the next v, shape (K, S, m_E)."""
     u = v @ problem.transposed
     u += problem.g[:, None, :]
@@ -282,12 +285,12 @@ def subspaces_exact(
         q = templates.feet[b] * theirs.scales[b, None]
         s, t = mine.radii[a, None], theirs.radii[b, None]
         columns = e.transpose(0, 2, 1)
-        problem = _Problem.of(
+        problem = Problem.of(
             s * (q[:, None, :] @ d.transpose(0, 2, 1))[:, 0, :],
             t * (p[:, None, :] @ columns)[:, 0, :],
             (s * t)[:, :, None] * (d @ columns),
         )
-        _, best = _maximise(problem, _starts(problem), steps)
+        _, best = maximise(problem, _starts(problem), steps)
         u = _normalised(problem.g + (problem.b @ best[:, :, None])[:, :, 0])
         best = _normalised(problem.h + (u[:, None, :] @ problem.b)[:, 0, :])
         x = p + s * _normalised((u[:, None, :] @ d)[:, 0, :])

@@ -133,7 +133,7 @@ def _step(square, c, g2, h, v):
 
 @triton.jit
 def _ascended(square, c, g2, h, v, inside, steps):
-    """Value and v of the accelerated alternation, ``templates.spherical._maximise``."""
+    """Value and v of the accelerated alternation, ``templates.spherical.maximise``."""
     value, stepped = _step(square, c, g2, h, v)
     moved = stepped - v
     trial = stepped
