@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from templates.distances import DEFAULT_STEPS, Labels, Metric
 from templates.kernels.selection import count_within, keep_nearest
 from templates.subspace import SubspaceBatch
-from templates.tiles import Floats, Probes, paired_tile, traverse, whole
+from templates.tiles import Floats, Probes, fill, paired_tile, traverse, whole
 
 Integers = NDArray[np.int64]
 
@@ -24,7 +24,7 @@ def matrix(
     probes: ArrayLike | SubspaceBatch, templates: SubspaceBatch, out: Floats, **options: Any
 ) -> None:
     """Write all distances to ``out``, (P, T) float32."""
-    traverse(_contiguous(probes), templates, lambda: _Whole(out), **options)
+    fill(_contiguous(probes), templates, out, **options)
 
 
 def nearest(
@@ -84,22 +84,6 @@ def _contiguous(probes: ArrayLike | SubspaceBatch) -> Probes:
     if isinstance(probes, SubspaceBatch):
         return probes
     return np.ascontiguousarray(probes, dtype=np.float32)
-
-
-class _Whole:
-    """The matrix of all distances; threads write to parts of their own.
-
-    Parameters
-    ----------
-    out : (P, T) float32
-    """
-
-    def __init__(self, out: Floats) -> None:
-        self._out = out
-
-    def take(self, rows: slice, columns: slice, distances: Floats) -> None:
-        """Copy a tile to its place."""
-        self._out[rows, columns] = _table(rows, columns, distances)
 
 
 class _Nearest:

@@ -56,9 +56,10 @@ def _normalised(rows: Floats) -> Floats:
     return np.asarray(rows / np.maximum(norms, np.finfo(rows.dtype).tiny))
 
 
-def directions(points: Floats) -> NDArray[np.float32]:
-    """Unit rows, rounded once; a zero row stays zero."""
-    return _normalised(points.astype(np.float64)).astype(np.float32)
+def directions(points: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Unit rows in float32; a zero row stays zero."""
+    norms = np.sqrt(np.einsum("ij,ij->i", points, points, dtype=np.float64))
+    return np.asarray(points / np.maximum(norms, 1e-37).astype(np.float32)[:, None])
 
 
 def _distances(similarities: Floats) -> Floats:
@@ -93,17 +94,16 @@ def points_exact(
 ) -> NDArray[np.float64]:
     """Distances of points ``i`` to templates ``j`` from explicit differences in float64."""
     out = np.empty(len(i))
-    scales, radii = spheres(templates)
     for part in chunks(len(i), templates.m * templates.n):
-        mine, theirs = i[part], j[part]
-        bases = templates.bases[theirs].astype(np.float64)
-        directions = _normalised(points[mine].astype(np.float64))
-        inside = (directions[:, None, :] @ bases.transpose(0, 2, 1) @ bases)[:, 0, :]
-        nearest = templates.feet[theirs] * scales[theirs, None]
-        nearest = nearest + radii[theirs, None] * _normalised(inside)
-        gaps = np.linalg.norm(directions - nearest, axis=1)
+        some = templates[j[part]]
+        scales, radii = spheres(some)
+        bases = some.bases.astype(np.float64)
+        units = _normalised(points[i[part]].astype(np.float64))
+        inside = (units[:, None, :] @ bases.transpose(0, 2, 1) @ bases)[:, 0, :]
+        nearest = some.feet * scales[:, None] + radii[:, None] * _normalised(inside)
+        gaps = np.linalg.norm(units - nearest, axis=1)
         # A zero probe has no direction: similarity 0 with everything.
-        out[part] = np.where(directions.any(axis=1), gaps, np.sqrt(2.0))
+        out[part] = np.where(units.any(axis=1), gaps, np.sqrt(2.0))
     return out
 
 
@@ -197,7 +197,7 @@ def _starts(problem: Problem) -> Floats:
     The objective has one or two local maxima, on either side of that vector, and its two signs
     lead to both: of 45,000 pairs of lifted faces, random subspaces and wolves one (in R⁸) ended
     more than 10⁻⁴ below random restarts. The vector is a column of a power of BᵀB, as good as the
-    exact one and is cheaper.
+    exact one, and cheaper.
     """
     power = problem.transposed @ problem.b
     tiny = np.finfo(power.dtype).tiny
@@ -277,13 +277,12 @@ def subspaces_exact(
 ) -> NDArray[np.float64]:
     """Distances of close pairs: iterate in float64 and subtract the closest points."""
     out = np.empty(len(i))
-    mine, theirs = spheres(probes), spheres(templates)
     for part in chunks(len(i), 2 * (probes.m + templates.m) * probes.n):
-        a, b = i[part], j[part]
-        d, e = probes.bases[a].astype(np.float64), templates.bases[b].astype(np.float64)
-        p = probes.feet[a] * mine.scales[a, None]
-        q = templates.feet[b] * theirs.scales[b, None]
-        s, t = mine.radii[a, None], theirs.radii[b, None]
+        a, b = probes[i[part]], templates[j[part]]
+        mine, theirs = spheres(a), spheres(b)
+        d, e = a.bases.astype(np.float64), b.bases.astype(np.float64)
+        p, q = a.feet * mine.scales[:, None], b.feet * theirs.scales[:, None]
+        s, t = mine.radii[:, None], theirs.radii[:, None]
         columns = e.transpose(0, 2, 1)
         problem = Problem.of(
             s * (q[:, None, :] @ d.transpose(0, 2, 1))[:, 0, :],

@@ -318,7 +318,8 @@ class SubspaceBatch:
     @property
     def foot_norms(self) -> NDArray[np.float64]:
         """‖p‖ of every template, shape (N,)."""
-        return np.asarray(np.linalg.norm(self.feet.astype(np.float64), axis=1))
+        squares = np.einsum("ij,ij->i", self.feet, self.feet, dtype=np.float64)
+        return np.asarray(np.sqrt(squares))
 
     @property
     def radii(self) -> NDArray[np.float64]:

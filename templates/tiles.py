@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,21 +75,55 @@ def traverse(
         At most; by default as many as the matrix library has.
     """
     solver = _Solver(probes, templates, metric, steps)
-    spaces = threading.local()
     collectors: list[_Kept] = []
-    if not len(probes) or not len(templates):
-        return collectors
+
+    def keep(rows: _Tile, columns: _Tile, space: _Space) -> None:
+        if space.collector is None:
+            space.collector = collector()
+            collectors.append(space.collector)
+        wide = whole(len(columns))
+        distances = space.distances[: len(rows) * wide]
+        solver.solve(rows, columns, space, distances.reshape(len(rows), wide))
+        space.collector.take(rows.part, columns.part, distances)
+
+    _each_tile(solver, keep, threads, progress)
+    return collectors
+
+
+def fill(
+    probes: Probes,
+    templates: SubspaceBatch,
+    out: Floats,
+    *,
+    metric: Metric,
+    steps: int,
+    threads: int | None = None,
+) -> None:
+    """Write all distances to ``out``, (P, T), C-contiguous."""
+    solver = _Solver(probes, templates, metric, steps)
+
+    def write(rows: _Tile, columns: _Tile, space: _Space) -> None:
+        solver.solve(rows, columns, space, out[rows.part, columns.part])
+
+    _each_tile(solver, write, threads, None)
+
+
+def _each_tile(
+    solver: "_Solver",
+    act: Callable[["_Tile", "_Tile", "_Space"], None],
+    threads: int | None,
+    progress: Progress | None,
+) -> None:
+    if not solver.pairs:
+        return
+    spaces = threading.local()
     lock = threading.Lock()
 
-    def solve(pair: tuple[_Tile, _Tile]) -> None:
+    def one(pair: tuple[_Tile, _Tile]) -> None:
         rows, columns = pair
         if not hasattr(spaces, "here"):
             spaces.here = solver.space()
-            spaces.collector = collector()
-            with lock:
-                collectors.append(spaces.collector)
-        distances = solver.distances(rows, columns, spaces.here)
-        spaces.collector.take(rows.part, columns.part, distances)
+        act(rows, columns, spaces.here)
         if progress is not None:
             with lock:
                 progress(len(rows) * len(columns))
@@ -99,8 +133,7 @@ def traverse(
             columns = crew.map(solver.pack_templates, some)
             for others in solver.row_blocks():
                 rows = crew.map(solver.pack_probes, others)
-                crew.map(solve, [(row, column) for column in columns for row in rows])
-    return collectors
+                crew.map(one, [(row, column) for column in columns for row in rows])
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -117,12 +150,14 @@ class _Tile:
         return int(self.part.stop - self.part.start)
 
 
-class _Space(NamedTuple):
-    """Working space of one thread."""
+@dataclass(eq=False, repr=False)
+class _Space:
+    """Working space of one thread, and its collector."""
 
     product: Floats
     work: Floats
     distances: Floats
+    collector: Any = None
 
 
 class _Crew:
@@ -172,6 +207,10 @@ class _Solver:
         width = LANES * max(1, _TILE_SIDE // ((templates.m + 1) * LANES))
         self._rows = _even(len(probes), max(1, _TILE_SIDE // (self._m + 1)))
         self._columns = whole(_even(len(templates), width))
+
+    @property
+    def pairs(self) -> int:
+        return len(self._probes) * len(self._templates)
 
     def row_blocks(self) -> Iterator[list[slice]]:
         return _blocks(len(self._probes), self._rows, (self._m + 1) * self._templates.n)
@@ -224,20 +263,17 @@ class _Solver:
         np.multiply(batch.feet, scales.astype(np.float32)[:, None], out=feet)
         np.multiply(batch.bases, radii.astype(np.float32)[:, None, None], out=bases)
 
-    def distances(self, rows: _Tile, columns: _Tile, space: _Space) -> Floats:
-        """Distances of a tile, (R · C,); valid until the space is used again."""
+    def solve(self, rows: _Tile, columns: _Tile, space: _Space, out: Floats) -> None:
+        """Write the distances of a tile to ``out``, (R, T or more), a part of an array's rows."""
         n = self._templates.n
         left, right = rows.stacked.reshape(-1, n), columns.stacked.reshape(-1, n)
         product = space.product[: len(left) * len(right)]
         with np.errstate(over="ignore", invalid="ignore"):  # such pairs are computed again
             np.matmul(left, right.T, out=product.reshape(len(left), len(right)))
-        wide = columns.stacked.shape[1]
-        out = space.distances[: len(rows) * wide]
-        if self._solve(product, rows.squares, columns.squares, len(rows), wide, space.work, out):
-            table = out.reshape(len(rows), wide)[:, : len(columns)]
+        if self._solve(product, rows.squares, columns.squares, space.work, out):
+            table = out[:, : len(columns)]
             i, j = np.nonzero(table < 0)
             table[i, j] = self._exact(i + rows.part.start, j + columns.part.start)
-        return out
 
     def paired(self, part: slice) -> Floats:
         """Distances of probes to the templates of the same positions."""
@@ -253,29 +289,30 @@ class _Solver:
         size = (euclidean_scratch if self._euclidean else spherical_scratch)(m_d, m_e)
         work, out = np.zeros(size, dtype=np.float32), np.empty(wide, dtype=np.float32)
         nothing = np.zeros(1, dtype=np.float32)
-        if self._solve(product.reshape(-1), nothing, squares, 1, wide, work, out):
+        if self._solve(product.reshape(-1), nothing, squares, work, out[None]):
             again = np.flatnonzero(out[:count] < 0)
             out[again] = self._exact(again + part.start, again + part.start)
         return out[:count]
 
     def _solve(
-        self,
-        product: Floats,
-        mine: Floats,
-        theirs: Floats,
-        rows: int,
-        columns: int,
-        work: Floats,
-        out: Floats,
+        self, product: Floats, mine: Floats, theirs: Floats, work: Floats, out: Floats
     ) -> int:
         m_d, m_e = self._m, self._templates.m
+        rows, columns = len(mine), len(theirs)
+        # The kernels write to the memory behind a view, row by row.
+        stride, count = out.strides[0] // out.itemsize, min(out.shape[1], columns)
+        flat = np.lib.stride_tricks.as_strided(out, ((rows - 1) * stride + count,), (out.itemsize,))
+        place = flat, stride, count
         if self._euclidean:
             if not m_d:
-                return euclidean_points(product, mine, theirs, m_e, _NEAR, out)
-            return euclidean_subspaces(product, mine, theirs, m_d, m_e, _NEAR, _ACCURACY, work, out)
+                return euclidean_points(product, mine, theirs, m_e, _NEAR, *place)
+            limits = _NEAR, _ACCURACY
+            return euclidean_subspaces(product, mine, theirs, m_d, m_e, *limits, work, *place)
         if not m_d:
-            return spherical_points(product, m_e, columns, _NEAR, out)
-        return spherical_subspaces(product, rows, columns, m_d, m_e, self._steps, _NEAR, work, out)
+            return spherical_points(product, rows, columns, m_e, _NEAR, *place)
+        return spherical_subspaces(
+            product, rows, columns, m_d, m_e, self._steps, _NEAR, work, *place
+        )
 
     def _exact(self, i: Indices, j: Indices) -> NDArray[np.float64]:
         probes, templates = self._probes, self._templates

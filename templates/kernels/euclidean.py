@@ -13,6 +13,7 @@ from templates.kernels.lanes import (
     larger,
     less,
     load,
+    put,
     root,
     store,
 )
@@ -41,6 +42,8 @@ def euclidean_subspaces(
     accuracy: np.float32,
     work: Floats,
     out: Floats,
+    stride: int,
+    count: int,
 ) -> int:
     """Distances by one Cholesky factorisation, for sixteen pairs at once.
 
@@ -64,8 +67,10 @@ def euclidean_subspaces(
         Largest relative error that a squared distance may have.
     work : float32
         Of ``scratch_size(m_d, m_e)`` numbers, zeros.
-    out : (R · C,) float32
-        Written.
+    out : flat float32
+        Row r of the distances is written from ``r · stride`` on.
+    count
+        Number of distances of a row that are written, at most C.
 
     Returns
     -------
@@ -75,10 +80,10 @@ def euclidean_subspaces(
     columns = len(theirs)
     swapped = m_e > m_d
     high, low = (m_e, m_d) if swapped else (m_d, m_e)
-    stride = low + _PAD
-    of_factor = high * stride * LANES
-    of_inverse = of_factor + stride * stride * LANES
-    of_beta = of_inverse + stride * LANES
+    wide = low + _PAD
+    of_factor = high * wide * LANES
+    of_inverse = of_factor + wide * wide * LANES
+    of_beta = of_inverse + wide * LANES
     # In the tile, one step along a row of M, and one down.
     across, down = columns, (m_e + 1) * columns
     if swapped:
@@ -86,6 +91,7 @@ def euclidean_subspaces(
     zero, one = every(np.float32(0)), every(np.float32(1))
     smallest = every(np.float32(100) * _EPS)
     limit = every(least * least)
+    spare = np.empty(LANES, dtype=np.float32)
     found = 0
     for i in range(len(mine)):
         for j in range(0, columns, LANES):
@@ -93,8 +99,8 @@ def euclidean_subspaces(
             for a in range(high):
                 for e in range(low):
                     x = load(tile, origin + (a + 1) * down + (e + 1) * across)
-                    store(work, (a * stride + e) * LANES, x)
-                store(work, (a * stride + low) * LANES, load(tile, origin + (a + 1) * down))
+                    store(work, (a * wide + e) * LANES, x)
+                store(work, (a * wide + low) * LANES, load(tile, origin + (a + 1) * down))
             gap = every(mine[i]) + load(theirs, j)
             gap = fma(every(np.float32(-2)), load(tile, origin), gap)
             sound = 0xFFFF
@@ -103,26 +109,26 @@ def euclidean_subspaces(
                 for r in range(k, low + 1, _PAD):
                     s0, s1, s2, s3 = zero, zero, zero, zero
                     for a in range(high):
-                        place = (a * stride + r) * LANES
-                        x = load(work, (a * stride + k) * LANES)
+                        place = (a * wide + r) * LANES
+                        x = load(work, (a * wide + k) * LANES)
                         s0 = fma(load(work, place), x, s0)
                         s1 = fma(load(work, place + LANES), x, s1)
                         s2 = fma(load(work, place + 2 * LANES), x, s2)
                         s3 = fma(load(work, place + 3 * LANES), x, s3)
-                    place = of_factor + r * stride * LANES
-                    pivot_row = of_factor + k * stride * LANES
+                    place = of_factor + r * wide * LANES
+                    pivot_row = of_factor + k * wide * LANES
                     for t in range(k):
                         x = load(work, pivot_row + t * LANES)
                         s0 = fma(load(work, place + t * LANES), x, s0)
-                        s1 = fma(load(work, place + (t + stride) * LANES), x, s1)
-                        s2 = fma(load(work, place + (t + 2 * stride) * LANES), x, s2)
-                        s3 = fma(load(work, place + (t + 3 * stride) * LANES), x, s3)
+                        s1 = fma(load(work, place + (t + wide) * LANES), x, s1)
+                        s2 = fma(load(work, place + (t + 2 * wide) * LANES), x, s2)
+                        s3 = fma(load(work, place + (t + 3 * wide) * LANES), x, s3)
                     place += k * LANES
                     store(work, place, zero - s0)
-                    store(work, place + stride * LANES, zero - s1)
-                    store(work, place + 2 * stride * LANES, zero - s2)
-                    store(work, place + 3 * stride * LANES, zero - s3)
-                corner = of_factor + (k * stride + k) * LANES
+                    store(work, place + wide * LANES, zero - s1)
+                    store(work, place + 2 * wide * LANES, zero - s2)
+                    store(work, place + 3 * wide * LANES, zero - s3)
+                corner = of_factor + (k * wide + k) * LANES
                 if k == low:
                     squared = load(work, corner) + gap
                     break
@@ -131,17 +137,17 @@ def euclidean_subspaces(
                 inverse = one / root(larger(pivot, smallest))
                 store(work, of_inverse + k * LANES, inverse)
                 right = load(tile, origin + (k + 1) * across)
-                last = of_factor + (low * stride + k) * LANES
+                last = of_factor + (low * wide + k) * LANES
                 store(work, last, load(work, last) - right)
                 for r in range(k + 1, low + 1):
-                    place = of_factor + (r * stride + k) * LANES
+                    place = of_factor + (r * wide + k) * LANES
                     store(work, place, load(work, place) * inverse)
             # An error of the products moves the square by that times the coefficients' squares.
             size = one
             for k in range(low - 1, -1, -1):
-                beta = load(work, of_factor + (low * stride + k) * LANES)
+                beta = load(work, of_factor + (low * wide + k) * LANES)
                 for r in range(k + 1, low):
-                    x = load(work, of_factor + (r * stride + k) * LANES)
+                    x = load(work, of_factor + (r * wide + k) * LANES)
                     beta = beta - x * load(work, of_beta + r * LANES)
                 beta = beta * load(work, of_inverse + k * LANES)
                 store(work, of_beta + k * LANES, beta)
@@ -149,9 +155,6 @@ def euclidean_subspaces(
             sound &= less(limit, squared) & less(squared, every(OVERFLOW))
             sound &= less(every(np.float32(4) * _EPS) * size, every(accuracy) * squared)
             found += sound != 0xFFFF
-            store(
-                out,
-                i * columns + j,
-                blend(sound, root(squared), every(np.float32(-1))),
-            )
+            distance = blend(sound, root(squared), every(np.float32(-1)))
+            put(out, i * stride + j, count - j, distance, spare)
     return found

@@ -189,3 +189,14 @@ overload(operator.add)(_operator("fadd"))
 overload(operator.sub)(_operator("fsub"))
 overload(operator.mul)(_operator("fmul"))
 overload(operator.truediv)(_operator("fdiv"))
+
+
+@inlined
+def put(out: Any, place: int, count: int, value: Lanes, spare: Any) -> None:
+    """Write the first ``count`` lanes, or all; ``spare`` has room for sixteen numbers."""
+    if count >= LANES:
+        store(out, place, value)
+    else:
+        store(spare, 0, value)
+        for lane in range(count):
+            out[place + lane] = spare[lane]

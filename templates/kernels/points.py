@@ -13,8 +13,8 @@ from templates.kernels.lanes import (
     larger,
     less,
     load,
+    put,
     root,
-    store,
 )
 
 Floats = NDArray[np.float32]
@@ -22,7 +22,14 @@ Floats = NDArray[np.float32]
 
 @compiled
 def euclidean_points(
-    tile: Floats, mine: Floats, theirs: Floats, m: int, least: np.float32, out: Floats
+    tile: Floats,
+    mine: Floats,
+    theirs: Floats,
+    m: int,
+    least: np.float32,
+    out: Floats,
+    stride: int,
+    count: int,
 ) -> int:
     """Distances by ‖e‖² + ‖p‖² − 2 e·p − ‖D e‖² (paper eq. 1).
 
@@ -38,8 +45,10 @@ def euclidean_points(
     least
         A distance that is not above this is −1 in ``out``: its square has lost digits. So is one
         whose square overflows.
-    out : (R · C,) float32
-        Written.
+    out : flat float32
+        Row r of the distances is written from ``r · stride`` on.
+    count
+        Number of distances of a row that are written, at most C.
 
     Returns
     -------
@@ -50,6 +59,7 @@ def euclidean_points(
     limit = every(least * least)
     unknown = every(np.float32(-1))
     two = every(np.float32(-2))
+    spare = np.empty(LANES, dtype=np.float32)
     found = 0
     for i in range(len(mine)):
         start = i * (m + 1) * columns
@@ -65,12 +75,22 @@ def euclidean_points(
             squared = fma(two, dots, length + load(theirs, j)) - inside
             known = less(limit, squared) & less(squared, every(OVERFLOW))
             found += known != 0xFFFF
-            store(out, i * columns + j, blend(known, root(squared), unknown))
+            distance = blend(known, root(squared), unknown)
+            put(out, i * stride + j, count - j, distance, spare)
     return found
 
 
 @compiled
-def spherical_points(tile: Floats, m: int, columns: int, least: np.float32, out: Floats) -> int:
+def spherical_points(
+    tile: Floats,
+    rows: int,
+    columns: int,
+    m: int,
+    least: np.float32,
+    out: Floats,
+    stride: int,
+    count: int,
+) -> int:
     """Distances by sim = e·p + s‖D e‖ (METHOD §3), of unit points and rows p and s D.
 
     Parameters and result as of :func:`euclidean_points`.
@@ -79,8 +99,9 @@ def spherical_points(tile: Floats, m: int, columns: int, least: np.float32, out:
     unknown = every(np.float32(-1))
     two, minus_two = every(np.float32(2)), every(np.float32(-2))
     zero = every(np.float32(0))
+    spare = np.empty(LANES, dtype=np.float32)
     found = 0
-    for i in range(len(out) // columns):
+    for i in range(rows):
         start = i * (m + 1) * columns
         for j in range(0, columns, LANES):
             inside = zero
@@ -93,5 +114,6 @@ def spherical_points(tile: Floats, m: int, columns: int, least: np.float32, out:
             distance = root(larger(fma(minus_two, dots + root(inside), two), zero))
             known = less(limit, distance)
             found += known != 0xFFFF
-            store(out, i * columns + j, blend(known, distance, unknown))
+            distance = blend(known, distance, unknown)
+            put(out, i * stride + j, count - j, distance, spare)
     return found

@@ -30,6 +30,7 @@ from templates.kernels.lanes import (
     larger,
     less,
     load,
+    put,
     root,
     smaller,
     store,
@@ -478,6 +479,8 @@ def spherical_subspaces(
     least: np.float32,
     work: Floats,
     out: Floats,
+    stride: int,
+    count: int,
 ) -> int:
     """Distances between the parts of two subspaces that lie on the unit sphere.
 
@@ -492,8 +495,10 @@ def spherical_subspaces(
         A distance that is not above this is −1 in ``out``.
     work : float32
         Of ``scratch_size(m_d, m_e)`` numbers, zeros.
-    out : (R · C,) float32
-        Written.
+    out : flat float32
+        Row r of the distances is written from ``r · stride`` on.
+    count
+        Number of distances of a row that are written, at most C.
 
     Returns
     -------
@@ -502,9 +507,9 @@ def spherical_subspaces(
     """
     swapped = m_e > m_d
     high, low = (m_e, m_d) if swapped else (m_d, m_e)
-    stride = low + _PAD
-    size = (low + 2) * stride * LANES
-    problem = high * stride * LANES
+    wide = low + _PAD
+    size = (low + 2) * wide * LANES
+    problem = high * wide * LANES
     waiting = problem + size
     best = waiting + size
     dots = best + LANES
@@ -512,38 +517,39 @@ def spherical_subspaces(
     across, down = columns, (m_e + 1) * columns
     if swapped:
         across, down = down, across
+    spare = np.empty(LANES, dtype=np.float32)
     places = np.zeros(LANES, dtype=np.int64)
-    count = found = 0
+    held = found = 0
     zero = every(np.float32(0))
     for i in range(rows):
         for j in range(0, columns, LANES):
             origin = i * (m_d + 1) * (m_e + 1) * columns + j
-            of_h = problem + (low + 1) * stride * LANES
+            of_h = problem + (low + 1) * wide * LANES
             for e in range(low):
                 store(work, of_h + e * LANES, load(tile, origin + (e + 1) * across))
             for a in range(high):
                 for e in range(low):
                     x = load(tile, origin + (a + 1) * down + (e + 1) * across)
-                    store(work, (a * stride + e) * LANES, x)
-                store(work, (a * stride + low) * LANES, load(tile, origin + (a + 1) * down))
+                    store(work, (a * wide + e) * LANES, x)
+                store(work, (a * wide + low) * LANES, load(tile, origin + (a + 1) * down))
             for k in range(low + 1):
                 for r in range(k, low + 1, _PAD):
                     s0, s1, s2, s3 = zero, zero, zero, zero
                     for a in range(high):
-                        place = (a * stride + r) * LANES
-                        x = load(work, (a * stride + k) * LANES)
+                        place = (a * wide + r) * LANES
+                        x = load(work, (a * wide + k) * LANES)
                         s0 = fma(load(work, place), x, s0)
                         s1 = fma(load(work, place + LANES), x, s1)
                         s2 = fma(load(work, place + 2 * LANES), x, s2)
                         s3 = fma(load(work, place + 3 * LANES), x, s3)
-                    place = problem + (k * stride + r) * LANES
+                    place = problem + (k * wide + r) * LANES
                     store(work, place, s0)
                     store(work, place + LANES, s1)
                     store(work, place + 2 * LANES, s2)
                     store(work, place + 3 * LANES, s3)
                 for r in range(k + 1, low + 1):
-                    x = load(work, problem + (k * stride + r) * LANES)
-                    store(work, problem + (r * stride + k) * LANES, x)
+                    x = load(work, problem + (k * wide + r) * LANES)
+                    store(work, problem + (r * wide + k) * LANES, x)
             if low == 1:
                 gain, proven = _of_one(work, problem), _ALL
             elif low == 2:
@@ -553,29 +559,30 @@ def spherical_subspaces(
             dot = load(tile, origin)
             distance = _distance(dot + gain)
             known = less(every(least), distance)
-            place = i * columns + j
-            store(out, place, blend(known, distance, every(np.float32(-1))))
+            place = i * stride + j
+            distance = blend(known, distance, every(np.float32(-1)))
+            put(out, place, count - j, distance, spare)
             found += known != _ALL
             if proven == _ALL:
                 continue
             store(work, free, gain)
             store(work, free + LANES, dot)
             for lane in range(LANES):
-                if proven >> lane & 1:
+                if proven >> lane & 1 or j + lane >= count:
                     continue
                 for k in range(0, size, LANES):
-                    work[waiting + k + count] = work[problem + k + lane]
-                work[best + count] = work[free + lane]
-                work[dots + count] = work[free + LANES + lane]
-                places[count] = place + lane
-                count += 1
-                if count == LANES:
+                    work[waiting + k + held] = work[problem + k + lane]
+                work[best + held] = work[free + lane]
+                work[dots + held] = work[free + LANES + lane]
+                places[held] = place + lane
+                held += 1
+                if held == LANES:
                     found += _finish(
-                        work, waiting, best, dots, free, low, steps, least, places, count, out
+                        work, waiting, best, dots, free, low, steps, least, places, held, out
                     )
-                    count = 0
+                    held = 0
                     store(work, free, gain)
                     store(work, free + LANES, dot)
-    if count:
-        found += _finish(work, waiting, best, dots, free, low, steps, least, places, count, out)
+    if held:
+        found += _finish(work, waiting, best, dots, free, low, steps, least, places, held, out)
     return found
