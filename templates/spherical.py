@@ -56,12 +56,6 @@ def _normalised(rows: Floats) -> Floats:
     return np.asarray(rows / np.maximum(norms, np.finfo(rows.dtype).tiny))
 
 
-def directions(points: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Unit rows in float32; a zero row stays zero."""
-    norms = np.sqrt(np.einsum("ij,ij->i", points, points, dtype=np.float64))
-    return np.asarray(points / np.maximum(norms, 1e-37).astype(np.float32)[:, None])
-
-
 def _distances(similarities: Floats) -> Floats:
     return np.asarray(np.sqrt(np.maximum(2 - 2 * similarities, 0)))
 

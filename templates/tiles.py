@@ -5,11 +5,12 @@ made by the matrix library and solved by a kernel while it is in the cache. Memo
 tiles of the threads. A distance depends neither on the number of threads nor on their order.
 """
 
+import math
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import CancelledError, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +38,13 @@ _ACCURACY = np.float32(5e-5)
 _TILE_SIDE = 1024
 _BLOCK_BYTES = 32 << 20
 _PAIRED_BYTES = 8 << 20
+_TASKS = 16
+_MOST_SPARE = 16
+_SPARE_BYTES = 16 << 20
+_TINY = np.float32(np.finfo(np.float32).tiny)
+
+_Place = tuple[slice, Floats | None]
+"""A part of the probes, and room for its stacked rows where they are stacked."""
 
 _In = TypeVar("_In")
 _Out = TypeVar("_Out")
@@ -114,26 +122,28 @@ def _each_tile(
     threads: int | None,
     progress: Progress | None,
 ) -> None:
-    if not solver.pairs:
+    tasks = solver.tasks()
+    if not tasks:
         return
-    spaces = threading.local()
     lock = threading.Lock()
+    with single_threaded() as available, _Crew(min(threads or available, len(tasks))) as crew:
+        spaces = [solver.space() for _ in range(crew.count)]
+        for block in solver.row_blocks():
+            tiles = crew.map(solver.pack_probes, block)
 
-    def one(pair: tuple[_Tile, _Tile]) -> None:
-        rows, columns = pair
-        if not hasattr(spaces, "here"):
-            spaces.here = solver.space()
-        act(rows, columns, spaces.here)
-        if progress is not None:
-            with lock:
-                progress(len(rows) * len(columns))
+            def one(task: _Task, tiles: list[_Tile] = tiles) -> None:
+                space = spaces.pop()
+                columns = solver.pack_templates(task.columns, space)
+                for rows in tiles[task.share :: task.shares]:
+                    act(rows, columns, space)
+                    if progress is not None:
+                        with lock:
+                            progress(len(rows) * len(columns))
+                spaces.append(space)
 
-    with single_threaded() as available, _Crew(threads or available) as crew:
-        for some in solver.column_blocks():
-            columns = crew.map(solver.pack_templates, some)
-            for others in solver.row_blocks():
-                rows = crew.map(solver.pack_probes, others)
-                crew.map(one, [(row, column) for column in columns for row in rows])
+            crew.map(one, tasks)
+        for space in spaces:
+            _spare.put(space.memory)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -143,56 +153,103 @@ class _Tile:
     part: slice
     stacked: Floats
     """(R, m + 1, n) of probes, (m + 1, C, n) of templates; (R, n) of points."""
-    squares: Floats
-    """Squared lengths of the points or feet; unused by the spherical metric."""
+    numbers: Floats
+    """One for each: squared lengths of feet or points, or what the kernel asks for."""
 
     def __len__(self) -> int:
         return int(self.part.stop - self.part.start)
 
 
-@dataclass(eq=False, repr=False)
-class _Space:
-    """Working space of one thread, and its collector."""
+class _Task(NamedTuple):
+    """Some templates, and a share of the probes' tiles."""
 
-    product: Floats
-    work: Floats
-    distances: Floats
-    collector: Any = None
+    columns: slice
+    share: int
+    shares: int
+
+
+class _Space:
+    """Working space of one thread, and its collector.
+
+    Fresh memory costs more than a small tile: it comes page by page. So a finished traversal leaves
+    its spaces to the next.
+    """
+
+    def __init__(self, product: int, stacked: int, distances: int, work: int) -> None:
+        sizes = product, stacked, distances, work
+        self.memory = _spare.get(sum(sizes))
+        ends = np.cumsum(sizes)
+        self.product, self.stacked, self.distances, self.work = (
+            self.memory[end - size : end] for end, size in zip(ends, sizes, strict=True)
+        )
+        self.work[:] = 0
+        self.collector: Any = None
+
+
+class _Spare:
+    """A few arrays for the next traversal."""
+
+    def __init__(self) -> None:
+        self._arrays: list[Floats] = []
+
+    def get(self, size: int) -> Floats:
+        try:
+            found = self._arrays.pop()
+        except IndexError:
+            return np.empty(size, dtype=np.float32)
+        return found if len(found) >= size else np.empty(size, dtype=np.float32)
+
+    def put(self, array: Floats) -> None:
+        if len(self._arrays) < _MOST_SPARE and array.nbytes <= _SPARE_BYTES:
+            self._arrays.append(array)
+
+
+_spare = _Spare()
 
 
 class _Crew:
-    """Threads that share the items of a list; none where one is enough."""
+    """The calling thread and others, which share the items of a list."""
 
-    def __init__(self, threads: int) -> None:
-        self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
-        self._error: BaseException | None = None
+    def __init__(self, count: int) -> None:
+        self.count = count
+        self._others = count - 1
+        self._pool = ThreadPoolExecutor(self._others) if self._others else None
 
     def __enter__(self) -> "_Crew":
         return self
 
     def __exit__(self, *_: object) -> None:
         if self._pool is not None:
-            self._pool.shutdown(cancel_futures=True)
+            self._pool.shutdown()
 
     def map(self, function: Callable[[_In], _Out], items: Sequence[_In]) -> list[_Out]:
-        if self._pool is None or len(items) < 2:
-            return [function(item) for item in items]
+        """Return the results in order; the first failure ends the work and is raised."""
+        waiting = iter(list(enumerate(items)))
+        lock = threading.Lock()
+        results: dict[int, _Out] = {}
+        failures: list[BaseException] = []
 
-        def one(item: _In) -> _Out:
-            if self._error is not None:
-                raise CancelledError
-            try:
-                return function(item)
-            except BaseException as error:
-                self._error = self._error or error
-                raise
+        def work() -> None:
+            while not failures:
+                with lock:
+                    number, item = next(waiting, (None, None))
+                if number is None:
+                    return
+                try:
+                    results[number] = function(item)  # type: ignore[arg-type]
+                except BaseException as failure:
+                    failures.append(failure)
 
-        try:
-            return list(self._pool.map(one, items))
-        except CancelledError:
-            if self._error is None:
-                raise
-            raise self._error from None
+        others = []
+        if self._pool is not None:
+            others = [self._pool.submit(work) for _ in range(min(self._others, len(items) - 1))]
+        # The calling thread works too: it holds a core already, and leaves the others the rest.
+        work()
+        for other in others:
+            other.result()
+        if failures:
+            raise failures[0]
+        return [results[number] for number in range(len(items))]
 
 
 class _Solver:
@@ -208,54 +265,64 @@ class _Solver:
         self._rows = _even(len(probes), max(1, _TILE_SIDE // (self._m + 1)))
         self._columns = whole(_even(len(templates), width))
 
-    @property
-    def pairs(self) -> int:
-        return len(self._probes) * len(self._templates)
+    def tasks(self) -> list[_Task]:
+        """Parts of equal work, enough of them for several threads; they do not show."""
+        columns = _parts(len(self._templates), self._columns)
+        tiles = len(_parts(len(self._probes), self._rows))
+        shares = min(tiles, -(-_TASKS // max(1, len(columns))))
+        return [_Task(some, share, shares) for some in columns for share in range(shares)]
 
-    def row_blocks(self) -> Iterator[list[slice]]:
-        return _blocks(len(self._probes), self._rows, (self._m + 1) * self._templates.n)
-
-    def column_blocks(self) -> Iterator[list[slice]]:
-        numbers = (self._templates.m + 1) * self._templates.n
-        return _blocks(len(self._templates), self._columns, numbers)
+    def row_blocks(self) -> Iterator[list[_Place]]:
+        """Parts of the probes, and room for their stacked rows, block by block."""
+        parts = _parts(len(self._probes), self._rows)
+        if not self._m:
+            yield [(part, None) for part in parts]
+            return
+        numbers = self._rows * (self._m + 1) * self._templates.n
+        several = min(len(parts), max(1, _BLOCK_BYTES // (4 * numbers)))
+        room = np.empty((several, numbers), dtype=np.float32)
+        for first in range(0, len(parts), several):
+            yield list(zip(parts[first : first + several], room, strict=False))
 
     def space(self) -> _Space:
-        """Allocate what a thread needs for the largest tile."""
+        """Make what a thread needs for the largest tile."""
         m_d, m_e = self._m, self._templates.m
         pairs = self._rows * self._columns
         size = 0
         if m_d:
             size = (euclidean_scratch if self._euclidean else spherical_scratch)(m_d, m_e)
-        return _Space(
-            np.empty(pairs * (m_d + 1) * (m_e + 1), dtype=np.float32),
-            np.zeros(size, dtype=np.float32),
-            np.empty(pairs, dtype=np.float32),
-        )
+        stacked = self._columns * (m_e + 1) * self._templates.n
+        return _Space(pairs * (m_d + 1) * (m_e + 1), stacked, pairs, size)
 
-    def pack_probes(self, part: slice) -> _Tile:
+    def pack_probes(self, place: _Place) -> _Tile:
         """Stack the rows of some probes, probe after probe."""
+        part, room = place
         if not isinstance(self._probes, SubspaceBatch):
             points = self._probes[part]
             squares = _squares(points)
-            return _Tile(part, points if self._euclidean else spherical.directions(points), squares)
+            if self._euclidean:
+                return _Tile(part, points, squares)
+            lengths = np.sqrt(np.maximum(squares, _TINY))
+            return _Tile(part, points, np.reciprocal(lengths))
         some = self._probes[part]
-        stacked = np.empty((len(some), some.m + 1, some.n), dtype=np.float32)
-        self._fill(some, stacked[:, 0], stacked[:, 1:])
+        shape = len(some), some.m + 1, some.n
+        stacked = np.empty(shape, np.float32) if room is None else _shaped(room, shape)
+        self._stack(some, stacked[:, 0], stacked[:, 1:])
         return _Tile(part, stacked, _squares(some.feet))
 
-    def pack_templates(self, part: slice) -> _Tile:
+    def pack_templates(self, part: slice, space: _Space | None) -> _Tile:
         """Stack the rows of some templates, all feet first; the number is filled up with zeros."""
         some = self._templates[part]
-        shape = (some.m + 1, whole(len(some)), some.n)
-        stacked = np.empty(shape, dtype=np.float32)
+        shape = some.m + 1, whole(len(some)), some.n
+        stacked = np.empty(shape, np.float32) if space is None else _shaped(space.stacked, shape)
         stacked[:, len(some) :] = 0
         own = stacked[:, : len(some)]
         squares = np.zeros(shape[1], dtype=np.float32)
         squares[: len(some)] = _squares(some.feet)
-        self._fill(some, own[0], own[1:].transpose(1, 0, 2))
+        self._stack(some, own[0], own[1:].transpose(1, 0, 2))
         return _Tile(part, stacked, squares)
 
-    def _fill(self, batch: SubspaceBatch, feet: Floats, bases: Floats) -> None:
+    def _stack(self, batch: SubspaceBatch, feet: Floats, bases: Floats) -> None:
         if self._euclidean:
             feet[:], bases[:] = batch.feet, batch.bases
             return
@@ -270,22 +337,22 @@ class _Solver:
         product = space.product[: len(left) * len(right)]
         with np.errstate(over="ignore", invalid="ignore"):  # such pairs are computed again
             np.matmul(left, right.T, out=product.reshape(len(left), len(right)))
-        if self._solve(product, rows.squares, columns.squares, space.work, out):
+        if self._solve(product, rows.numbers, columns.numbers, space.work, out):
             table = out[:, : len(columns)]
             i, j = np.nonzero(table < 0)
             table[i, j] = self._exact(i + rows.part.start, j + columns.part.start)
 
     def paired(self, part: slice) -> Floats:
         """Distances of probes to the templates of the same positions."""
-        mine, theirs = self.pack_probes(part), self.pack_templates(part)
+        mine, theirs = self.pack_probes((part, None)), self.pack_templates(part, None)
         count, wide = len(mine), theirs.stacked.shape[1]
         m_d, m_e = self._m, self._templates.m
         product = np.zeros((m_d + 1, m_e + 1, wide), dtype=np.float32)
         columns = theirs.stacked[:, :count].transpose(1, 2, 0)
         with np.errstate(over="ignore", invalid="ignore"):  # such pairs are computed again
             product[:, :, :count] = (mine.stacked @ columns).transpose(1, 2, 0)
-        squares = theirs.squares
-        squares[:count] += mine.squares
+        squares = theirs.numbers
+        squares[:count] += mine.numbers
         size = (euclidean_scratch if self._euclidean else spherical_scratch)(m_d, m_e)
         work, out = np.zeros(size, dtype=np.float32), np.empty(wide, dtype=np.float32)
         nothing = np.zeros(1, dtype=np.float32)
@@ -303,13 +370,14 @@ class _Solver:
         stride, count = out.strides[0] // out.itemsize, min(out.shape[1], columns)
         flat = np.lib.stride_tricks.as_strided(out, ((rows - 1) * stride + count,), (out.itemsize,))
         place = flat, stride, count
-        if self._euclidean:
-            if not m_d:
-                return euclidean_points(product, mine, theirs, m_e, _NEAR, *place)
-            limits = _NEAR, _ACCURACY
-            return euclidean_subspaces(product, mine, theirs, m_d, m_e, *limits, work, *place)
         if not m_d:
-            return spherical_points(product, rows, columns, m_e, _NEAR, *place)
+            if self._euclidean:
+                return euclidean_points(product, mine, theirs, m_e, _NEAR, *place)
+            return spherical_points(product, mine, columns, m_e, _NEAR, *place)
+        if self._euclidean:
+            return euclidean_subspaces(
+                product, mine, theirs, m_d, m_e, _NEAR, _ACCURACY, work, flat, stride, count
+            )
         return spherical_subspaces(
             product, rows, columns, m_d, m_e, self._steps, _NEAR, work, *place
         )
@@ -340,12 +408,12 @@ def _even(count: int, most: int) -> int:
     return -(-count // (parts + parts % 2 if parts > 1 else 1))
 
 
-def _blocks(count: int, step: int, numbers: int) -> Iterator[list[slice]]:
-    """Tiles in blocks whose stacked rows, of ``numbers`` each, fit the memory meant for them."""
-    tiles = [slice(start, min(start + step, count)) for start in range(0, count, step)]
-    several = max(1, _BLOCK_BYTES // (4 * step * numbers))
-    for first in range(0, len(tiles), several):
-        yield tiles[first : first + several]
+def _parts(count: int, step: int) -> list[slice]:
+    return [slice(start, min(start + step, count)) for start in range(0, count, step or 1)]
+
+
+def _shaped(room: Floats, shape: tuple[int, ...]) -> Floats:
+    return room[: math.prod(shape)].reshape(shape)
 
 
 def paired_tile(

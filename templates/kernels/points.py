@@ -83,7 +83,7 @@ def euclidean_points(
 @compiled
 def spherical_points(
     tile: Floats,
-    rows: int,
+    mine: Floats,
     columns: int,
     m: int,
     least: np.float32,
@@ -91,9 +91,14 @@ def spherical_points(
     stride: int,
     count: int,
 ) -> int:
-    """Distances by sim = e·p + s‖D e‖ (METHOD §3), of unit points and rows p and s D.
+    """Distances by sim = (e·p + s‖D e‖)/‖e‖ (METHOD §3), from the rows p and s D.
 
-    Parameters and result as of :func:`euclidean_points`.
+    Parameters
+    ----------
+    mine : (R,) float32
+        1/‖e‖.
+    tile, least, out, stride, count
+        As of :func:`euclidean_points`, and so is the result.
     """
     limit = every(least)
     unknown = every(np.float32(-1))
@@ -101,8 +106,9 @@ def spherical_points(
     zero = every(np.float32(0))
     spare = np.empty(LANES, dtype=np.float32)
     found = 0
-    for i in range(rows):
+    for i in range(len(mine)):
         start = i * (m + 1) * columns
+        scale = every(mine[i])
         for j in range(0, columns, LANES):
             inside = zero
             place = start + j
@@ -111,7 +117,8 @@ def spherical_points(
                 place += columns
                 x = load(tile, place)
                 inside = fma(x, x, inside)
-            distance = root(larger(fma(minus_two, dots + root(inside), two), zero))
+            similarity = (dots + root(inside)) * scale
+            distance = root(larger(fma(minus_two, similarity, two), zero))
             known = less(limit, distance)
             found += known != 0xFFFF
             distance = blend(known, distance, unknown)
