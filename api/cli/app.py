@@ -4,6 +4,7 @@ import typer
 
 from api.cli import (
     audit,
+    bench,
     calibrate,
     db,
     decoys,
@@ -39,6 +40,7 @@ app.add_typer(decoys.app, name="decoys")
 app.add_typer(keys.app, name="keys")
 app.add_typer(models.app, name="models")
 app.add_typer(db.app, name="db")
+app.add_typer(bench.app, name="bench")
 
 
 def main() -> None:

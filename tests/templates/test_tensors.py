@@ -8,8 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from templates import distances as entrance
 from templates.distances import Metric, pairwise_distances, similarity
-from templates.errors import InvalidTemplate
+from templates.errors import InvalidEmbedding, InvalidTemplate, TemplateError
+from templates.lifting import lift
 from templates.randomness import Keystream
 from templates.subspace import SubspaceBatch
 from tests.templates.test_distances import faces, pairs, randoms, units
@@ -424,3 +426,62 @@ def test_triton_kernels_compile_for_a_gpu(tmp_path: Path, monkeypatch: pytest.Mo
         compiled = triton.compile(source, target=target, options=options)
         assert f".entry {kernel.__name__}" in compiled.asm["ptx"]
         assert compiled.asm["cubin"]
+
+
+# --- the one entrance --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("metric", list(Metric))
+def test_a_device_gives_what_the_processor_gives(metric: Metric) -> None:
+    stream = Keystream.seeded("entrance")
+    rows = stream.normal((70, 64))
+    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+    a = lift(rows[:30], strategy="random", m=3, stream=stream)
+    b = lift(rows[30:], strategy="random", m=5, stream=stream)
+    labels = np.arange(30) % 4, np.arange(40) % 3
+    for probes in (a, rows[:30]):
+        options = {"metric": metric}
+        there = entrance.pairwise_distances(probes, b, device="cpu", **options)
+        here = entrance.pairwise_distances(probes, b, **options)
+        assert isinstance(there, np.ndarray)
+        np.testing.assert_allclose(there, here, atol=2e-5)
+        for of_templates in (False, True):
+            options = {"metric": metric, "k": 4, "of_templates": of_templates, "labels": labels}
+            there = entrance.nearest(probes, b, device="cpu", **options)
+            here = entrance.nearest(probes, b, **options)
+            np.testing.assert_array_equal(there.indices, here.indices)
+            np.testing.assert_allclose(there.distances, here.distances, atol=2e-5)
+        limits = [1.3, 0.2, 0.8]
+        np.testing.assert_array_equal(
+            entrance.count_within(probes, b, limits, metric=metric, labels=labels, device="cpu"),
+            entrance.count_within(probes, b, limits, metric=metric, labels=labels),
+        )
+    held = SubspaceTensors.of(b, "cpu")
+    kept = entrance.pairwise_distances(torch.tensor(rows[:30]), held, metric=metric)
+    assert isinstance(kept, torch.Tensor)
+    np.testing.assert_allclose(
+        kept.numpy(), entrance.pairwise_distances(rows[:30], b, metric=metric), atol=2e-5
+    )
+
+
+def test_what_a_device_cannot_do_is_said() -> None:
+    rows = np.eye(24)[:4]
+    templates = lift(rows, strategy="random", m=2)
+    with pytest.raises(TemplateError, match="cannot use the device nowhere"):
+        entrance.pairwise_distances(rows, templates, metric="euclidean", device="nowhere")
+    with pytest.raises(TemplateError, match="arrays or a batch"):
+        entrance.pairwise_distances(torch.tensor(rows), templates, metric="euclidean")
+    with pytest.raises(InvalidEmbedding, match="not finite"):
+        entrance.pairwise_distances(
+            np.full((1, 24), np.nan), templates, metric="euclidean", device="cpu"
+        )
+    with pytest.raises(InvalidEmbedding, match="shape"):
+        entrance.nearest(rows[:, :5], templates, k=1, metric="euclidean", device="cpu")
+    with pytest.raises(InvalidTemplate, match="does not fit"):
+        entrance.count_within(
+            lift(np.eye(25)[:4], strategy="random", m=2),
+            templates,
+            [1.0],
+            metric="euclidean",
+            device="cpu",
+        )

@@ -17,6 +17,7 @@ PROMISED = {
     *("decoys build", "models inspect", "db upgrade", "db check", "db compact", "db current"),
     *("keys create", "keys list", "keys revoke", "keys master", "keys rotate", "keys rewrap"),
     "keys verify-receipt",
+    "bench distances",
 }
 
 

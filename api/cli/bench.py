@@ -1,0 +1,198 @@
+"""``veilface bench``: how fast this machine is, as ratios to what it cannot do without."""
+
+import os
+from collections.abc import Sequence
+from enum import StrEnum
+from typing import Annotated, TypeVar
+
+import typer
+from rich.table import Table
+
+from api.cli.console import emit, progress, say, show, table
+from api.cli.errors import CommandError, UsageError
+from api.cli.evaluation_inputs import listed
+from api.cli.options import AsJson
+from api.distance_bench import (
+    MODES,
+    Question,
+    Row,
+    machine,
+    measure,
+    memory_needed,
+    require_device,
+)
+from templates.distances import DEFAULT_STEPS, Metric
+from templates.errors import TemplateError
+
+C = TypeVar("C", bound=StrEnum)
+
+_SMALLER = "take a smaller --count, or fewer of --dim and --n"
+
+app = typer.Typer(no_args_is_help=True)
+
+
+@app.callback()
+def bench() -> None:
+    """Measure how fast this machine is, as ratios to what it cannot do without."""
+
+
+@app.command()
+def distances(
+    *,
+    count: Annotated[
+        int, typer.Option(min=1, help="Probes, and templates: COUNT × COUNT distances.")
+    ] = 1000,
+    n: Annotated[str, typer.Option("--n", help="Numbers of a descriptor.")] = "128,512",
+    dim: Annotated[str, typer.Option(help="Dimensions m of the subspaces.")] = "2,4,8,16",
+    mode: Annotated[
+        str, typer.Option(help="`p2s` compares points with templates, `s2s` lifted probes.")
+    ] = "p2s,s2s",
+    metric: Annotated[
+        str, typer.Option(help="`euclidean` is the paper's, `spherical` the service's.")
+    ] = "euclidean,spherical",
+    repeats: Annotated[
+        int, typer.Option(min=1, help="Timed repeats; medians of them are shown.")
+    ] = 5,
+    threads: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="Threads of the distances and of the products. Unset: those of the matrix "
+            "library. Not with --device.",
+            show_default=False,
+        ),
+    ] = None,
+    device: Annotated[
+        str | None,
+        typer.Option(
+            help="Device of torch, such as `cuda` (extra `torch`). Unset: the processor, without "
+            "torch.",
+            show_default=False,
+        ),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the descriptors.")] = 0,
+    as_json: AsJson = False,
+) -> None:
+    """Time all distances between probes and templates, beside the bare matrix product.
+
+    Needs nothing: descriptors of nobody are drawn, spread like faces, and lifted among others of
+    them. Every time is shown as a multiple of the products that a distance starts from, made as
+    one matrix (`× product`), and of the point-to-point matrix of the descriptors (`× points`),
+    timed in turn in the same run. The default options take some minutes; the first run on a
+    machine compiles the kernels before, for half a minute.
+
+    Example: `veilface bench distances --n 512 --dim 16 --metric spherical`
+    """
+    question = Question(
+        count=count,
+        dimensions=_numbers(n, "--n", at_least=2),
+        dims=_numbers(dim, "--dim", at_least=1),
+        modes=_chosen(mode, MODES, "--mode"),
+        metrics=_chosen(metric, tuple(Metric), "--metric"),
+        repeats=repeats,
+        threads=threads,
+        device=device,
+        seed=seed,
+    )
+    _check(question)
+    facts = machine(question)
+    try:
+        with progress("measuring", question.rounds) as advance:
+            rows = measure(question, progress=advance)
+    except MemoryError:
+        raise CommandError(f"not enough memory for the products: {_SMALLER}") from None
+    if as_json:
+        emit(
+            {
+                "machine": facts,
+                "count": count,
+                "repeats": repeats,
+                "steps": DEFAULT_STEPS,
+                "dtype": "float32",
+                "seed": seed,
+                "rows": [row.to_json() for row in rows],
+            }
+        )
+        return
+    show(_listing(question, rows))
+    say(
+        f"Of {repeats} repeats: median times, and medians of their ratios (smallest to largest in "
+        "brackets)."
+    )
+    place = (
+        f"{facts['threads']} threads on {facts['processors']} processors, {facts['matrix_library']}"
+        if device is None
+        else f"{facts['device_name']}, torch {facts['torch']}"
+    )
+    say(f"Measured with {place}. docs/distances.md says how to read it.")
+
+
+def _numbers(text: str, option: str, *, at_least: int) -> tuple[int, ...]:
+    values = listed(text, int, option, expected="whole numbers such as 8,16")
+    wrong = [value for value in values if value < at_least]
+    if wrong:
+        raise UsageError(f"{option} takes numbers from {at_least}, not {wrong[0]}")
+    return tuple(dict.fromkeys(values))
+
+
+def _chosen(text: str, choices: Sequence[C], option: str) -> tuple[C, ...]:
+    known = {str(choice): choice for choice in choices}
+    names = listed(text, str, option, expected=" or ".join(known))
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise UsageError(f"{option} takes {' or '.join(known)}, not {unknown[0]!r}")
+    return tuple(known[name] for name in dict.fromkeys(names))
+
+
+def _check(question: Question) -> None:
+    """Refuse what cannot be measured here."""
+    if max(question.dims) >= min(question.dimensions):
+        raise UsageError(
+            f"--dim {max(question.dims)} does not fit --n {min(question.dimensions)}: a template "
+            "has fewer dimensions than its descriptors have numbers"
+        )
+    if question.device is not None:
+        if question.threads is not None:
+            raise UsageError("--threads counts the processor's threads: leave it out with --device")
+        try:
+            require_device(question.device)
+        except TemplateError as error:
+            raise UsageError(f"{error}; leave out --device to measure the processor") from None
+        return
+    needed, there = memory_needed(question), _memory()
+    if there is not None and needed > there:
+        raise UsageError(
+            f"the largest problem needs about {needed / 2**30:.1f} GiB, and this machine has "
+            f"{there / 2**30:.1f}: {_SMALLER}"
+        )
+
+
+def _memory() -> int | None:
+    """Bytes of memory of this machine, where it says so."""
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, OSError, ValueError):
+        return None
+
+
+def _listing(question: Question, rows: Sequence[Row]) -> Table:
+    listing = table(
+        f"{question.count} × {question.count} distances in float32",
+        *("n", "m", "mode", "metric", "points, ms", "product, ms", "distances, ms"),
+        *("× product", "× points"),
+    )
+    for row in rows:
+        shown, medians = row.to_json(), row.medians
+        listing.add_row(
+            str(row.n),
+            str(row.m),
+            str(row.mode),
+            str(row.metric),
+            f"{medians.points:.2f}",
+            f"{medians.product:.1f}",
+            f"{medians.distances:.1f}",
+            f"{shown['ratio_to_product']:.2f} ({min(row.to_product):.2f}-"
+            f"{max(row.to_product):.2f})",
+            f"{shown['ratio_to_points']:.1f}",
+        )
+    return listing

@@ -1,0 +1,176 @@
+"""`veilface bench distances`. No test judges a time."""
+
+import os
+import statistics
+import sys
+
+import numpy as np
+import pytest
+
+from api import distance_bench
+from api.cli import bench
+from api.distance_bench import Repeat, Row
+from benchmarks import all_pairs, distances
+from templates.distances import DEFAULT_STEPS, Metric, pairwise_distances, similarity
+from tests.api.cli.conftest import run
+from tests.templates.test_distances import faces
+from verify.evaluation.units import Mode
+
+TINY = ("bench", "distances", "--count", "9", "--n", "12,24", "--dim", "2,3", "--repeats", "3")
+
+
+@pytest.fixture(autouse=True)
+def no_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing here depends on what a time is."""
+    monkeypatch.setattr(distance_bench, "_REST", 0)
+
+
+def test_json_holds_every_combination_and_every_time():
+    shown = run(*TINY, "--threads", "1", "--seed", "7", "--json")
+    assert shown.status == 0
+    given = shown.json
+    assert {key: given[key] for key in ("count", "repeats", "steps", "dtype", "seed")} == {
+        "count": 9,
+        "repeats": 3,
+        "steps": DEFAULT_STEPS,
+        "dtype": "float32",
+        "seed": 7,
+    }
+    assert given["machine"]["threads"] == 1
+    assert given["machine"]["processors"] >= 1
+    assert given["machine"]["device"] is None
+    assert [(row["n"], row["m"], row["mode"], row["metric"]) for row in given["rows"]] == [
+        (n, m, mode, metric)
+        for n in (12, 24)
+        for m in (2, 3)
+        for mode in ("p2s", "s2s")
+        for metric in ("euclidean", "spherical")
+    ]
+
+
+def test_ratios_follow_from_the_times():
+    for row in run(*TINY, "--json").json["rows"]:
+        repeats = row["repeats"]
+        assert len(repeats) == 3
+        for name in ("points_ms", "product_ms", "distances_ms"):
+            assert min(repeat[name] for repeat in repeats) > 0
+            assert row[name] == statistics.median(repeat[name] for repeat in repeats)
+        to_product = [repeat["distances_ms"] / repeat["product_ms"] for repeat in repeats]
+        to_points = [repeat["distances_ms"] / repeat["points_ms"] for repeat in repeats]
+        assert row["ratio_to_product"] == pytest.approx(statistics.median(to_product))
+        assert row["ratio_to_product_low"] == pytest.approx(min(to_product))
+        assert row["ratio_to_product_high"] == pytest.approx(max(to_product))
+        assert row["ratio_to_points"] == pytest.approx(statistics.median(to_points))
+
+
+def test_the_table_has_what_was_asked_for():
+    shown = run(*TINY, "--mode", "s2s", "--metric", "spherical", "--threads", "1")
+    assert shown.status == 0
+    assert "9 × 9 distances in float32" in shown.stdout
+    assert "× product" in shown.stdout
+    assert shown.stdout.count("spherical") == shown.stdout.count("s2s") == 4
+    assert "euclidean" not in shown.stdout
+    assert "1 threads on" in shown.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--mode", "p2p"), "--mode takes p2s or s2s, not 'p2p'"),
+        (("--metric", "cosine"), "--metric takes euclidean or spherical, not 'cosine'"),
+        (("--dim", "2,24"), "--dim 24 does not fit --n 12"),
+        (("--dim", "0"), "--dim takes numbers from 1, not 0"),
+        (("--dim", "few"), "--dim takes whole numbers such as 8,16, not 'few'"),
+        (("--n", "1"), "--n takes numbers from 2, not 1"),
+        (("--device", "cpu", "--threads", "2"), "leave it out with --device"),
+        (("--repeats", "0"), "repeats"),
+    ],
+)
+def test_wrong_usage_says_what_is_taken(arguments: tuple[str, ...], said: str):
+    shown = run(*TINY, *arguments)
+    assert shown.status == 2
+    assert said in shown.stderr
+    assert not shown.stdout
+
+
+@pytest.mark.parametrize("device", ["cuda:99", "nonsense", "meta"])
+def test_a_device_that_is_not_there_is_refused(device: str):
+    pytest.importorskip("torch")
+    shown = run(*TINY, "--device", device)
+    assert shown.status == 2
+    assert f"torch cannot use the device {device}: " in shown.stderr
+    assert "leave out --device" in shown.stderr
+
+
+def test_a_device_without_torch_names_the_extra(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "torch", None)
+    shown = run(*TINY, "--device", "cuda")
+    assert shown.status == 2
+    assert "extra 'torch'" in shown.stderr
+
+
+def test_a_device_is_measured_with_torch():
+    pytest.importorskip("torch")
+    shown = run(*TINY, "--device", "cpu", "--metric", "euclidean", "--json")
+    assert shown.status == 0
+    assert shown.json["machine"]["device"] == "cpu"
+    assert "threads" not in shown.json["machine"]
+    assert len(shown.json["rows"]) == 8
+
+
+def test_what_does_not_fit_into_memory_is_refused(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(bench, "memory_needed", lambda question: 1 << 60)
+    shown = run(*TINY)
+    if hasattr(os, "sysconf"):
+        assert shown.status == 2
+        assert "GiB, and this machine has" in shown.stderr
+        assert "smaller --count" in shown.stderr
+
+
+def test_memory_that_runs_out_is_no_defect(monkeypatch: pytest.MonkeyPatch):
+    def exhausted(*_: object, **__: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(bench, "measure", exhausted)
+    shown = run(*TINY)
+    assert shown.status == 1
+    assert "error: not enough memory" in shown.stderr
+
+
+# --- the benchmarks that use it ----------------------------------------------------------------
+
+
+def test_the_benchmark_compares_with_the_reference_by_pair():
+    row = Row(128, 2, Mode.POINT, Metric.EUCLIDEAN, (Repeat(1, 2, 4), Repeat(1, 2, 4)))
+    line = distances.table([row], 200, lambda _: 250.0).splitlines()[-1]
+    # 4 ms for 40,000 pairs are 100 ns.
+    assert line.endswith("| 1.0 | 2.0 | 4.0 | 2.00 (2.00-2.00) | 4.0 | 100 | 2.5 × |")
+
+
+@pytest.mark.parametrize("mode", [Mode.POINT, Mode.SUBSPACE])
+@pytest.mark.parametrize("metric", Metric)
+def test_the_reference_is_timed(mode: Mode, metric: Metric):
+    assert distances.reference_ns(12, 3, mode, metric, size=4) > 0
+
+
+def test_thresholds_are_the_first_that_meet_a_target():
+    similarities = np.array([0.3, 0.4, 0.5])
+    lines = all_pairs.table(similarities, np.array([500, 30, 2]), 1000).splitlines()
+    assert lines[2].startswith("| 1e-01 | 0.400 | 30 | 0.03 |")
+    assert lines[3].startswith("| 1e-02 | 0.500 | 2 | 0.002 |")
+    assert lines[4].startswith("| 1e-03 | above 0.500")
+
+
+def test_impostor_pairs_are_counted_both_ways():
+    labels = np.array([0, 0, 1, 2, 2, 2])
+    assert all_pairs.impostor_pairs(labels) == int((labels[:, None] != labels[None]).sum())
+
+
+@pytest.mark.parametrize("metric", Metric)
+def test_thresholds_start_where_15_percent_of_the_strangers_are(metric: Metric):
+    templates = faces(40, 3, seed=1, n=24)
+    people = all_pairs.People(faces(40, 3, seed=2, n=24).feet, np.arange(40) // 2)
+    found = similarity(pairwise_distances(people.descriptors, templates, metric=metric))
+    strangers = found[people.labels[:, None] != people.labels]
+    low = all_pairs.thresholds(people, templates, metric)[0]
+    assert (strangers >= low).mean() == pytest.approx(0.15, abs=0.01)
