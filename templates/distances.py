@@ -128,7 +128,7 @@ def pairwise_distances(
         found = _tensors().pairwise(probes, templates, metric=metric, steps=steps, device=device)
         result: Floats = found.cpu().numpy() if isinstance(templates, SubspaceBatch) else found
         return result
-    probes, kind = _checked(probes, templates, steps, dtype)
+    probes, kind = _checked(probes, templates, steps, dtype, threads)
     out = np.empty((len(probes), len(templates)), dtype=kind)
     if out.size and kind == np.float64:
         return _reference(probes, templates, metric, steps)
@@ -187,7 +187,7 @@ def nearest(
         if isinstance(templates, SubspaceBatch):
             return Neighbours(*(part.cpu().numpy() for part in found))
         return Neighbours(*found)
-    probes, _ = _checked(probes, templates, steps, np.float32)
+    probes, _ = _checked(probes, templates, steps, np.float32, threads)
     return Neighbours(
         *_tiles().nearest(
             probes,
@@ -239,7 +239,7 @@ def count_within(
     """
     metric = Metric(metric)
     limits = np.atleast_1d(np.asarray(thresholds, dtype=np.float64))
-    if limits.ndim != 1 or np.isnan(limits).any():
+    if limits.ndim != 1 or not limits.size or np.isnan(limits).any():
         raise TemplateError("thresholds are a row of numbers")
     order = np.argsort(limits)
     counts = np.empty(len(limits), dtype=np.int64)
@@ -248,7 +248,7 @@ def count_within(
         found = _tensors().counts_within(probes, templates, limits[order], labels=labels, **options)
         counts[order] = found.cpu().numpy()
         return counts
-    probes, _ = _checked(probes, templates, steps, np.float32)
+    probes, _ = _checked(probes, templates, steps, np.float32, threads)
     counts[order] = _tiles().counts(
         probes,
         templates,
@@ -314,11 +314,17 @@ def similarity(distance: float | NDArray[np.floating]) -> float | NDArray[np.flo
 
 
 def _checked(
-    probes: Any, templates: SubspaceBatch, steps: int, dtype: DTypeLike
+    probes: Any,
+    templates: SubspaceBatch,
+    steps: int,
+    dtype: DTypeLike,
+    threads: int | None = None,
 ) -> tuple[Probes, Kind]:
     kind: Kind = np.dtype(np.float64 if np.dtype(dtype) == np.float64 else np.float32)
     if np.dtype(dtype) != kind:
         raise TemplateError(f"distances are computed in float32 or float64, not {np.dtype(dtype)}")
+    if threads is not None and threads < 1:
+        raise TemplateError(f"there is no work for {threads} threads; at least 1 is needed")
     if steps < 1:
         raise TemplateError(f"the iteration needs at least one step, not {steps}")
     _check_finite(templates)

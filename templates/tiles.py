@@ -39,6 +39,8 @@ _TILE_SIDE = 1024
 _BLOCK_BYTES = 32 << 20
 _PAIRED_BYTES = 8 << 20
 _TASKS = 16
+# Multiplications, about half a millisecond's, below which another thread does not pay.
+_LEAST = 1 << 25
 _MOST_SPARE = 16
 _SPARE_BYTES = 16 << 20
 _TINY = np.float32(np.finfo(np.float32).tiny)
@@ -126,7 +128,8 @@ def _each_tile(
     if not tasks:
         return
     lock = threading.Lock()
-    with single_threaded() as available, _Crew(min(threads or available, len(tasks))) as crew:
+    most = min(len(tasks), max(1, solver.multiplications // _LEAST))
+    with single_threaded() as available, _Crew(min(threads or available, most)) as crew:
         spaces = [solver.space() for _ in range(crew.count)]
         for block in solver.row_blocks():
             tiles = crew.map(solver.pack_probes, block)
@@ -264,6 +267,12 @@ class _Solver:
         width = LANES * max(1, _TILE_SIDE // ((templates.m + 1) * LANES))
         self._rows = _even(len(probes), max(1, _TILE_SIDE // (self._m + 1)))
         self._columns = whole(_even(len(templates), width))
+
+    @property
+    def multiplications(self) -> int:
+        """Of the product of all rows."""
+        each = (self._m + 1) * (self._templates.m + 1) * self._templates.n
+        return len(self._probes) * len(self._templates) * each
 
     def tasks(self) -> list[_Task]:
         """Parts of equal work, enough of them for several threads; they do not show."""

@@ -184,6 +184,7 @@ def test_the_number_of_threads_changes_nothing(
     metric: Metric, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tiles, "_TILE_SIDE", 96)
+    monkeypatch.setattr(tiles, "_LEAST", 1)
     a, b = lifted(faces(70, 64), 5, 1), lifted(faces(90, 64, 2), 3, 2)
     for probes in (a, faces(70, 64).astype(np.float32)):
         alone, *others = (
@@ -207,7 +208,10 @@ def test_a_distance_does_not_depend_on_the_pairs_beside_it(metric: Metric) -> No
         assert alone == pytest.approx(whole[i, j], abs=2e-6)
 
 
-def test_callers_in_several_threads_get_what_one_gets_and_leave_the_library_as_it_was() -> None:
+def test_callers_in_several_threads_get_what_one_gets_and_leave_the_library_as_it_was(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(tiles, "_LEAST", 1)
     a, b = lifted(faces(40, 64), 4, 1), lifted(faces(300, 64, 2), 4, 2)
     expected = pairwise_distances(a, b, metric="spherical")
     before = [library["num_threads"] for library in threadpoolctl.threadpool_info()]
@@ -230,6 +234,7 @@ def test_callers_in_several_threads_get_what_one_gets_and_leave_the_library_as_i
 
 def test_a_failure_in_one_thread_ends_the_traversal(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tiles, "_TILE_SIDE", 64)
+    monkeypatch.setattr(tiles, "_LEAST", 1)
     templates = lifted(faces(200, 64), 3, 1)
     calls: list[int] = []
 
@@ -339,6 +344,12 @@ def test_memory_does_not_grow_with_the_number_of_pairs(monkeypatch: pytest.Monke
         (lambda t: nearest(t, t, k=0, metric="euclidean"), "at least 1"),
         (lambda t: count_within(t, t, [[1.0]], metric="euclidean"), "a row of numbers"),
         (lambda t: count_within(t, t, [np.nan], metric="euclidean"), "a row of numbers"),
+        (lambda t: count_within(t, t, [], metric="euclidean"), "a row of numbers"),
+        (lambda t: nearest(t, t, k=1, metric="euclidean", threads=0), "at least 1 is needed"),
+        (
+            lambda t: pairwise_distances(t, t, metric="euclidean", threads=-1),
+            "at least 1 is needed",
+        ),
         (
             lambda t: count_within(
                 t, t, [1.0], metric="euclidean", labels=(np.arange(3), np.arange(4))
