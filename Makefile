@@ -37,4 +37,4 @@ lock: | $(UV)
 	$(UV) pip compile --quiet pyproject.toml --group dev --universal --generate-hashes --python-version 3.11 -c requirements.lock -o requirements-dev.lock
 
 clean:
-	rm -rf .venv .bootstrap .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf .venv .bootstrap templates/kernels/__pycache__ .mypy_cache .pytest_cache .ruff_cache .hypothesis

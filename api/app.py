@@ -45,8 +45,6 @@ def create_app(
             # Its sentence is written for the operator and holds no secret.
             log("start failed: " + str(error), severity=logging.ERROR)
             raise
-        # No request is answered before this is done, so none waits for the compiler.
-        await anyio.to_thread.run_sync(warm_up)
         app.state.runtime = runtime
         app.state.gate = Gate(slots=settings.resolved_compute_slots, waiting=settings.queue_limit)
         log(
@@ -57,6 +55,8 @@ def create_app(
             pack=None if runtime.pack is None else runtime.pack.info.name,
         )
         try:
+            # No request is answered before this is done, so none waits for the compiler.
+            await anyio.to_thread.run_sync(warm_up)
             async with anyio.create_task_group() as tasks:
                 tasks.start_soon(
                     partial(purge_regularly, runtime.store, every_s=settings.purge_interval_s)

@@ -1,21 +1,34 @@
 """The matrix library's threads: one per tile where tiles run in threads of their own."""
 
+import os
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
+from typing import Any
 
 from threadpoolctl import ThreadpoolController
 
 _lock = threading.Lock()
 _users = 0
-_limiter = None
+_limiter: Any = None
 _available = 1
 
 
 @cache
 def _controller() -> ThreadpoolController:
     return ThreadpoolController().select(user_api="blas")
+
+
+def _forget() -> None:
+    """A child of a fork starts anew: the callers that its parent had are not in it."""
+    global _lock, _users
+    if _users and _limiter is not None:
+        _limiter.restore_original_limits()
+    _lock, _users = threading.Lock(), 0
+
+
+os.register_at_fork(after_in_child=_forget)
 
 
 @contextmanager

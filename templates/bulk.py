@@ -46,7 +46,9 @@ def nearest(
     parts = traverse(side, templates, collector, **options) or [collector()]
     distances = np.concatenate([part.distances for part in parts], axis=1)
     indices = np.concatenate([part.indices for part in parts], axis=1)
-    order = np.lexsort((indices, distances), axis=1)[:, :k]
+    # An empty place is behind everything, as it is inside one collector.
+    last = np.where(indices < 0, np.iinfo(np.int64).max, indices)
+    order = np.lexsort((last, distances), axis=1)[:, :k]
     return np.take_along_axis(indices, order, 1), np.take_along_axis(distances, order, 1)
 
 

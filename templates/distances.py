@@ -124,11 +124,14 @@ def pairwise_distances(
     Paper eq. 1 to 9; METHOD §3 and §5.
     """
     metric = Metric(metric)
+    _check_options(steps, threads)
     if device is not None or not isinstance(templates, SubspaceBatch):
+        if np.dtype(dtype) != np.float32:
+            raise TemplateError(f"a device computes in float32, not in {np.dtype(dtype)}")
         found = _tensors().pairwise(probes, templates, metric=metric, steps=steps, device=device)
         result: Floats = found.cpu().numpy() if isinstance(templates, SubspaceBatch) else found
         return result
-    probes, kind = _checked(probes, templates, steps, dtype, threads)
+    probes, kind = _checked(probes, templates, dtype)
     out = np.empty((len(probes), len(templates)), dtype=kind)
     if out.size and kind == np.float64:
         return _reference(probes, templates, metric, steps)
@@ -179,6 +182,8 @@ def nearest(
     metric = Metric(metric)
     if k < 1:
         raise TemplateError(f"{k} neighbours cannot be found; k is at least 1")
+    _check_options(steps, threads)
+    labels = _labels(labels, len(probes), len(templates))
     if device is not None or not isinstance(templates, SubspaceBatch):
         options: dict[str, Any] = {"k": k, "metric": metric, "steps": steps, "device": device}
         found = _tensors().nearest(
@@ -187,14 +192,14 @@ def nearest(
         if isinstance(templates, SubspaceBatch):
             return Neighbours(*(part.cpu().numpy() for part in found))
         return Neighbours(*found)
-    probes, _ = _checked(probes, templates, steps, np.float32, threads)
+    probes, _ = _checked(probes, templates, np.float32)
     return Neighbours(
         *_tiles().nearest(
             probes,
             templates,
             k,
             of_templates=of_templates,
-            labels=_labels(labels, probes, templates),
+            labels=labels,
             metric=metric,
             steps=steps,
             threads=threads,
@@ -241,6 +246,8 @@ def count_within(
     limits = np.atleast_1d(np.asarray(thresholds, dtype=np.float64))
     if limits.ndim != 1 or not limits.size or np.isnan(limits).any():
         raise TemplateError("thresholds are a row of numbers")
+    _check_options(steps, threads)
+    labels = _labels(labels, len(probes), len(templates))
     order = np.argsort(limits)
     counts = np.empty(len(limits), dtype=np.int64)
     if device is not None or not isinstance(templates, SubspaceBatch):
@@ -248,12 +255,12 @@ def count_within(
         found = _tensors().counts_within(probes, templates, limits[order], labels=labels, **options)
         counts[order] = found.cpu().numpy()
         return counts
-    probes, _ = _checked(probes, templates, steps, np.float32, threads)
+    probes, _ = _checked(probes, templates, np.float32)
     counts[order] = _tiles().counts(
         probes,
         templates,
         limits[order],
-        labels=_labels(labels, probes, templates),
+        labels=labels,
         metric=metric,
         steps=steps,
         threads=threads,
@@ -277,7 +284,8 @@ def paired_distances(
     ndarray of ``dtype``, shape (P,)
     """
     metric = Metric(metric)
-    probes, kind = _checked(probes, templates, steps, dtype)
+    _check_options(steps, None)
+    probes, kind = _checked(probes, templates, dtype)
     if len(probes) != len(templates):
         raise TemplateError(f"{len(probes)} probes do not pair with {len(templates)} templates")
     if not len(probes):
@@ -313,20 +321,17 @@ def similarity(distance: float | NDArray[np.floating]) -> float | NDArray[np.flo
     return 1 - distance**2 / 2
 
 
-def _checked(
-    probes: Any,
-    templates: SubspaceBatch,
-    steps: int,
-    dtype: DTypeLike,
-    threads: int | None = None,
-) -> tuple[Probes, Kind]:
-    kind: Kind = np.dtype(np.float64 if np.dtype(dtype) == np.float64 else np.float32)
-    if np.dtype(dtype) != kind:
-        raise TemplateError(f"distances are computed in float32 or float64, not {np.dtype(dtype)}")
+def _check_options(steps: int, threads: int | None) -> None:
     if threads is not None and threads < 1:
         raise TemplateError(f"there is no work for {threads} threads; at least 1 is needed")
     if steps < 1:
         raise TemplateError(f"the iteration needs at least one step, not {steps}")
+
+
+def _checked(probes: Any, templates: SubspaceBatch, dtype: DTypeLike) -> tuple[Probes, Kind]:
+    kind: Kind = np.dtype(np.float64 if np.dtype(dtype) == np.float64 else np.float32)
+    if np.dtype(dtype) != kind:
+        raise TemplateError(f"distances are computed in float32 or float64, not {np.dtype(dtype)}")
     _check_finite(templates)
     if isinstance(probes, SubspaceBatch):
         if probes.n != templates.n:
@@ -339,14 +344,20 @@ def _checked(
         raise TemplateError("probes are arrays or a batch where templates are a batch")
     if probes.ndim != 2 or probes.shape[1] != templates.n:
         raise InvalidEmbedding(f"expected probes of shape (P, {templates.n}), seen {probes.shape}")
-    if not np.isfinite(probes).all():
+    with np.errstate(over="ignore"):  # what is infinite in the precision of the work is refused
+        probes = np.ascontiguousarray(probes, dtype=kind)
+    # The sum of float32 numbers in float64 is finite if they are, and needs no temporary.
+    single = kind == np.float32
+    if not np.isfinite(probes.sum(dtype=np.float64) if single else probes).all():
         raise InvalidEmbedding("a probe holds a number that is not finite")
     return probes, kind
 
 
 def _check_finite(batch: SubspaceBatch) -> None:
     # A sum is not finite if any of its terms is not, and needs no temporary of the batch's size.
-    if not np.isfinite(batch.feet.sum()) or not np.isfinite(batch.bases.sum()):
+    if not np.isfinite(batch.feet.sum(dtype=np.float64)) or not np.isfinite(
+        batch.bases.sum(dtype=np.float64)
+    ):
         raise InvalidTemplate("a template holds a number that is not finite")
 
 
@@ -379,13 +390,16 @@ def _reference(probes: Probes, templates: SubspaceBatch, metric: Metric, steps: 
     return spherical.points_pairwise(points, templates, kind)
 
 
-def _labels(labels: Labels | None, probes: Probes, templates: SubspaceBatch) -> Labels | None:
+def _labels(labels: Labels | None, probes: int, templates: int) -> Labels | None:
     if labels is None:
         return None
-    mine, theirs = (np.ascontiguousarray(side, dtype=np.int64) for side in labels)
-    if mine.shape != (len(probes),) or theirs.shape != (len(templates),):
+    given = [np.asarray(side) for side in labels]
+    if any(side.dtype.kind not in "iub" for side in given):
+        raise TemplateError("labels are whole numbers; number the names, as np.unique does")
+    mine, theirs = (np.array(side, dtype=np.int64) for side in given)
+    if mine.shape != (probes,) or theirs.shape != (templates,):
         raise TemplateError(
-            f"labels of shapes {mine.shape} and {theirs.shape} do not fit {len(probes)} probes "
-            f"and {len(templates)} templates"
+            f"labels of shapes {mine.shape} and {theirs.shape} do not fit {probes} probes "
+            f"and {templates} templates"
         )
     return mine, theirs

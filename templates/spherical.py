@@ -56,6 +56,11 @@ def _normalised(rows: Floats) -> Floats:
     return np.asarray(rows / np.maximum(norms, np.finfo(rows.dtype).tiny))
 
 
+def directions(points: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Unit rows; a zero row stays zero."""
+    return _normalised(points.astype(np.float64)).astype(np.float32)
+
+
 def _distances(similarities: Floats) -> Floats:
     return np.asarray(np.sqrt(np.maximum(2 - 2 * similarities, 0)))
 

@@ -43,6 +43,7 @@ _TASKS = 16
 _LEAST = 1 << 25
 _MOST_SPARE = 16
 _SPARE_BYTES = 16 << 20
+_SHORT = np.float32(1e-12)
 _TINY = np.float32(np.finfo(np.float32).tiny)
 
 _Place = tuple[slice, Floats | None]
@@ -146,6 +147,7 @@ def _each_tile(
 
             crew.map(one, tasks)
         for space in spaces:
+            space.clear()
             _spare.put(space.memory)
 
 
@@ -187,6 +189,11 @@ class _Space:
         )
         self.work[:] = 0
         self.collector: Any = None
+        self._used = sum(sizes)
+
+    def clear(self) -> None:
+        """Forget: what is kept for the next traversal holds nothing of this one."""
+        self.memory[: self._used] = 0
 
 
 class _Spare:
@@ -311,6 +318,12 @@ class _Solver:
             squares = _squares(points)
             if self._euclidean:
                 return _Tile(part, points, squares)
+            # Squares of very short and very long points do not fit float32.
+            odd = np.flatnonzero((squares < _SHORT) | (squares > 1 / _SHORT))
+            if odd.size:
+                points = points.copy()
+                points[odd] = spherical.directions(points[odd])
+                squares = _squares(points)
             lengths = np.sqrt(np.maximum(squares, _TINY))
             return _Tile(part, points, np.reciprocal(lengths))
         some = self._probes[part]

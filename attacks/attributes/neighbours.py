@@ -21,7 +21,7 @@ Advance = Callable[[int], None]
 """Called with a number of (template, face) pairs that are done."""
 
 METRICS = (Metric.EUCLIDEAN, Metric.SPHERICAL)
-_ROWS = 512
+_BYTES = 32 << 20
 # Enough to settle ties of the vote, too little to outweigh a neighbour (K is at most _MOST).
 _MOST = 1000
 _TIE = 1e-4
@@ -112,12 +112,14 @@ def _nearest_points(
 ) -> Neighbours:
     indices = np.empty((len(attacked), k), dtype=np.int64)
     distances = np.empty((len(attacked), k), dtype=np.float32)
-    for start in range(0, len(attacked), _ROWS):
-        rows = slice(start, min(start + _ROWS, len(attacked)))
+    step = max(1, _BYTES // (12 * len(gallery) + 8 * k * gallery.shape[1]))
+    for start in range(0, len(attacked), step):
+        rows = slice(start, min(start + step, len(attacked)))
         far = 1 - attacked[rows] @ gallery.T
         if skip is not None:
-            far[np.arange(len(far)), skip[rows]] = np.inf
-        some = np.argpartition(far, k - 1, axis=1)[:, :k]
+            own = np.flatnonzero(skip[rows] >= 0)
+            far[own, skip[rows][own]] = np.inf
+        some = np.argsort(far, axis=1, kind="stable")[:, :k]
         gaps = attacked[rows, None].astype(np.float64) - gallery[some]
         near = np.sqrt(np.einsum("pki,pki->pk", gaps, gaps))
         order = np.lexsort((some, near), axis=1)

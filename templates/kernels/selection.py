@@ -93,7 +93,7 @@ def count_within(
                 continue
             for c in range(j, min(j + LANES, columns)):
                 distance = distances[i * stride + c]
-                if distance > thresholds[last] or (labelled and mine[i] == theirs[c]):
+                if not distance <= thresholds[last] or (labelled and mine[i] == theirs[c]):
                     continue
                 low, high = 0, last
                 while low < high:

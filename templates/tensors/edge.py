@@ -43,10 +43,11 @@ def place(
         if isinstance(error, torch.OutOfMemoryError):
             raise
         raise TemplateError(
-            f"torch cannot use the device {device}: {str(error).splitlines()[0]}"
+            f"torch cannot use the device {device or there}: {str(error).splitlines()[0]}"
         ) from None
-    if mine.device != there:
-        raise TemplateError(f"the probes are on {mine.device}, the templates on {there}")
+    # Not the device that was asked for: torch tells "cuda" from "cuda:0".
+    if mine.device != theirs.device:
+        raise TemplateError(f"the probes are on {mine.device}, the templates on {theirs.device}")
     n = theirs.n
     if isinstance(mine, SubspaceTensors):
         if mine.n != n:

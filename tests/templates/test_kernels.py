@@ -24,7 +24,7 @@ from templates.distances import (
     pairwise_distances,
     similarity,
 )
-from templates.errors import TemplateError
+from templates.errors import InvalidEmbedding, TemplateError
 from templates.lifting import lift
 from templates.randomness import Keystream
 from templates.subspace import SubspaceBatch
@@ -275,6 +275,7 @@ def test_nearest_is_what_sorting_the_matrix_finds(
 ) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tiles, "_TILE_SIDE", side)
+        patch.setattr(tiles, "_LEAST", 1)
         mine, theirs = (lift(units(60, 24, seed), strategy="random", m=3) for seed in (1, 2))
         # Half of the rows twice, so that there are ties.
         order = np.arange(60) % 30
@@ -286,7 +287,8 @@ def test_nearest_is_what_sorting_the_matrix_finds(
             tags = np.arange(probes) % labels, np.arange(count) % 3
             matrix = np.where(tags[0][:, None] == tags[1], np.inf, matrix)
         matrix = matrix.T if of_templates else matrix
-        found = nearest(left, right, k=k, metric=metric, of_templates=of_templates, labels=tags)
+        options = {"metric": metric, "of_templates": of_templates, "labels": tags}
+        found = nearest(left, right, k=k, threads=3, **options)
         order = np.argsort(matrix, axis=1, kind="stable")[:, :k]
         expected = np.take_along_axis(matrix, order, 1)
         there = np.isfinite(expected)
@@ -298,7 +300,9 @@ def test_nearest_is_what_sorting_the_matrix_finds(
 
 
 @pytest.mark.parametrize("metric", METRICS)
-def test_counts_are_those_of_the_matrix(metric: Metric) -> None:
+def test_counts_are_those_of_the_matrix(metric: Metric, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tiles, "_TILE_SIDE", 64)
+    monkeypatch.setattr(tiles, "_LEAST", 1)
     points = faces(150, 64).astype(np.float32)
     templates = lifted(faces(170, 64, 2), 4, 2)
     for probes in (points, lifted(points, 3, 3)):
@@ -333,6 +337,7 @@ def test_memory_does_not_grow_with_the_number_of_pairs(monkeypatch: pytest.Monke
         tracemalloc.stop()
         return top
 
+    peak(20_000)  # leaves its working space to the next
     small, large = peak(4_000), peak(20_000)
     assert 20_000 * 400 * 4 > 30e6
     assert large < small + 1_500_000
@@ -356,6 +361,17 @@ def test_memory_does_not_grow_with_the_number_of_pairs(monkeypatch: pytest.Monke
             ),
             "do not fit 4 probes and 4 templates",
         ),
+        (
+            lambda t: nearest(
+                t, t, k=1, metric="euclidean", labels=(np.arange(4) + 0.5, np.arange(4))
+            ),
+            "labels are whole numbers",
+        ),
+        (lambda t: pairwise_distances(t, t, metric="euclidean", steps=0, device="cpu"), "one step"),
+        (
+            lambda t: pairwise_distances(t, t, metric="euclidean", dtype="f8", device="cpu"),
+            "in float32, not in float64",
+        ),
     ],
 )
 def test_wrong_parameters_are_refused(call, message: str) -> None:
@@ -371,6 +387,54 @@ def test_nothing_in_nothing_out() -> None:
     found = nearest(none, templates, k=2, metric="euclidean", of_templates=True)
     assert (found.indices == -1).all()
     assert count_within(none, templates, [1.0], metric="euclidean") == 0
+
+
+@pytest.mark.parametrize("size", [1e-25, 1e-12, 1e12, 3e19, 1e25])
+def test_the_length_of_a_point_does_not_count_on_the_sphere(size: float) -> None:
+    templates = lift(units(20, 24), strategy="random", m=2)
+    points = units(3, 24, 1)
+    seen = pairwise_distances((size * points).astype(np.float32), templates, metric="spherical")
+    expected = pairwise_distances(points, templates, metric="spherical")
+    np.testing.assert_allclose(seen, expected, rtol=1e-5)
+
+
+def test_what_is_infinite_in_float32_is_refused() -> None:
+    templates = lift(units(4, 24), strategy="random", m=2)
+    far = 1e39 * units(3, 24, 1)
+    for call in (
+        lambda: pairwise_distances(far, templates, metric="spherical"),
+        lambda: count_within(far, templates, [1.0], metric="euclidean"),
+    ):
+        with pytest.raises(InvalidEmbedding, match="not finite"):
+            call()
+
+
+def test_several_threads_take_part(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Otherwise no test would see how their collections are put together."""
+    monkeypatch.setattr(tiles, "_TILE_SIDE", 64)
+    monkeypatch.setattr(tiles, "_LEAST", 1)
+    seen: set[int] = set()
+
+    class Collector:
+        def take(self, rows: slice, columns: slice, distances: np.ndarray) -> None:
+            seen.add(threading.get_ident())
+            barrier.wait()
+
+    barrier = threading.Barrier(2, timeout=60)
+    templates = lifted(faces(64, 64), 3, 1)
+    options = {"metric": Metric.EUCLIDEAN, "steps": 1, "threads": 2}
+    parts = tiles.traverse(templates, templates, Collector, **options)
+    assert len(parts) == len(seen) == 2
+
+
+def test_nothing_of_a_traversal_is_left_in_the_working_space() -> None:
+    pairwise_distances(units(40, 64), lifted(faces(200, 64), 3, 1), metric="spherical")
+    assert tiles._spare._arrays
+    tiles._spare._arrays.clear()
+    templates = lifted(faces(300, 64), 3, 1)
+    pairwise_distances(templates, templates, metric="spherical")
+    (kept, *_) = tiles._spare._arrays
+    assert not kept.any()
 
 
 def test_huge_numbers_are_recomputed() -> None:
@@ -411,6 +475,7 @@ for m, k in ((1, 1), (2, 9), (16, 16), (20, 7)):
             pairwise_distances(probes, b, metric=metric)
             nearest(probes, b, k=3, metric=metric)
             labels = np.arange(len(probes)), np.arange(30)
+            labels[0].flags.writeable = False
             nearest(probes, b, k=3, metric=metric, of_templates=True, labels=labels)
             count_within(probes, b, [0.5], metric=metric)
         paired_distances(a, b, metric=metric)
