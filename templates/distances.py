@@ -344,20 +344,21 @@ def _checked(probes: Any, templates: SubspaceBatch, dtype: DTypeLike) -> tuple[P
         raise TemplateError("probes are arrays or a batch where templates are a batch")
     if probes.ndim != 2 or probes.shape[1] != templates.n:
         raise InvalidEmbedding(f"expected probes of shape (P, {templates.n}), seen {probes.shape}")
-    with np.errstate(over="ignore"):  # what is infinite in the precision of the work is refused
+    # What is infinite in the precision of the work is refused.
+    with np.errstate(over="ignore", invalid="ignore"):
         probes = np.ascontiguousarray(probes, dtype=kind)
-    # The sum of float32 numbers in float64 is finite if they are, and needs no temporary.
-    single = kind == np.float32
-    if not np.isfinite(probes.sum(dtype=np.float64) if single else probes).all():
+        # The sum of float32 numbers in float64 is finite if they are, and needs no temporary.
+        checked = probes.sum(dtype=np.float64) if kind == np.float32 else probes
+    if not np.isfinite(checked).all():
         raise InvalidEmbedding("a probe holds a number that is not finite")
     return probes, kind
 
 
 def _check_finite(batch: SubspaceBatch) -> None:
     # A sum is not finite if any of its terms is not, and needs no temporary of the batch's size.
-    if not np.isfinite(batch.feet.sum(dtype=np.float64)) or not np.isfinite(
-        batch.bases.sum(dtype=np.float64)
-    ):
+    with np.errstate(invalid="ignore"):
+        total = batch.feet.sum(dtype=np.float64) + batch.bases.sum(dtype=np.float64)
+    if not np.isfinite(total):
         raise InvalidTemplate("a template holds a number that is not finite")
 
 
