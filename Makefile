@@ -3,7 +3,7 @@ PYTHON ?= python3
 UV := $(or $(shell command -v uv),.bootstrap/bin/uv)
 VENV := .venv/bin
 
-.PHONY: demo test lint types lock clean
+.PHONY: demo test lint types audit sbom lock clean
 
 demo: .venv/core
 	$(VENV)/veilface demo
@@ -18,14 +18,28 @@ lint: .venv/dev
 types: .venv/dev
 	$(VENV)/mypy
 
+# What the release depends on: known vulnerabilities, and a bill of materials (CycloneDX).
+audit: | $(UV)
+	mkdir -p dist
+	rm -f dist/audit.json
+	-$(UV) tool run --quiet --from pip-audit==2.10.1 pip-audit --requirement requirements.lock \
+		--disable-pip --progress-spinner off --format json --output dist/audit.json >/dev/null 2>&1
+	$(PYTHON) .ci/audit_report.py dist/audit.json
+
+sbom: | $(UV)
+	mkdir -p dist
+	$(UV) tool run --quiet --from cyclonedx-bom==7.5.0 cyclonedx-py requirements requirements.lock \
+		--output-reproducible --output-file dist/sbom.json
+
 .venv/core: requirements.lock pyproject.toml | $(UV)
 	test -x $(VENV)/python || $(UV) venv --quiet --python '>=3.11' .venv
 	$(UV) pip install --quiet --python $(VENV)/python --require-hashes -r requirements.lock
 	$(UV) pip install --quiet --python $(VENV)/python --no-deps -e .
 	touch $@
 
-.venv/dev: requirements-dev.lock .venv/core | $(UV)
+.venv/dev: requirements-dev.lock clients/python/pyproject.toml .venv/core | $(UV)
 	$(UV) pip install --quiet --python $(VENV)/python --require-hashes -r requirements-dev.lock
+	$(UV) pip install --quiet --python $(VENV)/python --no-deps -e clients/python
 	touch $@
 
 .bootstrap/bin/uv:
@@ -35,6 +49,8 @@ types: .venv/dev
 lock: | $(UV)
 	$(UV) pip compile --quiet --upgrade pyproject.toml --universal --generate-hashes --python-version 3.11 -o requirements.lock
 	$(UV) pip compile --quiet pyproject.toml --group dev --universal --generate-hashes --python-version 3.11 -c requirements.lock -o requirements-dev.lock
+	$(UV) pip compile --quiet pyproject.toml --extra redis --universal --generate-hashes --python-version 3.11 -c requirements.lock -o deploy/requirements.lock
+	echo hatchling | $(UV) pip compile --quiet --upgrade - --universal --generate-hashes --python-version 3.11 -o deploy/build.lock
 
 clean:
-	rm -rf .venv .bootstrap templates/kernels/__pycache__ .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf .venv .bootstrap dist .schemathesis templates/kernels/__pycache__ .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -23,10 +23,19 @@ from attacks.hill_climbing import Answer
 from templates.contract import Contract
 from templates.decoys import DecoyGenerator, DecoyPool, DecoySource
 from templates.distances import similarity
+from templates.probe_signature import signed_probe
 from templates.sealing import MasterKeyring
 from templates.store import Right, TemplateStore
 
 Ask = Callable[[NDArray[np.float32]], Answer]
+
+UNLIMITED = """\
+lockout_after = 0
+rate_limit_key = "off"
+rate_limit_address = "off"
+"""
+"""Settings without which the attack would end at the first lockout: it measures what is left to
+gain where an operator has switched these defences off, or an attacker is patient."""
 
 _TENANT = "default"
 
@@ -64,7 +73,9 @@ def attacked_service(
         elif isinstance(source, DecoyPool):
             source.save(folder / "decoys.veil", file_sealer(keyring))
         quoted = str(folder).replace("\\", "\\\\").replace('"', '\\"')
-        (folder / "veilface.toml").write_text(f'data_dir = "{quoted}"\n', encoding="utf-8")
+        (folder / "veilface.toml").write_text(
+            f'data_dir = "{quoted}"\n{UNLIMITED}', encoding="utf-8"
+        )
         with running_service(folder) as client:
             subjects = [_enroll(client, i, wire) for i, wire in enumerate(templates)]
             store = TemplateStore(f"sqlite:///{folder / 'veilface.db'}", keyring)
@@ -121,7 +132,7 @@ def _asker(client: httpx.Client, subject: str, token: str) -> Ask:
     def ask(probe: NDArray[np.float32]) -> Answer:
         answer = client.post(
             f"/v1/subjects/{subject}/verify",
-            json={"embedding": [float(number) for number in probe]},
+            json=signed_probe(token, subject, probe),
             headers={"Authorization": f"Bearer {token}"},
         )
         if answer.status_code != httpx.codes.OK:

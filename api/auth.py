@@ -1,7 +1,7 @@
 """Who calls, and what they may do: API keys with a tenant and rights."""
 
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated
 
 from fastapi import Depends, Request, Security
@@ -9,8 +9,9 @@ from fastapi.security import APIKeyHeader, HTTPAuthorizationCredentials, HTTPBea
 
 from api.errors import ApiError
 from api.limits import Gate
+from api.rate_limits import RateLimits
 from api.runtime import Runtime
-from templates.store.api_keys import is_token
+from templates.store.api_keys import is_token, probe_key
 
 _bearer = HTTPBearer(
     auto_error=False, scheme_name="bearer", description="`Authorization: Bearer vf_…`"
@@ -22,11 +23,12 @@ _header = APIKeyHeader(
 
 @dataclass(frozen=True)
 class Caller:
-    """An API key that was recognised."""
+    """An API key that was recognised, and the key that its probes are signed with."""
 
     prefix: str
     tenant: str
     rights: frozenset[str]
+    probe_key: bytes = field(repr=False)
 
     def require(self, *rights: str) -> None:
         """Refuse unless the key has all of these rights.
@@ -61,7 +63,7 @@ async def caller(
     ------
     ApiError
         ``unauthorized``, in the same words for an absent, an unknown and a revoked key;
-        ``overloaded``.
+        ``overloaded``; ``rate_limited``.
     """
     runtime: Runtime = request.app.state.runtime
     gate: Gate = request.app.state.gate
@@ -79,8 +81,13 @@ async def caller(
     if found is None:
         raise refused
     request.state.log.update(tenant=found.tenant, key_id=found.prefix)
+    rate_limits: RateLimits = request.app.state.rate_limits
+    await rate_limits.count_key(found.prefix)
     return Caller(
-        prefix=found.prefix, tenant=found.tenant, rights=frozenset(map(str, found.rights))
+        prefix=found.prefix,
+        tenant=found.tenant,
+        rights=frozenset(map(str, found.rights)),
+        probe_key=probe_key(token),
     )
 
 

@@ -4,20 +4,27 @@ import logging
 import re
 import secrets
 import time
+from collections.abc import Awaitable, Callable, Collection
 from typing import Any
 
 import anyio
+from prometheus_client import Gauge
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from api.answers import error_answer
-from api.errors import ApiError
+from api.errors import ERROR_CODES, ApiError
+from api.limits import overloaded
 from api.logging import log
+from api.metrics import IN_FLIGHT, count_error, count_request
+from api.rate_limits import RateLimits
 from models.demo import DEMO_NOTICE
 
 SANE_REQUEST_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{7,63}")
 LINGER_S = 5.0
+SEND_TIMEOUT_S = 30.0
+"""Longest that one piece of an answer may wait for the client to take it."""
 LINGER_BYTES = 64 * 1024 * 1024
 SECURITY_HEADERS = {
     "X-Content-Type-Options": "nosniff",
@@ -25,6 +32,9 @@ SECURITY_HEADERS = {
     "Content-Security-Policy": "default-src 'none'; frame-ancestors 'none'",
     "Referrer-Policy": "no-referrer",
 }
+HSTS = "max-age=31536000"
+OPERATIONS_IN_FLIGHT = 64
+"""Requests for health and metrics that are answered at the same time, whatever else there is."""
 
 
 def request_id_of(offered: str | None) -> str:
@@ -54,6 +64,10 @@ class _Body:
         self._ended = message["type"] != "http.request" or not message.get("more_body", False)
         return message
 
+    def abandon(self) -> None:
+        """Read nothing more."""
+        self._ended = True
+
     async def linger(self) -> None:
         """Drop what still comes. A client that waits for ``100 Continue`` is not sent it."""
         dropped = 0
@@ -63,16 +77,68 @@ class _Body:
                 dropped += len(message.get("body", b""))
 
 
+class _Room:
+    """A bound on requests that are answered at the same time, and their number as a metric."""
+
+    def __init__(self, most: int, gauge: Gauge | None = None) -> None:
+        self._most = self._free = most
+        self._gauge = gauge
+
+    @property
+    def crowded(self) -> bool:
+        """Whether more than half of it is taken."""
+        return 2 * self._free < self._most
+
+    def take(self) -> bool:
+        """Take a place, if there is one."""
+        if self._free <= 0:
+            return False
+        self._free -= 1
+        if self._gauge is not None:
+            self._gauge.inc()
+        return True
+
+    def give_back(self) -> None:
+        """Give a place back."""
+        self._free += 1
+        if self._gauge is not None:
+            self._gauge.dec()
+
+
 class RequestContext:
     """ASGI middleware; it sits outside of all exception handlers.
 
     ``scope["state"]`` gets ``request_id`` and ``log``, a dictionary of fields for the request's
     log line that routes may add to.
+
+    Parameters
+    ----------
+    max_in_flight
+        Requests that are answered at the same time; the next one is refused unread.
+    operations_paths
+        Paths that have room of their own, and no rate limit: an overload must be seen from them.
+    demo, tls
+        What the headers of every answer say.
     """
 
-    def __init__(self, app: ASGIApp, *, demo: bool = False) -> None:
+    def __init__(
+        self,
+        app: ASGIApp,
+        *,
+        max_in_flight: int,
+        operations_paths: Collection[str] = frozenset(),
+        demo: bool = False,
+        tls: bool = False,
+    ) -> None:
         self._app = app
-        self._demo = demo
+        self._operations_paths = operations_paths
+        self._room = _Room(max_in_flight, IN_FLIGHT)
+        self._operations_room = _Room(OPERATIONS_IN_FLIGHT)
+        self._headers = dict(SECURITY_HEADERS)
+        if tls:
+            self._headers["Strict-Transport-Security"] = HSTS
+        if demo:
+            self._headers["X-Veilface-Notice"] = DEMO_NOTICE
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request."""
@@ -89,24 +155,35 @@ class RequestContext:
         started, status = time.perf_counter(), 0
         body = _Body(scope, receive)
 
+        async def deliver(message: Message) -> None:
+            # A client that takes nothing of its answer must not keep its place for ever.
+            with anyio.move_on_after(SEND_TIMEOUT_S):
+                await send(message)
+                return
+            raise ClientDisconnect
+
         async def send_with_headers(message: Message) -> None:
             nonlocal status
             if message["type"] == "http.response.body" and not message.get("more_body"):
-                await send({**message, "more_body": True})
-                await body.linger()
+                await deliver({**message, "more_body": True})
+                # Lingering is a courtesy: with it, nobody without a key shall fill the room.
+                if not self._room.crowded:
+                    await body.linger()
                 message = {"type": "http.response.body", "body": b""}
             if message["type"] == "http.response.start":
                 status = message["status"]
                 headers = MutableHeaders(scope=message)
                 headers["X-Request-ID"] = request_id
-                for name, value in SECURITY_HEADERS.items():
+                for name, value in self._headers.items():
                     headers.setdefault(name, value)
-                if self._demo:
-                    headers["X-Veilface-Notice"] = DEMO_NOTICE
-            await send(message)
+            await deliver(message)
+
+        async def refuse(refusal: ApiError) -> None:
+            fields["code"] = refusal.code
+            await error_answer(refusal, request_id)(scope, receive, send_with_headers)
 
         try:
-            await self._app(scope, body.receive, send_with_headers)
+            await self._admit(scope, body, send_with_headers, refuse)
         except ClientDisconnect:
             fields["code"] = "client_disconnected"
         except Exception as error:
@@ -119,17 +196,42 @@ class RequestContext:
                 )
                 await answer(scope, receive, send_with_headers)
         finally:
-            route = scope.get("route")
+            route, code = getattr(scope.get("route"), "path", None), fields.get("code")
+            seconds = time.perf_counter() - started
+            if code in ERROR_CODES:
+                count_error(code)
+            count_request(route=route, method=scope["method"], status=status, seconds=seconds)
             log(
                 "request",
-                severity=logging.ERROR if fields.get("code") == "internal_error" else logging.INFO,
+                severity=logging.ERROR if code == "internal_error" else logging.INFO,
                 request_id=request_id,
                 method=scope["method"],
-                route=getattr(route, "path", None),
+                route=route,
                 status=status,
-                duration_ms=round(1e3 * (time.perf_counter() - started), 2),
+                duration_ms=round(1e3 * seconds, 2),
                 **fields,
             )
+
+    async def _admit(
+        self, scope: Scope, body: _Body, send: Send, refuse: Callable[[ApiError], Awaitable[None]]
+    ) -> None:
+        """Pass a request on if there is room for it and its client's address sends few enough."""
+        operations = scope["path"] in self._operations_paths
+        room = self._operations_room if operations else self._room
+        if not room.take():
+            # To read on would be to hold what there is no room for.
+            body.abandon()
+            await refuse(overloaded())
+            return
+        try:
+            if not operations:
+                rate_limits: RateLimits = scope["app"].state.rate_limits
+                await rate_limits.count_address(scope)
+            await self._app(scope, body.receive, send)
+        except ApiError as refusal:
+            await refuse(refusal)
+        finally:
+            room.give_back()
 
     async def _start_and_stop(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass on the life of the worker, without the text of what ended it.

@@ -39,10 +39,14 @@ async def subject_of(
         If it breaks the rule.
     """
     runtime: Runtime = request.app.state.runtime
-    request.state.log["subject"] = runtime.store.pseudonym(
-        caller.tenant, checked_subject_id(subject_id)
-    )[:16]
+    note_subject(request, runtime.store.pseudonym(caller.tenant, checked_subject_id(subject_id)))
     return subject_id
+
+
+def note_subject(request: Request, pseudonym: str) -> None:
+    """Keep the subject's pseudonym for the audit log, and its beginning for the request's line."""
+    request.state.pseudonym = pseudonym
+    request.state.log["subject"] = pseudonym[:16]
 
 
 async def idempotency_key_of(
@@ -101,4 +105,5 @@ IdempotencyDep = Annotated[str | None, Depends(idempotency_key_of)]
 Enrolls = Annotated[Caller, Depends(holding("enroll"))]
 Verifies = Annotated[Caller, Depends(holding("verify"))]
 Erases = Annotated[Caller, Depends(holding("erase"))]
+Administers = Annotated[Caller, Depends(holding("admin"))]
 Exports = Annotated[Caller, Depends(holding("export"))]

@@ -24,21 +24,26 @@ from templates.errors import (
     VeilfaceError,
 )
 from templates.store.idempotency import IdempotencyConflict
-from templates.store.identifiers import InvalidIdentifier
+from templates.store.identifiers import InvalidIdentifier, UnknownTenant
+from templates.store.lockout import LockedOut, Replayed
+from templates.store.tenants import RetiredRotation
 
 
 class StartError(VeilfaceError):
     """The program cannot start; the message is the one sentence that an operator reads."""
 
 
+class DatabaseAway(StartError):
+    """The database does not answer now; it may later."""
+
+
 @dataclass(frozen=True)
 class ErrorCode:
-    """One code: its status, what it means, and whether a later release brings it into use."""
+    """One code: its status, and what it means."""
 
     code: str
     status: int
     meaning: str
-    reserved: bool = False
 
 
 ERROR_CODES: dict[str, ErrorCode] = {
@@ -48,8 +53,12 @@ ERROR_CODES: dict[str, ErrorCode] = {
         ErrorCode("unsupported_image", 400, "The photo cannot be decoded, or not safely."),
         ErrorCode("invalid_template", 400, "The template's bytes break the format or its limits."),
         ErrorCode("invalid_embedding", 400, "The embedding is no finite unit vector of n numbers."),
-        ErrorCode("unauthorized", 401, "No API key, or one that is unknown or revoked."),
-        ErrorCode("replayed", 401, "The signed probe was seen before.", reserved=True),
+        ErrorCode(
+            "unauthorized",
+            401,
+            "No API key, one that is unknown or revoked, or a probe whose `hmac` is wrong.",
+        ),
+        ErrorCode("replayed", 401, "The signed probe was seen before, or its time has passed."),
         ErrorCode("forbidden", 403, "The API key lacks the right that the call needs."),
         ErrorCode("not_enrolled", 404, "The tenant has no such subject."),
         ErrorCode("not_found", 404, "No such path, or nothing to return there."),
@@ -72,12 +81,14 @@ ERROR_CODES: dict[str, ErrorCode] = {
         ErrorCode("inconsistent_images", 422, "The photos do not show one and the same person."),
         ErrorCode("uncalibrated", 422, "The contract has no calibration for what was asked."),
         ErrorCode("validation_failed", 422, "A field is missing, unknown, or has a wrong value."),
-        ErrorCode("locked_out", 423, "Too many failed attempts on this subject.", reserved=True),
-        ErrorCode("rate_limited", 429, "Too many requests with this API key.", reserved=True),
+        ErrorCode("locked_out", 423, "Too many failed attempts on this subject."),
+        ErrorCode(
+            "rate_limited", 429, "Too many requests with this API key, or from this address."
+        ),
         ErrorCode("internal_error", 500, "A defect of the service: report the request id."),
         ErrorCode("model_unavailable", 503, "The service runs without a model pack."),
         ErrorCode("store_unavailable", 503, "The database does not answer."),
-        ErrorCode("overloaded", 503, "Too many requests wait already."),
+        ErrorCode("overloaded", 503, "Too many requests wait already, or the worker is stopping."),
     )
 }
 
@@ -103,6 +114,8 @@ class ApiError(Exception):
 
 
 UNAVAILABLE_HEADERS = {"Retry-After": "5"}
+DISABLED_RETRY_AFTER_S = 86_400
+"""What a client is told of a subject that waits for an operator: to ask again in a day."""
 
 
 def api_error(error: Exception) -> ApiError | None:
@@ -126,6 +139,8 @@ def api_error(error: Exception) -> ApiError | None:
     if isinstance(error, ImageError | FaceError):
         details = plain_details(getattr(error, "details", {}))
         return ApiError(error.code, str(error), details)
+    if isinstance(error, LockedOut):
+        return _locked_out(error)
     for kind, code, public in _TABLE:
         if isinstance(error, kind):
             status = ERROR_CODES[code].status
@@ -136,6 +151,12 @@ def api_error(error: Exception) -> ApiError | None:
                 UNAVAILABLE_HEADERS if status == 503 else {},
             )
     return None
+
+
+def _locked_out(error: LockedOut) -> ApiError:
+    disabled = error.retry_after_s is None
+    wait = DISABLED_RETRY_AFTER_S if disabled else max(1, math.ceil(error.retry_after_s or 0))
+    return ApiError("locked_out", str(error), {"disabled": disabled}, {"Retry-After": str(wait)})
 
 
 _TABLE: tuple[tuple[type[Exception], str, str | None], ...] = (
@@ -149,6 +170,10 @@ _TABLE: tuple[tuple[type[Exception], str, str | None], ...] = (
     (SealError, "store_unavailable", "what is stored cannot be opened with the master key"),
     (InvalidIdentifier, "validation_failed", None),
     (IdempotencyConflict, "idempotency_conflict", None),
+    (Replayed, "replayed", None),
+    (RetiredRotation, "store_unavailable", "the tenant's rotation is being renewed; send it again"),
+    # The key was good a moment ago: its tenant was erased meanwhile.
+    (UnknownTenant, "unauthorized", "the tenant of this API key is no more"),
     (StoreError, "store_unavailable", "the database does not answer"),
 )
 

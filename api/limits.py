@@ -1,5 +1,7 @@
 """Limits before allocation: how much of a body is read, for how long, and what waits for a turn."""
 
+import time
+from collections import Counter
 from collections.abc import AsyncGenerator, AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import TypeVar
@@ -9,6 +11,7 @@ import anyio.to_thread
 from starlette.requests import Request
 
 from api.errors import ApiError
+from api.metrics import COMPUTE_WAITING
 
 MAX_JSON_BYTES = 4 * 1024 * 1024
 """Largest JSON body. The largest template that the wire format admits, in base64, fits."""
@@ -17,6 +20,8 @@ MAX_WAITING_QUERIES = 256
 """Requests that may wait for their turn to ask the database, most of all whose API key it is."""
 
 RETRY_AFTER_S = 1
+SEEN_S = 60.0
+"""Seconds for which a key that asked counts as one that shares the places for bodies."""
 
 T = TypeVar("T")
 
@@ -75,30 +80,73 @@ class Gate:
 
     def __init__(self, *, slots: int, waiting: int) -> None:
         self._slots = anyio.CapacityLimiter(slots)
+        # Never short of threads: it has one for each slot.
+        self._threads = anyio.CapacityLimiter(slots)
         self._queries = anyio.CapacityLimiter(max(4, 2 * slots))
         self._room = slots + waiting
+        self._share = max(1, 3 * self._room // 4)
+        self._held: Counter[str] = Counter()
+        self._seen: dict[str, float] = {}
         self._asking = 0
+        self._waiting = 0
+
+    @property
+    def computing(self) -> int:
+        """Requests that compute now."""
+        return int(self._slots.borrowed_tokens)
+
+    @property
+    def waiting(self) -> int:
+        """Requests that wait for a compute slot now."""
+        return self._waiting
 
     @asynccontextmanager
-    async def admitted(self) -> AsyncIterator[None]:
+    async def admitted(self, key: str) -> AsyncIterator[None]:
         """Hold a place from before the body is read until the answer is known.
+
+        One API key may take all places while it is alone. Once another one asked within the last
+        minute, in vain or not, no key gets more than three quarters of them: who sends many bodies
+        slowly keeps nobody else out.
+
+        Parameters
+        ----------
+        key
+            Prefix of the API key.
 
         Raises
         ------
         ApiError
             ``overloaded``, with ``Retry-After``.
         """
-        if self._room <= 0:
-            raise _overloaded()
+        now = time.monotonic()
+        self._seen[key] = now
+        self._seen = {name: at for name, at in self._seen.items() if now - at < SEEN_S}
+        if self._room <= 0 or (len(self._seen) > 1 and self._held[key] >= self._share):
+            raise overloaded()
         self._room -= 1
+        self._held[key] += 1
         try:
             yield
         finally:
             self._room += 1
+            self._held[key] -= 1
+            if not self._held[key]:
+                del self._held[key]
 
     async def compute(self, work: Callable[[], T]) -> T:
         """Run ``work`` in a thread, once a slot is free."""
-        return await anyio.to_thread.run_sync(work, limiter=self._slots)
+        turn = object()
+        self._waiting += 1
+        COMPUTE_WAITING.inc()
+        try:
+            await self._slots.acquire_on_behalf_of(turn)
+        finally:
+            self._waiting -= 1
+            COMPUTE_WAITING.dec()
+        try:
+            return await anyio.to_thread.run_sync(work, limiter=self._threads)
+        finally:
+            self._slots.release_on_behalf_of(turn)
 
     async def query(self, work: Callable[[], T]) -> T:
         """Run ``work``, which asks the database and computes little, in a thread.
@@ -109,7 +157,7 @@ class Gate:
             ``overloaded``: anybody may make a request wait here, with a token of his own making.
         """
         if self._asking >= self._queries.total_tokens + MAX_WAITING_QUERIES:
-            raise _overloaded()
+            raise overloaded()
         self._asking += 1
         try:
             return await anyio.to_thread.run_sync(work, limiter=self._queries)
@@ -117,7 +165,8 @@ class Gate:
             self._asking -= 1
 
 
-def _overloaded() -> ApiError:
+def overloaded() -> ApiError:
+    """Return the refusal of a request for which there is no room."""
     return ApiError(
         "overloaded",
         "too many requests wait already; try again shortly",

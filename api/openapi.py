@@ -1,16 +1,31 @@
 """What OpenAPI says of errors and request bodies, derived from the one table of codes."""
 
+import re
+from collections.abc import Mapping
 from typing import Any
 
 from api.errors import ERROR_CODES
-from api.schemas import REQUEST_ID, ErrorAnswer, TemplateRequest, VerifyRequest
+from api.schemas import (
+    HEX,
+    NONCE_EXAMPLE,
+    REQUEST_ID,
+    ErrorAnswer,
+    TemplateRequest,
+    VerifyRequest,
+)
 
 DESCRIPTION = """\
 Face authentication that never stores a face descriptor. Every error has one shape; the codes are
 listed with every call. `X-Request-ID` is accepted, and returned in the header and in the body.
 """
 
-EVERY_CALL = ("unauthorized", "store_unavailable", "overloaded", "internal_error")
+EVERY_CALL = (
+    "unauthorized",
+    "rate_limited",
+    "store_unavailable",
+    "overloaded",
+    "internal_error",
+)
 BODY = ("malformed_request", "request_too_large", "validation_failed")
 IDEMPOTENT = ("idempotency_conflict",)
 PHOTO = (
@@ -23,6 +38,8 @@ PHOTO = (
     "low_quality",
     "model_unavailable",
 )
+
+CHECKED_PHOTO = ("unsupported_image", "image_too_large", "too_many_images", "model_unavailable")
 
 
 def error_responses(*codes: str) -> dict[int | str, dict[str, Any]]:
@@ -61,6 +78,7 @@ FACE = _text(
     enum=["single", "largest"],
 )
 FILE = {"type": "string", "format": "binary"}
+SIGNATURE_EXAMPLE = {"nonce": NONCE_EXAMPLE, "timestamp": 1767225600, "hmac": HEX}
 
 
 def _body(multipart: dict[str, Any] | None, json_body: dict[str, Any]) -> dict[str, Any]:
@@ -97,11 +115,27 @@ VERIFY_BODY = _body(
     {
         "schema": VerifyRequest.model_json_schema(),
         "examples": {
-            "embedding": {"value": {"embedding": [0.6, -0.8], "level": "fmr-1e-3"}},
-            "template": {"value": {"template": "kAAAAAAAAAB7Li4u"}},
+            "embedding": {
+                "value": {"embedding": [0.6, -0.8], "level": "fmr-1e-3", **SIGNATURE_EXAMPLE}
+            },
+            "template": {"value": {"template": "kAAAAAAAAAB7Li4u", **SIGNATURE_EXAMPLE}},
         },
     },
 )
+CHECK_BODY = {
+    "requestBody": {
+        "required": True,
+        "content": {
+            "multipart/form-data": {
+                "schema": {
+                    "type": "object",
+                    "required": ["image"],
+                    "properties": {"image": FILE, "face": FACE},
+                }
+            }
+        },
+    }
+}
 IMPORT_BODY = _body(
     None,
     {
@@ -115,10 +149,25 @@ IMPORT_BODY = _body(
 )
 
 
+def allowed_methods(document: Mapping[str, Any], path: str) -> list[str]:
+    """Return the methods of a path, by the OpenAPI document; the framework names one route's only.
+
+    Where two paths fit, the one that is written out is meant: `/v1/subjects/import`.
+    """
+    fitting = [
+        template
+        for template in document["paths"]
+        if re.fullmatch(re.sub(r"\{[^}]*\}", "[^/]+", template), path)
+    ]
+    for template in sorted(fitting, key=lambda each: each.count("{")):
+        return sorted(method.upper() for method in document["paths"][template])
+    return []
+
+
 def codes_table() -> str:
     """Write the table of ``docs/errors.md`` from the one table of codes."""
     rows = ["| status | code | meaning |", "|---|---|---|"]
-    for entry in ERROR_CODES.values():
-        later = " Comes with a later release." if entry.reserved else ""
-        rows.append(f"| {entry.status} | `{entry.code}` | {entry.meaning}{later} |")
+    rows += [
+        f"| {entry.status} | `{entry.code}` | {entry.meaning} |" for entry in ERROR_CODES.values()
+    ]
     return "\n".join(rows) + "\n"

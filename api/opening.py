@@ -4,6 +4,10 @@ Each function raises :class:`api.errors.StartError` with one sentence: which fil
 is wrong with it, and what to do.
 """
 
+import shlex
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import timedelta
 from pathlib import Path
 
 import numpy as np
@@ -11,16 +15,18 @@ from sqlalchemy import inspect, select
 from sqlalchemy.engine import Connection, make_url
 from sqlalchemy.exc import ArgumentError
 
-from api.errors import StartError
+from api.errors import DatabaseAway, StartError
 from api.settings import Settings
 from models.errors import ModelError
 from models.pack import ModelPack
 from templates.contract import Contract
 from templates.decoys import DecoyGenerator, DecoyPool, load_source
-from templates.errors import ContractMismatch, SealError, VeilfaceError
+from templates.errors import ContractMismatch, SealError, StoreUnavailable, VeilfaceError
 from templates.sealing import KeyringSealer, MasterKeyring
 from templates.store import TemplateStore
 from templates.store.database import Database
+from templates.store.lockout import LockoutPolicy
+from templates.store.retention import Retention
 from templates.store.schema import MasterKeyCheckRow
 
 
@@ -57,12 +63,22 @@ def file_sealer(keyring: MasterKeyring) -> KeyringSealer:
 def open_keyring(settings: Settings) -> MasterKeyring:
     """Load the master keys, or create the first one while nothing is stored yet.
 
+    They come from an environment variable, a command, or a file, whichever the settings name;
+    only the file is ever created.
+
     Raises
     ------
     StartError
-        If the file cannot be used; or it is absent, and the database holds something or does not
-        answer.
+        If they cannot be used; or the file is absent, and the database holds something or does
+        not answer.
     """
+    try:
+        if settings.master_key_variable is not None:
+            return MasterKeyring.from_environment(settings.master_key_variable)
+        if settings.master_key_command is not None:
+            return MasterKeyring.from_command(shlex.split(settings.master_key_command))
+    except SealError as error:
+        raise StartError(f"the master keys cannot be used: {error}") from None
     path = settings.resolved_master_key_file
     try:
         if path.exists():
@@ -114,9 +130,41 @@ def open_store(settings: Settings, keyring: MasterKeyring) -> TemplateStore:
     try:
         if settings.database_url is None:
             settings.data_dir.mkdir(parents=True, exist_ok=True)
-        return TemplateStore(settings.resolved_database_url, keyring)
+        return TemplateStore(
+            settings.resolved_database_url, keyring, lockout=lockout_policy(settings)
+        )
     except (OSError, VeilfaceError) as error:
         raise StartError(f"the database cannot be opened: {error}") from None
+
+
+@contextmanager
+def checked_store(settings: Settings) -> Iterator[TemplateStore]:
+    """Open the store for the block; schema and master key must be the right ones."""
+    store = open_store(settings, open_keyring(settings))
+    try:
+        store.check()
+        yield store
+    finally:
+        store.close()
+
+
+def retention_of(settings: Settings) -> Retention:
+    """Return how long subjects are kept, by the settings."""
+
+    def days(number: int | None) -> timedelta | None:
+        return None if number is None else timedelta(days=number)
+
+    return Retention(days(settings.retention_days), days(settings.retention_disuse_days))
+
+
+def lockout_policy(settings: Settings) -> LockoutPolicy:
+    """Return what the settings say of failed attempts."""
+    return LockoutPolicy(
+        after=settings.lockout_after,
+        first_s=settings.lockout_first_s,
+        longest_s=settings.lockout_longest_s,
+        disable_at=settings.lockout_disable_at,
+    )
 
 
 def prepare_database(store: TemplateStore) -> None:
@@ -131,6 +179,8 @@ def prepare_database(store: TemplateStore) -> None:
     """
     try:
         store.upgrade()
+    except StoreUnavailable as error:
+        raise DatabaseAway(f"the database cannot be used: {error}") from None
     except VeilfaceError as error:
         raise StartError(f"the database cannot be used: {error}") from None
 

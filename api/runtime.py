@@ -8,6 +8,7 @@
                                 open_pack     ┘
 """
 
+import contextlib
 import threading
 from collections import OrderedDict
 from collections.abc import Sequence
@@ -37,13 +38,15 @@ from models.pack import ModelPack
 from templates import wire
 from templates.contract import Contract
 from templates.decoys import Attributes, DecoyGenerator, DecoyPool
-from templates.errors import DecoyError
+from templates.errors import DecoyError, StoreBusy
 from templates.lifting import Strategy
 from templates.randomness import Keystream
 from templates.rotation import tenant_rotation
 from templates.sealing import MasterKeyring
 from templates.store import TemplateStore
-from templates.store.subjects import Source, StoredTemplate
+from templates.store.audit_log import By, Entry
+from templates.store.subjects import Source, StoredTemplate, SubjectTemplate
+from templates.store.tenants import RetiredRotation
 from verify import Verifier
 
 __all__ = [
@@ -58,6 +61,9 @@ __all__ = [
     "prepare_database",
     "try_inference",
 ]
+
+READS = 3
+"""Looks at a template whose rotation may be dropped between the looks at the two."""
 
 TENANTS_KEPT = 64
 """Tenants whose rotations a process keeps: 2 MB each where n = 512."""
@@ -94,7 +100,7 @@ class NoDecoys:
 
 
 @dataclass(frozen=True, eq=False)
-class _ForTenant:
+class InRotation:
     """What works with one epoch of one tenant's rotation, (n, n)."""
 
     rotation: NDArray[np.float64] = field(repr=False)
@@ -114,7 +120,7 @@ class Runtime:
     pack: ModelPack | None
     export_key: ExportKey
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
-    _tenants: OrderedDict[tuple[str, int], _ForTenant] = field(
+    _tenants: OrderedDict[tuple[str, int], InRotation] = field(
         default_factory=OrderedDict, repr=False
     )
 
@@ -161,7 +167,23 @@ class Runtime:
         """Return the tenant's verifier for one epoch of its rotation."""
         return self._of(tenant, epoch).verifier
 
-    def _of(self, tenant: str, epoch: int) -> _ForTenant:
+    def read(
+        self, tenant: str, subject: str, *, contract_id: str | None = None
+    ) -> tuple[SubjectTemplate, InRotation] | None:
+        """Return a subject's template and what works with its rotation; None if there is none.
+
+        ``contract_id`` as for ``TemplateStore.get``.
+        """
+        for _ in range(READS):
+            found = self.store.get(tenant, subject, contract_id=contract_id)
+            if found is None:
+                return None
+            with contextlib.suppress(RetiredRotation):
+                return found, self._of(tenant, found.record.rotation_epoch)
+            # Between the two looks it was turned into a newer rotation.
+        raise StoreBusy("the tenant's rotation is being renewed; send it again")
+
+    def _of(self, tenant: str, epoch: int) -> InRotation:
         named = (tenant, epoch)
         with self._lock:
             found = self._tenants.get(named)
@@ -171,7 +193,7 @@ class Runtime:
         # Outside of the lock: it takes a query and a QR decomposition.
         key = self.store.tenants.rotation_key(tenant, epoch=epoch).key
         rotation = tenant_rotation(key, self.contract.binding.n)
-        made = _ForTenant(
+        made = InRotation(
             rotation=rotation,
             enroller=Enroller(
                 self.contract, self.source or NoDecoys(self.contract), rotation=rotation
@@ -223,6 +245,7 @@ class Runtime:
         *,
         source: Source,
         photos: int,
+        by: By,
     ) -> StoredTemplate:
         """Store an enrollment in place of an earlier one."""
         binding = self.contract.binding
@@ -238,24 +261,28 @@ class Runtime:
             photos=photos,
             template_id=enrollment.template_id,
             rotation_epoch=epoch,
+            by=by,
         )
 
-    def export(self, tenant: str, subject: str) -> bytes | None:
+    def export(self, tenant: str, subject: str, *, by: By) -> bytes | None:
         """Return one subject, un-rotated and encrypted; None if there is none.
+
+        Its line stands in the audit log before it is returned.
 
         Raises
         ------
         ContractMismatch
             If the stored template belongs to another contract: its dimension may not even fit.
         """
-        found = self.store.get(tenant, subject)
-        if found is None:
+        read = self.read(tenant, subject)
+        if read is None:
             return None
+        found, room = read
         binding = self.contract.binding
         binding.require_contract(found.record.contract_id, what="the stored template")
         stored = wire.decode(found.wire, max_n=binding.n, max_m=binding.m)
         # A rotation's inverse is its transpose.
-        plain = stored.subspace.rotated(self._of(tenant, found.record.rotation_epoch).rotation.T)
+        plain = stored.subspace.rotated(room.rotation.T)
         exported = Exported(
             subject_id=subject,
             contract_id=self.contract.contract_id,
@@ -263,7 +290,11 @@ class Runtime:
             photos=found.record.photos,
             wire=wire.encode(plain, contract_id=self.contract.contract_id, dtype="float32"),
         )
-        return seal_export(exported, key=self.export_key, tenant=tenant)
+        sealed = seal_export(exported, key=self.export_key, tenant=tenant)
+        self.store.audit_log.record(
+            Entry("export", "exported", by, tenant, self.store.pseudonym(tenant, subject))
+        )
+        return sealed
 
     def close(self) -> None:
         """Let go of the database's connections."""

@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 HEX = "9f86d081884c7d659a2feaa0c55ad015a3bf4f1b2b0b822cd15d6c15b0f00a08"
 REQUEST_ID = "4b1f0d5c8f1e4c54a52b3c9f7e2d6a10"
+NONCE_EXAMPLE = "kT3v0m9Qe2-cB7xYwZ1a"
 
 
 class _Shape(BaseModel):
@@ -59,11 +60,24 @@ class TemplateRequest(_Shape):
 
 
 class VerifyRequest(_Shape):
-    """A probe that is no photo: exactly one of both."""
+    """A probe that is no photo, signed: exactly one of embedding and template."""
 
     embedding: list[float] | None = Field(None, description="Unit-norm, of the contract's n.")
     template: str | None = Field(None, description="Base64 of a lifted probe's wire bytes.")
     level: str | None = Field(None, description="Security level; default from the contract.")
+    nonce: str = Field(
+        pattern="^[A-Za-z0-9_-]{16,64}$",
+        description="Drawn at random for this probe; a second use is refused.",
+        examples=[NONCE_EXAMPLE],
+    )
+    timestamp: int = Field(
+        ge=0, lt=2**53, description="Seconds since 1970, UTC.", examples=[1767225600]
+    )
+    hmac: str = Field(
+        pattern="^[0-9a-f]{64}$",
+        description="HMAC-SHA256 of the probe under the API key; docs/rest.md says of what.",
+        examples=[HEX],
+    )
 
 
 class VerifyAnswer(_Answer):
@@ -100,6 +114,21 @@ class SubjectsAnswer(_Answer):
 
     subjects: list[Subject]
     next_cursor: str | None = Field(description="Send it as `cursor` for the next page.")
+
+
+class LockoutAnswer(_Answer):
+    """Failed verifications of a subject, enrolled or not."""
+
+    consecutive_failures: int = Field(description="Since the last accept, or the last reset.")
+    last_failed_at: str | None = Field(examples=["2026-01-31T12:00:00Z"])
+    locked_until: str | None = Field(description="No attempt is decided before; null: open.")
+    disabled_at: str | None = Field(description="Since when it waits for an operator.")
+
+
+class UnlockAnswer(_Answer):
+    """The lockout is lifted."""
+
+    lifted: bool = Field(description="False: there was nothing to lift.")
 
 
 class SignedReceipt(_Shape):
@@ -186,6 +215,105 @@ class ContractAnswer(_Answer):
     photos: bool = Field(description="The service runs with a model pack.")
     generator: bool = Field(description="GET /v1/contract/generator has a generator to give.")
     receipt_key: ReceiptKey
+
+
+class KeyAnswer(_Answer):
+    """The API key of the request, without its secret."""
+
+    prefix: str = Field(description="How lists and logs name the key.", examples=["0f3a5c7e9b1d"])
+    tenant: str = Field(examples=["default"])
+    rights: list[Literal["enroll", "verify", "erase", "export", "scores", "embeddings", "admin"]]
+    expires_at: str | None = Field(examples=["2026-01-31T12:00:00Z"])
+    demo: bool = Field(description="The service runs with the demo model.")
+
+
+class PhotoCheckAnswer(_Answer):
+    """Whether a photo would do."""
+
+    usable: bool
+    code: Literal["no_face", "multiple_faces", "face_too_small", "low_quality"] | None = Field(
+        description="Why not, as an enrollment would say; null: it would do."
+    )
+    message: str
+    details: dict[str, Any] = Field(description="As those of the error of this code.")
+    box: list[float] | None = Field(
+        description="x1, y1, x2, y2 of the face in pixels of the upright photo, if usable."
+    )
+    quality: dict[str, float | None] = Field(description="What was measured, if usable.")
+
+
+class StoredAnswer(_Answer):
+    """What is stored of a subject; never a byte of the template."""
+
+    subject_id: str = Field(examples=["alice"])
+    template_id: str
+    contract_id: str = Field(examples=[HEX])
+    current: bool = Field(description="Of the contract in force; otherwise enroll again.")
+    strategy: str | None = Field(description="How it was lifted; null: by another contract.")
+    decoys: int | None = Field(description="Decoys among its m directions.")
+    n: int = Field(description="Numbers of a descriptor.")
+    m: int = Field(description="Dimension of the set that hides it.")
+    dtype: str
+    wire_bytes: int = Field(description="Bytes of the template before encryption.")
+    sealed_bytes: int = Field(description="Bytes in the database.")
+    sealed_excerpt: str = Field(
+        description="64 bytes at most from the middle of the ciphertext, hexadecimal."
+    )
+    foot_point_similarity: float = Field(
+        description="Length of the foot point: its cosine to the hidden descriptor, 3 digits."
+    )
+    enrolled_by: Literal["photos", "template"]
+    photos: int = Field(description="Photos that were averaged; 0 for a template.")
+    created_at: str = Field(examples=["2026-01-31T12:00:00Z"])
+    updated_at: str = Field(examples=["2026-01-31T12:00:00Z"])
+    last_used_at: str | None = Field(description="Of the last accepted verification.")
+
+
+class AuditCell(_Shape):
+    """The strongest attack on one property by one kind of attacker."""
+
+    property: str
+    knowledge: str
+    attack: str
+    variant: str | None
+    value: float
+    ci_low: float | None
+    ci_high: float | None
+    chance: float | None
+    compared: float = Field(
+        description="What stands against the limit: the value, its distance from chance "
+        "(confidentiality), or its excess over chance (unlinkability, a number and no share)."
+    )
+    compared_low: float | None
+    compared_high: float | None
+    limit: str | None = Field(description="Name of the limit.")
+    most: float = Field(description="The limit; 1 limits nothing.")
+    status: str | None
+
+
+class AuditLimit(_Shape):
+    """What the operator accepts."""
+
+    name: str
+    most: float
+    meaning: str
+
+
+class AuditAnswer(_Answer):
+    """The figures of the audit's report, as far as they concern this contract."""
+
+    audited: bool = Field(description="False: the operator named no report.")
+    fits: Literal["contract", "scheme", "nothing"] = Field(
+        description="What the report is about: this contract, with these or earlier thresholds; "
+        "its embedder, strategy, dimension and kind of decoys only; or something else."
+    )
+    kind: str | None = Field(examples=["templates"])
+    passed: bool | None = Field(description="Of this scheme; null where the report fits nothing.")
+    headlines: list[str] = Field(description="Those on this scheme.")
+    strongest: AuditCell | None
+    cells: list[AuditCell]
+    limits: list[AuditLimit]
+    command: str = Field(description="What makes a report for this contract.")
 
 
 class HealthAnswer(_Answer):

@@ -6,12 +6,15 @@ working directory). ``docs/settings.md`` is written from these declarations, and
 so.
 """
 
+import ipaddress
 import os
+import shlex
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, ValidationError, field_validator
+import limits
+from pydantic import Field, ValidationError, ValidationInfo, field_validator
 from pydantic_settings import (
     BaseSettings,
     NoDecode,
@@ -26,6 +29,8 @@ ENV_PREFIX = "VEILFACE_"
 CONFIG_VARIABLE = "VEILFACE_CONFIG"
 DEFAULT_CONFIG_FILE = Path("veilface.toml")
 MIB = 1024 * 1024
+OFF = "off"
+NO_PROXIES = "none"
 
 
 def config_file() -> Path | None:
@@ -66,6 +71,18 @@ class Settings(BaseSettings):
         "created at first use while the database is empty. Unset: `master.key` in `data_dir`. "
         "Without it, nothing that is stored can be read again: keep a copy elsewhere.",
     )
+    master_key_variable: str | None = Field(
+        None,
+        pattern=r"^[A-Za-z_][A-Za-z0-9_]*$",
+        description="Name of an environment variable that holds the master keys in base64, the "
+        "first is current, separated by commas or newlines; instead of `master_key_file`.",
+    )
+    master_key_command: str | None = Field(
+        None,
+        description="Command that writes the master keys to its standard output in base64, one a "
+        "line, the first is current; instead of `master_key_file`. For a key management service. "
+        "It is split as a shell would, but run without one.",
+    )
     contract_file: Path | None = Field(
         None,
         description="The contract that `veilface calibrate` wrote. Unset: `contract.json` in "
@@ -105,9 +122,103 @@ class Settings(BaseSettings):
         "worker; further ones are answered `overloaded`. With `max_request_bytes` it bounds the "
         "memory for bodies.",
     )
+    max_in_flight: int = Field(
+        512,
+        ge=1,
+        le=100_000,
+        description="Requests of all kinds that one worker answers at the same time; further ones "
+        "are answered `overloaded` before anything of them is read.",
+    )
     workers: int = Field(1, ge=1, le=256, description="Server processes.")
     host: str = Field("127.0.0.1", description="Address to listen on.")
     port: int = Field(8421, ge=0, le=65535, description="Port to listen on; 0 takes a free one.")
+    operations_host: str = Field(
+        "127.0.0.1", description="Address that `operations_port` is opened on."
+    )
+    operations_port: int | None = Field(
+        None,
+        ge=0,
+        le=65535,
+        description="Port for `/metrics` and `/health/*`, which the main port then answers "
+        "`not_found`; 0 takes a free one. Unset: they are on the main port, open to everybody "
+        "who reaches it.",
+    )
+    tls_certificate: Path | None = Field(
+        None,
+        description="PEM file with the certificate chain for TLS on the main port. Unset: plain "
+        "HTTP, for a reverse proxy on the same machine.",
+    )
+    tls_key: Path | None = Field(
+        None,
+        validate_default=True,
+        description="PEM file with the certificate's private key, without a password, mode 0600.",
+    )
+    trusted_proxies: str = Field(
+        "127.0.0.1",
+        description="Addresses or networks of reverse proxies, separated by commas: from them, "
+        "and from nobody else, `X-Forwarded-For` and `X-Forwarded-Proto` are believed. `none`: "
+        "from nobody. `*`: from everybody, so that a client can choose its address.",
+    )
+    rate_limit_key: str = Field(
+        "600/minute",
+        description="Requests that one API key may make in any such time, as `COUNT/second`, "
+        "`minute`, `hour` or `day`, or `COUNT per 5 minute`; further ones are answered "
+        "`rate_limited`. `off`, or an empty value in the TOML file or as a flag: no limit.",
+    )
+    rate_limit_address: str = Field(
+        "1200/minute",
+        description="Requests that one client address (IPv6: one /64 network) may make, in the "
+        "same form; counted before the API key is looked up.",
+    )
+    rate_limit_storage: str = Field(
+        "memory://",
+        description="Where requests are counted. `memory://`: in each worker for itself, so that "
+        "up to `workers` times the limit may pass. `redis://USER:PASSWORD@HOST/NUMBER` or "
+        "`rediss://…`: in one place, for all workers and hosts; needs `veilface[redis]`.",
+    )
+    lockout_after: int = Field(
+        5,
+        ge=0,
+        le=1000,
+        description="Rejected verifications of one subject in a row after which it is locked for "
+        "a while; 0: never.",
+    )
+    lockout_first_s: float = Field(
+        30.0,
+        gt=0,
+        le=86_400,
+        description="Seconds of the first lock; each further rejection doubles them.",
+    )
+    lockout_longest_s: float = Field(
+        3600.0, gt=0, le=31_536_000, description="Longest lock, in seconds."
+    )
+    lockout_disable_at: int = Field(
+        50,
+        ge=1,
+        le=1_000_000,
+        description="Rejected verifications in a row at which the subject is locked until an "
+        "operator resets it.",
+    )
+    probe_window_s: float = Field(
+        60.0,
+        ge=1,
+        le=3600,
+        description="Seconds that the timestamp of a signed probe may differ from the service's "
+        "clock.",
+    )
+    retention_days: int | None = Field(
+        None,
+        ge=1,
+        le=36_500,
+        description="Days after its enrollment that a subject is erased. Unset: never.",
+    )
+    retention_disuse_days: int | None = Field(
+        None,
+        ge=1,
+        le=36_500,
+        description="Days after its last accepted verification, or its enrollment, that a subject "
+        "is erased. Unset: never.",
+    )
     max_request_bytes: int = Field(
         32 * MIB, ge=1024, le=1024 * MIB, description="Largest request body, in bytes."
     )
@@ -146,6 +257,13 @@ class Settings(BaseSettings):
     log_level: Literal["debug", "info", "warning", "error"] = Field(
         "info", description="Least severe log line that is written."
     )
+    web_page: bool = Field(True, description="Serve the web page at `/` (docs/web-page.md).")
+    audit_report_file: Path | None = Field(
+        None,
+        description="The `report.json` that `veilface audit templates` or `veilface audit "
+        "fairface` wrote: its figures are shown to whoever asks what is stored. Unset: the page "
+        "says that the deployment was not audited.",
+    )
     demo: bool = Field(False, description="Say in every answer that the pack is the demo model.")
 
     @field_validator("providers", mode="before")
@@ -158,6 +276,93 @@ class Settings(BaseSettings):
             if not names or not all(isinstance(name, str) and name for name in names):
                 raise ValueError("name at least one provider, for example cpu")
             return names
+        return value
+
+    @field_validator("rate_limit_key", "rate_limit_address")
+    @classmethod
+    def _known_limit(cls, value: str) -> str:
+        # Not kept empty: an empty variable, by which it travels to workers, counts as unset.
+        if value.strip() in ("", OFF):
+            return OFF
+        try:
+            (limit,) = limits.parse_many(value)
+        except ValueError:
+            raise ValueError("write one COUNT/second, minute, hour or day, or off") from None
+        if limit.amount < 1:
+            raise ValueError("allow at least one request, or write off")
+        return value
+
+    @field_validator("rate_limit_storage")
+    @classmethod
+    def _known_storage(cls, value: str) -> str:
+        if value != "memory://" and not value.startswith(("redis://", "rediss://")):
+            raise ValueError("must be memory:// or begin with redis:// or rediss://")
+        return value
+
+    @field_validator("trusted_proxies")
+    @classmethod
+    def _known_proxies(cls, value: str) -> str:
+        names = [part.strip() for part in value.split(",") if part.strip()]
+        if not names:
+            return NO_PROXIES
+        if value.strip() not in ("*", NO_PROXIES):
+            for name in names:
+                try:
+                    ipaddress.ip_network(name)
+                except ValueError:
+                    raise ValueError(
+                        "list IP addresses or networks, separated by commas, or write none or *"
+                    ) from None
+        return ",".join(names)
+
+    @field_validator("operations_port")
+    @classmethod
+    def _apart(cls, value: int | None, info: ValidationInfo) -> int | None:
+        if value and value == info.data.get("port"):
+            raise ValueError("must differ from port")
+        return value
+
+    @field_validator("tls_key")
+    @classmethod
+    def _both_of_tls(cls, value: Path | None, info: ValidationInfo) -> Path | None:
+        if (value is None) != (info.data.get("tls_certificate") is None):
+            raise ValueError("give tls_certificate and tls_key, or neither")
+        return value
+
+    @field_validator("lockout_longest_s")
+    @classmethod
+    def _not_below_the_first(cls, value: float, info: ValidationInfo) -> float:
+        if value < info.data.get("lockout_first_s", value):
+            raise ValueError("must not be below lockout_first_s")
+        return value
+
+    @field_validator("lockout_disable_at")
+    @classmethod
+    def _not_before_a_lock(cls, value: int, info: ValidationInfo) -> int:
+        if value < info.data.get("lockout_after", value):
+            raise ValueError("must not be below lockout_after")
+        return value
+
+    @field_validator("master_key_variable", "master_key_command")
+    @classmethod
+    def _one_source_of_keys(cls, value: str | None, info: ValidationInfo) -> str | None:
+        earlier = [info.data.get(name) for name in ("master_key_file", "master_key_variable")]
+        if value is not None and any(found is not None for found in earlier):
+            raise ValueError(
+                "give one of master_key_file, master_key_variable and master_key_command"
+            )
+        return value
+
+    @field_validator("master_key_command")
+    @classmethod
+    def _a_command(cls, value: str | None) -> str | None:
+        if value is not None:
+            try:
+                words = shlex.split(value)
+            except ValueError:
+                raise ValueError("is no command line: a quotation is not closed") from None
+            if not words:
+                raise ValueError("is empty")
         return value
 
     @classmethod
@@ -228,7 +433,7 @@ def load_settings(**flags: Any) -> Settings:
         name = ".".join(str(part) for part in first["loc"]) or "settings"
         if first["type"] == "extra_forbidden":
             raise StartError(f"unknown setting {name}; docs/settings.md lists them") from None
-        raise StartError(f"setting {name}: {first['msg']}") from None
+        raise StartError(f"setting {name}: {first['msg'].removeprefix('Value error, ')}") from None
 
 
 def settings_table() -> str:

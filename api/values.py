@@ -1,6 +1,7 @@
 """Fields of a request, checked and turned into the values of the rooms below."""
 
 from collections.abc import Mapping
+from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,13 @@ from models.pack import FacePolicy
 from templates.errors import InvalidEmbedding
 
 MAX_EMBEDDING = 4096
+
+
+def iso_time(value: datetime | None) -> str | None:
+    """Write a time in UTC to the second, as ``2026-01-31T12:00:00Z``."""
+    if value is None:
+        return None
+    return value.astimezone(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
 
 
 def one_of(fields: Mapping[str, Any], query: Mapping[str, str], name: str) -> str | None:

@@ -27,7 +27,7 @@ def main() -> None:
         done = subprocess.run(
             [str(VEILFACE), "demo", "--folder", "demo-data"],
             cwd=folder,
-            env={"PATH": "/usr/bin:/bin", "LANG": "C.UTF-8"},
+            env={"PATH": f"{VEILFACE.parent}:/usr/bin:/bin", "LANG": "C.UTF-8"},
             text=True,
             stdout=subprocess.PIPE,
             check=True,

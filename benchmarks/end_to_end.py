@@ -36,12 +36,19 @@ from models.extraction import Extractor
 from models.pack import FacePolicy, ModelPack
 from templates.decoys import DecoyGenerator
 from templates.lifting import Strategy, lift
+from templates.probe_signature import signed_probe
 from templates.sealing import KeyringSealer, MasterKeyring
 from templates.wire import encode
 from verify.datasets import labelled_folder
 from verify.metrics import wilson
 
 PHOTOS_ENROLLED = 3
+UNLIMITED = {
+    "VEILFACE_LOCKOUT_AFTER": "0",
+    "VEILFACE_RATE_LIMIT_KEY": "off",
+    "VEILFACE_RATE_LIMIT_ADDRESS": "off",
+}
+"""Settings under which every impostor attempt is decided: rates are measured, not defences."""
 
 
 @dataclass(frozen=True)
@@ -188,9 +195,14 @@ def attempt_all(
 ) -> Outcome:
     """Enroll everybody, then verify every genuine and impostor attempt."""
     outcome = Outcome()
-    probes: dict[Path, str] = {}
+    probes: dict[Path, bytes] = {}
     if lifting:
-        probes = {p: lifting.template([p], probe_dim) for person in people for p in person.probes}
+        probes = {
+            p: base64.b64decode(lifting.template([p], probe_dim))
+            for person in people
+            for p in person.probes
+        }
+        token = client.headers["Authorization"].removeprefix("Bearer ")
 
     def enroll(person: Person) -> httpx.Response:
         if lifting:
@@ -204,7 +216,8 @@ def attempt_all(
         subject, photo = attempt
         if lifting:
             return client.post(
-                f"/v1/subjects/{subject}/verify", json={"template": probes[photo], "level": level}
+                f"/v1/subjects/{subject}/verify",
+                json=signed_probe(token, subject, probes[photo], level=level),
             )
         return verify_photo(client, subject, photo, level)
 
@@ -341,6 +354,7 @@ def main() -> None:
             "VEILFACE_DECOYS_FILE": str(work / "decoys.veil"),
             "VEILFACE_CONTRACT_FILE": str(work / "contract.json"),
             "VEILFACE_MASTER_KEY_FILE": str(args.master_key or work / "master.key"),
+            **UNLIMITED,
         }
         started = time.perf_counter()
         prepare(args, work, env)

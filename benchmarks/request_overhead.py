@@ -29,7 +29,7 @@ import numpy.typing as npt
 from api.runtime import Runtime
 from api.settings import load_settings
 from benchmarks.deployment import service, veilface
-from benchmarks.end_to_end import Person, enroll_photos, people_of, verify_photo
+from benchmarks.end_to_end import UNLIMITED, Person, enroll_photos, people_of, verify_photo
 from models.decoding import decode_image
 from models.pack import ModelPack
 
@@ -78,6 +78,7 @@ def main() -> None:
             "VEILFACE_CONTRACT_FILE": str(args.work / "contract.json"),
             "VEILFACE_MASTER_KEY_FILE": str(args.master_key or args.work / "master.key"),
             "VEILFACE_ONNX_THREADS": str(args.threads),
+            **UNLIMITED,
         }
         env = os.environ | settings
         token = json.loads(

@@ -18,11 +18,12 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from models.errors import ImageError
+from models.lean import animated, lean
 
 FORMATS = ("JPEG", "PNG", "WEBP")
-# An MPO file is a JPEG that carries further pictures (portrait mode of many phones); Pillow's
-# JPEG reader names it so. The first picture is the photo.
-_READ_AS = {"JPEG": "JPEG", "MPO": "JPEG", "PNG": "PNG", "WEBP": "WebP"}
+# A JPEG that carries further pictures (MPO, portrait mode of many phones) is read as the first
+# one, the photo: the index of the others is not kept.
+_READ_AS = {"JPEG": "JPEG", "PNG": "PNG", "WEBP": "WebP"}
 
 # Transparent pixels are laid over white, the background of identity photos.
 BACKGROUND = 255
@@ -48,10 +49,6 @@ MEMORY_AT_A_TIME = 24_000_000 * 17
 
 # Pixels are converted in strips of rows, so that no second whole picture is held.
 _STRIP_PIXELS = 2**18
-
-_PNG = b"\x89PNG\r\n\x1a\n"
-# Texts in which older programs keep the orientation; Pillow reads it from there.
-_ORIENTING_TEXTS = (b"Raw profile type exif", b"XML:com.adobe.xmp")
 
 
 class Turns:
@@ -182,10 +179,10 @@ def image_size(data: bytes) -> tuple[int, int] | None:
     """
     try:
         _check_webp_canvas(data, DEFAULT_LIMITS)
-        lean = _lean_png(data)
+        parsed = lean(data)
         with _metadata_lock, warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            with Image.open(io.BytesIO(lean), formats=FORMATS) as image:
+            with Image.open(io.BytesIO(parsed), formats=FORMATS) as image:
                 return image.size
     except Exception:  # parsers of damaged files raise almost anything
         return None
@@ -193,7 +190,7 @@ def image_size(data: bytes) -> tuple[int, int] | None:
 
 def _decode(data: bytes, limits: ImageLimits) -> NDArray[np.uint8]:
     _check_webp_canvas(data, limits)
-    data = _lean_png(data)
+    data = lean(data)
     with _metadata_lock, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
@@ -211,46 +208,22 @@ def _decode(data: bytes, limits: ImageLimits) -> NDArray[np.uint8]:
         return _rgb(image, orientation)
 
 
-def _lean_png(data: bytes) -> bytes:
-    """Take the texts out of a PNG file, and refuse one with a chunk that makes it animated.
-
-    Pillow unpacks texts of up to 64 million characters, 4 bytes each, and keeps them. Only the
-    names of chunks count: a text may contain the four letters.
-    """
-    if not data.startswith(_PNG):
-        return data
-    view, kept, start, at = memoryview(data), [], 0, len(_PNG)
-    wanted = set(_ORIENTING_TEXTS)
-    while at + 8 <= len(data):
-        name = data[at + 4 : at + 8]
-        end = at + 12 + int.from_bytes(data[at : at + 4])  # length, name and checksum around it
-        if name == b"acTL":
-            raise _animated("PNG")
-        if name in (b"tEXt", b"zTXt", b"iTXt") and end <= len(data):
-            keyword = data[at + 8 : at + 88].partition(b"\0")[0]
-            if keyword in wanted:
-                wanted.remove(keyword)  # a second one would only replace the first
-            else:
-                kept.append(view[start:at])
-                start = end
-        at = end
-    return b"".join([*kept, view[start:]]) if kept else data
-
-
-def _animated(name: str) -> ImageError:
-    return ImageError(
-        "unsupported_image",
-        f"The {name} file is animated; send a still picture, so that the frame is known.",
-    )
-
-
 def _check_webp_canvas(data: bytes, limits: ImageLimits) -> None:
     """Check the canvas that a WebP file declares; its decoder allocates it when it is opened."""
-    if data[:4] != b"RIFF" or data[8:12] != b"WEBP" or data[12:16] != b"VP8X" or len(data) < 30:
-        # Sides of the simple forms have 14 bits; Pillow checks those before it allocates.
+    if data[:4] != b"RIFF" or data[8:12] != b"WEBP" or len(data) < 30:
         return
-    width = int.from_bytes(data[24:27], "little") + 1
-    height = int.from_bytes(data[27:30], "little") + 1
+    match data[12:16]:
+        case b"VP8X":
+            width = int.from_bytes(data[24:27], "little") + 1
+            height = int.from_bytes(data[27:30], "little") + 1
+        case b"VP8L" if data[20] == 0x2F:
+            bits = int.from_bytes(data[21:25], "little")
+            width, height = (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+        case b"VP8 " if data[23:26] == b"\x9d\x01\x2a":
+            width = int.from_bytes(data[26:28], "little") & 0x3FFF
+            height = int.from_bytes(data[28:30], "little") & 0x3FFF
+        case _:
+            return
     _check_size(width, height, limits)
 
 
@@ -272,7 +245,7 @@ def _check_header(image: Image.Image, data: bytes, limits: ImageLimits) -> str:
         raise ImageError("unsupported_image", "The file is not a JPEG, PNG or WebP picture.")
     _check_size(image.width, image.height, limits)
     if name != "JPEG" and getattr(image, "is_animated", False):
-        raise _animated(name)
+        raise animated(name)
     # Inside the coded pixels 0xFF is always followed by 0x00 or a restart marker, so this counts
     # scans (and those of an embedded thumbnail).
     if name == "JPEG" and data.count(b"\xff\xda") > MAX_JPEG_SCANS:

@@ -5,6 +5,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
+from importlib import import_module
 from typing import Any
 
 from threadpoolctl import ThreadpoolController
@@ -17,6 +18,8 @@ _available = 1
 
 @cache
 def _controller() -> ThreadpoolController:
+    # Compiled code loads SciPy's library at its first product, which is too late to be held.
+    import_module("scipy.linalg.cython_blas")
     return ThreadpoolController().select(user_api="blas")
 
 

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from templates.distances import DEFAULT_STEPS, Labels, Metric
 from templates.kernels.selection import count_within, keep_nearest
+from templates.rounded import RoundedSubspaces
 from templates.subspace import SubspaceBatch
 from templates.tiles import Floats, Probes, fill, paired_tile, traverse, whole
 
@@ -167,3 +168,4 @@ def warm_up() -> None:
         matrix(rows[:, 0], batch, np.empty((8, 8), dtype=np.float32), **options)
     nearest(rows[:, 0], batch, 1, of_templates=False, labels=None, **options)
     counts(rows[:, 0], batch, np.ones(1), labels=None, **options)
+    RoundedSubspaces.of(batch).similarities(rows[0, 0], metric=Metric.SPHERICAL)

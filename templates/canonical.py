@@ -19,6 +19,9 @@ MAX_DEPTH = 12
 FREE_DEPTH = 4  # of an object of free content, which sits some levels down in its document
 MAX_ITEMS = 4096
 MAX_STRING = 4096
+MAX_PARTS = 100_000
+"""Values in a document, counted before it is parsed: a parsed value takes up to a hundred times
+the bytes of its text."""
 
 
 def plain_json(value: object, *, depth: int = MAX_DEPTH) -> Json:
@@ -88,14 +91,21 @@ def digest(value: object) -> str:
     return hashlib.sha256(canonical_json(value)).hexdigest()
 
 
+def too_many_parts(data: bytes, most: int = MAX_PARTS) -> bool:
+    """Whether JSON text may hold more than ``most`` values; text that holds commas counts too."""
+    return sum(map(data.count, (b",", b"[", b"{"))) > most
+
+
 def parse_object(data: bytes, *, what: str) -> dict[str, object]:
-    """Parse one JSON object; refuse duplicate keys, NaN and infinity.
+    """Parse one JSON object; refuse duplicate keys, NaN, infinity and more than ``MAX_PARTS``.
 
     Raises
     ------
     ContractError
         Where the bytes are not one such object.
     """
+    if too_many_parts(data):
+        raise ContractError(f"{what} holds more than {MAX_PARTS} values")
 
     def refuse_constant(_: str) -> float:
         raise ContractError(f"{what} holds a number that is not finite")

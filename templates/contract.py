@@ -23,6 +23,7 @@ import safetensors
 import safetensors.numpy
 
 from templates.binding import Binding
+from templates.bounded_file import read_at_most
 from templates.canonical import Fields, Json, digest, free_object, parse_object
 from templates.distances import Metric
 from templates.errors import ContractError, SealError, Uncalibrated
@@ -105,6 +106,10 @@ class Contract:
             raise ContractError("the cohort's dimensions differ from the binding's")
         if not (np.isfinite(feet).all() and np.isfinite(bases).all()):
             raise ContractError("the cohort holds a number that is not finite")
+        # No entry of a unit row is larger, and the products below must not overflow: infinity less
+        # infinity is no number, which no tolerance refuses.
+        if max(np.abs(feet).max(), np.abs(bases).max()) > 1 + BASIS_TOLERANCE:
+            raise ContractError("a cohort template holds a number larger than 1")
         gram = np.matmul(bases, bases.transpose(0, 2, 1)) - np.eye(self.binding.m, dtype=np.float32)
         dots = np.matmul(bases, feet[:, :, None])
         if max(np.abs(gram).max(), np.abs(dots).max()) > BASIS_TOLERANCE:
@@ -274,7 +279,7 @@ def _open_cohort(
 def _read_bounded(path: Path) -> bytes:
     try:
         with path.open("rb") as file:
-            data = file.read(MAX_FILE_BYTES + 1)
+            data = read_at_most(file, MAX_FILE_BYTES)
     except OSError as error:
         raise ContractError(
             f"the contract file cannot be read ({error.strerror}); `veilface calibrate` writes one"

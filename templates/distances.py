@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from templates import euclidean, spherical
 from templates.crossgram import Floats, Kind
 from templates.errors import InvalidEmbedding, InvalidTemplate, TemplateError
-from templates.subspace import SubspaceBatch
+from templates.subspace import SubspaceBatch, is_finite
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -347,18 +347,13 @@ def _checked(probes: Any, templates: SubspaceBatch, dtype: DTypeLike) -> tuple[P
     # What is infinite in the precision of the work is refused.
     with np.errstate(over="ignore", invalid="ignore"):
         probes = np.ascontiguousarray(probes, dtype=kind)
-        # The sum of float32 numbers in float64 is finite if they are, and needs no temporary.
-        checked = probes.sum(dtype=np.float64) if kind == np.float32 else probes
-    if not np.isfinite(checked).all():
+    if not is_finite(probes):
         raise InvalidEmbedding("a probe holds a number that is not finite")
     return probes, kind
 
 
 def _check_finite(batch: SubspaceBatch) -> None:
-    # A sum is not finite if any of its terms is not, and needs no temporary of the batch's size.
-    with np.errstate(invalid="ignore"):
-        total = batch.feet.sum(dtype=np.float64) + batch.bases.sum(dtype=np.float64)
-    if not np.isfinite(total):
+    if not batch.is_finite:
         raise InvalidTemplate("a template holds a number that is not finite")
 
 

@@ -14,8 +14,14 @@
     ├── SealError                a ciphertext that does not open, or a key that cannot be used
     ├── StoreError
     │   ├── StoreUnavailable     the database does not answer
+    │   │   └── StoreBusy        it answers, but this request not now
+    │   │       └── Superseded   a decision on a template that was replaced or erased [12]
     │   ├── InvalidIdentifier    a subject id, tenant name or cursor that breaks the rules [1]
     │   ├── UnknownTenant        no tenant of this name [1]
+    │   │   └── RetiredRotation  no rotation of this epoch any more [11]
+    │   ├── LockedOut            too many failed attempts on the subject [12]
+    │   ├── Replayed             a signed probe that was seen before [12]
+    │   ├── BrokenAuditLog       an audit log whose head or key is missing or forged [13]
     │   └── IdempotencyConflict  a key that was used for another request, or still runs [2]
     ├── EnrollmentError [3]
     │   ├── PhotoRejected        one photo has no usable face
@@ -25,6 +31,7 @@
     ├── BackendError [6]         a place to work, such as a cluster, that cannot be used
     ├── AuditError [7]           an attack or an audit that cannot be made as it was asked for
     ├── StartError [8]           the service or a command cannot start
+    │   └── DatabaseAway         the database does not answer now
     ├── PreparationError [9]     decoys or a contract that cannot be made
     └── CommandError [10]        a command that cannot be done
         └── UsageError           wrong usage of a command
@@ -32,7 +39,9 @@
 Each is defined here, or next to what raises it: [1] ``templates.store.identifiers``,
 [2] ``templates.store.idempotency``, [3] ``enroll.errors``, [4] ``verify.datasets``,
 [5] ``verify.evaluation.plan``, [6] ``verify.evaluation.backends``, [7] ``attacks.errors``,
-[8] ``api.errors``, [9] ``api.preparation``, [10] ``api.cli.errors``.
+[8] ``api.errors``, [9] ``api.preparation``, [10] ``api.cli.errors``,
+[11] ``templates.store.tenants``, [12] ``templates.store.lockout``,
+[13] ``templates.store.audit_log``.
 
 Messages name the cause and the remedy. They never hold a number of a descriptor, a template or
 an image, nor a key.
@@ -85,3 +94,7 @@ class StoreError(VeilfaceError):
 
 class StoreUnavailable(StoreError):
     """The database does not answer."""
+
+
+class StoreBusy(StoreUnavailable):
+    """The database answers, but cannot do this now: the same request may succeed in a moment."""

@@ -8,6 +8,7 @@ the descriptor that was lifted nor on the decoys one by one.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Self, overload
 
 import numpy as np
@@ -34,6 +35,14 @@ def _stored(array: ArrayLike, ndim: int, name: str) -> NDArray[np.float32]:
     view = stored.view()
     view.flags.writeable = False
     return view
+
+
+def is_finite(numbers: NDArray[np.floating]) -> bool:
+    """Whether no number is infinite or NaN."""
+    # Both are NaN if any number is, and need no temporary of the numbers' size.
+    with np.errstate(invalid="ignore"):
+        ends = numbers.max(initial=0), numbers.min(initial=0)
+    return bool(np.isfinite(ends).all())
 
 
 def span_basis(directions: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -211,6 +220,15 @@ class SubspaceBatch:
             )
         if not 1 <= self.m < self.n:
             raise InvalidTemplate(f"expected 1 <= m < n, seen m = {self.m}, n = {self.n}")
+
+    @cached_property
+    def is_finite(self) -> bool:
+        """Whether no number is infinite or NaN; looked at once, as a batch does not change.
+
+        A large batch that many probes are compared with, such as a cohort, would otherwise be read
+        once more with each of them.
+        """
+        return is_finite(self.feet) and is_finite(self.bases)
 
     @classmethod
     def through(cls, points: ArrayLike, directions: ArrayLike, *, stream: Keystream) -> Self:

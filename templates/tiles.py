@@ -5,26 +5,33 @@ made by the matrix library and solved by a kernel while it is in the cache. Memo
 tiles of the threads. A distance depends neither on the number of threads nor on their order.
 """
 
-import math
 import threading
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol, TypeVar
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from templates import euclidean, spherical
 from templates.blas import single_threaded
+from templates.crew import Crew
 from templates.crossgram import Indices
 from templates.distances import Metric
 from templates.kernels.euclidean import euclidean_subspaces
 from templates.kernels.euclidean import scratch_size as euclidean_scratch
 from templates.kernels.lanes import LANES
-from templates.kernels.points import euclidean_points, spherical_points
 from templates.kernels.spherical import scratch_size as spherical_scratch
 from templates.kernels.spherical import spherical_subspaces
+from templates.kernels.tiles import (
+    Grid,
+    euclidean_tiles,
+    pack,
+    point_tiles,
+    spherical_tiles,
+    square,
+)
 from templates.subspace import SubspaceBatch
 
 Floats = NDArray[np.float32]
@@ -34,23 +41,21 @@ Progress = Callable[[int], None]
 
 _NEAR = np.float32(0.1)
 _ACCURACY = np.float32(5e-5)
-# Rows of the product of a tile, either way: 4 MiB.
+# Rows of the product of a tile; the probes have half: 2 MiB.
 _TILE_SIDE = 1024
+_FLAT = 2
+# Tiles between two chances to stop.
+_AT_ONCE = 64
+# Numbers that one thread stacks sooner than several.
+_SMALL_BLOCK = 1 << 22
 _BLOCK_BYTES = 32 << 20
 _PAIRED_BYTES = 8 << 20
-_TASKS = 16
 # Multiplications, about half a millisecond's, below which another thread does not pay.
 _LEAST = 1 << 25
 _MOST_SPARE = 16
 _SPARE_BYTES = 16 << 20
 _SHORT = np.float32(1e-12)
 _TINY = np.float32(np.finfo(np.float32).tiny)
-
-_Place = tuple[slice, Floats | None]
-"""A part of the probes, and room for its stacked rows where they are stacked."""
-
-_In = TypeVar("_In")
-_Out = TypeVar("_Out")
 
 
 class Collector(Protocol):
@@ -87,17 +92,28 @@ def traverse(
     """
     solver = _Solver(probes, templates, metric, steps)
     collectors: list[_Kept] = []
+    lock = threading.Lock()
 
-    def keep(rows: _Tile, columns: _Tile, space: _Space) -> None:
+    def work(block: _Block, space: _Space) -> None:
         if space.collector is None:
             space.collector = collector()
             collectors.append(space.collector)
-        wide = whole(len(columns))
-        distances = space.distances[: len(rows) * wide]
-        solver.solve(rows, columns, space, distances.reshape(len(rows), wide))
-        space.collector.take(rows.part, columns.part, distances)
+        while (number := block.take()) is not None:
+            rows, columns = block.grid.tile(number)
+            wide = whole(columns.stop - columns.start)
+            distances = space.distances[: (rows.stop - rows.start) * wide]
+            solver.compute(block, space, distances, one=number)
+            if block.found[number]:
+                solver.correct(block, number, distances.reshape(-1, wide))
+            part = slice(rows.start + block.first, rows.stop + block.first)
+            space.collector.take(part, columns, distances)
+            if progress is not None:
+                with lock:
+                    progress((part.stop - part.start) * (columns.stop - columns.start))
 
-    _each_tile(solver, keep, threads, progress)
+    with _spaces(solver, threads, collecting=True) as (crew, spaces):
+        for block in solver.blocks(crew):
+            crew.map(partial(_until_done, work, block), spaces)
     return collectors
 
 
@@ -112,65 +128,68 @@ def fill(
 ) -> None:
     """Write all distances to ``out``, (P, T), C-contiguous."""
     solver = _Solver(probes, templates, metric, steps)
+    with _spaces(solver, threads, collecting=False) as (crew, spaces):
+        for block in solver.blocks(crew):
+            rows = out[block.first : block.first + block.grid.probes]
 
-    def write(rows: _Tile, columns: _Tile, space: _Space) -> None:
-        solver.solve(rows, columns, space, out[rows.part, columns.part])
+            def work(block: _Block, space: _Space, rows: Floats = rows) -> None:
+                while block.counter[0] < block.grid.tiles:
+                    solver.compute(block, space, rows.reshape(-1))
 
-    _each_tile(solver, write, threads, None)
+            crew.map(partial(_until_done, work, block), spaces)
+
+            def correct(number: int, block: _Block = block, rows: Floats = rows) -> None:
+                solver.correct(block, number, rows[block.grid.tile(number)])
+
+            crew.map(correct, np.flatnonzero(block.found).tolist())
 
 
-def _each_tile(
-    solver: "_Solver",
-    act: Callable[["_Tile", "_Tile", "_Space"], None],
-    threads: int | None,
-    progress: Progress | None,
-) -> None:
-    tasks = solver.tasks()
-    if not tasks:
-        return
-    lock = threading.Lock()
-    most = min(len(tasks), max(1, solver.multiplications // _LEAST))
-    with single_threaded() as available, _Crew(min(threads or available, most)) as crew:
-        spaces = [solver.space() for _ in range(crew.count)]
-        for block in solver.row_blocks():
-            tiles = crew.map(solver.pack_probes, block)
-
-            def one(task: _Task, tiles: list[_Tile] = tiles) -> None:
-                space = spaces.pop()
-                columns = solver.pack_templates(task.columns, space)
-                for rows in tiles[task.share :: task.shares]:
-                    act(rows, columns, space)
-                    if progress is not None:
-                        with lock:
-                            progress(len(rows) * len(columns))
-                spaces.append(space)
-
-            crew.map(one, tasks)
+@contextmanager
+def _spaces(
+    solver: "_Solver", threads: int | None, *, collecting: bool
+) -> Iterator[tuple[Crew, list["_Space"]]]:
+    """Threads for a problem, and a working space for each."""
+    most = max(1, min(solver.tiles, solver.multiplications // _LEAST))
+    with single_threaded() as available, Crew(min(threads or available, most)) as crew:
+        spaces = [solver.space(collecting=collecting) for _ in range(crew.count)]
+        yield crew, spaces
         for space in spaces:
             space.clear()
             _spare.put(space.memory)
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class _Tile:
-    """Stacked rows of some probes or templates."""
-
-    part: slice
-    stacked: Floats
-    """(R, m + 1, n) of probes, (m + 1, C, n) of templates; (R, n) of points."""
-    numbers: Floats
-    """One for each: squared lengths of feet or points, or what the kernel asks for."""
-
-    def __len__(self) -> int:
-        return int(self.part.stop - self.part.start)
+def _until_done(
+    work: Callable[["_Block", "_Space"], None], block: "_Block", space: "_Space"
+) -> None:
+    try:
+        work(block, space)
+    except BaseException:
+        block.end()
+        raise
 
 
-class _Task(NamedTuple):
-    """Some templates, and a share of the probes' tiles."""
+class _Block:
+    """Stacked rows of some probes, and the tiles that they have with all templates."""
 
-    columns: slice
-    share: int
-    shares: int
+    def __init__(self, first: int, stacked: Floats, numbers: Floats, grid: Grid) -> None:
+        self.first, self.grid = first, grid
+        self.stacked = _locked(stacked)
+        self.numbers = numbers
+        """One for each: squared lengths of feet or points, or what the kernel asks for."""
+        self.counter = np.zeros(1, dtype=np.int64)
+        self.found = np.zeros(grid.tiles, dtype=np.int64)
+        self._lock = threading.Lock()
+
+    def take(self) -> int | None:
+        """Return the number of the next tile."""
+        with self._lock:
+            number = int(self.counter[0])
+            self.counter[0] = number + 1
+        return number if number < self.grid.tiles else None
+
+    def end(self) -> None:
+        """Leave the other tiles."""
+        self.counter[0] = self.grid.tiles
 
 
 class _Space:
@@ -180,14 +199,16 @@ class _Space:
     its spaces to the next.
     """
 
-    def __init__(self, product: int, stacked: int, distances: int, work: int) -> None:
-        sizes = product, stacked, distances, work
+    def __init__(self, product: int, stacked: int, squares: int, distances: int, work: int) -> None:
+        sizes = product, stacked, squares, distances, work
         self.memory = _spare.get(sum(sizes))
         ends = np.cumsum(sizes)
-        self.product, self.stacked, self.distances, self.work = (
+        self.product, self.stacked, self.squares, self.distances, self.work = (
             self.memory[end - size : end] for end, size in zip(ends, sizes, strict=True)
         )
         self.work[:] = 0
+        self.held = np.full(1, -1, dtype=np.int64)
+        """First of the templates that are packed."""
         self.collector: Any = None
         self._used = sum(sizes)
 
@@ -217,51 +238,6 @@ class _Spare:
 _spare = _Spare()
 
 
-class _Crew:
-    """The calling thread and others, which share the items of a list."""
-
-    def __init__(self, count: int) -> None:
-        self.count = count
-        self._others = count - 1
-        self._pool = ThreadPoolExecutor(self._others) if self._others else None
-
-    def __enter__(self) -> "_Crew":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._pool is not None:
-            self._pool.shutdown()
-
-    def map(self, function: Callable[[_In], _Out], items: Sequence[_In]) -> list[_Out]:
-        """Return the results in order; the first failure ends the work and is raised."""
-        waiting = iter(list(enumerate(items)))
-        lock = threading.Lock()
-        results: dict[int, _Out] = {}
-        failures: list[BaseException] = []
-
-        def work() -> None:
-            while not failures:
-                with lock:
-                    number, item = next(waiting, (None, None))
-                if number is None:
-                    return
-                try:
-                    results[number] = function(item)  # type: ignore[arg-type]
-                except BaseException as failure:
-                    failures.append(failure)
-
-        others = []
-        if self._pool is not None:
-            others = [self._pool.submit(work) for _ in range(min(self._others, len(items) - 1))]
-        # The calling thread works too: it holds a core already, and leaves the others the rest.
-        work()
-        for other in others:
-            other.result()
-        if failures:
-            raise failures[0]
-        return [results[number] for number in range(len(items))]
-
-
 class _Solver:
     """One problem: its tiles, and a tile's distances."""
 
@@ -272,7 +248,7 @@ class _Solver:
         self._euclidean, self._steps = metric is Metric.EUCLIDEAN, steps
         self._m = probes.m if isinstance(probes, SubspaceBatch) else 0
         width = LANES * max(1, _TILE_SIDE // ((templates.m + 1) * LANES))
-        self._rows = _even(len(probes), max(1, _TILE_SIDE // (self._m + 1)))
+        self._rows = _even(len(probes), max(1, _TILE_SIDE // _FLAT // (self._m + 1)))
         self._columns = whole(_even(len(templates), width))
 
     @property
@@ -281,26 +257,33 @@ class _Solver:
         each = (self._m + 1) * (self._templates.m + 1) * self._templates.n
         return len(self._probes) * len(self._templates) * each
 
-    def tasks(self) -> list[_Task]:
-        """Parts of equal work, enough of them for several threads; they do not show."""
-        columns = _parts(len(self._templates), self._columns)
-        tiles = len(_parts(len(self._probes), self._rows))
-        shares = min(tiles, -(-_TASKS // max(1, len(columns))))
-        return [_Task(some, share, shares) for some in columns for share in range(shares)]
+    @property
+    def tiles(self) -> int:
+        """Number of all tiles, at least."""
+        return self._grid(len(self._probes)).tiles
 
-    def row_blocks(self) -> Iterator[list[_Place]]:
-        """Parts of the probes, and room for their stacked rows, block by block."""
-        parts = _parts(len(self._probes), self._rows)
-        if not self._m:
-            yield [(part, None) for part in parts]
+    def _grid(self, probes: int) -> Grid:
+        return Grid(probes, len(self._templates), max(1, self._rows), max(1, self._columns))
+
+    def blocks(self, crew: Crew) -> Iterator[_Block]:
+        """Stack the rows of the probes, block by block in the same room."""
+        if not self._columns:
             return
-        numbers = self._rows * (self._m + 1) * self._templates.n
-        several = min(len(parts), max(1, _BLOCK_BYTES // (4 * numbers)))
-        room = np.empty((several, numbers), dtype=np.float32)
-        for first in range(0, len(parts), several):
-            yield list(zip(parts[first : first + several], room, strict=False))
+        numbers = max(1, self._rows) * (self._m + 1) * self._templates.n
+        step = self._rows * max(1, _BLOCK_BYTES // (4 * numbers))
+        room = None
+        for part in _parts(len(self._probes), step):
+            if isinstance(self._probes, SubspaceBatch):
+                count = part.stop - part.start
+                if room is None:
+                    room = np.empty((count, self._m + 1, self._templates.n), dtype=np.float32)
+                stacked, kept = self._stack_probes(part, room[:count], crew)
+            else:
+                stacked, kept = self._take_points(self._probes[part])
+            rows = stacked.reshape(-1, self._templates.n)
+            yield _Block(part.start, rows, kept, self._grid(len(stacked)))
 
-    def space(self) -> _Space:
+    def space(self, *, collecting: bool) -> _Space:
         """Make what a thread needs for the largest tile."""
         m_d, m_e = self._m, self._templates.m
         pairs = self._rows * self._columns
@@ -308,41 +291,34 @@ class _Solver:
         if m_d:
             size = (euclidean_scratch if self._euclidean else spherical_scratch)(m_d, m_e)
         stacked = self._columns * (m_e + 1) * self._templates.n
-        return _Space(pairs * (m_d + 1) * (m_e + 1), stacked, pairs, size)
+        product = pairs * (m_d + 1) * (m_e + 1)
+        return _Space(product, stacked, self._columns, pairs if collecting else 0, size)
 
-    def pack_probes(self, place: _Place) -> _Tile:
-        """Stack the rows of some probes, probe after probe."""
-        part, room = place
-        if not isinstance(self._probes, SubspaceBatch):
-            points = self._probes[part]
+    def _take_points(self, points: Floats) -> tuple[Floats, Floats]:
+        squares = _squares(points)
+        if self._euclidean:
+            return points, squares
+        # Squares of very short and very long points do not fit float32.
+        odd = np.flatnonzero((squares < _SHORT) | (squares > 1 / _SHORT))
+        if odd.size:
+            points = points.copy()
+            points[odd] = spherical.directions(points[odd])
             squares = _squares(points)
-            if self._euclidean:
-                return _Tile(part, points, squares)
-            # Squares of very short and very long points do not fit float32.
-            odd = np.flatnonzero((squares < _SHORT) | (squares > 1 / _SHORT))
-            if odd.size:
-                points = points.copy()
-                points[odd] = spherical.directions(points[odd])
-                squares = _squares(points)
-            lengths = np.sqrt(np.maximum(squares, _TINY))
-            return _Tile(part, points, np.reciprocal(lengths))
-        some = self._probes[part]
-        shape = len(some), some.m + 1, some.n
-        stacked = np.empty(shape, np.float32) if room is None else _shaped(room, shape)
-        self._stack(some, stacked[:, 0], stacked[:, 1:])
-        return _Tile(part, stacked, _squares(some.feet))
+        return points, np.reciprocal(np.sqrt(np.maximum(squares, _TINY)))
 
-    def pack_templates(self, part: slice, space: _Space | None) -> _Tile:
-        """Stack the rows of some templates, all feet first; the number is filled up with zeros."""
-        some = self._templates[part]
-        shape = some.m + 1, whole(len(some)), some.n
-        stacked = np.empty(shape, np.float32) if space is None else _shaped(space.stacked, shape)
-        stacked[:, len(some) :] = 0
-        own = stacked[:, : len(some)]
-        squares = np.zeros(shape[1], dtype=np.float32)
-        squares[: len(some)] = _squares(some.feet)
-        self._stack(some, own[0], own[1:].transpose(1, 0, 2))
-        return _Tile(part, stacked, squares)
+    def _stack_probes(self, part: slice, room: Floats, crew: Crew) -> tuple[Floats, Floats]:
+        """Stack the rows of lifted probes, probe after probe."""
+        probes = self._probes[part]
+        assert isinstance(probes, SubspaceBatch)  # noqa: S101
+        squares = np.empty(len(probes), dtype=np.float32)
+
+        def one(some: slice) -> None:
+            self._stack(probes[some], room[some, 0], room[some, 1:])
+            squares[some] = _squares(probes.feet[some])
+
+        step = len(probes) if room.size < _SMALL_BLOCK else self._rows
+        crew.map(one, _parts(len(probes), step))
+        return room, squares
 
     def _stack(self, batch: SubspaceBatch, feet: Floats, bases: Floats) -> None:
         if self._euclidean:
@@ -352,56 +328,71 @@ class _Solver:
         np.multiply(batch.feet, scales.astype(np.float32)[:, None], out=feet)
         np.multiply(batch.bases, radii.astype(np.float32)[:, None, None], out=bases)
 
-    def solve(self, rows: _Tile, columns: _Tile, space: _Space, out: Floats) -> None:
-        """Write the distances of a tile to ``out``, (R, T or more), a part of an array's rows."""
-        n = self._templates.n
-        left, right = rows.stacked.reshape(-1, n), columns.stacked.reshape(-1, n)
-        product = space.product[: len(left) * len(right)]
-        with np.errstate(over="ignore", invalid="ignore"):  # such pairs are computed again
-            np.matmul(left, right.T, out=product.reshape(len(left), len(right)))
-        if self._solve(product, rows.numbers, columns.numbers, space.work, out):
-            table = out[:, : len(columns)]
-            i, j = np.nonzero(table < 0)
-            table[i, j] = self._exact(i + rows.part.start, j + columns.part.start)
+    def compute(self, block: _Block, space: _Space, out: Floats, *, one: int | None = None) -> None:
+        """Write the distances of some of the next tiles to ``out``; −1 where they are not exact.
+
+        Parameters
+        ----------
+        out
+            All of the block, flat; or those of the tile ``one``.
+        """
+        batch, m_d = self._templates, self._m
+        counter = block.counter if one is None else np.array([one], dtype=np.int64)
+        last, stride = (block.grid.tiles, len(batch)) if one is None else (one + 1, 0)
+        task = batch.feet, batch.bases, block.grid, counter, last, _AT_ONCE, space.held
+        room = space.stacked, space.squares, space.product
+        ends = out, stride, block.found
+        if not m_d:
+            point_tiles(
+                block.stacked, block.numbers, *task, not self._euclidean, _NEAR, *room, *ends
+            )
+        elif self._euclidean:
+            euclidean_tiles(
+                block.stacked, block.numbers, *task, m_d, _NEAR, _ACCURACY, space.work, *room, *ends
+            )
+        else:
+            spherical_tiles(block.stacked, *task, m_d, self._steps, _NEAR, space.work, *room, *ends)
+
+    def correct(self, block: _Block, number: int, out: Floats) -> None:
+        """Compute the pairs of a tile exactly that are −1 in ``out``, (R, T or more)."""
+        rows, columns = block.grid.tile(number)
+        table = out[:, : columns.stop - columns.start]
+        i, j = np.nonzero(table < 0)
+        if i.size:
+            table[i, j] = self._exact(i + rows.start + block.first, j + columns.start)
 
     def paired(self, part: slice) -> Floats:
         """Distances of probes to the templates of the same positions."""
-        mine, theirs = self.pack_probes((part, None)), self.pack_templates(part, None)
-        count, wide = len(mine), theirs.stacked.shape[1]
-        m_d, m_e = self._m, self._templates.m
+        probes, batch = self._probes[part], self._templates
+        assert isinstance(probes, SubspaceBatch)  # noqa: S101
+        count, m_d, m_e, n = len(probes), self._m, batch.m, batch.n
+        wide = whole(count)
+        mine = np.empty((count, m_d + 1, n), dtype=np.float32)
+        self._stack(probes, mine[:, 0], mine[:, 1:])
+        theirs = np.empty((m_e + 1, wide, n), dtype=np.float32)
+        squares = np.empty(wide, dtype=np.float32)
+        spherical = not self._euclidean
+        pack(batch.feet, batch.bases, part.start, count, spherical, theirs.reshape(-1), squares)
+        squares[:count] += _squares(probes.feet)
         product = np.zeros((m_d + 1, m_e + 1, wide), dtype=np.float32)
-        columns = theirs.stacked[:, :count].transpose(1, 2, 0)
         with np.errstate(over="ignore", invalid="ignore"):  # such pairs are computed again
-            product[:, :, :count] = (mine.stacked @ columns).transpose(1, 2, 0)
-        squares = theirs.numbers
-        squares[:count] += mine.numbers
+            product[:, :, :count] = (mine @ theirs[:, :count].transpose(1, 2, 0)).transpose(1, 2, 0)
         size = (euclidean_scratch if self._euclidean else spherical_scratch)(m_d, m_e)
         work, out = np.zeros(size, dtype=np.float32), np.empty(wide, dtype=np.float32)
-        nothing = np.zeros(1, dtype=np.float32)
-        if self._solve(product.reshape(-1), nothing, squares, work, out[None]):
+        if self._solve(product.reshape(-1), squares, work, out):
             again = np.flatnonzero(out[:count] < 0)
             out[again] = self._exact(again + part.start, again + part.start)
         return out[:count]
 
-    def _solve(
-        self, product: Floats, mine: Floats, theirs: Floats, work: Floats, out: Floats
-    ) -> int:
-        m_d, m_e = self._m, self._templates.m
-        rows, columns = len(mine), len(theirs)
-        # The kernels write to the memory behind a view, row by row.
-        stride, count = out.strides[0] // out.itemsize, min(out.shape[1], columns)
-        flat = np.lib.stride_tricks.as_strided(out, ((rows - 1) * stride + count,), (out.itemsize,))
-        place = flat, stride, count
-        if not m_d:
-            if self._euclidean:
-                return euclidean_points(product, mine, theirs, m_e, _NEAR, *place)
-            return spherical_points(product, mine, columns, m_e, _NEAR, *place)
+    def _solve(self, product: Floats, squares: Floats, work: Floats, out: Floats) -> int:
+        m_d, m_e, wide = self._m, self._templates.m, len(squares)
         if self._euclidean:
+            nothing = np.zeros(1, dtype=np.float32)
             return euclidean_subspaces(
-                product, mine, theirs, m_d, m_e, _NEAR, _ACCURACY, work, flat, stride, count
+                product, nothing, squares, m_d, m_e, _NEAR, _ACCURACY, work, out, wide, wide
             )
         return spherical_subspaces(
-            product, rows, columns, m_d, m_e, self._steps, _NEAR, work, *place
+            product, 1, wide, m_d, m_e, self._steps, _NEAR, work, out, wide, wide
         )
 
     def _exact(self, i: Indices, j: Indices) -> NDArray[np.float64]:
@@ -415,8 +406,16 @@ class _Solver:
 
 
 def _squares(rows: Floats) -> Floats:
-    squares = np.einsum("ij,ij->i", rows, rows, dtype=np.float64)
-    return np.asarray(np.minimum(squares, np.finfo(np.float32).max), dtype=np.float32)
+    squares = np.empty(len(rows), dtype=np.float32)
+    square(_locked(rows), squares)
+    return squares
+
+
+def _locked(array: Floats) -> Floats:
+    """View that cannot be written, as those of a batch: kernels are compiled for one kind."""
+    view = array.view()
+    view.flags.writeable = False
+    return view
 
 
 def whole(count: int) -> int:
@@ -432,10 +431,6 @@ def _even(count: int, most: int) -> int:
 
 def _parts(count: int, step: int) -> list[slice]:
     return [slice(start, min(start + step, count)) for start in range(0, count, step or 1)]
-
-
-def _shaped(room: Floats, shape: tuple[int, ...]) -> Floats:
-    return room[: math.prod(shape)].reshape(shape)
 
 
 def paired_tile(

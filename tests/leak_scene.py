@@ -33,6 +33,7 @@ from templates.rotation import tenant_rotation
 from templates.sealing import MasterKeyring
 from templates.store import TemplateStore
 from templates.wire import decode, encode
+from tests.api.client import signed
 from tests.leak_material import PEOPLE, PROBE_M, Material, Photo
 from tests.leak_places import (
     copied_tables,
@@ -292,7 +293,9 @@ def _enroll_and_verify(scene: Scene, client: httpx.Client, pid: int) -> None:
 
     def decide(kind: str, subject: str, **body: Any) -> None:
         params = {"level": LEVEL} | ({"face": "largest"} if "json" not in body else {})
-        answer = client.post(f"/v1/subjects/{subject}/verify", params=params, **body)
+        path = f"/v1/subjects/{subject}/verify"
+        options = signed(path, f"Bearer {scene.token}", {"params": params, **body})
+        answer = client.post(path, **options)
         assert answer.status_code == 200, answer.text
         scene.decisions.setdefault(kind, []).append(answer.json()["decision"])
 
@@ -365,7 +368,7 @@ def _send_bad_requests(scene: Scene, client: httpx.Client) -> None:
         send(expected, "PUT", f"{subject}/enrollment", **body)
 
     def send(expected: str, method: str, path: str, **options: Any) -> None:
-        answer = client.request(method, path, **options)
+        answer = client.request(method, path, **signed(path, f"Bearer {scene.token}", options))
         scene.expected_refusals.append(expected)
         scene.refused.append(answer.json().get("error", {}).get("code", str(answer.status_code)))
         scene.refused_bodies.append(answer.content)

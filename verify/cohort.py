@@ -5,6 +5,9 @@ one subject must therefore exceed its mean similarity to the cohort by a calibra
 cohort's standard deviations (T-norm, METHOD §4.7).
 """
 
+from typing import TYPE_CHECKING
+from weakref import WeakKeyDictionary
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,6 +16,9 @@ from templates.distances import Metric, pairwise_distances, similarity
 from templates.lifting import Strategy, lift
 from templates.randomness import Keystream
 from templates.subspace import SubspaceBatch
+
+if TYPE_CHECKING:
+    from templates.rounded import RoundedSubspaces
 
 COHORT_SIZE = 400
 """Templates in a cohort. The score of a wolf rests on the cohort's mean and standard deviation as
@@ -91,11 +97,35 @@ def make_cohort(
     return lift(descriptors, strategy=plain_strategy(strategy), m=m, source=nobody, stream=stream)
 
 
+_rounded: "WeakKeyDictionary[SubspaceBatch, RoundedSubspaces]" = WeakKeyDictionary()
+
+
+def rounded_cohort(cohort: SubspaceBatch) -> "RoundedSubspaces":
+    """Return the form of a cohort that points are compared with; made once, at the first call."""
+    # Commands that decide nothing shall not wait for the compiler's import.
+    from templates.rounded import RoundedSubspaces
+
+    found = _rounded.get(cohort)
+    if found is None:
+        found = _rounded[cohort] = RoundedSubspaces.of(cohort)
+    return found
+
+
 def cohort_statistics(
     probes: Probes, cohort: SubspaceBatch, *, metric: Metric, steps: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Mean and standard deviation of every probe's similarities to the cohort, each (P,)."""
-    distances = pairwise_distances(probes, cohort, metric=metric, steps=steps)
-    similarities = np.asarray(similarity(distances), dtype=np.float64)
+    """Mean and standard deviation of every probe's similarities to the cohort, each (P,).
+
+    Points are compared with the cohort rounded to eight bits, here and in a calibration alike: one
+    decision would otherwise spend most of its time on reading the cohort.
+    """
+    if isinstance(probes, SubspaceBatch):
+        distances = pairwise_distances(probes, cohort, metric=metric, steps=steps)
+        similarities = np.asarray(similarity(distances), dtype=np.float64)
+    else:
+        rounded = rounded_cohort(cohort)
+        similarities = np.array(
+            [rounded.similarities(probe, metric=metric) for probe in probes], dtype=np.float64
+        ).reshape(len(probes), len(cohort))
     spread = np.maximum(similarities.std(axis=1, ddof=1), LEAST_SPREAD)
     return similarities.mean(axis=1), spread

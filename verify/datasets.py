@@ -4,6 +4,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from templates.bounded_file import read_at_most
 from templates.errors import VeilfaceError
 from verify.tenfold import FOLDS, Pair
 
@@ -208,7 +209,7 @@ def read_whole(file: Path, *, most: int) -> bytes:
         if not file.is_file():
             raise DatasetError(f"{file} is not there")
         with file.open("rb") as stream:
-            data = stream.read(most + 1)
+            data = read_at_most(stream, most)
     except OSError as error:
         raise DatasetError(f"{file} cannot be read: {error.strerror}") from None
     except MemoryError:

@@ -68,7 +68,20 @@ class Verifier:
         quality: QualityLimits | None = DEFAULT_QUALITY,
         limits: ImageLimits = DEFAULT_LIMITS,
     ) -> Decision:
-        """Decide for a photo file; see ``decide_embedding``.
+        """Decide for a photo file: :meth:`embed_photo`, then :meth:`decide_embedding`."""
+        embedding = self.embed_photo(pack, photo, policy=policy, quality=quality, limits=limits)
+        return self.decide_embedding(embedding, stored, level=level)
+
+    def embed_photo(
+        self,
+        pack: ModelPack,
+        photo: bytes,
+        *,
+        policy: FacePolicy = FacePolicy.SINGLE,
+        quality: QualityLimits | None = DEFAULT_QUALITY,
+        limits: ImageLimits = DEFAULT_LIMITS,
+    ) -> NDArray[np.float32]:
+        """Make a probe, (n,), of the face in a photo file.
 
         Raises
         ------
@@ -82,7 +95,7 @@ class Verifier:
             embedder_sha256=info.embedder_sha256, preprocessing=info.preprocessing, n=info.n
         )
         sample = pack.embed_photo(photo, policy=policy, quality=quality, limits=limits)
-        return self.decide_embedding(sample.embedding, stored, level=level)
+        return sample.embedding
 
     def decide_embedding(
         self,

@@ -1,10 +1,18 @@
 """``veilface db``: the schema of the database, and its files."""
 
+import json
+from pathlib import Path
+from typing import Annotated
+
 import typer
 
-from api.cli.console import emit, message, say
-from api.cli.options import STORE, AsJson, takes_settings
-from api.opening import open_keyring, open_store
+from api.audit import operator
+from api.cli.console import emit, message, progress, say
+from api.cli.errors import UsageError
+from api.cli.files import write_private
+from api.cli.options import STORE, AsJson, Tenant, takes_settings
+from api.opening import checked_store, open_keyring, open_store, retention_of
+from api.receipts import receipt_json
 from api.settings import Settings
 from templates.errors import VeilfaceError
 from templates.store.database import Database
@@ -15,7 +23,7 @@ app = typer.Typer(no_args_is_help=True)
 
 @app.callback()
 def db() -> None:
-    """Bring the database's schema up to date, check it, or compact its files."""
+    """Bring the database's schema up to date, check it, and clean up in it."""
 
 
 @app.command()
@@ -88,23 +96,115 @@ def compact(*, settings: Settings, as_json: AsJson = False) -> None:
 
     On PostgreSQL this is `VACUUM (FULL)` of the tables that hold subject data: remains of erased
     rows go, and each table is locked meanwhile. SQLite overwrites what is erased at once; there
-    this is `VACUUM`, which gives free space back. Both need free disk as large as the data, and
-    make writes wait: run it when few requests come.
+    this is `VACUUM`, which gives free space back. PostgreSQL needs free disk as large as the data,
+    SQLite free memory (nothing temporary goes to disk). Both make writes wait: run it when few
+    requests come.
 
     Example: `veilface db compact --data-dir veilface-data`
     """
-    store = open_store(settings, open_keyring(settings))
-    try:
-        store.check()
+    with checked_store(settings) as store:
         before = store.size()
         store.compact()
         after = store.size()
-    finally:
-        store.close()
     if as_json:
         emit({"bytes_before": before, "bytes_after": after})
     else:
         say(f"Compacted the database: {before:,} bytes before, {after:,} after.")
+
+
+@app.command()
+@takes_settings(*STORE, "default_tenant")
+def unlock(
+    subject: Annotated[str, typer.Argument(help="Whose lockout is lifted.", show_default=False)],
+    *,
+    settings: Settings,
+    tenant: Tenant = None,
+    as_json: AsJson = False,
+) -> None:
+    """Forget the failed attempts on a subject; exit status 1 where there were none.
+
+    This is how a subject that was disabled after many failures is enabled again. Make sure first
+    that it was the subject who failed.
+
+    Example: `veilface db unlock alice --tenant default`
+    """
+    name = tenant or settings.default_tenant
+    with checked_store(settings) as store:
+        lifted = store.attempts.reset(name, subject, by=operator())
+    if as_json:
+        emit({"subject_id": subject, "tenant": name, "lifted": lifted})
+    elif lifted:
+        say(f"The failed attempts on {subject} are forgotten.")
+    if not lifted:
+        message("error: there were no failed attempts on this subject")
+        raise typer.Exit(1)
+
+
+@app.command()
+@takes_settings(*STORE, "retention_days", "retention_disuse_days")
+def purge(
+    *,
+    settings: Settings,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Say how many subjects are due; erase none.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Erase the subjects whose time is over, and remove records that have expired.
+
+    The service does this by itself every `purge_interval_s` seconds. Each erased subject leaves a
+    receipt and a line in the audit log.
+
+    Example: `veilface db purge --retention-days 730 --retention-disuse-days 365 --dry-run`
+    """
+    retention = retention_of(settings)
+    with checked_store(settings) as store:
+        due, erased = store.due(retention), 0
+        if not dry_run:
+            erased = store.erase_expired(retention)
+            store.purge()
+    if as_json:
+        emit({"due": due, "erased": erased})
+    elif dry_run:
+        say(f"{due} subjects are due to be erased.")
+    else:
+        say(f"Erased {erased} subjects, and the records that had expired.")
+
+
+@app.command("erase-tenant")
+@takes_settings(*STORE)
+def erase_tenant(
+    tenant: Annotated[str, typer.Argument(help="The tenant's name.", show_default=False)],
+    *,
+    settings: Settings,
+    confirm: Annotated[
+        str,
+        typer.Option(
+            help="The tenant's name once more. Nothing brings it back.", show_default=False
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(help="File for the receipt. Unset: it goes to stdout.", show_default=False),
+    ] = None,
+) -> None:
+    """Erase a tenant: its subjects, templates, keys and rotation; write a signed receipt.
+
+    Its API keys are revoked first. Verify the receipt with `veilface keys verify-receipt`.
+
+    Example: `veilface db erase-tenant acme --confirm acme --out receipt.json`
+    """
+    if confirm != tenant:
+        raise UsageError("--confirm must be the tenant's name; nothing was erased")
+    with checked_store(settings) as store, progress("erasing", None) as advance:
+        receipt = store.tenant_erasures.erase(tenant, by=operator(), progress=advance).receipt
+    answer = receipt_json(receipt)
+    if out is None:
+        emit(answer)
+        return
+    write_private(out, json.dumps(answer, indent=2).encode())
+    counts = {each["item"]: each["count"] for each in receipt.claims["erased"]}
+    say(f"Erased tenant {tenant}: {counts.get('subjects', 0)} subjects. Receipt: {out}")
 
 
 def _revision(settings: Settings) -> str | None:

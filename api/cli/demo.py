@@ -1,6 +1,9 @@
 """``veilface demo``: everything once, with nothing configured."""
 
 import dataclasses
+import os
+import shutil
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -112,6 +115,11 @@ def _print(outcome: Outcome) -> None:
             entry.ciphertext_excerpt,
         )
     show(people, levels, stored)
+    if outcome.locks_lifted:
+        say(
+            f"Five rejections in a row locked a subject {outcome.locks_lifted} times; the demo "
+            "lifted the lock each time, as an operator may."
+        )
     for refusal in outcome.refused_photos:
         say(f"Not usable, counted as rejected: {refusal}")
     if outcome.receipt:
@@ -122,13 +130,23 @@ def _print(outcome: Outcome) -> None:
     folder = outcome.folder
     say(
         f"\nDone in {outcome.seconds:.0f} s. Start the service on the same data:\n\n"
-        f"  veilface serve --config {folder}/veilface.toml\n\n"
-        "and ask it, in another terminal (the API key is in a file that only you can read):\n\n"
+        f"  {_program()} serve --config {folder}/veilface.toml\n\n"
+        "and open its page, http://127.0.0.1:8421/, with the API key that is in a file which only "
+        f"you can read:\n\n  cat {folder}/api-key\n\n"
+        "or ask it, in another terminal:\n\n"
         f'  curl -H "Authorization: Bearer $(cat {folder}/api-key)" '
         "http://127.0.0.1:8421/v1/subjects\n"
     )
     if outcome.demo_model:
         say(DEMO_NOTICE)
+
+
+def _program() -> str:
+    """Return what to type for this program: its name, or its path where it is not found by name."""
+    program = Path(sys.argv[0])
+    if program.name != "veilface" or shutil.which("veilface") == str(program.absolute()):
+        return "veilface"
+    return os.path.relpath(program)
 
 
 def _json(outcome: Outcome) -> dict[str, Any]:

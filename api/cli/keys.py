@@ -10,10 +10,11 @@ from typing import Annotated, Any
 
 import typer
 
+from api.audit import operator
 from api.cli.console import emit, message, progress, say, show, table
 from api.cli.errors import CommandError, UsageError
 from api.cli.files import read_bounded
-from api.cli.options import STORE, AsJson, takes_settings
+from api.cli.options import STORE, AsJson, Tenant, takes_settings
 from api.opening import file_sealer, open_keyring, open_store, prepare_database
 from api.receipts import verify_answer
 from api.settings import Settings
@@ -21,6 +22,7 @@ from templates.canonical import parse_object
 from templates.contract import Contract
 from templates.decoys import DecoyPool, load_source
 from templates.errors import StoreError
+from templates.key_file import locked
 from templates.sealing import MasterKeyring
 from templates.store import TemplateStore
 from templates.store.api_keys import ApiKey, Right
@@ -34,7 +36,7 @@ app = typer.Typer(no_args_is_help=True)
 
 @app.callback()
 def keys() -> None:
-    """Make and revoke API keys, rotate the master key, verify receipts of erasure."""
+    """Make, replace and revoke API keys, rotate keys and rotations, verify receipts of erasure."""
 
 
 @app.command()
@@ -71,7 +73,7 @@ def create(
     with _store(settings) as store:
         store.tenants.create(name)
         expires = None if days is None else utc_now() + timedelta(days=days)
-        made = store.api_keys.create(name, right, label=label, expires_at=expires)
+        made = store.api_keys.create(name, right, label=label, expires_at=expires, by=operator())
     if as_json:
         emit({"token": made.token, **_described(made.key)})
     else:
@@ -127,7 +129,7 @@ def revoke(
     Example: `veilface keys revoke 3f9a1c0b7d2e`
     """
     with _store(settings) as store:
-        revoked = store.api_keys.revoke(prefix)
+        revoked = store.api_keys.revoke(prefix, by=operator())
     if as_json:
         emit({"prefix": prefix, "revoked": revoked})
     elif revoked:
@@ -135,6 +137,105 @@ def revoke(
     if not revoked:
         message("error: no key of this prefix, or it was revoked before; see `veilface keys list`")
         raise typer.Exit(1)
+
+
+@app.command()
+@takes_settings(*STORE)
+def replace(
+    prefix: Annotated[
+        str,
+        typer.Argument(help="The 12 digits after `vf_` of the old key.", show_default=False),
+    ],
+    *,
+    settings: Settings,
+    grace_hours: Annotated[
+        float,
+        typer.Option(min=0, max=8760, help="Hours that the old key still works."),
+    ] = 24.0,
+    as_json: AsJson = False,
+) -> None:
+    """Make a key with the rights of another one, which then expires; show the new one, once.
+
+    Give the new key to whoever holds the old one before the hours are over. After a leak use
+    `--grace-hours 0`. Exit status 1 where there is no valid key of this prefix.
+
+    Example: `veilface keys replace 3f9a1c0b7d2e --grace-hours 48`
+    """
+    with _store(settings) as store:
+        made = store.api_keys.replace(prefix, grace=timedelta(hours=grace_hours), by=operator())
+    if made is None:
+        raise CommandError("no valid key of this prefix; see `veilface keys list`")
+    if as_json:
+        emit({"token": made.token, "replaces": prefix, **_described(made.key)})
+    else:
+        message(f"Key {made.key.prefix} replaces {prefix}, shown only now:")
+        say(made.token)
+
+
+@app.command("rotate-tenant")
+@takes_settings(*FILES, "default_tenant")
+def rotate_tenant(
+    *,
+    settings: Settings,
+    tenant: Tenant = None,
+    stolen: Annotated[
+        bool,
+        typer.Option(
+            "--stolen",
+            help="Templates were stolen too: leave them in their old rotation, and list who must "
+            "be enrolled again.",
+        ),
+    ] = False,
+    finish: Annotated[
+        bool,
+        typer.Option(
+            "--finish", help="Begin no new rotation; go on with one that was interrupted."
+        ),
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Give a tenant a new secret rotation, and turn its stored templates into it.
+
+    Nobody has to be enrolled again, and the service may run meanwhile; the old rotation's key is
+    dropped at the end. That is enough where the rotation's key alone may be known. A template that
+    was stolen stays a credential whatever is done to ours: with `--stolen` only those who are
+    enrolled from now on get the new rotation, the others are listed and are verified as before
+    until they are enrolled again, with new photos. Run it with `--stolen --finish` to see who is
+    left, and once more when nobody is: `--finish` alone would turn the stolen templates too.
+
+    Example: `veilface keys rotate-tenant --tenant default`
+    """
+    name = tenant or settings.default_tenant
+    with _store(settings) as store:
+        rotations = store.rerotation
+        epoch = store.tenants.get(name).rotation_epoch
+        if not finish:
+            epoch = rotations.begin(name, by=operator())
+        moved = 0
+        if not stolen:
+            with progress("turning templates", rotations.remaining(name)) as advance:
+                moved = rotations.move(name, by=operator(), progress=advance)
+        left = list(rotations.subjects_of_old_epochs(name))
+        dropped = 0 if left else rotations.retire(name, by=operator())
+    if as_json:
+        emit(
+            {
+                "tenant": name,
+                "rotation_epoch": epoch,
+                "moved": moved,
+                "enroll_again": left,
+                "rotations_dropped": dropped,
+            }
+        )
+        return
+    say(f"Tenant {name} is in rotation {epoch}; {moved} templates were turned into it.")
+    if left:
+        say(f"{len(left)} subjects keep an older rotation until they are enrolled again:")
+        for subject in left:
+            say(f"  {subject}")
+        say(f"Then run `veilface keys rotate-tenant --tenant {name} --stolen --finish`.")
+    elif dropped:
+        say(f"Dropped the keys of {dropped} older rotations.")
 
 
 @app.command()
@@ -174,10 +275,11 @@ def rotate(*, settings: Settings, retire: Retire = False, as_json: AsJson = Fals
 
     Example: `veilface keys rotate --retire`
     """
+    _require_file(settings, "put a new key in front where they come from, then `keys rewrap`")
     path = settings.resolved_master_key_file
-    open_keyring(settings)
-    MasterKeyring.add_current(path)
-    _rewrap(settings, retire=retire, as_json=as_json)
+    with _alone(settings):
+        MasterKeyring.add_current(path)
+        _rewrap(settings, retire=retire, as_json=as_json)
 
 
 @app.command()
@@ -189,7 +291,10 @@ def rewrap(*, settings: Settings, retire: Retire = False, as_json: AsJson = Fals
 
     Example: `veilface keys rewrap --retire`
     """
-    _rewrap(settings, retire=retire, as_json=as_json)
+    if retire:
+        _require_file(settings, "drop the old key where they come from")
+    with _alone(settings):
+        _rewrap(settings, retire=retire, as_json=as_json)
 
 
 @app.command("verify-receipt")
@@ -227,10 +332,37 @@ def verify_receipt(
     if as_json:
         emit({"valid": True, "claims": claims})
         return
+    if "subject" not in claims:
+        counts = {each["item"]: each["count"] for each in claims["erased"]}
+        say(
+            f"Valid: tenant {claims['tenant']} was erased on {claims['erased_at']}, with "
+            f"{counts['subjects']} subjects."
+        )
+        return
     held = "what was held of" if claims["held"] else "that nothing was held of"
     verb = "erased" if claims["held"] else "stated"
     say(f"Valid: tenant {claims['tenant']} {verb} {held} a subject on {claims['erased_at']}.")
     say(f"The subject's pseudonym is {claims['subject']}.")
+
+
+def _require_file(settings: Settings, remedy: str) -> None:
+    if not _from_file(settings):
+        raise UsageError(f"the master keys do not come from a file: {remedy}")
+
+
+def _from_file(settings: Settings) -> bool:
+    return settings.master_key_variable is None and settings.master_key_command is None
+
+
+@contextmanager
+def _alone(settings: Settings) -> Iterator[None]:
+    """Keep other rotations of the same key file out."""
+    if not _from_file(settings):
+        yield
+        return
+    open_keyring(settings)  # it makes the file of a deployment that has none yet
+    with locked(settings.resolved_master_key_file):
+        yield
 
 
 def _rewrap(settings: Settings, *, retire: bool, as_json: bool) -> None:
@@ -240,7 +372,8 @@ def _rewrap(settings: Settings, *, retire: bool, as_json: bool) -> None:
         total = sum(n for key, n in store.wrapping_keys().items() if key != keyring.current)
         with progress("wrapping keys again", total) as advance:
             changed = store.rewrap(progress=advance)
-        left = set(store.wrapping_keys()) - {keyring.current}
+        current = keyring.current
+        left = set(store.wrapping_keys()) - {current}
     files = _seal_files_again(settings, keyring)
     dropped = 0
     if retire:
@@ -249,18 +382,18 @@ def _rewrap(settings: Settings, *, retire: bool, as_json: bool) -> None:
                 "something is still wrapped by an older master key; run `veilface keys rewrap` "
                 "again before retiring it"
             )
-        dropped = MasterKeyring.drop_retired(path)
+        dropped = MasterKeyring.drop_retired(path, keep=current)
     if as_json:
         emit(
             {
-                "key_id": keyring.current,
+                "key_id": current,
                 "rewrapped": changed,
                 "resealed_files": [str(file) for file in files],
                 "retired": dropped,
             }
         )
         return
-    say(f"Master key {keyring.current} is in force: {changed} keys and secrets wrapped again.")
+    say(f"Master key {current} is in force: {changed} keys and secrets wrapped again.")
     for file in files:
         say(f"Sealed again: {file}")
     if dropped:

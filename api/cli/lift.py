@@ -1,6 +1,7 @@
 """``veilface lift``: a client makes its own private template; no face leaves its machine."""
 
 import base64
+import os
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,8 +22,11 @@ from templates.canonical import parse_object
 from templates.decoys import DecoyGenerator
 from templates.errors import ContractError
 from templates.lifting import lift as lift_descriptors
+from templates.probe_signature import signed_probe
 from templates.randomness import Keystream
+from templates.store.api_keys import is_token
 
+TOKEN_VARIABLE = "VEILFACE_API_KEY"  # noqa: S105 - a name, not a secret
 MAX_CONTRACT_BYTES = 256 * 2**20
 MAX_PHOTO_BYTES = 64 * 2**20
 
@@ -65,6 +69,20 @@ def lift(
     probe: Annotated[
         bool, typer.Option("--probe", help="Make a probe for verify, not an enrollment.")
     ] = False,
+    subject: Annotated[
+        str | None,
+        typer.Option(
+            help="With `--probe --out -`: whom the probe is for; it is signed for one subject.",
+            show_default=False,
+        ),
+    ] = None,
+    level: Annotated[
+        str | None,
+        typer.Option(
+            help="With `--probe --out -`: security level to ask for. Unset: the contract's.",
+            show_default=False,
+        ),
+    ] = None,
     dim: Annotated[
         int | None,
         typer.Option(
@@ -81,18 +99,22 @@ def lift(
     ] = FacePolicy.SINGLE,
     as_json: AsJson = False,
 ) -> None:
-    """Turn photos into a private template on this machine, without any key of the service.
+    """Turn photos into a private template on this machine, without any secret of the service.
 
     Needs: the service's model pack, `GET /v1/contract` and `GET /v1/contract/generator` saved to
     files. Send the result as `{"template": …}`; the key needs the right `embeddings`. Several
     photos of one person are averaged before they are lifted. Never lift the same photo twice for
     enrollment: two templates of one descriptor give it away.
 
+    A probe on stdout is signed for one request, with the API key in the variable
+    `VEILFACE_API_KEY`; send it within a minute.
+
     Example: `veilface lift me-1.jpg me-2.jpg --pack buffalo_l --generator generator.bin
     --contract contract.json --out me.veil`
     """
     if len(photos) > MAX_PHOTOS:
         raise UsageError(f"a template is made from 1 to {MAX_PHOTOS} photos, not {len(photos)}")
+    token = _signing_token(subject, level, asked=probe and str(out) == "-")
     public = read_contract(contract)
     binding = public.binding
     m = public.dimension(probe=probe, dim=dim)
@@ -118,7 +140,10 @@ def lift(
     data = wire.encode(batch[0], contract_id=binding.contract_id)
     notice = demo_notice(info.embedder_sha256, n=info.n)
     if str(out) == "-":
-        emit({"template": base64.b64encode(data).decode("ascii")})
+        if token is None or subject is None:
+            emit({"template": base64.b64encode(data).decode("ascii")})
+        else:
+            emit(signed_probe(token, subject, data, level=level))
         return
     write_private(out, data)
     facts: dict[str, Any] = {
@@ -134,6 +159,22 @@ def lift(
         emit(facts)
     else:
         say(f"{out}: {facts['kind']} template of {len(photos)} photos, m = {m}, {len(data)} bytes.")
+
+
+def _signing_token(subject: str | None, level: str | None, *, asked: bool) -> str | None:
+    """Return the API key that signs a probe on stdout; None where nothing is signed."""
+    if not asked:
+        if subject is not None or level is not None:
+            raise UsageError("--subject and --level go with --probe --out -")
+        return None
+    if subject is None:
+        raise UsageError("a probe on stdout is signed for one subject: name it with --subject")
+    token = os.environ.get(TOKEN_VARIABLE, "")
+    if not is_token(token):
+        raise UsageError(
+            f"a probe on stdout is signed: put the API key into the variable {TOKEN_VARIABLE}"
+        )
+    return token
 
 
 def embed_file(pack: ModelPack, photo: Path, *, policy: FacePolicy) -> np.ndarray[Any, Any]:

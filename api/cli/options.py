@@ -20,7 +20,13 @@ from api.settings import CONFIG_VARIABLE, ENV_PREFIX, Settings, load_settings
 P = ParamSpec("P")
 R = TypeVar("R")
 
-STORE = ("data_dir", "database_url", "master_key_file")
+STORE = (
+    "data_dir",
+    "database_url",
+    "master_key_file",
+    "master_key_variable",
+    "master_key_command",
+)
 LOCAL = (*STORE, "contract_file", "decoys_file", "pack", "providers", "onnx_threads")
 
 AsJson = Annotated[
@@ -90,7 +96,14 @@ _CONFIG = inspect.Parameter(
         ),
     ],
 )
-_KINDS: dict[Any, Any] = {Path: Path, int: int, float: float, bool: bool, Path | None: Path}
+_KINDS: dict[Any, Any] = {
+    Path: Path,
+    int: int,
+    float: float,
+    bool: bool,
+    Path | None: Path,
+    int | None: int,
+}
 
 
 def _flag(name: str, declared: FieldInfo) -> inspect.Parameter:

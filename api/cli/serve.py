@@ -1,17 +1,21 @@
 """``veilface serve``: the REST service."""
 
 import socket
+from contextlib import nullcontext
 from typing import Annotated
 
 import typer
-import uvicorn
 
-from api.app import uvicorn_options
+from api.audit_report import open_audit_report
 from api.cli.console import demo_notice, message, say
 from api.cli.errors import CommandError
 from api.cli.options import takes_settings
+from api.metrics import shared_directory
+from api.operations import tls_options
+from api.rate_limits import RateLimits
 from api.runtime import Runtime, bootstrap_token
 from api.settings import Settings
+from api.supervisor import run_server
 
 
 def register(app: typer.Typer) -> None:
@@ -45,13 +49,34 @@ def serve(
     if token is not None:
         say(f"API key with all rights of tenant {settings.default_tenant}, shown only now:")
         say(token)
-    settings = settings.model_copy(update={"port": free_port(settings.host, settings.port)})
-    message(f"Veilface listens on http://{settings.host}:{settings.port}")
+    settings = _with_ports(settings)
+    scheme = "http" if settings.tls_certificate is None else "https"
+    message(f"Veilface listens on {scheme}://{_address(settings.host, settings.port)}")
+    if settings.operations_port is not None:
+        operations = _address(settings.operations_host, settings.operations_port)
+        message(f"Health and metrics are on http://{operations}")
+    # Workers count together in a folder; a single process counts in its memory.
+    counting = nullcontext() if settings.workers == 1 else shared_directory()
     try:
-        uvicorn.run(**uvicorn_options(settings))
+        with counting:
+            run_server(settings)
     except SystemExit as error:
         if error.code:
             raise CommandError("the service did not start; its log says why") from None
+
+
+def _with_ports(settings: Settings) -> Settings:
+    """Choose the free ports that are asked for by 0: all workers must open the same."""
+    chosen = {"port": free_port(settings.host, settings.port)}
+    if settings.operations_port is not None:
+        chosen["operations_port"] = free_port(
+            settings.operations_host, settings.operations_port, option="operations-"
+        )
+    return settings.model_copy(update=chosen)
+
+
+def _address(host: str, port: int) -> str:
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
 def _opened_once(settings: Settings, *, check: bool) -> tuple[str | None, bool]:
@@ -64,6 +89,9 @@ def _opened_once(settings: Settings, *, check: bool) -> tuple[str | None, bool]:
     demo : bool
         Whether the embedder is the demo model.
     """
+    tls_options(settings)
+    RateLimits.open(settings)
+    open_audit_report(settings)
     runtime = Runtime.open(settings)
     try:
         binding = runtime.contract.binding
@@ -73,8 +101,8 @@ def _opened_once(settings: Settings, *, check: bool) -> tuple[str | None, bool]:
         runtime.close()
 
 
-def free_port(host: str, port: int) -> int:
-    """Return the port, or a free one for 0.
+def free_port(host: str, port: int, *, option: str = "") -> int:
+    """Return the port, or a free one for 0; ``option`` begins the names of the two options.
 
     Raises
     ------
@@ -89,5 +117,6 @@ def free_port(host: str, port: int) -> int:
             return int(probe.getsockname()[1])
     except OSError as error:
         raise CommandError(
-            f"cannot listen on {host}:{port} ({error.strerror}); choose another --port or --host"
+            f"cannot listen on {host}:{port} ({error.strerror}); choose another "
+            f"--{option}port or --{option}host"
         ) from None

@@ -5,6 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
+from api.audit import operator
 from api.cli.console import demo_notice, emit, say
 from api.cli.errors import CommandError, UsageError
 from api.cli.files import read_bounded
@@ -16,6 +17,7 @@ from enroll.errors import InconsistentImages, PhotoRejected
 from models.errors import ModelError
 from models.pack import FacePolicy, ModelPack
 from templates.decoys import Attributes
+from templates.store.audit_log import Entry
 from templates.store.subjects import Source
 
 Subject = Annotated[str, typer.Argument(help="Name of the person.", show_default=False)]
@@ -87,7 +89,13 @@ def enroll(
                 "of one person"
             ) from None
         stored = runtime.put(
-            name, subject, epoch, enrollment, source=Source.PHOTOS, photos=len(photos)
+            name,
+            subject,
+            epoch,
+            enrollment,
+            source=Source.PHOTOS,
+            photos=len(photos),
+            by=operator(),
         )
         binding = runtime.contract.binding
         notice = demo_notice(binding.embedder_sha256, n=binding.n)
@@ -127,7 +135,8 @@ def verify(
     """Check whether a photo shows a person; exit status 0 accept, 1 reject.
 
     Needs: what `serve` needs; the service may run meanwhile. Status 1 with a message that starts
-    with `error:` means that no decision was made.
+    with `error:` means that no decision was made. The decision stands in the audit log; it neither
+    counts for the subject's lockout nor is stopped by it.
 
     Example: `veilface verify alice today.jpg --pack buffalo_l --level fmr-1e-4`
     """
@@ -136,22 +145,26 @@ def verify(
     try:
         pack = _required_pack(runtime)
         name = _tenant(runtime, tenant)
-        found = runtime.store.get(name, subject)
-        if found is None:
+        read = runtime.read(name, subject)
+        if read is None:
             raise CommandError(f"tenant {name} has no subject of that name; enroll it first")
-        verifier = runtime.verifier(name, found.record.rotation_epoch)
+        found, room = read
         try:
-            decision = verifier.decide_photo(
+            decision = room.verifier.decide_photo(
                 pack, data, found.wire, level=level, policy=face, limits=runtime.image_limits
             )
         except ModelError as error:
             raise CommandError(f"{photo.name}: {error}") from None
+        outcome = "accept" if decision.accepted else "reject"
+        runtime.store.audit_log.record(
+            Entry("verify", outcome, operator(), name, runtime.store.pseudonym(name, subject))
+        )
         binding = runtime.contract.binding
         notice = demo_notice(binding.embedder_sha256, n=binding.n)
     finally:
         runtime.close()
     answer: dict[str, Any] = {
-        "decision": "accept" if decision.accepted else "reject",
+        "decision": outcome,
         "reason": decision.reason,
         "level": decision.level,
         "fmr": decision.fmr,

@@ -6,8 +6,9 @@ from typing import Any
 from fastapi import APIRouter, Request
 from starlette.responses import Response
 
+from api.audit import by
 from api.auth import Caller
-from api.bodies import Form, base64_field, content_type, read_form, read_json, reject_unknown
+from api.bodies import Form, base64_field, content_type, reject_unknown, sent_form, sent_json
 from api.deps import (
     Enrolls,
     GateDep,
@@ -25,6 +26,7 @@ from api.values import face_policy, one_of
 from enroll import Enrollment
 from models.quality import Quality
 from templates.decoys import Attributes
+from templates.store.audit_log import By
 from templates.store.subjects import Source
 
 router = APIRouter(prefix="/v1/subjects", tags=["subjects"])
@@ -68,29 +70,23 @@ async def enroll(
     """
     settings = runtime.settings
     query = query_of(request, ("face",))
-    async with gate.admitted():
+    async with gate.admitted(caller.prefix):
         if content_type(request) == "multipart/form-data":
             runtime.required_pack()
             runtime.require_decoys()
-            form = await read_form(
-                request,
-                max_bytes=settings.max_request_bytes,
-                max_images=settings.max_images,
-                max_image_bytes=settings.max_image_bytes,
-                timeout_s=settings.body_timeout_s,
-            )
+            form = await sent_form(request, settings, max_images=settings.max_images)
             return await _enroll_photos(request, caller, subject, form, query, idempotency_key)
         caller.require("embeddings")
-        body = await read_json(
-            request, max_bytes=settings.max_request_bytes, timeout_s=settings.body_timeout_s
-        )
+        body = await sent_json(request, settings)
         reject_unknown([*body, *query], ("template",))
         template = base64_field(body.get("template"), "template", code="invalid_template")
 
         def work() -> Outcome:
             epoch = runtime.epoch(caller.tenant)
             enrollment = runtime.enroller(caller.tenant, epoch).from_template(template)
-            return _stored(runtime, caller.tenant, subject, epoch, enrollment, Source.TEMPLATE)
+            return _stored(
+                runtime, caller.tenant, subject, epoch, enrollment, Source.TEMPLATE, by(request)
+            )
 
         return await once(
             request,
@@ -123,7 +119,9 @@ async def _enroll_photos(
         enrollment = runtime.enroller(caller.tenant, epoch).from_photos(
             pack, photos, attributes=attributes, policy=policy, limits=runtime.image_limits
         )
-        return _stored(runtime, caller.tenant, subject, epoch, enrollment, Source.PHOTOS)
+        return _stored(
+            runtime, caller.tenant, subject, epoch, enrollment, Source.PHOTOS, by(request)
+        )
 
     return await once(
         request,
@@ -184,9 +182,16 @@ def _stored(
     epoch: int,
     enrollment: Enrollment,
     source: Source,
+    who: By,
 ) -> Outcome:
     stored = runtime.put(
-        tenant, subject, epoch, enrollment, source=source, photos=len(enrollment.per_photo)
+        tenant,
+        subject,
+        epoch,
+        enrollment,
+        source=source,
+        photos=len(enrollment.per_photo),
+        by=who,
     )
     body: dict[str, Any] = {
         "template_id": stored.template_id,

@@ -1,20 +1,24 @@
-"""Health: is the process alive, and can it answer."""
+"""Health and metrics: is the process alive, can it answer, and what has it done."""
 
+import anyio
+import anyio.to_thread
 from fastapi import APIRouter, Request
+from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
 from starlette.responses import Response
 
 from api.answers import answer
-from api.deps import GateDep, RuntimeDep
+from api.metrics import exposition
 from api.openapi import error_responses
+from api.operations import Readiness
 from api.schemas import HealthAnswer
 
-router = APIRouter(prefix="/health", tags=["health"])
+router = APIRouter(tags=["health"])
 
 
 @router.get(
-    "/live",
+    "/health/live",
     response_model=HealthAnswer,
-    responses=error_responses("internal_error"),
+    responses=error_responses("overloaded", "internal_error"),
     summary="The process answers",
 )
 async def live(request: Request) -> Response:
@@ -23,12 +27,42 @@ async def live(request: Request) -> Response:
 
 
 @router.get(
-    "/ready",
+    "/health/ready",
     response_model=HealthAnswer,
-    responses=error_responses("store_unavailable", "internal_error"),
-    summary="The database answers, and the model did at the start",
+    responses=error_responses(
+        "store_unavailable", "model_unavailable", "overloaded", "internal_error"
+    ),
+    summary="The worker can answer requests",
 )
-async def ready(request: Request, runtime: RuntimeDep, gate: GateDep) -> Response:
-    """Ask the database. A pack whose first inference fails stops the start already."""
-    await gate.query(runtime.store.ping)
+async def ready(request: Request) -> Response:
+    """Ask the database; after a failed write it must take one, after a failed inference do one.
+
+    A worker that was told to stop answers `overloaded`.
+    """
+    readiness: Readiness = request.app.state.readiness
+    await readiness.check()
     return answer(request, {"status": "ok"})
+
+
+@router.get(
+    "/metrics",
+    response_class=Response,
+    responses={
+        200: {
+            "description": "Metrics of all workers, in Prometheus' text format 0.0.4.",
+            "content": {
+                "text/plain": {
+                    "schema": {"type": "string"},
+                    "example": "veilface_store_up 1.0\n",
+                }
+            },
+        },
+        **error_responses("overloaded", "internal_error"),
+    },
+    summary="What the service has done, for Prometheus",
+)
+async def metrics(request: Request) -> Response:
+    """No series names a subject, a tenant or an API key."""
+    limiter: anyio.CapacityLimiter = request.app.state.scrapes
+    text = await anyio.to_thread.run_sync(exposition, limiter=limiter)
+    return Response(text, headers={"Content-Type": CONTENT_TYPE_PLAIN_0_0_4})

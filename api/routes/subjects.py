@@ -1,17 +1,18 @@
 """Subjects: list, describe, erase."""
 
-import datetime
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request
 from starlette.responses import Response
 
 from api.answers import answer
+from api.audit import by
 from api.deps import Enrolls, Erases, GateDep, IdempotencyDep, RuntimeDep, SubjectDep
 from api.errors import ApiError
 from api.openapi import EVERY_CALL, error_responses
 from api.receipts import receipt_json
 from api.schemas import ReceiptAnswer, SubjectAnswer, SubjectsAnswer
+from api.values import iso_time
 from templates.store.subjects import SubjectRecord
 
 router = APIRouter(prefix="/v1/subjects", tags=["subjects"])
@@ -89,7 +90,7 @@ async def erase_subject(
             and store.receipt(caller.tenant, subject) is None
         ):
             raise ApiError("not_enrolled", "the tenant never had such a subject")
-        return receipt_json(store.erase(caller.tenant, subject).receipt)
+        return receipt_json(store.erase(caller.tenant, subject, by=by(request)).receipt)
 
     # No stored answer: after another enrollment it would claim an erasure that did not happen.
     return answer(request, await gate.query(work))
@@ -103,10 +104,6 @@ def _described(record: SubjectRecord, contract_id: str) -> dict[str, Any]:
         "current": record.contract_id == contract_id,
         "enrolled_by": str(record.source),
         "photos": record.photos,
-        "created_at": _time(record.created_at),
-        "updated_at": _time(record.updated_at),
+        "created_at": iso_time(record.created_at),
+        "updated_at": iso_time(record.updated_at),
     }
-
-
-def _time(value: datetime.datetime) -> str:
-    return value.astimezone(datetime.UTC).isoformat(timespec="seconds").replace("+00:00", "Z")

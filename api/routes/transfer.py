@@ -6,8 +6,9 @@ from fastapi import APIRouter, Request
 from starlette.responses import Response
 
 from api.answers import answer
-from api.bodies import base64_field, read_json, reject_unknown
-from api.deps import Exports, GateDep, IdempotencyDep, RuntimeDep, SubjectDep
+from api.audit import by
+from api.bodies import base64_field, reject_unknown, sent_json
+from api.deps import Exports, GateDep, IdempotencyDep, RuntimeDep, SubjectDep, note_subject
 from api.errors import ApiError
 from api.idempotency import Outcome, once
 from api.openapi import BODY, EVERY_CALL, IDEMPOTENT, IMPORT_BODY, error_responses
@@ -39,7 +40,10 @@ async def export_subject(
 
     Only keys with `enroll` or `admin` are told `not_enrolled`; others get `not_found`.
     """
-    exported = await gate.compute(lambda: runtime.export(caller.tenant, subject))
+    async with gate.admitted(caller.prefix):
+        exported = await gate.compute(
+            lambda: runtime.export(caller.tenant, subject, by=by(request))
+        )
     if exported is None:
         if caller.sees_enrollment:
             raise ApiError("not_enrolled", "the tenant has no such subject")
@@ -76,10 +80,8 @@ async def import_subject(
 ) -> Response:
     """Right: `export`. The tenant's own rotation is put on the template."""
     settings = runtime.settings
-    async with gate.admitted():
-        body = await read_json(
-            request, max_bytes=settings.max_request_bytes, timeout_s=settings.body_timeout_s
-        )
+    async with gate.admitted(caller.prefix):
+        body = await sent_json(request, settings)
         reject_unknown(body, ("export",))
         data = base64_field(body.get("export"), "export", code="invalid_template")
         exported = await gate.query(
@@ -90,7 +92,8 @@ async def import_subject(
                 contract_id=runtime.contract.contract_id,
             )
         )
-        checked_subject_id(exported.subject_id)
+        subject = checked_subject_id(exported.subject_id)
+        note_subject(request, runtime.store.pseudonym(caller.tenant, subject))
 
         def work() -> Outcome:
             epoch = runtime.epoch(caller.tenant)
@@ -102,6 +105,7 @@ async def import_subject(
                 enrollment,
                 source=Source(exported.source),
                 photos=exported.photos,
+                by=by(request),
             )
             return Outcome(
                 201 if stored.created else 200,

@@ -1,26 +1,62 @@
-"""Verification: a photo, an embedding or a lifted probe against one subject."""
+"""Verification: a photo, an embedding or a lifted probe against one subject.
 
+The order of a verification, which is what bounds an attacker::
+
+    body and signature read ─▶ locked out, or nonce used? template ─▶ probe, decision
+        ─▶ one transaction: nonce used up, lockout checked and counted, audit line ─▶ answer
+
+No decision leaves before that transaction has committed. So of requests that run at the same time
+no more are answered than of requests that come one after the other.
+"""
+
+import contextlib
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
+import numpy as np
 from fastapi import APIRouter, Request
+from numpy.typing import NDArray
 from starlette.responses import Response
 
 from api.answers import answer
+from api.audit import by
 from api.auth import Caller
-from api.bodies import base64_field, content_type, read_form, read_json, reject_unknown
+from api.bodies import base64_field, content_type, reject_unknown, sent_form, sent_json
 from api.deps import GateDep, RuntimeDep, SubjectDep, Verifies, query_of
 from api.errors import ApiError
+from api.metrics import count_decision, step
 from api.openapi import BODY, EVERY_CALL, PHOTO, VERIFY_BODY, error_responses
 from api.runtime import Runtime
 from api.schemas import VerifyAnswer
+from api.signatures import FIELDS as SIGNATURE_FIELDS
+from api.signatures import checked_nonce
 from api.values import embedding_of, face_policy, one_of
 from templates.errors import ContractMismatch
+from templates.store.attempts import Attempt
+from templates.store.audit_log import By
+from templates.store.lockout import Nonce, Superseded
+from templates.store.tenants import RetiredRotation
 from verify import Decision, StandIn, Verifier
 
 router = APIRouter(prefix="/v1/subjects", tags=["subjects"])
 
+DECISIONS = 3
+"""Times that a probe is decided while others may replace the template before the record; then they
+must wait for it."""
+
 Decide = Callable[[Verifier, bytes | StandIn], Decision]
+
+
+@dataclass(frozen=True)
+class Probe:
+    """What a request asks to be compared: how to decide, and what keeps it from a second use."""
+
+    kind: str
+    decide: Decide
+    nonce: Nonce | None
+
 
 CODES = (
     *EVERY_CALL,
@@ -34,7 +70,6 @@ CODES = (
     "uncalibrated",
     "replayed",
     "locked_out",
-    "rate_limited",
 )
 
 
@@ -57,14 +92,18 @@ async def verify(
     only to keys with `scores`.
     """
     query = query_of(request, ("level", "face"))
-    async with gate.admitted():
-        if content_type(request) == "multipart/form-data":
-            decide = await _photo_probe(request, runtime, query)
-        else:
-            decide = await _sent_probe(request, runtime, caller, query)
-        decision = await gate.compute(lambda: _decide(runtime, caller, subject, decide))
+    async with gate.admitted(caller.prefix):
+        with step("body"):
+            if content_type(request) == "multipart/form-data":
+                probe = await _photo_probe(request, runtime, query)
+            else:
+                probe = await _sent_probe(request, runtime, caller, subject, query)
+        decision = await gate.compute(
+            partial(_decide, runtime, caller, subject, probe, by(request))
+        )
     request.state.log["security_level"] = decision.level
     request.state.log["decision"] = "accept" if decision.accepted else "reject"
+    count_decision(accepted=decision.accepted, level=decision.level, probe=probe.kind)
     body: dict[str, Any] = {
         "decision": "accept" if decision.accepted else "reject",
         "reason": decision.reason,
@@ -78,38 +117,36 @@ async def verify(
     return answer(request, body)
 
 
-async def _photo_probe(request: Request, runtime: Runtime, query: dict[str, str]) -> Decide:
+async def _photo_probe(request: Request, runtime: Runtime, query: dict[str, str]) -> Probe:
     pack = runtime.required_pack()
     settings = runtime.settings
-    form = await read_form(
-        request,
-        max_bytes=settings.max_request_bytes,
-        max_images=1,
-        max_image_bytes=settings.max_image_bytes,
-        timeout_s=settings.body_timeout_s,
-    )
+    form = await sent_form(request, settings, max_images=1)
     photo = form.images("image")[0]
     reject_unknown(form.fields, ("level", "face"))
     level = one_of(form.fields, query, "level")
     policy = face_policy(one_of(form.fields, query, "face"))
 
-    def decide(verifier: Verifier, stored: bytes | StandIn) -> Decision:
-        return verifier.decide_photo(
-            pack, photo, stored, level=level, policy=policy, limits=runtime.image_limits
-        )
+    embedded: list[NDArray[np.float32]] = []
 
-    return decide
+    def decide(verifier: Verifier, stored: bytes | StandIn) -> Decision:
+        if not embedded:  # a probe may be decided more than once
+            with step("photo"):
+                embedded.append(
+                    verifier.embed_photo(pack, photo, policy=policy, limits=runtime.image_limits)
+                )
+        with step("decide"):
+            return verifier.decide_embedding(embedded[0], stored, level=level)
+
+    return Probe("photo", decide, nonce=None)
 
 
 async def _sent_probe(
-    request: Request, runtime: Runtime, caller: Caller, query: dict[str, str]
-) -> Decide:
+    request: Request, runtime: Runtime, caller: Caller, subject: str, query: dict[str, str]
+) -> Probe:
     caller.require("embeddings")
     settings = runtime.settings
-    body = await read_json(
-        request, max_bytes=settings.max_request_bytes, timeout_s=settings.body_timeout_s
-    )
-    reject_unknown(body, ("embedding", "template", "level"))
+    body = await sent_json(request, settings)
+    reject_unknown(body, ("embedding", "template", "level", *SIGNATURE_FIELDS))
     if ("embedding" in body) == ("template" in body):
         raise ApiError(
             "validation_failed", "send exactly one of embedding and template, or a photo"
@@ -117,24 +154,75 @@ async def _sent_probe(
     if "face" in query:
         raise ApiError("validation_failed", "face applies to photos only", {"field": "face"})
     level = one_of(body, query, "level")
+    sent: bytes | NDArray[np.float64]
     if "embedding" in body:
-        embedding = embedding_of(body["embedding"])
-        return lambda verifier, stored: verifier.decide_embedding(embedding, stored, level=level)
-    template = base64_field(body["template"], "template", code="invalid_template")
-    return lambda verifier, stored: verifier.decide_template(template, stored, level=level)
+        kind, sent = "embedding", embedding_of(body["embedding"])
+    else:
+        kind, sent = "template", base64_field(body["template"], "template", code="invalid_template")
+    nonce = checked_nonce(
+        body,
+        sent,
+        key=caller.probe_key,
+        key_prefix=caller.prefix,
+        subject_id=subject,
+        level=level,
+        window_s=settings.probe_window_s,
+    )
+
+    def decide(verifier: Verifier, stored: bytes | StandIn) -> Decision:
+        with step("decide"):
+            if isinstance(sent, bytes):
+                return verifier.decide_template(sent, stored, level=level)
+            return verifier.decide_embedding(sent, stored, level=level)
+
+    return Probe(kind, decide, nonce)
 
 
-def _decide(runtime: Runtime, caller: Caller, subject: str, decide: Decide) -> Decision:
-    # Asked for in either case, so that a subject that does not exist costs no further query.
-    epoch = runtime.epoch(caller.tenant)
-    contract_id = runtime.contract.contract_id
-    found = runtime.store.get(caller.tenant, subject, contract_id=contract_id)
-    if found is None:
-        if caller.sees_enrollment:
-            raise _why_not(runtime, caller.tenant, subject)
-        stand_in = runtime.stand_ins.open(caller.tenant, subject)
-        return decide(runtime.verifier(caller.tenant, epoch), stand_in)
-    return decide(runtime.verifier(caller.tenant, found.record.rotation_epoch), found.wire)
+def _decide(runtime: Runtime, caller: Caller, subject: str, probe: Probe, who: By) -> Decision:
+    """Decide and record; a template that was replaced or erased meanwhile accepts nobody."""
+    attempts, contract_id = runtime.store.attempts, runtime.contract.contract_id
+
+    def decide(attempt: Attempt) -> Decision:
+        return probe.decide(*_compared(runtime, caller, subject, attempt))
+
+    for _ in range(DECISIONS):
+        # A retired rotation: the template was turned into a newer one between the two looks.
+        with contextlib.suppress(Superseded, RetiredRotation):
+            # In one step, which metrics show: it must not tell who is enrolled.
+            with step("store"):
+                attempt = attempts.begin(
+                    caller.tenant, subject, contract_id=contract_id, nonce=probe.nonce
+                )
+                verifier, stored = _compared(runtime, caller, subject, attempt)
+            decision = probe.decide(verifier, stored)
+            with step("record"):
+                attempts.conclude(
+                    caller.tenant,
+                    subject,
+                    accepted=decision.accepted,
+                    template_id=attempt.template_id,
+                    contract_id=contract_id,
+                    level=decision.level,
+                    nonce=probe.nonce,
+                    by=who,
+                )
+            return decision
+    return attempts.decide_alone(
+        caller.tenant, subject, decide, contract_id=contract_id, nonce=probe.nonce, by=who
+    )
+
+
+def _compared(
+    runtime: Runtime, caller: Caller, subject: str, attempt: Attempt
+) -> tuple[Verifier, bytes | StandIn]:
+    """Return the subject's template, or that of nobody, and what compares with it."""
+    template, tenant = attempt.template, caller.tenant
+    if template is not None:
+        return runtime.verifier(tenant, template.record.rotation_epoch), template.wire
+    if caller.sees_enrollment:
+        raise _why_not(runtime, tenant, subject)
+    verifier = runtime.verifier(tenant, attempt.rotation_epoch)
+    return verifier, runtime.stand_ins.open(tenant, subject)
 
 
 def _why_not(runtime: Runtime, tenant: str, subject: str) -> Exception:

@@ -3,6 +3,7 @@
 import os
 from pathlib import Path
 
+from templates.bounded_file import read_at_most
 from templates.errors import DecoyError
 from templates.private_file import replace_private
 
@@ -34,7 +35,7 @@ def read_bounded(path: Path, limit: int) -> bytes:
             size = os.fstat(file.fileno()).st_size
             if size > limit:
                 raise DecoyError(f"{path.name} has {size} bytes; at most {limit} are accepted")
-            data = file.read(limit + 1)
+            data = read_at_most(file, limit)
     except OSError as error:
         raise DecoyError(f"cannot read {path.name}: {error.strerror}") from error
     if len(data) > limit:

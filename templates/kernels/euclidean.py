@@ -91,7 +91,6 @@ def euclidean_subspaces(
     zero, one = every(np.float32(0)), every(np.float32(1))
     smallest = every(np.float32(100) * _EPS)
     limit = every(least * least)
-    spare = np.empty(LANES, dtype=np.float32)
     found = 0
     for i in range(len(mine)):
         for j in range(0, columns, LANES):
@@ -156,5 +155,5 @@ def euclidean_subspaces(
             sound &= less(every(np.float32(4) * _EPS) * size, every(accuracy) * squared)
             found += sound != 0xFFFF
             distance = blend(sound, root(squared), every(np.float32(-1)))
-            put(out, i * stride + j, count - j, distance, spare)
+            put(out, i * stride + j, count - j, distance)
     return found

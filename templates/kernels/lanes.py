@@ -89,6 +89,22 @@ def load(typing: Any, array: Any, index: Any) -> Any:
 
 
 @_primitive
+def load_bytes(typing: Any, array: Any, index: Any) -> Any:
+    """Numbers ``index`` to ``index + 15`` of a flat, contiguous int8 array, as float32."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
+        kind = ir.VectorType(ir.IntType(8), LANES)
+        place = builder.bitcast(builder.gep(data, [arguments[1]]), kind.as_pointer())
+        found = builder.load(place)
+        found.align = 1
+        wide = builder.sext(found, ir.VectorType(ir.IntType(32), LANES))
+        return builder.sitofp(wide, _FLOATS)
+
+    return _LANES(array, types.intp), generate
+
+
+@_primitive
 def store(typing: Any, array: Any, index: Any, value: Any) -> Any:
     """Write sixteen numbers of a flat, contiguous float32 array."""
 
@@ -100,15 +116,20 @@ def store(typing: Any, array: Any, index: Any, value: Any) -> Any:
     return types.none(array, types.intp, _LANES), generate
 
 
+def _spread(builder: Any, value: Any, kind: Any) -> Any:
+    """The same number in all lanes."""
+    undefined = ir.Constant(ir.VectorType(kind, LANES), ir.Undefined)
+    first = builder.insert_element(undefined, value, ir.Constant(ir.IntType(32), 0))
+    order = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
+    return builder.shuffle_vector(first, undefined, order)
+
+
 @_primitive
 def every(typing: Any, value: Any) -> Any:
     """The same float32 number in all lanes."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        undefined = ir.Constant(_FLOATS, ir.Undefined)
-        first = builder.insert_element(undefined, arguments[0], ir.Constant(ir.IntType(32), 0))
-        order = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
-        return builder.shuffle_vector(first, undefined, order)
+        return _spread(builder, arguments[0], ir.FloatType())
 
     return _LANES(types.float32), generate
 
@@ -191,12 +212,33 @@ overload(operator.mul)(_operator("fmul"))
 overload(operator.truediv)(_operator("fdiv"))
 
 
-@inlined
-def put(out: Any, place: int, count: int, value: Lanes, spare: Any) -> None:
-    """Write the first ``count`` lanes, or all; ``spare`` has room for sixteen numbers."""
-    if count >= LANES:
-        store(out, place, value)
-    else:
-        store(spare, 0, value)
-        for lane in range(count):
-            out[place + lane] = spare[lane]
+@_primitive
+def take(typing: Any, counter: Any) -> Any:
+    """Return the one number of an int64 array and add 1 to it, in one step for all threads."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
+        one = ir.Constant(ir.IntType(64), 1)
+        return builder.atomic_rmw("add", data, one, "monotonic")
+
+    return types.int64(counter), generate
+
+
+@_primitive
+def put(typing: Any, array: Any, index: Any, count: Any, value: Any) -> Any:
+    """Write the first ``count`` lanes, or all where there are more, as :func:`store` does."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        place = _address(context, builder, signature.args[0], *arguments[:2])
+        lanes = ir.Constant(ir.VectorType(ir.IntType(64), LANES), list(range(LANES)))
+        wanted = builder.icmp_signed("<", lanes, _spread(builder, arguments[2], ir.IntType(64)))
+        kind = ir.FunctionType(
+            ir.VoidType(), [_FLOATS, _FLOATS.as_pointer(), ir.IntType(32), _FLAGS]
+        )
+        found: Any = cgutils.get_or_insert_function  # untyped
+        write = found(builder.module, kind, f"llvm.masked.store.v{LANES}f32.p0")
+        alignment = ir.Constant(ir.IntType(32), _ALIGNMENT)
+        builder.call(write, [arguments[3], place, alignment, wanted])
+        return context.get_dummy_value()
+
+    return types.none(array, types.intp, types.intp, _LANES), generate

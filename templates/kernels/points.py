@@ -59,7 +59,6 @@ def euclidean_points(
     limit = every(least * least)
     unknown = every(np.float32(-1))
     two = every(np.float32(-2))
-    spare = np.empty(LANES, dtype=np.float32)
     found = 0
     for i in range(len(mine)):
         start = i * (m + 1) * columns
@@ -76,7 +75,7 @@ def euclidean_points(
             known = less(limit, squared) & less(squared, every(OVERFLOW))
             found += known != 0xFFFF
             distance = blend(known, root(squared), unknown)
-            put(out, i * stride + j, count - j, distance, spare)
+            put(out, i * stride + j, count - j, distance)
     return found
 
 
@@ -104,7 +103,6 @@ def spherical_points(
     unknown = every(np.float32(-1))
     two, minus_two = every(np.float32(2)), every(np.float32(-2))
     zero = every(np.float32(0))
-    spare = np.empty(LANES, dtype=np.float32)
     found = 0
     for i in range(len(mine)):
         start = i * (m + 1) * columns
@@ -122,5 +120,5 @@ def spherical_points(
             known = less(limit, distance)
             found += known != 0xFFFF
             distance = blend(known, distance, unknown)
-            put(out, i * stride + j, count - j, distance, spare)
+            put(out, i * stride + j, count - j, distance)
     return found

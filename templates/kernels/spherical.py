@@ -517,7 +517,6 @@ def spherical_subspaces(
     across, down = columns, (m_e + 1) * columns
     if swapped:
         across, down = down, across
-    spare = np.empty(LANES, dtype=np.float32)
     places = np.zeros(LANES, dtype=np.int64)
     held = found = 0
     zero = every(np.float32(0))
@@ -561,7 +560,7 @@ def spherical_subspaces(
             known = less(every(least), distance)
             place = i * stride + j
             distance = blend(known, distance, every(np.float32(-1)))
-            put(out, place, count - j, distance, spare)
+            put(out, place, count - j, distance)
             found += known != _ALL
             if proven == _ALL:
                 continue

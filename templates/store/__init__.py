@@ -4,11 +4,16 @@ Everything that a secret could be read from is encrypted; see ``docs/storage.md`
 """
 
 from templates.store.api_keys import ApiKey, NewApiKey, Right, probe_key
+from templates.store.attempts import Attempt, AttemptsStatus
+from templates.store.audit_chain import Anchor, Line, Problem, Verification
+from templates.store.audit_log import AuditLog, BrokenAuditLog, By, Entry
 from templates.store.erasure import Erasure
 from templates.store.idempotency import Answer, Claim, IdempotencyConflict
 from templates.store.identifiers import InvalidIdentifier, UnknownTenant
+from templates.store.lockout import LockedOut, LockoutPolicy, Nonce, Replayed, Superseded
 from templates.store.receipts import Receipt, verify_receipt
 from templates.store.repository import TemplateStore
+from templates.store.retention import Retention
 from templates.store.subjects import (
     Source,
     StoredTemplate,
@@ -16,17 +21,33 @@ from templates.store.subjects import (
     SubjectRecord,
     SubjectTemplate,
 )
-from templates.store.tenants import RotationKey, Tenant
+from templates.store.tenant_erasure import TenantErasure
+from templates.store.tenants import RetiredRotation, RotationKey, Tenant
 
 __all__ = [
+    "Anchor",
     "Answer",
     "ApiKey",
+    "Attempt",
+    "AttemptsStatus",
+    "AuditLog",
+    "BrokenAuditLog",
+    "By",
     "Claim",
+    "Entry",
     "Erasure",
     "IdempotencyConflict",
     "InvalidIdentifier",
+    "Line",
+    "LockedOut",
+    "LockoutPolicy",
     "NewApiKey",
+    "Nonce",
+    "Problem",
     "Receipt",
+    "Replayed",
+    "Retention",
+    "RetiredRotation",
     "Right",
     "RotationKey",
     "Source",
@@ -34,9 +55,12 @@ __all__ = [
     "SubjectPage",
     "SubjectRecord",
     "SubjectTemplate",
+    "Superseded",
     "TemplateStore",
     "Tenant",
+    "TenantErasure",
     "UnknownTenant",
+    "Verification",
     "probe_key",
     "verify_receipt",
 ]

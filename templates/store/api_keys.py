@@ -23,9 +23,10 @@ from sqlalchemy.engine import Connection
 
 from templates.errors import StoreError, StoreUnavailable
 from templates.sealing import MasterKeyring, derive_key, sealed_key_id
+from templates.store.audit_log import PROGRAM, TENANT_ERASE, AuditLog, By, Entry
 from templates.store.database import Database
 from templates.store.identifiers import Clock, UnknownTenant
-from templates.store.schema import ApiKeyRow, TenantRow
+from templates.store.schema import ApiKeyRow, AuditRow, TenantRow
 from templates.store.tenants import Tenants
 
 PROBE_KEY_PURPOSE = "api-key-probe-key"
@@ -79,11 +80,17 @@ class ApiKeys:
     """Repository of API keys."""
 
     def __init__(
-        self, database: Database, keyring: MasterKeyring, tenants: Tenants, clock: Clock
+        self,
+        database: Database,
+        keyring: MasterKeyring,
+        tenants: Tenants,
+        audit_log: AuditLog,
+        clock: Clock,
     ) -> None:
         self._database = database
         self._keyring = keyring
         self._tenants = tenants
+        self._audit_log = audit_log
         self._clock = clock
 
     def create(
@@ -93,8 +100,9 @@ class ApiKeys:
         *,
         label: str = "",
         expires_at: datetime | None = None,
+        by: By = PROGRAM,
     ) -> NewApiKey:
-        """Make a key of an existing tenant.
+        """Make a key of an existing tenant; the audit log names it by its prefix.
 
         Raises
         ------
@@ -104,24 +112,34 @@ class ApiKeys:
         granted = _rights(rights)
         if len(label) > MAX_LABEL or not label.isprintable():
             raise StoreError(f"a label has at most {MAX_LABEL} printable characters")
+        self._audit_log.prepare()
         return self._database.write(
-            lambda each: self._insert(each, tenant, granted, label=label, expires_at=expires_at)
+            lambda each: self._insert(
+                each, tenant, granted, label=label, expires_at=expires_at, by=by
+            )
         )
 
     def bootstrap(
-        self, *, tenant: str = "default", rights: Iterable[Right] = tuple(Right)
+        self,
+        *,
+        tenant: str = "default",
+        rights: Iterable[Right] = tuple(Right),
+        by: By = PROGRAM,
     ) -> NewApiKey | None:
         """Make the first tenant and the first key, once in the life of a store.
 
         Of any number of processes that call this at once, one gets the key and the others None.
         """
         granted = _rights(rights)
+        self._audit_log.prepare()
 
         def work(connection: Connection) -> NewApiKey | None:
-            if connection.execute(sa.select(ApiKeyRow.id).limit(1)).first() is not None:
+            if _had_keys(connection):
                 return None
             self._tenants.ensure(connection, tenant)
-            return self._insert(connection, tenant, granted, label="bootstrap", expires_at=None)
+            return self._insert(
+                connection, tenant, granted, label="bootstrap", expires_at=None, by=by
+            )
 
         return self._database.write(work, lock="bootstrap")
 
@@ -134,9 +152,7 @@ class ApiKeys:
         match = _TOKEN.fullmatch(token)
         prefix = match[1] if match else ""
         row = self._database.read(
-            lambda each: each.execute(
-                _KEYS.add_columns(ApiKeyRow.token_hash).where(ApiKeyRow.prefix == prefix)
-            ).one_or_none()
+            lambda each: each.execute(_KEY_AND_HASH, {"prefix": prefix}).one_or_none()
         )
         expected = _NOBODYS_HASH if row is None else row.token_hash
         same = hmac.compare_digest(_token_hash(token), expected)
@@ -163,14 +179,86 @@ class ApiKeys:
         rows = self._database.read(lambda each: each.execute(query).all())
         return tuple(_api_key(row) for row in rows)
 
-    def revoke(self, prefix: str) -> bool:
-        """Revoke a key for good; True unless it was unknown or revoked before."""
-        statement = (
-            sa.update(ApiKeyRow)
-            .where(ApiKeyRow.prefix == prefix, ApiKeyRow.revoked_at.is_(None))
-            .values(revoked_at=self._clock())
-        )
-        return self._database.write(lambda each: each.execute(statement).rowcount == 1)
+    def revoke(self, prefix: str, *, by: By = PROGRAM) -> bool:
+        """Revoke a key for good; True unless it was unknown or revoked before.
+
+        An unknown prefix does not get into the audit log: it may be a token that was taken for one.
+        """
+        self._audit_log.prepare()
+
+        def work(connection: Connection) -> bool:
+            tenant = connection.execute(
+                sa.select(TenantRow.name)
+                .join(ApiKeyRow, ApiKeyRow.tenant_id == TenantRow.id)
+                .where(ApiKeyRow.prefix == prefix)
+            ).scalar_one_or_none()
+            statement = (
+                sa.update(ApiKeyRow)
+                .where(ApiKeyRow.prefix == prefix, ApiKeyRow.revoked_at.is_(None))
+                .values(revoked_at=self._clock())
+            )
+            revoked = connection.execute(statement).rowcount == 1
+            if tenant is None:
+                entry = Entry("key-revoke", "unknown_key", by)
+            else:
+                outcome = "revoked" if revoked else "revoked_before"
+                entry = Entry("key-revoke", outcome, by, tenant, detail=prefix)
+            self._audit_log.append(connection, entry)
+            return revoked
+
+        return self._database.write(work)
+
+    def replace(self, prefix: str, *, grace: timedelta, by: By = PROGRAM) -> NewApiKey | None:
+        """Make a key in place of another one, which stays valid for a while.
+
+        The new key has the tenant, rights, label and expiry of the old one, so replacing a key
+        does not prolong what was granted.
+
+        Parameters
+        ----------
+        prefix
+            Of the key that goes.
+        grace
+            How long it stays valid, for its users to change over; never longer than before.
+        by
+            Who asks for it, for the audit log.
+
+        Returns
+        -------
+        NewApiKey or None
+            None if there is no valid key of this prefix.
+        """
+        if grace < timedelta(0):
+            raise StoreError("the time that an old key stays valid is nothing or more")
+        self._audit_log.prepare()
+
+        def work(connection: Connection) -> NewApiKey | None:
+            now = self._clock()
+            row = connection.execute(
+                _KEYS.where(ApiKeyRow.prefix == prefix).with_for_update(of=ApiKeyRow)
+            ).one_or_none()
+            old = None if row is None else _api_key(row)
+            if old is None or not old.is_valid_at(now):
+                return None
+            connection.execute(
+                sa.update(ApiKeyRow)
+                .where(ApiKeyRow.id == old.id)
+                .values(expires_at=_sooner(old.expires_at, now, grace))
+            )
+            new = self._insert(
+                connection,
+                old.tenant,
+                old.rights,
+                label=old.label,
+                expires_at=old.expires_at,
+                by=by,
+            )
+            self._audit_log.append(
+                connection, Entry("key-replace", "replaced", by, old.tenant, detail=prefix)
+            )
+            return new
+
+        return self._database.write(work)
 
     def probe_key(self, prefix: str) -> bytes:
         """Open the key that probes of this API key are signed with; see :func:`probe_key`."""
@@ -195,6 +283,7 @@ class ApiKeys:
         *,
         label: str,
         expires_at: datetime | None,
+        by: By,
     ) -> NewApiKey:
         tenant_id = connection.execute(
             sa.select(TenantRow.id).where(TenantRow.name == tenant)
@@ -219,6 +308,9 @@ class ApiKeys:
             )
         )
         key = ApiKey(key_id, prefix, tenant, rights, label, now, expires_at, None, None)
+        self._audit_log.append(
+            connection, Entry("key-create", "created", by, tenant, detail=prefix)
+        )
         return NewApiKey(key=key, token=token)
 
     def _note_use(self, key: ApiKey, now: datetime) -> None:
@@ -269,6 +361,25 @@ _KEYS = sa.select(
     ApiKeyRow.revoked_at,
     ApiKeyRow.last_used_at,
 ).join(TenantRow, TenantRow.id == ApiKeyRow.tenant_id)
+_KEY_AND_HASH = _KEYS.add_columns(ApiKeyRow.token_hash).where(
+    ApiKeyRow.prefix == sa.bindparam("prefix")
+)
+
+
+def _had_keys(connection: Connection) -> bool:
+    """Whether there are keys, or were some that went with their tenant."""
+    keys = sa.select(ApiKeyRow.id).limit(1)
+    erased = sa.select(AuditRow.sequence).where(AuditRow.action == TENANT_ERASE).limit(1)
+    return any(connection.execute(query).first() is not None for query in (keys, erased))
+
+
+def _sooner(expires_at: datetime | None, now: datetime, grace: timedelta) -> datetime | None:
+    """When a key expires that has only so long left, and not longer than it had."""
+    try:
+        limit = now + grace
+    except OverflowError:
+        return expires_at
+    return limit if expires_at is None else min(expires_at, limit)
 
 
 def _api_key(columns: Any) -> ApiKey:

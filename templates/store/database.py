@@ -24,7 +24,7 @@ from sqlalchemy.engine import URL, Connection, Engine, make_url
 from sqlalchemy.exc import ArgumentError, DBAPIError, SQLAlchemyError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 
-from templates.errors import StoreError, StoreUnavailable
+from templates.errors import StoreBusy, StoreError, StoreUnavailable
 
 T = TypeVar("T")
 
@@ -96,6 +96,48 @@ class Database:
             Seconds to wait for a lock that another write holds; the timeout by default, 0 for
             as long as it takes. (PostgreSQL only.)
         """
+        limit = {"limit": self._lock_limit(wait)}
+        if lock is None:
+            return self._transaction(work, _BESIDE, limit)
+        return self._transaction(work, _BESIDE_UNDER, {**limit, "lock": _lock_number(lock)})
+
+    def write_alone(self, work: Callable[[Connection], T]) -> T:
+        """:meth:`write`, while no other write of any process runs.
+
+        It begins when the writes that are under way have ended, and those that come wait for it:
+        for short work only.
+
+        Raises
+        ------
+        StoreUnavailable
+            If a write that is under way takes longer than the timeout.
+        """
+        # On SQLite the transaction itself waits for the other writers.
+        return self._transaction(work, _ALONE, {"limit": self._lock_limit(None)})
+
+    def try_locks(self, connection: Connection, names: Sequence[str]) -> list[bool]:
+        """Take locks of :meth:`write` until the end of a transaction, where they are free.
+
+        Parameters
+        ----------
+        connection
+            Of a write.
+        names
+            At most a thousand.
+
+        Returns
+        -------
+        list of bool
+            Whether each was free. On SQLite all are: no other write runs.
+        """
+        if self.is_sqlite or not names:
+            return [True] * len(names)
+        attempts = (sa.func.pg_try_advisory_xact_lock(_lock_number(name)) for name in names)
+        return list(connection.execute(sa.select(*attempts)).one())
+
+    def _transaction(
+        self, work: Callable[[Connection], T], locks: sa.Executable, names: dict[str, Any]
+    ) -> T:
         here = self._here()
         for attempt in range(1, _ATTEMPTS + 1):
             try:
@@ -104,7 +146,7 @@ class Database:
                     with here.writing, here.writers.begin() as connection:
                         return work(connection)
                 with here.writers.begin() as connection:
-                    connection.execute(self._locked(lock, wait))
+                    connection.execute(locks, names)
                     return work(connection)
             except DBAPIError as error:
                 if attempt < _ATTEMPTS and _state(error.orig) in _RETRIED_STATES:
@@ -141,11 +183,27 @@ class Database:
             raise _translated(error) from None
         return not busy
 
-    def try_purge_log(self) -> bool:
+    def try_purge_log(self, *, wait: float | None = None) -> bool:
         """:meth:`purge_log` after a commit: what is written is written, so this never raises."""
         with contextlib.suppress(StoreError):
-            return self.purge_log()
+            return self.purge_log(wait=wait)
         return False
+
+    def remove(self, table: type[Any], condition: sa.ColumnElement[bool], *, batch: int) -> int:
+        """Remove the rows of a mapped table that meet a condition; returns how many.
+
+        In small transactions of `batch` rows, so that after a long pause no write waits for all
+        of it.
+        """
+        primary_key = sa.inspect(table).primary_key
+        some = sa.select(*primary_key).where(condition).limit(batch)
+        # The condition twice: a row that changed since it was selected is looked at again.
+        statement = sa.delete(table).where(condition, sa.tuple_(*primary_key).in_(some))
+        removed = 0
+        # Read first: a round that finds nothing, and most do, takes no lock.
+        while self.read(lambda each: each.execute(some).first()) is not None:
+            removed += self.write(lambda each: each.execute(statement).rowcount)
+        return removed
 
     def compact(self, tables: Sequence[str]) -> None:
         """Rewrite tables (PostgreSQL) or the file (SQLite) without what was removed from them."""
@@ -185,28 +243,10 @@ class Database:
         StoreUnavailable
             If one takes longer than the timeout.
         """
-        here = self._here()
-        try:
-            with here.writing, here.writers.begin() as connection:
-                # On SQLite the transaction itself waits for the other writers.
-                if not self.is_sqlite:
-                    alone = sa.func.pg_advisory_xact_lock(_lock_number(_WRITING))
-                    connection.execute(self._lock_limit(None))
-                    connection.execute(sa.select(alone))
-        except _DATABASE_ERRORS as error:
-            raise _translated(error) from None
+        self.write_alone(lambda _: None)
 
-    def _lock_limit(self, wait: float | None) -> sa.Select[Any]:
-        milliseconds = str(round(1000 * (self._timeout if wait is None else wait)))
-        return sa.select(sa.func.set_config("lock_timeout", milliseconds, True))
-
-    def _locked(self, lock: str | None, wait: float | None) -> sa.Select[Any]:
-        # PostgreSQL takes the columns of this in their order: the limit holds for the locks.
-        shared = sa.func.pg_advisory_xact_lock_shared(_lock_number(_WRITING))
-        statement = self._lock_limit(wait).add_columns(shared)
-        if lock is None:
-            return statement
-        return statement.add_columns(sa.func.pg_advisory_xact_lock(_lock_number(lock)))
+    def _lock_limit(self, wait: float | None) -> str:
+        return str(round(1000 * (self._timeout if wait is None else wait)))
 
     def _here(self) -> "_Process":
         if self._process.pid != os.getpid():
@@ -341,6 +381,16 @@ def _lock_number(name: str) -> int:
     return int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big", signed=True)
 
 
+# Made once: building a statement costs more than running it. PostgreSQL takes the columns of one in
+# their order, so the limit, in milliseconds, holds for the locks.
+_LIMIT = sa.func.set_config("lock_timeout", sa.bindparam("limit", type_=sa.String), True)
+_ALONE = sa.select(_LIMIT, sa.func.pg_advisory_xact_lock(_lock_number(_WRITING)))
+_BESIDE = sa.select(_LIMIT, sa.func.pg_advisory_xact_lock_shared(_lock_number(_WRITING)))
+_BESIDE_UNDER = _BESIDE.add_columns(
+    sa.func.pg_advisory_xact_lock(sa.bindparam("lock", type_=sa.BigInteger))
+)
+
+
 def _state(error: BaseException | None) -> str:
     return getattr(error, "sqlstate", None) or ""
 
@@ -348,7 +398,7 @@ def _state(error: BaseException | None) -> str:
 def _translated(error: Exception) -> StoreError:
     """Say what went wrong without the statement, its parameters or any row."""
     if isinstance(error, PoolTimeout):
-        return StoreUnavailable("all connections to the database are busy")
+        return StoreBusy("all connections to the database are busy")
     lost = isinstance(error, DBAPIError) and error.connection_invalidated
     cause = error.orig if isinstance(error, DBAPIError) else error
     name = type(cause).__name__
@@ -359,7 +409,7 @@ def _translated(error: Exception) -> StoreError:
         if state == "42P01":
             return StoreError("a table is missing: run `veilface db upgrade`")
         if state == "55P03":
-            return StoreUnavailable("another write holds the same rows for too long")
+            return StoreBusy("another write holds the same rows for too long")
         if lost or state[:2] in _UNAVAILABLE_CLASSES or _without_answer(cause):
             return StoreUnavailable(f"the PostgreSQL server does not answer ({name} {state})")
         return StoreError(f"PostgreSQL refused the statement ({name} {state})")

@@ -1,7 +1,9 @@
 """Secrets of the whole deployment, made once, and the check of the master key."""
 
+import functools
 import os
 import threading
+from typing import Any
 
 import sqlalchemy as sa
 from sqlalchemy.dialects.postgresql import insert as postgresql_insert
@@ -44,14 +46,45 @@ class Secrets:
             If the master key that wrapped it is missing.
         """
         checked_opaque_id(name, what="secret's name")
+        # Without the lock: a transaction that needs a known secret must not wait for a thread
+        # that obtains another one, and so waits for that transaction.
+        if (known := self._known.get(name)) is not None:
+            return known
         with self._lock:
             if name not in self._known:
                 self._known[name] = self._database.write(lambda each: self._obtain(each, name))
             return self._known[name]
 
+    def existing(self, name: str) -> bytes | None:
+        """Return what :meth:`get` returns where it was made before, and None where it was not.
+
+        Raises
+        ------
+        SealError
+            If the master key that wrapped it is missing.
+        """
+        if (known := self._known.get(name)) is not None:
+            return known
+        found = self._database.read(lambda each: self._read(each, name))
+        if found is not None:
+            with self._lock:
+                self._known[name] = found
+        return found
+
+    def make(self, connection: Connection, name: str) -> bytes | None:
+        """Make a secret inside a transaction that is open already; None if there is one."""
+        checked_opaque_id(name, what="secret's name")
+        return self._read(connection, name) if self._insert(connection, name) else None
+
     def _obtain(self, connection: Connection, name: str) -> bytes:
+        self._insert(connection, name)
+        value = self._read(connection, name)
+        assert value is not None, "it was there, or was inserted"  # noqa: S101
+        return value
+
+    def _insert(self, connection: Connection, name: str) -> bool:
         fresh = self._keyring.seal(os.urandom(32), purpose=SECRET_PURPOSE, bound_to=[name])
-        insert_once(
+        return insert_once(
             connection,
             SecretRow,
             name=name,
@@ -59,9 +92,13 @@ class Secrets:
             wrapping_key=sealed_key_id(fresh),
             created_at=self._clock(),
         )
+
+    def _read(self, connection: Connection, name: str) -> bytes | None:
         wrapped = connection.execute(
             sa.select(SecretRow.wrapped_value).where(SecretRow.name == name)
-        ).scalar_one()
+        ).scalar_one_or_none()
+        if wrapped is None:
+            return None
         return self._keyring.open(wrapped, purpose=SECRET_PURPOSE, bound_to=[name])
 
     def __repr__(self) -> str:
@@ -70,10 +107,18 @@ class Secrets:
 
 def insert_once(connection: Connection, table: type[Base], **values: object) -> bool:
     """Insert a row unless its key is taken; True if it was inserted."""
-    insert = sqlite_insert if connection.dialect.name == "sqlite" else postgresql_insert
-    statement = insert(table).values(**values).on_conflict_do_nothing()
+    statement = _insert_once(connection.dialect.name, table)
+    return connection.execute(statement, values).first() is not None
+
+
+@functools.cache
+def _insert_once(dialect: str, table: type[Base]) -> sa.Executable:
+    insert: Any = sqlite_insert if dialect == "sqlite" else postgresql_insert
     # The inserted row is asked for, because drivers do not agree on the row count here.
-    return connection.execute(statement.returning(sa.literal(1))).first() is not None
+    statement: sa.Executable = (
+        insert(table.__table__).on_conflict_do_nothing().returning(sa.literal(1))
+    )
+    return statement
 
 
 def mark_master_key(database: Database, keyring: MasterKeyring, clock: Clock) -> None:

@@ -158,20 +158,9 @@ class Idempotency:
         self._database.write(lambda each: each.execute(statement))
 
     def expire(self) -> int:
-        """Remove records that are older than a day; returns how many.
-
-        In small transactions, so that after a long pause no write waits for all of it.
-        """
-        primary_key = (IdempotencyRow.tenant_id, IdempotencyRow.actor, IdempotencyRow.key_hash)
-        expired = (
-            sa.select(*primary_key).where(IdempotencyRow.expires_at <= self._clock()).limit(BATCH)
-        )
-        statement = sa.delete(IdempotencyRow).where(sa.tuple_(*primary_key).in_(expired))
-        removed = 0
-        # Read first: a round that finds nothing, and most do, takes no lock.
-        while self._database.read(lambda each: each.execute(expired).first()) is not None:
-            removed += self._database.write(lambda each: each.execute(statement).rowcount)
-        return removed
+        """Remove records that are older than a day; returns how many."""
+        expired = IdempotencyRow.expires_at <= self._clock()
+        return self._database.remove(IdempotencyRow, expired, batch=BATCH)
 
 
 def _is(claim: Claim) -> tuple[sa.ColumnElement[bool], ...]:

@@ -3,7 +3,7 @@
 A receipt is a canonical JSON text (``templates.canonical``) and its Ed25519 signature (RFC 8032).
 It names the subject by a pseudonym, HMAC-SHA256 of tenant and subject id under a key of the
 deployment: whoever holds the subject id and asks the deployment can find the receipt, nobody else
-learns whom it is about.
+learns whom it is about. The receipt of a whole tenant is of another kind, and names the tenant.
 """
 
 import base64
@@ -27,7 +27,8 @@ from templates.store.deployment import Secrets
 PSEUDONYM_SECRET = "pseudonym"  # noqa: S105 - a name, not a secret
 RECEIPT_SECRET = "receipt-signing"  # noqa: S105
 
-_KIND = "veilface-erasure-receipt"
+SUBJECT_KIND = "veilface-erasure-receipt"
+TENANT_KIND = "veilface-tenant-erasure-receipt"
 _VERSION = 1
 
 
@@ -63,15 +64,46 @@ class Erased:
 
 
 @dataclass(frozen=True)
+class ErasedTenant:
+    """What the erasure of a tenant removed, in numbers of records.
+
+    Attributes
+    ----------
+    subjects, templates, data_keys
+        A data key is a column of the subject's row.
+    rotation_keys
+        Keys of the tenant's rotation, one for each epoch that was left.
+    api_keys
+        API keys, those that were revoked or had expired before included.
+    failed_attempts, idempotency_records, nonces
+        Records of lockout, of repeated writes and of signed probes.
+    """
+
+    subjects: int
+    templates: int
+    data_keys: int
+    rotation_keys: int
+    api_keys: int
+    failed_attempts: int
+    idempotency_records: int
+    nonces: int
+
+    @property
+    def items(self) -> list[dict[str, Any]]:
+        """Every kind of record with its count, in the order above."""
+        return [{"item": each.name, "count": getattr(self, each.name)} for each in fields(self)]
+
+
+@dataclass(frozen=True)
 class Receipt:
-    """Proof that a subject's data was erased, or that none was held.
+    """Proof that the data of a subject or of a tenant was erased, or that none was held.
 
     Attributes
     ----------
     body
-        Canonical JSON: kind, version, receipt_id, tenant, subject (pseudonym), erased_at, held,
-        contract_id (null where nothing was held), erased (list of item and count), signing_key
-        (:func:`key_fingerprint`).
+        Canonical JSON: kind, version, receipt_id, tenant, erased_at, held, erased (list of item
+        and count), signing_key (:func:`key_fingerprint`). Of a subject also subject (pseudonym) and
+        contract_id (null where nothing was held); of a tenant also rotation_epoch, the last one.
     signature
         64 bytes, Ed25519 over the UTF-8 bytes of `body`.
     """
@@ -87,7 +119,7 @@ class Receipt:
 
     @property
     def held(self) -> bool:
-        """Whether there was a template to erase."""
+        """Whether there was a template, or a tenant, to erase."""
         return bool(self.claims["held"])
 
     def to_json(self) -> dict[str, Any]:
@@ -124,20 +156,40 @@ class ReceiptSigner:
         return self._private().public_key().public_bytes_raw()
 
     def sign(self, *, tenant: str, pseudonym: str, erased: Erased, erased_at: datetime) -> Receipt:
-        """Write and sign a receipt, with a random id of its own."""
+        """Write and sign the receipt of a subject, with a random id of its own."""
+        return self._signed(
+            SUBJECT_KIND,
+            erased_at,
+            tenant=tenant,
+            subject=pseudonym,
+            held=erased.contract_id is not None,
+            contract_id=erased.contract_id,
+            erased=erased.items,
+        )
+
+    def sign_tenant(
+        self, *, tenant: str, rotation_epoch: int, erased: ErasedTenant, erased_at: datetime
+    ) -> Receipt:
+        """Write and sign the receipt of a tenant, with a random id of its own."""
+        return self._signed(
+            TENANT_KIND,
+            erased_at,
+            tenant=tenant,
+            held=True,
+            rotation_epoch=rotation_epoch,
+            erased=erased.items,
+        )
+
+    def _signed(self, kind: str, erased_at: datetime, **claims: Any) -> Receipt:
         private = self._private()
         body = canonical_json(
             {
-                "kind": _KIND,
+                "kind": kind,
                 "version": _VERSION,
                 "receipt_id": uuid.uuid4().hex,
-                "tenant": tenant,
-                "subject": pseudonym,
                 "erased_at": erased_at.isoformat(),
-                "held": erased.contract_id is not None,
-                "contract_id": erased.contract_id,
-                "erased": erased.items,
                 "signing_key": key_fingerprint(private.public_key().public_bytes_raw()),
+                **claims,
             }
         )
         return Receipt(body.decode(), private.sign(body))
@@ -151,8 +203,16 @@ def key_fingerprint(public_key: bytes) -> str:
     return hashlib.sha256(public_key).hexdigest()[:16]
 
 
+def tenant_receipt_name(tenant: str) -> str:
+    """Column ``pseudonym`` of a tenant's receipts: no subject's, since those are keyed.
+
+    Not secret: the receipt itself names the tenant.
+    """
+    return hashlib.sha256(encode_parts("tenant erasure", tenant)).hexdigest()
+
+
 def verify_receipt(receipt: Receipt, public_key: bytes) -> dict[str, Any]:
-    """Check a receipt's signature and form, and return its claims.
+    """Check the signature and the form of a subject's or a tenant's receipt; return its claims.
 
     Raises
     ------
@@ -174,6 +234,10 @@ def verify_receipt(receipt: Receipt, public_key: bytes) -> dict[str, Any]:
         claims = receipt.claims
     except (ValueError, RecursionError):
         raise StoreError("the receipt's body is not JSON") from None
-    if not isinstance(claims, dict) or claims.get("kind") != _KIND or claims.get("version") != 1:
+    if (
+        not isinstance(claims, dict)
+        or claims.get("kind") not in (SUBJECT_KIND, TENANT_KIND)
+        or claims.get("version") != _VERSION
+    ):
         raise StoreError("the signed text is not an erasure receipt of version 1")
     return claims

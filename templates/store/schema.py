@@ -4,14 +4,16 @@ Whatever is a secret is a sealed blob, and beside each blob that a master key se
 of that key (``wrapping_key``), so that a rotation finds the rows it still has to re-wrap. Rows
 that must outlive a subject (receipts, audit lines) name it by a keyed pseudonym only.
 
-Some columns have their place here and their writer in the service's abuse and retention work:
-``failed_attempts``, ``used_nonces``, ``audit_log`` and ``subjects.last_used_at``.
+What is not drawn here: triggers that refuse to change or remove a line of ``audit_log``
+(migration 0002). A migration that rebuilds that table on SQLite has to make them again.
 """
 
 from datetime import UTC, datetime
 
 from sqlalchemy import (
+    JSON,
     BigInteger,
+    Boolean,
     DateTime,
     Dialect,
     ForeignKey,
@@ -23,6 +25,7 @@ from sqlalchemy import (
     Text,
     TypeDecorator,
     UniqueConstraint,
+    true,
 )
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
@@ -88,6 +91,18 @@ class TenantRow(Base):
     created_at: Mapped[datetime] = mapped_column(UtcDateTime)
 
 
+class TenantErasureRow(Base):
+    """A tenant that is being erased: how many records of each kind are gone so far."""
+
+    __tablename__ = "tenant_erasures"
+
+    tenant_id: Mapped[str] = mapped_column(
+        UUID_HEX, ForeignKey("tenants.id", ondelete="CASCADE"), primary_key=True
+    )
+    begun_at: Mapped[datetime] = mapped_column(UtcDateTime)
+    removed: Mapped[dict[str, int]] = mapped_column(JSON)
+
+
 class RotationKeyRow(Base):
     """The key of a tenant's rotation, one row for each epoch that templates still belong to."""
 
@@ -130,6 +145,7 @@ class SubjectRow(Base):
     __table_args__ = (
         UniqueConstraint("tenant_id", "subject_id"),
         Index("ix_subjects_wrapping_key", "wrapping_key"),
+        Index("ix_subjects_updated_at_id", "updated_at", "id"),
     )
 
     id: Mapped[str] = mapped_column(UUID_HEX, primary_key=True)
@@ -163,7 +179,10 @@ class TemplateRow(Base):
 
 
 class FailedAttemptsRow(Base):
-    """Failed verifications of a subject, enrolled or not, and until when it is locked."""
+    """Failed verifications of a subject, enrolled or not, and until when it is locked.
+
+    `known` says whether it was enrolled at the last one.
+    """
 
     __tablename__ = "failed_attempts"
 
@@ -176,6 +195,7 @@ class FailedAttemptsRow(Base):
     last_failed_at: Mapped[datetime] = mapped_column(UtcDateTime)
     locked_until: Mapped[datetime | None] = mapped_column(UtcDateTime)
     disabled_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
+    known: Mapped[bool] = mapped_column(Boolean, server_default=true())
 
 
 class UsedNonceRow(Base):
@@ -236,8 +256,23 @@ class AuditRow(Base):
     pseudonym: Mapped[str | None] = mapped_column(PSEUDONYM, index=True)
     outcome: Mapped[str] = mapped_column(String(64))
     request_id: Mapped[str | None] = mapped_column(String(64))
+    detail: Mapped[str | None] = mapped_column(String(64))
     previous_hash: Mapped[bytes] = mapped_column(LargeBinary(32))
     hash: Mapped[bytes] = mapped_column(LargeBinary(32))
+
+
+class AuditHeadRow(Base):
+    """One row: number and hash of the audit log's last line, and a MAC of both.
+
+    A line is added under the lock of this row.
+    """
+
+    __tablename__ = "audit_head"
+
+    id: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=False)
+    sequence: Mapped[int] = mapped_column(SERIAL)
+    hash: Mapped[bytes] = mapped_column(LargeBinary(32))
+    mac: Mapped[bytes] = mapped_column(LargeBinary(32))
 
 
 class SecretRow(Base):

@@ -11,8 +11,9 @@ from typing import Any
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
-from templates.errors import SealError, StoreError
+from templates.errors import SealError, StoreBusy, StoreError
 from templates.sealing import MasterKeyring, sealed_key_id
+from templates.store.audit_log import PROGRAM, AuditLog, By, Entry
 from templates.store.database import Database
 from templates.store.envelope import Envelope, Owner, close_envelope, open_envelope
 from templates.store.identifiers import (
@@ -22,7 +23,8 @@ from templates.store.identifiers import (
     checked_opaque_id,
     checked_subject_id,
 )
-from templates.store.schema import SubjectRow, TemplateRow, TenantRow
+from templates.store.receipts import ReceiptSigner
+from templates.store.schema import FailedAttemptsRow, SubjectRow, TemplateRow, TenantRow
 
 MAX_WIRE_BYTES = 4 * 1024 * 1024  # a float32 template of n = 4096, m = 128 has 2.1 MB
 MAX_PAGE = 1000
@@ -81,9 +83,18 @@ class SubjectPage:
 class Subjects:
     """Repository of subjects."""
 
-    def __init__(self, database: Database, keyring: MasterKeyring, clock: Clock) -> None:
+    def __init__(
+        self,
+        database: Database,
+        keyring: MasterKeyring,
+        signer: ReceiptSigner,
+        audit_log: AuditLog,
+        clock: Clock,
+    ) -> None:
         self._database = database
         self._keyring = keyring
+        self._signer = signer
+        self.audit_log = audit_log
         self._clock = clock
 
     def put(
@@ -100,6 +111,7 @@ class Subjects:
         photos: int,
         template_id: str | None = None,
         rotation_epoch: int | None = None,
+        by: By = PROGRAM,
     ) -> StoredTemplate:
         """Store a template, or replace the one there is, in one transaction.
 
@@ -115,6 +127,9 @@ class Subjects:
             Made here when not given.
         rotation_epoch
             Epoch of the tenant's rotation that the template is in; the current one by default.
+            Another one is refused: its key is, or will be, dropped.
+        by
+            Who enrolls, for the audit log.
 
         Raises
         ------
@@ -132,10 +147,14 @@ class Subjects:
             raise StoreError(
                 f"a template has 1 to {MAX_WIRE_BYTES} wire bytes, this has {len(wire)}"
             )
+        pseudonym = self._signer.pseudonym(tenant, subject_id)
+        self.audit_log.prepare()
 
         def work(connection: Connection) -> bool:
             tenant_id, current_epoch = tenant_row(connection, tenant)
             epoch = current_epoch if rotation_epoch is None else rotation_epoch
+            if epoch != current_epoch:
+                raise StoreBusy("the tenant's rotation was renewed meanwhile; send it again")
             now = self._clock()
             known = subject_row_id(connection, tenant_id, subject_id)
             subject_pk = known or uuid.uuid4().hex
@@ -155,6 +174,15 @@ class Subjects:
                         created_at=now,
                         **key_columns,
                     )
+                )
+                # A count of failures from before goes when the subject goes, and not earlier.
+                connection.execute(
+                    sa.update(FailedAttemptsRow)
+                    .where(
+                        FailedAttemptsRow.tenant_id == tenant_id,
+                        FailedAttemptsRow.pseudonym == pseudonym,
+                    )
+                    .values(known=True)
                 )
             else:
                 connection.execute(
@@ -176,6 +204,8 @@ class Subjects:
                     created_at=now,
                 )
             )
+            outcome = "created" if known is None else "replaced"
+            self.audit_log.append(connection, Entry("enroll", outcome, by, tenant, pseudonym))
             return known is None
 
         created = self._database.write(work, lock=subject_lock(tenant, subject_id))
@@ -201,36 +231,11 @@ class Subjects:
         SealError
             If the row was altered or moved, or its master key is missing.
         """
-        checked_subject_id(subject_id)
-        query = (
-            sa.select(
-                *_RECORD_COLUMNS,
-                SubjectRow.id,
-                SubjectRow.tenant_id,
-                SubjectRow.wrapped_key,
-                TemplateRow.ciphertext,
-            )
-            .join(TemplateRow, TemplateRow.subject_pk == SubjectRow.id)
-            .join(TenantRow, TenantRow.id == SubjectRow.tenant_id)
-            .where(TenantRow.name == tenant, SubjectRow.subject_id == subject_id)
-        )
+        query = template_query(tenant, checked_subject_id(subject_id))
         if contract_id is not None:
             query = query.where(TemplateRow.contract_id == contract_id)
         row = self._database.read(lambda each: each.execute(query).one_or_none())
-        if row is None:
-            return None
-        *columns, subject_pk, tenant_id, wrapped_key, ciphertext = row
-        record = _record(columns)
-        owner = Owner(
-            tenant_id,
-            subject_pk,
-            subject_id,
-            record.contract_id,
-            record.template_id,
-            record.rotation_epoch,
-        )
-        wire = open_envelope(Envelope(wrapped_key, ciphertext), owner, self._keyring)
-        return SubjectTemplate(record=record, wire=wire)
+        return None if row is None else opened_template(row, self._keyring)
 
     def describe(self, tenant: str, subject_id: str) -> SubjectRecord | None:
         """Return a subject's metadata, or None; nothing is decrypted."""
@@ -282,7 +287,9 @@ class Subjects:
             raise InvalidIdentifier("this cursor is too long to be one of ours")
         try:
             sealed = base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4))
-            opened = self._keyring.open(sealed, purpose=_CURSOR_PURPOSE, bound_to=[tenant])
+            opened = self._keyring.open(
+                sealed, purpose=_CURSOR_PURPOSE, bound_to=[tenant], refresh=False
+            )
         except (SealError, binascii.Error, ValueError):
             raise InvalidIdentifier(
                 "this cursor was not given for this list: start again without one"
@@ -304,6 +311,15 @@ _RECORD_COLUMNS = (
     SubjectRow.updated_at,
 )
 
+TEMPLATE_COLUMNS = (
+    *_RECORD_COLUMNS,
+    SubjectRow.id,
+    SubjectRow.tenant_id,
+    SubjectRow.wrapped_key,
+    TemplateRow.ciphertext,
+)
+"""What :func:`opened_template` needs."""
+
 
 def _records(
     tenant: str,
@@ -319,6 +335,38 @@ def _records(
 def _record(columns: Any) -> SubjectRecord:
     values = dict(zip(SubjectRecord.__dataclass_fields__, columns, strict=True))
     return SubjectRecord(**{**values, "source": Source(values["source"])})
+
+
+def template_query(tenant: str, subject_id: str) -> Any:
+    """Select a subject's template, as :data:`TEMPLATE_COLUMNS`."""
+    return (
+        sa.select(*TEMPLATE_COLUMNS)
+        .join(TemplateRow, TemplateRow.subject_pk == SubjectRow.id)
+        .join(TenantRow, TenantRow.id == SubjectRow.tenant_id)
+        .where(TenantRow.name == tenant, SubjectRow.subject_id == subject_id)
+    )
+
+
+def opened_template(columns: Any, keyring: MasterKeyring) -> SubjectTemplate:
+    """Decrypt a template that was read as :data:`TEMPLATE_COLUMNS`.
+
+    Raises
+    ------
+    SealError
+        If the row was altered or moved, or its master key is missing.
+    """
+    *metadata, subject_pk, tenant_id, wrapped_key, ciphertext = columns
+    record = _record(metadata)
+    owner = Owner(
+        tenant_id,
+        subject_pk,
+        record.subject_id,
+        record.contract_id,
+        record.template_id,
+        record.rotation_epoch,
+    )
+    wire = open_envelope(Envelope(wrapped_key, ciphertext), owner, keyring)
+    return SubjectTemplate(record=record, wire=wire)
 
 
 def tenant_row(connection: Connection, name: str) -> tuple[str, int]:

@@ -1,5 +1,11 @@
-"""Tenants, and the key of each one's rotation."""
+"""Tenants, and the key of each one's rotation.
 
+A tenant's name and an epoch name one rotation for ever: the epochs of a tenant that is made anew,
+after one of its name was erased, go on where those ended. So a process that keeps rotations in
+memory, and an enrollment that was under way, cannot mistake one for the other.
+"""
+
+import json
 import os
 import uuid
 from dataclasses import dataclass, field
@@ -13,7 +19,8 @@ from templates.sealing import MasterKeyring, sealed_key_id
 from templates.store.database import Database
 from templates.store.deployment import insert_once
 from templates.store.identifiers import Clock, UnknownTenant, checked_tenant_name
-from templates.store.schema import RotationKeyRow, TenantRow
+from templates.store.receipts import tenant_receipt_name
+from templates.store.schema import ReceiptRow, RotationKeyRow, TenantRow
 
 ROTATION_PURPOSE = "tenant-rotation-key"
 
@@ -36,6 +43,10 @@ class RotationKey:
     key: bytes = field(repr=False)
 
 
+class RetiredRotation(UnknownTenant):
+    """No rotation of this epoch any more: what was read in it was moved on since, read it again."""
+
+
 class Tenants:
     """Repository of tenants."""
 
@@ -52,22 +63,12 @@ class Tenants:
     def ensure(self, connection: Connection, name: str) -> Tenant:
         """:meth:`create` inside a transaction that is open already."""
         tenant_id, now = uuid.uuid4().hex, self._clock()
+        epoch = 1 + _last_epoch_of_erased(connection, name)
         made = insert_once(
-            connection, TenantRow, id=tenant_id, name=name, rotation_epoch=1, created_at=now
+            connection, TenantRow, id=tenant_id, name=name, rotation_epoch=epoch, created_at=now
         )
         if made:
-            wrapped = self._keyring.seal(
-                os.urandom(32), purpose=ROTATION_PURPOSE, bound_to=[tenant_id, 1]
-            )
-            connection.execute(
-                sa.insert(RotationKeyRow).values(
-                    tenant_id=tenant_id,
-                    epoch=1,
-                    wrapped_key=wrapped,
-                    wrapping_key=sealed_key_id(wrapped),
-                    created_at=now,
-                )
-            )
+            self.add_rotation_key(connection, tenant_id, epoch)
         return _tenant(connection.execute(_COLUMNS.where(TenantRow.name == name)).one())
 
     def get(self, name: str) -> Tenant:
@@ -98,12 +99,38 @@ class Tenants:
             ).scalar_one_or_none()
         )
         if wrapped is None:
-            raise UnknownTenant(f"tenant {name!r} has no rotation of epoch {epoch}")
+            raise RetiredRotation(f"tenant {name!r} has no rotation of epoch {epoch}")
         key = self._keyring.open(wrapped, purpose=ROTATION_PURPOSE, bound_to=[tenant.id, epoch])
         return RotationKey(epoch=epoch, key=key)
 
+    def add_rotation_key(self, connection: Connection, tenant_id: str, epoch: int) -> None:
+        """Draw the key of a new epoch inside a transaction that is open already."""
+        wrapped = self._keyring.seal(
+            os.urandom(32), purpose=ROTATION_PURPOSE, bound_to=[tenant_id, epoch]
+        )
+        connection.execute(
+            sa.insert(RotationKeyRow).values(
+                tenant_id=tenant_id,
+                epoch=epoch,
+                wrapped_key=wrapped,
+                wrapping_key=sealed_key_id(wrapped),
+                created_at=self._clock(),
+            )
+        )
+
 
 _COLUMNS = sa.select(TenantRow.id, TenantRow.name, TenantRow.rotation_epoch, TenantRow.created_at)
+
+
+def _last_epoch_of_erased(connection: Connection, name: str) -> int:
+    """Last epoch of the latest tenant of this name that was erased, by its receipt; else 0."""
+    body = connection.execute(
+        sa.select(ReceiptRow.body)
+        .where(ReceiptRow.pseudonym == tenant_receipt_name(name))
+        .order_by(ReceiptRow.sequence.desc())
+        .limit(1)
+    ).scalar_one_or_none()
+    return 0 if body is None else int(json.loads(body)["rotation_epoch"])
 
 
 def _tenant(row: Any) -> Tenant:

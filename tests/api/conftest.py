@@ -13,8 +13,11 @@ from tests.databases import database_url, postgres_database, postgres_url  # noq
 
 @pytest.fixture(scope="module")
 def deployment(tmp_path_factory: pytest.TempPathFactory) -> Deployment:
-    """A deployment on SQLite, shared by the tests of one module."""
-    return deploy(tmp_path_factory.mktemp("deployment"))
+    """A deployment on SQLite, shared by the tests of one module.
+
+    Without the lockout: they fail to verify the same few subjects many times on purpose.
+    """
+    return deploy(tmp_path_factory.mktemp("deployment"), lockout_after=0)
 
 
 @pytest.fixture(scope="module")

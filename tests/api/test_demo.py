@@ -36,6 +36,8 @@ def test_it_accepts_the_enrolled_and_rejects_the_others(played):
     assert all(person.impostor_trials == 2 * 2 + 2 for person in outcome.people)
     assert sum(person.genuine_accepted for person in outcome.people) >= 5
     assert "starting the service" in said
+    assert outcome.locks_lifted >= 1
+    assert outcome.refused_photos == ()
 
 
 def test_what_it_shows_of_the_database_is_ciphertext(played):

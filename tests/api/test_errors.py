@@ -74,7 +74,7 @@ def test_every_exception_of_the_rooms_has_a_code() -> None:
 
     # Raised before there is a server, or by rooms that requests do not reach.
     elsewhere = {
-        *("StartError", "DatasetError", "CacheError", "AlignmentError", "PreparationError"),
+        *("DatabaseAway", "DatasetError", "CacheError", "AlignmentError", "PreparationError"),
         *("EvaluationError", "BackendError", "AuditError"),
     }
     for root in (template_errors.VeilfaceError, model_errors.ModelError):
@@ -118,7 +118,7 @@ def test_details_become_json() -> None:
 @pytest.mark.parametrize(
     ("method", "path", "status", "code"),
     [
-        ("GET", "/", 404, "not_found"),
+        ("GET", "/nothing", 404, "not_found"),
         ("GET", "/v1", 404, "not_found"),
         ("GET", "/v1/subjects/", 404, "not_found"),
         ("GET", "/docs", 404, "not_found"),

@@ -3,6 +3,7 @@
 import json
 import time
 from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -12,9 +13,9 @@ from api.app import create_app
 from api.opening import open_keyring, open_store
 from templates.errors import StoreUnavailable
 from templates.store import TemplateStore
-from templates.store.schema import IdempotencyRow
+from templates.store.schema import IdempotencyRow, SubjectRow
 from tests.api.client import Client
-from tests.api.deployment import Deployment, bearer, deploy
+from tests.api.deployment import Deployment, bearer, deploy, images, photo
 
 
 @pytest.fixture
@@ -86,3 +87,21 @@ def test_a_purge_that_fails_is_a_log_line(
     assert failed[0]["error_type"] == "StoreUnavailable"
     assert "secret words" not in json.dumps(lines)
     assert lines[-1]["event"] == "stopped"
+
+
+def test_subjects_whose_time_is_over_go_by_themselves(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own = deploy(tmp_path, purge_interval_s=1, retention_days=30)
+    with Client(create_app(own.settings)) as client:
+        client.headers.update(bearer(own.token))
+        for name in ("old", "young"):
+            answer = client.put(f"/v1/subjects/{name}/enrollment", files=images(photo(1)))
+            assert answer.status_code == 201
+        store = client.app.state.runtime.store
+        month_ago = datetime.now(UTC) - timedelta(days=31)
+        old = sa.update(SubjectRow).values(updated_at=month_ago)
+        store._database.write(lambda each: each.execute(old.where(SubjectRow.subject_id == "old")))
+        assert comes_true(lambda: client.get("/v1/subjects/old").status_code == 404)
+        assert client.get("/v1/subjects/young").status_code == 200
+        assert store.receipt("default", "old") is not None

@@ -51,7 +51,9 @@ def failures(client: Client, cases: list[Case]) -> list[str]:
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Client]:
     """With the tiny pack, which takes any square picture for an aligned face."""
-    deployment = deploy(tmp_path_factory.mktemp("plain"), max_image_pixels=MAX_PIXELS)
+    deployment = deploy(
+        tmp_path_factory.mktemp("plain"), max_image_pixels=MAX_PIXELS, lockout_after=0
+    )
     with Client(create_app(deployment.settings), headers=bearer(deployment.token)) as client:
         put = client.put("/v1/subjects/a/enrollment", files=images(encoded(picture(1))))
         assert put.status_code == 201
@@ -107,7 +109,10 @@ def real(
 ) -> Iterator[Client]:
     """With a real detector and a real embedder; the thresholds are not calibrated."""
     deployment = deploy(
-        tmp_path_factory.mktemp("real"), pack=mbf_pack_dir, max_image_pixels=MAX_PIXELS
+        tmp_path_factory.mktemp("real"),
+        pack=mbf_pack_dir,
+        max_image_pixels=MAX_PIXELS,
+        lockout_after=0,
     )
     with Client(create_app(deployment.settings), headers=bearer(deployment.token)) as client:
         put = client.put("/v1/subjects/a/enrollment", files=images(encoded(faces[0])))

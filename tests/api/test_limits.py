@@ -3,6 +3,7 @@ import tempfile
 import threading
 from collections import Counter
 from collections.abc import AsyncIterator
+from contextlib import AsyncExitStack
 from typing import Any
 
 import anyio
@@ -10,8 +11,11 @@ import anyio.from_thread
 import httpx
 import pytest
 from starlette.requests import Request
+from starlette.responses import Response
+from starlette.types import Message, Receive, Scope, Send
 
 from api.bodies import MAX_FIELD_BYTES, read_json
+from api.context import RequestContext
 from api.errors import ApiError
 from api.limits import MAX_JSON_BYTES, Gate
 from tests.api.client import Client
@@ -176,16 +180,60 @@ def test_a_body_that_does_not_arrive_is_given_up(client: Client, deployment: Dep
 def test_the_gate_turns_the_next_one_away() -> None:
     async def scenario() -> None:
         gate = Gate(slots=1, waiting=1)
-        async with gate.admitted(), gate.admitted():
+        async with gate.admitted("a"), gate.admitted("a"):
             with pytest.raises(ApiError) as caught:
-                async with gate.admitted():
+                async with gate.admitted("a"):
                     pass
             assert caught.value.code == "overloaded"
             assert caught.value.headers["Retry-After"]
-        async with gate.admitted():
+        async with gate.admitted("a"):
             pass
 
     anyio.run(scenario)
+
+
+def test_one_key_leaves_places_to_the_others() -> None:
+    async def scenario() -> None:
+        gate = Gate(slots=1, waiting=3)
+        async with AsyncExitStack() as alone:
+            for _ in range(4):  # nobody else asks: all of them
+                await alone.enter_async_context(gate.admitted("a"))
+            with pytest.raises(ApiError):
+                await alone.enter_async_context(gate.admitted("b"))
+        async with AsyncExitStack() as shared:
+            for _ in range(3):
+                await shared.enter_async_context(gate.admitted("a"))
+            with pytest.raises(ApiError) as caught:
+                await shared.enter_async_context(gate.admitted("a"))
+            assert caught.value.code == "overloaded"
+            await shared.enter_async_context(gate.admitted("b"))
+
+    anyio.run(scenario)
+
+
+def test_a_client_that_takes_no_answer_loses_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("api.context.SEND_TIMEOUT_S", 0.05)
+    answered: list[str] = []
+
+    async def app(scope: Scope, receive: Receive, send: Send) -> None:
+        await Response(b"x" * 100)(scope, receive, send)
+        answered.append("all of it")
+
+    async def scenario() -> None:
+        context = RequestContext(app, max_in_flight=1, operations_paths=frozenset({"/health/live"}))
+        scope: Scope = {"type": "http", "method": "GET", "path": "/health/live", "headers": []}
+
+        async def receive() -> Message:
+            return {"type": "http.disconnect"}
+
+        async def stuck(message: Message) -> None:
+            await anyio.sleep(60)
+
+        with anyio.fail_after(5):
+            await context(scope, receive, stuck)
+
+    anyio.run(scenario)
+    assert answered == []
 
 
 def test_the_queue_for_the_database_has_an_end(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -275,3 +323,16 @@ def test_overload_is_an_answer(client: Client, monkeypatch: pytest.MonkeyPatch) 
     ):
         assert isinstance(answer, httpx.Response)
         assert_error(answer, 503, "overloaded")
+
+
+@pytest.mark.parametrize("unit", [b'{"":0},', b"[],", b"1.5,"])
+def test_a_body_of_more_values_than_any_request_has_is_not_parsed(
+    client: Client, monkeypatch: pytest.MonkeyPatch, unit: bytes
+) -> None:
+    """Small values take up to thirty times the memory of their text."""
+    body = b'{"embedding":[' + unit * ((MAX_JSON_BYTES - 30) // len(unit)) + b"0]}"
+    with monkeypatch.context() as patch:
+        patch.setattr("api.bodies.json.loads", None)
+        answer = client.post(VERIFY, content=body, headers={"Content-Type": "application/json"})
+    assert_error(answer, 400, "malformed_request")
+    assert "more than 16384 values" in answer.json()["error"]["message"]

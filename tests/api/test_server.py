@@ -1,5 +1,6 @@
 """The service as it is run: uvicorn, two worker processes, real sockets, signals."""
 
+import contextlib
 import json
 import signal
 import socket
@@ -13,15 +14,14 @@ from pathlib import Path
 import httpx
 import pytest
 
-from api.app import environment_of
+from api.app import environment_of, uvicorn_options
 from tests.api.deployment import Deployment, bearer, deploy, images, photo
 from tests.api.shapes import assert_error
 
 RUN = """
-import uvicorn
-from api.app import uvicorn_options
 from api.settings import load_settings
-uvicorn.run(**uvicorn_options(load_settings()))
+from api.supervisor import run_server
+run_server(load_settings())
 """
 
 
@@ -98,6 +98,7 @@ def test_the_kernels_are_compiled_before_the_server_is_ready(tmp_path: Path) -> 
     assert {
         "euclidean_points",
         "spherical_points",
+        "squares_inside",
         "euclidean_subspaces",
         "spherical_subspaces",
         "keep_nearest",
@@ -158,6 +159,20 @@ def test_a_client_that_goes_away_does_no_harm(server: Server, http: httpx.Client
             )
     assert http.get("/health/ready").status_code == 200
     assert http.get("/v1/subjects/a").status_code == 200
+
+
+def test_headers_without_end_are_refused(server: Server) -> None:
+    assert uvicorn_options(server.deployment.settings)["http"] == "h11"  # the other has no bound
+    with socket.create_connection(("127.0.0.1", server.deployment.settings.port)) as raw:
+        raw.settimeout(20)
+        raw.sendall(b"GET /v1/contract HTTP/1.1\r\nHost: x\r\nX-Long: ")
+        seen = b""
+        with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+            for _ in range(64):
+                raw.sendall(b"a" * 4096)
+            seen = raw.recv(65536)
+        assert seen.startswith(b"HTTP/1.1 400") or not seen
+    assert httpx.get(f"{server.url}/health/ready").status_code == 200
 
 
 def test_a_client_that_asks_first_is_told_at_once(server: Server) -> None:

@@ -73,6 +73,22 @@ def test_a_slot_for_each_processor_that_the_process_may_use(
         ("providers = ''", "setting providers"),
         ("default_tenant = 'a b'", "setting default_tenant"),
         ("port = ", "cannot be read as TOML"),
+        ("rate_limit_key = 'many'", "setting rate_limit_key"),
+        ("rate_limit_key = '0/minute'", "at least one"),
+        ("rate_limit_address = '5/second;9/minute'", "write one"),
+        ("rate_limit_storage = 'memcached://x'", "setting rate_limit_storage"),
+        ("trusted_proxies = 'proxy.example'", "setting trusted_proxies"),
+        ("operations_port = 8421", "must differ from port"),
+        ("tls_key = 'key.pem'", "or neither"),
+        ("tls_certificate = 'c.pem'", "or neither"),
+        ("lockout_first_s = 60.0\nlockout_longest_s = 30.0", "setting lockout_longest_s"),
+        ("lockout_after = 9\nlockout_disable_at = 8", "setting lockout_disable_at"),
+        ("retention_days = 0", "setting retention_days"),
+        ("master_key_variable = 'a-b'", "setting master_key_variable"),
+        ("master_key_command = '  '", "is empty"),
+        ('master_key_command = "a \'b"', "quotation"),
+        ("master_key_file = 'k'\nmaster_key_variable = 'K'", "give one of"),
+        ("master_key_variable = 'K'\nmaster_key_command = 'kms'", "give one of"),
     ],
 )
 def test_a_wrong_file_is_one_sentence(elsewhere: Path, text: str, sentence: str) -> None:
@@ -89,9 +105,36 @@ def test_an_error_never_repeats_a_value(monkeypatch: pytest.MonkeyPatch) -> None
     assert "hunter2" not in str(caught.value)
 
 
+@pytest.mark.parametrize("given", ["", "off", " off "])
+def test_a_limit_that_is_off_stays_off_on_its_way_to_workers(
+    monkeypatch: pytest.MonkeyPatch, given: str
+) -> None:
+    settings = load_settings(rate_limit_key=given, trusted_proxies="")
+    assert (settings.rate_limit_key, settings.trusted_proxies) == ("off", "none")
+    for name, value in environment_of(settings).items():
+        monkeypatch.setenv(name, value)
+    assert load_settings() == settings
+
+
+def test_a_limit_may_be_written_as_the_library_takes_it() -> None:
+    for text in ("10/second", "600 per minute", "100 per 5 minute", "2/day"):
+        assert load_settings(rate_limit_key=text).rate_limit_key == text
+
+
 def test_settings_travel_to_workers_in_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     settings = load_settings(
-        port=9, providers=("cuda", "cpu"), demo=True, pack="a/b", queue_limit=7, body_timeout_s=1.5
+        port=9,
+        providers=("cuda", "cpu"),
+        demo=True,
+        pack="a/b",
+        queue_limit=7,
+        body_timeout_s=1.5,
+        operations_port=10,
+        tls_certificate="c",
+        tls_key="k",
+        rate_limit_storage="redis://u:p@h/1",
+        retention_days=30,
+        master_key_command="kms read 'a b'",
     )
     for name, value in environment_of(settings).items():
         monkeypatch.setenv(name, value)

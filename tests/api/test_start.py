@@ -23,6 +23,7 @@ from models.pack import ModelPack
 from templates.decoys import DecoyGenerator
 from templates.sealing import MasterKeyring
 from templates.store.database import Database
+from templates.subspace import SubspaceBatch
 from tests.api.cli.conftest import run
 from tests.api.client import Client
 from tests.api.deployment import (
@@ -302,16 +303,26 @@ def test_serving_keeps_no_second_copy_of_the_models(
         opened.append(weakref.ref(runtime))
         return runtime
 
-    def serving(**_: Any) -> None:
+    def serving(_: Settings) -> None:
         gc.collect()
         alive.extend(each() is not None for each in opened)
 
     monkeypatch.setattr(Runtime, "open", remembered)
-    monkeypatch.setattr("api.cli.serve.uvicorn.run", serving)
+    monkeypatch.setattr("api.cli.serve.run_server", serving)
     folders = ("--data-dir", fresh.settings.data_dir, "--pack", str(fresh.settings.pack))
     ran = run("serve", "--port", "0", *folders)
     assert ran.status == 0, ran.stderr
     assert alive == [False]
+
+
+def test_the_cohort_is_rounded_before_the_service_is_ready(
+    fresh: Deployment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rounded: list[SubspaceBatch] = []
+    monkeypatch.setattr("api.app.rounded_cohort", rounded.append)
+    app = create_app(fresh.settings)
+    with Client(app):
+        assert rounded == [app.state.runtime.contract.cohort]
 
 
 def test_recalibration_keeps_the_templates(fresh: Deployment) -> None:

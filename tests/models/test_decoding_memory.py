@@ -41,6 +41,24 @@ def test_webp_canvas_bomb_is_refused_before_its_decoder_starts():
     assert code_of(data) == "image_too_large"
 
 
+@pytest.mark.parametrize("name", [b"VP8 ", b"VP8L"])
+def test_canvases_of_the_simple_webp_forms_are_refused_before_their_decoder_starts(
+    name, monkeypatch
+):
+    """Pillow's own limit admits 178 million pixels, for which two canvases are asked."""
+    side = 12_000
+    bits = struct.pack("<I", (side - 1) | (side - 1) << 14)
+    body = {
+        b"VP8 ": bytes(3) + b"\x9d\x01\x2a" + struct.pack("<HH", side, side),
+        b"VP8L": b"\x2f" + bits + bytes(9),
+    }[name]
+    data = b"RIFF" + struct.pack("<I", 12 + len(body)) + b"WEBP" + name
+    data += struct.pack("<I", len(body)) + body + bytes(20)
+    monkeypatch.setattr("PIL.WebPImagePlugin._webp", None)
+    with pytest.raises(ImageError, match="12000 x 12000 pixels"):
+        decode_image(data)
+
+
 @pytest.mark.parametrize("kind", [b"iCCP", b"zTXt", b"iTXt"])
 def test_compressed_metadata_bombs_stay_small(kind):
     packed = zlib.compress(b"\0" * (40 * 2**20), 9)

@@ -16,10 +16,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from templates import contract as contract_module
-from templates.canonical import canonical_json
-from templates.contract import Binding, Calibration, Contract, Level, Rate
+from templates.canonical import MAX_ITEMS, MAX_PARTS, canonical_json, too_many_parts
+from templates.contract import MAX_CALIBRATIONS, Binding, Calibration, Contract, Level, Rate
 from templates.distances import Metric
 from templates.errors import ContractError, ContractMismatch, SealError, Uncalibrated
+from templates.levels import MAX_LEVELS
 from templates.lifting import Strategy, lift
 from templates.randomness import Keystream
 from templates.sealing import KeyringSealer, MasterKeyring
@@ -471,6 +472,8 @@ def test_a_cohort_that_is_no_cohort_is_refused(tmp_path: Path) -> None:
     context = contract_module._seal_context(document)
     good = SEALER.open(base64.b64decode(sealed), context=context)
     feet, bases = np.zeros((5, N), np.float32), np.zeros((5, M, N), np.float32)
+    endless = np.full_like(bases, 3e38)
+    endless[:, :, ::2] *= -1
     for plain in (
         b"",
         good[:-1],
@@ -480,6 +483,9 @@ def test_a_cohort_that_is_no_cohort_is_refused(tmp_path: Path) -> None:
         safetensors.numpy.save({"feet": feet, "bases": bases, "more": feet}),
         safetensors.numpy.save({"feet": np.array(1, dtype=np.float32), "bases": bases}),
         safetensors.numpy.save({"feet": feet, "bases": bases}),
+        # Products of these overflow, to infinities whose difference no tolerance refuses.
+        safetensors.numpy.save({"feet": feet, "bases": endless}),
+        safetensors.numpy.save({"feet": feet + np.float32(3e38), "bases": endless}),
     ):
         text = base64.b64encode(SEALER.seal(plain, context=context)).decode()
         with pytest.raises(ContractError):
@@ -489,3 +495,34 @@ def test_a_cohort_that_is_no_cohort_is_refused(tmp_path: Path) -> None:
 def test_frozen() -> None:
     with pytest.raises(dataclasses.FrozenInstanceError):
         make_contract().photo_consistency = 0.0  # type: ignore[misc]
+
+
+def test_a_file_of_more_values_than_any_contract_has_is_not_parsed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = saved(tmp_path)
+    document = json.loads(path.read_text())
+    wide = tmp_path / "wide.json"
+    wide.write_text(json.dumps(document | {"recorded": {"a": [[]] * MAX_PARTS}}))
+    with monkeypatch.context() as patch:
+        patch.setattr("templates.canonical.json.loads", None)
+        with pytest.raises(ContractError, match="more than 100000 values"):
+            Contract.load(wide, SEALER)
+    assert Contract.load(path, SEALER).contract_id == document["contract_id"]
+
+
+def test_the_largest_contract_has_fewer_values_than_are_read() -> None:
+    levels = tuple(Level(f"level-{i}", 1e-2, 0.3, 2.0, RATE, RATE) for i in range(MAX_LEVELS))
+    entries = tuple(
+        make_calibration(mode="s2s", probe_m=m, foot_point_norm=(0.2, 0.9), levels=levels)
+        for m in range(1, MAX_CALIBRATIONS + 1)
+    )
+    binding = make_binding(n=MAX_CALIBRATIONS + 2)
+    largest = make_contract(
+        binding=binding,
+        calibrations=entries,
+        cohort=make_cohort(n=binding.n),
+        default_level="level-0",
+        recorded={str(i): i for i in range(MAX_ITEMS)},
+    )
+    assert not too_many_parts(json.dumps(largest.public()).encode(), MAX_PARTS // 2)

@@ -453,6 +453,7 @@ import numpy as np
 from numba.core import event
 from templates.distances import nearest, paired_distances, pairwise_distances, count_within, warm_up
 from templates.lifting import lift
+from templates.rounded import RoundedSubspaces
 
 warm_up()
 compiled = []
@@ -479,6 +480,9 @@ for m, k in ((1, 1), (2, 9), (16, 16), (20, 7)):
             nearest(probes, b, k=3, metric=metric, of_templates=True, labels=labels)
             count_within(probes, b, [0.5], metric=metric)
         paired_distances(a, b, metric=metric)
+        rounded = RoundedSubspaces.of(b)
+        for probe in (rows[0], rows[0].astype(np.float32), a.feet[0]):
+            rounded.similarities(probe, metric=metric)
 print(compiled)
 """
 

@@ -78,6 +78,21 @@ def test_reading_removes_the_rounding_of_the_wire(dtype: WireDtype):
         assert np.abs(raw @ raw.T - np.eye(16)).max() > 3e-5
 
 
+@pytest.mark.parametrize("m", [3, 300])
+def test_rows_at_the_edge_of_the_tolerance_are_orthonormalised(m: int):
+    """Many rows that all lean the same way are further from orthonormal than any pair of them."""
+    n, lean = 400, 1.8e-3
+    rows = np.linalg.qr(np.random.default_rng(m).standard_normal((n, m + 1)))[0].T
+    gram = (1 - lean) * np.eye(m) + lean
+    leaning = np.linalg.cholesky(gram) @ rows[1:]
+    tensors = {"foot": (0.4 * rows[0]).astype("<f2"), "basis": leaning.astype("<f2")}
+    metadata = {"format": "veilface-template", "version": "1", "contract_id": CONTRACT}
+    data = safetensors.numpy.save(tensors, metadata=metadata)
+    basis = decode(data, max_m=m).subspace.basis.astype(np.float64)
+    np.testing.assert_allclose(basis @ basis.T, np.eye(m), atol=1e-6)
+    np.testing.assert_allclose(basis.T @ basis, rows[1:].T @ rows[1:], atol=2e-3)
+
+
 @pytest.mark.parametrize(("m", "near_zero"), [(4, 1e-3), (16, 4e-4)])
 def test_float16_moves_distances_by_little(m: int, near_zero: float):
     stream = Keystream.seeded("f16")
@@ -350,3 +365,15 @@ def test_any_json_in_the_header_is_refused(path: tuple[str, ...], value: object)
 def test_random_numbers_are_refused(payload: bytes):
     header, _ = parts(GOOD["float16"])
     assert read_or_refused(packed(header, payload)) is None
+
+
+@pytest.mark.parametrize(
+    ("dtype", "number"), [("float16", b"\x01\x7c"), ("float32", b"\x01\x00\x80\x7f")]
+)
+def test_a_signalling_nan_is_refused_and_not_warned_of(dtype: WireDtype, number: bytes):
+    data = encode(template(), contract_id=CONTRACT, dtype=dtype)
+    start = len(data) - len(parts(data)[1])
+    for at in (start, len(data) - len(number)):
+        broken = data[:at] + number + data[at + len(number) :]
+        with pytest.raises(InvalidTemplate, match="not finite"):
+            decode(broken)

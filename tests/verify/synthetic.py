@@ -1,6 +1,6 @@
 """Synthetic people: descriptors that cluster by person, and contracts calibrated on them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +9,7 @@ from templates.contract import Binding
 from templates.decoys import DecoyGenerator, DecoyPool
 from templates.lifting import Strategy
 from templates.rotation import ROTATION_VERSION
+from templates.subspace import AffineSubspace
 from verify import Calibrated, CalibrationOptions, calibrate
 
 N = 64
@@ -25,6 +26,12 @@ class People:
 
 def unit(rows: NDArray[np.floating]) -> NDArray[np.float32]:
     return np.asarray(rows / np.linalg.norm(rows, axis=-1, keepdims=True), dtype=np.float32)
+
+
+def rounded(template: AffineSubspace) -> AffineSubspace:
+    """The template as the cohort test sees it: rows in multiples of 1/127 of their largest."""
+    steps = np.abs(template.basis).max(axis=1, keepdims=True) / np.float32(127)
+    return replace(template, basis=np.rint(template.basis / steps) * steps)
 
 
 def draw_people(

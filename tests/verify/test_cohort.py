@@ -1,5 +1,8 @@
 """The cohort stands for the templates that a probe meets, not for the decoys."""
 
+import gc
+import weakref
+
 import numpy as np
 import pytest
 
@@ -8,7 +11,7 @@ from templates.distances import Metric, pairwise_distances, similarity
 from templates.lifting import Strategy
 from templates.randomness import Keystream
 from templates.subspace import SubspaceBatch
-from verify.cohort import make_cohort
+from verify.cohort import cohort_statistics, make_cohort, rounded_cohort
 
 N, M = 32, 4
 
@@ -57,3 +60,24 @@ def test_nobody_of_the_people_is_in_the_cohort(others: DecoyGenerator) -> None:
 def test_too_few_people_leave_the_cohort_to_the_decoys(others: DecoyGenerator) -> None:
     few = cohort(others, around(0, N - 1, seed=2))
     np.testing.assert_array_equal(few.bases, cohort(others, None).bases)
+
+
+@pytest.mark.parametrize("metric", Metric)
+def test_the_rounded_cohort_tells_points_what_the_exact_one_would(
+    others: DecoyGenerator, metric: Metric
+) -> None:
+    templates, strangers = cohort(others, None), around(0, 50, seed=3)
+    means, spreads = cohort_statistics(strangers, templates, metric=metric, steps=50)
+    distances = pairwise_distances(strangers, templates, metric=metric, dtype=np.float64)
+    exact = np.asarray(similarity(distances))
+    np.testing.assert_allclose(means, exact.mean(axis=1), atol=2e-4)
+    np.testing.assert_allclose(spreads, exact.std(axis=1, ddof=1), rtol=5e-3)
+
+
+def test_a_cohort_is_rounded_once_and_forgotten_with_its_templates(others: DecoyGenerator) -> None:
+    templates = cohort(others, None)
+    kept = weakref.ref(rounded_cohort(templates))
+    assert rounded_cohort(templates) is kept()
+    del templates
+    gc.collect()
+    assert kept() is None

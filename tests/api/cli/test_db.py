@@ -1,7 +1,12 @@
+import base64
+import sqlite3
+
 import pytest
 
 from templates.sealing import MasterKeyring
 from templates.store import TemplateStore
+from templates.store.audit_log import By
+from templates.store.lockout import LockedOut
 from templates.store.migrate import head_revision
 from tests.api.cli.conftest import run
 from tests.templates.store.conftest import put
@@ -66,3 +71,87 @@ def test_a_database_that_does_not_answer_is_a_sentence(tmp_path, command):
     assert ran.stderr.startswith("error: ")
     assert "s3cret" not in ran.stderr
     assert "Traceback" not in ran.stderr
+
+
+@pytest.fixture
+def opened(tmp_path):
+    """A store with the tenants default and acme, and the flag that leads there."""
+    where = ("--data-dir", tmp_path)
+    assert run("db", "upgrade", *where).status == 0
+    store = TemplateStore(
+        f"sqlite:///{tmp_path / 'veilface.db'}", MasterKeyring.load(tmp_path / "master.key")
+    )
+    for name in ("default", "acme"):
+        store.tenants.create(name)
+    yield store, where
+    store.close()
+
+
+def reject(store, subject, tenant="default"):
+    store.attempts.conclude(
+        tenant,
+        subject,
+        accepted=False,
+        template_id=None,
+        level="x",
+        nonce=None,
+        by=By(),
+    )
+
+
+def test_unlock_forgets_failures(opened):
+    store, where = opened
+    for _ in range(5):
+        reject(store, "ann")
+    with pytest.raises(LockedOut):
+        reject(store, "ann")
+    ran = run("db", "unlock", "ann", *where, "--json")
+    assert (ran.status, ran.json["lifted"]) == (0, True)
+    reject(store, "ann")
+    assert run("db", "unlock", "ann", *where).status == 0
+    again = run("db", "unlock", "ann", *where)
+    assert again.status == 1
+    assert "no failed attempts" in again.stderr
+
+
+def test_purge_erases_who_is_due(opened):
+    store, where = opened
+    for subject in ("old", "new"):
+        put(store, subject, bytes(100))
+    with sqlite3.connect(where[1] / "veilface.db") as connection:
+        connection.execute(
+            "UPDATE subjects SET updated_at = '2020-01-01 00:00:00.000000' WHERE subject_id = 'old'"
+        )
+    connection.close()
+    keep = ("--retention-days", "30", *where, "--json")
+    assert run("db", "purge", *where, "--json").json == {"due": 0, "erased": 0}
+    assert run("db", "purge", "--dry-run", *keep).json == {"due": 1, "erased": 0}
+    assert store.describe("default", "old") is not None
+    assert run("db", "purge", *keep).json == {"due": 1, "erased": 1}
+    assert store.describe("default", "old") is None
+    assert store.describe("default", "new") is not None
+    assert store.receipt("default", "old") is not None
+
+
+def test_a_tenant_is_erased_with_a_receipt(opened, tmp_path):
+    store, where = opened
+    for subject in ("a", "b"):
+        put(store, subject, bytes(100), tenant="acme")
+    put(store, "a", bytes(100))
+    token = store.api_keys.create("acme", ["verify"]).token
+    unsure = run("db", "erase-tenant", "acme", "--confirm", "acmf", *where)
+    assert unsure.status == 2
+    assert store.describe("acme", "a") is not None
+    receipt = tmp_path / "receipt.json"
+    ran = run("db", "erase-tenant", "acme", "--confirm", "acme", "--out", receipt, *where)
+    assert ran.status == 0, ran.stderr
+    assert "2 subjects" in ran.stdout
+    assert store.api_keys.verify(token) is None
+    assert "acme" not in [tenant.name for tenant in store.tenants.all()]
+    assert store.describe("default", "a") is not None
+    key = base64.b64encode(store.receipt_public_key()).decode()
+    checked = run("keys", "verify-receipt", receipt, "--public-key", key)
+    assert checked.status == 0, checked.stderr
+    assert "acme was erased" in checked.stdout
+    missing = run("db", "erase-tenant", "nobody", "--confirm", "nobody", *where)
+    assert missing.status == 1

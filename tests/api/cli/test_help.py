@@ -16,7 +16,9 @@ PROMISED = {
     *("audit fairface", "audit templates"),
     *("decoys build", "models inspect", "db upgrade", "db check", "db compact", "db current"),
     *("keys create", "keys list", "keys revoke", "keys master", "keys rotate", "keys rewrap"),
-    "keys verify-receipt",
+    *("keys verify-receipt", "keys replace", "keys rotate-tenant"),
+    *("db unlock", "db purge", "db erase-tenant"),
+    *("audit-log verify", "audit-log head", "audit-log show"),
     "bench distances",
 }
 

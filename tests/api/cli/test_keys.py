@@ -1,12 +1,17 @@
 import base64
 import json
+import os
 import stat
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
+from api.cli import keys
 from api.opening import file_sealer
 from api.receipts import receipt_json
 from templates.contract import Contract
+from templates.errors import SealError
+from templates.key_file import locked, read_key_file, write_key_file
 from templates.sealing import MasterKeyring
 from templates.store import TemplateStore
 from tests.api.cli.conftest import run
@@ -99,6 +104,81 @@ def test_a_rotation_without_retiring_keeps_both_keys(veilface, data):
     assert len((data / "master.key").read_text().split()) == 2
 
 
+def test_a_key_that_came_first_during_a_rotation_keeps_the_others_in_the_file(
+    veilface, data, store, monkeypatch
+):
+    file, seal_again = data / "master.key", keys._seal_files_again
+
+    def rotate_meanwhile(*arguments):
+        """Another program, which knows nothing of our lock, between the check and the drop."""
+        done = seal_again(*arguments)
+        write_key_file(file, [os.urandom(32), *read_key_file(file)[0]], replace=True)
+        return done
+
+    with monkeypatch.context() as patch:
+        patch.setattr("api.cli.keys._seal_files_again", rotate_meanwhile)
+        ran = veilface("keys", "rotate", "--retire")
+    assert ran.status == 1
+    assert "no key was dropped: run `veilface keys rewrap --retire`" in " ".join(ran.stderr.split())
+    assert len(MasterKeyring.load(file).key_ids) == 3
+    store.check()
+
+    assert veilface("keys", "rewrap", "--retire", "--json").json["retired"] == 2
+    fresh = TemplateStore(f"sqlite:///{data / 'veilface.db'}", MasterKeyring.load(file))
+    fresh.check()
+    fresh.close()
+    Contract.load(data / "contract.json", file_sealer(MasterKeyring.load(file)))
+
+
+@pytest.mark.parametrize("command", ["rotate", "rewrap"])
+def test_one_rotation_runs_at_a_time(veilface, data, monkeypatch, command):
+    other = []
+
+    def start_another(*_):
+        with (
+            ThreadPoolExecutor(1) as thread,
+            pytest.raises(SealError, match="another rotation") as caught,
+        ):
+            thread.submit(MasterKeyring.add_current, data / "master.key").result()
+        other.append(caught.value)
+        return []
+
+    monkeypatch.setattr("api.cli.keys._seal_files_again", start_another)
+    assert veilface("keys", command).status == 0
+    assert len(other) == 1  # the lock was held over the whole command
+    with ThreadPoolExecutor(1) as thread:
+        holding = locked(data / "master.key")
+        thread.submit(holding.__enter__).result()
+        before = (data / "master.key").read_bytes()
+        ran = veilface("keys", command, "--retire")
+        thread.submit(holding.__exit__, None, None, None).result()
+    assert ran.status == 1
+    assert "another rotation" in ran.stderr
+    assert (data / "master.key").read_bytes() == before
+    assert veilface("keys", command, "--retire").status == 0
+
+
+def test_a_rotation_leaves_links_and_owners_as_they_are(veilface, data, tmp_path):
+    real = tmp_path / "real"
+    real.mkdir()
+    names = ("master.key", "contract.json")
+    for name in names:
+        (data / name).rename(real / name)
+        (data / name).symlink_to(real / name)
+    owner = 61234 if os.geteuid() == 0 else os.geteuid()
+    for each in (real, *real.iterdir()):
+        os.chown(each, owner, -1)
+    ran = veilface("keys", "rotate", "--retire")
+    assert ran.status == 0, ran.stderr
+    for name in names:
+        assert (data / name).is_symlink()
+        assert (real / name).stat().st_uid == owner
+        assert stat.S_IMODE((real / name).stat().st_mode) == 0o600
+    keyring = MasterKeyring.load(real / "master.key")
+    assert len(keyring.key_ids) == 1
+    Contract.load(real / "contract.json", file_sealer(keyring))
+
+
 def test_a_receipt_is_verified_and_a_changed_one_is_not(store, tmp_path):
     store.tenants.create("default")
     answer = receipt_json(store.erase("default", "ann").receipt)
@@ -120,3 +200,86 @@ def test_a_receipt_is_verified_and_a_changed_one_is_not(store, tmp_path):
     assert ran.status == 1
     assert ran.json["valid"] is False
     assert run("keys", "verify-receipt", receipt, "--public-key", "%%").status == 2
+
+
+def test_a_key_is_replaced_with_time_to_change_over(veilface, store):
+    made = veilface("keys", "create", "--right", "verify", "--label", "shop", "--json").json
+    replaced = veilface("keys", "replace", made["prefix"], "--grace-hours", "2", "--json")
+    assert replaced.status == 0, replaced.stderr
+    assert replaced.json["replaces"] == made["prefix"]
+    assert (replaced.json["rights"], replaced.json["label"]) == (["verify"], "shop")
+    assert store.api_keys.verify(made["token"]) is not None
+    assert store.api_keys.verify(replaced.json["token"]) is not None
+    at_once = veilface("keys", "replace", replaced.json["prefix"], "--grace-hours", "0")
+    assert at_once.status == 0
+    assert store.api_keys.verify(replaced.json["token"]) is None
+    assert store.api_keys.verify(at_once.stdout.strip()) is not None
+    refused = veilface("keys", "replace", "0" * 12)
+    assert refused.status == 1
+    assert "no valid key of this prefix" in refused.stderr
+
+
+def test_a_tenants_rotation_is_renewed_and_nobody_enrolls_again(world, veilface, store):
+    pack = ("--pack", world.pack)
+    assert veilface("enroll", "ann", *world.photos(1, range(3)), *pack).status == 0
+    before = store.get("default", "ann")
+    ran = veilface("keys", "rotate-tenant", "--json")
+    assert ran.status == 0, ran.stderr
+    assert ran.json == {
+        "tenant": "default",
+        "rotation_epoch": 2,
+        "moved": 1,
+        "enroll_again": [],
+        "rotations_dropped": 1,
+    }
+    after = store.get("default", "ann")
+    assert (before.record.rotation_epoch, after.record.rotation_epoch) == (1, 2)
+    assert before.wire != after.wire
+    assert veilface("verify", "ann", *world.photos(1, range(3, 4)), *pack).status == 0
+    assert veilface("verify", "ann", *world.photos(2, range(1)), *pack).status == 1
+
+
+def test_stolen_templates_keep_their_rotation_until_they_are_enrolled_again(world, veilface, store):
+    pack = ("--pack", world.pack)
+    for number, name in ((1, "ann"), (2, "bob")):
+        assert veilface("enroll", name, *world.photos(number, range(3)), *pack).status == 0
+    ran = veilface("keys", "rotate-tenant", "--stolen", "--json")
+    assert (ran.json["moved"], ran.json["enroll_again"]) == (0, ["ann", "bob"])
+    assert ran.json["rotations_dropped"] == 0
+    assert veilface("verify", "ann", *world.photos(1, range(3, 4)), *pack).status == 0
+    assert veilface("enroll", "ann", *world.photos(1, range(3, 5)), *pack).status == 0
+    ran = veilface("keys", "rotate-tenant", "--stolen", "--finish", "--json")
+    assert (ran.json["rotation_epoch"], ran.json["enroll_again"]) == (2, ["bob"])
+    assert veilface("enroll", "bob", *world.photos(2, range(3, 5)), *pack).status == 0
+    ran = veilface("keys", "rotate-tenant", "--stolen", "--finish", "--json")
+    assert (ran.json["enroll_again"], ran.json["rotations_dropped"]) == ([], 1)
+    assert veilface("verify", "bob", *world.photos(2, range(2, 3)), *pack).status == 0
+
+
+def test_master_keys_come_from_the_environment_or_a_command(veilface, data, monkeypatch, tmp_path):
+    assert veilface("db", "upgrade").status == 0
+    text = (data / "master.key").read_text()
+    (data / "master.key").unlink()
+    monkeypatch.setenv("SOME_VARIABLE", text)
+    assert veilface("db", "check", "--master-key-variable", "SOME_VARIABLE").status == 0
+    hook = tmp_path / "hook"
+    hook.write_text(f"#!/bin/sh\nprintf '%s' '{text}'\n")
+    hook.chmod(0o700)
+    assert veilface("db", "check", "--master-key-command", str(hook)).status == 0
+    both = veilface(
+        *("db", "check", "--master-key-command", str(hook)),
+        *("--master-key-variable", "SOME_VARIABLE"),
+    )
+    assert both.status == 1
+    assert "give one of master_key_file, master_key_variable" in both.stderr
+    for arguments, said in (
+        (("--master-key-variable", "NO_SUCH_VARIABLE"), "NO_SUCH_VARIABLE"),
+        (("--master-key-command", "false"), "command"),
+    ):
+        ran = veilface("db", "check", *arguments)
+        assert ran.status == 1
+        assert said in ran.stderr
+        assert text.strip() not in ran.stderr
+    rotated = veilface("keys", "rotate", "--master-key-variable", "SOME_VARIABLE")
+    assert rotated.status == 2
+    assert "do not come from a file" in rotated.stderr

@@ -1,6 +1,7 @@
 import base64
 import json
 import stat
+import time
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from models.pack import ModelPack
 from templates import wire
 from templates.contract import Binding, Contract
 from templates.decoys import DecoyGenerator
+from templates.probe_signature import sign_probe
 from templates.sealing import MasterKeyring
 from tests.api.cli.conftest import DIM, PROBE_DIM, run
 
@@ -67,12 +69,38 @@ def test_two_lifts_share_nothing_but_the_descriptor(world, lift, tmp_path):
     assert overlap.max() < 0.999
 
 
-def test_a_probe_has_a_calibrated_dimension_and_can_go_to_stdout(world, lift):
+def test_a_probe_has_a_calibrated_dimension_and_goes_to_stdout_signed(world, lift, monkeypatch):
     (photo,) = world.photos(1, range(1))
-    ran = lift(photo, "--probe", "--out", "-")
+    token = f"vf_{'a' * 12}_{'b' * 64}"
+    monkeypatch.setenv("VEILFACE_API_KEY", token)
+    ran = lift(photo, "--probe", "--out", "-", "--subject", "me", "--level", "fmr-1e-2")
     assert ran.status == 0
-    received = wire.decode(base64.b64decode(ran.json["template"]))
-    assert received.subspace.m == PROBE_DIM
+    assert token not in ran.stderr
+    sent = base64.b64decode(ran.json["template"])
+    assert wire.decode(sent).subspace.m == PROBE_DIM
+    assert abs(ran.json["timestamp"] - time.time()) < 60
+    again = sign_probe(
+        token,
+        "me",
+        sent,
+        level="fmr-1e-2",
+        nonce=ran.json["nonce"],
+        timestamp=ran.json["timestamp"],
+    )
+    assert ran.json["hmac"] == again.hmac
+
+
+def test_a_probe_on_stdout_needs_a_subject_and_a_key(world, lift, monkeypatch):
+    (photo,) = world.photos(1, range(1))
+    monkeypatch.delenv("VEILFACE_API_KEY", raising=False)
+    for arguments, said in (
+        (("--probe",), "--subject"),
+        (("--probe", "--subject", "me"), "VEILFACE_API_KEY"),
+        (("--subject", "me"), "--probe"),
+    ):
+        ran = lift(photo, *arguments, "--out", "-")
+        assert ran.status == 2
+        assert said in ran.stderr
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,9 @@ from tests.api.cli.conftest import run
 
 
 @contextmanager
-def started(folder: Path, *arguments: str) -> Iterator[tuple["subprocess.Popen[bytes]", str]]:
+def started(
+    folder: Path, *arguments: str, ready: str = "listens on "
+) -> Iterator[tuple["subprocess.Popen[bytes]", str]]:
     """Start the service and wait until it listens; hand out the process and its URL."""
     environment = {k: v for k, v in os.environ.items() if not k.startswith("VEILFACE_")}
     with (folder / "out").open("w") as output, (folder / "err").open("w") as errors:
@@ -32,8 +34,8 @@ def started(folder: Path, *arguments: str) -> Iterator[tuple["subprocess.Popen[b
         deadline = time.monotonic() + 60
         while time.monotonic() < deadline and process.poll() is None:
             told = (folder / "err").read_text()
-            if "listens on " in told:
-                url = told.split("listens on ", 1)[1].split()[0]
+            if ready in told:
+                url = told.split(ready, 1)[1].split()[0]
                 try:
                     if httpx.get(f"{url}/health/ready").status_code == 200:
                         yield process, url
@@ -93,6 +95,43 @@ def test_a_taken_port_is_named(world, data):
         ran = run("serve", "--data-dir", data, "--pack", world.pack, "--port", str(port))
     assert ran.status == 1
     assert f"cannot listen on 127.0.0.1:{port}" in ran.stderr
+
+
+def test_a_taken_operations_port_is_named(world, data):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        ran = run(
+            "serve", "--data-dir", data, "--pack", world.pack, "--port", "0",
+            "--operations-port", str(port),
+        )  # fmt: skip
+    assert ran.status == 1
+    assert f"cannot listen on 127.0.0.1:{port}" in ran.stderr
+    assert "--operations-port" in ran.stderr
+
+
+def test_operations_get_a_free_port_too(world, data, tmp_path):
+    with started(
+        tmp_path, "--data-dir", str(data), "--pack", str(world.pack), "--operations-port", "0",
+        ready="Health and metrics are on ",
+    ) as (_, url):  # fmt: skip
+        assert "veilface_build_info" in httpx.get(f"{url}/metrics").text
+        assert httpx.get(f"{url}/v1/contract").status_code == 404
+
+
+def test_the_check_looks_at_the_key_of_tls_and_the_storage_of_limits(world, data, tmp_path):
+    common = ("serve", "--check", "--data-dir", data, "--pack", world.pack)
+    key = tmp_path / "key.pem"
+    key.write_text("")
+    key.chmod(0o644)
+    open_to_all = run(*common, "--tls-certificate", key, "--tls-key", key)
+    assert open_to_all.status == 1
+    assert "chmod 600" in open_to_all.stderr
+    storage = run(*common, "--rate-limit-storage", "redis://:hunter2@host:port")
+    assert storage.status == 1
+    assert "rate_limit_storage" in storage.stderr
+    assert "hunter2" not in storage.stderr
 
 
 @pytest.mark.parametrize("arguments", [("--help",), ("db", "current", "--json")])

@@ -1,13 +1,16 @@
 """A store on each database, with a clock that the test sets."""
 
+import threading
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from templates.sealing import MasterKeyring
 from templates.store import Source, StoredTemplate, TemplateStore
+from templates.store.envelope import Envelope, close_envelope
 from tests.databases import database_url, postgres_database, postgres_url  # noqa: F401
 
 CONTRACT = "c" * 64
@@ -50,6 +53,32 @@ def store(database_url: str, keyring: MasterKeyring, clock: Clock) -> Iterator[T
     store.tenants.create("other")
     yield store
     store.close()
+
+
+def template_id(store: TemplateStore, subject_id: str, tenant: str = "default") -> str | None:
+    """Id of the template that a subject has now."""
+    record = store.describe(tenant, subject_id)
+    return None if record is None else record.template_id
+
+
+class SlowSealing:
+    """Holds every enrollment of this process after it sealed its template, before it commits."""
+
+    def __init__(self) -> None:
+        self.sealed, self.go_on = threading.Event(), threading.Event()
+
+    def close_envelope(self, *arguments: Any) -> Envelope:
+        envelope = close_envelope(*arguments)
+        self.sealed.set()
+        assert self.go_on.wait(20)
+        return envelope
+
+
+@pytest.fixture
+def slow_sealing(monkeypatch: pytest.MonkeyPatch) -> SlowSealing:
+    slow = SlowSealing()
+    monkeypatch.setattr("templates.store.subjects.close_envelope", slow.close_envelope)
+    return slow
 
 
 def put(

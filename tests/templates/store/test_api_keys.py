@@ -1,6 +1,7 @@
 import hashlib
 import hmac
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
 from unittest import mock
 
@@ -9,7 +10,7 @@ import sqlalchemy as sa
 
 from templates.errors import StoreError
 from templates.sealing import MasterKeyring
-from templates.store import NewApiKey, Right, TemplateStore, UnknownTenant, probe_key
+from templates.store import By, NewApiKey, Right, TemplateStore, UnknownTenant, probe_key
 from templates.store.database import Database
 from templates.store.schema import ApiKeyRow
 from tests.templates.store.conftest import Clock
@@ -170,3 +171,81 @@ def test_bootstrap_happens_once(database_url: str, keyring: MasterKeyring) -> No
     store.api_keys.revoke(found.prefix)
     assert store.api_keys.bootstrap() is None  # not even when no key is left
     store.close()
+
+
+def audit(store: TemplateStore) -> list[tuple[str, str, str | None]]:
+    return [(line.action, line.outcome, line.detail) for line in store.audit_log.lines()]
+
+
+def test_a_replaced_key_works_for_the_grace_only(store: TemplateStore, clock: Clock) -> None:
+    keys = store.api_keys
+    old = keys.create("default", [Right.VERIFY, Right.ENROLL], label="front end")
+    clock.pass_by(days=1)
+    new = keys.replace(old.key.prefix, grace=timedelta(hours=2), by=By("operator:kim"))
+    assert new is not None
+    assert new.token != old.token
+    for name in ("tenant", "rights", "label", "expires_at"):
+        assert getattr(new.key, name) == getattr(old.key, name), name
+    assert new.key.created_at == clock.time
+    assert probe_key(new.token) == keys.probe_key(new.key.prefix) != probe_key(old.token)
+    assert keys.verify(old.token)
+    assert keys.verify(new.token)
+    clock.pass_by(hours=2)
+    assert keys.verify(old.token) is None
+    assert keys.verify(new.token)
+    assert audit(store) == [
+        ("key-create", "created", old.key.prefix),
+        ("key-create", "created", new.key.prefix),
+        ("key-replace", "replaced", old.key.prefix),
+    ]
+    assert [line.actor for line in store.audit_log.lines()][1:] == ["operator:kim"] * 2
+
+
+def test_replacing_does_not_prolong_anything(store: TemplateStore, clock: Clock) -> None:
+    keys = store.api_keys
+    end = clock.time + timedelta(hours=1)
+    for grace in (timedelta(hours=2), timedelta.max):
+        old = keys.create("default", [Right.VERIFY], expires_at=end)
+        new = keys.replace(old.key.prefix, grace=grace)
+        assert new is not None
+        kept = keys.get(old.key.prefix)
+        assert kept is not None
+        assert kept.expires_at == new.key.expires_at == end
+    first = keys.create("default", [Right.VERIFY])
+    second = keys.replace(first.key.prefix, grace=timedelta(0))
+    assert second is not None
+    assert keys.verify(first.token) is None
+    assert keys.verify(second.token)
+
+
+def test_only_a_valid_key_is_replaced(store: TemplateStore, clock: Clock) -> None:
+    keys, grace = store.api_keys, timedelta(hours=1)
+    revoked = keys.create("default", [Right.VERIFY])
+    keys.revoke(revoked.key.prefix)
+    expired = keys.create("default", [Right.VERIFY], expires_at=clock.time + timedelta(minutes=1))
+    clock.pass_by(minutes=1)
+    count = len(keys.all())
+    for prefix in (revoked.key.prefix, expired.key.prefix, "nothing"):
+        assert keys.replace(prefix, grace=grace) is None
+    assert len(keys.all()) == count
+    assert not [line for line in audit(store) if line[0] == "key-replace"]
+    with pytest.raises(StoreError, match="nothing or more"):
+        keys.replace(revoked.key.prefix, grace=-grace)
+
+
+def test_a_key_that_is_replaced_and_revoked_at_once_ends_revoked(store: TemplateStore) -> None:
+    keys = store.api_keys
+    for _ in range(10):
+        old = keys.create("default", [Right.VERIFY])
+        start = threading.Barrier(2)
+
+        def replace(prefix: str = old.key.prefix, start: threading.Barrier = start) -> object:
+            start.wait()
+            return keys.replace(prefix, grace=timedelta(hours=1))
+
+        with ThreadPoolExecutor(1) as threads:
+            replacing = threads.submit(replace)
+            start.wait()
+            assert keys.revoke(old.key.prefix)
+            replacing.result()
+        assert keys.verify(old.token) is None

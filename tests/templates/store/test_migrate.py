@@ -1,5 +1,6 @@
 import logging
 import threading
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -7,9 +8,9 @@ import sqlalchemy as sa
 
 from templates.errors import SealError, StoreError
 from templates.sealing import MasterKeyring
-from templates.store import TemplateStore, migrate
+from templates.store import Retention, TemplateStore, migrate
 from templates.store.database import Database
-from templates.store.schema import Base
+from templates.store.schema import Base, SubjectRow, TenantRow
 from tests.templates.store.conftest import put
 
 
@@ -47,6 +48,71 @@ def test_each_migration_can_be_taken_back(database_url: str) -> None:
     database.close()
 
 
+def test_who_is_enrolled_at_the_upgrade_is_not_taken_for_unused(
+    database_url: str, keyring: MasterKeyring
+) -> None:
+    """No use was noted before: a retention of unused subjects begins to count at the upgrade."""
+    database = Database(database_url)
+    migrate.upgrade(database, "0001")
+    now = datetime.now(UTC)
+    long_ago = now - timedelta(days=3650)
+    tenant = sa.insert(TenantRow).values(
+        id="t", name="default", rotation_epoch=1, created_at=long_ago
+    )
+    subjects = sa.insert(SubjectRow).values(
+        [
+            {
+                "id": name,
+                "tenant_id": "t",
+                "subject_id": name,
+                "wrapped_key": b"w",
+                "wrapping_key": "k",
+                "created_at": long_ago,
+                "updated_at": long_ago,
+            }
+            for name in ("ada", "eve")
+        ]
+    )
+    for statement in (tenant, subjects):
+        database.write(lambda each, run=statement: each.execute(run))
+    store = TemplateStore(database_url, keyring)
+    store.upgrade()
+    disuse = Retention(max_disuse=timedelta(days=1))
+    assert store.due(disuse) == 0
+    assert store.erase_expired(disuse) == 0
+    assert store.due(Retention(max_age=timedelta(days=3649))) == 2
+    used = database.read(lambda each: each.execute(sa.select(SubjectRow.last_used_at)).all())
+    assert len(used) == 2
+    assert all(now <= at <= datetime.now(UTC) for (at,) in used)
+    # It counts from there on, in the format that the column has: two days later they are due.
+    later = TemplateStore(database_url, keyring, clock=lambda: now + timedelta(days=2))
+    assert later.due(disuse) == 2
+    assert later.due(Retention(max_disuse=timedelta(days=3))) == 0
+    for each in (later, store, database):
+        each.close()
+
+
+def test_a_schema_with_lines_in_the_audit_log_is_not_taken_back(store: TemplateStore) -> None:
+    """Its head would begin again at 0, and the next line have the number of the first."""
+    put(store, "ada", b"wire")
+    with pytest.raises(StoreError, match="the audit log has lines"):
+        migrate.downgrade(store._database, "0001")
+    store.check()
+    put(store, "eve", b"wire")
+    assert store.audit_log.verify().intact
+
+
+def test_a_schema_that_was_taken_back_begins_the_audit_log_anew(
+    database_url: str, keyring: MasterKeyring
+) -> None:
+    for _ in range(2):
+        store = TemplateStore(database_url, keyring)
+        store.upgrade()
+        assert store.audit_log.verify().intact
+        migrate.downgrade(store._database, "0001")
+        store.close()
+
+
 def test_upgrading_twice_keeps_the_data(store: TemplateStore) -> None:
     put(store, "ada", b"wire")
     store.upgrade()
@@ -68,6 +134,7 @@ def test_workers_that_start_at_once_agree(database_url: str, keyring: MasterKeyr
             store.upgrade()
             if new := store.api_keys.bootstrap():
                 tokens.append(new.token)
+            assert store.audit_log.verify().intact
             secrets.append(store.secrets.get("pseudonym"))
         except Exception as error:
             errors.append(error)

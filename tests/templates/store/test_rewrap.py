@@ -1,7 +1,6 @@
 import threading
 from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
-from typing import Any
 
 import pytest
 import sqlalchemy as sa
@@ -10,10 +9,9 @@ from templates.errors import SealError
 from templates.sealing import MasterKeyring
 from templates.store import TemplateStore, probe_key
 from templates.store.database import Database
-from templates.store.envelope import Envelope, close_envelope
 from templates.store.rewrap import WRAPPED_COLUMNS
 from templates.store.schema import Base, TemplateRow
-from tests.templates.store.conftest import put
+from tests.templates.store.conftest import SlowSealing, put
 
 SUBJECTS = [f"s{number}" for number in range(12)]
 
@@ -45,7 +43,7 @@ def test_a_rotation_leaves_nothing_under_the_old_key(
     assert store.rewrap() == 0
     assert ciphertexts(database_url) == before  # templates are not touched
 
-    MasterKeyring.drop_retired(key_file)
+    MasterKeyring.drop_retired(key_file, keep=current)
     fresh = TemplateStore(database_url, MasterKeyring.load(key_file))
     fresh.check()
     assert wires(fresh) == {name: name.encode() for name in SUBJECTS}
@@ -68,9 +66,9 @@ def test_dropping_the_old_key_too_early_fails_at_the_start(
     store: TemplateStore, database_url: str, key_file: Path
 ) -> None:
     put(store, "ada", b"wire")
-    MasterKeyring.add_current(key_file)
+    current = MasterKeyring.add_current(key_file)
     backup = key_file.read_bytes()
-    MasterKeyring.drop_retired(key_file)
+    MasterKeyring.drop_retired(key_file, keep=current)
     early = TemplateStore(database_url, MasterKeyring.load(key_file))
     with pytest.raises(SealError, match="not the master key"):
         early.check()
@@ -133,13 +131,13 @@ def test_a_service_in_use_loses_nothing(
     thread = threading.Thread(target=use)
     thread.start()
     for _ in range(3):
-        MasterKeyring.add_current(key_file)
+        current = MasterKeyring.add_current(key_file)
         store.rewrap(batch=3)
     stop.set()
     thread.join()
     assert errors == []
     store.rewrap()
-    MasterKeyring.drop_retired(key_file)
+    MasterKeyring.drop_retired(key_file, keep=current)
     fresh = TemplateStore(database_url, MasterKeyring.load(key_file))
     assert wires(fresh) == latest
     service.close()
@@ -150,32 +148,23 @@ def test_a_write_that_sealed_before_the_rotation_is_waited_for(
     store: TemplateStore,
     database_url: str,
     key_file: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    slow_sealing: SlowSealing,
 ) -> None:
     """It sealed under the old key and has not committed: no query can see it yet."""
     service = TemplateStore(database_url, MasterKeyring.load(key_file))
     service.pseudonym("default", "-")
-    sealed, go_on = threading.Event(), threading.Event()
-
-    def slowly(*arguments: Any) -> Envelope:
-        envelope = close_envelope(*arguments)
-        sealed.set()
-        assert go_on.wait(20)
-        return envelope
-
-    monkeypatch.setattr("templates.store.subjects.close_envelope", slowly)
     with ThreadPoolExecutor(2) as threads:
         writing = threads.submit(put, service, "ada", b"wire")
-        assert sealed.wait(20)
+        assert slow_sealing.sealed.wait(20)
         current = MasterKeyring.add_current(key_file)
         rotating = threads.submit(store.rewrap)
         early = wait([rotating], timeout=0.5).done
-        go_on.set()
+        slow_sealing.go_on.set()
         writing.result()
         rotating.result()
     assert not early
     assert set(store.wrapping_keys()) == {current}
-    MasterKeyring.drop_retired(key_file)
+    MasterKeyring.drop_retired(key_file, keep=current)
     fresh = TemplateStore(database_url, MasterKeyring.load(key_file))
     found = fresh.get("default", "ada")
     assert found is not None

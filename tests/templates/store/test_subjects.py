@@ -80,7 +80,7 @@ def test_what_is_committed_is_not_reported_as_failed(
 ) -> None:
     put(store, "ada", b"first")
 
-    def fail() -> bool:
+    def fail(*, wait: float | None = None) -> bool:
         raise StoreUnavailable("all connections to the database are busy")
 
     monkeypatch.setattr(store._database, "purge_log", fail)

@@ -58,12 +58,9 @@ def read_bin(path: Path) -> VerificationSet:
     if not same:
         raise DatasetError(f"{path} holds no pair")
     photos = _photos(path, bins)
-    names: dict[bytes, str] = {}
-    for place, photo in enumerate(photos):
-        names.setdefault(photo, f"{place:05d}")
-    content_of = {name: photo for photo, name in names.items()}
+    named, content_of = _named(photos)
     trials = [
-        Trial(names[photos[2 * pair]], names[photos[2 * pair + 1]], answer, int(fold))
+        Trial(named[2 * pair], named[2 * pair + 1], answer, int(fold))
         for pair, (answer, fold) in enumerate(
             zip(same, contiguous_folds(len(same)).tolist(), strict=True)
         )
@@ -103,6 +100,24 @@ def _photos(path: Path, bins: tuple[object, ...] | list[object]) -> list[bytes]:
     if faults:
         raise DatasetError(faults_in(path, "expected encoded photos", faults))
     return photos
+
+
+def _named(photos: list[bytes]) -> tuple[list[str], dict[str, bytes]]:
+    """Name every photo by the first place of its content; also return the contents by name.
+
+    A pickle may say one photo a million times at two bytes each. Each object is looked up once,
+    so that its bytes are compared once and not each time that it is said.
+    """
+    names: dict[bytes, str] = {}
+    name_of_object: dict[int, str] = {}
+    named = []
+    for place, photo in enumerate(photos):
+        name = name_of_object.get(id(photo))
+        if name is None:
+            name = names.setdefault(photo, f"{place:05d}")
+            name_of_object[id(photo)] = name
+        named.append(name)
+    return named, {name: photo for photo, name in names.items()}
 
 
 def _answers(path: Path, answers: object) -> list[bool]:

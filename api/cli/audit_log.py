@@ -1,0 +1,173 @@
+"""``veilface audit-log``: who did what, and whether the log is whole."""
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from api.cli.console import emit, message, progress, say
+from api.cli.errors import UsageError
+from api.cli.files import read_bounded
+from api.cli.options import STORE, AsJson, takes_settings
+from api.opening import checked_store
+from api.settings import Settings
+from api.values import iso_time
+from templates.store.audit_chain import Anchor, Line
+from templates.store.audit_log import AuditLog, BrokenAuditLog
+from templates.store.identifiers import InvalidIdentifier
+
+PROBLEMS_SHOWN = 20
+MAX_ANCHOR_BYTES = 4096
+
+app = typer.Typer(no_args_is_help=True)
+
+
+@app.callback()
+def audit_log() -> None:
+    """Verify and read the audit log, in which each line is chained to the one before."""
+
+
+@app.command()
+@takes_settings(*STORE)
+def verify(
+    *,
+    settings: Settings,
+    anchor: Annotated[
+        str | None,
+        typer.Option(
+            help="What `audit-log head` wrote earlier, or a file with it. With it, a log that was "
+            "put back to an older state, head and all, is found too.",
+            show_default=False,
+        ),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Check every line; exit status 1 where one was altered, removed, added or moved.
+
+    Needs: the database and its master key, under which the chain is computed: whoever can write
+    the database but has no master key cannot write a line that passes. The service may run
+    meanwhile.
+
+    Example: `veilface audit-log verify --anchor head.txt`
+    """
+    kept = None if anchor is None else _read_anchor(anchor)
+    with (
+        checked_store(settings) as store,
+        progress("verifying the audit log", _length(store.audit_log)) as advance,
+    ):
+        found = store.audit_log.verify(anchor=kept, progress=advance)
+    problems = [
+        {"sequence": each.sequence, "through": each.through, "problem": each.what}
+        for each in found.problems
+    ]
+    if as_json:
+        emit(
+            {
+                "intact": found.intact,
+                "lines": found.lines,
+                "head": str(found.head),
+                "problems": problems,
+                "unlisted": found.unlisted,
+            }
+        )
+    elif found.intact:
+        checked = "" if kept is None else f", and holds the head of line {kept.sequence}"
+        say(f"The audit log is whole: {found.lines} lines{checked}.")
+    if not found.intact:
+        for each in found.problems[:PROBLEMS_SHOWN]:
+            through = "" if each.through in (None, each.sequence) else f" to {each.through}"
+            message(f"line {each.sequence}{through}: {each.what}")
+        more = len(problems) - PROBLEMS_SHOWN + found.unlisted
+        if more > 0:
+            message(f"… and {more} more")
+        message("error: the audit log was tampered with, or damaged")
+        raise typer.Exit(1)
+
+
+@app.command()
+@takes_settings(*STORE)
+def head(*, settings: Settings, as_json: AsJson = False) -> None:
+    """Write the number and the hash of the last line, to be kept elsewhere.
+
+    Keep it where whoever administers the database cannot write: `verify --anchor` then finds a log
+    that was put back to a state before it.
+
+    Example: `veilface audit-log head > head.txt`
+    """
+    with checked_store(settings) as store:
+        last = store.audit_log.head()
+    if as_json:
+        emit({"sequence": last.sequence, "hash": last.hash.hex()})
+    else:
+        say(str(last))
+
+
+@app.command()
+@takes_settings(*STORE, "default_tenant")
+def show(
+    *,
+    settings: Settings,
+    subject: Annotated[
+        str | None,
+        typer.Option(help="Only lines on this subject, of `--tenant`.", show_default=False),
+    ] = None,
+    tenant: Annotated[
+        str | None, typer.Option(help="Only lines of this tenant.", show_default=False)
+    ] = None,
+    after: Annotated[int, typer.Option(min=0, help="Begin after this line.")] = 0,
+    limit: Annotated[int | None, typer.Option(min=1, help="At most so many lines.")] = None,
+) -> None:
+    """Write the lines as JSON, one a line, the oldest first. Nothing is verified.
+
+    Subjects appear as pseudonyms; name one with `--subject` to find its lines.
+
+    Example: `veilface audit-log show --subject alice --limit 100`
+    """
+    written = 0
+    with checked_store(settings) as store:
+        name = tenant or (settings.default_tenant if subject is not None else None)
+        pseudonym = None if subject is None else store.pseudonym(str(name), subject)
+        for line in store.audit_log.lines(after=after):
+            if name is not None and line.tenant != name:
+                continue
+            if pseudonym is not None and line.pseudonym != pseudonym:
+                continue
+            say(json.dumps(_described(line)))
+            written += 1
+            if written == limit:
+                return
+
+
+def _described(line: Line) -> dict[str, Any]:
+    return {
+        "sequence": line.sequence,
+        "at": iso_time(line.at),
+        "tenant": line.tenant,
+        "actor": line.actor,
+        "action": line.action,
+        "subject": line.pseudonym,
+        "outcome": line.outcome,
+        "detail": line.detail,
+        "request_id": line.request_id,
+    }
+
+
+def _length(log: AuditLog) -> int | None:
+    """Lines to read, for the progress bar; None where the head, which says so, is broken."""
+    try:
+        return log.head().sequence
+    except BrokenAuditLog:
+        return None
+
+
+def _read_anchor(text: str) -> Anchor:
+    path = Path(text)
+    if path.is_file():
+        text = read_bounded(path, MAX_ANCHOR_BYTES).decode("ascii", errors="replace")
+    try:
+        return Anchor.parse(text.strip())
+    except InvalidIdentifier:
+        raise UsageError(
+            "--anchor takes what `veilface audit-log head` wrote, or its file"
+        ) from None

@@ -1,0 +1,198 @@
+// The camera, with live guidance: about one small frame a second is asked about, and slower where
+// the service says so. The photo that counts is taken at full size, when the visitor says so, and
+// asked about itself before it is handed on.
+
+import { h, s } from "./dom.js";
+import { Problem, call, crops, form } from "./service.js";
+import { guidance, sentence } from "./words.js";
+
+const EVERY_MS = 1000;
+const FRAME = 480;
+const PHOTO = 1280;
+const QUALITY = 0.92;
+const OFF = "The camera is off.";
+
+// A picture of at most `side` pixels as JPEG, its middle square where that is asked for.
+export async function picture(source, width, height, { side, quality = QUALITY, square = false }) {
+  const [w, hgt] = square ? [Math.min(width, height), Math.min(width, height)] : [width, height];
+  const scale = Math.min(1, side / Math.max(w, hgt));
+  const canvas = h("canvas", { width: Math.round(w * scale), height: Math.round(hgt * scale) });
+  canvas
+    .getContext("2d")
+    .drawImage(source, (width - w) / 2, (height - hgt) / 2, w, hgt, 0, 0, canvas.width, canvas.height);
+  const blob = await new Promise((done) => canvas.toBlob(done, "image/jpeg", quality));
+  // No blob: the picture is empty, or too large for the browser.
+  if (!blob) throw new Problem({ code: "page_error", message: "the browser could not make a photo" });
+  return { blob, width: canvas.width, height: canvas.height };
+}
+
+export const check = (blob, face, signal) =>
+  call("POST", "/v1/photos/check", { body: form("image", [blob], { face }), signal });
+
+// The service could not be asked; that says nothing of the photo.
+export const unasked = ({ status, code }) =>
+  code !== "page_error" && (!status || status === 429 || status >= 500);
+
+function whyNot(error) {
+  if (!navigator.mediaDevices) {
+    return "The browser gives the camera to pages over HTTPS or on localhost only. Use files instead.";
+  }
+  if (error?.name === "NotAllowedError") {
+    return "The browser was not allowed to use the camera. Allow it in the address bar, or use files.";
+  }
+  if (error?.name === "NotFoundError") return "No camera was found. Use files instead.";
+  return "The camera cannot be used; another program may hold it. Use files instead.";
+}
+
+const release = (stream) => stream?.getTracks().forEach((each) => each.stop());
+
+// `onphoto(blob, name, seen)` is called for each photo that would do, with what the service saw, or
+// null where it could not be asked; `face()` says which face counts.
+export function camera({ onphoto, face, capture = "Take photo" }) {
+  const video = h("video", { playsinline: true, muted: true, "aria-label": "Your camera" });
+  video.muted = true;
+  const frame = s("rect", { class: "found", rx: "6" });
+  const overlay = s("svg", { class: "overlay", "aria-hidden": "true" }, frame);
+  const stage = h("div", { class: "stage", hidden: true }, video, overlay);
+  const said = h("p", { class: "guidance", role: "status", "data-state": "idle" }, OFF);
+  const start = h("button", { type: "button", class: "secondary", onclick: begin }, "Start camera");
+  const take = h("button", { type: "button", hidden: true, onclick: photo }, capture);
+  const refused = h("p", { class: "refused", role: "status" });
+  let stream = null;
+  let running = new AbortController();
+
+  function say(text, state) {
+    // Only what changed is read out.
+    if (said.textContent !== text) said.textContent = text;
+    said.dataset.state = state;
+    stage.dataset.state = state;
+  }
+
+  async function begin() {
+    stop();
+    running = new AbortController();
+    const { signal } = running;
+    start.disabled = true;
+    refused.textContent = "";
+    let opened = null;
+    try {
+      if (!navigator.mediaDevices) throw new Error("insecure");
+      opened = await navigator.mediaDevices.getUserMedia({
+        audio: false,
+        video: { facingMode: "user", width: { ideal: PHOTO } },
+      });
+    } catch (error) {
+      start.disabled = false;
+      if (!signal.aborted) say(whyNot(error), "bad");
+      return;
+    }
+    if (over(signal)) return release(opened);
+    stream = opened;
+    for (const track of stream.getVideoTracks()) {
+      // Unplugged, forbidden, or taken by another program.
+      for (const name of ["ended", "mute"]) track.addEventListener(name, lost, { signal });
+    }
+    addEventListener("pagehide", lost, { signal });
+    video.srcObject = stream;
+    await video.play().catch(() => {});
+    if (over(signal)) return release(opened);
+    stage.hidden = take.hidden = false;
+    start.hidden = true;
+    take.focus();
+    say("Looking for a face…", "idle");
+    guide(signal);
+  }
+
+  // The view was left, or the camera stopped, while something was awaited.
+  function over(signal) {
+    if (!signal.aborted && !root.isConnected) stop();
+    return signal.aborted;
+  }
+
+  async function guide(signal) {
+    while (!over(signal)) {
+      const begun = Date.now();
+      let pause = EVERY_MS;
+      if (!document.hidden && video.videoWidth) {
+        try {
+          const small = await snap(FRAME, 0.8);
+          if (over(signal)) return;
+          const seen = await check(small.blob, face(), signal);
+          if (over(signal)) return;
+          say(guidance(seen), seen.usable ? "good" : "bad");
+          mark(seen.box, small);
+        } catch (error) {
+          if (over(signal)) return;
+          mark(null);
+          const known = error instanceof Problem;
+          pause = 1000 * Math.max(2, (known && error.wait) || 0);
+          say(
+            error.code === "rate_limited"
+              ? "Guidance pauses: too many requests. You can still take a photo."
+              : "Guidance is not available now. You can still take a photo.",
+            "idle",
+          );
+        }
+      }
+      await new Promise((done) => setTimeout(done, Math.max(250, pause - (Date.now() - begun))));
+    }
+  }
+
+  function mark(box, size) {
+    frame.toggleAttribute("hidden", !box);
+    if (!box) return;
+    overlay.setAttribute("viewBox", `0 0 ${size.width} ${size.height}`);
+    const [x1, y1, x2, y2] = box;
+    for (const [name, value] of Object.entries({ x: x1, y: y1, width: x2 - x1, height: y2 - y1 })) {
+      frame.setAttribute(name, value);
+    }
+  }
+
+  // Packs without a detector take aligned crops, which are square.
+  const snap = (side, quality) =>
+    picture(video, video.videoWidth, video.videoHeight, { side, quality, square: crops() });
+
+  async function photo() {
+    const { signal } = running;
+    take.disabled = true;
+    refused.textContent = "";
+    let taken = null;
+    let seen = null;
+    let why = null;
+    try {
+      taken = await snap(PHOTO, QUALITY);
+      if (over(signal)) return;
+      seen = await check(taken.blob, face(), signal);
+    } catch (error) {
+      if (over(signal)) return;
+      if (!(error instanceof Problem)) throw error;
+      if (!unasked(error)) why = sentence(error.message);
+    } finally {
+      take.disabled = false;
+    }
+    if (over(signal)) return;
+    // Unless the visitor went on meanwhile; a button that is switched off loses the focus.
+    if (document.activeElement === document.body) take.focus();
+    if (seen && !seen.usable) why = guidance(seen);
+    if (why) refused.textContent = `Not taken. ${why}`;
+    else onphoto(taken.blob, "camera", seen);
+  }
+
+  function lost() {
+    const focused = document.activeElement === take;
+    stop();
+    stage.hidden = take.hidden = true;
+    start.hidden = start.disabled = false;
+    if (focused) start.focus();
+    say("The camera has stopped. Start it again, or use files.", "bad");
+  }
+
+  function stop() {
+    running.abort();
+    release(stream);
+    video.srcObject = stream = null;
+  }
+
+  const root = h("div", { class: "camera" }, stage, said, h("div", { class: "row" }, start, take), refused);
+  return { root, stop };
+}

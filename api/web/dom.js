@@ -1,0 +1,90 @@
+// Elements from code: no text is ever parsed as markup.
+
+const SVG = "http://www.w3.org/2000/svg";
+
+function fill(node, attributes, children) {
+  for (const [name, value] of Object.entries(attributes ?? {})) {
+    if (value === null || value === undefined || value === false) continue;
+    if (name.startsWith("on")) node.addEventListener(name.slice(2), value);
+    else if (name === "value") node.value = value;
+    else node.setAttribute(name, value === true ? "" : value);
+  }
+  node.append(...children.flat().filter((each) => each !== null && each !== undefined));
+  return node;
+}
+
+export const h = (tag, attributes, ...children) =>
+  fill(document.createElement(tag), attributes, children);
+
+export const s = (tag, attributes, ...children) =>
+  fill(document.createElementNS(SVG, tag), attributes, children);
+
+let last = 0;
+export const newId = (name) => `${name}-${++last}`;
+
+// A labelled control, with a hint that belongs to it.
+export function field(label, control, hint) {
+  control.id ||= newId("field");
+  const parts = [h("label", { for: control.id }, label), control];
+  if (hint) {
+    const id = `${control.id}-hint`;
+    control.setAttribute("aria-describedby", id);
+    parts.push(h("p", { class: "hint", id }, hint));
+  }
+  return h("div", { class: "field" }, parts);
+}
+
+// Terms and values; a value that is null is left out.
+export function facts(pairs) {
+  return h(
+    "dl",
+    { class: "facts" },
+    pairs
+      .filter(([, value]) => value !== null && value !== undefined)
+      .map(([term, value]) => h("div", {}, h("dt", {}, term), h("dd", {}, value))),
+  );
+}
+
+// A table that scrolls by itself where it is too wide; the keyboard reaches it.
+export function table(caption, head, rows) {
+  return h(
+    "div",
+    { class: "scroll", tabindex: "0", role: "region", "aria-label": caption },
+    h(
+      "table",
+      {},
+      h("caption", {}, caption),
+      h("thead", {}, h("tr", {}, head.map((each) => h("th", { scope: "col" }, each)))),
+      h(
+        "tbody",
+        {},
+        rows.map(([first, ...rest]) =>
+          h("tr", {}, h("th", { scope: "row" }, first), rest.map((each) => h("td", {}, each))),
+        ),
+      ),
+    ),
+  );
+}
+
+export const percent = (rate) =>
+  rate === null || rate === undefined ? "unknown" : `${Number((100 * rate).toPrecision(3))} %`;
+
+export const oneIn = (rate) => (rate > 0 ? `1 in ${Math.round(1 / rate).toLocaleString("en")}` : "none seen");
+
+export function when(text) {
+  if (!text) return "never";
+  const time = new Date(text);
+  return h(
+    "time",
+    { datetime: text },
+    time.toLocaleString("en-GB", { dateStyle: "medium", timeStyle: "short" }),
+  );
+}
+
+export const bytes = (count) => `${count.toLocaleString("en")} bytes`;
+
+export function download(name, text) {
+  const url = URL.createObjectURL(new Blob([text], { type: "application/json" }));
+  h("a", { href: url, download: name }).click();
+  setTimeout(() => URL.revokeObjectURL(url), 10000);
+}

@@ -1,0 +1,119 @@
+import { facts, field, h } from "./dom.js";
+import { photoPicker } from "./photos.js";
+import { call, form, may, nonce, session, subjectPath } from "./service.js";
+import { lacking, problemBox } from "./words.js";
+
+export function subjectField(id = "") {
+  const input = h("input", {
+    type: "text",
+    required: true,
+    maxlength: "128",
+    pattern: "[A-Za-z0-9._@:\\-]{1,128}",
+    autocomplete: "off",
+    autocapitalize: "none",
+    spellcheck: "false",
+    value: id,
+  });
+  return [input, field("Person's id", input, "1 to 128 letters, digits or . _ @ : -")];
+}
+
+// What the key, or the service, does not allow: said once, above the form that it switches off.
+export function whyOff(right) {
+  if (!may(right)) return lacking(right);
+  if (!session.contract.photos) {
+    return "This service runs without a model pack: it takes lifted templates only, and no photos.";
+  }
+  return null;
+}
+
+export const offNote = (why) => (why ? h("p", { class: "off", role: "note" }, why) : null);
+
+export function enrollView(id) {
+  const why = whyOff("enroll");
+  const [subject, subjectPart] = subjectField(id);
+  const result = h("div", { class: "result" });
+  const send = h("button", { type: "submit", disabled: true }, "Enroll");
+  const picker = why
+    ? null
+    : photoPicker({
+        most: 10,
+        onchange: (ready) => {
+          send.disabled = !ready;
+          result.replaceChildren();
+        },
+      });
+
+  async function submit(event) {
+    event.preventDefault();
+    if (fields.disabled) return;
+    // The answer is about this person and these photos, whatever else is chosen when it comes.
+    const name = subject.value;
+    const sent = picker.chosen();
+    const body = form("images", picker.blobs(), { face: picker.face() });
+    fields.disabled = true;
+    send.textContent = "Enrolling…";
+    result.replaceChildren();
+    try {
+      const answer = await call("PUT", `${subjectPath(name)}/enrollment`, {
+        body,
+        headers: { "Idempotency-Key": nonce() },
+      });
+      fields.disabled = false;
+      picker.drop(sent);
+      const shown = enrolled(name, answer);
+      result.replaceChildren(shown);
+      shown.focus();
+    } catch (error) {
+      fields.disabled = false;
+      if (error.details) picker.blame(error, sent);
+      result.replaceChildren(problemBox(error));
+    }
+    send.textContent = "Enroll";
+    send.disabled = !picker.ready();
+    if (document.activeElement === document.body) send.focus();
+  }
+
+  const fields = h(
+    "fieldset",
+    { class: "plain", disabled: why !== null },
+    subjectPart,
+    picker?.root ?? null,
+    send,
+  );
+
+  const root = h(
+    "section",
+    {},
+    h("h1", { tabindex: "-1" }, "Enroll"),
+    h(
+      "p",
+      { class: "lead" },
+      "The photos become one private template, encrypted; the photos are not kept. ",
+      "A person who is enrolled already is replaced.",
+    ),
+    offNote(why),
+    h("form", { class: "card", onsubmit: submit }, fields),
+    result,
+  );
+  return { root, stop: () => picker?.stop() };
+}
+
+function enrolled(id, answer) {
+  return h(
+    "div",
+    { class: "verdict accept", role: "status", tabindex: "-1" },
+    h("p", { class: "verdict-word" }, answer.replaced ? "Enrolled anew" : "Enrolled"),
+    facts([
+      ["Person", id],
+      ["Photos used", String(answer.images.length)],
+      ["Earlier enrollment", answer.replaced ? "replaced" : "none"],
+      ["Template", h("code", {}, answer.template_id)],
+    ]),
+    h(
+      "p",
+      { class: "row" },
+      h("a", { href: `#/verify/${encodeURIComponent(id)}` }, "Verify this person"),
+      h("a", { href: `#/stored/${encodeURIComponent(id)}` }, "See what is stored"),
+    ),
+  );
+}

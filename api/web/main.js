@@ -1,0 +1,169 @@
+// Sign-in, navigation and focus; each view is a module of its own.
+
+import { h } from "./dom.js";
+import { enrollView } from "./enroll.js";
+import { peopleView } from "./people.js";
+import { serviceView } from "./panel.js";
+import { forgetKey, hasKey, learn, session, useKey } from "./service.js";
+import { storedView } from "./stored.js";
+import { verifyView } from "./verify.js";
+import { problemBox } from "./words.js";
+
+const VIEWS = {
+  verify: ["Verify", verifyView],
+  enroll: ["Enroll", enrollView],
+  people: ["People", peopleView],
+  stored: ["Stored", storedView],
+  service: ["Service", serviceView],
+};
+
+const main = document.getElementById("main");
+const nav = document.getElementById("nav");
+const who = document.getElementById("who");
+let open = null;
+
+function show(view, title, focus = true) {
+  open?.stop();
+  open = view;
+  main.replaceChildren(view.root);
+  document.title = `${title} · Veilface`;
+  if (focus) {
+    view.root.querySelector("h1").focus({ preventScroll: true });
+    scrollTo(0, 0);
+  }
+}
+
+function route(focus = true) {
+  if (!session.own) return;
+  const [, name, id] = location.hash.split("/");
+  const known = Object.hasOwn(VIEWS, name ?? "") ? name : "verify";
+  for (const link of nav.querySelectorAll("a")) {
+    if (link.dataset.view === known) link.setAttribute("aria-current", "page");
+    else link.removeAttribute("aria-current");
+  }
+  const [title, view] = VIEWS[known];
+  let subject = "";
+  try {
+    subject = decodeURIComponent(id ?? "");
+  } catch {
+    // A link that was cut: as if it named nobody.
+  }
+  show(view(subject), title, focus);
+}
+
+function signedIn(focus) {
+  nav.replaceChildren(
+    h(
+      "ul",
+      {},
+      Object.entries(VIEWS).map(([name, [title]]) =>
+        h("li", {}, h("a", { href: `#/${name}`, "data-view": name }, title)),
+      ),
+    ),
+  );
+  who.replaceChildren(
+    h("span", { class: "fine" }, h("code", {}, `vf_${session.own.prefix}_…`)),
+    h("button", { type: "button", class: "quiet", onclick: () => signOut(null) }, "Sign out"),
+  );
+  nav.hidden = who.hidden = false;
+  if (session.own.demo) document.documentElement.dataset.demo = "yes";
+  route(focus);
+}
+
+function signOut(problem) {
+  forgetKey();
+  nav.hidden = who.hidden = true;
+  show(signInView(problem), "Sign in");
+}
+
+function signInView(problem = null) {
+  const key = h("input", {
+    type: "password",
+    id: "key",
+    required: true,
+    autocomplete: "off",
+    spellcheck: "false",
+    "aria-describedby": "key-hint",
+  });
+  const keep = h("input", { type: "checkbox", id: "keep" });
+  const send = h("button", { type: "submit" }, "Sign in");
+  const trouble = h("div", {}, problem ? problemBox(problem) : null);
+
+  async function submit(event) {
+    event.preventDefault();
+    const token = key.value.trim();
+    // A header carries visible ASCII only; anything else is no key.
+    if (!/^[!-~]+$/.test(token)) {
+      trouble.replaceChildren(
+        problemBox({ code: "unauthorized", message: "this is no API key: keys begin with vf_", details: {} }),
+      );
+      return;
+    }
+    send.disabled = true;
+    trouble.replaceChildren();
+    useKey(token, keep.checked);
+    try {
+      await learn();
+    } catch (error) {
+      forgetKey();
+      trouble.replaceChildren(problemBox(error));
+      send.disabled = false;
+      key.focus();
+      return;
+    }
+    key.value = "";
+    signedIn(true);
+  }
+
+  const root = h(
+    "section",
+    { class: "sign-in" },
+    h("h1", { tabindex: "-1" }, "Sign in"),
+    h(
+      "p",
+      { class: "lead" },
+      "Enroll and verify faces with this service, and see what it stores of them.",
+    ),
+    h(
+      "form",
+      { class: "card", onsubmit: submit },
+      h(
+        "div",
+        { class: "field" },
+        h("label", { for: "key" }, "API key"),
+        key,
+        h(
+          "p",
+          { class: "hint", id: "key-hint" },
+          "The first start of the service prints one; ",
+          h("code", {}, "veilface keys create"),
+          " makes others.",
+        ),
+      ),
+      h("p", { class: "check" }, keep, h("label", { for: "keep" }, "Keep it until this tab is closed")),
+      send,
+    ),
+    trouble,
+  );
+  return { root, stop() {} };
+}
+
+session.onrefused = signOut;
+document.querySelector(".skip").addEventListener("click", (event) => {
+  // Without a change of the address, which names the view.
+  event.preventDefault();
+  main.focus();
+});
+addEventListener("hashchange", () => route());
+
+if (hasKey()) {
+  try {
+    await learn();
+    signedIn(false);
+  } catch (error) {
+    if (error.status === 401) signOut(error);
+    else show(signInView(error), "Sign in", false);
+  }
+} else {
+  show(signInView(), "Sign in", false);
+}

@@ -1,0 +1,129 @@
+import { download, facts, h, oneIn, percent, table, when } from "./dom.js";
+import { call, session } from "./service.js";
+import { problemBox } from "./words.js";
+
+const RIGHTS = {
+  enroll: "enroll, list and describe people",
+  verify: "verify a photo",
+  erase: "erase a person",
+  export: "export and import",
+  scores: "see distances",
+  embeddings: "send templates and embeddings",
+  admin: "lift lockouts",
+};
+
+export function serviceView() {
+  const { contract, own } = session;
+  const health = h("div", { role: "status" }, h("p", { class: "hint" }, "Asking…"));
+  ask(health);
+  const root = h(
+    "section",
+    {},
+    h("h1", { tabindex: "-1" }, "Service"),
+    h(
+      "div",
+      { class: "columns" },
+      h(
+        "section",
+        { class: "card" },
+        h("h2", {}, "Health"),
+        health,
+        h(
+          "p",
+          {},
+          h("button", { type: "button", class: "secondary", onclick: () => ask(health) }, "Ask again"),
+        ),
+      ),
+      h(
+        "section",
+        { class: "card" },
+        h("h2", {}, "This key"),
+        facts([
+          ["Key", h("code", {}, `vf_${own.prefix}_…`)],
+          ["Tenant", own.tenant],
+          ["Ends", own.expires_at ? when(own.expires_at) : "never"],
+        ]),
+        h(
+          "ul",
+          { class: "rights", "aria-label": "Rights" },
+          Object.entries(RIGHTS).map(([right, meaning]) => {
+            const has = own.rights.includes(right);
+            return h(
+              "li",
+              { class: has ? "has" : "lacks" },
+              h("span", { "aria-hidden": "true" }, has ? "✓ " : "– "),
+              h("strong", {}, right),
+              `: ${has ? "may" : "may not"} ${meaning}`,
+            );
+          }),
+        ),
+      ),
+    ),
+    h(
+      "section",
+      { class: "card" },
+      h("h2", {}, "Contract"),
+      h("p", { class: "hint" }, "What templates and thresholds belong to."),
+      facts([
+        ["Contract", h("code", {}, contract.contract_id)],
+        ["Model pack", String(contract.recorded.pack ?? "not recorded")],
+        ["Takes photos", contract.photos ? "yes" : "no: no model pack"],
+        ["Lifting", `${contract.binding.strategy}, m = ${contract.binding.m}, n = ${contract.binding.n}`],
+        ["Decoys", h("code", {}, contract.binding.decoy_source_id)],
+        ["Default level", contract.default_level],
+        ["Key of receipts", h("code", {}, contract.receipt_key.public_key)],
+      ]),
+      h(
+        "p",
+        {},
+        h(
+          "button",
+          {
+            type: "button",
+            class: "secondary",
+            onclick: () => download("contract.json", JSON.stringify(contract, null, 1)),
+          },
+          "Download contract",
+        ),
+      ),
+      contract.calibrations.map((each) =>
+        table(
+          each.mode === "p2s"
+            ? "Levels for photos"
+            : `Levels for lifted probes, m = ${each.probe_m}`,
+          ["Level", "Target FMR", "FMR seen", "FNMR seen"],
+          each.levels.map((level) => [
+            level.name,
+            level.target_fmr ? `${percent(level.target_fmr)} (${oneIn(level.target_fmr)})` : "none",
+            counted(level.fmr),
+            counted(level.fnmr),
+          ]),
+        ),
+      ),
+    ),
+  );
+  return { root, stop() {} };
+}
+
+function counted(rate) {
+  if (!rate) return "unknown";
+  const value = rate.trials ? rate.errors / rate.trials : null;
+  return `${percent(value)} (${rate.errors} of ${rate.trials.toLocaleString("en")})`;
+}
+
+async function ask(place) {
+  const parts = [];
+  for (const [what, path] of [
+    ["Process", "/health/live"],
+    ["Database and model", "/health/ready"],
+  ]) {
+    try {
+      await call("GET", path);
+      parts.push([what, h("span", { class: "ok" }, "✓ answers")]);
+    } catch (error) {
+      if (error.code === "not_found") parts.push([what, "asked on the operations port only"]);
+      else parts.push([what, problemBox(error)]);
+    }
+  }
+  place.replaceChildren(facts(parts));
+}

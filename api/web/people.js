@@ -1,0 +1,203 @@
+import { download, facts, h, when } from "./dom.js";
+import { offNote } from "./enroll.js";
+import { call, may, subjectPath } from "./service.js";
+import { lacking, problemBox } from "./words.js";
+
+const PAGE = 25;
+
+export function peopleView() {
+  const list = h("ul", { class: "people" });
+  const said = h("p", { class: "hint", role: "status" }, "");
+  const problem = h("div", {});
+  const receipts = h("div", { class: "result" });
+  const more = h("button", { type: "button", class: "secondary", hidden: true, onclick: load }, "Show more");
+  const title = h("h1", { tabindex: "-1" }, "People");
+  const why = may("enroll") ? null : lacking("enroll");
+  let cursor = null;
+  let dialog = null;
+
+  async function load() {
+    more.disabled = true;
+    problem.replaceChildren();
+    try {
+      const query = new URLSearchParams({ limit: String(PAGE), ...(cursor ? { cursor } : {}) });
+      const page = await call("GET", `/v1/subjects?${query}`);
+      const added = page.subjects.map(card);
+      list.append(...added);
+      if (cursor) added[0]?.querySelector("a, button")?.focus();
+      cursor = page.next_cursor;
+      more.hidden = cursor === null;
+      count();
+    } catch (error) {
+      problem.replaceChildren(problemBox(error));
+    }
+    more.disabled = false;
+  }
+
+  function count() {
+    const shown = list.childElementCount;
+    said.textContent = shown
+      ? `${shown} ${shown === 1 ? "person" : "people"} shown${cursor ? ", and there are more" : ""}.`
+      : "Nobody is enrolled yet.";
+  }
+
+  function card(person) {
+    const id = person.subject_id;
+    const path = encodeURIComponent(id);
+    const erasing = may("erase");
+    const erase = h(
+      "button",
+      {
+        type: "button",
+        class: "danger",
+        disabled: !erasing,
+        title: erasing ? null : lacking("erase"),
+        "aria-label": `Erase ${id}`,
+        onclick: () => {
+          const failed = (error) => problem.replaceChildren(problemBox(error));
+          dialog = confirmErasure(id, () => gone(id, item), failed);
+        },
+      },
+      "Erase…",
+    );
+    const item = h(
+      "li",
+      { class: "card person" },
+      h("h2", {}, id),
+      h(
+        "p",
+        { class: "hint" },
+        person.enrolled_by === "photos" ? `${person.photos} photos, ` : "lifted by the client, ",
+        "enrolled ",
+        when(person.updated_at),
+        person.current ? "" : ". Of an earlier contract: enroll again",
+      ),
+      h(
+        "p",
+        { class: "row" },
+        h("a", { href: `#/stored/${path}`, "aria-label": `What is stored of ${id}` }, "What is stored"),
+        h("a", { href: `#/verify/${path}`, "aria-label": `Verify ${id}` }, "Verify"),
+        h("a", { href: `#/enroll/${path}`, "aria-label": `Enroll ${id} again` }, "Enroll again"),
+        erase,
+      ),
+    );
+    return item;
+  }
+
+  async function gone(id, item) {
+    problem.replaceChildren();
+    const answer = await call("DELETE", subjectPath(id));
+    item.remove();
+    count();
+    const shown = receipt(id, answer);
+    // Those of earlier erasures stay: they may not have been downloaded yet.
+    receipts.prepend(shown);
+    return shown;
+  }
+
+  if (!why) load();
+  const root = h(
+    "section",
+    {},
+    title,
+    h("p", { class: "lead" }, "Everybody whom this key's tenant has enrolled, in the order of their ids."),
+    offNote(why),
+    may("erase") ? null : offNote(lacking("erase")),
+    receipts,
+    problem,
+    said,
+    list,
+    more,
+  );
+  return { root, stop: () => dialog?.close() };
+}
+
+// The work is done while the dialog is open, so that a failure is told where it was asked for; a
+// browser may close it all the same, and then `failed` tells it.
+function confirmErasure(id, work, failed) {
+  const before = document.activeElement;
+  const problem = h("div", {});
+  const keep = h("button", { type: "button", class: "secondary", onclick: () => dialog.close() }, "Keep");
+  const erase = h(
+    "button",
+    {
+      type: "button",
+      class: "danger",
+      onclick: async () => {
+        erase.disabled = keep.disabled = true;
+        problem.replaceChildren();
+        try {
+          then = await work();
+          dialog.close();
+        } catch (error) {
+          if (dialog.open) problem.replaceChildren(problemBox(error));
+          else failed(error);
+          erase.disabled = keep.disabled = false;
+        }
+      },
+    },
+    "Erase",
+  );
+  // What has the focus afterwards; nothing outside can take it while the dialog is open.
+  let then = before;
+  const dialog = h(
+    "dialog",
+    { "aria-labelledby": "erase-title", "aria-describedby": "erase-text" },
+    h("h2", { id: "erase-title" }, `Erase ${id}?`),
+    h(
+      "p",
+      { id: "erase-text" },
+      "The template, its key and all that is kept about this person are removed, and cannot be ",
+      "brought back. You get a signed receipt.",
+    ),
+    problem,
+    h("p", { class: "row" }, keep, erase),
+  );
+  dialog.addEventListener("cancel", (event) => {
+    if (erase.disabled) event.preventDefault();
+  });
+  dialog.addEventListener("close", () => {
+    dialog.remove();
+    then?.focus();
+  });
+  document.body.append(dialog);
+  dialog.showModal();
+  keep.focus();
+  return dialog;
+}
+
+function receipt(id, answer) {
+  const { claims } = answer;
+  const text = JSON.stringify(answer, null, 1);
+  return h(
+    "div",
+    { class: "verdict accept", role: "status", tabindex: "-1" },
+    h("p", { class: "verdict-word" }, `Erased ${id}`),
+    facts([
+      ["Erased at", when(claims.erased_at)],
+      ["Removed", claims.erased.map((each) => `${each.count} ${each.item.replaceAll("_", " ")}`).join(", ")],
+      ["Receipt names the person", h("code", {}, `${claims.subject.slice(0, 16)}…`)],
+      ["Signed by key", h("code", {}, claims.signing_key)],
+    ]),
+    h(
+      "p",
+      { class: "row" },
+      h(
+        "button",
+        {
+          type: "button",
+          class: "secondary",
+          onclick: () => download(`receipt-${claims.receipt_id}.json`, text),
+        },
+        "Download receipt",
+      ),
+    ),
+    h(
+      "p",
+      { class: "fine" },
+      "Check it with ",
+      h("code", {}, "veilface keys verify-receipt receipt.json --public-key contract.json"),
+      "; the view Service has the contract to download.",
+    ),
+  );
+}

@@ -1,0 +1,256 @@
+// Where photos come from: the camera, files, and in the demo drawn people; and a tray of those chosen.
+
+import { camera, check, picture, unasked } from "./camera.js";
+import { h, newId } from "./dom.js";
+import { Problem, call } from "./service.js";
+import { guidance, problemBox, sentence } from "./words.js";
+
+// What is larger is made smaller once, when it is chosen; the same bytes are then checked and sent.
+// Ten of the largest stay below what a request may have.
+const SIDE = 1600;
+const BYTES = 2 * 1024 * 1024;
+
+const SOURCES = { camera: "Camera", files: "Files", drawn: "Drawn people" };
+
+// Runs one piece of work after the other.
+function inTurn() {
+  let last = Promise.resolve();
+  return (work) => (last = last.then(work, work));
+}
+
+// What the browser cannot decode or draw goes to the service as it is, which says why it will not do.
+async function smaller(blob) {
+  let bitmap = null;
+  try {
+    bitmap = await createImageBitmap(blob);
+    if (Math.max(bitmap.width, bitmap.height) <= SIDE && blob.size <= BYTES) return blob;
+    return (await picture(bitmap, bitmap.width, bitmap.height, { side: SIDE })).blob;
+  } catch {
+    return blob;
+  } finally {
+    bitmap?.close();
+  }
+}
+
+export function photoPicker({ most, capture, onchange }) {
+  const demo = document.documentElement.dataset.demo === "yes";
+  const photos = [];
+  const tray = h("ul", { class: "tray", "aria-label": most > 1 ? "Chosen photos" : "Chosen photo" });
+  const told = h("p", { class: "hint", role: "status" });
+  const panel = h("div", { class: "source" });
+  const largest = h("input", { type: "checkbox", id: newId("largest") });
+  const face = () => (largest.checked ? "largest" : "");
+  let live = null;
+  // Decoded, photos of a telephone take 50 MB each.
+  const decoding = inTurn();
+  const asking = inTurn();
+
+  // `seen` is what the service saw already in this very photo.
+  function add(blob, name, seen = null) {
+    if (photos.length >= most) {
+      if (most > 1) {
+        told.textContent = `${most} photos at most: remove one first.`;
+        return;
+      }
+      remove(photos[0]);
+    }
+    const photo = { blob: null, name, url: URL.createObjectURL(blob) };
+    photo.said = h("span", { class: "seen", "data-state": "idle" }, "Checking…");
+    photo.item = h(
+      "li",
+      {},
+      h("img", { src: photo.url, alt: `Chosen photo, from ${name}` }),
+      photo.said,
+      h(
+        "button",
+        {
+          type: "button",
+          class: "quiet",
+          "aria-label": `Remove photo from ${name}`,
+          onclick: () => {
+            remove(photo);
+            (tray.querySelector("button") ?? panel.querySelector("button, input, select"))?.focus();
+          },
+        },
+        "Remove",
+      ),
+    );
+    photos.push(photo);
+    tray.append(photo.item);
+    changed();
+    decoding(async () => {
+      if (!photos.includes(photo)) return;
+      photo.blob = seen ? blob : await smaller(blob);
+      if (!photos.includes(photo)) return;
+      onchange(ready());
+      if (seen) tell(photo, seen);
+      else look(photo);
+    });
+  }
+
+  function remove(photo) {
+    URL.revokeObjectURL(photo.url);
+    photo.item.remove();
+    photos.splice(photos.indexOf(photo), 1);
+    changed();
+  }
+
+  function changed() {
+    told.textContent = most > 1 ? `${photos.length} of ${most} photos chosen.` : "";
+    onchange(ready());
+  }
+
+  const ready = () => photos.length > 0 && photos.every((each) => each.blob);
+
+  function look(photo) {
+    asking(async () => {
+      if (!photo.blob || !photos.includes(photo)) return;
+      try {
+        tell(photo, await check(photo.blob, face(), ended.signal));
+      } catch (error) {
+        if (error.name === "AbortError") return;
+        if (!(error instanceof Problem)) throw error;
+        if (unasked(error)) mark(photo, "Not checked beforehand.", "idle");
+        else mark(photo, sentence(error.message), "bad");
+      }
+    });
+  }
+
+  const ended = new AbortController();
+  const tell = (photo, seen) => mark(photo, guidance(seen), seen.usable ? "good" : "bad");
+
+  function mark(photo, text, state) {
+    photo.said.textContent = text;
+    photo.said.dataset.state = state;
+  }
+
+  const builders = {
+    camera() {
+      live = camera({ onphoto: add, face, capture });
+      return live.root;
+    },
+    files() {
+      const input = h("input", {
+        type: "file",
+        id: newId("files"),
+        accept: "image/jpeg,image/png,image/webp",
+        multiple: most > 1,
+        onchange: () => {
+          for (const file of input.files) add(file, file.name);
+          input.value = "";
+        },
+      });
+      const many = most > 1 ? `Photos: JPEG, PNG or WebP, ${most} at most` : "Photo: JPEG, PNG or WebP";
+      return h("div", { class: "field" }, h("label", { for: input.id }, many), input);
+    },
+    drawn() {
+      const who = h("select", { id: newId("who") });
+      const shots = h("div", { class: "shots" });
+      const show = () => {
+        const urls = Array.from({ length: shown }, (_, index) => `/demo/people/${who.value}/${index}.png`);
+        shots.replaceChildren(
+          ...urls.map((url, index) =>
+            h(
+              "button",
+              {
+                type: "button",
+                class: "shot",
+                "aria-label": `Choose photo ${index + 1} of ${who.value}`,
+                onclick: async () => {
+                  const drawn = await fetch(url);
+                  if (drawn.ok) add(await drawn.blob(), `${who.value}, photo ${index + 1}`);
+                },
+              },
+              h("img", { src: url, alt: "", width: "84", height: "84" }),
+            ),
+          ),
+        );
+      };
+      let shown = 0;
+      who.addEventListener("change", show);
+      const place = h("div", {});
+      call("GET", "/demo/people")
+        .then((told) => {
+          shown = told.shots;
+          who.append(...told.people.map((each) => h("option", {}, each)));
+          show();
+        })
+        .catch((error) => place.replaceChildren(problemBox(error)));
+      return h(
+        "div",
+        {},
+        h("div", { class: "field" }, h("label", { for: who.id }, "Person who does not exist"), who),
+        shots,
+        place,
+      );
+    },
+  };
+
+  function choose(source) {
+    live?.stop();
+    live = null;
+    panel.replaceChildren(builders[source]());
+  }
+
+  const name = newId("source");
+  const sources = Object.keys(SOURCES).filter((each) => demo || each !== "drawn");
+  const first = demo ? "drawn" : "camera";
+  const choice = h(
+    "fieldset",
+    { class: "choice" },
+    h("legend", {}, most > 1 ? `Photos, 1 to ${most}, of one person` : "Photo"),
+    sources.map((each) => {
+      const radio = h("input", {
+        type: "radio",
+        name,
+        id: newId("source"),
+        value: each,
+        checked: each === first,
+        onchange: () => choose(each),
+      });
+      return h("span", {}, radio, h("label", { for: radio.id }, SOURCES[each]));
+    }),
+  );
+  choose(first);
+  largest.addEventListener("change", () => photos.forEach(look));
+  const root = h(
+    "div",
+    { class: "picker" },
+    choice,
+    demo
+      ? h("p", { class: "hint" }, "The demo model knows drawn faces only: a real face is not recognised.")
+      : null,
+    panel,
+    h(
+      "p",
+      { class: "check" },
+      largest,
+      h("label", { for: largest.id }, "Others may be in the picture: take the large face near the middle"),
+    ),
+    tray,
+    told,
+  );
+  return {
+    root,
+    face,
+    ready,
+    blobs: () => photos.map((each) => each.blob),
+    chosen: () => [...photos],
+    // What the service said of single photos of an enrollment, by their places among those `sent`.
+    blame(problem, sent) {
+      const { image, pairs } = problem.details;
+      if (Number.isInteger(image) && sent[image]) {
+        mark(sent[image], sentence(problem.message.replace(/^photo \d+: /, "")), "bad");
+      }
+      for (const index of new Set((pairs ?? []).flat())) {
+        if (sent[index]) mark(sent[index], "Does not look like the same person as another photo.", "bad");
+      }
+    },
+    drop: (sent) => sent.filter((each) => photos.includes(each)).forEach(remove),
+    stop: () => {
+      live?.stop();
+      ended.abort();
+      photos.forEach((each) => URL.revokeObjectURL(each.url));
+    },
+  };
+}

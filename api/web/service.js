@@ -1,0 +1,105 @@
+// Calls to the service, all to the page's own origin. The key is in memory; only where the visitor
+// asks for it is it kept in this tab's session storage.
+
+const KEPT = "veilface-key";
+let key = kept((storage) => storage.getItem(KEPT)) ?? null;
+// Ends what still runs for a key that is forgotten.
+let running = new AbortController();
+
+export const session = { own: null, contract: null, onrefused: () => {} };
+
+export const hasKey = () => key !== null;
+
+export function useKey(token, keep) {
+  key = token;
+  kept((storage) => (keep ? storage.setItem(KEPT, token) : storage.removeItem(KEPT)));
+}
+
+export function forgetKey() {
+  key = null;
+  session.own = session.contract = null;
+  kept((storage) => storage.removeItem(KEPT));
+  running.abort();
+  running = new AbortController();
+}
+
+// Some browsers are set to block the storage: then the key is not kept, and all else works.
+function kept(use) {
+  try {
+    return use(sessionStorage);
+  } catch {
+    return null;
+  }
+}
+
+export const may = (right) => session.own?.rights.includes(right) ?? false;
+
+// An answer that is no success, or no answer at all (code "unreachable").
+export class Problem extends Error {
+  constructor(fields) {
+    super(fields.message);
+    Object.assign(this, { details: {}, requestId: null, wait: null, status: 0 }, fields);
+  }
+}
+
+export async function call(method, path, { body, headers, signal } = {}) {
+  const used = key;
+  const ended = AbortSignal.any([running.signal, ...(signal ? [signal] : [])]);
+  let answer;
+  try {
+    answer = await fetch(path, {
+      method,
+      body,
+      signal: ended,
+      headers: { ...(used ? { Authorization: `Bearer ${used}` } : {}), ...headers },
+      cache: "no-store",
+      credentials: "omit",
+    });
+  } catch (error) {
+    if (error.name === "AbortError") throw error;
+    throw new Problem({ code: "unreachable", message: "the service does not answer" });
+  }
+  if (answer.headers.get("X-Veilface-Notice")) document.documentElement.dataset.demo = "yes";
+  const told = await answer.json().catch(() => null);
+  ended.throwIfAborted();
+  if (answer.ok && told) return told;
+  const problem = new Problem({
+    status: answer.status,
+    code: told?.error?.code ?? "unreachable",
+    message: told?.error?.message ?? `an answer of status ${answer.status} that is not the service's`,
+    details: told?.error?.details ?? {},
+    requestId: told?.request_id ?? answer.headers.get("X-Request-ID"),
+    wait: Number(answer.headers.get("Retry-After")) || null,
+  });
+  // The probe's own 401 codes do not occur here: the key itself was refused, if it is still in use.
+  if (answer.status === 401 && session.own && used === key) session.onrefused(problem);
+  throw problem;
+}
+
+export const subjectPath = (id) => `/v1/subjects/${encodeURIComponent(id)}`;
+
+export function form(name, photos, fields = {}) {
+  const data = new FormData();
+  photos.forEach((blob, index) => data.append(name, blob, `${index}`));
+  for (const [field, value] of Object.entries(fields)) if (value) data.append(field, value);
+  return data;
+}
+
+// 32 random hexadecimal digits; randomUUID is there in secure contexts only.
+export const nonce = () =>
+  Array.from(crypto.getRandomValues(new Uint8Array(16)), (each) =>
+    each.toString(16).padStart(2, "0"),
+  ).join("");
+
+export async function learn() {
+  [session.own, session.contract] = await Promise.all([
+    call("GET", "/v1/key"),
+    call("GET", "/v1/contract"),
+  ]);
+}
+
+// Levels that a photo can be verified at.
+export const levels = () =>
+  session.contract.calibrations.filter((each) => each.mode === "p2s").flatMap((each) => each.levels);
+
+export const crops = () => !session.contract.recorded.detector;

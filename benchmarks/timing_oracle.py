@@ -1,0 +1,148 @@
+"""Whether the time of an answer tells who is enrolled.
+
+One connection asks a running service about an enrolled subject and about one that does not exist,
+with the probe of a stranger, in an order drawn at random, many times. Both are rejected in the same
+words; this compares how long it took. The lockout is off (with it the sixth attempt on either is
+refused), and so are the rate limits.
+
+The test, chosen before the first run: the area under the ROC curve of an attacker who calls the
+slower answer "enrolled" (the Mann-Whitney statistic over n²), with a 95 % interval by DeLong's
+variance. 0.5 is guessing. The verdict is "indistinguishable" where the whole interval lies within
+0.47 to 0.53, "distinguishable" where it does not contain 0.5, and "undecided" otherwise. The
+figures of the first and of the second half stand beside it, because a machine drifts.
+
+Example
+-------
+::
+
+    python -m benchmarks.timing_oracle --work FOLDER --pairs 4000   # a folder of service_load
+"""
+
+import argparse
+import json
+import os
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.deployment import database, service, veilface
+from benchmarks.end_to_end import UNLIMITED, enroll_photos, people_of, prepare
+from benchmarks.service_load import Prepared, prepared_probes
+from models.pack import ModelPack
+
+BOUND = 0.03
+
+
+def auc(slow: NDArray[np.float64], fast: NDArray[np.float64]) -> tuple[float, float, float]:
+    """Area under the ROC curve of "slower means enrolled", with DeLong's 95 % interval.
+
+    Parameters
+    ----------
+    slow, fast : (a,), (b,) float64
+        Latencies of the enrolled and of the unknown subject.
+    """
+    above = np.searchsorted(np.sort(fast), slow, side="left")
+    equal = np.searchsorted(np.sort(fast), slow, side="right") - above
+    places_slow = (above + equal / 2) / len(fast)
+    below = np.searchsorted(np.sort(slow), fast, side="right")
+    tied = below - np.searchsorted(np.sort(slow), fast, side="left")
+    places_fast = (len(slow) - below + tied / 2) / len(slow)
+    area = float(places_slow.mean())
+    spread = np.sqrt(places_slow.var(ddof=1) / len(slow) + places_fast.var(ddof=1) / len(fast))
+    return area, area - 1.96 * float(spread), area + 1.96 * float(spread)
+
+
+def compare(known: NDArray[np.float64], unknown: NDArray[np.float64]) -> dict[str, Any]:
+    """The figures of one kind of probe."""
+    area, low, high = auc(known, unknown)
+    if low >= 0.5 - BOUND and high <= 0.5 + BOUND:
+        verdict = "indistinguishable"
+    else:
+        verdict = "undecided" if low <= 0.5 <= high else "distinguishable"
+    half = len(known) // 2
+    return {
+        "pairs": len(known),
+        "median_ms_enrolled": round(1000 * float(np.median(known)), 3),
+        "median_ms_unknown": round(1000 * float(np.median(unknown)), 3),
+        "auc": round(area, 4),
+        "auc_95": [round(low, 4), round(high, 4)],
+        "auc_first_half": round(auc(known[:half], unknown[:half])[0], 4),
+        "auc_second_half": round(auc(known[half:], unknown[half:])[0], 4),
+        "verdict": verdict,
+    }
+
+
+def ask(client: httpx.Client, token: str, subject: str, probe: Prepared) -> float:
+    """Seconds until the answer, which must be a rejection."""
+    own = Prepared(subject, probe.kind, probe.body, probe.signed, probe.key)
+    body, kind = own.request()
+    headers = {"Authorization": f"Bearer {token}", "Content-Type": kind}
+    started = time.perf_counter()
+    answer = client.post(f"/v1/subjects/{subject}/verify", content=body, headers=headers)
+    took = time.perf_counter() - started
+    if answer.status_code != 200 or answer.json()["decision"] != "reject":
+        raise SystemExit(f"not a rejection: {answer.text}")
+    return took
+
+
+def main() -> None:
+    """Ask, and print the figures as JSON."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
+    parser.add_argument("--pack", type=Path, help="default: DATA/packs/w600k_mbf")
+    parser.add_argument("--work", type=Path, required=True, help="keeps decoys and contract")
+    parser.add_argument("--kind", default="embedding,template,photo")
+    parser.add_argument("--pairs", type=int, default=4000)
+    parser.add_argument("--database", choices=["sqlite", "postgresql"], default="sqlite")
+    parser.add_argument("--dim", type=int, default=64)
+    parser.add_argument("--probe-dim", type=int, default=8)
+    parser.add_argument("--seed", type=int, default=0)
+    args = parser.parse_args()
+    args.pack = args.pack or args.data / "packs" / "w600k_mbf"
+    args.cache, args.pool, args.strategy = None, False, "adversarial"
+    rng = np.random.default_rng(args.seed)
+    args.work.mkdir(parents=True, exist_ok=True)
+    with ExitStack() as stack:
+        url = stack.enter_context(database(args.database, args.work))
+        settings = {
+            "VEILFACE_DATA_DIR": str(args.work),
+            "VEILFACE_DATABASE_URL": url,
+            "VEILFACE_PACK": str(args.pack),
+            "VEILFACE_DECOYS_FILE": str(args.work / "decoys.veil"),
+            "VEILFACE_CONTRACT_FILE": str(args.work / "contract.json"),
+            "VEILFACE_MASTER_KEY_FILE": str(args.work / "master.key"),
+        }
+        env = os.environ | settings | UNLIMITED
+        if not (args.work / "contract.json").exists():
+            prepare(args, args.work, env)
+        rights = [x for r in ("enroll", "verify", "embeddings") for x in ("--right", r)]
+        token = json.loads(veilface("keys", "create", "--json", *rights, env=env))["token"]
+        outsider = [x for r in ("verify", "embeddings") for x in ("--right", r)]
+        asking = json.loads(veilface("keys", "create", "--json", *outsider, env=env))["token"]
+        address = stack.enter_context(service(env, workers=1, log=args.work / "serve.log"))
+        client = stack.enter_context(httpx.Client(base_url=address, timeout=60))
+        client.headers["Authorization"] = f"Bearer {token}"
+        victim, stranger = people_of(args.data / "lfw" / "photos")[:2]
+        enroll_photos(client, victim, None).raise_for_status()
+        pack = ModelPack.load(args.pack, threads=1)
+        report: dict[str, Any] = {"database": args.database, "lockout": "off", "kinds": {}}
+        for kind in args.kind.split(","):
+            probe = prepared_probes(kind, [stranger], client, pack, asking, args.probe_dim)[0]
+            subjects = (victim.name, "x" + victim.name[1:])
+            for subject in subjects * 20:
+                ask(client, asking, subject, probe)
+            times = np.empty((args.pairs, 2))
+            for row in times:
+                for which in rng.permutation(2):
+                    row[which] = ask(client, asking, subjects[which], probe)
+            report["kinds"][kind] = compare(times[:, 0], times[:, 1])
+    print(json.dumps(report, indent=2))
+
+
+if __name__ == "__main__":
+    main()

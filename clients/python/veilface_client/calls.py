@@ -1,0 +1,227 @@
+"""Every call of the service as a value: what is sent, how the answer is read, when to send again.
+
+Nothing here does I/O.
+"""
+
+import base64
+import json
+import re
+import secrets
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any, Generic, Literal, TypeVar
+
+import httpx
+
+from veilface_client import results
+from veilface_client.errors import UnexpectedAnswer
+from veilface_client.results import parse
+from veilface_client.signature import signed_probe
+
+T = TypeVar("T")
+Face = Literal["single", "largest"]
+
+_SUBJECT = re.compile(r"[A-Za-z0-9._@:-]{1,128}")
+_KEY = re.compile(r"[\x21-\x7e]{1,255}")
+
+
+class Resend(Enum):
+    """When a call may be sent again."""
+
+    WHEN_LOST = "also when the answer was lost: done twice is as done once"
+    WHEN_NOT_DONE = "only when the service has certainly not done it"
+    NEVER = "the first answer is the answer"
+
+
+@dataclass(frozen=True, repr=False)
+class Call(Generic[T]):
+    """One call.
+
+    Attributes
+    ----------
+    content
+        Makes what httpx builds a request of (``json``, ``files``, ``params`` …), anew for each
+        sending.
+    read
+        Reads a success.
+    """
+
+    method: str
+    path: str
+    read: Callable[[httpx.Response], T]
+    content: Callable[[], Mapping[str, Any]] = dict
+    resend: Resend = Resend.WHEN_LOST
+
+
+def subject_path(subject: str, rest: str = "") -> str:
+    """Return the path of a subject; a subject id needs no escapes in it."""
+    if not _SUBJECT.fullmatch(subject) or subject in (".", ".."):
+        raise ValueError("a subject id has 1 to 128 characters out of A-Z a-z 0-9 . _ @ : -")
+    return f"/v1/subjects/{subject}{rest}"
+
+
+def idempotency(key: str | None) -> dict[str, str]:
+    """Return the header of a write: the caller's key, or one that is made for this call."""
+    key = secrets.token_urlsafe(24) if key is None else key
+    if not _KEY.fullmatch(key):
+        raise ValueError("an idempotency key has 1 to 255 visible ASCII characters")
+    return {"Idempotency-Key": key}
+
+
+def enroll_photos(
+    subject: str,
+    photos: Sequence[bytes],
+    *,
+    attributes: Mapping[str, str] | None,
+    face: Face | None,
+    key: str | None,
+) -> Call[results.Enrollment]:
+    """Enroll by photos."""
+    fields = _fields(attributes=None if attributes is None else json.dumps(dict(attributes)))
+    content = {
+        "files": [("images", _file(photo)) for photo in photos],
+        "data": {**fields, **_fields(face=face)},
+        "headers": idempotency(key),
+    }
+    return Call(
+        "PUT",
+        subject_path(subject, "/enrollment"),
+        lambda answer: parse(results.Enrollment, answer),
+        lambda: content,
+    )
+
+
+def enroll_template(subject: str, template: bytes, *, key: str) -> Call[results.Enrollment]:
+    """Enroll by a private template."""
+    content = {
+        "json": {"template": base64.b64encode(template).decode("ascii")},
+        "headers": idempotency(key),
+    }
+    return Call(
+        "PUT",
+        subject_path(subject, "/enrollment"),
+        lambda answer: parse(results.Enrollment, answer),
+        lambda: content,
+    )
+
+
+def verify_photo(
+    subject: str, photo: bytes, *, level: str | None, face: Face | None
+) -> Call[results.Decision]:
+    """Verify a photo."""
+    content = {"files": {"image": _file(photo)}, "data": _fields(level=level, face=face)}
+    return Call(
+        "POST",
+        subject_path(subject, "/verify"),
+        lambda answer: parse(results.Decision, answer),
+        lambda: content,
+        Resend.WHEN_NOT_DONE,
+    )
+
+
+def verify_template(
+    token: str, subject: str, template: bytes, *, level: str | None
+) -> Call[results.Decision]:
+    """Verify a lifted probe, signed anew for each sending."""
+    return Call(
+        "POST",
+        subject_path(subject, "/verify"),
+        lambda answer: parse(results.Decision, answer),
+        lambda: {"json": signed_probe(token, subject, template, level=level)},
+        Resend.WHEN_NOT_DONE,
+    )
+
+
+def page(*, limit: int, cursor: str | None) -> Call[results.SubjectPage]:
+    """One page of subjects."""
+    params = {"limit": limit} | ({} if cursor is None else {"cursor": cursor})
+    return Call(
+        "GET",
+        "/v1/subjects",
+        lambda answer: parse(results.SubjectPage, answer),
+        lambda: {"params": params},
+    )
+
+
+def describe(subject: str) -> Call[results.SubjectAnswer]:
+    """One subject."""
+    return Call("GET", subject_path(subject), lambda answer: parse(results.SubjectAnswer, answer))
+
+
+def erase(subject: str) -> Call[results.Receipt]:
+    """Erase a subject; sent again, it returns the same receipt."""
+    return _erasing(subject_path(subject), results.Receipt)
+
+
+def lockout(subject: str) -> Call[results.Lockout]:
+    """Failed attempts on a subject."""
+    path = subject_path(subject, "/lockout")
+    return Call("GET", path, lambda answer: parse(results.Lockout, answer))
+
+
+def reset_lockout(subject: str) -> Call[results.Unlocked]:
+    """Forget them."""
+    return _erasing(subject_path(subject, "/lockout"), results.Unlocked)
+
+
+def contract() -> Call[results.Contract]:
+    """The contract in force."""
+    return Call("GET", "/v1/contract", lambda answer: parse(results.Contract, answer))
+
+
+def generator() -> Call[results.Generator]:
+    """The decoy generator."""
+
+    def read(answer: httpx.Response) -> results.Generator:
+        source_id = answer.headers.get("X-Decoy-Source-ID")
+        if source_id is None:
+            raise UnexpectedAnswer("the answer has no header X-Decoy-Source-ID")
+        return results.Generator(data=answer.content, source_id=source_id)
+
+    return Call("GET", "/v1/contract/generator", read)
+
+
+def export(subject: str) -> Call[results.Export]:
+    """Export a subject."""
+    path = subject_path(subject, "/export")
+    return Call("GET", path, lambda answer: parse(results.Export, answer))
+
+
+def import_(exported: str | results.Export, *, key: str | None) -> Call[results.Imported]:
+    """Import what was exported."""
+    text = exported.export if isinstance(exported, results.Export) else exported
+    content = {"json": {"export": text}, "headers": idempotency(key)}
+    return Call(
+        "POST",
+        "/v1/subjects/import",
+        lambda answer: parse(results.Imported, answer),
+        lambda: content,
+    )
+
+
+def ready() -> Call[results.Health]:
+    """Whether the service can answer; asked once, because no is an answer too."""
+    return Call(
+        "GET",
+        "/health/ready",
+        lambda answer: parse(results.Health, answer),
+        resend=Resend.NEVER,
+    )
+
+
+_Parsed = TypeVar("_Parsed", bound=results.Answer)
+
+
+def _erasing(path: str, model: type[_Parsed]) -> Call[_Parsed]:
+    headers = idempotency(None)
+    return Call("DELETE", path, lambda answer: parse(model, answer), lambda: {"headers": headers})
+
+
+def _file(photo: bytes) -> tuple[str, bytes, str]:
+    # A file name of the user's machine is nobody else's business.
+    return ("photo", photo, "application/octet-stream")
+
+
+def _fields(**values: str | None) -> dict[str, str]:
+    return {name: value for name, value in values.items() if value is not None}

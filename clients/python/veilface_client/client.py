@@ -1,0 +1,331 @@
+"""The blocking clients."""
+
+import os
+import ssl
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Self, TypeVar
+
+import httpx
+
+from veilface_client import calls, flows, private_flows, results
+from veilface_client.calls import Call, Face
+from veilface_client.connection import DEFAULT_TIMEOUT, options, signing_token
+from veilface_client.errors import UnexpectedAnswer
+from veilface_client.flows import Flow, Send, Wait, Work
+from veilface_client.lifting import Lifter
+from veilface_client.photos import Photo
+from veilface_client.results import Enrollable, Probe
+from veilface_client.retries import DEFAULT_RETRIES, Retries
+
+T = TypeVar("T")
+
+
+class Session:
+    """The calls that carry no face: what :class:`Client` and :class:`PrivateClient` share.
+
+    Parameters
+    ----------
+    url
+        Where the service is: ``https://faces.example.org``.
+    token
+        An API key.
+    timeout
+        Seconds, or an :class:`httpx.Timeout`: for each sending, not for all of them together.
+    retries
+        When and how often a call is sent again.
+    verify
+        As for httpx: whom to trust with TLS.
+    transport
+        As for httpx: how requests travel, for tests.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        token: str,
+        *,
+        timeout: httpx.Timeout | float = DEFAULT_TIMEOUT,
+        retries: Retries = DEFAULT_RETRIES,
+        verify: ssl.SSLContext | bool = True,
+        transport: httpx.BaseTransport | None = None,
+    ) -> None:
+        self._retries = retries
+        self._http = httpx.Client(
+            **options(url, token, timeout=timeout, verify=verify), transport=transport
+        )
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({str(self._http.base_url)!r})"
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        value: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the connections."""
+        self._http.close()
+
+    def page(self, *, limit: int = 100, cursor: str | None = None) -> results.SubjectPage:
+        """List one page of subjects. Right: ``enroll``."""
+        return self._send(calls.page(limit=limit, cursor=cursor))
+
+    def subjects(self, *, page_size: int = 100) -> Iterator[results.Subject]:
+        """Iterate over all subjects, in the order of their ids, a page at a time."""
+        cursor: str | None = None
+        while True:
+            page = self.page(limit=page_size, cursor=cursor)
+            yield from page.subjects
+            if page.next_cursor is None:
+                return
+            if page.next_cursor == cursor:
+                raise UnexpectedAnswer("the page names itself as the next one")
+            cursor = page.next_cursor
+
+    def describe(self, subject: str) -> results.SubjectAnswer:
+        """Describe a subject, without its template. Right: ``enroll``."""
+        return self._send(calls.describe(subject))
+
+    def erase(self, subject: str) -> results.Receipt:
+        """Erase a subject, for good; keep the receipt. Right: ``erase``."""
+        return self._send(calls.erase(subject))
+
+    def lockout(self, subject: str) -> results.Lockout:
+        """Count the failed attempts; :class:`NotFound` where there are none. Right: ``admin``."""
+        return self._send(calls.lockout(subject))
+
+    def reset_lockout(self, subject: str) -> results.Unlocked:
+        """Forget the failed attempts, and enable the subject again. Right: ``admin``."""
+        return self._send(calls.reset_lockout(subject))
+
+    def contract(self) -> results.Contract:
+        """Fetch the contract in force, with the key of receipts."""
+        return self._send(calls.contract())
+
+    def generator(self) -> results.Generator:
+        """Fetch the decoy generator. Right: ``embeddings``."""
+        return self._send(calls.generator())
+
+    def export(self, subject: str) -> results.Export:
+        """Export a subject, encrypted. Right: ``export``."""
+        return self._send(calls.export(subject))
+
+    def import_(
+        self, exported: str | results.Export, *, idempotency_key: str | None = None
+    ) -> results.Imported:
+        """Import what :meth:`export` returned. Right: ``export``."""
+        return self._send(calls.import_(exported, key=idempotency_key))
+
+    def ready(self) -> results.Health:
+        """Ask once whether the service can answer; otherwise :class:`Unavailable`."""
+        return self._send(calls.ready())
+
+    def _send(self, call: Call[T]) -> T:
+        return self._run(flows.send(call, self._retries))
+
+    def _run(self, flow: Flow[T]) -> T:
+        try:
+            step = next(flow)
+            while True:
+                try:
+                    came = self._do(step)
+                except Exception as error:
+                    step = flow.throw(error)
+                else:
+                    step = flow.send(came)
+        except StopIteration as end:
+            result: T = end.value
+            return result
+        finally:
+            flow.close()
+
+    def _do(self, step: Send | Wait | Work) -> object:
+        match step:
+            case Send(method, path, content):
+                return self._http.request(method, path, **content)
+            case Wait(seconds):
+                time.sleep(seconds)
+                return None
+            case Work(function):
+                # An interrupt reaches the function itself: nobody else must stop it.
+                return function()
+
+
+class Client(Session):
+    """Sends photos to the service, which embeds them; see :class:`Session` for the parameters.
+
+    Examples
+    --------
+    ::
+
+        with Client("https://faces.example.org", token) as client:
+            client.enroll("anna", ["anna1.jpg", "anna2.jpg"])
+            if client.verify("anna", "today.jpg"):
+                ...
+    """
+
+    def enroll(
+        self,
+        subject: str,
+        photos: Photo | Iterable[Photo],
+        *,
+        attributes: Mapping[str, str] | None = None,
+        face: Face | None = None,
+        idempotency_key: str | None = None,
+    ) -> results.Enrollment:
+        """Enroll a subject, or replace its enrollment. Right: ``enroll``.
+
+        Parameters
+        ----------
+        photos
+            1 to 10 of one person: bytes, paths or binary files.
+        attributes
+            ``gender`` and ``race``, for services that lift with hybrid+; never stored.
+        face
+            ``single`` (the service's default) refuses a photo with several faces; ``largest``
+            takes one that is large and central.
+        idempotency_key
+            Of this one logical write; made anew for each call where it is not given.
+        """
+        return self._run(
+            flows.enroll(
+                subject,
+                photos,
+                self._retries,
+                attributes=attributes,
+                face=face,
+                key=idempotency_key,
+            )
+        )
+
+    def verify(
+        self, subject: str, photo: Photo, *, level: str | None = None, face: Face | None = None
+    ) -> results.Decision:
+        """Check whether a photo shows the subject. Right: ``verify``.
+
+        A rejection is no error: the decision is false. Each rejection counts on the subject's
+        lockout.
+        """
+        return self._run(flows.verify(subject, photo, self._retries, level=level, face=face))
+
+
+class PrivateClient(Session):
+    """Embeds and lifts on this machine, and sends private templates only.
+
+    Parameters
+    ----------
+    url, token, timeout, retries, verify, transport
+        As for :class:`Session`. The key needs the right ``embeddings``.
+    pack
+        The model pack of the service's contract.
+    command
+        The executable ``veilface``; a bare name is looked for on the path.
+    dim
+        Dimension of probes; None: the largest that the contract takes.
+    lift_limit_s
+        The longest that one lift may take, in seconds.
+    lift_environment
+        Variables that the command gets beside the few that every program needs.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        token: str,
+        *,
+        pack: str | os.PathLike[str],
+        command: str | os.PathLike[str] = "veilface",
+        dim: int | None = None,
+        lift_limit_s: float = 120.0,
+        lift_environment: Mapping[str, str] | None = None,
+        timeout: httpx.Timeout | float = DEFAULT_TIMEOUT,
+        retries: Retries = DEFAULT_RETRIES,
+        verify: ssl.SSLContext | bool = True,
+        transport: httpx.BaseTransport | None = None,
+    ) -> None:
+        self._token = signing_token(token)
+        super().__init__(
+            url, token, timeout=timeout, retries=retries, verify=verify, transport=transport
+        )
+        self._lifter = Lifter(
+            pack,
+            command=command,
+            dim=dim,
+            limit_s=lift_limit_s,
+            environment=lift_environment,
+        )
+
+    @property
+    def folder(self) -> Path:
+        """Where contract and generator are kept until :meth:`close`."""
+        return self._lifter.folder
+
+    def close(self) -> None:
+        """Close the connections, and remove the folder."""
+        self._lifter.close()
+        super().close()
+
+    def enroll(
+        self,
+        subject: str,
+        photos: Photo | Iterable[Photo] | Enrollable,
+        *,
+        face: Face | None = None,
+    ) -> results.Enrollment:
+        """Lift photos here (or take a lift of :meth:`lift_enrollment`), and enroll by it alone.
+
+        Rights: ``enroll``, ``embeddings``. Never enroll the same photos twice: two lifts of them
+        give the descriptor away. After an error repeat with its ``lift``.
+        """
+        return self._run(
+            private_flows.enroll(subject, photos, self._lifter, self._retries, face=face)
+        )
+
+    def lift_enrollment(
+        self, photos: Photo | Iterable[Photo], *, face: Face | None = None
+    ) -> Enrollable:
+        """Lift photos of one person here, and send nothing of them.
+
+        :meth:`enroll` takes the lift, as often as it must: it is one and the same write.
+        """
+        return self._run(
+            private_flows.lift_enrollment(photos, self._lifter, self._retries, face=face)
+        )
+
+    def lift(self, photo: Photo, *, face: Face | None = None) -> Probe:
+        """Lift a probe here; it may be verified against several subjects, and again."""
+        return self._run(private_flows.lift_probe(photo, self._lifter, self._retries, face=face))
+
+    def verify(
+        self,
+        subject: str,
+        photo: Photo | Probe,
+        *,
+        level: str | None = None,
+        face: Face | None = None,
+    ) -> results.Decision:
+        """Lift a photo here (or take a probe of :meth:`lift`), and verify by it.
+
+        Rights: ``verify``, ``embeddings``. Each sending is signed anew. After an error repeat
+        with its ``lift``, never with the photo.
+        """
+        return self._run(
+            private_flows.verify(
+                subject,
+                photo,
+                self._token,
+                self._lifter,
+                self._retries,
+                level=level,
+                face=face,
+            )
+        )

@@ -1,0 +1,144 @@
+"""Flows of the clients that never send a face: lift here, send templates."""
+
+from collections.abc import Iterable
+from functools import partial
+from typing import TypeVar
+
+from veilface_client import calls, results
+from veilface_client.calls import Call, Face
+from veilface_client.child import Leash
+from veilface_client.errors import ContractMismatch, UnexpectedAnswer, VeilfaceError
+from veilface_client.flows import Flow, Work, send
+from veilface_client.lifting import Kit, Lifter
+from veilface_client.photos import Photo, read_photo, read_photos
+from veilface_client.results import Enrollable, Probe
+from veilface_client.retries import Retries
+
+T = TypeVar("T")
+
+_LOOKS = 3
+
+
+def kit_of(lifter: Lifter, retries: Retries, *, fresh: bool = False) -> Flow[Kit]:
+    """Return the kit of the contract; fetch it where there is none, or a fresh one is wanted."""
+    kept = lifter.kit
+    if kept is not None and not fresh:
+        return kept
+    for _ in range(_LOOKS):
+        contract = yield from send(calls.contract(), retries)
+        generator = yield from send(calls.generator(), retries)
+        # The contract may have changed between the two answers, or between two workers.
+        if generator.source_id == contract.binding.get("decoy_source_id"):
+            kit: Kit = yield Work(partial(lifter.keep, contract, generator))
+            return kit
+    raise UnexpectedAnswer("the generator of the service is not that of its contract")
+
+
+def lift_probe(photo: Photo, lifter: Lifter, retries: Retries, *, face: Face | None) -> Flow[Probe]:
+    """Lift a probe; nothing is sent of it."""
+    picture: bytes = yield Work(lambda: read_photo(photo))
+    kit = yield from kit_of(lifter, retries)
+    return (yield from _probe(picture, lifter, kit, face))
+
+
+def lift_enrollment(
+    photos: Photo | Iterable[Photo], lifter: Lifter, retries: Retries, *, face: Face | None
+) -> Flow[Enrollable]:
+    """Lift a template that enrolls; nothing is sent of it."""
+    pictures: list[bytes] = yield Work(lambda: read_photos(photos))
+    kit = yield from kit_of(lifter, retries)
+    return (yield from _enrollable(pictures, lifter, kit, face))
+
+
+def enroll(
+    subject: str,
+    photos: Photo | Iterable[Photo] | Enrollable,
+    lifter: Lifter,
+    retries: Retries,
+    *,
+    face: Face | None,
+) -> Flow[results.Enrollment]:
+    """Enroll by photos that are lifted here, or by a template that was lifted before."""
+    calls.subject_path(subject)
+    if isinstance(photos, Enrollable):
+        return (yield from _enroll(subject, photos, retries))
+    pictures: list[bytes] = yield Work(lambda: read_photos(photos))
+    lift = yield from lift_enrollment(pictures, lifter, retries, face=face)
+    try:
+        return (yield from _enroll(subject, lift, retries))
+    except ContractMismatch:
+        renewed = yield from kit_of(lifter, retries, fresh=True)
+        if renewed.contract_id == lift.contract_id:
+            raise
+    lift = yield from _enrollable(pictures, lifter, renewed, face)
+    return (yield from _enroll(subject, lift, retries))
+
+
+def verify(
+    subject: str,
+    photo: Photo | Probe,
+    token: str,
+    lifter: Lifter,
+    retries: Retries,
+    *,
+    level: str | None,
+    face: Face | None,
+) -> Flow[results.Decision]:
+    """Verify a photo that is lifted here, or a probe that was lifted before."""
+    calls.subject_path(subject)
+    if isinstance(photo, Probe):
+        return (yield from _verify(subject, photo, token, retries, level))
+    picture: bytes = yield Work(lambda: read_photo(photo))
+    probe = yield from lift_probe(picture, lifter, retries, face=face)
+    try:
+        return (yield from _verify(subject, probe, token, retries, level))
+    except ContractMismatch:
+        renewed = yield from kit_of(lifter, retries, fresh=True)
+        if renewed.contract_id == probe.contract_id:
+            # It is the subject's stored template that is of another contract.
+            raise
+    probe = yield from _probe(picture, lifter, renewed, face)
+    return (yield from _verify(subject, probe, token, retries, level))
+
+
+def _probe(picture: bytes, lifter: Lifter, kit: Kit, face: Face | None) -> Flow[Probe]:
+    leash = Leash()
+    lift = partial(lifter.probe, kit, picture, face=face, leash=leash)
+    probe: Probe = yield Work(lift, leash.pull)
+    return probe
+
+
+def _enrollable(
+    pictures: list[bytes], lifter: Lifter, kit: Kit, face: Face | None
+) -> Flow[Enrollable]:
+    leash = Leash()
+    lift = partial(lifter.enrollment, kit, pictures, face=face, leash=leash)
+    enrollable: Enrollable = yield Work(lift, leash.pull)
+    return enrollable
+
+
+def _enroll(subject: str, lift: Enrollable, retries: Retries) -> Flow[results.Enrollment]:
+    call = calls.enroll_template(subject, lift.template, key=lift.key_for(subject))
+    return (yield from _send(call, lift, retries))
+
+
+def _verify(
+    subject: str, lift: Probe, token: str, retries: Retries, level: str | None
+) -> Flow[results.Decision]:
+    call = calls.verify_template(token, subject, lift.template, level=level)
+    return (yield from _send(call, lift, retries))
+
+
+def _send(call: Call[T], lift: Enrollable | Probe, retries: Retries) -> Flow[T]:
+    """Send a lift. A resend repeats it; the error that ends it has it, so that callers can."""
+    try:
+        return (yield from send(call, retries))
+    except ContractMismatch:
+        raise
+    except VeilfaceError as error:
+        error.lift = lift
+        error.add_note(
+            "The service may have this lift: repeat the call with the error's `lift`, never with "
+            "the photo. Two lifts of one photo give the descriptor away."
+        )
+        raise

@@ -1,0 +1,241 @@
+"""What the service answers, as frozen values.
+
+Fields that this version does not know are ignored, so that it reads the answers of later ones.
+"""
+
+import hashlib
+import os
+import secrets
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self, TypeVar
+
+import httpx
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
+
+from veilface_client.errors import UnexpectedAnswer
+
+Hex = Annotated[str, StringConstraints(pattern=r"\A[0-9a-f]{64}\z")]
+
+
+class _Value(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+
+class Answer(_Value):
+    """What every answer has."""
+
+    request_id: str
+    notice: str | None = None
+
+
+class PhotoUsed(_Value):
+    """One photo of an enrollment: its position, and the measures of the quality gate."""
+
+    index: int
+    status: str
+    quality: dict[str, float | None]
+
+
+class Enrollment(Answer):
+    """The subject is enrolled; ``images`` is empty for a template."""
+
+    template_id: str
+    contract_id: str
+    replaced: bool
+    images: tuple[PhotoUsed, ...]
+
+
+class Decision(Answer):
+    """Whether the probe shows the subject. It is true if, and only if, it was accepted."""
+
+    decision: Literal["accept", "reject"]
+    reason: str
+    level: str
+    fmr: float | None = None
+    contract_id: str
+    calibration_id: str
+    distance: float | None = None
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the decision is accept."""
+        return self.decision == "accept"
+
+    def __bool__(self) -> bool:
+        # `if client.verify(…):` is what people write; an object that is always true lets all in.
+        return self.accepted
+
+
+class Subject(_Value):
+    """A subject, without its template."""
+
+    subject_id: str
+    template_id: str
+    contract_id: str
+    current: bool
+    enrolled_by: str
+    photos: int
+    created_at: str
+    updated_at: str
+
+
+class SubjectAnswer(Subject, Answer):
+    """One subject."""
+
+
+class SubjectPage(Answer):
+    """One page of subjects, in the order of their ids; no cursor on the last one."""
+
+    subjects: tuple[Subject, ...]
+    next_cursor: str | None
+
+
+class Lockout(Answer):
+    """Failed verifications of a subject."""
+
+    consecutive_failures: int
+    last_failed_at: str | None
+    locked_until: str | None
+    disabled_at: str | None
+
+
+class Unlocked(Answer):
+    """The lockout is reset; not ``lifted``: there was nothing to reset."""
+
+    lifted: bool
+
+
+class SignedText(_Value):
+    """The text of a receipt, and its Ed25519 signature in base64."""
+
+    body: str
+    signature: str
+
+
+class _Verbatim(Answer):
+    raw: bytes = Field(default=b"", repr=False, exclude=True)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the answer to a file, byte for byte."""
+        Path(path).write_bytes(self.raw)
+
+
+class Receipt(_Verbatim):
+    """The signed receipt of an erasure. ``claims`` is for reading; ``receipt`` is what is signed.
+
+    ``raw`` is the answer as it came: ``veilface keys verify-receipt`` takes it.
+    """
+
+    receipt: SignedText
+    claims: dict[str, Any]
+
+    @property
+    def held(self) -> bool:
+        """Whether a template was stored."""
+        return self.claims.get("held") is True
+
+
+class ReceiptKey(_Value):
+    """The key that receipts are verified with; ``public_key`` is base64 of 32 bytes."""
+
+    algorithm: str
+    key_id: str
+    public_key: str
+
+
+class Contract(_Verbatim):
+    """The contract in force. ``raw`` is the answer as it came, which ``veilface lift`` takes."""
+
+    contract_id: Hex
+    binding: dict[str, Any]
+    calibrations: tuple[dict[str, Any], ...]
+    default_level: str
+    photos: bool
+    generator: bool
+    receipt_key: ReceiptKey
+
+
+class Generator(_Value):
+    """The decoy generator, for clients that lift."""
+
+    data: bytes = Field(repr=False)
+    source_id: str
+
+
+class Export(Answer):
+    """One subject, encrypted: base64."""
+
+    export: str = Field(repr=False)
+    contract_id: str
+    key_id: str
+
+
+class Imported(Answer):
+    """The subject of an export is enrolled."""
+
+    subject_id: str
+    template_id: str
+    contract_id: str
+    replaced: bool
+
+
+class Health(Answer):
+    """The service can answer."""
+
+    status: str
+
+
+class _Lift(_Value):
+    template: bytes = Field(repr=False)
+    contract_id: str
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} of {len(self.template)} bytes>"
+
+    @classmethod
+    def of(cls, template: bytes, contract_id: str) -> Self:
+        """Make a lift."""
+        return cls(template=template, contract_id=contract_id)
+
+
+class Probe(_Lift):
+    """A lifted probe: no photo, and no descriptor. Use it once for each attempt it is meant for."""
+
+
+class Enrollable(_Lift):
+    """A template that enrolls, lifted and not yet (or perhaps) sent: no photo, no descriptor.
+
+    Attributes
+    ----------
+    idempotency_key
+        Makes its enrollment one write, however often it is sent.
+    """
+
+    idempotency_key: str = Field(default_factory=lambda: secrets.token_urlsafe(24))
+
+    def key_for(self, subject: str) -> str:
+        """Return the ``Idempotency-Key`` of a subject: another subject is another write."""
+        return hashlib.sha256(f"{self.idempotency_key}/{subject}".encode()).hexdigest()
+
+
+A = TypeVar("A", bound=Answer)
+
+
+def parse(model: type[A], response: httpx.Response) -> A:
+    """Read an answer.
+
+    Raises
+    ------
+    UnexpectedAnswer
+        It lacks a field, or has another type. The text names fields, and no value.
+    """
+    try:
+        found = model.model_validate_json(response.content)
+    except ValidationError as error:
+        fields = sorted({".".join(map(str, each["loc"])) or "body" for each in error.errors()})
+        raise UnexpectedAnswer(
+            f"the answer does not fit {model.__name__}: {', '.join(fields)}"
+        ) from None
+    if isinstance(found, _Verbatim):
+        return found.model_copy(update={"raw": response.content})
+    return found

@@ -1,0 +1,382 @@
+"""The audit log: who did what to which subject, and with which result; lines are only ever added.
+
+A line names the subject by its pseudonym, and holds nothing of a face. It is written in the
+transaction of what it tells of: what is committed has its line, and what is rolled back has none.
+The chain that shows whether a line was altered, removed or moved is in
+``templates.store.audit_chain``; triggers of the database refuse to change or remove a line at all.
+"""
+
+import functools
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import sqlalchemy as sa
+from sqlalchemy.engine import Connection
+
+from templates.errors import StoreError
+from templates.store.audit_chain import (
+    START,
+    Anchor,
+    Chain,
+    Line,
+    Verification,
+    head_mac,
+    is_head,
+    line_hash,
+    read_line,
+)
+from templates.store.database import Database
+from templates.store.deployment import Secrets
+from templates.store.identifiers import (
+    Clock,
+    InvalidIdentifier,
+    checked_opaque_id,
+    checked_tenant_name,
+)
+from templates.store.schema import AuditHeadRow, AuditRow
+
+CHAIN_SECRET = "audit-chain"  # noqa: S105 - a name, not a secret
+BATCH = 1000
+MAX_ACTOR = 64
+MAX_REQUEST_ID = 64
+MAX_DETAIL = 64
+
+TENANT_ERASE = "tenant-erase"
+
+_BEGIN_LOCK = "veilface audit chain"
+_PSEUDONYM = re.compile(r"[0-9a-f]{64}")
+# Made once: building a statement costs more than running it, and every write appends a line.
+_ADD_LINE = sa.insert(AuditRow.__table__)  # type: ignore[arg-type]
+_MOVE_HEAD = sa.update(AuditHeadRow.__table__)  # type: ignore[arg-type]
+
+
+class BrokenAuditLog(StoreError):
+    """The head of the audit log, or its key, is missing or forged, so no line can be added."""
+
+
+def _checked_text(text: str | None, longest: int, what: str) -> None:
+    if text is not None and not (0 < len(text) <= longest and text.isprintable()):
+        raise InvalidIdentifier(
+            f"the {what} of an audit line is 1 to {longest} printable characters"
+        )
+
+
+@dataclass(frozen=True)
+class By:
+    """Who does something.
+
+    Attributes
+    ----------
+    actor
+        ``"key:<prefix>"``, ``"operator:<user>"``, ``"retention"`` or ``"program"``.
+    request_id
+        Of the request, where it is one.
+    """
+
+    actor: str = "program"
+    request_id: str | None = None
+
+    def __post_init__(self) -> None:
+        _checked_text(self.actor, MAX_ACTOR, "actor")
+        _checked_text(self.request_id, MAX_REQUEST_ID, "request id")
+
+
+PROGRAM = By()
+"""Whoever does something without saying who."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What a line tells, before it has its place in the log.
+
+    Attributes
+    ----------
+    action, outcome
+        Short words, such as ``"erase"`` and ``"erased"``.
+    by
+        Who did it.
+    tenant
+        Name of the tenant it was done in.
+    pseudonym
+        Of the subject it was done to (:meth:`TemplateStore.pseudonym`). Never a subject id:
+        anything but 64 hexadecimal digits is refused.
+    detail
+        What else it was done with: the level of a verification, the prefix of a key.
+    """
+
+    action: str
+    outcome: str
+    by: By
+    tenant: str | None = None
+    pseudonym: str | None = None
+    detail: str | None = None
+
+    def __post_init__(self) -> None:
+        checked_opaque_id(self.action, what="audit action")
+        checked_opaque_id(self.outcome, what="audit outcome")
+        if self.tenant is not None:
+            checked_tenant_name(self.tenant)
+        if self.pseudonym is not None and _PSEUDONYM.fullmatch(self.pseudonym) is None:
+            raise InvalidIdentifier("the audit log names a subject by its pseudonym only")
+        _checked_text(self.detail, MAX_DETAIL, "detail")
+
+
+class AuditLog:
+    """The audit log of a deployment.
+
+    Parameters
+    ----------
+    database, secrets, clock
+        Where it is kept, what its chain is keyed with, and what time it is.
+    """
+
+    def __init__(self, database: Database, secrets: Secrets, clock: Clock) -> None:
+        self._database = database
+        self._secrets = secrets
+        self._clock = clock
+        self._key: bytes | None = None
+
+    def begin(self) -> None:
+        """Make the key of a chain that never began, and the MAC of its head; else do nothing.
+
+        The migration made the head row, and has no key. Nothing but this makes the key: once it is
+        gone, it is not made anew while a line or the MAC of a head tells that there was one. Where
+        all three are gone, the log is taken for one that never began: then an anchor from before
+        is what shows that lines are missing.
+
+        Raises
+        ------
+        BrokenAuditLog
+            If the key is gone.
+        """
+        self._database.write(self._begin, lock=_BEGIN_LOCK)
+
+    def _begin(self, connection: Connection) -> None:
+        key = self._secrets.make(connection, CHAIN_SECRET)
+        if key is None:
+            return
+        columns = (AuditHeadRow.sequence, AuditHeadRow.hash, AuditHeadRow.mac)
+        heads = [tuple(row) for row in connection.execute(sa.select(*columns))]
+        written = connection.execute(sa.select(sa.exists(AuditRow.sequence))).scalar_one()
+        if written or heads != [(START.sequence, START.hash, b"")]:
+            raise _without_key()  # which takes back the key that was made
+        connection.execute(sa.update(AuditHeadRow).values(mac=head_mac(key, START)))
+
+    def prepare(self) -> None:
+        """Open the key of the chain; to be called before a transaction that appends.
+
+        Raises
+        ------
+        BrokenAuditLog
+            If there is none.
+        SealError
+            If the master key that wrapped it is missing.
+        """
+        self._opened_key()
+
+    def append(self, connection: Connection, entry: Entry) -> None:
+        """Add a line inside a transaction that is open already, as its last statement.
+
+        The lines of all processes are added one after the other, each waiting for the commit of
+        the one before: whatever follows this call in the transaction makes every other write wait.
+        As everybody takes the head row last, no two of them wait for each other.
+
+        Raises
+        ------
+        BrokenAuditLog
+            If the head row is missing or forged. Adding to it would hide that.
+        RuntimeError
+            If :meth:`prepare` was not called before the transaction: opening the key is a
+            transaction of its own, which on SQLite would wait for this one.
+        """
+        key = self._key
+        if key is None:
+            raise RuntimeError("call AuditLog.prepare before the transaction")
+        last = self._head(connection, key, for_update=True)
+        columns = (
+            last.sequence + 1,
+            self._clock(),
+            entry.tenant,
+            entry.by.actor,
+            entry.action,
+            entry.pseudonym,
+            entry.outcome,
+            entry.by.request_id,
+            entry.detail,
+            last.hash,
+        )
+        new = Anchor(last.sequence + 1, line_hash(key, columns))
+        names = Line.__dataclass_fields__
+        connection.execute(_ADD_LINE, dict(zip(names, (*columns, new.hash), strict=True)))
+        moved = {"sequence": new.sequence, "hash": new.hash, "mac": head_mac(key, new)}
+        connection.execute(_MOVE_HEAD, moved)
+
+    def record(self, entry: Entry) -> None:
+        """Add a line in a transaction of its own."""
+        self.prepare()
+        self._database.write(lambda each: self.append(each, entry))
+
+    def head(self) -> Anchor:
+        """Number and hash of the last line; keep them elsewhere, to verify the log against.
+
+        Raises
+        ------
+        BrokenAuditLog
+            If the head row is missing or forged.
+        """
+        key = self._opened_key()
+        return self._database.read(lambda each: self._head(each, key))
+
+    def lines(self, *, after: int = 0, batch: int = BATCH) -> Iterator[Line]:
+        """Read the log from the line after `after` on, a batch in memory at a time.
+
+        Raises
+        ------
+        StoreError
+            At a line that was altered so that it cannot be read.
+        """
+        while rows := self._database.read(partial(_rows, after=after, batch=batch)):
+            yield from map(read_line, rows)
+            after = rows[-1][0]
+
+    def verify(
+        self,
+        *,
+        anchor: Anchor | None = None,
+        progress: Callable[[int], None] | None = None,
+        batch: int = BATCH,
+    ) -> Verification:
+        """Walk over the whole chain beside a service in use, a batch in memory at a time.
+
+        Parameters
+        ----------
+        anchor
+            An earlier head. Without one, an old state of the whole log is not told from a new one.
+        progress
+            Called after each batch with the number of its lines.
+        batch
+            Lines read at once.
+
+        Raises
+        ------
+        BrokenAuditLog
+            If the key of the chain is gone, so that nothing can be checked.
+        SealError
+            If the master key is not the one that the log was written with.
+        """
+        chain = Chain(self._opened_key(), anchor=anchor)
+        after: int | None = None
+        while True:
+            while rows := self._database.read(partial(_rows, after=after, batch=batch)):
+                for row in rows:
+                    chain.step(row)
+                after = rows[-1][0]
+                if progress is not None:
+                    progress(len(rows))
+            end = self._database.read(partial(_end, after=after))
+            if not end.more:
+                return chain.end(end.head, end.mac, held=end.held)
+
+    def _opened_key(self) -> bytes:
+        if self._key is None:
+            self._key = self._secrets.existing(CHAIN_SECRET)
+        if self._key is None:
+            raise _without_key()
+        return self._key
+
+    def _head(self, connection: Connection, key: bytes, *, for_update: bool = False) -> Anchor:
+        query = _head_query(connection.dialect.name, for_update)
+        rows = connection.execute(query).all()
+        head, mac = _only_head(rows[0] if len(rows) == 1 else (None, None, None))
+        if head is None or not is_head(key, head, mac):
+            raise BrokenAuditLog(
+                "the head of the audit log is missing or was altered: "
+                "run `veilface audit-log verify`, and restore the database from a backup"
+            )
+        return head
+
+    def __repr__(self) -> str:
+        return "AuditLog()"
+
+
+class _End(NamedTuple):
+    """What the database holds in one moment, seen from the last line that was read."""
+
+    head: Anchor | None
+    mac: bytes
+    held: int  # lines up to that one
+    more: bool  # whether there are lines after it
+
+
+def _end(connection: Connection, *, after: int | None) -> _End:
+    before, later = _sides(after)
+    # With a limit: PostgreSQL refuses a subquery of two rows, and this must find them.
+    columns_of_head = _head_columns(connection.dialect.name)
+    head = [sa.select(each).limit(1).scalar_subquery() for each in columns_of_head]
+    heads = sa.select(sa.func.count()).select_from(AuditHeadRow).scalar_subquery()
+    held = sa.select(sa.func.count()).select_from(AuditRow).where(before).scalar_subquery()
+    columns: list[Any] = [heads, held, sa.exists().where(later), *head]
+    count, lines, more, *row = connection.execute(sa.select(*columns)).one()
+    return _End(*_only_head(row if count == 1 else (None, None, None)), lines, more)
+
+
+def _only_head(row: Sequence[Any]) -> tuple[Anchor | None, bytes]:
+    """Read the head row; None for it where a column has no value, as after a lost NOT NULL."""
+    sequence, own_hash, mac = row
+    if sequence is None or own_hash is None:
+        return None, b""
+    return Anchor(sequence, own_hash), mac or b""
+
+
+def _without_key() -> BrokenAuditLog:
+    return BrokenAuditLog(
+        "the key of the audit log is missing: run `veilface db upgrade` on a new database, and "
+        "restore any other from a backup"
+    )
+
+
+def _rows(connection: Connection, *, after: int | None, batch: int) -> Sequence[Any]:
+    _, later = _sides(after)
+    query = sa.select(*_line_columns(connection))
+    return connection.execute(query.where(later).order_by(AuditRow.sequence).limit(batch)).all()
+
+
+def _sides(after: int | None) -> tuple[sa.ColumnElement[bool], sa.ColumnElement[bool]]:
+    # Without a bound first: a line that was slipped in may have any number.
+    if after is None:
+        return sa.false(), AuditRow.sequence.is_not(None)
+    return AuditRow.sequence <= after, AuditRow.sequence > after
+
+
+def _line_columns(connection: Connection) -> list[Any]:
+    """The columns of :class:`Line`, in a form in which an altered one still arrives.
+
+    SQLite keeps any value in any column, and PostgreSQL knows times that Python does not. Read as
+    their types they would end the verification instead of failing it.
+    """
+    sequence, at, *rest = (getattr(AuditRow, name) for name in Line.__dataclass_fields__)
+    if connection.dialect.name == "sqlite":
+        return [sequence, *map(_raw, (at, *rest))]
+    utc = sa.func.to_char(sa.func.timezone("UTC", at), "YYYY-MM-DD HH24:MI:SS.US")
+    return [sequence, utc, *rest]
+
+
+@functools.cache
+def _head_query(dialect: str, for_update: bool) -> "sa.Select[*tuple[Any, ...]]":
+    query = sa.select(*_head_columns(dialect))
+    return query.with_for_update() if for_update else query
+
+
+def _head_columns(dialect: str) -> list[Any]:
+    columns: list[Any] = [AuditHeadRow.hash, AuditHeadRow.mac]
+    if dialect == "sqlite":
+        sequence = sa.cast(AuditHeadRow.sequence, sa.Integer).label("sequence")
+        return [sequence, *(_raw(each).label(each.key) for each in columns)]
+    return [AuditHeadRow.sequence, *columns]
+
+
+def _raw(column: Any) -> sa.ColumnElement[Any]:
+    return sa.type_coerce(sa.cast(column, sa.LargeBinary), sa.types.NullType())

@@ -1,0 +1,360 @@
+"""Erasing a whole tenant: in bounded steps, then its row with whatever is left, for one receipt.
+
+Its API keys are revoked first, so that no request of its own arrives any more. Then records go in
+small transactions beside a service in use, and a count of them is kept, so that a run that was
+interrupted is finished by the next one and its receipt counts everything. The last transaction
+runs while no other write does: what an enrollment that was under way has still stored goes with
+it, and a write that comes later finds no tenant.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import sqlalchemy as sa
+from sqlalchemy.engine import Connection
+from sqlalchemy.orm import InstrumentedAttribute
+
+from templates.store.audit_log import PROGRAM, TENANT_ERASE, AuditLog, By, Entry
+from templates.store.database import Database
+from templates.store.deployment import insert_once
+from templates.store.identifiers import Clock, UnknownTenant, checked_tenant_name
+from templates.store.receipts import ErasedTenant, Receipt, ReceiptSigner, tenant_receipt_name
+from templates.store.schema import (
+    ApiKeyRow,
+    Base,
+    FailedAttemptsRow,
+    IdempotencyRow,
+    ReceiptRow,
+    RotationKeyRow,
+    SubjectRow,
+    TemplateRow,
+    TenantErasureRow,
+    TenantRow,
+    UsedNonceRow,
+)
+from templates.store.subjects import subject_lock
+
+BATCH = 200
+
+Counts = dict[str, int]
+Key = tuple[Any, ...]
+
+
+@dataclass(frozen=True)
+class TenantErasure:
+    """What :meth:`TenantErasures.erase` did.
+
+    Attributes
+    ----------
+    receipt
+        The signed receipt.
+    erased
+        Whether this call removed the tenant; False where it was gone already.
+    log_purged
+        False if SQLite could not empty its write-ahead log just now, as beside a long reader; the
+        next erasure or ``purge_log`` does it.
+    """
+
+    receipt: Receipt
+    erased: bool
+    log_purged: bool
+
+
+@dataclass(frozen=True)
+class _Records:
+    """One kind of record of a tenant: its table and key, and which rows are the tenant's.
+
+    `lock` is the subject id where writes hold the lock of a subject rather than of the row.
+    """
+
+    items: Sequence[str]
+    table: type[Base]
+    key: Sequence[InstrumentedAttribute[Any]]
+    owned_by: Callable[[str], sa.ColumnElement[bool]]
+    lock: Sequence[InstrumentedAttribute[str]] = ()
+
+
+# Before the row of the tenant, so that they can be counted; a subject's template goes with it.
+_IN_BATCHES = (
+    _Records(
+        ("subjects", "data_keys"),
+        SubjectRow,
+        [SubjectRow.id],
+        lambda tenant_id: SubjectRow.tenant_id == tenant_id,
+        [SubjectRow.subject_id],
+    ),
+    _Records(
+        ("failed_attempts",),
+        FailedAttemptsRow,
+        [FailedAttemptsRow.tenant_id, FailedAttemptsRow.pseudonym],
+        lambda tenant_id: FailedAttemptsRow.tenant_id == tenant_id,
+    ),
+    _Records(
+        ("idempotency_records",),
+        IdempotencyRow,
+        [IdempotencyRow.tenant_id, IdempotencyRow.actor, IdempotencyRow.key_hash],
+        lambda tenant_id: IdempotencyRow.tenant_id == tenant_id,
+    ),
+    _Records(
+        ("nonces",),
+        UsedNonceRow,
+        [UsedNonceRow.api_key_id, UsedNonceRow.nonce_hash],
+        lambda tenant_id: UsedNonceRow.api_key_id.in_(
+            sa.select(ApiKeyRow.id).where(ApiKeyRow.tenant_id == tenant_id)
+        ),
+    ),
+)
+
+
+class TenantErasures:
+    """The only way to erase a tenant."""
+
+    def __init__(
+        self, database: Database, signer: ReceiptSigner, audit_log: AuditLog, clock: Clock
+    ) -> None:
+        self._database = database
+        self._signer = signer
+        self._audit_log = audit_log
+        self._clock = clock
+
+    def erase(
+        self,
+        tenant: str,
+        *,
+        by: By = PROGRAM,
+        batch: int = BATCH,
+        progress: Callable[[int], None] | None = None,
+    ) -> TenantErasure:
+        """Remove all that is held of a tenant, its keys included; leave one signed receipt.
+
+        It may be interrupted and called again: the call that removes the tenant signs the receipt,
+        which counts what all of them removed. Erasing again returns that receipt.
+
+        Parameters
+        ----------
+        tenant
+            Its name. A tenant that is made anew under it later is another one.
+        by
+            Who asks for it, for the audit log.
+        batch
+            Records in one transaction.
+        progress
+            Called after each transaction with the number of records that it removed.
+
+        Raises
+        ------
+        UnknownTenant
+            If there never was a tenant of this name.
+        """
+        checked_tenant_name(tenant)
+        # Obtains the keys before the transactions need them.
+        self._signer.public_key()
+        self._audit_log.prepare()
+        begun = self._database.write(lambda each: self._begin(each, tenant, by))
+        if isinstance(begun, Receipt):
+            return TenantErasure(begun, erased=False, log_purged=self._database.try_purge_log())
+        for records in _IN_BATCHES:
+            while removed := self._remove_batch(begun, tenant, records, batch):
+                if progress is not None:
+                    progress(removed)
+        receipt, erased = self._database.write_alone(
+            lambda each: self._finish(each, begun, tenant, by)
+        )
+        return TenantErasure(receipt, erased, log_purged=self._database.try_purge_log())
+
+    def held(self, tenant: str) -> ErasedTenant:
+        """Count what there is of a tenant now; :class:`UnknownTenant` where there is none."""
+        checked_tenant_name(tenant)
+
+        def work(connection: Connection) -> ErasedTenant:
+            tenant_id = _tenant_id(connection, tenant)
+            if tenant_id is None:
+                raise _unknown(tenant)
+            counts = dict.fromkeys(_ITEMS, 0)
+            owned: list[tuple[Sequence[str], type[Base], sa.ColumnElement[bool]]] = [
+                (each.items, each.table, each.owned_by(tenant_id)) for each in _IN_BATCHES
+            ]
+            owned += [
+                (["templates"], TemplateRow, _template_of(tenant_id)),
+                (["api_keys"], ApiKeyRow, ApiKeyRow.tenant_id == tenant_id),
+                (["rotation_keys"], RotationKeyRow, RotationKeyRow.tenant_id == tenant_id),
+            ]
+            for items, table, condition in owned:
+                query = sa.select(sa.func.count()).select_from(table).where(condition)
+                counts |= dict.fromkeys(items, connection.execute(query).scalar_one())
+            return ErasedTenant(**counts)
+
+        return self._database.read(work)
+
+    def receipt(self, tenant: str) -> Receipt | None:
+        """Return the latest receipt of the erasure of a tenant of this name, or None."""
+        checked_tenant_name(tenant)
+        return self._database.read(lambda each: _latest_receipt(each, tenant))
+
+    def _begin(self, connection: Connection, tenant: str, by: By) -> str | Receipt:
+        """Revoke the tenant's API keys; returns its row id, or the receipt where it is gone."""
+        tenant_id = _tenant_id(connection, tenant)
+        if tenant_id is None:
+            earlier = _latest_receipt(connection, tenant)
+            if earlier is None:
+                raise _unknown(tenant)
+            self._note(connection, "receipt_repeated", tenant, by)
+            return earlier
+        now = self._clock()
+        connection.execute(
+            sa.update(ApiKeyRow)
+            .where(ApiKeyRow.tenant_id == tenant_id, ApiKeyRow.revoked_at.is_(None))
+            .values(revoked_at=now)
+        )
+        first = insert_once(
+            connection, TenantErasureRow, tenant_id=tenant_id, begun_at=now, removed={}
+        )
+        self._note(connection, "begun" if first else "resumed", tenant, by)
+        return tenant_id
+
+    def _remove_batch(self, tenant_id: str, tenant: str, records: _Records, batch: int) -> int:
+        def work(connection: Connection) -> int:
+            rows = self._rows(connection, tenant_id, tenant, records, batch)
+            counts = _remove(connection, records, rows)
+            if any(counts.values()):
+                _add(connection, tenant_id, counts)
+            return sum(counts.values())
+
+        # The lock is for the count, should the same tenant be erased twice at once.
+        return self._database.write(work, lock=f"tenant erasure {tenant_id}")
+
+    def _finish(
+        self, connection: Connection, tenant_id: str, tenant: str, by: By
+    ) -> tuple[Receipt, bool]:
+        epoch = connection.execute(
+            sa.select(TenantRow.rotation_epoch).where(TenantRow.id == tenant_id)
+        ).scalar_one_or_none()
+        if epoch is None:  # another call was faster
+            earlier = _latest_receipt(connection, tenant)
+            assert earlier is not None, "only the last transaction removes a tenant"  # noqa: S101
+            return earlier, False
+        for records in _IN_BATCHES:
+            rows = self._rows(connection, tenant_id, tenant, records, None)
+            _add(connection, tenant_id, _remove(connection, records, rows))
+        for item, table in (("api_keys", ApiKeyRow), ("rotation_keys", RotationKeyRow)):
+            gone = connection.execute(sa.delete(table).where(table.tenant_id == tenant_id))
+            _add(connection, tenant_id, {item: gone.rowcount})
+        removed = connection.execute(
+            sa.select(TenantErasureRow.removed).where(TenantErasureRow.tenant_id == tenant_id)
+        ).scalar_one()
+        connection.execute(
+            sa.delete(TenantErasureRow).where(TenantErasureRow.tenant_id == tenant_id)
+        )
+        connection.execute(sa.delete(TenantRow).where(TenantRow.id == tenant_id))
+        now = self._clock()
+        receipt = self._signer.sign_tenant(
+            tenant=tenant,
+            rotation_epoch=epoch,
+            erased=ErasedTenant(**{**dict.fromkeys(_ITEMS, 0), **removed}),
+            erased_at=now,
+        )
+        connection.execute(
+            sa.insert(ReceiptRow).values(
+                pseudonym=tenant_receipt_name(tenant),
+                body=receipt.body,
+                signature=receipt.signature,
+                created_at=now,
+            )
+        )
+        self._note(connection, "erased", tenant, by)
+        return receipt, True
+
+    def _rows(
+        self,
+        connection: Connection,
+        tenant_id: str,
+        tenant: str,
+        records: _Records,
+        batch: int | None,
+    ) -> Sequence[Key]:
+        """Keys of a batch of records that no other write is at; of all of them without a number.
+
+        Those that are in use are left to a later batch, or to the last transaction: waiting for
+        them, in whatever order they come, could make a deadlock.
+        """
+        query = (
+            sa.select(*records.key, *records.lock)
+            .where(records.owned_by(tenant_id))
+            .order_by(*records.key)
+            .limit(batch)
+            .with_for_update(skip_locked=True)
+        )
+        rows = [tuple(row) for row in connection.execute(query)]
+        if not records.lock or batch is None:
+            return [row[: len(records.key)] for row in rows]
+        free: list[bool] = []
+        for start in range(0, len(rows), BATCH):
+            names = [subject_lock(tenant, row[-1]) for row in rows[start : start + BATCH]]
+            free += self._database.try_locks(connection, names)
+        return [row[: len(records.key)] for row, ours in zip(rows, free, strict=True) if ours]
+
+    def _note(self, connection: Connection, outcome: str, tenant: str, by: By) -> None:
+        self._audit_log.append(
+            connection, Entry(action=TENANT_ERASE, outcome=outcome, by=by, tenant=tenant)
+        )
+
+
+_ITEMS = tuple(each.name for each in fields(ErasedTenant))
+
+
+def _remove(connection: Connection, records: _Records, rows: Sequence[Key]) -> Counts:
+    counts: Counts = {}
+    for start in range(0, len(rows), BATCH):  # a statement has a bounded number of parameters
+        keys = rows[start : start + BATCH]
+        if records.table is SubjectRow:
+            templates = sa.delete(TemplateRow).where(
+                TemplateRow.subject_pk.in_([subject_pk for (subject_pk,) in keys])
+            )
+            _count(counts, ["templates"], connection.execute(templates).rowcount)
+        gone = sa.delete(records.table).where(sa.tuple_(*records.key).in_(keys))
+        _count(counts, records.items, connection.execute(gone).rowcount)
+    return counts
+
+
+def _add(connection: Connection, tenant_id: str, counts: Counts) -> None:
+    """Add to what the erasure of the tenant has removed so far."""
+    mine = TenantErasureRow.tenant_id == tenant_id
+    removed: Counts = dict(
+        connection.execute(sa.select(TenantErasureRow.removed).where(mine)).scalar_one_or_none()
+        or {}
+    )
+    for item, count in counts.items():
+        _count(removed, [item], count)
+    connection.execute(sa.update(TenantErasureRow).where(mine).values(removed=removed))
+
+
+def _count(counts: Counts, items: Sequence[str], count: int) -> None:
+    for item in items:
+        counts[item] = counts.get(item, 0) + count
+
+
+def _template_of(tenant_id: str) -> sa.ColumnElement[bool]:
+    return TemplateRow.subject_pk.in_(
+        sa.select(SubjectRow.id).where(SubjectRow.tenant_id == tenant_id)
+    )
+
+
+def _tenant_id(connection: Connection, tenant: str) -> str | None:
+    return connection.execute(
+        sa.select(TenantRow.id).where(TenantRow.name == tenant)
+    ).scalar_one_or_none()
+
+
+def _unknown(tenant: str) -> UnknownTenant:
+    return UnknownTenant(f"there is no tenant {tenant!r}")
+
+
+def _latest_receipt(connection: Connection, tenant: str) -> Receipt | None:
+    row = connection.execute(
+        sa.select(ReceiptRow.body, ReceiptRow.signature)
+        .where(ReceiptRow.pseudonym == tenant_receipt_name(tenant))
+        .order_by(ReceiptRow.sequence.desc())
+        .limit(1)
+    ).one_or_none()
+    return None if row is None else Receipt(row.body, row.signature)

@@ -1,0 +1,104 @@
+import json
+import sqlite3
+
+import pytest
+
+from tests.api.cli.conftest import run
+
+
+@pytest.fixture
+def log(world, veilface):
+    """A log with a few lines: keys, an enrollment, two verifications."""
+    pack = ("--pack", world.pack)
+    assert veilface("keys", "create", "--right", "verify").status == 0
+    assert veilface("enroll", "ann", *world.photos(1, range(3)), *pack).status == 0
+    assert veilface("verify", "ann", *world.photos(1, range(3, 4)), *pack).status == 0
+    assert veilface("verify", "ann", *world.photos(2, range(1)), *pack).status == 1
+    return veilface
+
+
+def tamper(data, statement):
+    """Change the table as somebody may who owns the database."""
+    with sqlite3.connect(data / "veilface.db") as connection:
+        names = connection.execute(
+            "SELECT name FROM sqlite_master WHERE type = 'trigger'"
+        ).fetchall()
+        for (name,) in names:
+            connection.execute(f'DROP TRIGGER "{name}"')
+        assert connection.execute(statement).rowcount > 0
+    connection.close()
+
+
+def lines(ran):
+    return [json.loads(line) for line in ran.stdout.splitlines()]
+
+
+def test_a_whole_log_is_verified_and_shown(log):
+    ran = log("audit-log", "verify", "--json")
+    assert ran.status == 0, ran.stderr
+    assert ran.json["intact"] is True
+    shown = lines(log("audit-log", "show"))
+    assert ran.json["lines"] == len(shown)
+    assert ran.json["head"] == log("audit-log", "head").stdout.strip()
+    assert [line["sequence"] for line in shown] == list(range(1, len(shown) + 1))
+    done = [(line["action"], line["outcome"]) for line in shown]
+    assert ("key-create", "created") in done
+    assert done[-3:] == [("enroll", "created"), ("verify", "accept"), ("verify", "reject")]
+    assert all(line["actor"].startswith("operator:") for line in shown[-3:])
+    assert "ann" not in json.dumps(shown)
+    assert "whole" in log("audit-log", "verify").stdout
+
+
+def test_lines_are_found_by_subject_and_number(log):
+    everything = lines(log("audit-log", "show"))
+    of_ann = lines(log("audit-log", "show", "--subject", "ann"))
+    assert [line["action"] for line in of_ann] == ["enroll", "verify", "verify"]
+    assert len({line["subject"] for line in of_ann}) == 1
+    assert lines(log("audit-log", "show", "--subject", "bob")) == []
+    assert lines(log("audit-log", "show", "--after", "1", "--limit", "1")) == everything[1:2]
+
+
+@pytest.mark.parametrize(
+    ("statement", "said"),
+    [
+        ("UPDATE audit_log SET outcome = 'accept' WHERE outcome = 'reject'", "altered"),
+        ("DELETE FROM audit_log WHERE sequence = 2", "missing"),
+        ("DELETE FROM audit_log WHERE sequence = (SELECT max(sequence) FROM audit_log)", "missing"),
+        ("UPDATE audit_head SET sequence = sequence - 1", "head"),
+    ],
+)
+def test_a_tampered_log_is_told(log, data, statement, said):
+    tamper(data, statement)
+    ran = log("audit-log", "verify")
+    assert ran.status == 1
+    assert said in ran.stderr
+    ran = log("audit-log", "verify", "--json")
+    assert (ran.status, ran.json["intact"]) == (1, False)
+    assert ran.json["problems"]
+
+
+def test_an_anchor_finds_a_log_that_was_put_back(log, data, tmp_path, world):
+    old = (data / "veilface.db").read_bytes()
+    kept = tmp_path / "head.txt"
+    assert log("keys", "create", "--right", "verify").status == 0
+    kept.write_text(log("audit-log", "head").stdout)
+    assert log("audit-log", "verify", "--anchor", kept).status == 0
+    for extra in data.glob("veilface.db-*"):
+        extra.unlink()
+    (data / "veilface.db").write_bytes(old)
+    assert log("audit-log", "verify").status == 0  # the old state is whole in itself
+    ran = log("audit-log", "verify", "--anchor", kept)
+    assert ran.status == 1
+    assert "anchor" in ran.stderr
+
+
+def test_what_is_no_anchor_is_refused(log):
+    ran = log("audit-log", "verify", "--anchor", "yesterday")
+    assert ran.status == 2
+    assert "audit-log head" in ran.stderr
+
+
+def test_an_absent_database_is_not_made(tmp_path):
+    ran = run("audit-log", "verify", "--data-dir", tmp_path / "new")
+    assert ran.status == 1
+    assert "veilface db upgrade" in ran.stderr

@@ -1,0 +1,254 @@
+"""Both clients against a running service: every call."""
+
+import asyncio
+import inspect
+import io
+import socket
+from pathlib import Path
+
+import httpx
+import pytest
+
+from tests.api.cli.conftest import run
+from tests.api.deployment import make_source, photo
+from tests.clients.conftest import Running
+from veilface_client import (
+    AsyncClient,
+    AsyncPrivateClient,
+    Client,
+    ConnectionFailed,
+    Forbidden,
+    LockedOut,
+    NotEnrolled,
+    NotFound,
+    PhotoRefused,
+    PrivateClient,
+    Retries,
+    Unauthorized,
+    Unavailable,
+    UnexpectedAnswer,
+)
+
+
+def test_a_person_from_enrollment_to_receipt(service: Running, token: str, tmp_path: Path) -> None:
+    path = tmp_path / "anna.png"
+    path.write_bytes(photo(1, 1))
+    with Client(service.url, token) as client:
+        first = client.enroll("anna", [photo(1, 0), path, io.BytesIO(photo(1, 2))])
+        assert not first.replaced
+        assert [image.index for image in first.images] == [0, 1, 2]
+        assert client.enroll("anna", path, attributes={"gender": "Female"}, face="single").replaced
+
+        with path.open("rb") as file:
+            accepted = client.verify("anna", file, level="fmr-1e-2")
+        assert accepted
+        assert (accepted.decision, accepted.level, accepted.fmr) == ("accept", "fmr-1e-2", 0.01)
+        assert accepted.distance is not None, "the key has the right scores"
+        assert client.verify("anna", str(path)).accepted
+        rejected = client.verify("anna", photo(2, 0))
+        assert not rejected
+        assert rejected.reason == "no_match"
+
+        described = client.describe("anna")
+        assert (described.subject_id, described.photos, described.current) == ("anna", 1, True)
+        assert client.ready().status == "ok"
+
+        contract = client.contract()
+        assert client.generator().source_id == contract.binding["decoy_source_id"]
+        assert client.generator().data == make_source().to_bytes()
+
+        receipt = client.erase("anna")
+        assert receipt.held
+        assert client.erase("anna").receipt == receipt.receipt
+        with pytest.raises(NotEnrolled):
+            client.describe("anna")
+
+    receipt.save(tmp_path / "receipt.json")
+    contract.save(tmp_path / "contract.json")
+    saved = (tmp_path / "receipt.json", "--public-key", tmp_path / "contract.json")
+    assert run("keys", "verify-receipt", *saved).status == 0
+    forged = receipt.raw.replace(b'\\"held\\":true', b'\\"held\\":false')
+    assert forged != receipt.raw
+    (tmp_path / "receipt.json").write_bytes(forged)
+    assert run("keys", "verify-receipt", *saved).status != 0
+
+
+def test_export_and_import(service: Running, token: str) -> None:
+    with Client(service.url, token) as client:
+        client.enroll("carl", photo(3))
+        exported = client.export("carl")
+        client.erase("carl")
+        imported = client.import_(exported)
+        assert (imported.subject_id, imported.replaced) == ("carl", False)
+        assert client.import_(exported.export).replaced
+        assert client.verify("carl", photo(3, 1))
+        client.erase("carl")
+
+
+def test_pages_hold_everybody_once(service: Running, token: str) -> None:
+    names = [f"page-{index}" for index in range(5)]
+    with Client(service.url, token) as client:
+        for name in names:
+            client.enroll(name, photo(4))
+        page = client.page(limit=2)
+        assert len(page.subjects) == 2
+        assert page.next_cursor is not None
+        assert client.page(limit=2, cursor=page.next_cursor).subjects != page.subjects
+        found = [subject.subject_id for subject in client.subjects(page_size=2)]
+        for name in names:
+            client.erase(name)
+    assert sorted(found) == found
+    assert [name for name in found if name.startswith("page-")] == names
+
+
+def test_a_lockout_and_its_reset(service: Running, token: str) -> None:
+    with Client(service.url, token) as client:
+        client.enroll("dora", photo(5))
+        with pytest.raises(NotFound):
+            client.lockout("dora")
+        for _ in range(5):
+            assert not client.verify("dora", photo(6))
+        with pytest.raises(LockedOut) as locked:
+            client.verify("dora", photo(5))
+        assert locked.value.retry_after is not None
+        assert 0 < locked.value.retry_after <= 30
+        assert locked.value.details == {"disabled": False}
+        assert client.lockout("dora").consecutive_failures == 5
+        assert client.reset_lockout("dora").lifted
+        assert client.verify("dora", photo(5))
+        assert not client.reset_lockout("dora").lifted
+        client.erase("dora")
+
+
+def test_every_call_asynchronously(service: Running, token: str, tmp_path: Path) -> None:
+    path = tmp_path / "emil.png"
+    path.write_bytes(photo(7))
+
+    async def scenario() -> None:
+        async with AsyncClient(service.url, token) as client:
+            enrolled = await client.enroll("emil", [path, photo(7, 1)])
+            assert len(enrolled.images) == 2
+            answers = await asyncio.gather(
+                client.verify("emil", photo(7, 2)), client.verify("emil", photo(8))
+            )
+            assert [bool(each) for each in answers] == [True, False]
+            assert (await client.describe("emil")).photos == 2
+            assert "emil" in [each.subject_id async for each in client.subjects(page_size=1)]
+            # An acceptance forgets the failures: of the two above either may have been the last.
+            assert not await client.verify("emil", photo(8))
+            assert (await client.lockout("emil")).consecutive_failures in (1, 2)
+            await client.reset_lockout("emil")
+            exported = await client.export("emil")
+            assert (await client.import_(exported)).replaced
+            contract, generator = await asyncio.gather(client.contract(), client.generator())
+            assert contract.binding["decoy_source_id"] == generator.source_id
+            assert (await client.ready()).status == "ok"
+            assert (await client.erase("emil")).held
+            with pytest.raises(NotEnrolled):
+                await client.describe("emil")
+
+    asyncio.run(scenario())
+
+
+def test_errors_of_the_service_are_typed(service: Running, token: str) -> None:
+    with Client(service.url, token) as client:
+        with pytest.raises(PhotoRefused) as refused:
+            client.enroll("fritz", [photo(9), b"no picture at all"])
+        assert refused.value.code == "unsupported_image"
+        assert refused.value.details["image"] == 1
+        assert refused.value.request_id is not None
+        with pytest.raises(PhotoRefused, match="inconsistent_images"):
+            client.enroll("fritz", [photo(9), photo(10)])
+        with pytest.raises(NotEnrolled):
+            client.verify("nobody", photo(9))
+    with Client(service.url, f"vf_{'0' * 12}_{'0' * 64}") as client, pytest.raises(Unauthorized):
+        client.contract()
+    with Client(service.url, service.deployment.key("verify")) as client:
+        with pytest.raises(Forbidden) as forbidden:
+            client.enroll("fritz", photo(9))
+        assert forbidden.value.details["missing"] == ["enroll"]
+
+
+def test_a_service_without_a_pack_takes_no_photo(packless: Running) -> None:
+    with Client(packless.url, packless.deployment.token) as client:
+        assert not client.contract().photos
+        with pytest.raises(Unavailable, match="model_unavailable"):
+            client.verify("anna", photo(1))
+
+
+def test_something_else_at_the_url(service: Running, token: str) -> None:
+    with Client(f"{service.url}/elsewhere", token) as client, pytest.raises(NotFound):
+        client.contract()
+
+
+@pytest.mark.parametrize("subject", ["", ".", "..", "a/b", "../x", "a?b", "a b", "ä", "x" * 129])
+def test_a_subject_is_one_segment_of_the_path(subject: str) -> None:
+    with Client("http://127.0.0.1:9", "vf_x") as client:
+        with pytest.raises(ValueError, match="subject id"):
+            client.describe(subject)
+        with pytest.raises(ValueError, match="subject id"):
+            client.verify(subject, b"x")
+
+
+def test_what_is_no_photo() -> None:
+    with Client("http://127.0.0.1:9", "vf_x") as client:
+        for wrong in (b"", io.StringIO("text"), 3):
+            with pytest.raises((ValueError, TypeError), match="a photo"):
+                client.verify("anna", wrong)  # type: ignore[arg-type]
+        with pytest.raises(ValueError, match="at least one"):
+            client.enroll("anna", [])
+        with pytest.raises(FileNotFoundError):
+            client.verify("anna", "there/is/no.jpg")
+
+
+@pytest.mark.parametrize(
+    ("blocking", "asynchronous"), [(Client, AsyncClient), (PrivateClient, AsyncPrivateClient)]
+)
+def test_both_have_the_same_calls(blocking: type, asynchronous: type) -> None:
+    def calls(kind: type) -> dict[str, list[tuple[str, object]]]:
+        return {
+            name: [
+                (each.name, each.default)
+                for each in inspect.signature(getattr(kind, name)).parameters.values()
+            ]
+            for name in dir(kind)
+            if not name.startswith("_") and callable(getattr(kind, name))
+        }
+
+    assert calls(blocking) == calls(asynchronous)
+    assert {"enroll", "verify", "erase", "subjects"} <= calls(blocking).keys()
+    made = [inspect.signature(kind).parameters for kind in (blocking, asynchronous)]
+    assert list(made[0]) == list(made[1])
+
+
+def test_a_private_client_is_no_client_that_takes_photos() -> None:
+    """Neither class inherits from the other: nothing of the photo path can be reached."""
+    assert not issubclass(PrivateClient, Client)
+    assert not issubclass(AsyncPrivateClient, AsyncClient)
+
+
+def test_a_service_that_never_answers() -> None:
+    once = Retries(sendings=1)
+    with (
+        socket.create_server(("127.0.0.1", 0)) as silent,
+        Client(
+            f"http://127.0.0.1:{silent.getsockname()[1]}", "vf_x", timeout=0.2, retries=once
+        ) as client,
+        pytest.raises(ConnectionFailed, match="ReadTimeout") as failed,
+    ):
+        client.contract()
+    assert failed.value.sent
+
+
+def test_answers_that_make_no_sense() -> None:
+    def answer(request: httpx.Request) -> httpx.Response:
+        if request.url.path == "/v1/subjects":
+            body = {"subjects": [], "next_cursor": "same", "request_id": "r"}
+            return httpx.Response(200, json=body)
+        return httpx.Response(200, content=b"generator")
+
+    with Client("http://x", "vf_x", transport=httpx.MockTransport(answer)) as client:
+        with pytest.raises(UnexpectedAnswer, match="next one"):
+            list(client.subjects())
+        with pytest.raises(UnexpectedAnswer, match="X-Decoy-Source-ID"):
+            client.generator()

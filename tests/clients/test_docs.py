@@ -1,0 +1,88 @@
+"""Every snippet of the client's pages runs, and prints what its comments say."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.api.deployment import photo
+from tests.clients.conftest import VEILFACE, Running
+from veilface_client import Client
+from veilface_client.errors import FAMILIES
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = ("docs/client.md", "clients/python/README.md")
+EXAMPLE = "http://127.0.0.1:8421"
+
+
+def blocks(page: str, language: str) -> list[str]:
+    """The fenced blocks of a page."""
+    text = (ROOT / page).read_text(encoding="utf-8")
+    return re.findall(rf"^```{language}\n(.*?)^```", text, flags=re.MULTILINE | re.DOTALL)
+
+
+PYTHON = [
+    pytest.param(block, id=f"{page}-{number}")
+    for page in PAGES
+    for number, block in enumerate(blocks(page, "python"))
+]
+
+
+@pytest.fixture
+def newcomer(service: Running, token: str, tmp_path: Path) -> tuple[Path, dict[str, str]]:
+    """A folder with three photos and a pack, on a service where nobody is enrolled."""
+    with Client(service.url, token) as client:
+        for subject in list(client.subjects()):
+            client.erase(subject.subject_id)
+    for shot in range(3):
+        (tmp_path / f"anna{shot + 1}.jpg").write_bytes(photo(1, shot))
+    (tmp_path / "buffalo_l").symlink_to(service.pack)
+    path = f"{VEILFACE.parent}:{os.environ['PATH']}"
+    return tmp_path, {"PATH": path, "HOME": str(tmp_path), "VEILFACE_API_KEY": token}
+
+
+@pytest.mark.parametrize("block", PYTHON)
+def test_a_snippet_prints_what_it_says(
+    block: str, service: Running, newcomer: tuple[Path, dict[str, str]], remembering: Path
+) -> None:
+    folder, env = newcomer
+    env["PATH"] = f"{remembering.parent}:{env['PATH']}"
+    assert EXAMPLE in block
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", block.replace(EXAMPLE, service.url)],
+        cwd=folder,
+        env=env,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    expected = re.findall(r"^ *print\(.*\)  # (.*)$", block, flags=re.MULTILINE)
+    assert expected, "a snippet that shows nothing"
+    assert done.stdout.splitlines() == expected
+
+
+def test_the_same_from_the_shell(service: Running, newcomer: tuple[Path, dict[str, str]]) -> None:
+    folder, env = newcomer
+    install, script = blocks(PAGES[0], "sh")
+    assert install == "pip install ./clients/python\n"
+    assert (ROOT / "clients" / "python" / "pyproject.toml").exists()
+    done = subprocess.run(
+        ["bash", "-euo", "pipefail", "-c", script.replace(EXAMPLE, service.url)],
+        cwd=folder,
+        env=env,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert '"decision":"accept"' in done.stdout.replace(": ", ":")
+
+
+def test_the_table_of_classes_is_that_of_the_code() -> None:
+    text = (ROOT / PAGES[0]).read_text(encoding="utf-8")
+    table = text.split("| class | codes |")[1].split("\n\n")[0]
+    rows = re.findall(r"^\| `(\w+)`.*? \| (.*) \|$", table, flags=re.MULTILINE)
+    stated = {code: name for name, codes in rows for code in re.findall(r"`(\w+)`", codes)}
+    assert stated == {code: kind.__name__ for code, kind in FAMILIES.items()}

@@ -1,0 +1,153 @@
+"""One class for every error code of the service, and a sensible one for codes to come."""
+
+import json
+
+import httpx
+import pytest
+from pydantic import ValidationError
+
+import veilface_client
+from api.errors import ERROR_CODES
+from veilface_client import errors, results
+from veilface_client.errors import FAMILIES, ServiceError, UnexpectedAnswer, error_of
+from veilface_client.results import parse
+
+
+def answer(status: int, body: object, **headers: str) -> httpx.Response:
+    return httpx.Response(status, content=json.dumps(body).encode(), headers=headers)
+
+
+def shaped(code: str) -> dict[str, object]:
+    error = {"code": code, "message": "said", "details": {"limit": 3}}
+    return {"error": error, "request_id": "4b1f0d5c"}
+
+
+def test_the_families_are_those_of_the_service() -> None:
+    assert FAMILIES.keys() == ERROR_CODES.keys()
+
+
+@pytest.mark.parametrize("code", ERROR_CODES)
+def test_every_code_has_its_class(code: str) -> None:
+    status = ERROR_CODES[code].status
+    error = error_of(answer(status, shaped(code), **{"Retry-After": "7"}))
+    assert type(error) is FAMILIES[code]
+    assert (error.code, error.status, error.message) == (code, status, "said")
+    assert (error.details, error.request_id, error.retry_after) == ({"limit": 3}, "4b1f0d5c", 7.0)
+    assert str(error) == f"said ({code}, request 4b1f0d5c)"
+
+
+@pytest.mark.parametrize("code", ERROR_CODES)
+def test_the_class_of_the_status_is_an_ancestor_of_that_of_the_code(code: str) -> None:
+    """So that a handler that is written for a later code's status still works."""
+    status = ERROR_CODES[code].status
+    later = type(error_of(answer(status, shaped("later_code"))))
+    refused_photo = FAMILIES[code] is errors.PhotoRefused
+    assert refused_photo or issubclass(FAMILIES[code], later)
+
+
+@pytest.mark.parametrize(
+    ("status", "kind"),
+    [
+        (400, errors.InvalidRequest),
+        (401, errors.Unauthorized),
+        (403, errors.Forbidden),
+        (404, errors.NotFound),
+        (409, errors.Conflict),
+        (418, errors.InvalidRequest),
+        (423, errors.LockedOut),
+        (429, errors.RateLimited),
+        (500, errors.ServerFailed),
+        (502, errors.Unavailable),
+        (503, errors.Unavailable),
+        (507, errors.ServerFailed),
+    ],
+)
+def test_an_unknown_code_has_the_class_of_its_status(status: int, kind: type[ServiceError]) -> None:
+    error = error_of(answer(status, shaped("later_code")))
+    assert type(error) is kind
+    assert error.code == "later_code"
+
+
+@pytest.mark.parametrize(
+    "body", ["<html>vf_secret</html>", [], {"error": "x"}, {"error": {"code": 1, "message": ""}}]
+)
+def test_the_page_of_a_proxy_is_not_repeated(body: object) -> None:
+    error = error_of(answer(502, body))
+    assert isinstance(error, errors.Unavailable)
+    assert error.code == "http_502"
+    assert "vf_secret" not in str(error)
+
+
+def test_a_redirection_is_no_answer() -> None:
+    assert isinstance(error_of(answer(302, {})), UnexpectedAnswer)
+
+
+@pytest.mark.parametrize("header", ["Fri, 31 Dec 1999 23:59:59 GMT", "-1", "1e9", "٣", ""])
+def test_a_strange_retry_after_is_none(header: str) -> None:
+    error = error_of(
+        httpx.Response(503, json=shaped("overloaded"), headers=[(b"Retry-After", header.encode())])
+    )
+    assert isinstance(error, errors.Unavailable)
+    assert error.retry_after is None
+
+
+def test_every_class_is_drawn_in_the_tree_and_handed_out() -> None:
+    classes = {
+        value
+        for value in vars(errors).values()
+        if isinstance(value, type) and issubclass(value, errors.VeilfaceError)
+    }
+    for kind in classes:
+        assert kind.__name__ in (errors.__doc__ or "")
+        assert getattr(veilface_client, kind.__name__) is kind
+
+
+DECISION = {
+    "decision": "accept",
+    "reason": "match",
+    "level": "fmr-1e-3",
+    "fmr": 0.001,
+    "contract_id": "c",
+    "calibration_id": "k",
+    "request_id": "r",
+}
+
+
+def test_fields_to_come_are_ignored_and_values_are_frozen() -> None:
+    decision = parse(results.Decision, answer(200, {**DECISION, "liveness": 0.9}))
+    assert decision.accepted
+    with pytest.raises(ValidationError, match="frozen"):
+        decision.decision = "reject"
+
+
+@pytest.mark.parametrize("said", ["ACCEPT", "maybe", "", None, True, 1])
+def test_only_accept_is_accept(said: object) -> None:
+    with pytest.raises(UnexpectedAnswer, match="decision"):
+        parse(results.Decision, answer(200, {**DECISION, "decision": said}))
+
+
+def test_an_answer_that_does_not_fit_names_fields_and_no_value() -> None:
+    with pytest.raises(UnexpectedAnswer) as unexpected:
+        parse(results.Decision, answer(200, {"decision": "vf_secret"}))
+    assert "calibration_id" in str(unexpected.value)
+    assert "vf_secret" not in str(unexpected.value)
+    with pytest.raises(UnexpectedAnswer):
+        parse(results.Decision, httpx.Response(200, content=b"<html>"))
+
+
+@pytest.mark.parametrize("contract_id", ["../../etc/x", "A" * 64, "a" * 63, "a" * 64 + "\n"])
+def test_a_contract_id_is_a_hash_before_it_names_a_file(contract_id: str) -> None:
+    body = {
+        "contract_id": contract_id,
+        "binding": {},
+        "calibrations": [],
+        "default_level": "x",
+        "photos": False,
+        "generator": True,
+        "receipt_key": {"algorithm": "Ed25519", "key_id": "k", "public_key": "p"},
+        "request_id": "r",
+    }
+    with pytest.raises(UnexpectedAnswer, match="contract_id"):
+        parse(results.Contract, answer(200, body))
+    good = parse(results.Contract, answer(200, {**body, "contract_id": "a" * 64}))
+    assert json.loads(good.raw)["binding"] == {}

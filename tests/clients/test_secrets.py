@@ -1,0 +1,163 @@
+"""The API key is in no text that this package makes; the package needs httpx and pydantic alone."""
+
+import ast
+import importlib.metadata
+import logging
+import re
+import subprocess
+import sys
+import traceback
+from pathlib import Path
+
+import httpx
+import pytest
+
+import veilface_client
+from tests.api.deployment import photo
+from tests.clients.conftest import Running
+from veilface_client import AsyncClient, Client, PrivateClient, VeilfaceError
+from veilface_client.results import Enrollable, Export, Generator, Probe
+
+PACKAGE = Path(veilface_client.__file__).parent
+SECRET = "5e" * 32
+TOKEN = f"vf_{'0' * 12}_{SECRET}"
+
+
+def test_the_key_is_in_no_representation(tmp_path: Path) -> None:
+    with (
+        Client("http://service.test", TOKEN) as client,
+        PrivateClient("http://service.test", TOKEN, pack=tmp_path) as private,
+    ):
+        shown = [
+            form(each)
+            for form in (repr, str)
+            for each in (client, private, AsyncClient("http://service.test", TOKEN))
+        ]
+        shown += [repr(vars(client)), repr(vars(private)["_lifter"]), repr(client._http.headers)]
+    assert "Client('http://service.test')" in shown[0]
+    assert not any(SECRET in each for each in shown)
+
+
+def test_templates_and_exports_are_in_no_representation() -> None:
+    marked = b"private-bytes"
+    values = [
+        Probe(template=marked, contract_id="c"),
+        Enrollable(template=marked, contract_id="c"),
+        Generator(data=marked, source_id="s"),
+        Export(export="private-bytes", contract_id="c", key_id="k", request_id="r"),
+    ]
+    assert not any("private-bytes" in form(value) for value in values for form in (repr, str))
+
+
+def test_the_key_is_in_no_log_and_no_error(
+    service: Running, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.DEBUG)
+    texts = []
+    for url in (service.url, "http://127.0.0.1:9"):
+        with Client(url, TOKEN, retries=veilface_client.Retries(sendings=1)) as client:
+            with pytest.raises(VeilfaceError) as failed:
+                client.verify("anna", photo(1))
+            texts.append("".join(traceback.format_exception(failed.value)))
+    assert caplog.records, "httpx logs, or this test sees nothing"
+    assert not any(SECRET in text for text in [*texts, caplog.text])
+
+
+@pytest.mark.parametrize("wrong", [f"{TOKEN}\n", f"{TOKEN}\r\nX: y", f" {TOKEN}", f"{TOKEN}ä", ""])
+def test_a_key_that_cannot_be_sent_is_refused_without_being_repeated(wrong: str) -> None:
+    with pytest.raises(ValueError, match="API key") as refused:
+        Client("http://service.test", wrong)
+    assert SECRET not in str(refused.value)
+
+
+def test_httpx_would_repeat_such_a_key(service: Running) -> None:
+    """The reason for the check above; where this fails, the check may go."""
+    with (
+        httpx.Client(headers={"Authorization": f"Bearer {TOKEN}\n"}) as plain,
+        pytest.raises(httpx.HTTPError, match=SECRET),
+    ):
+        plain.get(service.url)
+
+
+@pytest.mark.parametrize(
+    "url",
+    ["", "service.test", "ftp://service.test", f"https://u:{SECRET}@x", "http://", "http://x/?a=b"],
+)
+def test_a_url_that_is_none(url: str) -> None:
+    with pytest.raises(ValueError, match="URL") as refused:
+        Client(url, TOKEN)
+    assert SECRET not in str(refused.value)
+
+
+def test_redirections_are_not_followed() -> None:
+    seen = []
+
+    def elsewhere(request: httpx.Request) -> httpx.Response:
+        seen.append(str(request.url))
+        return httpx.Response(307, headers={"Location": "http://thief.test/"})
+
+    with (
+        Client("http://service.test", TOKEN, transport=httpx.MockTransport(elsewhere)) as client,
+        pytest.raises(VeilfaceError, match="307"),
+    ):
+        client.contract()
+    assert seen == ["http://service.test/v1/contract"]
+
+
+def imported(path: Path) -> set[str]:
+    """Top-level modules that a file imports."""
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names |= {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            names.add((node.module or "").split(".")[0])
+    return names
+
+
+def test_it_imports_httpx_and_pydantic_alone() -> None:
+    files = sorted(PACKAGE.rglob("*.py"))
+    assert len(files) > 5
+    rest = set().union(*map(imported, files)) - set(sys.stdlib_module_names)
+    assert rest == {"httpx", "pydantic", "veilface_client"}
+    stated = importlib.metadata.requires("veilface-client")
+    assert sorted(re.split(r"[<>=]", each)[0] for each in stated or []) == ["httpx", "pydantic"]
+
+
+def needed(*names: str) -> dict[str, importlib.metadata.Distribution]:
+    """The distributions that these need, with all that those need, extras left out."""
+    found: dict[str, importlib.metadata.Distribution] = {}
+    rest = list(names)
+    while rest:
+        name = rest.pop().lower().replace("_", "-")
+        if name in found:
+            continue
+        try:
+            found[name] = importlib.metadata.distribution(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue  # for another platform or Python
+        for each in found[name].requires or []:
+            if "extra ==" not in each:
+                rest.append(re.split(r"[<>=!~;\[ (]", each)[0])
+    return found
+
+
+def test_it_imports_where_nothing_else_is_installed(tmp_path: Path) -> None:
+    closure = needed("httpx", "pydantic")
+    assert {"httpcore", "pydantic-core"} <= closure.keys()
+    for distribution in closure.values():
+        for top in {file.parts[0] for file in distribution.files or [] if file.parts[0] != ".."}:
+            source = Path(str(distribution.locate_file(top)))
+            if source.exists() and not (tmp_path / top).exists() and top != "__pycache__":
+                (tmp_path / top).symlink_to(source)
+    (tmp_path / "veilface_client").symlink_to(PACKAGE)
+    script = (
+        f"import sys; sys.path.append({str(tmp_path)!r}); import veilface_client; "
+        "veilface_client.Client('http://service.test', 'vf_x').close(); "
+        "print(sorted({n.split('.')[0] for n in sys.modules} & "
+        "{'templates', 'models', 'enroll', 'verify', 'api', 'numpy', 'cryptography'}))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-I", "-S", "-c", script], capture_output=True, text=True, cwd=tmp_path
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "[]\n", "")

@@ -1,0 +1,274 @@
+"""The readers under test: what each is given, what it may raise, and what it may cost."""
+
+import asyncio
+import json
+import threading
+from collections.abc import Callable, Coroutine, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import numpy as np
+
+Read = Callable[[bytes], object]
+MIB = 2**20
+COPIES = 5
+"""A file as it was read, in parts, opened, and as what it says."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """A reader of hostile bytes.
+
+    Parameters
+    ----------
+    read
+        Reads one case, and checks what was accepted.
+    refusals
+        The exceptions that the reader documents. Any other is a finding.
+    make
+        Makes one case from a source of randomness; equal states give equal cases.
+    memory_mib
+        What reading one case may add to the memory of the process, MiB, beside
+        :data:`COPIES` times its own size.
+    found
+        Inputs that once were findings, each made when it is asked for.
+    """
+
+    read: Read
+    refusals: tuple[type[Exception], ...]
+    make: Callable[[Random], bytes]
+    memory_mib: int
+    found: Sequence[Callable[[], bytes]] = field(default=())
+
+    def memory_for(self, size: int) -> int:
+        """Bytes that a case of ``size`` bytes may take."""
+        return self.memory_mib * MIB + COPIES * size
+
+
+class Broken(AssertionError):
+    """A reader accepted what it must not, or gave something else than it promises."""
+
+
+def demand(holds: bool, promise: str) -> None:
+    """Raise :class:`Broken` unless ``holds``."""
+    if not holds:
+        raise Broken(promise)
+
+
+def image(folder: Path) -> Target:
+    """``models.decoding``: any picture of a request."""
+    from models.decoding import DEFAULT_LIMITS, MEMORY_AT_A_TIME, decode_image, image_size
+    from models.errors import ImageError
+    from tests.fuzz import found
+    from tests.fuzz.pictures import Pictures
+
+    def read(data: bytes) -> None:
+        try:
+            pixels = decode_image(data)
+        finally:
+            image_size(data)
+        height, width, channels = pixels.shape
+        demand(pixels.dtype == np.uint8 and channels == 3, "8-bit RGB")
+        demand(pixels.flags.c_contiguous, "C-contiguous")
+        demand(max(height, width) <= DEFAULT_LIMITS.max_side, "no side above the limit")
+        demand(height * width <= DEFAULT_LIMITS.max_pixels, "no more pixels than the limit")
+
+    most = MEMORY_AT_A_TIME // MIB + 1
+    return Target(read, (ImageError,), Pictures().make, most, found.pictures())
+
+
+def template(folder: Path) -> Target:
+    """``templates.wire``: templates and lifted probes of clients, and the store's own."""
+    from templates import wire
+    from templates.errors import InvalidTemplate
+    from tests.fuzz import found
+    from tests.fuzz.tensors import Templates
+
+    def read(data: bytes) -> None:
+        received = wire.decode(data)
+        received.subspace.validate()
+        again = wire.encode(
+            received.subspace, contract_id=received.contract_id, dtype=received.dtype
+        )
+        wire.decode(again)
+        demand(len(again) <= wire.size_limit(4096, 128), "no larger than the limit")
+
+    return Target(read, (InvalidTemplate,), Templates().make, 64, found.templates())
+
+
+def probe(folder: Path) -> Target:
+    """``Verifier.decide_template``: a lifted probe on its way to a decision."""
+    from templates import wire
+    from templates.errors import ContractMismatch, InvalidTemplate, Uncalibrated
+    from tests.fuzz.tensors import Templates, subspace
+    from tests.templates.test_contract import M, N, make_contract
+    from verify import Verifier
+
+    contract = make_contract()
+    rotation = np.linalg.qr(np.random.default_rng(0).normal(size=(N, N)))[0]
+    verifier = Verifier(contract, rotation=rotation)
+    enrolled = subspace(N, M, 5).rotated(rotation)
+    stored = wire.encode(enrolled, contract_id=contract.contract_id)
+    templates = Templates(contract.contract_id)
+    right = [one for one in templates.sound if (wire.decode(one).subspace.n) == N]
+    templates.sound = right * 3 + templates.sound
+
+    def read(data: bytes) -> None:
+        decision = verifier.decide_template(data, stored)
+        demand(np.isfinite(decision.distance), "a finite distance")
+        demand(np.isfinite(decision.cohort_score), "a finite cohort score")
+
+    read(wire.encode(subspace(N, 2), contract_id=contract.contract_id))  # compiles the kernels
+    refusals = (InvalidTemplate, ContractMismatch, Uncalibrated)
+    return Target(read, refusals, templates.make, 64)
+
+
+def export(folder: Path) -> Target:
+    """``api.transfer.open_export`` and the template inside."""
+    from api.transfer import open_export
+    from templates import wire
+    from templates.errors import ContractMismatch, InvalidTemplate
+    from tests.fuzz.tensors import CONTRACT, KEY, TENANT, Exports
+
+    def read(data: bytes) -> None:
+        exported = open_export(data, key=KEY, tenant=TENANT, contract_id=CONTRACT)
+        demand(exported.contract_id == CONTRACT, "the contract that was asked for")
+        wire.decode(exported.wire)
+
+    return Target(read, (InvalidTemplate, ContractMismatch), Exports().make, 64)
+
+
+def bin_file(folder: Path) -> Target:
+    """``verify.evaluation.readers.insightface_bin``: pickles of strangers."""
+    from tests.fuzz import found
+    from tests.fuzz.pickles import Pickles
+    from verify.datasets import DatasetError
+    from verify.evaluation.readers.insightface_bin import read_bin
+
+    file = folder / "case.bin"
+
+    def read(data: bytes) -> None:
+        file.write_bytes(data)
+        benchmark = read_bin(file)
+        count = len(benchmark.pictures)
+        for side in (benchmark.first, benchmark.second):
+            demand(len(side) == len(benchmark.same), "as many photos as answers")
+            demand(side.min() >= 0 and side.max() < count, "photos that are there")
+        for picture in benchmark.pictures[:3]:
+            demand(isinstance(picture.read(), bytes), "photos as bytes")
+
+    return Target(read, (DatasetError,), Pickles().make, 256, found.pickles())
+
+
+def contract(folder: Path) -> Target:
+    """``templates.contract``: the contract file, its JSON and its sealed cohort."""
+    from templates.contract import Binding, Contract
+    from templates.errors import ContractError, SealError
+    from tests.fuzz import found
+    from tests.fuzz.contracts import Contracts
+    from tests.fuzz.tensors import SEALER
+
+    file = folder / "case.contract"
+
+    def read(data: bytes) -> None:
+        file.write_bytes(data)
+        loaded = Contract.load(file, SEALER)
+        public = loaded.public()
+        demand(json.loads(json.dumps(public, allow_nan=False)) == public, "plain JSON")
+        demand(Binding.from_json(public["binding"]) == loaded.binding, "a binding as it was read")
+        score = loaded.cohort.foot_norms
+        demand(bool(np.isfinite(score).all()), "a finite cohort")
+
+    made = Contracts(folder)
+    return Target(read, (ContractError, SealError), made.make, 64, found.contracts(folder))
+
+
+def decoys(folder: Path) -> Target:
+    """``templates.decoys``: generators that anybody may send, and sealed pools."""
+    from templates.decoys.loading import load_source
+    from templates.errors import DecoyError, SealError
+    from templates.randomness import Keystream
+    from tests.fuzz.tensors import SEALER, Decoys
+
+    file = folder / "case.decoys"
+
+    def read(data: bytes) -> None:
+        file.write_bytes(data)
+        source = load_source(file, SEALER)
+        with Keystream.seeded("fuzz", 0) as stream:
+            drawn = source.draw(2, 3, stream=stream)
+        demand(bool(np.isfinite(drawn).all()), "finite decoys")
+
+    return Target(read, (DecoyError, SealError), Decoys().make, 64)
+
+
+def body(folder: Path) -> Target:
+    """``api.bodies``: JSON and multipart bodies, up to the largest that are read."""
+    from starlette.requests import Request
+
+    from api.bodies import read_form, read_json
+    from api.errors import ApiError
+    from tests.fuzz import found
+    from tests.fuzz.bodies import Bodies
+
+    runner = asyncio.Runner()
+
+    def run(reading: Coroutine[Any, Any, Any]) -> Any:
+        try:
+            return runner.run(reading)
+        finally:
+            # The worker threads of a root task go with it, and a server has one task for all.
+            for thread in threading.enumerate():
+                if thread is not threading.current_thread():
+                    thread.join(5)
+
+    def read(data: bytes) -> None:
+        kind, _, content = data.partition(b"\n")
+        parts = [content[at : at + 65536] for at in range(0, len(content), 65536)] or [b""]
+
+        async def receive() -> dict[str, Any]:
+            return {"type": "http.request", "body": parts.pop(0), "more_body": bool(parts)}
+
+        headers = [(b"content-type", kind)]
+        request = Request({"type": "http", "method": "POST", "headers": headers}, receive)
+        if kind == b"application/json":
+            reading = read_json(request, max_bytes=64 * MIB, timeout_s=60)
+            demand(isinstance(run(reading), dict), "an object")
+        else:
+            limits: dict[str, Any] = {"max_images": 5, "max_image_bytes": 10 * MIB}
+            form = run(read_form(request, max_bytes=64 * MIB, timeout_s=60, **limits))
+            demand(len(form.files) <= 5 and len(form.fields) <= 16, "no more parts than the limit")
+
+    return Target(read, (ApiError,), Bodies().make, 64, found.bodies())
+
+
+TARGETS: dict[str, Callable[[Path], Target]] = {
+    "image": image,
+    "template": template,
+    "probe": probe,
+    "export": export,
+    "bin": bin_file,
+    "contract": contract,
+    "decoys": decoys,
+    "body": body,
+}
+SHARES = {
+    "image": 6,
+    "template": 3,
+    "probe": 2,
+    "export": 2,
+    "bin": 4,
+    "contract": 3,
+    "decoys": 2,
+    "body": 2,
+}
+"""Parts of the time that each target gets."""
+
+
+def target_of(name: str) -> Callable[[Path], Target]:
+    """The maker of a target, or of one of the faulty ones that the tests of the runner use."""
+    from tests.fuzz.faulty import FAULTY
+
+    return TARGETS[name] if name in TARGETS else FAULTY[name]

@@ -1,0 +1,116 @@
+"""A PostgreSQL server of the tests' own, which they may stop and start."""
+
+import os
+import pwd
+import shutil
+import subprocess
+import tempfile
+import time
+from pathlib import Path
+
+import psycopg
+
+from tests.reliability.service import free_port
+
+ACCOUNT = "postgres"
+
+
+class NoPostgres(Exception):
+    """The programs of PostgreSQL, or an account to run them under, are not on this machine."""
+
+
+def _programs() -> Path:
+    found = shutil.which("pg_config")
+    if found is not None:
+        folder = Path(subprocess.check_output([found, "--bindir"], text=True).strip())
+        if (folder / "pg_ctl").exists():
+            return folder
+    for folder in sorted(Path("/usr/lib/postgresql").glob("*/bin"), reverse=True):
+        if (folder / "pg_ctl").exists():
+            return folder
+    raise NoPostgres("the programs initdb and pg_ctl of PostgreSQL are not on this machine")
+
+
+class Cluster:
+    """A throw-away server on a port of its own; it runs from the start of the block to its end."""
+
+    def __init__(self) -> None:
+        self._bin = _programs()
+        # Root may not run the server. A short path: that of a socket has about 100 characters.
+        self._account = ACCOUNT if os.geteuid() == 0 else None
+        if self._account is not None:
+            try:
+                entry = pwd.getpwnam(self._account)
+            except KeyError:
+                raise NoPostgres(f"root runs no PostgreSQL, and {ACCOUNT} is unknown") from None
+        self._folder = Path(tempfile.mkdtemp(prefix="veilface-pg-"))
+        if self._account is not None:
+            os.chown(self._folder, entry.pw_uid, entry.pw_gid)
+        self.port = free_port()
+
+    def __enter__(self) -> "Cluster":
+        try:
+            self._call("initdb", "-D", "data", "-A", "trust", "-U", "veilface", "-N", "-E", "UTF8")
+            self.start()
+            with psycopg.connect(self._url("postgres"), autocommit=True) as connection:
+                connection.execute("CREATE DATABASE veilface")
+        except BaseException:
+            self.__exit__()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        try:
+            self.stop("immediate")
+        finally:
+            shutil.rmtree(self._folder)
+
+    @property
+    def url(self) -> str:
+        """URL of its one database."""
+        return self._url("veilface")
+
+    @property
+    def runs(self) -> bool:
+        """Whether the server runs."""
+        return self._call("pg_ctl", "-D", "data", "status", check=False) == 0
+
+    def start(self) -> None:
+        """Start it, and return when it accepts connections."""
+        settings = {
+            "port": self.port,
+            "listen_addresses": "127.0.0.1",
+            "unix_socket_directories": self._folder,
+        }
+        options = " ".join(f"-c {name}={value}" for name, value in settings.items())
+        self._call("pg_ctl", "-D", "data", "-l", "log", "-o", options, "-w", "-t", "60", "start")
+
+    def stop(self, mode: str) -> None:
+        """Stop it, ``fast`` (sessions are ended) or ``immediate`` (as by a crash)."""
+        if self.runs:
+            self._call("pg_ctl", "-D", "data", "-m", mode, "-w", "-t", "60", "stop")
+        deadline = time.monotonic() + 10
+        while self.runs:
+            if time.monotonic() > deadline:
+                raise AssertionError("the PostgreSQL server does not stop")
+            time.sleep(0.02)
+
+    def _url(self, database: str) -> str:
+        return f"postgresql://veilface@127.0.0.1:{self.port}/{database}"
+
+    def _call(self, program: str, *arguments: str, check: bool = True) -> int:
+        # Into a file: the server inherits the output, and a pipe would be open as long as it runs.
+        with tempfile.TemporaryFile() as output:
+            done = subprocess.run(
+                [self._bin / program, *arguments],
+                cwd=self._folder,
+                user=self._account,
+                env={"PATH": os.environ.get("PATH", ""), "LC_ALL": "C.UTF-8"},
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                timeout=120,
+            )
+            output.seek(0)
+            if check and done.returncode:
+                raise AssertionError(f"{program} failed: {output.read().decode()}")
+        return done.returncode

@@ -1,0 +1,323 @@
+"""What a scenario leaves behind, held against what the clients were answered.
+
+Three records are compared with each other: the answers, the audit log and the tables. No
+acknowledged write may be missing in the other two, and nothing may be there that nobody asked for.
+"""
+
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import sqlalchemy as sa
+
+from api.runtime import open_keyring, open_store
+from templates import wire
+from templates.errors import VeilfaceError
+from templates.store import TemplateStore
+from templates.store.audit_chain import Line
+from templates.store.receipts import Receipt, verify_receipt
+from templates.store.schema import ReceiptRow, SubjectRow, TemplateRow, UsedNonceRow
+from tests.api.deployment import Deployment, M, N
+from tests.reliability.linearizability import SearchTooLong
+from tests.reliability.operations import Operation
+from tests.reliability.register import call_of, explain
+
+DECIDED = ("accept", "reject")
+ENROLLED = {True: "replaced", False: "created"}
+
+
+class Asked(Protocol):
+    """What clients asked of one deployment."""
+
+    @property
+    def service(self) -> Any:
+        """Has a ``deployment``."""
+
+    @property
+    def history(self) -> list[Operation]: ...
+
+    @property
+    def replays(self) -> list[tuple[Operation, Operation]]: ...
+
+
+@dataclass(frozen=True)
+class Examined:
+    """What was found.
+
+    Attributes
+    ----------
+    violations
+        One sentence for each thing that is wrong.
+    effective
+        Writes without a good answer that took effect nevertheless, by the audit log.
+    lines
+        Lines of the audit log.
+    """
+
+    violations: list[str]
+    effective: int
+    lines: int
+
+
+def examine(asked: Asked, subjects: Sequence[str]) -> Examined:
+    """Compare history, audit log and tables; the service must not run any more."""
+    deployment: Deployment = asked.service.deployment
+    store = open_store(deployment.settings, open_keyring(deployment.settings))
+    try:
+        return _Examination(deployment, store, asked, subjects).run()
+    finally:
+        store.close()
+
+
+class _Examination:
+    def __init__(
+        self,
+        deployment: Deployment,
+        store: TemplateStore,
+        asked: Asked,
+        subjects: Sequence[str],
+    ) -> None:
+        self.tenant = deployment.settings.default_tenant
+        self.store = store
+        self.subjects = subjects
+        self.history = [each for each in asked.history if each.kind != "contract"]
+        self.replays = asked.replays
+        self.violations: list[str] = []
+        self.lines = list(store.audit_log.lines())
+        self.by_request: dict[str, list[Line]] = defaultdict(list)
+        for line in self.lines:
+            if line.request_id is not None:
+                self.by_request[line.request_id].append(line)
+
+    def run(self) -> Examined:
+        for check in (
+            self._chain,
+            self._answers_have_their_lines,
+            self._lines_have_their_requests,
+            self._lines_follow_the_clock,
+            self._tables_are_whole,
+            self._receipts,
+            self._nonces,
+            self._repeated_probes,
+        ):
+            check()
+        for subject in self.subjects:
+            self._subject(subject)
+            self._counted(subject)
+            self._serial(subject)
+        unsure = [each for each in self.history if each.writes and each.may_have_happened]
+        effective = sum(1 for each in unsure if self.by_request[each.request_id])
+        return Examined(self.violations, effective, len(self.lines))
+
+    def _wrong(self, what: str) -> None:
+        self.violations.append(what)
+
+    def _chain(self) -> None:
+        found = self.store.audit_log.verify()
+        for problem in found.problems:
+            self._wrong(f"audit log: line {problem.sequence}: {problem.what}")
+
+    def _answers_have_their_lines(self) -> None:
+        for each in self.history:
+            lines = self.by_request.get(each.request_id, [])
+            if each.kind == "describe":
+                continue
+            if each.answered_well:
+                if [(line.action, line.outcome) for line in lines] != [_line_of(each, lines)]:
+                    self._wrong(f"audit log: {len(lines)} lines, or another one, for {each}")
+            elif len(lines) > each.may_have_happened:
+                self._wrong(f"audit log: a line for {each}")
+            for line in lines:
+                if line.pseudonym != self.store.pseudonym(self.tenant, each.subject):
+                    self._wrong(f"audit log: another subject's line for {each}")
+
+    def _lines_have_their_requests(self) -> None:
+        known = {each.request_id for each in self.history}
+        known |= {again.request_id for _, again in self.replays}
+        for request_id in self.by_request.keys() - known:
+            self._wrong(f"audit log: a line of request {request_id}, which nobody sent")
+
+    def _lines_follow_the_clock(self) -> None:
+        """A line is written between request and answer: the log's order is a serial order."""
+        sent = {each.request_id: each for each in self.history}
+        latest = -1.0
+        for line in self.lines:
+            each = sent.get(line.request_id or "")
+            if each is None:
+                continue
+            if each.over < latest:
+                self._wrong(f"audit log: the line of {each} stands too late")
+            latest = max(latest, each.started)
+
+    def _tables_are_whole(self) -> None:
+        for what, query in (
+            ("subject without a template", _lacking(SubjectRow.id, TemplateRow.subject_pk)),
+            ("template without a subject", _lacking(TemplateRow.subject_pk, SubjectRow.id)),
+        ):
+            if self._scalar(query):
+                self._wrong(f"tables: a {what}")
+        if self.store._database.is_sqlite:
+            found = self._scalar(sa.text("PRAGMA integrity_check"))
+            if found != "ok":
+                self._wrong(f"SQLite: integrity_check says {found}")
+
+    def _receipts(self) -> None:
+        """Every acknowledged receipt is there, and each erasure of the audit log left one."""
+        key = self.store.receipt_public_key()
+        rows = self.store._database.read(
+            lambda each: each.execute(
+                sa.select(ReceiptRow.pseudonym, ReceiptRow.body, ReceiptRow.signature)
+            ).all()
+        )
+        kept = {(body, bytes(signature)) for _, body, signature in rows}
+        for body, signature in kept:
+            with self._noting("a receipt cannot be verified"):
+                verify_receipt(Receipt(body, signature), key)
+        for each in self.history:
+            if each.kind == "erase" and each.answered_well:
+                receipt = Receipt.from_json(each.receipt)
+                if (receipt.body, receipt.signature) not in kept:
+                    self._wrong(f"receipts: none for {each}")
+        written = Counter(
+            line.pseudonym
+            for line in self.lines
+            if line.action == "erase" and line.outcome in ("erased", "nothing_held")
+        )
+        if written != Counter(row.pseudonym for row in rows):
+            self._wrong("receipts: not one for each erasure of the audit log")
+
+    def _nonces(self) -> None:
+        """Every decision of a signed probe has used up a nonce; nothing else has."""
+        decisions = sum(
+            1 for line in self.lines if line.action == "verify" and line.outcome in DECIDED
+        )
+        used = self._scalar(sa.select(sa.func.count()).select_from(UsedNonceRow))
+        if used != decisions:
+            self._wrong(f"nonces: {used} are used up by {decisions} decisions")
+
+    def _repeated_probes(self) -> None:
+        """A probe that was decided is refused when it is sent again, and only such a one."""
+        for earlier, again in self.replays:
+            decided = bool(self.by_request.get(earlier.request_id))
+            if earlier.answered_well and not decided:
+                continue  # found already: an answer without its line
+            expected = (401, "replayed") if decided else (200, None)
+            if (again.outcome, again.code) != expected:
+                self._wrong(f"replay: {again.outcome} {again.code} for {earlier}")
+
+    def _subject(self, subject: str) -> None:
+        """What is stored is what the last write of the audit log left, and it can be opened."""
+        writes = self._writes_of(subject)
+        last = writes[-1] if writes else None
+        expected = last is not None and last.kind == "enroll"
+        with self._noting(f"{subject}: its template cannot be opened"):
+            found = self.store.get(self.tenant, subject)
+            if (found is not None) != expected:
+                state = "enrolled" if found else "not enrolled"
+                self._wrong(f"{subject}: {state} after {last}")
+            elif found is not None and last is not None:
+                if last.answered_well and found.record.template_id != last.template_id:
+                    self._wrong(f"{subject}: another template than that of {last}")
+                wire.decode(found.wire, max_n=N, max_m=M)
+        held, erased = False, False
+        for line in self._lines_of(subject):
+            if line.action == "enroll":
+                if line.outcome != ENROLLED[held]:
+                    self._wrong(f"audit log: line {line.sequence} says {line.outcome}")
+                held = True
+            elif line.action == "erase":
+                repeated = "receipt_repeated" if erased else "nothing_held"
+                if line.outcome != ("erased" if held else repeated):
+                    self._wrong(f"audit log: line {line.sequence} says {line.outcome}")
+                held, erased = False, True
+
+    def _counted(self, subject: str) -> None:
+        """The failed attempts are those of the audit log."""
+        counted: tuple[int, int] | None = None
+        for line in self._lines_of(subject):
+            consecutive, total = counted or (0, 0)
+            match line.action, line.outcome:
+                case "erase", _:
+                    counted = None
+                case "verify", "reject":
+                    counted = (consecutive + 1, total + 1)
+                case "verify", "accept":
+                    counted = None if counted is None else (0, total)
+        status = self.store.attempts.status(self.tenant, subject)
+        found = None if status is None else (status.consecutive, status.total)
+        if found != counted:
+            self._wrong(f"{subject}: failed attempts are {found}, by the audit log {counted}")
+
+    def _serial(self, subject: str) -> None:
+        calls = []
+        for each in self.history:
+            effective = bool(self.by_request.get(each.request_id))
+            unsure = each.writes and each.may_have_happened and effective
+            if each.subject == subject and (each.answered_well or unsure):
+                calls.append(call_of(each, effective=effective))
+        try:
+            order = explain(calls)
+        except SearchTooLong as error:
+            self._wrong(f"{subject}: no verdict: {error}")
+            return
+        if order is None:
+            self._wrong(f"{subject}: no serial order explains its {len(calls)} answers")
+
+    def _lines_of(self, subject: str) -> list[Line]:
+        pseudonym = self.store.pseudonym(self.tenant, subject)
+        return [line for line in self.lines if line.pseudonym == pseudonym]
+
+    def _writes_of(self, subject: str) -> list[Operation]:
+        sent = {each.request_id: each for each in self.history if each.writes}
+        return [
+            sent[line.request_id or ""]
+            for line in self._lines_of(subject)
+            if line.request_id in sent and line.action in ("enroll", "erase")
+        ]
+
+    def _scalar(self, query: Any) -> Any:
+        return self.store._database.read(lambda each: each.execute(query).scalar())
+
+    def _noting(self, what: str) -> Any:
+        return _Noting(self._wrong, what)
+
+
+class _Noting(suppress):
+    """Turns an error of ours into a violation."""
+
+    def __init__(self, note: Callable[[str], None], what: str) -> None:
+        super().__init__(VeilfaceError)
+        self._note, self._what = note, what
+
+    def __exit__(self, kind: Any, value: Any, trace: Any) -> bool:
+        if isinstance(value, VeilfaceError):
+            self._note(f"{self._what}: {value}")
+        return bool(super().__exit__(kind, value, trace))
+
+
+def _line_of(each: Operation, lines: Sequence[Line]) -> tuple[str, str]:
+    """Action and outcome that the line of an acknowledged operation must have."""
+    match each.kind:
+        case "enroll":
+            return "enroll", ENROLLED[bool(each.replaced)]
+        case "verify":
+            return "verify", "accept" if each.accepted else "reject"
+        case "erase":
+            # Which erasure a receipt is of shows in the order of the lines; see _subject.
+            allowed = ("erased" if each.held else "nothing_held", "receipt_repeated")
+            said = lines[0].outcome if lines else ""
+            return "erase", said if said in allowed else allowed[0]
+    raise AssertionError(each.kind)
+
+
+def _lacking(column: Any, other: Any) -> Any:
+    return sa.select(sa.func.count()).where(column.not_in(sa.select(other)))
+
+
+def unexpected(history: Sequence[Operation], allowed: Callable[[Operation], bool]) -> Iterator[str]:
+    """One sentence for every operation that ended as none should."""
+    for each in history:
+        if not each.answered_well and not allowed(each):
+            yield f"unexpected: {each}"

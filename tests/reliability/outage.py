@@ -1,0 +1,193 @@
+"""PostgreSQL stopped and started under load; the service stays up."""
+
+import math
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+from tests.api.deployment import deploy
+from tests.reliability.cluster import Cluster
+from tests.reliability.evidence import examine, unexpected
+from tests.reliability.kill import QUIET
+from tests.reliability.load import Load, look_at_all, make_subjects, people_of
+from tests.reliability.operations import Clients, Operation, People
+from tests.reliability.service import Service, free_port
+
+ANSWERED_WITHIN_S = 5.0
+"""Longest that a request may take while the database is stopped."""
+RECOVERED_WITHIN_S = 10.0
+"""Longest from the database's return until every request is answered well again."""
+WRITERS = 5
+READERS = 3
+
+
+@dataclass
+class Outage:
+    """One stop and start of the database."""
+
+    mode: str
+    requests: int = 0
+    slowest_s: float = 0.0
+    recovered_after_s: float = 0.0
+
+
+@dataclass
+class OutageReport:
+    """Figures of a run; `violations` is empty where all holds."""
+
+    acknowledged_writes: int = 0
+    unacknowledged_writes: int = 0
+    of_these_effective: int = 0
+    acknowledged_decisions: int = 0
+    answers_503: int = 0
+    audit_lines: int = 0
+    outages: list[Outage] = field(default_factory=list)
+    violations: list[str] = field(default_factory=list)
+
+    def as_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+class _Watch:
+    """Asks for health all the time."""
+
+    def __init__(self, url: str) -> None:
+        self._url = url
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self.seen: list[tuple[float, float, int, int]] = []
+
+    def __enter__(self) -> "_Watch":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stopping.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._stopping.wait(0.05):
+            before = time.monotonic()
+            ready, live = (
+                httpx.get(f"{self._url}/health/{name}", timeout=60).status_code
+                for name in ("ready", "live")
+            )
+            self.seen.append((before, time.monotonic(), ready, live))
+
+    def between(self, begin: float, end: float) -> list[tuple[int, int]]:
+        """Return statuses of readiness and liveness, asked and answered between two moments."""
+        return [each[2:] for each in list(self.seen) if begin <= each[0] and each[1] <= end]
+
+
+def outage_run(
+    cluster: Cluster, folder: Path, *, modes: Sequence[str], down_s: float, seed: int
+) -> OutageReport:
+    """Stop the database once in each mode, while clients enroll, erase and verify."""
+    report = OutageReport()
+    subjects = make_subjects(8)
+    deployment = deploy(folder, database_url=cluster.url, port=free_port(), **QUIET)
+    people = People(deployment, people_of(subjects))
+    with Service(deployment, folder) as service:
+        clients, workers = Clients(service, people), sorted(service.workers())
+        with (
+            Load(clients, subjects, writers=WRITERS, readers=READERS, seed=seed) as load,
+            _Watch(service.url) as watch,
+        ):
+            for mode in modes:
+                load.wait_for(load.acknowledged + 40)
+                _stop_and_start(cluster, clients, watch, mode, down_s, report)
+                load.wait_for(load.acknowledged + 20)
+        if sorted(service.workers()) != workers:
+            report.violations.append("workers died: " + service.tail())
+        clients.settle()
+        look_at_all(clients, subjects)
+        service.kill()
+        found = examine(clients, list(subjects))
+    history = clients.history
+    report.violations += [
+        *unexpected(history, _is_unavailable),
+        *(f"took {each.seconds:.1f} s: {each}" for each in history if _is_slow(each)),
+        *found.violations,
+    ]
+    report.of_these_effective, report.audit_lines = found.effective, found.lines
+    for each in history:
+        report.acknowledged_writes += each.writes and each.answered_well
+        report.unacknowledged_writes += each.writes and each.may_have_happened
+        report.acknowledged_decisions += each.kind == "verify" and each.answered_well
+        report.answers_503 += each.outcome == 503
+    return report
+
+
+def _is_unavailable(each: Operation) -> bool:
+    retry_after = each.retry_after or ""
+    return (
+        each.outcome == 503
+        and each.code == "store_unavailable"
+        and retry_after.isdecimal()
+        and int(retry_after) >= 1
+    )
+
+
+def _is_slow(each: Operation) -> bool:
+    return each.seconds > ANSWERED_WITHIN_S
+
+
+def _stop_and_start(
+    cluster: Cluster,
+    clients: Clients,
+    watch: _Watch,
+    mode: str,
+    down_s: float,
+    report: OutageReport,
+) -> None:
+    before = len(clients.history)
+    cluster.stop(mode)
+    stopped = time.monotonic()
+    clients.contract()
+    time.sleep(down_s)
+    starting = time.monotonic()
+    cluster.start()
+    started = time.monotonic()
+    outage = Outage(mode)
+    report.outages.append(outage)
+    recovered = _wait_until_well(clients, watch, started)
+    if recovered is None:
+        report.violations.append(f"{mode}: not well again after {RECOVERED_WITHIN_S} s")
+    else:
+        outage.recovered_after_s = round(max(0.0, recovered - started), 2)
+    # A request that is still under way is looked at when the run is over.
+    asked = [each for each in clients.history[before:] if each.answered < math.inf]
+    within = [each for each in asked if stopped <= each.started and each.answered <= starting]
+    outage.requests = len(within)
+    # Those, too, that were under way when it stopped.
+    ended = [each for each in asked if stopped <= each.answered <= starting]
+    outage.slowest_s = round(max((each.seconds for each in ended), default=0.0), 2)
+    report.violations += [
+        f"{mode}: answered well without a database: {each}" for each in within if each.answered_well
+    ]
+    kinds = {each.kind for each in within}
+    if kinds != {"enroll", "erase", "verify", "describe", "contract"}:
+        report.violations.append(f"{mode}: only {sorted(kinds)} were tried during the outage")
+    statuses = set(watch.between(stopped, starting))
+    if statuses != {(503, 200)}:
+        report.violations.append(f"{mode}: readiness and liveness were {statuses}")
+
+
+def _wait_until_well(clients: Clients, watch: _Watch, started: float) -> float | None:
+    """Return the moment from which on nothing was refused; None if there is none."""
+    deadline = started + RECOVERED_WITHIN_S
+    while time.monotonic() < deadline:
+        time.sleep(0.25)
+        now = time.monotonic()
+        later = [each for each in list(clients.history) if started <= each.answered <= now]
+        refused = [each.answered for each in later if not each.answered_well]
+        last = max(refused, default=started)
+        health = watch.between(max(last, now - 1), now)
+        if now - last > 1 and len(later) > 20 and set(health) == {(200, 200)}:
+            return last
+    return None

@@ -1,0 +1,198 @@
+"""Many clients on the same few subjects, over two workers."""
+
+import random
+import threading
+from collections import Counter
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from tests.api.deployment import deploy
+from tests.reliability.evidence import examine, unexpected
+from tests.reliability.kill import QUIET
+from tests.reliability.load import look_at_all, make_subjects, people_of
+from tests.reliability.operations import Clients, Operation, People
+from tests.reliability.service import Service, free_port
+
+CLIENTS = 32
+SUBJECTS = 5
+KINDS = ("enroll", "enroll", "verify", "verify", "verify", "erase", "describe")
+
+
+@dataclass
+class RaceReport:
+    """Figures of a run; `violations` is empty where all holds."""
+
+    database: str
+    clients: int = CLIENTS
+    subjects: int = SUBJECTS
+    operations: dict[str, int] = field(default_factory=dict)
+    most_at_once_on_one_subject: int = 0
+    audit_lines: int = 0
+    violations: list[str] = field(default_factory=list)
+
+    def as_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+@dataclass
+class LockoutReport:
+    """Figures of a run; `violations` is empty where all holds."""
+
+    database: str
+    lockout_after: int
+    subjects: int = 0
+    attempts: int = 0
+    rejections: int = 0
+    locked_out: int = 0
+    violations: list[str] = field(default_factory=list)
+
+    def as_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def race_run(
+    database: str, database_url: str | None, folder: Path, *, each: int, seed: int
+) -> RaceReport:
+    """Let 32 clients send so many operations each, and look for a serial order."""
+    report = RaceReport(database)
+    subjects = make_subjects(SUBJECTS)
+    deployment = deploy(folder, database_url=database_url, port=free_port(), **QUIET)
+    people = People(deployment, people_of(subjects))
+    with Service(deployment, folder) as service:
+        clients = Clients(service, people)
+
+        def client(number: int) -> None:
+            draw = random.Random(f"{seed} {number}")
+            for _ in range(each):
+                _something(clients, subjects, draw)
+
+        with _BothWork(service, report.violations):
+            _at_once(client, CLIENTS)
+        look_at_all(clients, subjects)
+        service.kill()
+        found = examine(clients, list(subjects))
+    report.violations += [*unexpected(clients.history, lambda _: False), *found.violations]
+    report.operations = dict(Counter(each.kind for each in clients.history))
+    report.most_at_once_on_one_subject = max(
+        _most_at_once([each for each in clients.history if each.subject == subject])
+        for subject in subjects
+    )
+    report.audit_lines = found.lines
+    return report
+
+
+def lockout_run(
+    database: str, database_url: str | None, folder: Path, *, subjects: int, seed: int
+) -> LockoutReport:
+    """Send wrong probes to one subject after the other, many at once; half are not enrolled."""
+    after = 5
+    report = LockoutReport(database, after, subjects)
+    deployment = deploy(
+        folder,
+        database_url=database_url,
+        port=free_port(),
+        **{**QUIET, "lockout_after": after, "lockout_first_s": 3600, "compute_slots": 4},
+    )
+    people = People(deployment, [1, 2])
+    with Service(deployment, folder) as service:
+        clients = Clients(service, people)
+        with _BothWork(service, report.violations):
+            for number in range(subjects):
+                subject = f"subject-{number}"
+                if number % 2 == 0 and not clients.enroll(subject, 1).answered_well:
+                    report.violations.append(f"{subject} was not enrolled")
+                _at_once(partial(_fail, clients, subject), CLIENTS)
+                # Who is who is locked out too.
+                clients.verify(subject, 1)
+                _count_answers(clients.history, subject, report)
+    return report
+
+
+def _fail(clients: Clients, subject: str, _: int) -> Operation:
+    return clients.verify(subject, 2)
+
+
+def _count_answers(history: Sequence[Operation], subject: str, report: LockoutReport) -> None:
+    asked = [each for each in history if each.kind == "verify" and each.subject == subject]
+    answers = Counter(
+        (each.outcome, "" if each.code else str(each.answer["decision"])) for each in asked
+    )
+    report.attempts += len(asked)
+    report.rejections += answers[200, "reject"]
+    report.locked_out += answers[423, ""]
+    expected = {
+        (200, "reject"): report.lockout_after,
+        (423, ""): CLIENTS + 1 - report.lockout_after,
+    }
+    if answers != expected:
+        report.violations.append(f"{subject}: {dict(answers)}")
+    for each in asked:
+        if each.outcome == 423 and not 3000 < int(each.retry_after or 0) <= 3600:
+            report.violations.append(f"{subject}: Retry-After {each.retry_after}")
+
+
+def _something(clients: Clients, subjects: dict[str, list[int]], draw: random.Random) -> None:
+    subject, people = draw.choice(list(subjects.items()))
+    match draw.choice(KINDS):
+        case "enroll":
+            clients.enroll(subject, draw.choice(people))
+        case "verify":
+            clients.verify(subject, draw.choice(people))
+        case "erase":
+            clients.erase(subject)
+        case _:
+            clients.describe(subject)
+
+
+def _at_once(work: Callable[[int], object], count: int) -> None:
+    """Run `work` in so many threads that start together; what one of them raises is raised."""
+    start = threading.Barrier(count)
+
+    def one(number: int) -> None:
+        start.wait()
+        work(number)
+
+    with ThreadPoolExecutor(count) as pool:
+        for done in [pool.submit(one, number) for number in range(count)]:
+            done.result()
+
+
+class _BothWork:
+    """Requires that both workers computed within the block."""
+
+    def __init__(self, service: Service, violations: list[str]) -> None:
+        self._workers = [psutil.Process(pid) for pid in service.workers()]
+        self._violations = violations
+
+    def __enter__(self) -> None:
+        self._before = [self._seconds(each) for each in self._workers]
+
+    def __exit__(self, *_: object) -> None:
+        used = [
+            self._seconds(each) - before
+            for each, before in zip(self._workers, self._before, strict=True)
+        ]
+        if len(used) != 2 or min(used) < 0.1 * sum(used):
+            self._violations.append(f"not both workers had work: CPU seconds {used}")
+
+    @staticmethod
+    def _seconds(process: psutil.Process) -> float:
+        times = process.cpu_times()
+        return float(times.user + times.system)
+
+
+def _most_at_once(history: Sequence[Operation]) -> int:
+    moments = sorted(
+        [(each.started, 1) for each in history] + [(each.answered, -1) for each in history]
+    )
+    most = now = 0
+    for _, change in moments:
+        now += change
+        most = max(most, now)
+    return most

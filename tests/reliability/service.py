@@ -1,0 +1,158 @@
+"""``veilface serve`` as a process group of its own, which can be killed and started again."""
+
+import contextlib
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import httpx
+import psutil
+
+from api.app import environment_of
+from tests.api.deployment import Deployment
+
+START_S = 180.0
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def free_port() -> int:
+    """A TCP port that nobody listens on at the moment."""
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        return int(listener.getsockname()[1])
+
+
+class Service:
+    """One deployment's service on its port; it may be started as often as it was killed."""
+
+    def __init__(self, deployment: Deployment, folder: Path) -> None:
+        self.deployment = deployment
+        self.url = f"http://127.0.0.1:{deployment.settings.port}"
+        self.up = threading.Event()
+        self.starts = 0
+        self.log: list[dict[str, Any]] = []
+        self._folder = folder
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def __enter__(self) -> "Service":
+        try:
+            self.start()
+        except BaseException:
+            self.kill()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.kill()
+
+    def start(self) -> None:
+        """Start it, and return when every worker is ready."""
+        self.starts += 1
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "api.cli", "serve"],
+            cwd=ROOT,
+            env={
+                **{k: v for k, v in os.environ.items() if not k.startswith("VEILFACE_")},
+                **environment_of(self.deployment.settings),
+                "OMP_NUM_THREADS": "1",
+                "TMPDIR": str(self._folder),
+            },
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            start_new_session=True,
+        )
+        self._reader = threading.Thread(target=self._collect, args=(self._process,), daemon=True)
+        self._reader.start()
+        self.wait_for_workers()
+        self.up.set()
+
+    def wait_for_workers(self) -> None:
+        """Return when as many workers as there should be have opened their runtime."""
+        deadline = time.monotonic() + START_S
+        while len(self.workers()) < self.deployment.settings.workers or not self.is_ready():
+            if self.process.poll() is not None:
+                raise AssertionError(f"the service ended with {self.process.poll()}: {self.tail()}")
+            if time.monotonic() > deadline:
+                raise AssertionError(f"not ready after {START_S:.0f} s: {self.tail()}")
+            time.sleep(0.05)
+
+    def is_ready(self) -> bool:
+        """Whether a worker says that it is ready."""
+        try:
+            return httpx.get(f"{self.url}/health/ready", timeout=30).status_code == 200
+        except httpx.TransportError:
+            return False
+
+    @property
+    def process(self) -> "subprocess.Popen[bytes]":
+        """The supervisor of the workers."""
+        assert self._process is not None
+        return self._process
+
+    def workers(self) -> list[int]:
+        """Process ids of the workers that live and have opened their runtime."""
+        opened = {line["pid"] for line in list(self.log) if line.get("event") == "started"}
+        try:
+            children = psutil.Process(self.process.pid).children()
+            return [each.pid for each in children if each.pid in opened and _lives(each)]
+        except psutil.NoSuchProcess:
+            return []
+
+    def kill_worker(self, pid: int) -> None:
+        """SIGKILL one worker; the supervisor starts another one."""
+        os.kill(pid, signal.SIGKILL)
+
+    def kill(self) -> None:
+        """SIGKILL the supervisor and all workers at once, and wait until they are gone."""
+        self.up.clear()
+        if self._process is None:
+            return
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.wait()
+        deadline = time.monotonic() + 10
+        while _group_lives(self._process.pid):
+            if time.monotonic() > deadline:
+                raise AssertionError("killed processes are still there after 10 s")
+            time.sleep(0.005)
+        self._reader.join()
+
+    def stop(self) -> int:
+        """SIGTERM, as an operator stops it."""
+        self.up.clear()
+        self.process.send_signal(signal.SIGTERM)
+        return self.process.wait(timeout=60)
+
+    def tail(self) -> str:
+        """The end of its log."""
+        return "\n".join(json.dumps(line) for line in self.log[-20:])
+
+    def _collect(self, process: "subprocess.Popen[bytes]") -> None:
+        assert process.stderr is not None
+        with process.stderr as lines:
+            for line in lines:
+                try:
+                    self.log.append(json.loads(line))
+                except ValueError:
+                    self.log.append({"text": line.decode(errors="replace").rstrip()})
+
+
+def _lives(process: psutil.Process) -> bool:
+    return bool(process.is_running()) and process.status() != psutil.STATUS_ZOMBIE
+
+
+def _group_lives(group: int) -> bool:
+    for process in psutil.process_iter():
+        try:
+            if os.getpgid(process.pid) == group and _lives(process):
+                return True
+        except (ProcessLookupError, psutil.NoSuchProcess):
+            continue
+    return False

@@ -1,0 +1,270 @@
+"""What the scenarios would find: each fault is made by hand, and must be found."""
+
+import copy
+import dataclasses
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+import sqlalchemy as sa
+
+from api.app import create_app
+from api.runtime import open_keyring, open_store
+from templates.store import TemplateStore
+from tests.api.client import Client
+from tests.api.deployment import Deployment, deploy
+from tests.reliability.evidence import examine, unexpected
+from tests.reliability.kill import QUIET
+from tests.reliability.load import look_at_all, make_subjects, people_of
+from tests.reliability.operations import LOST, NOT_SENT, Clients, Operation, People
+from tests.reliability.service import Service
+
+SUBJECTS = make_subjects(2)
+
+
+class InProcess(Clients):
+    """Clients of an application in this process."""
+
+    def __init__(self, client: Client, deployment: Deployment, people: People) -> None:
+        super().__init__(cast(Service, SimpleNamespace(deployment=deployment)), people)
+        self._application = client
+
+    def _client(self) -> Any:
+        return self._application
+
+
+@dataclass
+class Scene:
+    """A deployment that does not run, and what was asked of it."""
+
+    service: Any
+    history: list[Operation]
+    replays: list[tuple[Operation, Operation]]
+
+    @contextmanager
+    def store(self) -> Iterator[TemplateStore]:
+        """The database, behind the application's back."""
+        settings = self.service.deployment.settings
+        store = open_store(settings, open_keyring(settings))
+        try:
+            yield store
+        finally:
+            store.close()
+
+    def execute(self, *statements: str) -> None:
+        """Change the database."""
+
+        def work(connection: sa.Connection) -> None:
+            for statement in statements:
+                connection.execute(sa.text(statement))
+
+        with self.store() as store:
+            store._database.write(work)
+
+    def the(self, kind: str, *, last: bool = False) -> Operation:
+        found = [each for each in self.history if each.kind == kind]
+        return found[-1 if last else 0]
+
+    def violations(self) -> list[str]:
+        return examine(self, list(SUBJECTS)).violations
+
+
+@pytest.fixture(scope="module")
+def lived(tmp_path_factory: pytest.TempPathFactory) -> InProcess:
+    """Two subjects: one erased and enrolled as somebody else in the end, one erased."""
+    deployment = deploy(tmp_path_factory.mktemp("lived"), **QUIET)
+    people = People(deployment, people_of(SUBJECTS))
+    with Client(create_app(deployment.settings)) as client:
+        made = InProcess(client, deployment, people)
+        made.enroll("subject-0", 1)
+        made.verify("subject-0", 1)
+        made.erase("subject-0")
+        made.erase("subject-0")
+        made.enroll("subject-0", 2)
+        made.erase("subject-1")
+        made.enroll("subject-1", 4)
+        made.enroll("subject-1", 5)
+        made.erase("subject-1")
+        look_at_all(made, SUBJECTS)
+        made.verify("subject-0", 2)
+        made.replay(made.history[1])
+    return made
+
+
+@pytest.fixture
+def scene(lived: InProcess, tmp_path: Path) -> Scene:
+    """A copy of it, to be spoilt."""
+    deployment = lived.service.deployment
+    shutil.copytree(deployment.settings.data_dir, tmp_path / "data")
+    settings = deployment.settings.model_copy(update={"data_dir": tmp_path / "data"})
+    copied = dataclasses.replace(deployment, settings=settings)
+    history, replays = copy.deepcopy((lived.history, lived.replays))
+    return Scene(SimpleNamespace(deployment=copied), history, replays)
+
+
+def test_nothing_is_found_where_nothing_is_wrong(scene: Scene) -> None:
+    found = examine(scene, list(SUBJECTS))
+    assert found.violations == []
+    assert found.effective == 0
+    assert found.lines >= len(scene.history)
+    assert list(unexpected(scene.history, lambda _: False)) == []
+
+
+def test_a_write_that_nobody_was_told_of_may_have_happened_or_not(scene: Scene) -> None:
+    happened = scene.the("enroll")
+    happened.outcome, happened.answer = LOST, {}
+    happened.over += 1
+    never = Operation("enroll", "subject-1", 6, "000099-never", happened.started)
+    scene.history.append(never)
+    found = examine(scene, list(SUBJECTS))
+    assert found.violations == []
+    assert found.effective == 1
+
+
+def loses_the_write(scene: Scene) -> None:
+    scene.execute("DELETE FROM templates", "DELETE FROM subjects")
+
+
+def loses_half_of_it(scene: Scene) -> None:
+    scene.execute("DELETE FROM templates")
+
+
+def keeps_what_was_erased(scene: Scene) -> None:
+    with scene.store() as store:
+        other = store.get("default", "subject-0")
+        assert other is not None
+        columns = ("contract_id", "n", "m", "dtype", "source", "photos")
+        known = {name: getattr(other.record, name) for name in columns}
+        store.put("default", "subject-1", other.wire, **known)
+
+
+def moves_a_template(scene: Scene) -> None:
+    scene.execute("UPDATE subjects SET subject_id = 'subject-1'")
+
+
+def spoils_the_template(scene: Scene) -> None:
+    scene.execute("UPDATE templates SET ciphertext = zeroblob(length(ciphertext))")
+
+
+def has_another_template(scene: Scene) -> None:
+    enrolled = [each for each in scene.history if each.kind == "enroll"][1]
+    enrolled.answer = {**enrolled.answer, "template_id": "other"}
+    described = scene.the("describe")
+    described.answer = {**described.answer, "template_id": "other"}
+
+
+def loses_the_receipts(scene: Scene) -> None:
+    scene.execute("DELETE FROM receipts")
+
+
+def forgets_a_nonce(scene: Scene) -> None:
+    scene.execute("DELETE FROM used_nonces WHERE nonce_hash IN "
+                    "(SELECT nonce_hash FROM used_nonces LIMIT 1)")  # fmt: skip
+
+
+def counts_wrongly(scene: Scene) -> None:
+    scene.execute("UPDATE failed_attempts SET consecutive = consecutive + 1")
+
+
+def alters_a_line(scene: Scene) -> None:
+    triggers = sa.text("SELECT name FROM sqlite_master WHERE type = 'trigger'")
+    with scene.store() as store:
+        named = store._database.read(lambda each: each.execute(triggers).scalars().all())
+    scene.execute(
+        *(f"DROP TRIGGER {name}" for name in named),
+        "UPDATE audit_log SET outcome = 'accept' WHERE outcome = 'reject'",
+    )
+
+
+def answered_without_a_line(scene: Scene) -> None:
+    said = scene.the("enroll", last=True)
+    scene.history.append(dataclasses.replace(said, request_id="000099-unheard"))
+
+
+def wrote_what_was_refused(scene: Scene) -> None:
+    said = scene.the("enroll")
+    said.outcome, said.code, said.answer = 429, "rate_limited", {}
+
+
+def wrote_what_was_not_sent(scene: Scene) -> None:
+    scene.the("erase").outcome = NOT_SENT
+
+
+def wrote_what_nobody_sent(scene: Scene) -> None:
+    scene.history.remove(scene.the("erase"))
+
+
+def decided_otherwise(scene: Scene) -> None:
+    said = scene.the("verify")
+    said.answer = {**said.answer, "decision": "reject"}
+
+
+def accepted_who_was_replaced(scene: Scene) -> None:
+    """Answer, line and counts agree that person 1 is accepted again at the end."""
+    late = scene.the("verify", last=True)
+    assert late.accepted
+    late.person = 1
+
+
+def described_who_was_erased(scene: Scene) -> None:
+    gone = scene.the("describe", last=True)
+    gone.outcome, gone.answer = 200, {"template_id": scene.the("enroll").template_id}
+
+
+def repeated_another_receipt(scene: Scene) -> None:
+    first, second, *_, other = [each for each in scene.history if each.kind == "erase"]
+    assert first.receipt_id == second.receipt_id
+    second.answer = other.answer
+
+
+def wrote_before_it_was_asked(scene: Scene) -> None:
+    said = scene.the("enroll")
+    later = max(each.answered for each in scene.history)
+    said.started, said.answered, said.over = later + 1, later + 2, later + 2
+
+
+def decided_twice(scene: Scene) -> None:
+    (_, again), *_ = scene.replays
+    again.outcome, again.code = 200, None
+
+
+@pytest.mark.parametrize(
+    ("fault", "sentence"),
+    [
+        (loses_the_write, "not enrolled after"),
+        (loses_half_of_it, "subject without a template"),
+        (keeps_what_was_erased, "subject-1: enrolled after erase"),
+        (moves_a_template, "subject-1: its template cannot be opened"),
+        (spoils_the_template, "its template cannot be opened"),
+        (has_another_template, "another template than"),
+        (loses_the_receipts, "receipts: none for erase"),
+        (forgets_a_nonce, "nonces: "),
+        (counts_wrongly, "failed attempts are"),
+        (alters_a_line, ": altered"),
+        (answered_without_a_line, "audit log: 0 lines"),
+        (wrote_what_was_refused, "a line for enroll"),
+        (wrote_what_was_not_sent, "a line for erase"),
+        (wrote_what_nobody_sent, "which nobody sent"),
+        (decided_otherwise, "another one, for verify"),
+        (accepted_who_was_replaced, "no serial order"),
+        (described_who_was_erased, "no serial order"),
+        (repeated_another_receipt, "no serial order"),
+        (wrote_before_it_was_asked, "stands too late"),
+        (decided_twice, "replay: 200"),
+    ],
+)
+def test_a_fault_is_found(scene: Scene, fault: Callable[[Scene], object], sentence: str) -> None:
+    fault(scene)
+    found = scene.violations()
+    assert any(sentence in each for each in found), found
+
+
+def test_an_answer_that_should_not_be_is_found(scene: Scene) -> None:
+    scene.the("verify").outcome = 500
+    (found,) = unexpected(scene.history, lambda each: each.outcome == 503)
+    assert "500" in found

@@ -1,0 +1,36 @@
+"""SQLite runs out of space: a clear refusal, nothing damaged, and recovery without a restart."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.reliability.full_disk import (
+    FileSizeLimit,
+    FullDiskReport,
+    FullFileSystem,
+    full_disk_run,
+    may_mount,
+    small_file_system,
+)
+
+
+def assert_sound(report: FullDiskReport) -> None:
+    assert report.violations == []
+    assert report.refused >= 20
+    assert report.acknowledged_writes >= 40
+    assert report.acknowledged_decisions >= 10
+
+
+def test_a_full_file_system(tmp_path: Path) -> None:
+    if not may_mount():
+        pytest.skip("this process may not mount a small file system; see the test of file sizes")
+    with small_file_system() as small:
+        database = small / "veilface.db"
+        assert_sound(
+            full_disk_run(FullFileSystem(small), database, tmp_path, rounds=1, short_s=1.0, seed=6)
+        )
+
+
+def test_a_limit_of_file_sizes(tmp_path: Path) -> None:
+    database = tmp_path / "veilface.db"
+    assert_sound(full_disk_run(FileSizeLimit(), database, tmp_path, rounds=1, short_s=1.0, seed=6))

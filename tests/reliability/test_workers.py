@@ -1,0 +1,113 @@
+"""Workers and their supervisor, when one of them dies at a bad moment."""
+
+import os
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import psutil
+import pytest
+
+from api.app import IMPORT_S
+from tests.api.deployment import deploy
+from tests.reliability.cluster import Cluster
+from tests.reliability.kill import QUIET
+from tests.reliability.operations import Clients, People
+from tests.reliability.service import START_S, Service, free_port
+
+
+def wait_until(what: Callable[[], bool], *, seconds: float = 60.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not what():
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+
+
+def children(service: Service) -> set[int]:
+    return {child.pid for child in psutil.Process(service.process.pid).children()}
+
+
+def says(service: Service, text: str) -> Callable[[], bool]:
+    return lambda: any(text in line.get("event", "") for line in list(service.log))
+
+
+def test_a_worker_that_dies_in_an_outage_comes_back_after_it(
+    cluster: Cluster, tmp_path: Path
+) -> None:
+    deployment = deploy(tmp_path, database_url=cluster.url, port=free_port(), **QUIET)
+    with Service(deployment, tmp_path) as service:
+        clients = Clients(service, People(deployment, [1]))
+        assert clients.enroll("a", 1).outcome == 201
+        cluster.stop("fast")
+        first, second = service.workers()
+        service.kill_worker(first)
+        wait_until(says(service, "the worker waits for it"))
+        time.sleep(1.5)
+        assert service.process.poll() is None
+        assert service.workers() == [second]
+        refused = clients.verify("a", 1)
+        assert (refused.outcome, refused.code) == (503, "store_unavailable")
+        cluster.start()
+        wait_until(lambda: len(service.workers()) == 2)
+        assert clients.verify("a", 1).accepted
+
+        # A worker that waits can be told to stop.
+        service.log.clear()
+        cluster.stop("fast")
+        service.kill_worker(second)
+        wait_until(says(service, "the worker waits for it"))
+        assert service.stop() == 0
+        cluster.start()
+
+
+def test_a_worker_killed_while_it_is_asked_for_a_sign_of_life_is_replaced_at_once(
+    tmp_path: Path,
+) -> None:
+    deployment = deploy(tmp_path, port=free_port(), **QUIET)
+    with Service(deployment, tmp_path) as service:
+        first = service.workers()[0]
+        known = children(service)
+        os.kill(first, signal.SIGSTOP)
+        time.sleep(2)  # the supervisor asks every half second, and is waiting by now
+        service.kill_worker(first)
+        wait_until(lambda: bool(children(service) - known), seconds=IMPORT_S / 3)
+        wait_until(lambda: len(service.workers()) == 2)
+        assert service.stop() == 0
+
+
+def test_the_service_fails_when_a_worker_cannot_start(tmp_path: Path) -> None:
+    deployment = deploy(tmp_path, port=free_port(), **QUIET)
+    with Service(deployment, tmp_path) as service:
+        deployment.settings.resolved_contract_file.write_bytes(b"no contract")
+        service.kill_worker(service.workers()[0])
+        assert service.process.wait(timeout=START_S) == 1
+        assert says(service, "start failed")()
+
+
+def test_workers_end_with_their_supervisor(tmp_path: Path) -> None:
+    deployment = deploy(tmp_path, port=free_port(), **QUIET)
+    with Service(deployment, tmp_path) as service:
+        clients = Clients(service, People(deployment, [1]))
+        assert clients.enroll("a", 1).outcome == 201
+        os.kill(service.process.pid, signal.SIGKILL)
+        service.process.wait()
+        wait_until(says(service, "the supervisor is gone"))
+        wait_until(lambda: not service.is_ready())
+        with Service(deployment, tmp_path) as again:
+            assert Clients(again, People(deployment, [1])).verify("a", 1).accepted
+
+
+def test_workers_that_take_long_to_import_are_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "sitecustomize.py").write_text(
+        "import sys, time\n"
+        "if any('spawn_main' in argument for argument in sys.orig_argv):\n"
+        "    time.sleep(7)  # as on a slow or busy machine\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    deployment = deploy(tmp_path, port=free_port(), **QUIET)
+    with Service(deployment, tmp_path) as service:
+        assert len(service.workers()) == 2
+        assert service.stop() == 0

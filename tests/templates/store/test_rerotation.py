@@ -1,0 +1,554 @@
+import random
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, wait
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import sqlalchemy as sa
+from numpy.typing import NDArray
+
+from templates import wire
+from templates.distances import Metric, pairwise_distances
+from templates.errors import StoreError, StoreUnavailable
+from templates.lifting import lift
+from templates.randomness import Keystream
+from templates.rotation import rotate, tenant_rotation
+from templates.sealing import MasterKeyring
+from templates.store import Source, TemplateStore, UnknownTenant
+from templates.store.audit_log import By
+from templates.store.database import Database
+from templates.store.rerotation import _Turns
+from templates.store.schema import RotationKeyRow, SubjectRow, TemplateRow
+from templates.store.tenants import RetiredRotation
+from templates.subspace import AffineSubspace, SubspaceBatch
+from tests.templates.store.conftest import CONTRACT, Clock, SlowSealing, template_id
+from tests.templates.store.test_erasure import found, pieces
+
+N, M = 48, 4
+OPERATOR = By("operator:kim", "request-1")
+
+
+def units(stream: Keystream, count: int, n: int = N) -> NDArray[np.float64]:
+    rows = stream.normal((count, n))
+    return np.asarray(rows / np.linalg.norm(rows, axis=1, keepdims=True))
+
+
+class People:
+    """Subjects with a template each, enrolled as the service does it: lifted, then rotated."""
+
+    def __init__(self, store: TemplateStore, count: int, *, n: int = N, m: int = M) -> None:
+        self._store = store
+        self.names = [f"s{number:03}" for number in range(count)]
+        stream = Keystream.seeded("rerotation")
+        self.points = units(stream, count, n)
+        self.templates = lift(self.points, strategy="random", m=m, stream=stream)
+        self._stream = stream
+        self.n, self.m = n, m
+        self._rotations: dict[bytes, NDArray[np.float64]] = {}
+
+    def enroll(
+        self, name: str, *, tenant: str = "default", dtype: wire.WireDtype = "float16"
+    ) -> None:
+        epoch = self._store.tenants.get(tenant).rotation_epoch
+        template = self.templates[self.names.index(name)]
+        self.put(name, self.encoded(template, tenant, epoch, dtype), epoch, tenant, dtype)
+
+    def encoded(
+        self, template: AffineSubspace, tenant: str, epoch: int, dtype: wire.WireDtype = "float16"
+    ) -> bytes:
+        rotated = template.rotated(self.rotation(epoch, tenant))
+        return wire.encode(rotated, contract_id=CONTRACT, dtype=dtype)
+
+    def put(
+        self, name: str, encoded: bytes, epoch: int | None, tenant: str, dtype: str = "float16"
+    ) -> None:
+        self._store.put(
+            tenant,
+            name,
+            encoded,
+            contract_id=CONTRACT,
+            n=self.n,
+            m=self.m,
+            dtype=dtype,
+            source=Source.PHOTOS,
+            photos=3,
+            rotation_epoch=epoch,
+        )
+
+    def rotation(self, epoch: int, tenant: str = "default") -> NDArray[np.float64]:
+        key = self._store.tenants.rotation_key(tenant, epoch=epoch).key
+        if key not in self._rotations:
+            self._rotations[key] = tenant_rotation(key, self.n)
+        return self._rotations[key]
+
+    def distances(
+        self, probes: NDArray[np.float64], metric: Metric = Metric.EUCLIDEAN
+    ) -> NDArray[np.float64]:
+        """Distances of probes to all stored templates, each in its rotation, in float64."""
+        stored = [self._store.get("default", name) for name in self.names]
+        held = [each for each in stored if each is not None]
+        assert len(held) == len(stored)
+        table = np.empty((len(probes), len(held)))
+        for epoch in {each.record.rotation_epoch for each in held}:
+            of_epoch = [i for i, each in enumerate(held) if each.record.rotation_epoch == epoch]
+            subspaces = SubspaceBatch.of([wire.decode(held[i].wire).subspace for i in of_epoch])
+            rotated = rotate(probes, self.rotation(epoch))
+            table[:, of_epoch] = pairwise_distances(
+                rotated, subspaces, metric=metric, dtype=np.float64
+            )
+        return table
+
+    def exact(
+        self, probes: NDArray[np.float64], metric: Metric = Metric.EUCLIDEAN
+    ) -> NDArray[np.float64]:
+        exact = pairwise_distances(probes, self.templates, metric=metric, dtype=np.float64)
+        return exact.astype(np.float64)
+
+    def own_distances(self) -> NDArray[np.float64]:
+        """Distance of each subject's descriptor to its own stored template; it lies in it."""
+        return np.diagonal(self.distances(self.points))
+
+
+def rows(store: TemplateStore) -> dict[str, Any]:
+    """All columns of the default tenant's subjects and templates, by subject id."""
+    columns = [*SubjectRow.__table__.columns, *TemplateRow.__table__.columns]
+    names = [f"{each.table.name}.{each.name}" for each in columns]
+    query = (
+        sa.select(*columns)
+        .select_from(SubjectRow)
+        .join(TemplateRow, TemplateRow.subject_pk == SubjectRow.id)
+        .where(SubjectRow.tenant_id == store.tenants.get("default").id)
+    )
+    found = store._database.read(lambda each: each.execute(query).all())
+    by_name = [dict(zip(names, row, strict=True)) for row in found]
+    return {row["subjects.subject_id"]: row for row in by_name}
+
+
+def epochs(store: TemplateStore) -> list[int]:
+    query = sa.select(RotationKeyRow.epoch).order_by(RotationKeyRow.epoch)
+    owner = store.tenants.get("default").id
+    return list(
+        store._database.read(
+            lambda each: each.execute(query.where(RotationKeyRow.tenant_id == owner)).scalars()
+        )
+    )
+
+
+def audit(store: TemplateStore, action: str = "tenant-rotate") -> list[tuple[Any, ...]]:
+    return [
+        (line.outcome, line.tenant, line.actor, line.request_id, line.detail)
+        for line in store.audit_log.lines()
+        if line.action == action
+    ]
+
+
+def test_a_new_epoch_serves_new_enrollments_and_keeps_the_old(store: TemplateStore) -> None:
+    people = People(store, 2)
+    people.enroll("s000")
+    old = store.tenants.rotation_key("default")
+    assert store.rerotation.begin("default", by=OPERATOR) == 2
+    people.enroll("s001")
+    new = store.tenants.rotation_key("default")
+    assert (old.epoch, new.epoch) == (1, 2)
+    assert old.key != new.key
+    assert store.tenants.rotation_key("default", epoch=1) == old
+    found = {name: row["templates.rotation_epoch"] for name, row in rows(store).items()}
+    assert found == {"s000": 1, "s001": 2}
+    assert people.own_distances().max() < 1e-3
+    assert store.tenants.get("other").rotation_epoch == 1
+    assert audit(store) == [("begun", "default", "operator:kim", "request-1", "epoch 2")]
+    with pytest.raises(UnknownTenant):
+        store.rerotation.begin("nobody")
+
+
+@pytest.mark.parametrize("dtype", ["float16", "float32"])
+def test_moved_templates_are_the_same_sets_in_the_new_rotation(
+    store: TemplateStore, clock: Clock, dtype: wire.WireDtype
+) -> None:
+    people = People(store, 7)
+    for name in people.names:
+        people.enroll(name, dtype=dtype)
+    people.enroll("s003", tenant="other")
+    theirs = store.get("other", "s003")
+    probes = units(Keystream.seeded("probes"), 20)
+    before, distances_before = rows(store), people.distances(probes)
+    clock.pass_by(days=1)
+
+    store.rerotation.begin("default")
+    assert store.rerotation.remaining("default") == 7
+    progress: list[int] = []
+    assert store.rerotation.move("default", batch=3, progress=progress.append) == 7
+    assert progress == [3, 3, 1]
+    assert store.rerotation.remaining("default") == 0
+    assert store.rerotation.move("default") == 0
+
+    assert np.abs(people.distances(probes) - distances_before).max() < 1e-3
+    assert people.own_distances().max() < 1e-3
+    after = rows(store)
+    changed = {
+        "subjects.wrapped_key",
+        "templates.ciphertext",
+        "templates.rotation_epoch",
+    }
+    for name in people.names:
+        different = {key for key in before[name] if before[name][key] != after[name][key]}
+        assert different == changed, name
+        stored = store.get("default", name)
+        assert stored is not None
+        assert wire.decode(stored.wire).dtype == dtype
+        # The new numbers are those of the new rotation only.
+        subspace = SubspaceBatch.of([wire.decode(stored.wire).subspace])
+        own = people.points[[people.names.index(name)]]
+        old = pairwise_distances(rotate(own, people.rotation(1)), subspace, metric="euclidean")
+        assert old.min() > 0.1
+    assert store.get("other", "s003") == theirs
+
+
+@pytest.mark.parametrize("metric", list(Metric))
+def test_what_another_rounding_costs(
+    tmp_path: Path, keyring: MasterKeyring, metric: Metric
+) -> None:
+    """The numbers that the module and docs/storage.md state, at the service's dimensions."""
+    store = TemplateStore(f"sqlite:///{tmp_path / 'veilface.db'}", keyring)
+    store.upgrade()
+    store.tenants.create("default")
+    people = People(store, 40, n=512, m=16)
+    for name in people.names:
+        people.enroll(name)
+    stream = Keystream.seeded("probes")
+    genuine = people.points + 0.6 * units(stream, 40, 512)
+    genuine /= np.linalg.norm(genuine, axis=1, keepdims=True)
+    probes = np.concatenate([genuine, units(stream, 160, 512)])
+    exact = people.exact(probes, metric)
+    seen = [people.distances(probes, metric)]
+    for _ in range(3):
+        store.rerotation.begin("default")
+        assert store.rerotation.move("default") == 40
+        seen.append(people.distances(probes, metric))
+    one = seen[1] - seen[0]
+    assert one.size == 8000
+    assert 0.8e-5 < np.sqrt(np.mean(one**2)) < 1.8e-5
+    assert np.abs(one).max() < 1e-4
+    first = np.sqrt(np.mean((seen[0] - exact) ** 2))
+    last = np.sqrt(np.mean((seen[-1] - exact) ** 2))
+    assert first < 1.8e-5
+    assert 1.5 * first < last < 3.5e-5
+    store.close()
+
+
+def test_an_enrollment_of_an_older_epoch_is_refused(store: TemplateStore) -> None:
+    people = People(store, 1)
+    late = people.encoded(people.templates[0], "default", 1)
+    store.rerotation.begin("default")
+    for epoch in (1, 3):
+        with pytest.raises(StoreUnavailable, match="rotation was renewed meanwhile; send it again"):
+            people.put("s000", late, epoch, "default")
+    assert store.describe("default", "s000") is None
+    people.enroll("s000")
+    record = store.describe("default", "s000")
+    assert record is not None
+    assert record.rotation_epoch == 2
+
+
+def test_retiring_drops_the_old_keys_once_nothing_needs_them(store: TemplateStore) -> None:
+    people = People(store, 4)
+    for name in people.names[:3]:
+        people.enroll(name)
+    store.rerotation.begin("default")
+    store.rerotation.begin("default")
+    people.enroll("s003")
+    with pytest.raises(StoreError, match=r"3 templates .* move them first"):
+        store.rerotation.retire("default")
+    assert epochs(store) == [1, 2, 3]
+    store.rerotation.move("default")
+    assert store.rerotation.retire("default", by=OPERATOR) == 2
+    assert epochs(store) == [3]
+    assert store.rerotation.retire("default") == 0
+    with pytest.raises(RetiredRotation, match="epoch 1"):
+        store.tenants.rotation_key("default", epoch=1)
+    assert people.own_distances().max() < 1e-3
+    assert store.tenants.rotation_key("other").epoch == 1
+    assert audit(store)[-1] == ("retired", "default", "operator:kim", "request-1", "epoch 3")
+
+
+def test_a_move_has_its_line_and_takes_back_no_decision(store: TemplateStore) -> None:
+    """The template keeps its id, so whoever was compared with it before was compared with it."""
+    people = People(store, 3)
+    for name in people.names:
+        people.enroll(name)
+    decided_on = template_id(store, people.names[0])
+    store.rerotation.begin("default")
+    assert store.rerotation.move("default", by=OPERATOR) == 3
+    assert audit(store)[-1] == ("moved", "default", "operator:kim", "request-1", "epoch 2")
+    before = store.audit_log.head()
+    assert store.rerotation.move("default", by=OPERATOR) == 0
+    assert store.audit_log.head() == before
+    store.attempts.conclude(
+        "default",
+        people.names[0],
+        accepted=True,
+        template_id=decided_on,
+        level="m",
+        nonce=None,
+        by=OPERATOR,
+    )
+    assert store.audit_log.head().sequence == before.sequence + 1
+
+
+def test_what_is_left_is_named_in_pages(store: TemplateStore) -> None:
+    people = People(store, 5)
+    for name in people.names:
+        people.enroll(name)
+    people.enroll("s001", tenant="other")
+    store.rerotation.begin("default")
+    people.enroll("s002")
+    left = ["s000", "s001", "s003", "s004"]
+    assert list(store.rerotation.subjects_of_old_epochs("default", batch=2)) == left
+    assert list(store.rerotation.subjects_of_old_epochs("other")) == []
+    assert store.rerotation.remaining("default") == 4
+    for call in (store.rerotation.remaining, store.rerotation.move, store.rerotation.retire):
+        with pytest.raises(UnknownTenant):
+            call("nobody")
+    with pytest.raises(UnknownTenant):
+        list(store.rerotation.subjects_of_old_epochs("nobody"))
+
+
+def test_an_interrupted_move_goes_on_where_it_stopped(store: TemplateStore) -> None:
+    people = People(store, 8)
+    for name in people.names:
+        people.enroll(name)
+    store.rerotation.begin("default")
+
+    def stop(count: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        store.rerotation.move("default", batch=3, progress=stop)
+    assert store.rerotation.remaining("default") == 5
+    assert people.own_distances().max() < 1e-3  # in both epochs
+    assert store.rerotation.move("default") == 5
+    assert people.own_distances().max() < 1e-3
+
+
+def meanwhile(monkeypatch: pytest.MonkeyPatch, action: Callable[[], object]) -> None:
+    """Do something once, after a template was read and before it is replaced."""
+    turn, done = _Turns.turn, threading.Event()
+
+    def turn_later(*arguments: Any) -> bytes:
+        turned = turn(*arguments)
+        if not done.is_set():
+            done.set()
+            action()
+        return turned
+
+    monkeypatch.setattr(_Turns, "turn", turn_later)
+
+
+def test_a_subject_that_is_enrolled_again_meanwhile_is_left_alone(
+    store: TemplateStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    people = People(store, 2)
+    people.enroll("s000")
+    people.enroll("s001")
+    store.rerotation.begin("default")
+    new = people.encoded(people.templates[1], "default", 2)
+    meanwhile(monkeypatch, lambda: people.put("s000", new, 2, "default"))
+    assert store.rerotation.move("default") == 1
+    stored = store.get("default", "s000")
+    assert stored is not None
+    assert stored.wire == new
+    assert store.rerotation.remaining("default") == 0
+
+
+def test_a_subject_that_is_erased_meanwhile_stays_erased(
+    store: TemplateStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    people = People(store, 2)
+    people.enroll("s000")
+    people.enroll("s001")
+    store.rerotation.begin("default")
+    meanwhile(monkeypatch, lambda: [store.erase("default", name) for name in people.names])
+    assert store.rerotation.move("default") == 0
+    assert rows(store) == {}
+
+
+def test_a_key_that_was_wrapped_again_meanwhile_is_not_put_back(
+    store: TemplateStore, key_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    people = People(store, 3)
+    for name in people.names:
+        people.enroll(name)
+    store.rerotation.begin("default")
+    MasterKeyring.add_current(key_file)
+    meanwhile(monkeypatch, store.rewrap)
+    assert store.rerotation.move("default") == 3  # looked at again
+    assert list(store.wrapping_keys()) == [MasterKeyring.load(key_file).current]
+    assert people.own_distances().max() < 1e-3
+
+
+def test_a_template_that_does_not_open_is_said_and_the_rest_is_moved(store: TemplateStore) -> None:
+    people = People(store, 5)
+    for name in people.names:
+        people.enroll(name)
+    people.put("s003", b"no template", 1, "default")
+    pk = rows(store)["s001"]["subjects.id"]
+    damage = sa.update(TemplateRow).where(TemplateRow.subject_pk == pk).values(template_id="x")
+    store._database.write(lambda each: each.execute(damage))
+    store.rerotation.begin("default")
+    with pytest.raises(StoreError, match=r"2 templates .* could not be moved") as caught:
+        store.rerotation.move("default", batch=2)
+    assert "s001" not in str(caught.value)
+    assert list(store.rerotation.subjects_of_old_epochs("default")) == ["s001", "s003"]
+    with pytest.raises(StoreError, match="move them first"):
+        store.rerotation.retire("default")
+    store.erase("default", "s001")
+    people.enroll("s003")
+    assert store.rerotation.move("default") == 0
+    assert store.rerotation.retire("default") == 1
+
+
+def test_an_enrollment_under_way_is_waited_for_before_a_key_goes(
+    store: TemplateStore,
+    database_url: str,
+    key_file: Path,
+    slow_sealing: SlowSealing,
+) -> None:
+    """It read epoch 1 and has not committed: no query can see its template yet."""
+    service = TemplateStore(database_url, MasterKeyring.load(key_file))
+    service.pseudonym("default", "-")
+    service.audit_log.prepare()
+    people, slow_people = People(store, 1), People(service, 1)
+    with ThreadPoolExecutor(2) as threads:
+        writing = threads.submit(slow_people.enroll, "s000")
+        assert slow_sealing.sealed.wait(20)
+
+        def renew() -> None:
+            store.rerotation.begin("default")
+            store.rerotation.move("default")
+            store.rerotation.retire("default")
+
+        renewing = threads.submit(renew)
+        early = wait([renewing], timeout=0.5).done
+        slow_sealing.go_on.set()
+        writing.result()
+        failure = renewing.exception()
+    assert not early
+    # On SQLite `begin` waits, on PostgreSQL `move`: either way `move` sees the template.
+    assert failure is None
+    assert ("moved", "default", "program", None, "epoch 2") in audit(store)
+    assert epochs(store) == [2]
+    assert people.own_distances().max() < 1e-3
+    service.close()
+
+
+def test_a_service_in_use_loses_nothing(
+    store: TemplateStore, database_url: str, key_file: Path
+) -> None:
+    service = TemplateStore(database_url, MasterKeyring.load(key_file))
+    people, users = People(store, 10), People(service, 10)
+    for name in people.names:
+        people.enroll(name)
+    errors: list[BaseException] = []
+    refused: list[str] = []
+    left: list[str] = []
+    stop = threading.Event()
+
+    def use(seed: int) -> None:
+        generator = random.Random(seed)
+        try:
+            while not stop.is_set():
+                name = generator.choice(users.names)
+                try:
+                    if generator.random() < 0.2:
+                        service.erase("default", name)
+                    users.enroll(name)
+                except StoreUnavailable as error:
+                    refused.append(str(error))
+                service.get("default", name)
+        except BaseException as error:
+            errors.append(error)
+
+    def verify() -> None:
+        try:
+            while not stop.is_set():
+                for name, point in zip(users.names, users.points, strict=True):
+                    stored = service.get("default", name)
+                    if stored is None:
+                        continue
+                    try:
+                        rotation = users.rotation(stored.record.rotation_epoch)
+                    except RetiredRotation:
+                        continue  # moved and retired since it was read: the caller reads it again
+                    subspace = SubspaceBatch.of([wire.decode(stored.wire).subspace])
+                    probe = rotate(point[None], rotation)
+                    assert pairwise_distances(probe, subspace, metric="euclidean").max() < 1e-2
+        except BaseException as error:
+            errors.append(error)
+
+    threads = [threading.Thread(target=use, args=(seed,)) for seed in range(2)]
+    threads.append(threading.Thread(target=verify))
+    for thread in threads:
+        thread.start()
+    try:
+        for _ in range(3):
+            store.rerotation.begin("default")
+            with ThreadPoolExecutor(2) as movers:
+                moving = [movers.submit(store.rerotation.move, "default", batch=3)] * 2
+                for each in moving:
+                    each.result()
+            while True:
+                try:
+                    store.rerotation.retire("default")
+                    break
+                except StoreError as error:
+                    left.append(str(error))
+                    store.rerotation.move("default")
+    finally:
+        stop.set()
+        for thread in threads:
+            thread.join()
+    assert errors == []
+    assert all("renewed meanwhile" in each for each in refused)
+    assert all("move them first" in each for each in left)
+    for name in people.names:
+        if store.describe("default", name) is None:
+            people.enroll(name)
+    assert people.own_distances().max() < 1e-2
+    assert epochs(store) == [4]
+    assert store.audit_log.verify().intact
+    service.close()
+
+
+def test_sqlite_files_keep_nothing_of_the_old_rotation(
+    tmp_path: Path, keyring: MasterKeyring
+) -> None:
+    folder = tmp_path / "data"
+    folder.mkdir()
+    url = f"sqlite:///{folder / 'veilface.db'}"
+    store = TemplateStore(url, keyring)
+    store.upgrade()
+    store.tenants.create("default")
+    people = People(store, 12, n=128, m=16)
+    for name in people.names:
+        people.enroll(name)
+    database = Database(url)
+    row = rows(store)["s007"]
+    key = database.read(
+        lambda each: each.execute(sa.select(RotationKeyRow.wrapped_key)).scalar_one()
+    )
+    ciphertext = pieces(row["templates.ciphertext"])
+    data_key, rotation_key = pieces(row["subjects.wrapped_key"][9:]), pieces(key[9:])
+    assert max(found(folder, ciphertext).values()) >= 0.9 * len(ciphertext)
+    assert found(folder, data_key) != {}
+    assert found(folder, rotation_key) != {}
+    store.rerotation.begin("default")
+    store.rerotation.move("default", batch=5)
+    assert found(folder, ciphertext) == {}
+    assert found(folder, data_key) == {}
+    store.rerotation.retire("default")
+    assert found(folder, rotation_key) == {}
+    database.close()
+    store.close()

@@ -1,0 +1,285 @@
+"""The tutorial's own blocks, in order, in an empty folder; and what it says one should see."""
+
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import tarfile
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import httpx
+import pytest
+
+from tests import test_readme
+from tests.api.cli.conftest import run
+from tests.test_readme import ROOT, newcomer, wait_until_ready
+
+__all__ = ["newcomer"]
+
+PAGE = (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")
+BIN = Path(sys.executable).parent
+EXAMPLE_PORT = "8421"
+SPAN = re.compile(r"`([^`]+)`")
+STRANGERS = 120
+# Code spans of what one should see that are names, not output.
+NAMES = {".venv", "veilface", "veilface-data", "key", "embedder", "calibrate"}
+# The installation without a network: from a real one, not made to happen again here.
+UNSEEN = {"ERROR: No matching distribution found for uv"}
+DOWNLOADS = {
+    "https://github.com/deepinsight/insightface/releases/download/v0.7/buffalo_sc.zip",
+    "https://ndownloader.figshare.com/files/5976018",
+}
+
+
+@dataclass(frozen=True)
+class Block:
+    """A fenced block, the prose before it and what one should see after it."""
+
+    before: str
+    code: str
+    expected: list[str]
+
+
+def blocks_of(page: str) -> list[Block]:
+    parts = re.split(r"^```sh\n(.*?)^```\n", page, flags=re.M | re.S)
+    found = []
+    for before, code, after in zip(parts[::2], parts[1::2], parts[2::2], strict=False):
+        seen = re.findall(r"^\*You should see\*.*?(?=\n\n)", after, flags=re.M | re.S)
+        spans = [" ".join(span.split()) for text in seen for span in SPAN.findall(text)]
+        found.append(Block(before, code, [span for span in spans if span not in NAMES]))
+    return found
+
+
+BLOCKS = blocks_of(PAGE)
+MISTAKES = [
+    span
+    for row in re.findall(r"^\| (.*?) \| .* \|$", PAGE, flags=re.M)
+    for span in SPAN.findall(row)
+]
+
+
+def occurs(span: str, output: str) -> bool:
+    """Whether a quoted text is in an output; … stands for anything in one line."""
+    pattern = ".*".join(re.escape(part) for part in span.split("…"))
+    return re.search(pattern, " ".join(output.split())) is not None
+
+
+class Terminal:
+    """A shell whose folder and variables last from one block to the next."""
+
+    def __init__(self, folder: Path, env: dict[str, str], state: Path) -> None:
+        self.env, self.state = env, state
+        names = sorted({"PATH"} | set(re.findall(r"^(\w+)=", PAGE, flags=re.M)))
+        self._keep = (
+            f'\n{{ declare -p {" ".join(names)} || true; printf "cd %q\\n" "$PWD"; }}'
+            f' > "{state}" 2>/dev/null\n'
+        )
+        state.write_text(f"cd '{folder}'\n")
+
+    def type(self, block: str, *, fails: bool = False) -> str:
+        """Type a block; what the terminal shows."""
+        script = f'. "{self.state}"\n{block}' + ("" if fails else self._keep)
+        done = subprocess.run(
+            ["bash", "-euo", "pipefail", "-c", script],
+            env=self.env,
+            text=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            timeout=280,
+        )
+        assert (done.returncode != 0) == fails, f"{block}\n{done.stdout}"
+        return done.stdout
+
+    def start(self, command: str, log: Path, port: int) -> subprocess.Popen[bytes]:
+        """Start a command that stays: the service."""
+        with log.open("wb") as out:
+            return subprocess.Popen(
+                ["bash", "-c", f'. "{self.state}"\nexec {command}'],
+                env=self.env | {"VEILFACE_PORT": str(port)},
+                stdout=out,
+                stderr=subprocess.STDOUT,
+            )
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def archives(folder: Path, pack: Path, people: Path, fairface: Path) -> Path:
+    """What the two addresses answer: a pack, and people of whom some have one photo only."""
+    folder.mkdir()
+    with zipfile.ZipFile(folder / "buffalo_sc.zip", "w") as archive:
+        for graph in sorted(pack.glob("*.onnx")):
+            archive.write(graph, graph.name)
+    with tarfile.open(folder / "5976018", "w:gz", compresslevel=1) as archive:
+        for photo in sorted(people.glob("*/*.jpg")):
+            archive.add(photo, f"lfw/{photo.parent.name}/{photo.name}")
+        strangers = sorted((fairface / "train").glob("*.jpg"))[:STRANGERS]
+        for index, photo in enumerate(strangers):
+            archive.add(photo, f"lfw/Stranger_{index}/Stranger_{index}_0001.jpg")
+    return folder
+
+
+def test_the_page_says_what_one_should_see_after_every_block() -> None:
+    silent = [block.code.split("\n")[0] for block in BLOCKS if not block.expected]
+    assert silent == ["mkdir ../tutorial"]
+    assert len(MISTAKES) >= 15
+
+
+def test_make_demo_is_the_command_that_stands_in_for_it() -> None:
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    assert re.search(r"^demo: .*\n\t\$\(VENV\)/veilface demo\n\n", makefile, flags=re.M)
+    assert re.search(r"^VENV := \.venv/bin$", makefile, flags=re.M)
+
+
+@pytest.mark.timeout(580)
+def test_the_tutorial_from_nothing_to_a_receipt(
+    newcomer: tuple[Path, dict[str, str]],
+    mbf_pack_dir: Path,
+    fairface: Path,
+    lfw_photos: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    folder, env = newcomer
+    env["PATH"] = os.pathsep.join(part for part in env["PATH"].split(":") if part != str(BIN))
+    port = free_port()
+    monkeypatch.setattr(test_readme, "PORT", port)
+    away = archives(folder / "away", mbf_pack_dir, lfw_photos, fairface)
+    replaced = {
+        "git clone https://example.org/veilface.git": "mkdir veilface; mv .venv veilface/.venv",
+        "make demo": "PATH=.venv/bin:$PATH; . .venv/bin/activate; veilface demo",
+        **{address: f"file://{away}/{Path(address).name}" for address in DOWNLOADS},
+        f":{EXAMPLE_PORT}": f":{port}",
+    }
+    assert all(text in PAGE for text in replaced)
+    clone, tutorial = folder / "veilface", folder / "tutorial"
+    terminals = {
+        "first": Terminal(folder, env, folder / "first"),
+        "second": Terminal(clone, env, folder / "second"),
+    }
+    shown: list[str] = []
+    service: subprocess.Popen[bytes] | None = None
+    terminal = ""
+    try:
+        for number, block in enumerate(BLOCKS):
+            if service is not None and "Ctrl-C in the first terminal" in block.before:
+                shown.append(terminals["second"].type(listening_too(port), fails=True))
+                try_drawn_people(f"http://127.0.0.1:{port}", clone / "demo-data" / "api-key")
+                stop(service)
+                service = None
+            if "## 8. Erase" in block.before:
+                shown += mistakes_of_calls(terminals["second"])
+            for named in re.findall(r"\*\*(first|second) terminal\*\*", block.before):
+                terminal = named
+            code = block.code
+            for old, new in replaced.items():
+                code = code.replace(old, new)
+            log = folder / f"{number}.log"
+            *lines, last = code.rstrip("\n").split("\n")
+            if last.startswith("veilface serve") and "--check" not in last:
+                output = terminals[terminal].type("\n".join([*lines, ""]))
+                service = terminals[terminal].start(last, log, port)
+                wait_until_ready(service)  # type: ignore[arg-type]
+                output += log.read_text()
+            else:
+                output = terminals[terminal].type(code)
+            shown.append(output)
+            expected = [span.replace(f":{EXAMPLE_PORT}", f":{port}") for span in block.expected]
+            assert [span for span in expected if not occurs(span, output)] == [], output
+        assert service is not None
+        stop(service)
+        shown.append(terminals["second"].type("curl -sS $URL", fails=True))
+    finally:
+        if service is not None and service.poll() is None:
+            stop(service)
+
+    shown += mistakes_of_the_command_line(tutorial, monkeypatch)
+    output = "\n".join(shown).replace(f"{port}", EXAMPLE_PORT)
+    assert {span for span in MISTAKES if not occurs(span, output)} == UNSEEN
+
+
+def listening_too(port: int) -> str:
+    return (
+        f"VEILFACE_PORT={port} {BIN}/veilface serve --config demo-data/veilface.toml || "
+        "veilface serve --config demo-data/veilface.toml"
+    )
+
+
+def try_drawn_people(url: str, key: Path) -> None:
+    """What the tutorial has one do in the browser, by the calls that the page makes."""
+    with httpx.Client(base_url=url, timeout=30) as page:
+        assert "demo model: not for authentication" in page.get("/").text
+        page.headers["Authorization"] = f"Bearer {key.read_text().strip()}"
+        decisions = {
+            person: {
+                page.post(
+                    "/v1/subjects/person-2/verify",
+                    files={"image": page.get(f"/demo/people/{person}/{shot}.png").content},
+                ).json()["decision"]
+                for shot in (3, 4)
+            }
+            for person in ("person-2", "person-3")
+        }
+    assert "accept" in decisions["person-2"]
+    assert "reject" in decisions["person-3"]
+
+
+def stop(service: subprocess.Popen[bytes]) -> None:
+    """Ctrl-C."""
+    service.send_signal(signal.SIGINT)
+    assert service.wait(timeout=30) in (0, -signal.SIGINT, 130)
+
+
+def mistakes_of_calls(terminal: Terminal) -> list[str]:
+    """Make each mistake of the tables that a call answers; what is shown."""
+    enroll = "curl -sS -X PUT $URL/emma/enrollment"
+    key = '-H "Authorization: Bearer $KEY"'
+    verify = f"curl -sS -X POST $URL/emma/verify {key}"
+    emma, colin = "emma/Emma_Watson_0001.jpg", "colin/Colin_Farrell_0001.jpg"
+    return [
+        terminal.type(f'{enroll} -H "Authorization: Bearer " -F images=@{emma}'),
+        terminal.type(f"{enroll} {key} -F images=@{emma} -F images=@{colin}"),
+        terminal.type(f"{verify} -F image=@colin/Colin_Farrell_0003.jpg"),
+        terminal.type(f"{verify} -F image=@nobody.jpg", fails=True),
+    ]
+
+
+def mistakes_of_the_command_line(folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Make each mistake of the tables that a command answers; what is shown."""
+    monkeypatch.chdir(folder)
+    pack = folder / "buffalo_sc"
+    few = folder / "few"
+    few.mkdir()
+    for person in ("emma", "colin"):
+        (few / person).symlink_to(folder / person)
+    flat = folder / "flat"
+    flat.mkdir()
+    for photo in sorted(few.glob("*/*.jpg")):
+        (flat / photo.name).symlink_to(photo)
+    elsewhere = folder / "elsewhere"
+    (elsewhere / "buffalo_sc").mkdir(parents=True)
+    (elsewhere / "faces").mkdir()
+    (elsewhere / "demo-data").mkdir()
+    (elsewhere / "demo-data" / "mine").touch()
+    made = [
+        run("decoys", "build", "flat", "--pack", pack, "--out", "few.veil"),
+        run("calibrate", "few", "--pack", pack, "--out", "few.json"),
+    ]
+    monkeypatch.chdir(elsewhere)
+    made += [
+        run("demo"),
+        run("models", "inspect", "buffalo_sc"),
+        run("decoys", "build", "faces", "--pack", pack),
+        run("calibrate", few, "--pack", pack),
+        run("serve", "--pack", pack, "--check"),
+    ]
+    (elsewhere / "buffalo_sc").rmdir()
+    made.append(run("models", "inspect", "buffalo_sc"))
+    assert all(ran.status == 1 for ran in made)
+    return [ran.stderr for ran in made]

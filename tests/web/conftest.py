@@ -1,0 +1,169 @@
+"""A browser with a fake camera, a real service with real faces, and the demo's service.
+
+The browser belongs to this package and not to the session: Playwright's blocking interface keeps an
+event loop in its thread, and other tests want one of their own.
+"""
+
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from playwright.sync_api import Browser, expect, sync_playwright
+
+from api.demo import run_demo
+from api.demo_cast import Scale
+from api.opening import file_sealer, open_keyring
+from api.preparation import calibrate_folder, make_generator
+from api.settings import Settings
+from models.extraction import Extractor
+from models.pack import ModelPack
+from templates.blas import single_threaded
+from templates.contract import Contract
+from templates.lifting import Strategy
+from tests.api.test_stored import report
+from tests.web.camera import FakeCamera
+from tests.web.served import Served, serving
+from tests.web.visit import Visit
+from verify import CalibrationOptions, LabelledFolder, labelled_folder
+
+NAMES = ("chromium", "chromium-browser", "google-chrome")
+DECOY_FACES = 110
+PEOPLE = 32
+SMALL = Scale(
+    enrolled=2, strangers=1, decoy_people=110, calibration_people=28, calibration_photos=4
+)
+WHO, OTHER = "Ashanti", "Antonio_Palocci"
+
+OpenVisit = Callable[..., Visit]
+
+
+@pytest.fixture(scope="session")
+def chromium() -> Path:
+    """The system's browser; ``VEILFACE_TEST_BROWSER`` names another one."""
+    found = os.environ.get("VEILFACE_TEST_BROWSER") or next(
+        filter(None, map(shutil.which, NAMES)), None
+    )
+    if found is None:
+        reason = f"no browser is installed: none of {', '.join(NAMES)}"
+        if os.environ.get("VEILFACE_REQUIRE_BROWSER") == "1":
+            pytest.fail(f"{reason}, and VEILFACE_REQUIRE_BROWSER=1 asks for one")
+        pytest.skip(reason)
+    return Path(found)
+
+
+@pytest.fixture(scope="package")
+def camera(tmp_path_factory: pytest.TempPathFactory) -> FakeCamera:
+    return FakeCamera(tmp_path_factory.mktemp("camera") / "camera.mjpeg")
+
+
+@pytest.fixture(scope="package")
+def browser(chromium: Path, camera: FakeCamera) -> Iterator[Browser]:
+    expect.set_options(timeout=20_000)
+    with sync_playwright() as playwright:
+        # Chromium refuses to be root inside its own sandbox; the page it visits is ours.
+        running = playwright.chromium.launch(
+            executable_path=chromium, args=["--no-sandbox", *camera.flags]
+        )
+        yield running
+        running.close()
+
+
+@pytest.fixture
+def visit(browser: Browser) -> Iterator[OpenVisit]:
+    """Open a tab on a service; at its end, every one of them must have been clean."""
+    opened: list[tuple[Any, Visit]] = []
+
+    def open_visit(served: Served, *, sign_in: str | None = "", **options: Any) -> Visit:
+        context = browser.new_context(
+            viewport={"width": options.pop("width", 1280), "height": 800}, **options
+        )
+        made = Visit.of(context, served.url + "/")
+        opened.append((context, made))
+        if sign_in is not None:
+            made.sign_in(sign_in or served.token)
+        return made
+
+    yield open_visit
+    try:
+        for _, made in opened:
+            made.assert_clean()
+    finally:
+        for context, _ in opened:
+            context.close()
+
+
+@pytest.fixture(scope="package")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """What `make demo` leaves, served by the command that it prints; person-1 is erased."""
+    folder = tmp_path_factory.mktemp("demo") / "data"
+    with single_threaded():
+        outcome = run_demo(folder, scale=SMALL)
+    assert outcome.faults == ()
+    token = (folder / "api-key").read_text().strip()
+    config = str(folder / "veilface.toml")
+    settings = Settings(data_dir=folder, pack=folder / "pack", demo=True)
+    with serving(folder, settings, "--config", config, token=token) as served:
+        yield served
+
+
+@pytest.fixture(scope="package")
+def people(lfw_photos: Path) -> dict[str, list[Path]]:
+    """Photos of two people who are alone in them."""
+    return {name: sorted((lfw_photos / name).glob("*.jpg")) for name in (WHO, OTHER)}
+
+
+@pytest.fixture(scope="package")
+def real(
+    tmp_path_factory: pytest.TempPathFactory, mbf_pack_dir: Path, lfw_aligned: Path
+) -> Iterator[Served]:
+    """A service with the real pack, calibrated on a small share of LFW without our two people."""
+    folder = tmp_path_factory.mktemp("real")
+    settings = Settings(data_dir=folder / "data", pack=mbf_pack_dir)
+    with single_threaded():
+        contract = _prepare(settings, mbf_pack_dir, lfw_aligned)
+    audit = folder / "report.json"
+    audit.write_text(
+        json.dumps(report(contract.binding.m, settings={"contract_id": contract.contract_id}))
+    )
+    options = {
+        "--data-dir": settings.data_dir,
+        "--pack": mbf_pack_dir,
+        "--audit-report-file": audit,
+    }
+    flags = [str(part) for option in options.items() for part in option]
+    with serving(folder, settings, *flags) as served:
+        yield served
+
+
+def _prepare(settings: Settings, pack_dir: Path, aligned: Path) -> Contract:
+    pack = ModelPack.load(pack_dir, threads=1)
+    everybody = labelled_folder(aligned)
+    photos: dict[str, list[Path]] = {}
+    for path, name in zip(everybody.paths, everybody.identities, strict=True):
+        if name not in (WHO, OTHER):
+            photos.setdefault(name, []).append(path)
+    single = [found[0] for found in photos.values() if len(found) == 1][:DECOY_FACES]
+    several = {name: found[:3] for name, found in photos.items() if len(found) >= 3}
+    chosen = [(path, name) for name in list(several)[:PEOPLE] for path in several[name]]
+    folder = LabelledFolder(
+        aligned, tuple(path for path, _ in chosen), tuple(name for _, name in chosen), 0
+    )
+    extractor = Extractor(pack, aligned=True)
+    source = make_generator(extractor.extract(single), pack)
+    done = calibrate_folder(
+        folder,
+        extractor.extract(folder.paths),
+        pack=pack,
+        source=source,
+        strategy=Strategy.ADVERSARIAL,
+        m=16,
+        options=CalibrationOptions(targets=(1e-1, 1e-2), photos_per_enrollment=2),
+    )
+    settings.data_dir.mkdir(parents=True)
+    source.save(settings.resolved_decoys_file)
+    done.contract.save(settings.resolved_contract_file, file_sealer(open_keyring(settings)))
+    return done.contract

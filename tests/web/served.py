@@ -1,0 +1,80 @@
+"""`veilface serve` as a process of its own, for a browser to visit."""
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import httpx
+import pytest
+
+from api.runtime import open_keyring, open_store
+from api.settings import Settings
+from tests.api.test_server import free_port
+
+
+@dataclass
+class Served:
+    """A running service."""
+
+    url: str
+    token: str = field(repr=False)
+    settings: Settings
+    log: Path
+
+    def key(self, *rights: str) -> str:
+        """Make another API key; return its token."""
+        store = open_store(self.settings, open_keyring(self.settings))
+        try:
+            return store.api_keys.create("default", rights).token
+        finally:
+            store.close()
+
+    def client(self) -> httpx.Client:
+        """A client with all rights."""
+        return httpx.Client(
+            base_url=self.url, headers={"Authorization": f"Bearer {self.token}"}, timeout=30
+        )
+
+
+@contextmanager
+def serving(
+    folder: Path, settings: Settings, *options: str, token: str | None = None
+) -> Iterator[Served]:
+    """Start the command with these options; without a token, take the one that it prints."""
+    port = free_port()
+    log, shown = folder / "page.log", folder / "page.out"
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("VEILFACE_")}
+    with log.open("wb") as errors, shown.open("wb") as output:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "api.cli", "serve", *options, "--port", str(port)],
+            stdout=output,
+            stderr=errors,
+            env={**environment, "PYTHONUNBUFFERED": "1", "OMP_NUM_THREADS": "1"},
+        )
+    try:
+        url = f"http://127.0.0.1:{port}"
+        _wait(process, url, log)
+        if token is None:
+            token = next(line for line in shown.read_text().splitlines() if line.startswith("vf_"))
+        yield Served(url, token, settings, log)
+    finally:
+        process.terminate()
+        process.wait(timeout=30)
+
+
+def _wait(process: "subprocess.Popen[bytes]", url: str, log: Path) -> None:
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline:
+        if process.poll() is not None:
+            pytest.fail(log.read_text())
+        try:
+            if httpx.get(f"{url}/health/ready", timeout=5).status_code == 200:
+                return
+        except httpx.TransportError:
+            time.sleep(0.1)
+    pytest.fail("the service did not get ready: " + log.read_text())

@@ -1,0 +1,215 @@
+"""The camera ends when it should, and what is checked is what is sent."""
+
+import io
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+from playwright.sync_api import expect
+
+from tests.web.camera import FakeCamera
+from tests.web.conftest import OpenVisit
+from tests.web.served import Served
+from tests.web.visit import Visit
+
+WATCH = """
+window.tracks = [];
+window.sent = [];
+window.bitmaps = {open: 0, most: 0, all: 0};
+const media = navigator.mediaDevices;
+const getUserMedia = media.getUserMedia.bind(media);
+media.getUserMedia = async (wanted) => {
+  const stream = await getUserMedia(wanted);
+  window.tracks.push(...stream.getTracks());
+  return stream;
+};
+const play = HTMLMediaElement.prototype.play;
+HTMLMediaElement.prototype.play = async function () {
+  await play.call(this);
+  await window.playing;
+};
+const decode = window.createImageBitmap;
+window.createImageBitmap = async (...given) => {
+  const count = window.bitmaps;
+  count.all += 1;
+  count.most = Math.max(count.most, (count.open += 1));
+  const bitmap = await decode(...given);
+  const close = bitmap.close.bind(bitmap);
+  bitmap.close = () => { count.open -= 1; close(); };
+  return bitmap;
+};
+const send = window.fetch;
+window.fetch = (path, options) => {
+  for (const [, part] of options?.body ?? [])
+    if (part instanceof Blob) window.sent.push([path, part]);
+  return send(path, options);
+};
+"""
+SENT = """
+async () => Promise.all(window.sent.map(async ([path, blob]) => {
+  const bitmap = await createImageBitmap(blob);
+  const bytes = new Uint8Array(await blob.arrayBuffer());
+  return {path, type: blob.type, width: bitmap.width, height: bitmap.height, text: bytes.join()};
+}))
+"""
+
+
+def watched(visit: OpenVisit, served: Served) -> Visit:
+    tab = visit(served, sign_in=None)
+    tab.page.add_init_script(WATCH)
+    tab.sign_in(served.token)
+    return tab
+
+
+def start(tab: Visit) -> None:
+    tab.page.get_by_label("Camera", exact=True).check()
+    tab.page.get_by_role("button", name="Start camera").click()
+
+
+def leave(tab: Visit, how: str, token: str) -> None:
+    """Leave the view in one of three ways; the camera was this view's."""
+    match how:
+        case "view":
+            tab.open("People")
+        case "source":
+            tab.page.get_by_label("Files").check()
+        case _:
+            tab.page.get_by_role("button", name="Sign out").click()
+            expect(tab.page.get_by_role("heading", level=1, name="Sign in")).to_be_visible()
+
+
+def states(tab: Visit) -> list[str]:
+    found: list[str] = tab.page.evaluate("window.tracks.map((each) => each.readyState)")
+    return found
+
+
+def checks(tab: Visit) -> int:
+    return sum(url.endswith("/v1/photos/check") for url in tab.requests)
+
+
+def test_nothing_is_sent_once_the_camera_was_left(visit: OpenVisit, demo: Served) -> None:
+    tab = watched(visit, demo)
+    page = tab.page
+    for number, how in enumerate(("view", "source", "sign-out"), start=1):
+        # Left while the video is about to play.
+        tab.open("Service")
+        tab.open("Verify")
+        page.evaluate("() => { window.playing = new Promise((done) => { window.goOn = done; }); }")
+        start(tab)
+        page.wait_for_function("count => window.tracks.length === count", arg=number)
+        leave(tab, how, demo.token)
+        page.evaluate("window.goOn()")
+        page.wait_for_timeout(100)
+        assert states(tab) == number * ["ended"]
+    page.wait_for_timeout(1200)
+    assert checks(tab) == 0
+    for how in ("view", "sign-out"):
+        # Left while frames go out.
+        tab.sign_in(demo.token)
+        start(tab)
+        expect(page.locator(".guidance:not([data-state=idle])")).to_be_visible()
+        leave(tab, how, demo.token)
+        assert set(states(tab)) == {"ended"}
+        sent = checks(tab)
+        assert sent > 0
+        page.wait_for_timeout(1300)
+        assert checks(tab) == sent
+
+
+def test_a_camera_that_stops_is_said_and_can_be_started_again(
+    visit: OpenVisit, demo: Served
+) -> None:
+    tab = watched(visit, demo)
+    page = tab.page
+    button = page.get_by_role("button", name="Start camera")
+    for event in ("ended", "mute", "pagehide"):
+        start(tab)
+        expect(button).to_be_hidden()
+        page.evaluate(
+            "name => (name === 'pagehide' ? window : window.tracks.at(-1))"
+            ".dispatchEvent(new Event(name))",
+            event,
+        )
+        tab.guided("The camera has stopped.")
+        expect(button).to_be_focused()
+        expect(page.locator("video")).to_be_hidden()
+        assert set(states(tab)) == {"ended"}
+    start(tab)
+    expect(page.get_by_role("button", name="Take photo")).to_be_visible()
+    assert states(tab)[-1] == "live"
+
+
+def test_the_photo_that_is_sent_was_itself_checked(
+    visit: OpenVisit, real: Served, camera: FakeCamera, people: dict[str, list[Path]]
+) -> None:
+    camera.shows(people["Ashanti"][0])
+    tab = watched(visit, real)
+    page = tab.page
+    page.get_by_label("Person's id").fill("nobody-there")
+    tab.take_photo()
+    expect(page.locator(".tray .seen[data-state=good]")).to_have_count(1)
+    page.get_by_role("button", name="Verify", exact=True).click()
+    expect(page.get_by_role("alert")).to_contain_text("not_enrolled")
+    taken = page.evaluate(SENT)
+    assert_sent_as_checked(taken, (640, 480))
+    assert {(each["width"], each["height"]) for each in taken} == {(640, 480), (480, 360)}
+
+    # A large photo is made smaller once; one that is small stays as it is, byte for byte.
+    small = people["Ashanti"][1].read_bytes()
+    large = io.BytesIO()
+    Image.open(io.BytesIO(small)).resize((2400, 1800)).save(large, "JPEG")
+    page.get_by_label("Files").check()
+    for data, size in ((large.getvalue(), (1600, 1200)), (small, (250, 250))):
+        page.evaluate("window.sent.length = 0")
+        file: Any = {"name": "photo.jpg", "mimeType": "image/jpeg", "buffer": data}
+        page.get_by_label("Photo: JPEG").set_input_files(file)
+        expect(page.locator(".tray .seen[data-state=good]")).to_have_count(1)
+        page.get_by_role("button", name="Verify", exact=True).click()
+        expect(page.get_by_role("alert")).to_contain_text("not_enrolled")
+        assert_sent_as_checked(page.evaluate(SENT), size)
+    assert page.evaluate(SENT)[-1]["text"] == ",".join(map(str, small))
+
+    # A photo that would be refused is not taken.
+    camera.shows()
+    page.get_by_label("Camera", exact=True).check()
+    page.get_by_role("button", name="Remove photo").click()
+    page.get_by_role("button", name="Start camera").click()
+    page.get_by_role("button", name="Take photo").click()
+    expect(page.locator(".refused")).to_have_text(
+        "Not taken. No face found. Look into the camera, upright."
+    )
+    expect(page.locator(".tray li")).to_have_count(0)
+
+
+def assert_sent_as_checked(sent: list[dict[str, Any]], size: tuple[int, int]) -> None:
+    *before, last = sent
+    assert last["path"].endswith("/verify")
+    assert (last["width"], last["height"]) == size
+    assert last["text"] in {each["text"] for each in before if each["path"] == "/v1/photos/check"}
+
+
+def test_photos_are_decoded_one_at_a_time(visit: OpenVisit, demo: Served) -> None:
+    out = io.BytesIO()
+    Image.open(demo.settings.data_dir / "people" / "person-2" / "0.png").resize((1700, 1700)).save(
+        out, "JPEG"
+    )
+    tab = watched(visit, demo)
+    page = tab.page
+    tab.open("Enroll")
+    page.get_by_label("Files").check()
+    page.get_by_label("Photos: JPEG").set_input_files(
+        [{"name": f"{n}.jpg", "mimeType": "image/jpeg", "buffer": out.getvalue()} for n in range(4)]
+    )
+    expect(page.locator(".tray .seen[data-state=good]")).to_have_count(4)
+    assert page.evaluate("window.bitmaps") == {"open": 0, "most": 1, "all": 4}
+    # A browser that cannot make the smaller copy sends the photo, and says why it takes no frame.
+    page.evaluate("() => { HTMLCanvasElement.prototype.toBlob = (done) => done(null); }")
+    page.get_by_label("Photos: JPEG").set_input_files(
+        {"name": "5.jpg", "mimeType": "image/jpeg", "buffer": out.getvalue()}
+    )
+    expect(page.locator(".tray .seen[data-state=good]")).to_have_count(5)
+    assert page.evaluate("window.bitmaps.open") == 0
+    page.get_by_label("Camera", exact=True).check()
+    page.get_by_role("button", name="Start camera").click()
+    page.get_by_role("button", name="Take photo").click()
+    expect(page.locator(".refused")).to_have_text("Not taken. The browser could not make a photo.")

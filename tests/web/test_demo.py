@@ -1,0 +1,118 @@
+"""The demo deployment in the browser: a visitor without weights, and drawn people."""
+
+import re
+from http.client import HTTPConnection
+from urllib.parse import urlsplit
+
+import httpx
+from playwright.sync_api import expect
+
+from models.demo import DEMO_NOTICE
+from tests.web.conftest import OpenVisit
+from tests.web.served import Served
+from tests.web.visit import Visit
+
+
+def choose(tab: Visit, person: str, shot: int) -> None:
+    """Take one photo of a drawn person."""
+    tab.page.get_by_label("Person who does not exist").select_option(person)
+    tab.page.get_by_role("button", name=f"Choose photo {shot} of {person}", exact=True).click()
+    expect(tab.page.locator(".tray .seen[data-state=good]").last).to_be_visible()
+
+
+def test_a_visitor_enrolls_and_verifies_a_drawn_person(visit: OpenVisit, demo: Served) -> None:
+    tab = visit(demo)
+    page = tab.page
+    tab.open("Enroll")
+    page.get_by_label("Person's id").fill("visitor")
+    for shot in (1, 2, 3):
+        choose(tab, "person-1", shot)
+    expect(page.locator(".tray li")).to_have_count(3)
+    page.get_by_role("button", name="Enroll", exact=True).click()
+    expect(page.locator(".verdict")).to_contain_text("Photos used3")
+    page.get_by_role("link", name="Verify this person").click()
+    choose(tab, "person-1", 4)
+    page.get_by_role("button", name="Verify", exact=True).click()
+    expect(page.locator(".verdict.accept")).to_contain_text("Accepted")
+    choose(tab, "person-101", 1)
+    expect(page.locator(".verdict")).to_have_count(0)
+    page.get_by_role("button", name="Verify", exact=True).click()
+    expect(page.locator(".verdict.reject")).to_contain_text("Rejected")
+    with demo.client() as client:
+        assert client.delete("/v1/subjects/visitor").is_success
+
+
+def test_every_screen_is_marked(visit: OpenVisit, demo: Served) -> None:
+    tab = visit(demo, sign_in=None)
+    tab.page.goto(tab.url)
+    mark = tab.page.get_by_text(DEMO_NOTICE, exact=True)
+    expect(mark).to_be_visible()
+    tab.sign_in(demo.token)
+    for view in ("Verify", "Enroll", "People", "Stored", "Service"):
+        tab.open(view)
+        expect(mark).to_be_visible()
+        expect(mark).to_be_in_viewport()
+
+
+def test_drawn_photos_are_the_demos_only_and_always_the_same(demo: Served) -> None:
+    with httpx.Client(base_url=demo.url) as client:
+        listed = client.get("/demo/people").json()
+        assert listed["people"][0] == "person-1"
+        path = "/demo/people/person-1/0.png"
+        one, again = client.get(path), client.get(path)
+        assert one.headers["content-type"] == "image/png"
+        assert one.content == again.content
+        drawn = demo.settings.data_dir / "people" / "person-1" / "0.png"
+        assert one.content == drawn.read_bytes()
+    absent = ("person-9/0.png", "person-1/5.png", "person-1/00.png", "../../etc/0.png",
+              "../people/person-1/0.png", "person-1/../../../assets/main.js")  # fmt: skip
+    for each in ("person-1/0.png", *absent):
+        # Nothing resolves the dots on the way, as httpx and a browser would.
+        wire = HTTPConnection(urlsplit(demo.url).netloc, timeout=30)
+        wire.request("GET", f"/demo/people/{each}")
+        assert wire.getresponse().status == (404 if each in absent else 200), each
+        wire.close()
+
+
+def test_people_come_page_by_page(visit: OpenVisit, demo: Served) -> None:
+    photo = (demo.settings.data_dir / "people" / "person-2" / "0.png").read_bytes()
+    names = [f"many-{number:02}" for number in range(26)]
+    with demo.client() as client:
+        for name in names:
+            answer = client.put(
+                f"/v1/subjects/{name}/enrollment", files={"images": ("0.png", photo)}
+            )
+            assert answer.status_code == 201, answer.text
+        tab = visit(demo)
+        tab.open("People")
+        cards = tab.page.locator("li.person")
+        expect(cards).to_have_count(25)
+        expect(tab.page.get_by_role("status").first).to_contain_text("there are more")
+        tab.page.get_by_role("button", name="Show more").click()
+        total = len(client.get("/v1/subjects").json()["subjects"])
+        expect(cards).to_have_count(total)
+        expect(tab.page.get_by_role("button", name="Show more")).to_be_hidden()
+        expect(cards.nth(25).get_by_role("link").first).to_be_focused()
+        for name in names:
+            client.delete(f"/v1/subjects/{name}")
+
+
+def test_too_many_rejections_are_told_with_the_time_to_wait(visit: OpenVisit, demo: Served) -> None:
+    stranger = (demo.settings.data_dir / "people" / "person-2" / "0.png").read_bytes()
+    with demo.client() as client:
+        enrolled = client.put(
+            "/v1/subjects/locked/enrollment", files={"images": ("0.png", stranger)}
+        )
+        assert enrolled.is_success
+        other = httpx.get(f"{demo.url}/demo/people/person-101/0.png").content
+        for _ in range(5):
+            client.post("/v1/subjects/locked/verify", files={"image": ("0.png", other)})
+        tab = visit(demo)
+        tab.page.get_by_label("Person's id").fill("locked")
+        choose(tab, "person-2", 1)
+        tab.page.get_by_role("button", name="Verify", exact=True).click()
+        alert = tab.page.get_by_role("alert")
+        expect(alert).to_contain_text("locked_out")
+        expect(alert).to_contain_text(re.compile(r"Try again in \d+ s"))
+        expect(alert).to_contain_text(re.compile(r"request [0-9a-f]{32}"))
+        client.delete("/v1/subjects/locked")

@@ -1,0 +1,224 @@
+"""What comes late: answers after the visitor went on, and a key that was changed meanwhile."""
+
+import contextlib
+from typing import Any
+
+from playwright.sync_api import Error, Page, Route, expect
+
+from tests.web.conftest import OpenVisit
+from tests.web.served import Served
+from tests.web.test_demo import choose
+
+DECISION = {
+    "decision": "accept", "reason": "match", "level": "fmr-1e-2", "fmr": 0, "contract_id": "0" * 64,
+    "calibration_id": "0" * 64, "request_id": "0" * 32,
+}  # fmt: skip
+BLOCKED = """
+Object.defineProperty(window, "sessionStorage", {
+  get() { throw new DOMException("blocked", "SecurityError"); },
+});
+"""
+
+
+class Held:
+    """Requests of one pattern, answered when the test says so."""
+
+    def __init__(self, page: Page, pattern: str) -> None:
+        self.page = page
+        self.routes: list[Route] = []
+        page.route(pattern, lambda route: self.routes.append(route))
+
+    def wait(self) -> Route:
+        """Wait for the first one."""
+        for _ in range(200):
+            if self.routes:
+                return self.routes[0]
+            self.page.wait_for_timeout(25)
+        raise AssertionError("no such request came")
+
+
+def refusal(code: str, message: str, **details: Any) -> dict[str, Any]:
+    return {
+        "error": {"code": code, "message": message, "details": details},
+        "request_id": "0" * 32,
+    }
+
+
+def test_a_late_decision_names_whom_it_is_about(visit: OpenVisit, demo: Served) -> None:
+    tab = visit(demo)
+    page = tab.page
+    subject = page.get_by_label("Person's id")
+    held = Held(page, "**/verify")
+    for heard in (False, True):
+        held.routes.clear()
+        subject.fill("alice")
+        choose(tab, "person-2", 1)
+        page.get_by_role("button", name="Verify", exact=True).click()
+        waiting = held.wait()
+        expect(subject).to_be_disabled()
+        expect(page.get_by_role("button", name="Remove photo")).to_be_disabled()
+        subject.evaluate(
+            "(input, heard) => { input.value = 'bob'; input.form.requestSubmit();"
+            " if (heard) input.dispatchEvent(new Event('input')); }",
+            heard,
+        )
+        waiting.fulfill(json=DECISION)
+        expect(subject).to_be_enabled()
+        if heard:
+            # Something else is asked by now: the answer is not shown at all.
+            expect(page.locator(".verdict")).to_have_count(0)
+        else:
+            expect(page.locator(".verdict")).to_contain_text("Personalice")
+            expect(page.locator(".verdict")).to_contain_text("0 % (none seen)")
+        assert len(held.routes) == 1
+
+
+def test_a_late_enrollment_is_of_the_photos_that_were_sent(visit: OpenVisit, demo: Served) -> None:
+    tab = visit(demo)
+    page = tab.page
+    tab.open("Enroll")
+    subject = page.get_by_label("Person's id")
+    subject.fill("alice")
+    for shot in (1, 2):
+        choose(tab, "person-1", shot)
+    photo, enrollment = Held(page, "**/demo/people/person-1/2.png"), Held(page, "**/enrollment")
+    page.get_by_role("button", name="Choose photo 3 of person-1").click()
+    late = photo.wait()
+    page.get_by_role("button", name="Enroll", exact=True).click()
+    waiting = enrollment.wait()
+    expect(subject).to_be_disabled()
+    late.continue_()
+    expect(page.locator(".tray li")).to_have_count(3)
+    expect(page.locator(".tray .seen[data-state=good]")).to_have_count(3)
+    subject.evaluate("(input) => { input.value = 'bob'; input.form.requestSubmit(); }")
+    # The first photo was sent, the third one was not.
+    refused = refusal("inconsistent_images", "they differ", pairs=[[0, 2]])
+    waiting.fulfill(status=422, json=refused)
+    expect(page.locator(".tray .seen[data-state=bad]")).to_have_count(1)
+    assert len(enrollment.routes) == 1
+
+    enrollment.routes.clear()
+    page.get_by_label("Remove photo from person-1, photo 3").click()
+    page.get_by_role("button", name="Choose photo 3 of person-1").click()
+    subject.fill("alice")
+    page.get_by_role("button", name="Enroll", exact=True).click()
+    waiting = enrollment.wait()
+    photo.routes[1].continue_()
+    expect(page.locator(".tray li")).to_have_count(3)
+    subject.evaluate("(input) => { input.value = 'bob'; }")
+    images = [{"index": index, "status": "used", "quality": {}} for index in range(2)]
+    waiting.fulfill(
+        status=201,
+        json={"template_id": "0" * 32, "contract_id": "0" * 64, "replaced": False,
+              "images": images, "request_id": "0" * 32},
+    )  # fmt: skip
+    expect(page.locator(".verdict")).to_contain_text("Personalice")
+    # It came too late to be sent, and is there still.
+    expect(page.locator(".tray li")).to_have_count(1)
+    expect(page.locator(".tray")).to_contain_text("Good")
+    expect(page.get_by_label("Remove photo from person-1, photo 3")).to_be_visible()
+
+
+def test_a_late_refusal_of_another_key_does_not_sign_out(visit: OpenVisit, demo: Served) -> None:
+    tab = visit(demo)
+    page = tab.page
+    held = Held(page, "**/v1/subjects?*")
+    page.get_by_role("link", name="People").click()
+    waiting = held.wait()
+    page.get_by_role("button", name="Sign out").click()
+    page.get_by_label("API key").fill(demo.token)
+    page.get_by_role("button", name="Sign in").click()
+    expect(page.get_by_role("button", name="Sign out")).to_be_visible()
+    # It was ended with the key it was made with, so it may be too late to answer it.
+    with contextlib.suppress(Error):
+        waiting.fulfill(status=401, json=refusal("unauthorized", "send a valid API key"))
+    page.wait_for_timeout(200)
+    expect(page.get_by_role("button", name="Sign out")).to_be_visible()
+    tab.complaints[:] = [each for each in tab.complaints if "ERR_ABORTED" not in each]
+
+
+def people(page: Page, *names: str) -> Held:
+    """Show these people, whose erasures wait for the test."""
+    described = [
+        {"subject_id": name, "template_id": "0" * 32, "contract_id": "0" * 64, "current": True,
+         "enrolled_by": "photos", "photos": 1, "created_at": "2026-01-31T12:00:00Z",
+         "updated_at": "2026-01-31T12:00:00Z"}
+        for name in names
+    ]  # fmt: skip
+    page.route(
+        "**/v1/subjects?*",
+        lambda route: route.fulfill(
+            json={"subjects": described, "next_cursor": None, "request_id": "0" * 32}
+        ),
+    )
+    return Held(page, "**/v1/subjects/*")
+
+
+def erase(page: Page, name: str) -> None:
+    page.get_by_role("button", name=f"Erase {name}", exact=True).click()
+    page.get_by_role("dialog").get_by_role("button", name="Erase", exact=True).click()
+
+
+def test_every_receipt_stays_and_no_failure_is_lost(visit: OpenVisit, demo: Served) -> None:
+    tab = visit(demo)
+    page = tab.page
+    held = people(page, "ada", "bob", "cleo")
+    tab.open("People")
+    for name in ("ada", "bob"):
+        held.routes.clear()
+        erase(page, name)
+        claims = {"erased_at": "2026-01-31T12:00:00Z", "erased": [], "subject": "0" * 64,
+                  "signing_key": "0f3a", "receipt_id": name}  # fmt: skip
+        held.wait().fulfill(json={"receipt": {}, "claims": claims, "request_id": "0" * 32})
+        expect(page.locator(".verdict").first).to_contain_text(f"Erased {name}")
+    expect(page.get_by_role("button", name="Download receipt")).to_have_count(2)
+
+    held.routes.clear()
+    erase(page, "cleo")
+    waiting = held.wait()
+    # The browser itself closes a dialog that refuses twice: the failure is told all the same.
+    page.keyboard.press("Escape")
+    expect(page.get_by_role("dialog")).to_be_visible()
+    page.keyboard.press("Escape")
+    waiting.fulfill(status=429, json=refusal("rate_limited", "too many requests"))
+    expect(page.get_by_role("alert")).to_contain_text("rate_limited")
+    expect(page.get_by_role("alert")).to_be_visible()
+
+
+def test_a_key_that_ends_during_an_erasure_leaves_no_dialog(visit: OpenVisit, demo: Served) -> None:
+    tab = visit(demo)
+    held = people(tab.page, "ada")
+    tab.open("People")
+    erase(tab.page, "ada")
+    held.wait().fulfill(status=401, json=refusal("unauthorized", "send a valid API key"))
+    expect(tab.page.get_by_role("heading", level=1, name="Sign in")).to_be_visible()
+    expect(tab.page.locator("dialog")).to_have_count(0)
+    tab.page.get_by_label("API key").click()
+
+
+def test_a_browser_without_storage_and_a_view_that_is_none(visit: OpenVisit, demo: Served) -> None:
+    tab = visit(demo, sign_in=None)
+    tab.page.add_init_script(BLOCKED)
+    tab.sign_in(demo.token, keep=True)
+    for name in ("constructor", "toString", "__proto__", ""):
+        tab.page.evaluate("name => { location.hash = `#/${name}`; }", name)
+        expect(tab.page.get_by_role("heading", level=1, name="Verify")).to_be_visible()
+    tab.page.get_by_role("button", name="Sign out").click()
+    expect(tab.page.get_by_role("heading", level=1, name="Sign in")).to_be_visible()
+
+
+def test_what_a_client_lifted_is_told_as_the_contract_has_it(
+    visit: OpenVisit, demo: Served
+) -> None:
+    with demo.client() as client:
+        stored = client.get("/v1/subjects/person-2/stored").json()
+    tab = visit(demo)
+    tab.page.route(
+        "**/stored", lambda route: route.fulfill(json={**stored, "enrolled_by": "template"})
+    )
+    tab.page.goto(f"{tab.url}#/stored/person-2")
+    tab.open("Stored")
+    tab.page.get_by_label("Person's id").fill("person-2")
+    tab.page.get_by_role("button", name="Show").click()
+    expect(tab.page.locator(".facts").first).to_contain_text("by the contract; a client lifted it")
+    expect(tab.page.locator("figcaption")).to_contain_text("By the contract the set was laid")

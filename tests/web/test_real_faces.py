@@ -1,0 +1,211 @@
+"""Real faces before a fake camera: enroll, accept, reject, erase, and guidance on the way."""
+
+import math
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import expect
+
+from tests.api.cli.conftest import run
+from tests.web.access import assert_accessible
+from tests.web.camera import FakeCamera
+from tests.web.conftest import OTHER, WHO, OpenVisit
+from tests.web.served import Served
+
+
+def test_one_person_from_enrollment_to_erasure(
+    visit: OpenVisit,
+    real: Served,
+    camera: FakeCamera,
+    people: dict[str, list[Path]],
+    tmp_path: Path,
+) -> None:
+    mine, theirs = people[WHO], people[OTHER]
+    tab = visit(real)
+    page = tab.page
+
+    tab.open("Enroll")
+    page.get_by_label("Person's id").fill("anna")
+    camera.shows(mine[0])
+    tab.take_photo()
+    tab.guided("Good: one face")
+    # Another photo from a file, as a visitor may mix them.
+    page.get_by_label("Files").check()
+    page.get_by_label("Photos: JPEG").set_input_files(mine[1])
+    expect(page.locator(".tray .seen[data-state=good]")).to_have_count(2)
+    page.get_by_role("button", name="Enroll", exact=True).click()
+    expect(page.locator(".verdict")).to_contain_text("Enrolled")
+    expect(page.locator(".verdict")).to_be_focused()
+    page.get_by_role("link", name="Verify this person").click()
+
+    expect(page.get_by_label("Person's id")).to_have_value("anna")
+    page.get_by_label("Level").select_option("fmr-1e-1")
+    camera.shows(mine[2])
+    tab.take_photo()
+    page.get_by_role("button", name="Verify", exact=True).click()
+    expect(page.locator(".verdict.accept")).to_contain_text("Accepted")
+    expect(page.locator(".verdict")).to_contain_text("10 % (1 in 10)")
+
+    camera.shows(theirs[0])
+    tab.open("People")
+    page.get_by_role("link", name="Verify anna").click()
+    tab.take_photo()
+    page.get_by_role("button", name="Verify", exact=True).click()
+    expect(page.locator(".verdict.reject")).to_contain_text("Rejected")
+    expect(page.locator(".verdict")).to_contain_text("no_match")
+    expect(page.locator(".verdict")).to_contain_text("fmr-1e-2")
+
+    tab.open("Service")
+    with page.expect_download() as contract:
+        page.get_by_role("button", name="Download contract").click()
+    contract.value.save_as(tmp_path / "contract.json")
+    tab.open("People")
+    page.get_by_role("button", name="Erase anna").click()
+    dialog = page.get_by_role("dialog")
+    expect(dialog.get_by_role("button", name="Keep")).to_be_focused()
+    page.keyboard.press("Escape")
+    expect(page.get_by_role("button", name="Erase anna")).to_be_focused()
+    page.get_by_role("button", name="Erase anna").click()
+    dialog.get_by_role("button", name="Erase", exact=True).click()
+    expect(page.locator(".verdict")).to_contain_text("Erased anna")
+    expect(page.get_by_text("Nobody is enrolled yet.")).to_be_visible()
+    with page.expect_download() as receipt:
+        page.get_by_role("button", name="Download receipt").click()
+    receipt.value.save_as(tmp_path / "receipt.json")
+    checked = run(
+        "keys", "verify-receipt", tmp_path / "receipt.json",
+        "--public-key", tmp_path / "contract.json",
+    )  # fmt: skip
+    assert checked.status == 0, checked.stderr
+    with real.client() as client:
+        assert client.get("/v1/subjects/anna").status_code == 404
+
+
+@pytest.mark.parametrize(
+    ("shown", "words"),
+    [
+        ("nobody", "No face found"),
+        ("two", "2 faces found"),
+        ("dark", "Too dark"),
+        ("one", "Good: one face"),
+    ],
+)
+def test_guidance_says_what_the_camera_shows(
+    visit: OpenVisit,
+    real: Served,
+    camera: FakeCamera,
+    people: dict[str, list[Path]],
+    shown: str,
+    words: str,
+) -> None:
+    one, other = people[WHO][0], people[OTHER][0]
+    match shown:
+        case "nobody":
+            camera.shows()
+        case "two":
+            camera.shows(one, other)
+        case "dark":
+            camera.shows(one, dark=0.14)
+        case _:
+            camera.shows(one)
+    tab = visit(real, width=360)
+    tab.page.get_by_role("button", name="Start camera").click()
+    tab.guided(words)
+    assert_accessible(tab, f"camera-{shown}")
+    assert any(url.endswith("/v1/photos/check") for url in tab.requests)
+    good = shown == "one"
+    expect(tab.page.locator(".found")).to_be_visible(visible=good)
+
+
+def test_photos_that_the_service_refuses_are_named(
+    visit: OpenVisit, real: Served, people: dict[str, list[Path]]
+) -> None:
+    tab = visit(real)
+    page = tab.page
+    tab.open("Enroll")
+    page.get_by_label("Person's id").fill("two-people")
+    page.get_by_label("Files").check()
+    page.get_by_label("Photos: JPEG").set_input_files([people[WHO][0], people[OTHER][0]])
+    expect(page.locator(".tray .seen[data-state=good]")).to_have_count(2)
+    page.get_by_role("button", name="Enroll", exact=True).click()
+    alert = page.get_by_role("alert")
+    expect(alert).to_contain_text("inconsistent_images")
+    expect(alert).to_contain_text("Remove the photos that show another person")
+    expect(page.locator(".tray .seen[data-state=bad]")).to_have_count(2)
+    with real.client() as client:
+        assert client.get("/v1/subjects/two-people").status_code == 404
+
+
+def test_what_is_stored_is_shown_with_its_true_numbers(
+    visit: OpenVisit, real: Served, people: dict[str, list[Path]]
+) -> None:
+    with real.client() as client:
+        files = [("images", (photo.name, photo.read_bytes())) for photo in people[OTHER][:2]]
+        assert client.put("/v1/subjects/palocci/enrollment", files=files).is_success
+        stored = client.get("/v1/subjects/palocci/stored").json()
+    tab = visit(real)
+    tab.open("Stored")
+    tab.page.get_by_label("Person's id").fill("palocci")
+    tab.page.get_by_role("button", name="Show").click()
+    similarity = stored["foot_point_similarity"]
+    words = (
+        f"resembles your face with similarity {similarity:.3f}; every unit vector in the "
+        "16-dimensional set at that angle"
+    )
+    expect(tab.page.locator("figcaption")).to_contain_text(words)
+    drawing = tab.page.locator("figure svg").nth(0)
+    assert words in (drawing.get_attribute("aria-label") or "")
+    # The drawing is to scale: foot point and face lie where their numbers say.
+    sphere, foot, face = (
+        {name: float(drawing.locator(f".{kind}").get_attribute(name) or "nan") for name in names}
+        for kind, names in (
+            ("sphere", ("cx", "cy", "r")),
+            ("foot", ("cx", "cy")),
+            ("face", ("cx", "cy")),
+        )
+    )
+    assert (foot["cx"] - sphere["cx"]) / sphere["r"] == pytest.approx(similarity, abs=1e-6)
+    right, up = face["cx"] - sphere["cx"], sphere["cy"] - face["cy"]
+    assert (right**2 + up**2) ** 0.5 == pytest.approx(sphere["r"])
+    assert right / sphere["r"] == pytest.approx(similarity, abs=1e-6)
+    # A decoy is a candidate like the face: no place on the line is its own, and from the front all
+    # of them are as far from the foot point as the face.
+    expect(drawing.locator(".decoy")).to_have_count(0)
+    front = tab.page.locator("figure svg").nth(1)
+    assert "the decoys, as far from the foot point as the face" in (
+        front.get_attribute("aria-label") or ""
+    )
+    rim = sphere["r"] * (1 - similarity**2) ** 0.5
+    places = front.locator("circle").evaluate_all(
+        "all => all.map(each => [each.getAttribute('class'), each.cx.baseVal.value,"
+        " each.cy.baseVal.value, each.r.baseVal.value])"
+    )
+    (middle,) = [place for kind, *place in places if kind == "foot"]
+    assert [r for kind, _, _, r in places if kind == "rim"] == [pytest.approx(rim, abs=1e-3)]
+    candidates = [place for kind, *place in places if kind in ("decoy", "face")]
+    assert len(candidates) == 1 + stored["decoys"]
+    for x, y, r in candidates:
+        assert math.dist((x, y), middle[:2]) == pytest.approx(rim, abs=1e-3)
+        assert r == candidates[0][2]
+    expect(tab.page.locator(".hex")).to_have_text(
+        " ".join(stored["sealed_excerpt"][i : i + 8] for i in range(0, 128, 8))
+    )
+    audit = tab.page.locator("[data-audit=contract]")
+    expect(audit).to_contain_text("20 % of stolen and decrypted templates gave a match")
+    expect(audit).to_contain_text("failed, a limit is exceeded")
+    rows = audit.get_by_role("row")
+    expect(rows).to_have_count(1 + 6)
+    # What is compared stands beside the limit: not the value; and D_sys is no share.
+    linkability = ["unlinkability", "algorithm", "0.25 [0.2, 0.3]", "0.1", "0.15 [0.1, 0.2]", "0.1"]
+    assert rows.nth(5).get_by_role("cell").all_inner_texts() == [*linkability, "fail"]
+    gender = [
+        "confidentiality",
+        "algorithm",
+        "63 % [58 %, 68 %]",
+        "51 %",
+        "12 % [7 %, 17 %]",
+        "10 %",
+    ]
+    assert rows.nth(6).get_by_role("cell").all_inner_texts() == [*gender, "fail"]
+    expect(audit).to_contain_text("if it was calibrated again since")
+    assert_accessible(tab, "stored-audited")

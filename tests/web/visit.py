@@ -1,0 +1,85 @@
+"""A visit of the page: what the browser asked for, and what it complained of."""
+
+from dataclasses import dataclass, field
+from typing import Any
+from urllib.parse import urlsplit
+
+from playwright.sync_api import BrowserContext, Page, expect
+
+# A refusal of the service is an answer that the page shows; the browser notes it all the same.
+REFUSED = "Failed to load resource: the server responded with a status of 4"
+LISTEN = """
+window.violations = [];
+addEventListener("securitypolicyviolation", (e) =>
+  window.violations.push(`${e.violatedDirective} ${e.blockedURI}`));
+"""
+
+
+@dataclass
+class Visit:
+    """One tab, and a record of it."""
+
+    page: Page
+    url: str
+    requests: list[str] = field(default_factory=list)
+    complaints: list[str] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, context: BrowserContext, url: str) -> "Visit":
+        """Open a tab and record it from its first request on."""
+        visit = cls(context.new_page(), url)
+        visit.page.add_init_script(LISTEN)
+        context.on("request", lambda each: visit.requests.append(each.url))
+        visit.page.on("pageerror", lambda each: visit.complaints.append(str(each)))
+        visit.page.on("console", visit._noted)
+        return visit
+
+    def _noted(self, message: Any) -> None:
+        if message.type in ("error", "warning") and not message.text.startswith(REFUSED):
+            self.complaints.append(message.text)
+
+    def strays(self) -> list[str]:
+        """Requests that left the page's origin."""
+        here = urlsplit(self.url).netloc
+        return [
+            url
+            for url in self.requests
+            if urlsplit(url).scheme not in ("blob", "data") and urlsplit(url).netloc != here
+        ]
+
+    def violations(self) -> list[str]:
+        """What the content security policy stopped."""
+        found: list[str] = self.page.evaluate("window.violations")
+        return found
+
+    def assert_clean(self) -> None:
+        """Nothing left the origin, and the browser had nothing to complain of."""
+        assert self.strays() == []
+        assert self.violations() == []
+        assert self.complaints == []
+        assert any(url.endswith("/assets/main.js") for url in self.requests)
+
+    def sign_in(self, token: str, *, keep: bool = False) -> None:
+        """Sign in with a key."""
+        self.page.goto(self.url)
+        self.page.get_by_label("API key").fill(token)
+        if keep:
+            self.page.get_by_label("Keep it until this tab is closed").check()
+        self.page.get_by_role("button", name="Sign in").click()
+        expect(self.page.get_by_role("navigation", name="Views")).to_be_visible()
+
+    def open(self, view: str) -> None:
+        """Follow a link of the navigation."""
+        self.page.get_by_role("navigation", name="Views").get_by_role("link", name=view).click()
+        expect(self.page.get_by_role("heading", level=1)).to_be_focused()
+
+    def take_photo(self) -> None:
+        """Start the camera, and take one photo once it shows something."""
+        self.page.get_by_label("Camera", exact=True).check()
+        self.page.get_by_role("button", name="Start camera").click()
+        self.page.get_by_role("button", name="Take photo").click()
+        expect(self.page.locator(".tray .seen").last).not_to_have_text("Checking…")
+
+    def guided(self, text: str) -> None:
+        """Wait for the live guidance to say this."""
+        expect(self.page.locator(".guidance")).to_contain_text(text, timeout=15_000)
