@@ -209,15 +209,15 @@ async def _close(runtime: Runtime) -> None:
 
 
 def app_from_environment() -> FastAPI:
-    """Make the application in a worker process; ``uvicorn_options`` passed the settings on."""
+    """Make the application in a worker process; the settings come from the environment."""
     return create_app(load_settings())
 
 
 def uvicorn_options(settings: Settings) -> dict[str, Any]:
     """Return the keyword arguments of ``uvicorn.run``.
 
-    With one worker the application itself is passed; with several, the settings travel to the
-    workers in the environment, because they are started anew.
+    With one worker the application itself is passed; several are started anew, and take the
+    settings from their environment, in which :func:`environment_of` has to stand.
     """
     options: dict[str, Any] = {
         "host": settings.host,
@@ -235,7 +235,6 @@ def uvicorn_options(settings: Settings) -> dict[str, Any]:
     }
     if settings.workers == 1:
         return {"app": create_app(settings), **options}
-    os.environ.update(environment_of(settings))
     return {
         "app": "api.app:app_from_environment",
         "factory": True,

@@ -31,6 +31,7 @@ from prometheus_client.mmap_dict import MmapedDict, mmap_key
 from prometheus_client.multiprocess import MultiProcessCollector, mark_process_dead
 from prometheus_client.registry import Collector
 
+from api.environment import variables_set
 from api.errors import ERROR_CODES
 
 DIRECTORY_VARIABLE = "PROMETHEUS_MULTIPROC_DIR"
@@ -206,16 +207,11 @@ def shared_directory() -> Iterator[Path]:
 
     Only processes that start meanwhile use it: this one has imported prometheus_client already.
     """
-    before = os.environ.get(DIRECTORY_VARIABLE)
-    with tempfile.TemporaryDirectory(prefix="veilface-metrics-") as folder:
-        os.environ[DIRECTORY_VARIABLE] = folder
-        try:
-            yield Path(folder)
-        finally:
-            if before is None:
-                del os.environ[DIRECTORY_VARIABLE]
-            else:
-                os.environ[DIRECTORY_VARIABLE] = before
+    with (
+        tempfile.TemporaryDirectory(prefix="veilface-metrics-") as folder,
+        variables_set({DIRECTORY_VARIABLE: folder}),
+    ):
+        yield Path(folder)
 
 
 def join_shared_directory() -> None:

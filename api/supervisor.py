@@ -7,7 +7,8 @@ import uvicorn
 from uvicorn.config import STARTUP_FAILURE
 from uvicorn.supervisors.multiprocess import Multiprocess
 
-from api.app import uvicorn_options
+from api.app import environment_of, uvicorn_options
+from api.environment import variables_set
 from api.settings import Settings
 
 
@@ -25,7 +26,8 @@ def run_server(settings: Settings) -> None:
         return
     config = uvicorn.Config(**options)
     workers = Workers(config, [config.bind_socket()])
-    workers.run()
+    with variables_set(environment_of(settings)):
+        workers.run()
     if workers.gave_up:
         sys.exit(STARTUP_FAILURE)
 

@@ -1,11 +1,22 @@
 """Fixtures shared by all rooms: the real models and faces, where they are present."""
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 DEFAULT_SHARED_DATA = Path(__file__).resolve().parent.parent.parent / "shared" / "data"
+
+
+@pytest.fixture(autouse=True)
+def the_environment_stays() -> Iterator[None]:
+    """Fail a test that leaves variables behind: the next one would read them as settings."""
+
+    before = set(os.environ.items())
+    yield
+    changed = {name for name, _ in before ^ set(os.environ.items())}
+    assert changed <= {"PYTEST_CURRENT_TEST"}
 
 
 @pytest.fixture(scope="session")

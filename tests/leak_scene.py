@@ -300,7 +300,11 @@ def _enroll_and_verify(scene: Scene, client: httpx.Client, pid: int) -> None:
         scene.decisions.setdefault(kind, []).append(answer.json()["decision"])
 
     for number, subject in enumerate(scene.subjects):
-        stranger = material.probes[(number + 1) % PEOPLE]
+        # Nearly orthogonal: chance must not let in who has to be rejected. An opposite face will
+        # not do, because a combination of decoys can turn its sign.
+        face = scene.descriptors_of(subject)[0]
+        others = [probe for i, probe in enumerate(material.probes) if i != number]
+        stranger = min(others, key=lambda probe: abs(float(probe.embedding @ face)))
         decide("genuine", subject, files=form(material.probes[number], name="image"))
         decide("impostor", subject, files=form(stranger, name="image"))
     probe = material.probes[1].embedding

@@ -6,7 +6,6 @@ gets one flag for each with the same help, and the :class:`Settings` that result
 
 import functools
 import inspect
-import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import Annotated, Any, ParamSpec, TypeVar
 import typer
 from pydantic.fields import FieldInfo
 
+from api.environment import variables_set
 from api.settings import CONFIG_VARIABLE, ENV_PREFIX, Settings, load_settings
 
 P = ParamSpec("P")
@@ -70,17 +70,8 @@ def configured_by(file: Path | None) -> Iterator[None]:
 
     The variable stays set while the command runs: the workers of ``serve`` read it too.
     """
-    before = os.environ.get(CONFIG_VARIABLE)
-    if file is not None:
-        os.environ[CONFIG_VARIABLE] = str(file)
-    try:
+    with variables_set({} if file is None else {CONFIG_VARIABLE: str(file)}):
         yield
-    finally:
-        if file is not None:
-            if before is None:
-                del os.environ[CONFIG_VARIABLE]
-            else:
-                os.environ[CONFIG_VARIABLE] = before
 
 
 _CONFIG = inspect.Parameter(
