@@ -76,7 +76,9 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 
 @pytest.fixture(scope="module")
 def http(server: Server) -> Iterator[httpx.Client]:
+    """A client of the service, in which subject ``a`` is enrolled."""
     with httpx.Client(base_url=server.url, headers=bearer(server.deployment.token)) as client:
+        assert client.put("/v1/subjects/a/enrollment", files=images(photo(1))).status_code == 201
         yield client
 
 
@@ -107,9 +109,8 @@ def test_the_kernels_are_compiled_before_the_server_is_ready(tmp_path: Path) -> 
     assert sorted(path.name for path in kernels.rglob("*.nb[ci]")) == ready
 
 
-def test_workers_share_the_database_and_nothing_else(server: Server, http: httpx.Client) -> None:
-    assert http.put("/v1/subjects/a/enrollment", files=images(photo(1))).status_code == 201
-
+@pytest.mark.usefixtures("http")
+def test_workers_share_the_database_and_nothing_else(server: Server) -> None:
     def verify(person: int) -> str:
         # A connection of its own each time, so that either worker answers.
         answer = httpx.post(
@@ -186,6 +187,7 @@ def test_a_client_that_asks_first_is_told_at_once(server: Server) -> None:
     assert first.startswith(b"HTTP/1.1 401")
 
 
+@pytest.mark.usefixtures("http")
 def test_stopping_finishes_what_runs_and_logs_only_json(server: Server) -> None:
     body = (
         b'--b\r\nContent-Disposition: form-data; name="image"; filename="f"\r\n\r\n'
