@@ -24,11 +24,24 @@ class Proxy:
         self.lose = 0
         self._connections: list[bytearray] = []
         self._threads = [threading.Thread(target=self._accept, daemon=True)]
+        self._ups: list[threading.Thread] = []
 
     @property
     def sent(self) -> bytes:
         """Every byte that clients sent, connection after connection."""
         return b"\n".join(bytes(each) for each in list(self._connections))
+
+    def taken(self) -> bytes:
+        """Return :attr:`sent` and forget it, once every client has hung up and was read to its end.
+
+        A service may answer before it has the whole request, and so may a client go on.
+        """
+        for thread in self._ups:
+            thread.join(timeout=10)
+        assert not any(thread.is_alive() for thread in self._ups), "a client is still connected"
+        sent = self.sent
+        self.forget()
+        return sent
 
     def forget(self) -> None:
         """Keep from now on only."""
@@ -60,10 +73,10 @@ class Proxy:
             kept = bytearray()
             self._connections.append(kept)
             service = socket.create_connection(("127.0.0.1", self._target))
-            for pump in (
-                threading.Thread(target=self._up, args=(client, service, kept), daemon=True),
-                threading.Thread(target=self._down, args=(service, client), daemon=True),
-            ):
+            up = threading.Thread(target=self._up, args=(client, service, kept), daemon=True)
+            down = threading.Thread(target=self._down, args=(service, client), daemon=True)
+            self._ups.append(up)
+            for pump in (up, down):
                 self._threads.append(pump)
                 pump.start()
 

@@ -76,18 +76,16 @@ def traffic(
             decided = client.verify("someone", files[ENROLLED]).reason
             client.page()
             client.erase("someone")
-        private = proxy.sent
-        proxy.forget()
+        private = proxy.taken()
         with Client(proxy.url, deployment.token) as careless, pytest.raises(Unavailable):
             careless.verify("someone", files[ENROLLED])
-        photo = proxy.sent
-        proxy.forget()
+        photo = proxy.taken()
         httpx.post(
             f"{proxy.url}/v1/subjects/someone/verify",
             headers={"Authorization": f"Bearer {deployment.token}"},
             json={"embedding": [float(number) for number in rows[ENROLLED]]},
         )
-        embedding = proxy.sent
+        embedding = proxy.taken()
     mean = rows[:ENROLLED].mean(axis=0)
     descriptors = {f"descriptor {i}": row for i, row in enumerate(rows)} | {
         "plain mean": mean,
