@@ -1,5 +1,6 @@
 """The REST application: routes, handlers and the life of one worker."""
 
+import gc
 import logging
 import os
 import threading
@@ -179,6 +180,9 @@ async def _open(
     # No request is answered before this is done, so none waits for the compiler.
     await anyio.to_thread.run_sync(warm_up)
     await anyio.to_thread.run_sync(rounded_cohort, runtime.contract.cohort)
+    # What was made so far stays: looking through it for garbage would stop requests for 0.1 s.
+    gc.freeze()
+    running.callback(gc.unfreeze)
     tasks = await running.enter_async_context(anyio.create_task_group())
     running.callback(tasks.cancel_scope.cancel)
     tasks.start_soon(

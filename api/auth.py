@@ -23,12 +23,17 @@ _header = APIKeyHeader(
 
 @dataclass(frozen=True)
 class Caller:
-    """An API key that was recognised, and the key that its probes are signed with."""
+    """An API key that was recognised."""
 
     prefix: str
     tenant: str
     rights: frozenset[str]
-    probe_key: bytes = field(repr=False)
+    token: str = field(repr=False)
+
+    @property
+    def probe_key(self) -> bytes:
+        """The key that its probes are signed with."""
+        return probe_key(self.token)
 
     def require(self, *rights: str) -> None:
         """Refuse unless the key has all of these rights.
@@ -87,7 +92,7 @@ async def caller(
         prefix=found.prefix,
         tenant=found.tenant,
         rights=frozenset(map(str, found.rights)),
-        probe_key=probe_key(token),
+        token=token,
     )
 
 

@@ -64,6 +64,11 @@ class _Body:
         self._ended = message["type"] != "http.request" or not message.get("more_body", False)
         return message
 
+    @property
+    def ended(self) -> bool:
+        """Whether all of it was received, or nobody will read the rest."""
+        return self._ended
+
     def abandon(self) -> None:
         """Read nothing more."""
         self._ended = True
@@ -164,7 +169,8 @@ class RequestContext:
 
         async def send_with_headers(message: Message) -> None:
             nonlocal status
-            if message["type"] == "http.response.body" and not message.get("more_body"):
+            last = message["type"] == "http.response.body" and not message.get("more_body")
+            if last and not body.ended:
                 await deliver({**message, "more_body": True})
                 # Lingering is a courtesy: with it, nobody without a key shall fill the room.
                 if not self._room.crowded:

@@ -136,6 +136,16 @@ class Gate:
     async def compute(self, work: Callable[[], T]) -> T:
         """Run ``work`` in a thread, once a slot is free."""
         turn = object()
+        try:
+            self._slots.acquire_on_behalf_of_nowait(turn)
+        except anyio.WouldBlock:
+            await self._wait_for_a_slot(turn)
+        try:
+            return await anyio.to_thread.run_sync(work, limiter=self._threads)
+        finally:
+            self._slots.release_on_behalf_of(turn)
+
+    async def _wait_for_a_slot(self, turn: object) -> None:
         self._waiting += 1
         COMPUTE_WAITING.inc()
         try:
@@ -143,10 +153,6 @@ class Gate:
         finally:
             self._waiting -= 1
             COMPUTE_WAITING.dec()
-        try:
-            return await anyio.to_thread.run_sync(work, limiter=self._threads)
-        finally:
-            self._slots.release_on_behalf_of(turn)
 
     async def query(self, work: Callable[[], T]) -> T:
         """Run ``work``, which asks the database and computes little, in a thread.

@@ -288,7 +288,7 @@ def _strip(image: Image.Image) -> NDArray[np.uint8]:
         canvas = Image.new("RGBA", image.size, (BACKGROUND,) * 3 + (255,))
         canvas.alpha_composite(image)
         image = canvas
-    return np.asarray(image.convert("RGB"), dtype=np.uint8)
+    return np.asarray(image if image.mode == "RGB" else image.convert("RGB"), dtype=np.uint8)
 
 
 _ON_ITS_SIDE = (5, 6, 7, 8)

@@ -135,18 +135,22 @@ def measure_sharpness(grey: NDArray[np.uint8]) -> float:
         uint8, shape (112, 112).
     """
     smooth = cv2.GaussianBlur(grey.astype(np.float64), (0, 0), _SMOOTHING)
-    window = slice(_MARGIN, -_MARGIN)
-    variance = float(smooth[window, window].var())
+
+    def window(down: int, right: int) -> NDArray[np.float64]:
+        """Return the centre of the picture, moved."""
+        rows = slice(_MARGIN + down, _SIDE - _MARGIN + down)
+        columns = slice(_MARGIN + right, _SIDE - _MARGIN + right)
+        return np.asarray(smooth[rows, columns])
+
+    centre = window(0, 0)
+    variance = float(centre.var())
     if variance < 1e-6:
         return 0.0
     # Diagonal neighbours are sqrt(2) apart, which doubles a second difference.
     directions = (((0, 1), 1.0), ((1, 0), 1.0), ((1, 1), 0.5), ((1, -1), 0.5))
     energies = []
     for (down, right), weight in directions:
-        step = (down, right)
-        ahead = np.roll(smooth, step, axis=(0, 1))
-        behind = np.roll(smooth, (-down, -right), axis=(0, 1))
-        second = (ahead - 2 * smooth + behind)[window, window] * weight
+        second = (window(-down, -right) - 2 * centre + window(down, right)) * weight
         energies.append(float((second * second).mean()))
     return 1000 * min(energies) / variance
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 from templates.canonical import Fields, Json, digest, free_object
 from templates.errors import ContractError, ContractMismatch
@@ -82,7 +83,7 @@ class Binding:
         object.__setattr__(self, "preprocessing", preprocessing)
         object.__setattr__(self, "strategy", Strategy(self.strategy))
 
-    @property
+    @cached_property
     def contract_id(self) -> str:
         """SHA-256 of the canonical JSON, 64 hexadecimal digits."""
         return digest(self.to_json())

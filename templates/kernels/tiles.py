@@ -161,6 +161,19 @@ def _multiply(
     return row, end, first, count, wide
 
 
+@inlined
+def _place(
+    out: Floats, stride: int, row: int, first: int, count: int, wide: int
+) -> tuple[Floats, int, int]:
+    """Return where a tile's distances go, the length of a row there, and how many of it to write.
+
+    In the matrix of all distances, or, where ``stride`` is 0, in working space for this tile.
+    """
+    if stride:
+        return out[row * stride + first :], stride, count
+    return out, wide, wide
+
+
 @compiled
 def point_tiles(
     left: Floats,
@@ -212,9 +225,7 @@ def point_tiles(
         row, end, first, count, wide = _multiply(
             left, feet, bases, grid, number, held, spherical, 0, stacked, squares, product
         )
-        place = out[row * stride + first :] if stride else out
-        step = stride if stride else wide
-        width = count if stride else wide
+        place, step, width = _place(out, stride, row, first, count, wide)
         if spherical:
             found[number] = spherical_points(
                 product, mine[row:end], wide, m, least, place, step, width
@@ -259,9 +270,7 @@ def euclidean_tiles(
         row, end, first, count, wide = _multiply(
             left, feet, bases, grid, number, held, False, m_d, stacked, squares, product
         )
-        place = out[row * stride + first :] if stride else out
-        step = stride if stride else wide
-        width = count if stride else wide
+        place, step, width = _place(out, stride, row, first, count, wide)
         found[number] = euclidean_subspaces(
             product,
             mine[row:end],
@@ -310,9 +319,7 @@ def spherical_tiles(
         row, end, first, count, wide = _multiply(
             left, feet, bases, grid, number, held, True, m_d, stacked, squares, product
         )
-        place = out[row * stride + first :] if stride else out
-        step = stride if stride else wide
-        width = count if stride else wide
+        place, step, width = _place(out, stride, row, first, count, wide)
         found[number] = spherical_subspaces(
             product, end - row, wide, m_d, m, steps, least, work, place, step, width
         )
