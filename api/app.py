@@ -181,6 +181,7 @@ async def _open(
     await anyio.to_thread.run_sync(warm_up)
     await anyio.to_thread.run_sync(rounded_cohort, runtime.contract.cohort)
     # What was made so far stays: looking through it for garbage would stop requests for 0.1 s.
+    gc.collect()
     gc.freeze()
     running.callback(gc.unfreeze)
     tasks = await running.enter_async_context(anyio.create_task_group())

@@ -28,7 +28,7 @@ class Caller:
     prefix: str
     tenant: str
     rights: frozenset[str]
-    token: str = field(repr=False)
+    token: str = field(repr=False, compare=False)
 
     @property
     def probe_key(self) -> bytes:

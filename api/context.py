@@ -25,6 +25,8 @@ SANE_REQUEST_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{7,63}")
 LINGER_S = 5.0
 SEND_TIMEOUT_S = 30.0
 """Longest that one piece of an answer may wait for the client to take it."""
+SMALL_ANSWER = 16 * 1024
+"""Bytes that are sent with the end of the answer: whether the client takes them, is not awaited."""
 LINGER_BYTES = 64 * 1024 * 1024
 SECURITY_HEADERS = {
     "X-Content-Type-Options": "nosniff",
@@ -170,7 +172,8 @@ class RequestContext:
         async def send_with_headers(message: Message) -> None:
             nonlocal status
             last = message["type"] == "http.response.body" and not message.get("more_body")
-            if last and not body.ended:
+            if last and not (body.ended and len(message.get("body", b"")) <= SMALL_ANSWER):
+                # The end, sent by itself, waits until the client has taken most of the rest.
                 await deliver({**message, "more_body": True})
                 # Lingering is a courtesy: with it, nobody without a key shall fill the room.
                 if not self._room.crowded:

@@ -9,8 +9,8 @@ from contextlib import contextmanager
 def variables_set(values: Mapping[str, str]) -> Iterator[None]:
     """Set environment variables of this process, and put back what was there before."""
     before = {name: os.environ.get(name) for name in values}
-    os.environ.update(values)
     try:
+        os.environ.update(values)
         yield
     finally:
         for name, value in before.items():

@@ -85,7 +85,7 @@ class Binding:
 
     @cached_property
     def contract_id(self) -> str:
-        """SHA-256 of the canonical JSON, 64 hexadecimal digits."""
+        """SHA-256 of the canonical JSON, 64 hexadecimal digits; computed once."""
         return digest(self.to_json())
 
     @property

@@ -11,7 +11,10 @@ DEFAULT_SHARED_DATA = Path(__file__).resolve().parent.parent.parent / "shared" /
 
 @pytest.fixture(autouse=True)
 def the_environment_stays() -> Iterator[None]:
-    """Fail a test that leaves variables behind: the next one would read them as settings."""
+    """Fail a test that leaves variables behind: the next one would read them as settings.
+
+    What fixtures of a wider scope set is not seen.
+    """
 
     def ours() -> set[tuple[str, str]]:
         prefixes = ("VEILFACE_", "PROMETHEUS_")  # libraries set others when they are imported

@@ -300,8 +300,8 @@ def _enroll_and_verify(scene: Scene, client: httpx.Client, pid: int) -> None:
         scene.decisions.setdefault(kind, []).append(answer.json()["decision"])
 
     for number, subject in enumerate(scene.subjects):
-        # Nearly orthogonal: chance must not let in who has to be rejected. An opposite face will
-        # not do, because a combination of decoys can turn its sign.
+        # Nearly orthogonal: who is only a little similar is let in by chance now and then. An
+        # opposite face will not do, because a combination of decoys can turn its sign.
         face = scene.descriptors_of(subject)[0]
         others = [probe for i, probe in enumerate(material.probes) if i != number]
         stranger = min(others, key=lambda probe: abs(float(probe.embedding @ face)))

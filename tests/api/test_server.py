@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import os
 import signal
 import socket
 import subprocess
@@ -13,8 +14,10 @@ from pathlib import Path
 
 import httpx
 import pytest
+import uvicorn
 
 from api.app import environment_of, uvicorn_options
+from api.supervisor import run_server
 from tests.api.deployment import Deployment, bearer, deploy, images, photo
 from tests.api.shapes import assert_error
 
@@ -107,6 +110,30 @@ def test_the_kernels_are_compiled_before_the_server_is_ready(tmp_path: Path) -> 
         "count_within",
     } <= named
     assert sorted(path.name for path in kernels.rglob("*.nb[ci]")) == ready
+
+
+def test_the_settings_are_in_the_environment_while_workers_are_started(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Flags are nowhere else where a worker could find them."""
+    settings = deploy(tmp_path, workers=2, port=free_port(), queue_limit=7).settings
+    seen: dict[str, str] = {}
+
+    class Workers:
+        gave_up = False
+
+        def __init__(self, config: uvicorn.Config, sockets: list[socket.socket]) -> None:
+            for each in sockets:
+                each.close()
+
+        def run(self) -> None:
+            seen.update(os.environ)
+
+    monkeypatch.setattr("api.supervisor.Workers", Workers)
+    run_server(settings)
+    assert {name: seen.get(name) for name in environment_of(settings)} == environment_of(settings)
+    assert seen["VEILFACE_QUEUE_LIMIT"] == "7"
+    assert "VEILFACE_QUEUE_LIMIT" not in os.environ
 
 
 @pytest.mark.usefixtures("http")

@@ -32,7 +32,7 @@ class Proxy:
         return b"\n".join(bytes(each) for each in list(self._connections))
 
     def taken(self) -> bytes:
-        """Return :attr:`sent` and forget it, once every client has hung up and was read to its end.
+        """Return :attr:`sent` and forget it, once every connection is over.
 
         A service may answer before it has the whole request, and so may a client go on.
         """
@@ -75,10 +75,10 @@ class Proxy:
             service = socket.create_connection(("127.0.0.1", self._target))
             up = threading.Thread(target=self._up, args=(client, service, kept), daemon=True)
             down = threading.Thread(target=self._down, args=(service, client), daemon=True)
-            self._ups.append(up)
             for pump in (up, down):
-                self._threads.append(pump)
                 pump.start()
+                self._threads.append(pump)
+            self._ups.append(up)
 
     def _up(self, client: socket.socket, service: socket.socket, kept: bytearray) -> None:
         with contextlib.suppress(OSError):
