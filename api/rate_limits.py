@@ -16,6 +16,7 @@ import time
 from collections.abc import Callable
 from typing import Any, Protocol
 
+import anyio
 import limits
 from limits.aio.storage import MemoryStorage, RedisStorage
 from limits.aio.strategies import SlidingWindowCounterRateLimiter
@@ -296,4 +297,10 @@ async def _hit(
     if await limiter.hit(limit, kind, identity):
         return None
     window = await limiter.get_window_stats(limit, kind, identity)
-    return window.reset_time - time.time()
+    wait = window.reset_time - time.time()
+    if wait <= 0 and not window.remaining:
+        # In the very first millisecond of a window, limits takes its end for its beginning.
+        await anyio.sleep(0.002)
+        window = await limiter.get_window_stats(limit, kind, identity)
+        wait = window.reset_time - time.time()
+    return wait

@@ -123,6 +123,30 @@ def test_the_next_one_is_refused_and_told_how_long_to_wait(make: Make) -> None:
     anyio.run(scenario)
 
 
+def test_the_wait_is_right_in_the_first_millisecond_of_a_window() -> None:
+    """All at once, Redis' clock standing still: it counts whole milliseconds."""
+
+    class Standing(InProcess):
+        def __init__(self) -> None:
+            super().__init__()
+            self._counters.get_sliding_window = self._window  # type: ignore[method-assign]
+            self.asked = 0
+
+        async def _window(self, key: str, expiry: int) -> tuple[int, float, int, float]:
+            self.asked += 1
+            return 0, 0.0, 3, 2.0 * expiry - (0.0 if self.asked == 1 else 0.002)
+
+    async def scenario() -> None:
+        async with limited(Standing(), key="3/100 second") as rates:
+            for _ in range(3):
+                await rates.count_key("a")
+            refused = await refusal(rates.count_key("a"))
+            assert refused is not None
+            assert refused.headers["Retry-After"] == "100"
+
+    anyio.run(scenario)
+
+
 def test_exactly_as_many_pass_as_may_however_many_come_at_once(make: Make) -> None:
     outcomes: Counter[str] = Counter()
 
