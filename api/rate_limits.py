@@ -297,10 +297,8 @@ async def _hit(
     if await limiter.hit(limit, kind, identity):
         return None
     window = await limiter.get_window_stats(limit, kind, identity)
-    wait = window.reset_time - time.time()
-    if wait <= 0 and not window.remaining:
+    if not window.remaining and window.reset_time <= time.time():
         # In the very first millisecond of a window, limits takes its end for its beginning.
         await anyio.sleep(0.002)
         window = await limiter.get_window_stats(limit, kind, identity)
-        wait = window.reset_time - time.time()
-    return wait
+    return window.reset_time - time.time()

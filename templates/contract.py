@@ -136,7 +136,7 @@ class Contract:
                 raise ContractError("a calibration_id is not the hash of its calibration")
         object.__setattr__(self, "calibrations", identified)
 
-    @cached_property
+    @property
     def contract_id(self) -> str:
         """SHA-256 of the binding's canonical JSON."""
         return self.binding.contract_id
