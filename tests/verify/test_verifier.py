@@ -91,7 +91,8 @@ def test_decision_agrees_with_brute_force(
     assert decision.similarity == pytest.approx(similarity, abs=1e-5)
     assert decision.distance == pytest.approx(np.sqrt(2 - 2 * similarity), abs=1e-4)
     assert decision.cohort_score == pytest.approx(z, abs=1e-3)
-    assert z == pytest.approx(score(contract.cohort), rel=3e-3)
+    # A score counts standard deviations; a stranger's may be near 0, where a share is nothing.
+    assert z == pytest.approx(score(contract.cohort), rel=3e-3, abs=3e-3)
     calibration = contract.calibration("p2s")
     rule = calibration.level(level or "fmr-1e-3")
     assert decision.accepted == (
