@@ -7,6 +7,7 @@ import threading
 from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
 from functools import partial
+from importlib.metadata import version
 from typing import Any
 
 import anyio
@@ -29,13 +30,13 @@ from api.metrics import count_lockout, join_shared_directory, set_build
 from api.openapi import DESCRIPTION, allowed_methods
 from api.opening import retention_of
 from api.operations import (
-    HTTP_PROTOCOL,
     OPERATIONS_PATHS,
     Readiness,
     not_ready_once_told_to_stop,
     operations_server,
     tls_options,
 )
+from api.protocol import Protocol
 from api.rate_limits import RateLimits
 from api.routes import (
     contract,
@@ -59,7 +60,7 @@ from templates.distances import warm_up
 from templates.errors import VeilfaceError
 from verify.cohort import rounded_cohort
 
-VERSION = "0.1.0"
+VERSION = version("veilface")
 GRACE_S = 20
 IMPORT_S = 60
 """Seconds in which a worker must show that it lives. It cannot before it has imported everything,
@@ -177,6 +178,9 @@ async def _open(
         contract_id=runtime.contract.contract_id,
         pack=None if runtime.pack is None else runtime.pack.info.name,
     )
+    if (warning := await anyio.to_thread.run_sync(runtime.superseded_calibrations)) is not None:
+        log(warning, severity=logging.WARNING, contract_id=runtime.contract.contract_id)
+    await anyio.to_thread.run_sync(runtime.note_calibrations)
     # No request is answered before this is done, so none waits for the compiler.
     await anyio.to_thread.run_sync(warm_up)
     await anyio.to_thread.run_sync(rounded_cohort, runtime.contract.cohort)
@@ -229,7 +233,7 @@ def uvicorn_options(settings: Settings) -> dict[str, Any]:
         "port": settings.port,
         "log_config": uvicorn_log_config("warning" if settings.log_level == "info" else "info"),
         "access_log": False,
-        "http": HTTP_PROTOCOL,
+        "http": Protocol,
         "server_header": False,
         "date_header": True,
         "timeout_graceful_shutdown": GRACE_S,

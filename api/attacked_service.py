@@ -74,12 +74,13 @@ def attacked_service(
             source.save(folder / "decoys.veil", file_sealer(keyring))
         quoted = str(folder).replace("\\", "\\\\").replace('"', '\\"')
         (folder / "veilface.toml").write_text(
-            f'data_dir = "{quoted}"\n{UNLIMITED}', encoding="utf-8"
+            f'data_dir = "{quoted}"\nmaster_key_file = "{quoted}/master.key"\n{UNLIMITED}',
+            encoding="utf-8",
         )
         with running_service(folder) as client:
-            subjects = [_enroll(client, i, wire) for i, wire in enumerate(templates)]
             store = TemplateStore(f"sqlite:///{folder / 'veilface.db'}", keyring)
             try:
+                store.tenants.set_template_enrollment(_TENANT, True)
                 rights = [Right.VERIFY, Right.EMBEDDINGS]
                 tokens = [
                     store.api_keys.create(_TENANT, chosen, label=label, expires_at=None).token
@@ -90,6 +91,7 @@ def attacked_service(
                 ]
             finally:
                 store.close()
+            subjects = [_enroll(client, i, wire) for i, wire in enumerate(templates)]
             with_scores, without = (
                 [_asker(client, subject, token) for subject in subjects] for token in tokens
             )

@@ -29,6 +29,7 @@ class Caller:
     tenant: str
     rights: frozenset[str]
     token: str = field(repr=False, compare=False)
+    lowest_level: str | None = None
 
     @property
     def probe_key(self) -> bytes:
@@ -93,6 +94,7 @@ async def caller(
         tenant=found.tenant,
         rights=frozenset(map(str, found.rights)),
         token=token,
+        lowest_level=found.lowest_level,
     )
 
 

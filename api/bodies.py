@@ -194,14 +194,34 @@ async def read_json(request: Request, *, max_bytes: int, timeout_s: float) -> di
         )
     try:
         if len(body) > MAX_PARSED_AT_ONCE:
-            value = await anyio.to_thread.run_sync(json.loads, body)
+            value = await anyio.to_thread.run_sync(parse_json, body)
         else:
-            value = json.loads(body)
+            value = parse_json(body)
     except (ValueError, RecursionError):
-        raise ApiError("malformed_request", "the body is not well-formed JSON") from None
+        raise ApiError(
+            "malformed_request", "the body is not well-formed JSON, or names a field twice"
+        ) from None
     if not isinstance(value, dict):
         raise ApiError("malformed_request", "the body must be a JSON object")
     return value
+
+
+def parse_json(text: str | bytes) -> Any:
+    """Parse JSON in which no object names a field twice: readers differ in which one counts.
+
+    Raises
+    ------
+    ValueError, RecursionError
+        It is no such JSON.
+    """
+    return json.loads(text, object_pairs_hook=_unique)
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    fields = dict(pairs)
+    if len(fields) != len(pairs):
+        raise ValueError("a field is named twice")
+    return fields
 
 
 class _arrives_within:

@@ -22,10 +22,10 @@ import httpx
 
 from api.demo_cast import ENROLLED_PHOTOS, PROBE_PHOTOS, Cast, Scale, drawn_cast, found_cast
 from api.demo_service import running_service
-from api.demo_storage import Stored, read_stored, rows_of
+from api.demo_storage import KEY_FILE, Stored, read_stored, rows_of
 from api.errors import StartError
 from api.opening import file_sealer
-from api.preparation import calibrate_folder, make_generator
+from api.preparation import calibrate_folder, default_probe_dims, make_generator
 from api.receipts import verify_answer
 from models.demo import build_demo_pack, is_demo_model
 from models.extraction import Extraction, Extractor
@@ -172,9 +172,11 @@ def _calibrate(
         source=generator,
         strategy=Strategy.ADVERSARIAL,
         m=m,
-        options=CalibrationOptions(photos_per_enrollment=ENROLLED_PHOTOS),
+        options=CalibrationOptions(
+            photos_per_enrollment=ENROLLED_PHOTOS, probe_dims=(0, *default_probe_dims(m))
+        ),
     )
-    keyring = MasterKeyring.create(folder / "master.key")
+    keyring = MasterKeyring.create(folder / KEY_FILE)
     done.contract.save(folder / "contract.json", file_sealer(keyring))
     return done.contract
 
@@ -191,7 +193,13 @@ def _write_settings(folder: Path, pack: Path) -> None:
         text = str(path.resolve()).replace("\\", "\\\\").replace('"', '\\"')
         return f'"{text}"'
 
-    lines = [MARKER, f"data_dir = {quoted(folder)}", f"pack = {quoted(pack)}"]
+    lines = [
+        MARKER,
+        f"data_dir = {quoted(folder)}",
+        "# Beside the database only here: a deployment keeps the two apart.",
+        f"master_key_file = {quoted(folder / KEY_FILE)}",
+        f"pack = {quoted(pack)}",
+    ]
     if is_demo_model(ModelPack.load(pack, threads=1).info.embedder_sha256):
         lines.append("demo = true")
     (folder / "veilface.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -11,6 +11,7 @@ from templates.sealing import MasterKeyring
 from templates.store import TemplateStore
 
 TENANT = "default"
+KEY_FILE = "master.key"
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,7 @@ class Stored:
 def read_stored(folder: Path, names: Sequence[str]) -> tuple[Stored, ...]:
     """Read the database's file as a thief would, and open it with the master key beside that."""
     url = f"sqlite:///{(folder / 'veilface.db').resolve()}"
-    store = TemplateStore(url, MasterKeyring.load(folder / "master.key"))
+    store = TemplateStore(url, MasterKeyring.load(folder / KEY_FILE))
     found = []
     try:
         for name in names:

@@ -27,6 +27,7 @@ from templates.store.idempotency import IdempotencyConflict
 from templates.store.identifiers import InvalidIdentifier, UnknownTenant
 from templates.store.lockout import LockedOut, Replayed
 from templates.store.tenants import RetiredRotation
+from templates.store.transfers import ExportSuperseded
 
 
 class StartError(VeilfaceError):
@@ -49,7 +50,11 @@ class ErrorCode:
 ERROR_CODES: dict[str, ErrorCode] = {
     entry.code: entry
     for entry in (
-        ErrorCode("malformed_request", 400, "The body is not what its content type says."),
+        ErrorCode(
+            "malformed_request",
+            400,
+            "The body is not what its content type says, or the request is not well-formed HTTP.",
+        ),
         ErrorCode("unsupported_image", 400, "The photo cannot be decoded, or not safely."),
         ErrorCode("invalid_template", 400, "The template's bytes break the format or its limits."),
         ErrorCode("invalid_embedding", 400, "The embedding is no finite unit vector of n numbers."),
@@ -59,7 +64,11 @@ ERROR_CODES: dict[str, ErrorCode] = {
             "No API key, one that is unknown or revoked, or a probe whose `hmac` is wrong.",
         ),
         ErrorCode("replayed", 401, "The signed probe was seen before, or its time has passed."),
-        ErrorCode("forbidden", 403, "The API key lacks the right that the call needs."),
+        ErrorCode(
+            "forbidden",
+            403,
+            "The API key lacks the right, asks below the lowest level, or the tenant forbids it.",
+        ),
         ErrorCode("not_enrolled", 404, "The tenant has no such subject."),
         ErrorCode("not_found", 404, "No such path, or nothing to return there."),
         ErrorCode("method_not_allowed", 405, "The path exists, but not with this method."),
@@ -68,6 +77,11 @@ ERROR_CODES: dict[str, ErrorCode] = {
             "idempotency_conflict",
             409,
             "The Idempotency-Key was used for another request, or its first request still runs.",
+        ),
+        ErrorCode(
+            "export_superseded",
+            409,
+            "The subject was erased, or enrolled again, after the export was made.",
         ),
         ErrorCode("image_too_large", 413, "The photo has too many bytes or pixels."),
         ErrorCode("request_too_large", 413, "The request body has too many bytes."),
@@ -132,10 +146,9 @@ def api_error(error: Exception) -> ApiError | None:
         if known is None:
             return None
         details = {"image": error.index, **known.details}
-        return ApiError(known.code, f"photo {error.index}: {known.message}", details, known.headers)
+        return ApiError(known.code, f"{error.place}: {known.message}", details, known.headers)
     if isinstance(error, InconsistentImages):
-        pairs = [list(pair) for pair in error.pairs]
-        return ApiError("inconsistent_images", str(error), {"pairs": pairs})
+        return ApiError("inconsistent_images", str(error), {"photos": list(error.photos)})
     if isinstance(error, ImageError | FaceError):
         details = plain_details(getattr(error, "details", {}))
         return ApiError(error.code, str(error), details)
@@ -170,6 +183,7 @@ _TABLE: tuple[tuple[type[Exception], str, str | None], ...] = (
     (SealError, "store_unavailable", "what is stored cannot be opened with the master key"),
     (InvalidIdentifier, "validation_failed", None),
     (IdempotencyConflict, "idempotency_conflict", None),
+    (ExportSuperseded, "export_superseded", None),
     (Replayed, "replayed", None),
     (RetiredRotation, "store_unavailable", "the tenant's rotation is being renewed; send it again"),
     # The key was good a moment ago: its tenant was erased meanwhile.

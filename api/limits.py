@@ -1,7 +1,6 @@
 """Limits before allocation: how much of a body is read, for how long, and what waits for a turn."""
 
-import time
-from collections import Counter
+from collections import Counter, OrderedDict, deque
 from collections.abc import AsyncGenerator, AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import TypeVar
@@ -20,8 +19,8 @@ MAX_WAITING_QUERIES = 256
 """Requests that may wait for their turn to ask the database, most of all whose API key it is."""
 
 RETRY_AFTER_S = 1
-SEEN_S = 60.0
-"""Seconds for which a key that asked counts as one that shares the places for bodies."""
+SHARE = 3
+"""Times as many places for bodies as are left that one API key may take."""
 
 T = TypeVar("T")
 
@@ -66,6 +65,71 @@ async def read_limited(request: Request, limit: int) -> bytes:
     return bytes(body)
 
 
+class Slots:
+    """Compute slots, which go round the keys that wait for one.
+
+    A key's own requests get theirs in the order they came. So a key with many requests delays one
+    of another key by at most what runs, and by one turn for each other key that waits.
+
+    Parameters
+    ----------
+    count
+        Turns that may be taken at the same time.
+    """
+
+    def __init__(self, count: int) -> None:
+        self._count = self._free = count
+        self._waiting: OrderedDict[str, deque[anyio.Event]] = OrderedDict()
+
+    @property
+    def taken(self) -> int:
+        """Turns that are taken now."""
+        return self._count - self._free
+
+    @property
+    def waiting(self) -> int:
+        """Turns that are waited for now."""
+        return sum(map(len, self._waiting.values()))
+
+    @asynccontextmanager
+    async def turn(self, key: str) -> AsyncIterator[None]:
+        """Wait for a slot, and hold it."""
+        if self._free:
+            self._free -= 1
+        else:
+            await self._wait(key)
+        try:
+            yield
+        finally:
+            self._pass_on()
+
+    async def _wait(self, key: str) -> None:
+        given = anyio.Event()
+        self._waiting.setdefault(key, deque()).append(given)
+        COMPUTE_WAITING.inc()
+        try:
+            await given.wait()
+        except BaseException:
+            if given.is_set():  # and nobody will take it
+                self._pass_on()
+            else:
+                self._waiting[key].remove(given)
+                if not self._waiting[key]:
+                    del self._waiting[key]
+            raise
+        finally:
+            COMPUTE_WAITING.dec()
+
+    def _pass_on(self) -> None:
+        if not self._waiting:
+            self._free += 1
+            return
+        key, turns = self._waiting.popitem(last=False)
+        turns.popleft().set()
+        if turns:
+            self._waiting[key] = turns
+
+
 class Gate:
     """Lets a bounded number of requests into one worker, and fewer of them compute at a time.
 
@@ -79,34 +143,31 @@ class Gate:
     """
 
     def __init__(self, *, slots: int, waiting: int) -> None:
-        self._slots = anyio.CapacityLimiter(slots)
+        self._slots = Slots(slots)
         # Never short of threads: it has one for each slot.
         self._threads = anyio.CapacityLimiter(slots)
         self._queries = anyio.CapacityLimiter(max(4, 2 * slots))
         self._room = slots + waiting
-        self._share = max(1, 3 * self._room // 4)
-        self._held: Counter[str] = Counter()
-        self._seen: dict[str, float] = {}
+        self._places: Counter[str] = Counter()
         self._asking = 0
-        self._waiting = 0
 
     @property
     def computing(self) -> int:
         """Requests that compute now."""
-        return int(self._slots.borrowed_tokens)
+        return self._slots.taken
 
     @property
     def waiting(self) -> int:
         """Requests that wait for a compute slot now."""
-        return self._waiting
+        return self._slots.waiting
 
     @asynccontextmanager
     async def admitted(self, key: str) -> AsyncIterator[None]:
-        """Hold a place from before the body is read until the answer is known.
+        """Take a place from before the body is read until the answer is known.
 
-        One API key may take all places while it is alone. Once another one asked within the last
-        minute, in vain or not, no key gets more than three quarters of them: who sends many bodies
-        slowly keeps nobody else out.
+        A key that has places gets another one only while it would have at most three times as many
+        as are then left. So one key alone gets three quarters of them, several get equal shares,
+        and there is always a place for a key that has none, until there are as many keys as places.
 
         Parameters
         ----------
@@ -118,41 +179,29 @@ class Gate:
         ApiError
             ``overloaded``, with ``Retry-After``.
         """
-        now = time.monotonic()
-        self._seen[key] = now
-        self._seen = {name: at for name, at in self._seen.items() if now - at < SEEN_S}
-        if self._room <= 0 or (len(self._seen) > 1 and self._held[key] >= self._share):
+        taken, left = self._places[key] + 1, self._room - 1
+        if left < 0 or (taken > 1 and taken > SHARE * left):
             raise overloaded()
-        self._room -= 1
-        self._held[key] += 1
+        self._room = left
+        self._places[key] = taken
         try:
             yield
         finally:
             self._room += 1
-            self._held[key] -= 1
-            if not self._held[key]:
-                del self._held[key]
+            self._places[key] -= 1
+            if not self._places[key]:
+                del self._places[key]
 
-    async def compute(self, work: Callable[[], T]) -> T:
-        """Run ``work`` in a thread, once a slot is free."""
-        turn = object()
-        try:
-            self._slots.acquire_on_behalf_of_nowait(turn)
-        except anyio.WouldBlock:
-            await self._wait_for_a_slot(turn)
-        try:
+    async def compute(self, work: Callable[[], T], *, key: str) -> T:
+        """Run ``work`` in a thread, once it is the turn of ``key``.
+
+        Parameters
+        ----------
+        key
+            Prefix of the API key; where there is none, what else names who asks.
+        """
+        async with self._slots.turn(key):
             return await anyio.to_thread.run_sync(work, limiter=self._threads)
-        finally:
-            self._slots.release_on_behalf_of(turn)
-
-    async def _wait_for_a_slot(self, turn: object) -> None:
-        self._waiting += 1
-        COMPUTE_WAITING.inc()
-        try:
-            await self._slots.acquire_on_behalf_of(turn)
-        finally:
-            self._waiting -= 1
-            COMPUTE_WAITING.dec()
 
     async def query(self, work: Callable[[], T]) -> T:
         """Run ``work``, which asks the database and computes little, in a thread.

@@ -70,7 +70,9 @@ def _text(description: str, **extra: Any) -> dict[str, Any]:
     return {"type": "string", "description": description, **extra}
 
 
-LEVEL = _text("Security level; default from the contract.", examples=["fmr-1e-3"])
+LEVEL = _text(
+    "Security level; default from the contract, or the lowest allowed.", examples=["fmr-1e-3"]
+)
 FACE = _text(
     "Which face counts when a photo shows several: none (`single`, the default: the photo is "
     "refused), or the first by rank (`largest`), which is large and near the middle: area − "
@@ -142,7 +144,15 @@ IMPORT_BODY = _body(
         "schema": {
             "type": "object",
             "required": ["export"],
-            "properties": {"export": _text("`export` of an export call.")},
+            "properties": {
+                "export": _text("`export` of an export call."),
+                "restore": {
+                    "type": "boolean",
+                    "default": False,
+                    "description": "Import it though the subject was erased or enrolled again "
+                    "since; needs the right `admin`.",
+                },
+            },
         },
         "examples": {"import": {"value": {"export": "VkZYMS4uLg=="}}},
     },

@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 from sqlalchemy import inspect, select
 from sqlalchemy.engine import Connection, make_url
-from sqlalchemy.exc import ArgumentError
 
 from api.errors import DatabaseAway, StartError
 from api.settings import Settings
@@ -84,7 +83,6 @@ def open_keyring(settings: Settings) -> MasterKeyring:
         if path.exists():
             return MasterKeyring.load(path)
         _require_unused(settings.resolved_database_url, path)
-        path.parent.mkdir(parents=True, exist_ok=True)
         return _create_or_load(path)
     except StartError:
         raise
@@ -92,11 +90,25 @@ def open_keyring(settings: Settings) -> MasterKeyring:
         raise StartError(f"the master key file {path} cannot be used: {error}") from error
 
 
+def key_beside_database(settings: Settings) -> str | None:
+    """Say that the master key lies in the folder of an SQLite database, or None."""
+    if settings.master_key_variable is not None or settings.master_key_command is not None:
+        return None
+    url = make_url(settings.resolved_database_url)
+    if url.get_backend_name() != "sqlite" or not url.database:
+        return None
+    path = settings.resolved_master_key_file
+    if Path(url.database).resolve().parent != path.resolve().parent:
+        return None
+    return (
+        f"the master key file {path} lies in the folder of the database, and so in every copy of "
+        "that folder: move it elsewhere, and name the place in the setting master_key_file"
+    )
+
+
 def _require_unused(url: str, path: Path) -> None:
     try:
         in_use = database_in_use(url)
-    except ArgumentError:
-        raise StartError("the database URL cannot be read (setting database_url)") from None
     except (OSError, VeilfaceError) as error:
         raise StartError(
             f"there is no master key file {path}, and none is made while the database cannot be "

@@ -6,6 +6,7 @@ import ssl
 import stat
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
+from functools import partial
 from typing import Any
 
 import anyio
@@ -17,6 +18,7 @@ from api.limits import Gate
 from api.logging import log
 from api.metrics import MODEL_UP, STORE_UP
 from api.opening import try_inference
+from api.protocol import Protocol
 from api.settings import Settings
 from api.supervised import told_to_stop
 from models.errors import ModelError
@@ -28,9 +30,6 @@ from templates.store.tenants import RetiredRotation
 
 OPERATIONS_PATHS = frozenset({"/health/live", "/health/ready", "/metrics"})
 WATCH_S = 5.0
-HTTP_PROTOCOL = "h11"
-"""Of both ports. uvicorn would take httptools where it is installed, which bounds no headers."""
-
 CIPHERS = "ECDHE+AESGCM:ECDHE+CHACHA20"
 """Of TLS 1.2: forward secrecy and authenticated encryption. Those of TLS 1.3 are all like that."""
 
@@ -96,7 +95,7 @@ class Readiness:
         try:
             await self._gate.query(self._store.ping)
             await self._again("store", lambda: self._store.ping_write(), self._gate.query)
-            await self._again("model", self._infer, self._gate.compute)
+            await self._again("model", self._infer, partial(self._gate.compute, key=""))
         except Exception as error:
             self.note(error)
             raise
@@ -197,7 +196,7 @@ async def operations_server(app: ASGIApp, *, host: str, port: int) -> AsyncItera
     config = uvicorn.Config(
         app,
         lifespan="off",
-        http=HTTP_PROTOCOL,
+        http=Protocol,
         log_config=None,
         access_log=False,
         server_header=False,

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from api.errors import ApiError
+from api.levels import Levels
 from api.opening import (
     file_sealer,
     open_contract,
@@ -44,8 +45,8 @@ from templates.randomness import Keystream
 from templates.rotation import tenant_rotation
 from templates.sealing import MasterKeyring
 from templates.store import TemplateStore
-from templates.store.audit_log import By, Entry
-from templates.store.subjects import Source, StoredTemplate, SubjectTemplate
+from templates.store.audit_log import By
+from templates.store.subjects import Guard, Source, StoredTemplate, SubjectTemplate
 from templates.store.tenants import RetiredRotation
 from verify import Verifier
 
@@ -64,6 +65,11 @@ __all__ = [
 
 READS = 3
 """Looks at a template whose rotation may be dropped between the looks at the two."""
+
+SUPERSEDED_CALIBRATIONS = (
+    "the calibrations of the contract file are older ones: others of the same contract were served "
+    "since; put the newer contract file back, or calibrate again"
+)
 
 TENANTS_KEPT = 64
 """Tenants whose rotations a process keeps: 2 MB each where n = 512."""
@@ -125,6 +131,7 @@ class Runtime:
     )
 
     def __post_init__(self) -> None:
+        self.levels = Levels(self.contract, lowest=self.settings.lowest_level)
         self.stand_ins = StandIns(
             self.contract, self.keyring, key=self.store.secrets.get(STAND_IN_SECRET)
         )
@@ -154,6 +161,21 @@ class Runtime:
         else:
             export_key = ExportKey.from_secret(store.secrets.get("export"))
         return cls(settings, keyring, store, contract, source, pack, export_key)
+
+    def superseded_calibrations(self) -> str | None:
+        """Return what to tell the operator of a contract file that is older than one served."""
+        if not self.store.known_calibrations.are_superseded(*self._calibrations):
+            return None
+        return SUPERSEDED_CALIBRATIONS
+
+    def note_calibrations(self) -> None:
+        """Remember the contract's calibrations as served."""
+        self.store.known_calibrations.note(*self._calibrations)
+
+    @property
+    def _calibrations(self) -> tuple[str, list[str]]:
+        contract = self.contract
+        return contract.contract_id, [each.calibration_id for each in contract.calibrations]
 
     def epoch(self, tenant: str) -> int:
         """Return the epoch of the rotation that the tenant's new templates are in."""
@@ -217,6 +239,24 @@ class Runtime:
         if self.source is None and self.contract.binding.strategy is not Strategy.RANDOM:
             raise _lacking("decoys file")
 
+    def require_template_enrollment(self, tenant: str) -> None:
+        """Refuse a template that a client made, unless the operator lets the tenant enroll them.
+
+        Asked of the database every time, so that a change counts at once in all workers.
+
+        Raises
+        ------
+        ApiError
+            ``forbidden``.
+        """
+        if not self.store.tenants.get(tenant).template_enrollment:
+            raise ApiError(
+                "forbidden",
+                "this tenant does not take templates that clients made: enroll photos, or ask the "
+                "operator to allow it (`veilface db template-enrollment --allow`)",
+                {"tenant_setting": "template_enrollment"},
+            )
+
     @property
     def image_limits(self) -> ImageLimits:
         """What a photo may cost before it is decoded, by the settings."""
@@ -246,8 +286,9 @@ class Runtime:
         source: Source,
         photos: int,
         by: By,
+        guard: Guard | None = None,
     ) -> StoredTemplate:
-        """Store an enrollment in place of an earlier one."""
+        """Store an enrollment in place of an earlier one; `guard` as for ``TemplateStore.put``."""
         binding = self.contract.binding
         return self.store.put(
             tenant,
@@ -261,6 +302,7 @@ class Runtime:
             photos=photos,
             template_id=enrollment.template_id,
             rotation_epoch=epoch,
+            guard=guard,
             by=by,
         )
 
@@ -289,12 +331,11 @@ class Runtime:
             source=str(found.record.source),
             photos=found.record.photos,
             wire=wire.encode(plain, contract_id=self.contract.contract_id, dtype="float32"),
+            stamp=self.store.transfers.stamp(
+                tenant, subject, template_id=found.record.template_id, by=by
+            ),
         )
-        sealed = seal_export(exported, key=self.export_key, tenant=tenant)
-        self.store.audit_log.record(
-            Entry("export", "exported", by, tenant, self.store.pseudonym(tenant, subject))
-        )
-        return sealed
+        return seal_export(exported, key=self.export_key, tenant=tenant)
 
     def close(self) -> None:
         """Let go of the database's connections."""

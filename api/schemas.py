@@ -64,7 +64,9 @@ class VerifyRequest(_Shape):
 
     embedding: list[float] | None = Field(None, description="Unit-norm, of the contract's n.")
     template: str | None = Field(None, description="Base64 of a lifted probe's wire bytes.")
-    level: str | None = Field(None, description="Security level; default from the contract.")
+    level: str | None = Field(
+        None, description="Security level; default from the contract, or the lowest allowed."
+    )
     nonce: str = Field(
         pattern="^[A-Za-z0-9_-]{16,64}$",
         description="Drawn at random for this probe; a second use is refused.",
@@ -209,11 +211,15 @@ class ContractAnswer(_Answer):
     calibrations: list[dict[str, Any]]
     default_level: str
     photo_consistency: float
+    template_stranger_score: float
     template_foot_point_norm: list[float]
     cohort_size: int
     cohort_id: str
     photos: bool = Field(description="The service runs with a model pack.")
     generator: bool = Field(description="GET /v1/contract/generator has a generator to give.")
+    template_enrollment: bool = Field(
+        description="The key's tenant takes templates that clients made."
+    )
     receipt_key: ReceiptKey
 
 
@@ -223,6 +229,11 @@ class KeyAnswer(_Answer):
     prefix: str = Field(description="How lists and logs name the key.", examples=["0f3a5c7e9b1d"])
     tenant: str = Field(examples=["default"])
     rights: list[Literal["enroll", "verify", "erase", "export", "scores", "embeddings", "admin"]]
+    levels: list[str] = Field(
+        description="Security levels that it may ask for; not those below the lowest that the "
+        "deployment or the key allows.",
+        examples=[["fmr-1e-3", "fmr-1e-4"]],
+    )
     expires_at: str | None = Field(examples=["2026-01-31T12:00:00Z"])
     demo: bool = Field(description="The service runs with the demo model.")
 

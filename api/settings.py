@@ -24,6 +24,7 @@ from pydantic_settings import (
 )
 
 from api.errors import StartError
+from templates.levels import LEVEL_NAME
 
 ENV_PREFIX = "VEILFACE_"
 CONFIG_VARIABLE = "VEILFACE_CONFIG"
@@ -58,7 +59,8 @@ class Settings(BaseSettings):
     )
 
     data_dir: Path = Field(
-        Path("veilface-data"), description="Folder for everything that Veilface keeps."
+        Path("veilface-data"),
+        description="Folder for everything that Veilface keeps, but for the master key.",
     )
     database_url: str | None = Field(
         None,
@@ -68,8 +70,10 @@ class Settings(BaseSettings):
     master_key_file: Path | None = Field(
         None,
         description="File with the master keys, mode 0600, one a line, the first is current; "
-        "created at first use while the database is empty. Unset: `master.key` in `data_dir`. "
-        "Without it, nothing that is stored can be read again: keep a copy elsewhere.",
+        "created at first use while the database is empty. Unset: `master.key` in a folder beside "
+        "`data_dir`, of the same name with `-keys` after it; where an earlier version left "
+        "`master.key` in `data_dir` itself, that one. Without it, nothing that is stored can be "
+        "read again: keep a copy elsewhere, and not with the database.",
     )
     master_key_variable: str | None = Field(
         None,
@@ -119,8 +123,8 @@ class Settings(BaseSettings):
         ge=1,
         le=100_000,
         description="Requests with a body that may send it or wait for a compute slot in one "
-        "worker; further ones are answered `overloaded`. With `max_request_bytes` it bounds the "
-        "memory for bodies.",
+        "worker; further ones are answered `overloaded`. One API key gets three quarters of the "
+        "places at most. With `max_request_bytes` it bounds the memory for bodies.",
     )
     max_in_flight: int = Field(
         512,
@@ -175,6 +179,14 @@ class Settings(BaseSettings):
         description="Where requests are counted. `memory://`: in each worker for itself, so that "
         "up to `workers` times the limit may pass. `redis://USER:PASSWORD@HOST/NUMBER` or "
         "`rediss://…`: in one place, for all workers and hosts; needs `veilface[redis]`.",
+    )
+    lowest_level: str | None = Field(
+        None,
+        pattern=f"^{LEVEL_NAME.pattern}$",
+        description="Lowest security level that a verification may ask for, as the contract names "
+        "it: levels of a larger false match rate are answered `forbidden`. Where none is asked, "
+        "the contract's default decides, or this level if the default is below it. Unset: any. An "
+        "API key may have a stricter one of its own.",
     )
     lockout_after: int = Field(
         5,
@@ -276,6 +288,20 @@ class Settings(BaseSettings):
             if not names or not all(isinstance(name, str) and name for name in names):
                 raise ValueError("name at least one provider, for example cpu")
             return names
+        return value
+
+    @field_validator("database_url")
+    @classmethod
+    def _known_database(cls, value: str | None) -> str | None:
+        # Imported here: most commands that read settings ask no database.
+        from templates.errors import StoreError
+        from templates.store.database import checked_url
+
+        if value:
+            try:
+                checked_url(value)
+            except StoreError as error:
+                raise ValueError(str(error)) from None
         return value
 
     @field_validator("rate_limit_key", "rate_limit_address")
@@ -388,8 +414,17 @@ class Settings(BaseSettings):
 
     @property
     def resolved_master_key_file(self) -> Path:
-        """The master key file, with the default filled in."""
-        return self.master_key_file or self.data_dir / "master.key"
+        """The master key file, with the default filled in: not where the database is."""
+        if self.master_key_file is not None:
+            return self.master_key_file
+        # A folder has one key, whatever link leads to it.
+        plain = self.data_dir.name not in ("", "..") and not self.data_dir.is_symlink()
+        data = self.data_dir if plain else self.data_dir.resolve()
+        apart = data.parent / f"{data.name}-keys" / "master.key"
+        of_earlier_version = self.data_dir / "master.key"
+        if of_earlier_version.exists() and not apart.exists():
+            return of_earlier_version
+        return apart
 
     @property
     def resolved_contract_file(self) -> Path:

@@ -1,4 +1,4 @@
-"""Templates of nobody, kept sealed as the store keeps real ones: opening one costs the same."""
+"""Stand-ins of unknown subjects: what opening a real template costs, and what is told of them."""
 
 import hashlib
 import hmac
@@ -9,7 +9,8 @@ from templates.contract import Contract
 from templates.errors import SealError
 from templates.sealing import MasterKeyring, encode_parts
 from templates.store.envelope import Envelope, Owner, close_envelope, open_envelope
-from verify import StandIn, pick_stand_in
+from templates.subspace import AffineSubspace
+from verify import StandIn, lift_stand_in
 
 STAND_IN_SECRET = "stand-ins"  # noqa: S105 - a name, not a secret
 
@@ -20,9 +21,9 @@ class StandIns:
     Parameters
     ----------
     contract
-        Whose cohort they are.
+        Whose strangers they are lifted from.
     keyring
-        What seals them.
+        What seals the template that is opened for all of them, as the store keeps real ones.
     key
         32 secret bytes, the same in all processes: without them nobody can tell which template an
         unknown subject gets.
@@ -35,28 +36,26 @@ class StandIns:
         self._nobody = Owner("", "stand-in", "", contract.contract_id, "", 0)
         self._sealed = self._seal()
 
-    def open(self, tenant: str, subject: str) -> StandIn:
-        """Decrypt the stand-in of a subject: the work that a stored template would have cost."""
+    def lift(self, tenant: str, subject: str) -> AffineSubspace:
+        """Lift the template that an unknown subject's distances are told of."""
         digest = hmac.digest(self._key, encode_parts(tenant, subject), hashlib.sha256)
-        index, mirror = pick_stand_in(self._contract.cohort, digest)
-        try:
-            plain = open_envelope(self._sealed[index], self._nobody, self._keyring)
-        except SealError:
-            # The master key that they were sealed with was retired since.
-            self._sealed = self._seal()
-            plain = open_envelope(self._sealed[index], self._nobody, self._keyring)
-        return StandIn(plain, mirror)
+        return lift_stand_in(self._contract, digest)
 
-    def _seal(self) -> list[Envelope]:
-        contract_id = self._contract.contract_id
-        return [
-            close_envelope(
-                wire.encode(member, contract_id=contract_id, dtype=WIRE_DTYPE),
-                self._nobody,
-                self._keyring,
-            )
-            for member in self._contract.cohort
-        ]
+    def open(self, lifted: AffineSubspace | None) -> StandIn:
+        """Decrypt a template of nobody: the work that a stored one would have cost."""
+        try:
+            plain = open_envelope(self._sealed, self._nobody, self._keyring)
+        except SealError:
+            # The master key that it was sealed with was retired since.
+            self._sealed = self._seal()
+            plain = open_envelope(self._sealed, self._nobody, self._keyring)
+        return StandIn(plain, lifted)
+
+    def _seal(self) -> Envelope:
+        data = wire.encode(
+            self._contract.cohort[0], contract_id=self._contract.contract_id, dtype=WIRE_DTYPE
+        )
+        return close_envelope(data, self._nobody, self._keyring)
 
     def __repr__(self) -> str:
         return "StandIns()"

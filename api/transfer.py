@@ -10,19 +10,26 @@ It holds::
 
     length of the header (4 bytes, big-endian) | header (canonical JSON) | wire bytes
 
+The header tells when the export was made (:class:`templates.store.transfers.Stamp`), so that an old
+one does not undo an erasure or another enrollment; in exports of earlier versions it does not.
+
 The template inside is un-rotated, float32: another tenant's rotation can be put on it, and no
 second rounding to half precision takes place.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from datetime import datetime
 from pathlib import Path
 
 from api.errors import StartError
-from templates.canonical import Fields, canonical_json, parse_object
+from templates.canonical import Fields, Json, canonical_json, parse_object
 from templates.errors import ContractError, ContractMismatch, InvalidTemplate, SealError
 from templates.sealing import MasterKeyring
+from templates.store.audit_chain import Anchor
+from templates.store.identifiers import InvalidIdentifier
 from templates.store.subjects import Source
+from templates.store.transfers import Stamp
 
 MAGIC = b"VEILEXP1"
 CONTRACT_ID_BYTES = 32
@@ -76,25 +83,33 @@ class ExportKey:
 
 @dataclass(frozen=True)
 class Exported:
-    """One subject as it travels: ``wire`` is an un-rotated template."""
+    """One subject as it travels: ``wire`` is an un-rotated template.
+
+    ``stamp`` is None in an export of an earlier version.
+    """
 
     subject_id: str
     contract_id: str
     source: str
     photos: int
     wire: bytes = field(repr=False)
+    stamp: Stamp | None = None
 
 
 def seal_export(exported: Exported, *, key: ExportKey, tenant: str) -> bytes:
     """Encrypt one subject."""
-    header = canonical_json(
-        {
-            "subject_id": exported.subject_id,
-            "contract_id": exported.contract_id,
-            "source": exported.source,
-            "photos": exported.photos,
+    fields: dict[str, Json] = {
+        "subject_id": exported.subject_id,
+        "contract_id": exported.contract_id,
+        "source": exported.source,
+        "photos": exported.photos,
+    }
+    if exported.stamp is not None:
+        fields |= {
+            "exported_at": exported.stamp.at.isoformat(),
+            "audit_line": str(exported.stamp.line),
         }
-    )
+    header = canonical_json(fields)
     plain = len(header).to_bytes(LENGTH_BYTES, "big") + header + exported.wire
     sealed = key.keyring.seal(
         plain, purpose=PURPOSE, bound_to=key._bound_to(exported.contract_id, tenant)
@@ -147,12 +162,23 @@ def _parse(plain: bytes, contract_id: str) -> Exported:
             source=fields.text("source"),
             photos=fields.integer("photos"),
             wire=plain[LENGTH_BYTES + length :],
+            stamp=_stamp(fields) if "exported_at" in parsed else None,
         )
         fields.done()
-    except ContractError as error:
+    except (ContractError, InvalidIdentifier) as error:
         raise InvalidTemplate(f"the export's header is broken: {error}") from None
     if exported.contract_id != contract_id:
         raise InvalidTemplate("the export names one contract outside and another one inside")
     if exported.source not in list(Source) or not 0 <= exported.photos <= 10:
         raise InvalidTemplate("the export's header is not one of a subject")
     return exported
+
+
+def _stamp(fields: Fields) -> Stamp:
+    try:
+        at = datetime.fromisoformat(fields.text("exported_at"))
+    except ValueError:
+        raise ContractError("the export's header: 'exported_at' is not a time") from None
+    if at.tzinfo is None:
+        raise ContractError("the export's header: 'exported_at' is not a time")
+    return Stamp(at, Anchor.parse(fields.text("audit_line")))

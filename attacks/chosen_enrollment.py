@@ -5,7 +5,7 @@ enrolled from photos (``attacks.databases``), but the whole set. The service sto
 under R in a basis of its own drawing, so no row of it is known to be the image of another. What no
 basis changes is the foot point, and the orthogonal projection on the directions: so every product
 of projections, applied to a foot point, gives a pair (x, R x), and some N² pairs of N accounts fix
-R. Not in the paper, which has no rotation; METHOD §4.9 has the measure without accounts.
+R. Not in the paper, which has no rotation; docs/method.md §4.9 has the measure without accounts.
 """
 
 from typing import NamedTuple

@@ -1,10 +1,10 @@
 """Whether templates of one person, held by two tenants, can be told from those of two people.
 
-Without a secret, templates link by what they are for (METHOD §4.9). A secret rotation of each
-tenant leaves of a single template nothing but its foot point's length: two affine subspaces of
-one dimension are images of each other under a rotation exactly if their feet are equally long.
-So ``foot-length`` is all that an attacker with one template of each side can compare. An attacker
-with both whole databases has more: see ``attacks.databases``.
+Without a secret, templates link by what they are for (docs/method.md §4.9). A secret rotation of
+each tenant leaves of a single template nothing but its foot point's length: two affine subspaces of
+one dimension are images of each other under a rotation exactly if their feet are equally long. So
+``foot-length`` is all that an attacker with one template of each side can compare. An attacker with
+both whole databases has more: see ``attacks.databases``.
 """
 
 from collections.abc import Callable, Mapping

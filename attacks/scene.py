@@ -12,20 +12,23 @@ from attacks.outcomes import POOLED, Scheme
 from templates.canonical import Json
 from templates.contract import Binding, Calibration, Contract, Level
 from templates.decoys import DecoyPool, DecoySource
-from templates.distances import Metric
+from templates.distances import DEFAULT_STEPS, Metric
 from templates.errors import Uncalibrated
 from templates.lifting import Strategy
+from templates.nobody import Nobody
 from templates.randomness import Keystream
 from templates.rotation import ROTATION_VERSION
 from templates.subspace import SubspaceBatch
 from verify import CalibrationOptions, calibrate
-from verify.cohort import client_source, make_cohort
+from verify.cohort import client_source, make_cohort, people_like
 from verify.comparisons import Lifter
 from verify.metrics import most_errors, threshold_at_fmr
+from verify.strangers import make_nobody
 
 LIFTED_PROBE_DIM = 8
-"""Dimension of the lifted probes that wolves are tried with: where METHOD §4.7 found them best."""
+"""Dimension of the lifted probes that wolves are tried with, the best of docs/method.md §4.7."""
 _TILE = 1024
+_STRANGERS = 50
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -86,7 +89,7 @@ class Scene:
     def lifted(self) -> Calibration | None:
         """The calibration of lifted probes, of the largest dimension; None where there is none.
 
-        The largest is where lifted wolves open most (METHOD §4.7).
+        The largest is where lifted wolves open most (docs/method.md §4.7).
         """
         found = [each for each in self.contract.calibrations if each.mode == "s2s"]
         return max(found, key=lambda each: each.probe_m, default=None)
@@ -189,6 +192,7 @@ def stage(
         rotation_version=ROTATION_VERSION,
     )
     if contract is None:
+        cohort, nobody = _cohort(cast, chosen, strategy, scheme.dim, seed)
         contract = calibrate(
             cast.calibration,
             cast.names,
@@ -201,7 +205,8 @@ def stage(
                 lifted_impostor_pairs=60_000,
                 seed=seed,
             ),
-            cohort=_cohort(cast, chosen, strategy, scheme.dim, seed),
+            cohort=cohort,
+            nobody=nobody,
             progress=progress,
         ).contract
     elif contract.binding != binding:
@@ -237,8 +242,11 @@ def stage(
 
 def _cohort(
     cast: Cast, source: DecoySource, strategy: Strategy, m: int, seed: int
-) -> SubspaceBatch:
-    """Make the cohort as ``calibrate`` does, of a seed: one audit gives the same figures twice."""
+) -> tuple[SubspaceBatch, Nobody]:
+    """Make the cohort as ``calibrate`` does, of a seed: one audit gives the same figures twice.
+
+    The strangers are few: an audit enrolls no template that a client sent.
+    """
     person = np.unique(cast.names, return_inverse=True)[1]
     means = np.stack(
         [
@@ -246,14 +254,21 @@ def _cohort(
             for one in range(person.max() + 1)
         ]
     )
+    people = np.asarray(means / np.linalg.norm(means, axis=1, keepdims=True), dtype=np.float32)
+    generator = client_source(source)
+    hidden = people_like(generator, people)
     with Keystream.seeded("audit", seed, strategy, m, "cohort") as stream:
-        return make_cohort(
-            client_source(source),
-            strategy=strategy,
-            m=m,
+        cohort = make_cohort(generator, strategy=strategy, m=m, stream=stream, hidden=hidden)
+        nobody = make_nobody(
+            generator,
+            strangers=(hidden,),
+            cohort=cohort,
+            metric=Metric.SPHERICAL,
+            steps=DEFAULT_STEPS,
             stream=stream,
-            people=means / np.linalg.norm(means, axis=1, keepdims=True),
+            size=_STRANGERS,
         )
+    return cohort, nobody
 
 
 def owners_pool(cast: Cast, made_with: str | None) -> DecoyPool:

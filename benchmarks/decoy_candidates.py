@@ -67,7 +67,7 @@ class SampledSource:
 
 
 def gaussian(data: FitData) -> Sampler:
-    """Full covariance of the descriptors (METHOD §3)."""
+    """Full covariance of the descriptors (docs/method.md §7.3)."""
     x = data.x
     return _affine(x.mean(axis=0), _root(np.cov(x, rowvar=False)))
 

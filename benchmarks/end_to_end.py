@@ -309,7 +309,7 @@ def prepare(args: argparse.Namespace, work: Path, env: dict[str, str]) -> None:
     """Decoys and contract by the command line, people of the attempts left out."""
     data = args.data
     cache = ["--cache", args.cache] if args.cache else []
-    probe_dims = ["--probe-dims", str(args.probe_dim)] if args.probe_dim else []
+    probe_dims = ["--probe-dims", str(args.probe_dim or "none")]
     kind = "pool" if args.pool else "generator"
     veilface(
         "decoys", "build", data / "fairface" / "train", "--pack", args.pack,

@@ -100,6 +100,7 @@ def private_outcome(
 def key_of(env: dict[str, str]) -> str:
     """An API key that may enroll and verify, with photos and with templates."""
     rights = [word for each in ("enroll", "verify", "embeddings") for word in ("--right", each)]
+    veilface("db", "template-enrollment", "--allow", env=env)
     token: str = json.loads(veilface("keys", "create", "--json", *rights, env=env))["token"]
     return token
 

@@ -235,7 +235,7 @@ def main() -> None:
     limits = {
         "VEILFACE_RATE_LIMIT_KEY": "off",
         "VEILFACE_RATE_LIMIT_ADDRESS": "off",
-        "VEILFACE_QUEUE_LIMIT": "64",
+        "VEILFACE_QUEUE_LIMIT": "96",
         "VEILFACE_ONNX_THREADS": "1",
     }
     with ExitStack() as stack:

@@ -1,8 +1,8 @@
 """From photos, embeddings or a client's template to the one private template that is stored.
 
 The order matters: the photos' embeddings are averaged first and lifted once, because two lifts of
-one person meet in that person's descriptor (METHOD §4.6). Randomness is fresh for every template
-and dropped with it. The tenant's rotation comes last, so that clients never need it.
+one person meet in that person's descriptor (docs/method.md §4.6). Randomness is fresh for every
+template and dropped with it. The tenant's rotation comes last, so that clients never need it.
 """
 
 import secrets
@@ -18,6 +18,7 @@ from models.errors import ModelError
 from models.pack import FacePolicy, ModelPack
 from models.quality import DEFAULT_QUALITY, QualityLimits
 from templates import wire
+from templates.agreement import weakest_split
 from templates.contract import Contract
 from templates.decoys import Attributes, DecoySource
 from templates.embedding import unit_rows
@@ -129,7 +130,7 @@ class Enroller:
             try:
                 sample = pack.embed_photo(photo, policy=policy, quality=quality, limits=limits)
             except ModelError as error:
-                raise PhotoRejected(index, error) from error
+                raise PhotoRejected(index, error, count=len(photos)) from error
             samples.append(sample)
         return self.from_embeddings(
             np.stack([sample.embedding for sample in samples]),
@@ -158,7 +159,7 @@ class Enroller:
         InvalidEmbedding
             Where an embedding is not a finite unit vector of n numbers.
         InconsistentImages
-            Where two embeddings are less alike than ``photo_consistency``.
+            Where the embeddings part into two groups less alike than ``photo_consistency``.
         """
         rows = unit_rows(embeddings, n=self._contract.binding.n, most=MAX_PHOTOS)
         descriptor = mean_descriptor(rows, consistency=self._contract.photo_consistency)
@@ -179,7 +180,9 @@ class Enroller:
     def from_template(self, data: bytes) -> Enrollment:
         """Enroll a template that a client lifted, in the wire format, un-rotated.
 
-        The set is kept; its basis is drawn anew.
+        The set is kept; its basis is drawn anew. A template that lies near strangers, as a wolf
+        does, is refused. One that was laid through a few dozen people is not: nothing tells it
+        from a lift of one of them.
 
         Raises
         ------
@@ -188,6 +191,26 @@ class Enroller:
         ContractMismatch
             Where the template belongs to another contract.
         """
+        contract, subspace = self._contract, self._received(data)
+        rule = contract.calibrations[0]
+        score = contract.nobody.score(subspace, metric=rule.metric, steps=rule.steps)
+        # NaN is not below the limit either.
+        if not score <= contract.template_stranger_score:
+            raise InvalidTemplate(
+                "the template lies nearer to strangers than the contract recorded of honest ones: "
+                "lift photos of one person with the contract's decoys"
+            )
+        return self._of(subspace)
+
+    def from_export(self, data: bytes) -> Enrollment:
+        """Enroll the template of an export that this service sealed, un-rotated.
+
+        As :meth:`from_template`, for a template that was made of photos by the service itself.
+        """
+        return self._of(self._received(data))
+
+    def _received(self, data: bytes) -> AffineSubspace:
+        """Decode a template, and check whether it is one of the contract."""
         binding = self._contract.binding
         received = wire.decode(data)
         binding.require_contract(received.contract_id, what="the template")
@@ -203,6 +226,9 @@ class Enroller:
                 "the template's foot point is outside the range that the contract recorded: "
                 "lift a unit-norm descriptor with the contract's decoys"
             )
+        return subspace
+
+    def _of(self, subspace: AffineSubspace) -> Enrollment:
         # The client knows its rows. Rotated as they are, they would be pairs (x, R x) of the
         # tenant's rotation for whoever sees them stored; of a fresh basis only the set is known.
         with Keystream.fresh() as stream:
@@ -228,16 +254,13 @@ def mean_descriptor(rows: NDArray[np.float32], *, consistency: float) -> NDArray
     Raises
     ------
     InconsistentImages
-        Where a pair's cosine is below ``consistency``, or the rows cancel.
+        Where the rows part into two groups that agree less than ``consistency``
+        (``templates.agreement``), or cancel.
     """
-    exact = rows.astype(np.float64)
-    cosines = exact @ exact.T
-    first, second = np.triu_indices(len(rows), k=1)
-    differing = cosines[first, second] < consistency
-    mean = exact.mean(axis=0)
+    mean = rows.astype(np.float64).mean(axis=0)
     norm = float(np.linalg.norm(mean))
-    if differing.any() or norm < 1e-6:
-        chosen = differing if differing.any() else np.ones_like(differing)
-        pairs = zip(first[chosen].tolist(), second[chosen].tolist(), strict=True)
-        raise InconsistentImages(list(pairs))
+    if len(rows) > 1:
+        split = weakest_split(rows)
+        if split.agreement < consistency or norm < 1e-6:
+            raise InconsistentImages(split.apart, split.others)
     return np.asarray(mean / norm, dtype=np.float32)

@@ -8,6 +8,8 @@
         └── InconsistentImages    the photos do not show one and the same person
 """
 
+from collections.abc import Sequence
+
 from templates.errors import VeilfaceError
 
 
@@ -21,13 +23,16 @@ class PhotoRejected(EnrollmentError):
     Parameters
     ----------
     index
-        Position of the photo in the request, from 0.
+        Position of the photo in the request, from 0. Words count from 1.
     cause
         The error of the models room, which has its own code and message.
+    count
+        Photos in the request.
     """
 
-    def __init__(self, index: int, cause: Exception) -> None:
-        super().__init__(f"photo {index}: {cause}")
+    def __init__(self, index: int, cause: Exception, *, count: int) -> None:
+        self.place = f"photo {index + 1} of {count}"
+        super().__init__(f"{self.place}: {cause}")
         self.index = index
         self.cause = cause
 
@@ -37,19 +42,40 @@ class InconsistentImages(EnrollmentError):
 
     Parameters
     ----------
-    pairs
-        The pairs of photos, by position from 0, that are less alike than the contract asks.
+    apart, others
+        Positions from 0, ascending: the photos that differ from the others. Where both are as
+        many, either may be the stranger's.
     """
 
-    def __init__(self, pairs: list[tuple[int, int]]) -> None:
-        named = ", ".join(f"{first} and {second}" for first, second in pairs)
-        super().__init__(
-            f"these photos do not look like the same person: {named} (counted from 0); "
-            "send photos of one person only, or clearer ones"
-        )
-        self.pairs = tuple(pairs)
+    def __init__(self, apart: Sequence[int], others: Sequence[int]) -> None:
+        self.apart = tuple(apart)
+        self.others = tuple(others)
+        super().__init__(self.sentence())
 
     @property
     def photos(self) -> tuple[int, ...]:
-        """All photos that occur in a differing pair."""
-        return tuple(sorted({index for pair in self.pairs for index in pair}))
+        """The photos that differ, ascending: all of them where either half may."""
+        if len(self.apart) < len(self.others):
+            return self.apart
+        return tuple(sorted(self.apart + self.others))
+
+    def sentence(self, names: Sequence[str] | None = None) -> str:
+        """Say which photos differ: by their names, else by numbers from 1."""
+        if len(self.apart) == len(self.others) == 1:
+            differing = f"{_listed(self.photos, names)} do not look like the same person"
+        else:
+            verb = "does" if len(self.apart) == 1 else "do"
+            differing = (
+                f"{_listed(self.apart, names)} {verb} not look like the person on "
+                f"{_listed(self.others, names)}"
+            )
+        return f"{differing}; send photos of one person only, or clearer ones"
+
+
+def _listed(positions: Sequence[int], names: Sequence[str] | None) -> str:
+    if names is not None:
+        shown = [names[position] for position in positions]
+    else:
+        shown = [str(position + 1) for position in positions]
+        shown[0] = f"{'photos' if len(shown) > 1 else 'photo'} {shown[0]}"
+    return " and ".join([", ".join(shown[:-1]), shown[-1]] if len(shown) > 1 else shown)

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 from models.errors import PackError
 
 # Left eye, right eye, nose, left and right mouth corner as the viewer sees them, for 112 x 112
-# (FORMATS, "Alignment").
+# (docs/models.md "Detection and alignment").
 TEMPLATE_112: NDArray[np.float64] = np.array(
     [
         [38.2946, 51.6963],

@@ -65,6 +65,15 @@ def ranked(faces: Sequence[Face], image_shape: tuple[int, ...]) -> list[Face]:
     return sorted(faces, key=lambda face: centre_rank(face, image_shape), reverse=True)
 
 
+def intersection_over_union(first: NDArray[np.float32], second: NDArray[np.float32]) -> float:
+    """Shared area of two boxes (x1, y1, x2, y2) over the area they cover together, 0...1."""
+    width = min(first[2], second[2]) - max(first[0], second[0])
+    height = min(first[3], second[3]) - max(first[1], second[1])
+    shared = max(float(width), 0.0) * max(float(height), 0.0)
+    areas = sum(float((box[2] - box[0]) * (box[3] - box[1])) for box in (first, second))
+    return shared / (areas - shared)
+
+
 def non_maximum_suppression(
     boxes: NDArray[np.float32], scores: NDArray[np.float32], *, threshold: float
 ) -> NDArray[np.intp]:

@@ -8,6 +8,10 @@ learnt, and nothing has seen a real face.
 
 **Demo model: not for authentication.** On photos of real people it is little more than a
 comparison of pictures.
+
+It has no detector, because drawn faces come aligned. In its place :func:`require_face` holds the
+edges of a picture against those of the average drawn face, so that a picture of something else is
+refused as one without a face.
 """
 
 import hashlib
@@ -21,6 +25,7 @@ import onnxruntime as ort
 from numpy.typing import NDArray
 from onnx import ModelProto, NodeProto, TensorProto, helper, numpy_helper
 
+from models.errors import NoFace
 from models.synthetic import draw_people
 
 DEMO_NOTICE = "demo model: not for authentication"
@@ -37,6 +42,7 @@ _CELLS = (_SIDE - _CELL) // _STRIDE + 1
 _FLAT = 9e-4  # squared contrast below which a cell is sensor noise: (0.03)^2 on a scale of -1 to 1
 _CENTRE = (56.0, 62.0)  # of the window that keeps background and most hair out
 _WINDOW = (30.0, 42.0)
+_LEAST_ALIKE = 0.30  # cosine to the average face; tests/models/test_demo.py measures both sides
 _AVERAGED = range(10_000_000, 10_000_096)  # people whom no demo and no test enrolls
 _GRID = 1 / 4096  # constants are rounded to it, so that no bit depends on a machine's libm
 _OPSET = 17
@@ -72,11 +78,9 @@ def build_demo_pack(folder: Path) -> Path:
 @cache
 def demo_model_bytes() -> bytes:
     """Build the ONNX file: the same bytes each time, since its SHA-256 stands in contracts."""
-    model = _model(_features(), "features", dimension=None, constants=_feature_constants())
-    mean = _average_features(model.SerializeToString())
     constants = {
         **_feature_constants(),
-        "average": np.asarray(-mean, np.float32),
+        "average": np.asarray(-_average_features(), np.float32),
         "window": _window(),
         "signs": _signs(_DIRECTIONS * _CELLS * _CELLS, DEMO_DIMENSION),
         "scale": np.asarray(1 / 64, np.float32),
@@ -97,6 +101,44 @@ def demo_model_sha256() -> str:
 def is_demo_model(sha256: str) -> bool:
     """Whether an embedder's fingerprint is the demo model's: then show ``DEMO_NOTICE``."""
     return sha256.lower() == demo_model_sha256()
+
+
+def require_face(crop: NDArray[np.uint8]) -> None:
+    """Refuse what is no aligned face, by how alike its edges are to the average drawn face's.
+
+    Which side of an edge is the darker one differs between people, so opposite directions count
+    together; and what every picture has of a direction is taken off.
+
+    Parameters
+    ----------
+    crop
+        RGB uint8, shape (112, 112, 3).
+
+    Raises
+    ------
+    NoFace
+        The cosine is below 0.30. Drawn faces have 0.35 or more, drawn faces that are not aligned,
+        other pictures and noise 0.28 or less.
+    """
+    edges, average = _undirected(_features_of(crop)), _undirected(_average_features())
+    weight = np.square(_window(), dtype=np.float64)
+    both, own, other = (
+        float((weight * product).sum())
+        for product in (edges * average, np.square(edges), np.square(average))
+    )
+    if both < _LEAST_ALIKE * np.sqrt(own * other) or own == 0:
+        raise NoFace(
+            "no drawn face was found, and the demo model sees no other: send one, upright and "
+            "aligned, as the demo draws them"
+        )
+
+
+def _undirected(features: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Edges by undirected direction and cell, (4, 27, 27), less their mean over the window."""
+    half = _DIRECTIONS // 2
+    edges = features[:half].astype(np.float64) + features[half:]
+    weight = np.square(_window(), dtype=np.float64)
+    return np.asarray(edges - (edges * weight).sum(axis=(1, 2), keepdims=True) / weight.sum())
 
 
 def _features() -> list[NodeProto]:
@@ -147,17 +189,30 @@ def _feature_constants() -> dict[str, NDArray[np.generic]]:
     return {"edges": _rounded(edges), "flat": np.asarray([_FLAT], np.float32)}
 
 
-def _average_features(model: bytes) -> NDArray[np.float64]:
-    """Mean features of drawn people: (8, 27, 27), rounded so that its last bits are stable."""
+@cache
+def _feature_session() -> ort.InferenceSession:
+    model = _model(_features(), "features", dimension=None, constants=_feature_constants())
     options = ort.SessionOptions()
     options.intra_op_num_threads = 1  # the order of a sum must not depend on the number of cores
-    session = ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+    return ort.InferenceSession(
+        model.SerializeToString(), options, providers=["CPUExecutionProvider"]
+    )
+
+
+@cache
+def _average_features() -> NDArray[np.float64]:
+    """Mean features of drawn people: (8, 27, 27), rounded so that its last bits are stable."""
     faces = draw_people(_AVERAGED, range(1), size=_SIDE)
     total = np.zeros((_DIRECTIONS, _CELLS, _CELLS))
     for face in faces:
-        image = ((face.astype(np.float32) - 127.5) / 127.5).transpose(2, 0, 1)[None]
-        total += session.run(None, {"image": np.ascontiguousarray(image)})[0][0]
+        total += _features_of(face)
     return np.asarray(np.round(total / len(faces) * 64) / 64)
+
+
+def _features_of(crop: NDArray[np.uint8]) -> NDArray[np.float32]:
+    image = ((crop.astype(np.float32) - 127.5) / 127.5).transpose(2, 0, 1)[None]
+    features = _feature_session().run(None, {"image": np.ascontiguousarray(image)})[0][0]
+    return np.asarray(features, np.float32)
 
 
 def _window() -> NDArray[np.float32]:

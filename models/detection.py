@@ -1,4 +1,4 @@
-"""What every face detector does alike: the canvas, and looking again when nothing was found."""
+"""What every face detector does alike: the canvas, and which canvas speaks for which face."""
 
 from collections.abc import Sequence
 from typing import Protocol
@@ -7,10 +7,22 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from models.boxes import Face, non_maximum_suppression
+from models.boxes import Face, intersection_over_union, non_maximum_suppression
 
 DEFAULT_SIZE = 640
-RETRY_SIZE = 320
+# A canvas for faces that fill the picture, which the default one makes too large.
+NEAR_SIZE = 320
+# A canvas that is only asked whether there is such a face.
+SCOUT_SIZE = 128
+# Longer side, in canvas pixels, of the largest face that the main canvas is trusted with: of 480
+# pixels SCRFD finds half and none of 540, and the points of YuNet wander (docs/models.md).
+LARGEST_FACE = 480
+# Share of the picture's longer side from which on a face on that canvas asks to be confirmed.
+LARGE_SHARE = 0.25
+# Smaller faces on the near canvas are left to the main one, which shows them twice as large.
+SMALLEST_NEAR_FACE = 32
+# Two passes found the same face when their boxes overlap by so much.
+_SAME_FACE = 0.4
 # Added on each side as a share of that side, for crops so tight that the head fills them.
 RETRY_BORDER = 0.4
 # Of the five points of a face, in canvas pixels.
@@ -37,19 +49,24 @@ class Detector(Protocol):
 
 
 def canvas_sizes(size: int, fixed: Size | None) -> tuple[Size, ...]:
-    """Canvases to try in order: ``size``, then 320; only the graph's own where it has one."""
+    """The main canvas and, below it, the near one; only the graph's own where it has one."""
     if fixed is not None:
         return (fixed,)
-    if size <= RETRY_SIZE:
+    if size <= NEAR_SIZE:
         return ((size, size),)
-    return ((size, size), (RETRY_SIZE, RETRY_SIZE))
+    return ((size, size), (NEAR_SIZE, NEAR_SIZE))
 
 
 def find_faces(detector: Detector, image: NDArray[np.uint8]) -> list[Face]:
-    """Detect; when nothing is found, look again on a small canvas, then inside a border.
+    """Detect each face on the canvas that shows it at a size the detector knows.
 
-    A face that fills the picture is larger than what a detector saw in training at 640; the
-    smaller canvas and the border both make it relatively smaller.
+    Detectors lose sight of a face that fills a canvas of 640, and may then take an ear or somebody
+    in the background for the only face. So a quick pass on a small canvas first asks for large
+    faces. The main canvas speaks alone where it confirms them all; its points are those that
+    InsightFace finds at that size. Otherwise the near canvas adds what the main one missed or was
+    not sure of; and where a face is too large for the main canvas, only the smallest faces come
+    from there. When nothing is found, the near canvas and then a border around the picture are
+    tried.
 
     Parameters
     ----------
@@ -61,24 +78,70 @@ def find_faces(detector: Detector, image: NDArray[np.uint8]) -> list[Face]:
     list of Face
         In pixels of ``image``, best score first; empty when all passes found nothing.
     """
-    tried = set()
-    for size in detector.sizes:
-        canvas = detector.canvas(image, size)
-        if canvas in tried:  # the same pass again would find the same
-            continue
-        tried.add(canvas)
-        faces = detector.detect_once(image, size)
-        if faces:
-            return faces
+    main, near = detector.sizes[0], detector.sizes[-1]
+    canvas = detector.canvas(image, main)
+    if detector.canvas(image, near) == canvas:  # the same pass again would find the same
+        return detector.detect_once(image, main) or _inside_border(detector, image, main)
+    large = _large_faces(detector, image) if max(canvas) > LARGEST_FACE else []
+    longest = max(image.shape[:2])
+    sight = LARGEST_FACE / max(canvas) * longest
+    blind = any(_longer_side(face) > sight for face in large)
+    if blind and longest <= max(near):
+        # The near canvas shows all that such a picture has.
+        on_main = []
+    else:
+        on_main = detector.detect_once(image, main)
+        certain = [face for face in on_main if face.score >= detector.recommended_score]
+        if on_main and not blind and all(_among(face, certain) for face in large):
+            return on_main
+    on_near = detector.detect_once(image, near)
+    if not on_near:
+        if blind and not on_main:
+            on_main = detector.detect_once(image, main)
+        return on_main or _inside_border(detector, image, main)
+    limit = SMALLEST_NEAR_FACE / max(near) * longest
+    sure = detector.recommended_score
+    faces = [
+        face for face in on_main if _longer_side(face) < limit or (face.score >= sure and not blind)
+    ]
+    faces += [face for face in on_near if not _among(face, faces)]
+    return sorted(faces, key=lambda face: face.score, reverse=True)
+
+
+def _large_faces(detector: Detector, image: NDArray[np.uint8]) -> list[Face]:
+    """Faces of at least `LARGE_SHARE` of the picture, from a quick pass on a small canvas."""
+    small = _shrunk(image, 2 * SCOUT_SIZE)
+    shrink = min(1.0, SCOUT_SIZE / max(small.shape[:2]))
+    height, width = (max(1, round(side * shrink)) for side in small.shape[:2])
+    # The last half by areas: single pixels of a grainy photo are noise.
+    small = np.asarray(cv2.resize(small, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+    scale = np.array([image.shape[1] / width, image.shape[0] / height], dtype=np.float32)
+    return [
+        Face(face.box * np.tile(scale, 2), face.score, face.keypoints * scale)
+        for face in detector.detect_once(small, (SCOUT_SIZE, SCOUT_SIZE))
+        if _longer_side(face) >= LARGE_SHARE * max(height, width)
+    ]
+
+
+def _among(face: Face, others: Sequence[Face]) -> bool:
+    """Whether one of ``others`` is the same face."""
+    return any(intersection_over_union(face.box, other.box) > _SAME_FACE for other in others)
+
+
+def _longer_side(face: Face) -> float:
+    return max(face.width, face.height)
+
+
+def _inside_border(detector: Detector, image: NDArray[np.uint8], main: Size) -> list[Face]:
+    """Faces found with a black border around the picture, in pixels of ``image``."""
     height, width = image.shape[:2]
-    top, left = round(height * RETRY_BORDER), round(width * RETRY_BORDER)
     # Only what the canvas needs is kept, so that the border of a 24 MP photo costs no second one.
-    shrink = min(1.0, max(detector.sizes[0]) / max(height, width))
-    small = resize(image, max(1, round(height * shrink)), max(1, round(width * shrink)))
+    small = _shrunk(image, max(main))
     fy, fx = small.shape[0] / height, small.shape[1] / width
-    pad_y, pad_x = round(top * fy), round(left * fx)
+    pad_y = round(round(height * RETRY_BORDER) * fy)
+    pad_x = round(round(width * RETRY_BORDER) * fx)
     bordered = cv2.copyMakeBorder(small, pad_y, pad_y, pad_x, pad_x, cv2.BORDER_CONSTANT)
-    faces = detector.detect_once(np.asarray(bordered, dtype=np.uint8), detector.sizes[0])
+    faces = detector.detect_once(np.asarray(bordered, dtype=np.uint8), main)
     scale = np.array([fx, fy], dtype=np.float32)
     offset = np.array([pad_x, pad_y], dtype=np.float32)
     return [
@@ -89,6 +152,13 @@ def find_faces(detector: Detector, image: NDArray[np.uint8]) -> list[Face]:
         )
         for face in faces
     ]
+
+
+def _shrunk(image: NDArray[np.uint8], longest: int) -> NDArray[np.uint8]:
+    """The picture with a longer side of at most ``longest`` pixels."""
+    height, width = image.shape[:2]
+    shrink = min(1.0, longest / max(height, width))
+    return resize(image, max(1, round(height * shrink)), max(1, round(width * shrink)))
 
 
 def resize(image: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
@@ -102,6 +172,10 @@ def letterbox(
     image: NDArray[np.uint8], size: Size, *, enlarge: bool
 ) -> tuple[NDArray[np.uint8], float]:
     """Resize into the top-left corner of a black canvas, keeping the aspect ratio.
+
+    The sides are cut to whole pixels and the scale is that of the cut height, as InsightFace
+    does: embedders are trained and evaluated on crops that come from its key points, and half a
+    pixel of the canvas is several pixels of a photo that is far from square.
 
     Parameters
     ----------
@@ -117,14 +191,18 @@ def letterbox(
         Canvas pixels per image pixel.
     """
     height, width = image.shape[:2]
-    scale = min(size[0] / height, size[1] / width)
-    if not enlarge:
-        scale = min(scale, 1.0)
-    new_height = min(size[0], max(1, round(height * scale)))
-    new_width = min(size[1], max(1, round(width * scale)))
+    ratio = height / width
+    if not enlarge and height <= size[0] and width <= size[1]:
+        new_height, new_width = height, width
+    elif ratio > size[0] / size[1]:
+        new_height, new_width = size[0], int(size[0] / ratio)
+    else:
+        new_height, new_width = int(size[1] * ratio), size[1]
+    # A sliver keeps one row or column of pixels.
+    new_height, new_width = max(1, new_height), max(1, new_width)
     canvas = np.zeros((*size, 3), dtype=np.uint8)
     canvas[:new_height, :new_width] = resize(image, new_height, new_width)
-    return canvas, scale
+    return canvas, new_height / height
 
 
 def cell_centres(rows: int, columns: int, *, stride: int, per_cell: int) -> NDArray[np.float32]:

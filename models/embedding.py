@@ -12,6 +12,9 @@ from models.sessions import Session
 
 # Activations of one batch are alive at once; 32 crops keep them small and the cores busy.
 MAX_BATCH = 32
+# Counts the ways from a photo to its crop. 2: the letterbox and the two canvases of
+# `models.detection`; 1, without a number in the contract, was one canvas, its sides rounded.
+PREPROCESSING_VERSION = 2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,6 +34,7 @@ class Preprocessing:
     def as_dict(self) -> dict[str, Any]:
         """JSON-able form, the one that contracts bind to."""
         return {
+            "version": PREPROCESSING_VERSION,
             "alignment": self.alignment,
             "size": self.size,
             "channel_order": self.channel_order,

@@ -23,7 +23,10 @@ _ORIENTING_TEXTS = (b"Raw profile type exif", b"XML:com.adobe.xmp")
 _JPEG = b"\xff\xd8\xff"
 _ORIENTING_SEGMENTS = (b"Exif\0\0", b"http://ns.adobe.com/xap/1.0/\0")
 _FILL = re.compile(rb"\xff+")
+# Inside the coded pixels, 0xFF before 0x00 or a restart marker is none.
+_MARKER_AFTER_PIXELS = re.compile(rb"\xff+([\x01-\xcf\xd8-\xfe])")
 _SCAN = 0xDA
+_END = 0xD9
 _COMMENT = 0xFE
 _APPLICATION = range(0xE0, 0xF0)
 # JFIF and Adobe say which colours the channels are.
@@ -44,6 +47,28 @@ def lean(data: bytes) -> bytes:
     if data.startswith(_JPEG):
         return _lean_jpeg(data)
     return data
+
+
+def jpeg_scans(data: bytes, *, most: int) -> int:
+    """Count the scans of a JPEG file's first picture without decoding them.
+
+    Only markers count, up to the end of that picture, as a decoder reads them: thumbnails, further
+    pictures, and the film that a phone appends may hold the same bytes.
+
+    Parameters
+    ----------
+    most
+        One more than these is not looked for.
+    """
+    scans, at = 0, 2
+    while scans <= most and (found := _MARKER_AFTER_PIXELS.search(data, at)) is not None:
+        marker, at = found[1][0], found.end()
+        if marker == _END:
+            break
+        scans += marker == _SCAN
+        if marker not in _WITHOUT_LENGTH:
+            at += int.from_bytes(data[at : at + 2])
+    return scans
 
 
 def animated(name: str) -> ImageError:

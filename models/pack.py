@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from models.alignment import TEMPLATE_NAME, align, template
 from models.boxes import Face, ranked
 from models.decoding import DEFAULT_LIMITS, ImageLimits, decode_image
+from models.demo import DEMO_DIMENSION, is_demo_model, require_face
 from models.detection import DEFAULT_SIZE, Detector, find_faces
 from models.embedding import Embedder, Preprocessing
 from models.errors import ImageError, ModelError, PackError
@@ -125,6 +126,9 @@ class ModelPack:
         self.info = info
         self._embedder = embedder
         self._detector = detector
+        self._demo = (
+            detector is None and info.n == DEMO_DIMENSION and is_demo_model(info.embedder_sha256)
+        )
 
     @classmethod
     def load(
@@ -260,6 +264,8 @@ class ModelPack:
         if quality is not None:
             recommended = 0.0 if self._detector is None else self._detector.recommended_score
             check(measured, quality, recommended_score=recommended)
+            if self._demo:
+                require_face(crop)
         return crop, measured, face
 
     def embed_photo(

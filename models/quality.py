@@ -276,8 +276,10 @@ def select_face(faces: Sequence[Face], *, single: bool, limits: QualityLimits | 
     """
     if not faces:
         raise NoFace("No face was found; send an upright photo that shows one face.")
-    main = faces[0]
-    others = [face for face in faces[1:] if limits is None or _counts(face, main, limits)]
+    # A speck in the middle outranks nobody who is large enough to be meant.
+    large_enough = [face for face in faces if limits is None or _reaches(face, limits)]
+    main = large_enough[0] if large_enough else faces[0]
+    others = [face for face in large_enough[1:] if limits is None or _counts(face, main, limits)]
     if single and others:
         raise MultipleFaces(
             f"The photo shows {1 + len(others)} faces; send one with a single face.",
@@ -286,9 +288,10 @@ def select_face(faces: Sequence[Face], *, single: bool, limits: QualityLimits | 
     return main
 
 
+def _reaches(face: Face, limits: QualityLimits) -> bool:
+    return min(face.width, face.height) >= limits.min_face_size
+
+
 def _counts(face: Face, main: Face, limits: QualityLimits) -> bool:
-    """Whether a further face is large enough to be a second person in the photo."""
-    return (
-        min(face.width, face.height) >= limits.min_face_size
-        and face.area >= limits.second_face_share * main.area
-    )
+    """Whether a further face is large enough beside ``main`` to be a second person."""
+    return face.area >= limits.second_face_share * main.area

@@ -10,8 +10,8 @@ from onnx import ModelProto, TensorProto, ValueInfoProto
 from models.errors import PackError
 from models.yunet import OUTPUTS as YUNET_OUTPUTS
 
-# Graphs whose first nodes both subtract and scale bring their own normalisation (FORMATS,
-# "Model packs"; the rule InsightFace uses).
+# Graphs whose first nodes both subtract and scale bring their own normalisation
+# (docs/models.md "Packs"; the rule InsightFace uses).
 FIRST_NODES = 8
 _SCALES = {"Mul", "Div"}
 
@@ -126,7 +126,7 @@ def _tensor(value: ValueInfoProto) -> Tensor:
 
 
 def classify(signature: Signature, *, input_size: int | None = None) -> tuple[Role, str]:
-    """Route a graph by its signature (FORMATS, "Model packs").
+    """Route a graph by its signature (docs/models.md "Packs").
 
     Parameters
     ----------

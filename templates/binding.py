@@ -24,7 +24,7 @@ def embedding_id(*, embedder_sha256: str, preprocessing: Mapping[str, object]) -
     embedder_sha256
         SHA-256 of the embedder's ONNX file, 64 hexadecimal digits.
     preprocessing
-        Alignment template, size, channel order, mean, scale and flip.
+        Its version, alignment template, size, channel order, mean, scale and flip.
 
     Returns
     -------
@@ -49,7 +49,7 @@ class Binding:
     embedder_sha256
         SHA-256 of the embedder's ONNX file, 64 hexadecimal digits.
     preprocessing
-        Alignment template, size, channel order, mean, scale and flip.
+        Its version, alignment template, size, channel order, mean, scale and flip.
     n
         Descriptor dimension.
     strategy, m
@@ -133,7 +133,11 @@ class Binding:
                 f"{key}: contract {self.preprocessing.get(key)}, pack {theirs.get(key)}"
                 for key in differing
             )
-            raise ContractMismatch(f"the pack preprocesses otherwise than the contract: {sides}")
+            raise ContractMismatch(
+                f"the pack preprocesses otherwise than the contract: {sides}; use the pack and "
+                "the settings that it was calibrated with, or, after an upgrade that changed the "
+                "version, build the decoys, calibrate and enroll anew"
+            )
 
     def require_source(self, *, source_id: str, made_with: str | None = None) -> None:
         """Refuse a decoy source other than the contract's, or of another descriptor space.

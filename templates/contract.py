@@ -1,18 +1,20 @@
 """The contract: what a template and a threshold belong to, and the file that carries it.
 
 ``contract_id`` is the SHA-256 of the canonical JSON of the binding. Every stored template carries
-it, and a template of another contract is refused (PRODUCT "Contract"). Recalibrating changes the
+it, and a template of another contract is refused (docs/contract.md). Recalibrating changes the
 calibrations, their ids and perhaps the cohort, never the ``contract_id``.
 
 The file is JSON. The cohort is a secret: who has it can search for a probe that passes the cohort
-test. It is sealed inside the file, and the seal's context holds the digest of everything else in
-the file, so that an edited threshold is refused as well.
+test; and so are the strangers whom templates of clients are held against. Both are sealed inside
+the file, and the seal's context holds the digest of everything else in the file, so that an edited
+threshold is refused as well.
 """
 
 import base64
 import binascii
 import hashlib
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -26,7 +28,7 @@ from templates.binding import Binding
 from templates.bounded_file import read_at_most
 from templates.canonical import Fields, Json, digest, free_object, parse_object
 from templates.distances import Metric
-from templates.errors import ContractError, SealError, Uncalibrated
+from templates.errors import ContractError, DecoyError, SealError, Uncalibrated
 from templates.levels import (
     LEVEL_NAME,
     Calibration,
@@ -36,6 +38,7 @@ from templates.levels import (
     check_norm_range,
     norm_range,
 )
+from templates.nobody import Nobody
 from templates.private_file import replace_private
 from templates.sealing import Sealer
 from templates.subspace import SubspaceBatch
@@ -43,11 +46,12 @@ from templates.subspace import SubspaceBatch
 __all__ = ["Binding", "Calibration", "Contract", "Level", "Mode", "Rate"]
 
 FORMAT = "veilface-contract"
-VERSION = 1
+VERSION = 2
 MAX_FILE_BYTES = 256 * 2**20
 MAX_CALIBRATIONS = 64
 COHORT_SIZES = (2, 4096)
 BASIS_TOLERANCE = 1e-4
+SEALED = frozenset({"feet", "bases", "people", "means", "spreads", "generator"})
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,8 +73,12 @@ class Contract:
         Least raw cosine between any two photos of one enrollment.
     template_foot_point_norm
         Range of ‖p‖ that an honest template of this contract has.
+    template_stranger_score
+        Largest ``Nobody.score`` that an honest template of this contract has.
     cohort
         Templates that belong to nobody, un-rotated; (C, n) feet and (C, m, n) bases. Secret.
+    nobody
+        Strangers who do not exist. Secret.
 
     Raises
     ------
@@ -84,7 +92,9 @@ class Contract:
     default_level: str
     photo_consistency: float
     template_foot_point_norm: tuple[float, float]
+    template_stranger_score: float
     cohort: SubspaceBatch = field(repr=False)
+    nobody: Nobody = field(repr=False)
 
     def __post_init__(self) -> None:
         recorded = free_object(self.recorded, what="the record")
@@ -94,7 +104,10 @@ class Contract:
         if not LEVEL_NAME.fullmatch(self.default_level):
             raise ContractError("the default level's name must match " + LEVEL_NAME.pattern)
         check_norm_range(self.template_foot_point_norm)
+        if not math.isfinite(self.template_stranger_score):
+            raise ContractError("template_stranger_score is not a finite number")
         self._check_cohort()
+        self.nobody.check(self.binding.n)
         self._check_calibrations()
 
     def _check_cohort(self) -> None:
@@ -169,7 +182,7 @@ class Contract:
         raise Uncalibrated(f"no calibration for {wanted}; calibrated are: {', '.join(have)}")
 
     def public(self) -> dict[str, Json]:
-        """Everything but the cohort, as JSON values."""
+        """Everything but the cohort and the strangers, as JSON values."""
         return {
             "contract_id": self.contract_id,
             "binding": self.binding.to_json(),
@@ -178,6 +191,7 @@ class Contract:
             "default_level": self.default_level,
             "photo_consistency": self.photo_consistency,
             "template_foot_point_norm": list(self.template_foot_point_norm),
+            "template_stranger_score": self.template_stranger_score,
             "cohort_size": len(self.cohort),
             "cohort_id": self.cohort_id,
         }
@@ -191,6 +205,7 @@ class Contract:
         tensors = {
             "feet": np.ascontiguousarray(self.cohort.feet, dtype=np.float32),
             "bases": np.ascontiguousarray(self.cohort.bases, dtype=np.float32),
+            **self.nobody.tensors(),
         }
         sealed = sealer.seal(safetensors.numpy.save(tensors), context=_seal_context(document))
         document["cohort"] = base64.b64encode(sealed).decode("ascii")
@@ -224,7 +239,7 @@ class Contract:
         )
         if not all(entry.calibration_id for entry in calibrations):
             raise ContractError("a calibration has no calibration_id")
-        cohort = _open_cohort(cohort_text, sealer, document, binding)
+        cohort, nobody = _open_cohort(cohort_text, sealer, document, binding)
         contract = cls(
             binding=binding,
             recorded=fields.free("recorded"),
@@ -232,7 +247,9 @@ class Contract:
             default_level=fields.text("default_level"),
             photo_consistency=fields.number("photo_consistency"),
             template_foot_point_norm=norm_range(fields.take("template_foot_point_norm")),
+            template_stranger_score=fields.number("template_stranger_score"),
             cohort=cohort,
+            nobody=nobody,
         )
         if fields.integer("cohort_size") != len(cohort):
             raise ContractError("cohort_size is not the size of the cohort")
@@ -249,7 +266,7 @@ def _seal_context(document: Mapping[str, object]) -> str:
 
 def _open_cohort(
     text: str, sealer: Sealer, document: Mapping[str, object], binding: Binding
-) -> SubspaceBatch:
+) -> tuple[SubspaceBatch, Nobody]:
     try:
         sealed = base64.b64decode(text, validate=True)
     except (binascii.Error, ValueError):
@@ -265,15 +282,21 @@ def _open_cohort(
         tensors = safetensors.numpy.load(plain)
     except (safetensors.SafetensorError, ValueError, KeyError):
         raise ContractError("the contract's cohort is not a safetensors container") from None
-    if sorted(tensors) != ["bases", "feet"]:
-        raise ContractError("the contract's cohort does not hold exactly feet and bases")
+    if set(tensors) != SEALED:
+        raise ContractError(
+            "the contract's cohort does not hold exactly " + ", ".join(sorted(SEALED))
+        )
     feet, bases = tensors["feet"], tensors["bases"]
     count = len(feet) if feet.ndim else 0
     if feet.shape != (count, binding.n) or bases.shape != (count, binding.m, binding.n):
         raise ContractError("the contract's cohort has shapes other than the binding's")
     if feet.dtype != np.float32 or bases.dtype != np.float32:
         raise ContractError("the contract's cohort is not float32")
-    return SubspaceBatch(feet=np.ascontiguousarray(feet), bases=np.ascontiguousarray(bases))
+    try:
+        nobody = Nobody.from_tensors(tensors)
+    except DecoyError:
+        raise ContractError("the contract's generator of decoys of nobody is broken") from None
+    return SubspaceBatch(np.ascontiguousarray(feet), np.ascontiguousarray(bases)), nobody
 
 
 def _read_bounded(path: Path) -> bytes:

@@ -1,4 +1,4 @@
-"""The cross-Gram matrix of probes and templates, a tile at a time (METHOD §5).
+"""The cross-Gram matrix of probes and templates, a tile at a time (docs/method.md §5).
 
 Every distance starts from the products of the stacked rows [p; D] of one side with those of the
 other. They are one matrix product, the floor of the computation on any machine. It is made in

@@ -121,7 +121,7 @@ def pairwise_distances(
 
     References
     ----------
-    Paper eq. 1 to 9; METHOD §3 and §5.
+    Paper eq. 1 to 9; docs/method.md §3 and §5.
     """
     metric = Metric(metric)
     _check_options(steps, threads)

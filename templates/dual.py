@@ -1,8 +1,8 @@
 """The dual form of a template: n − m hyperplanes instead of m directions (supplement A).
 
 Point to subspace costs n − m products instead of m, which is better when m ≥ n/2. The
-subspace-to-subspace system of 3n − 2m unknowns is singular as soon as 2m > n (METHOD §3), where
-the primal form decides; it is kept in float64 as an independent check for 2m < n.
+subspace-to-subspace system of 3n − 2m unknowns is singular as soon as 2m > n (docs/method.md §3.3),
+where the primal form decides; it is kept in float64 as an independent check for 2m < n.
 """
 
 from dataclasses import dataclass

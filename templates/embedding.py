@@ -12,7 +12,7 @@ def unit_rows(embeddings: NDArray[np.generic], *, n: int, most: int) -> NDArray[
     """Validate raw embeddings and return them normalised exactly.
 
     A probe that is not a unit vector is refused, since distances assume the unit sphere: the zero
-    vector is at Euclidean distance ‖p‖ from every template (METHOD §4.7).
+    vector is at Euclidean distance ‖p‖ from every template (docs/method.md §4.7).
 
     Parameters
     ----------

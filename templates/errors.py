@@ -18,10 +18,12 @@
     │   │       └── Superseded   a decision on a template that was replaced or erased [12]
     │   ├── InvalidIdentifier    a subject id, tenant name or cursor that breaks the rules [1]
     │   ├── UnknownTenant        no tenant of this name [1]
+    │   │   ├── AlteredTenant    its row is not as this program left it [11]
     │   │   └── RetiredRotation  no rotation of this epoch any more [11]
     │   ├── LockedOut            too many failed attempts on the subject [12]
     │   ├── Replayed             a signed probe that was seen before [12]
     │   ├── BrokenAuditLog       an audit log whose head or key is missing or forged [13]
+    │   ├── ExportSuperseded     an export older than the last enrollment or erasure [14]
     │   └── IdempotencyConflict  a key that was used for another request, or still runs [2]
     ├── EnrollmentError [3]
     │   ├── PhotoRejected        one photo has no usable face
@@ -41,7 +43,7 @@ Each is defined here, or next to what raises it: [1] ``templates.store.identifie
 [5] ``verify.evaluation.plan``, [6] ``verify.evaluation.backends``, [7] ``attacks.errors``,
 [8] ``api.errors``, [9] ``api.preparation``, [10] ``api.cli.errors``,
 [11] ``templates.store.tenants``, [12] ``templates.store.lockout``,
-[13] ``templates.store.audit_log``.
+[13] ``templates.store.audit_log``, [14] ``templates.store.transfers``.
 
 Messages name the cause and the remedy. They never hold a number of a descriptor, a template or
 an image, nor a key.

@@ -1,4 +1,6 @@
-"""Euclidean distances between points and affine subspaces (paper eq. 1 to 9, METHOD §3).
+"""Euclidean distances between points and affine subspaces.
+
+Paper eq. 1 to 9; docs/method.md §3.1 and §3.2.
 
 Bulk work uses the cross-Gram matrix in the caller's precision. Where that form cancels (small
 distances) or its system is nearly singular (shared decoys, shared directions), the pair is

@@ -12,7 +12,13 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from templates.errors import SealError
-from templates.private_file import follow_links, is_trusted, replace_private, user_name
+from templates.private_file import (
+    create_private,
+    follow_links,
+    is_trusted,
+    replace_private,
+    user_name,
+)
 
 KEY_BYTES = 32
 
@@ -192,29 +198,11 @@ def write_key_file(path: Path, keys: Sequence[bytes], *, replace: bool) -> None:
         if replace:
             replace_private(path, text)
         else:
-            _create(path, text)
+            create_private(path, text)
     except FileExistsError:
         raise SealError(f"the key file {path} exists already and is not overwritten") from None
     except OSError as error:
         raise SealError(f"the key file {path} cannot be written: {error.strerror}") from None
-
-
-def _create(path: Path, text: bytes) -> None:
-    draft = path.with_name(f".{path.name}.{os.urandom(8).hex()}")
-    descriptor = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
-    try:
-        with os.fdopen(descriptor, "wb") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        path.hardlink_to(draft)
-    finally:
-        draft.unlink(missing_ok=True)
-    directory = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(directory)
-    finally:
-        os.close(directory)
 
 
 def _own_target(path: Path, *, source: str) -> Path:
@@ -225,7 +213,7 @@ def _own_target(path: Path, *, source: str) -> Path:
 
 
 def _check_owner(status: os.stat_result, folder: Path, *, source: str) -> None:
-    if not is_trusted(status.st_uid, folder):
+    if not is_trusted(status.st_uid, folder.stat().st_uid):
         raise SealError(
             f"{source} belongs to user {user_name(status.st_uid)}, who is neither the user of "
             "this program, nor root, nor the owner of its folder: find out who put it there, "

@@ -82,7 +82,8 @@ class Level:
     """A security level: both thresholds, and the errors seen on the calibration data.
 
     A probe is accepted where its similarity reaches ``similarity_threshold`` *and* its cohort
-    score reaches ``cohort_threshold`` (METHOD §4.7). The rates are those of this joint decision.
+    score reaches ``cohort_threshold`` (docs/method.md §6). The rates are those of this joint
+    decision.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""From descriptors to private templates: the strategies of the paper's §3.2 and §4.3."""
+"""From descriptors to private templates: the strategies of paper §3.2, §4.2 and §4.3."""
 
 from collections.abc import Sequence
 from enum import StrEnum
@@ -12,7 +12,7 @@ from templates.randomness import Keystream
 from templates.subspace import SubspaceBatch, span_basis
 
 SUB_DATABASES = 16
-"""Parts that the sub-strategies split the database into (paper §4.3)."""
+"""Parts that the sub-strategies split the database into (paper §4.2)."""
 
 UNIT_TOLERANCE = 1e-3
 # Two decoys, or a decoy and the descriptor, nearer than this are one photo twice: they would add
@@ -23,7 +23,7 @@ _TILE_BYTES = 64 << 20
 
 
 class Strategy(StrEnum):
-    """How the directions of a subspace are chosen (METHOD §2)."""
+    """How the directions of a subspace are chosen (docs/method.md §2.1)."""
 
     RANDOM = "random"
     ADVERSARIAL = "adversarial"
@@ -94,7 +94,7 @@ def lift(
     ----------
     descriptors : array_like, shape (N, n)
         Unit rows (tolerance 1e-3). A person's photos are averaged first and lifted once: two
-        lifts of one descriptor meet in it (METHOD §4.6).
+        lifts of one descriptor meet in it (docs/method.md §4.6).
     strategy : Strategy
     m : int
         Subspace dimension, 1 ≤ m < n; 2 or more for the hybrid strategies.
@@ -160,7 +160,7 @@ def draw_directions(
 def paper_basis(
     points: ArrayLike, directions: ArrayLike, *, stream: Keystream
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Describe ``points[i] + span(directions[i])`` as the paper does (§3.2).
+    """Describe ``points[i] + span(directions[i])`` as in paper §3.2.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 """Random samples from a ChaCha20 keystream.
 
-METHOD §2 asks for a cryptographic generator: who sees a template (which is public to whoever
-steals it) must not be able to predict the randomness of the next one, as they could with PCG64 or
-the Mersenne Twister.
+The generator is a cryptographic one (docs/method.md §2.3): who sees a template (which is public to
+whoever steals it) must not be able to predict the randomness of the next one, as they could with
+PCG64 or the Mersenne Twister.
 """
 
 import hashlib

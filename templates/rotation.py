@@ -1,4 +1,4 @@
-"""The secret rotation of a tenant: templates of two tenants cannot be linked (METHOD §4.9).
+"""The secret rotation of a tenant: templates of two tenants cannot be linked (docs/method.md §4.9).
 
 The rotation maps a descriptor x to R x, before lifting or, which is the same, after it
 (``AffineSubspace.rotated``). Distances inside a tenant do not change.

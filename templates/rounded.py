@@ -93,7 +93,7 @@ class RoundedSubspaces:
 
         References
         ----------
-        Paper eq. 1 (Euclidean); METHOD §3 (spherical).
+        Paper eq. 1 (Euclidean); docs/method.md §3.4 (spherical).
         """
         n = self.feet.shape[1]
         point = np.array(point, dtype=np.float32, order="C")

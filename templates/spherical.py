@@ -1,4 +1,6 @@
-"""Distances between the parts of points and subspaces that lie on the unit sphere (METHOD §3).
+"""Distances between the parts of points and subspaces that lie on the unit sphere.
+
+See docs/method.md §3.4 and §3.5.
 
 Descriptors are of unit length, so only the points of a subspace at unit length can be one. A
 subspace with foot point p meets the unit sphere in a sphere around p of radius s = √(1 − ‖p‖²).

@@ -1,9 +1,9 @@
 """The private template: an affine subspace in a form that shows nothing but the set.
 
 A template stores the foot point (the point of the set nearest the coordinate origin) and an
-orthonormal basis. METHOD §2 asks that nothing beyond the set 𝒟 can be read from it: the foot
-point is a function of 𝒟, and the basis a uniformly random one of span(D), so neither depends on
-the descriptor that was lifted nor on the decoys one by one.
+orthonormal basis. Nothing beyond the set 𝒟 can be read from it (docs/method.md §2.2): the foot
+point is a function of 𝒟, and the basis a uniformly random one of span(D), so neither depends on the
+descriptor that was lifted nor on the decoys one by one.
 """
 
 from collections.abc import Iterator, Sequence

@@ -1,8 +1,8 @@
 """Distances of all probes to all templates, a tile at a time, on compiled kernels and all cores.
 
-One tile is the product of the stacked rows [p; D] of some probes and some templates (METHOD §5),
-made by the matrix library and solved by a kernel while it is in the cache. Memory is bounded by the
-tiles of the threads. A distance depends neither on the number of threads nor on their order.
+One tile is the product of the stacked rows [p; D] of some probes and some templates (docs/method.md
+§5), made by the matrix library and solved by a kernel while it is in the cache. Memory is bounded
+by the tiles of the threads.
 """
 
 import threading

@@ -5,6 +5,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
+
+# A busy machine is no failure: no example has a deadline, and none is too slow to be drawn.
+settings.register_profile("veilface", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("veilface")
 
 DEFAULT_SHARED_DATA = Path(__file__).resolve().parent.parent.parent / "shared" / "data"
 

@@ -17,7 +17,8 @@ COMPOSE: dict[str, Any] = yaml.safe_load((DEPLOY / "compose.yaml").read_text())
 DOCKERFILE = (DEPLOY / "Dockerfile").read_text()
 UNIT = (DEPLOY / "veilface.service").read_text()
 # Read by compose.yaml itself, or by commands before there are settings.
-BESIDE_SETTINGS = {"VEILFACE_CONFIG", "VEILFACE_DATA", "VEILFACE_SECRETS"}
+IMAGES = {"VEILFACE_BASE_IMAGE", "VEILFACE_POSTGRES_IMAGE", "VEILFACE_REDIS_IMAGE"}
+BESIDE_SETTINGS = {"VEILFACE_CONFIG", "VEILFACE_DATA", "VEILFACE_SECRETS", *IMAGES}
 
 
 @pytest.mark.parametrize("name", ["Dockerfile", "compose.yaml", "veilface.service"])
@@ -58,6 +59,23 @@ def test_every_secret_is_a_file_that_a_service_uses() -> None:
     assert all(set(secret) == {"file"} for secret in COMPOSE["secrets"].values())
     text = (DEPLOY / "compose.yaml").read_text()
     assert not re.search(r"PASSWORD:|PASSWORD=|://[^/\s]*:[^/\s@]*@", text)
+
+
+def test_every_image_from_elsewhere_can_be_pinned_as_the_page_says() -> None:
+    services = COMPOSE["services"]
+    named = [
+        services["veilface"]["build"]["args"]["BASE"],
+        *(service["image"] for name, service in services.items() if name != "veilface"),
+    ]
+    parsed = [re.fullmatch(r"\$\{(\w+):-(.+)\}", image) for image in named]
+    images = {match[1]: match[2] for match in parsed if match is not None}
+    assert len(images) == len(named)
+    assert set(images) == IMAGES
+    assert f"ARG BASE={images['VEILFACE_BASE_IMAGE']}\n" in DOCKERFILE
+    assert re.findall(r"^FROM (\S+)", DOCKERFILE, re.M) == ["${BASE}", "${BASE}"]
+    page = (ROOT / "docs" / "deployment.md").read_text(encoding="utf-8")
+    for variable, image in images.items():
+        assert f"{variable}=$(pinned {image})" in page
 
 
 def test_what_the_unit_refuses_does_not_kill() -> None:

@@ -33,6 +33,7 @@ from templates.store import By
 from tests.api.cli.conftest import run
 from tests.api.deployment import PROBE_M, Deployment, bearer, deploy, images, photo
 from tests.clients.conftest import Running, started
+from tests.patience import PATIENCE_S
 from verify.evaluation.embeddings_file import read_embeddings
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -51,6 +52,7 @@ WHOLE_PAGES = {
 }
 # Blocks that another test executes: page and first line.
 ELSEWHERE = {
+    ("CONTRIBUTING.md", "make demo"): "tests/test_project.py",
     ("README.md", "make demo"): "tests/test_readme.py",
     ("README.md", "PACK=~/.insightface/models/buffalo_l"): "tests/test_readme.py",
     ("README.md", "URL=http://127.0.0.1:8421/v1/subjects"): "tests/test_readme.py",
@@ -68,7 +70,7 @@ HERE = {
         "veilface keys revoke 3f9a1c0b7d2e",
         "veilface keys replace 3f9a1c0b7d2e --grace-hours 48",
         "veilface keys rotate-tenant --tenant default",
-        "veilface keys master --master-key-file veilface-data/master.key",
+        "veilface keys master --master-key-file /etc/veilface/master.key",
         "veilface keys rotate --retire",
         "veilface keys rewrap --retire",
         "veilface db upgrade --database-url postgresql+psycopg://veilface@localhost/veilface",
@@ -77,6 +79,7 @@ HERE = {
         "veilface db unlock alice --tenant default",
         "veilface db purge --retention-days 730 --retention-disuse-days 365 --dry-run",
         "veilface db erase-tenant acme --confirm acme --out receipt.json",
+        "veilface db template-enrollment --tenant default --allow",
         "veilface audit-log verify --anchor head.txt",
         "veilface audit-log head > head.txt",
         "veilface audit-log show --subject alice --limit 100",
@@ -140,12 +143,14 @@ NOT_EXECUTED = {
     ("docs/deployment.md", "sh", "export VEILFACE_DATA=/opt/veilface-deploy/data "
      "VEILFACE_SECRETS=/opt/veilface-deploy/secrets"): NEEDS_A_HOST,
     ("docs/deployment.md", "sh", "python3 -m venv /opt/veilface"): NEEDS_A_HOST,
+    ("docs/deployment.md", "sh", "pinned() { echo \"$1@$(docker buildx imagetools inspect \"$1\" "
+     "--format '{{.Manifest.Digest}}')\"; }"): "asks an image registry; the page says so",
 }  # fmt: skip
 DRAWINGS = {
     ("docs/architecture.md", "photo bytes ──models──▶"),
     ("docs/architecture.md", "set ─readers─▶"),
     ("docs/architecture.md", "photos of people ──make_cast──▶"),
-    ("docs/architecture.md", "ASGI ─▶ context"),
+    ("docs/architecture.md", "bytes ─▶ protocol"),
     ("docs/architecture.md", "Call (method, path, body) ─flow─▶"),
     ("docs/distances.md", "probes, templates ──stack──▶"),
     ("docs/rest.md", "veilface-probe-1"),
@@ -173,7 +178,7 @@ class Snippet:
 
 
 def pages(root: Path) -> list[Path]:
-    return [root / "README.md", *sorted((root / "docs").glob("*.md"))]
+    return [*sorted(root.glob("*.md")), *sorted((root / "docs").glob("*.md"))]
 
 
 def collect(root: Path) -> list[Snippet]:
@@ -543,7 +548,7 @@ def test_commands_do_what_the_page_says(tmp_path: Path, monkeypatch: pytest.Monk
             line = line.replace(
                 "postgresql+psycopg://veilface@localhost/veilface", f"sqlite:///{tmp_path}/new.db"
             )
-            line = line.replace("veilface-data/master.key", "another.key")
+            line = line.replace("/etc/veilface/master.key", "another.key")
             if "3f9a1c0b7d2e" in line:
                 made = run("keys", "create", "--right", "verify", "--json").json
                 line = line.replace("3f9a1c0b7d2e", made["prefix"])
@@ -558,7 +563,9 @@ def test_commands_do_what_the_page_says(tmp_path: Path, monkeypatch: pytest.Monk
 @pytest.fixture(scope="module")
 def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
     folder = tmp_path_factory.mktemp("live")
-    with started(deploy(folder), folder) as running:
+    deployment = deploy(folder)
+    deployment.allow_templates()
+    with started(deployment, folder) as running:
         yield running
 
 
@@ -586,7 +593,7 @@ def test_blocks_for_a_running_service(live: Running, tmp_path: Path) -> None:
         code = find(page, first).code.replace("https://example.org", live.url)
         done = subprocess.run(
             ["bash", "-euo", "pipefail", "-c", code.replace("--dim 4", f"--dim {PROBE_M}")],
-            cwd=tmp_path, env=env, capture_output=True, text=True, timeout=120,
+            cwd=tmp_path, env=env, capture_output=True, text=True, timeout=PATIENCE_S,
         )  # fmt: skip
         assert done.returncode == 0, f"{page}: {first}\n{done.stderr}"
         shown += done.stdout

@@ -50,6 +50,26 @@ def test_no_arrow_goes_up_or_sideways(room: str) -> None:
     assert not wrong
 
 
+def test_commands_write_no_file_where_a_link_of_somebody_else_leads() -> None:
+    """What a command writes goes through ``templates/private_file.py``."""
+    modules = [
+        path
+        for folder in ("api/cli", "enroll", "verify", "attacks", "templates/decoys")
+        for path in (ROOT / folder).rglob("*.py")
+    ]
+    writing = re.compile(
+        r"""\.write_(text|bytes)\(|\.mkdir\(|savefig\((?!png|svg)|open\([^)]*["'][wxa]b?["']"""
+    )
+    wrong = {
+        str(path.relative_to(ROOT)): lines
+        for path in modules
+        if (
+            lines := [line for line in path.read_text("utf-8").splitlines() if writing.search(line)]
+        )
+    }
+    assert not wrong
+
+
 @pytest.mark.parametrize("room", FLOORS)
 def test_rooms_are_of_use_below_the_tests_only(room: str) -> None:
     for path in (ROOT / room).rglob("*.py"):

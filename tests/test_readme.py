@@ -15,6 +15,9 @@ from benchmarks.readme_results import merged, read_results, readme_table, writte
 from models.errors import FaceError
 from models.pack import ModelPack
 from models.quality import QualityLimits
+from tests.patience import PATIENCE_S
+
+pytestmark = pytest.mark.long
 
 ROOT = Path(__file__).resolve().parent.parent
 BLOCKS = re.findall(r"^```sh\n(.*?)^```", (ROOT / "README.md").read_text(), flags=re.M | re.S)
@@ -38,7 +41,7 @@ def shell(script: str, folder: Path, env: dict[str, str]) -> str:
         env=env,
         text=True,
         capture_output=True,
-        timeout=280,
+        timeout=PATIENCE_S,
     )
     assert done.returncode == 0, f"{script}\n{done.stderr}"
     return done.stdout
@@ -69,7 +72,6 @@ def test_the_first_block_is_what_ci_runs() -> None:
     assert all(command in ci for command in commands)
 
 
-@pytest.mark.timeout(580)
 def test_the_real_path_from_weights_to_a_receipt(
     newcomer: tuple[Path, dict[str, str]], mbf_pack_dir: Path, fairface: Path, lfw_photos: Path
 ) -> None:
@@ -89,6 +91,8 @@ def test_the_real_path_from_weights_to_a_receipt(
     prepare, serve = with_values(BLOCKS[1], values).rsplit("\nveilface serve", 1)
     key = shell(f'{prepare}\necho "$KEY"', folder, env).splitlines()[-1]
     assert key.startswith("vf_")
+    assert (folder / "veilface-data-keys" / "master.key").is_file()
+    assert not list((folder / "veilface-data").glob("*.key"))
 
     activate = ". .venv/bin/activate"
     pack = f"PACK={mbf_pack_dir}"
@@ -105,7 +109,7 @@ def test_the_real_path_from_weights_to_a_receipt(
         answers = shell(f"{activate}\nKEY={key}\n{script}", folder, env)
     finally:
         server.terminate()
-        server.wait(timeout=30)
+        server.wait(timeout=PATIENCE_S)
     assert '"decision":"accept"' in answers.replace(": ", ":")
 
 

@@ -16,7 +16,10 @@ import pytest
 
 from tests import test_readme
 from tests.api.cli.conftest import run
+from tests.patience import PATIENCE_S
 from tests.test_readme import ROOT, newcomer, wait_until_ready
+
+pytestmark = pytest.mark.long
 
 __all__ = ["newcomer"]
 
@@ -26,7 +29,7 @@ EXAMPLE_PORT = "8421"
 SPAN = re.compile(r"`([^`]+)`")
 STRANGERS = 120
 # Code spans of what one should see that are names, not output.
-NAMES = {".venv", "veilface", "veilface-data", "key", "embedder", "calibrate"}
+NAMES = {".venv", "veilface", "veilface-data", "veilface-data-keys", "key", "embedder", "calibrate"}
 # The installation without a network: from a real one, not made to happen again here.
 UNSEEN = {"ERROR: No matching distribution found for uv"}
 DOWNLOADS = {
@@ -89,7 +92,7 @@ class Terminal:
             text=True,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
-            timeout=280,
+            timeout=PATIENCE_S,
         )
         assert (done.returncode != 0) == fails, f"{block}\n{done.stdout}"
         return done.stdout
@@ -138,7 +141,6 @@ def test_make_demo_is_the_command_that_stands_in_for_it() -> None:
     assert re.search(r"^VENV := \.venv/bin$", makefile, flags=re.M)
 
 
-@pytest.mark.timeout(580)
 def test_the_tutorial_from_nothing_to_a_receipt(
     newcomer: tuple[Path, dict[str, str]],
     mbf_pack_dir: Path,
@@ -213,7 +215,7 @@ def listening_too(port: int) -> str:
 
 def try_drawn_people(url: str, key: Path) -> None:
     """What the tutorial has one do in the browser, by the calls that the page makes."""
-    with httpx.Client(base_url=url, timeout=30) as page:
+    with httpx.Client(base_url=url, timeout=PATIENCE_S) as page:
         assert "demo model: not for authentication" in page.get("/").text
         page.headers["Authorization"] = f"Bearer {key.read_text().strip()}"
         decisions = {
@@ -233,7 +235,7 @@ def try_drawn_people(url: str, key: Path) -> None:
 def stop(service: subprocess.Popen[bytes]) -> None:
     """Ctrl-C."""
     service.send_signal(signal.SIGINT)
-    assert service.wait(timeout=30) in (0, -signal.SIGINT, 130)
+    assert service.wait(timeout=PATIENCE_S) in (0, -signal.SIGINT, 130)
 
 
 def mistakes_of_calls(terminal: Terminal) -> list[str]:

@@ -7,7 +7,7 @@ from verify.calibration import Calibrated, CalibrationReport, calibrate
 from verify.calibration_mode import CalibrationOptions
 from verify.datasets import DatasetError, LabelledFolder, labelled_folder, read_lfw_pairs
 from verify.decision import Decision
-from verify.stand_ins import StandIn, pick_stand_in
+from verify.stand_ins import StandIn, lift_stand_in
 from verify.verifier import Verifier
 
 __all__ = [
@@ -21,6 +21,6 @@ __all__ = [
     "Verifier",
     "calibrate",
     "labelled_folder",
-    "pick_stand_in",
+    "lift_stand_in",
     "read_lfw_pairs",
 ]

@@ -11,12 +11,15 @@ from templates.contract import Binding, Calibration, Contract
 from templates.decoys import Attributes, DecoySource
 from templates.errors import ContractError
 from templates.lifting import unit_descriptors
+from templates.nobody import Nobody
 from templates.randomness import Keystream
 from templates.subspace import SubspaceBatch
 from verify.calibration_mode import Bench, CalibrationOptions, calibrate_mode
-from verify.cohort import COHORT_SIZE, client_source, make_cohort, plain_strategy
+from verify.cohort import COHORT_SIZE, client_source, make_cohort, people_like, plain_strategy
 from verify.comparisons import Lifter, Progress, honest_norms
-from verify.raw_pairs import SuspiciousPair, consistency_threshold, suspicious_pairs
+from verify.consistency import Consistency, photo_consistency
+from verify.raw_pairs import SuspiciousPair, suspicious_pairs
+from verify.strangers import honest_score, make_nobody, strangers_like
 from verify.tenfold import Pair, TenFold, pair_arrays, random_pairs, require_folds
 from verify.trials import Plan, chosen_photos, enrolled_means, plan_trials
 
@@ -29,13 +32,13 @@ class CalibrationReport:
 
     Parameters
     ----------
-    consistency_pairs
-        Raw photo pairs that ``photo_consistency`` was set on.
+    consistency
+        How ``photo_consistency`` was set.
     unresolved
         Sentences about the FMR targets that the data cannot resolve.
     suspicious
         People who may be one person under two names: look at them before believing a threshold
-        at FMR 1e-4 or below, then name them in ``aliases`` (METHOD §3).
+        at FMR 1e-4 or below, then name them in ``aliases`` (docs/method.md §7.3).
     suspicious_above
         Raw cosine that makes a pair suspicious.
     ten_folds
@@ -43,7 +46,7 @@ class CalibrationReport:
         under protocol ``fmr``.
     """
 
-    consistency_pairs: int
+    consistency: Consistency
     unresolved: tuple[str, ...]
     suspicious: tuple[SuspiciousPair, ...]
     suspicious_above: float
@@ -79,6 +82,7 @@ def calibrate(
     attributes: Sequence[Attributes] | None = None,
     pairs: Sequence[Pair] | None = None,
     cohort: SubspaceBatch | None = None,
+    nobody: Nobody | None = None,
     recorded: Mapping[str, Json] | None = None,
     dataset: str = "labelled folder",
     progress: Callable[[str, float], None] = _silent,
@@ -89,7 +93,7 @@ def calibrate(
     passed through the wire format as in the service. Genuine probes are the photos that were left
     out. Impostor trials are all cross-identity pairs in p-to-s, and a stated random subset of
     them in s-to-s. A level's two thresholds stand at one marginal quantile, chosen so that the
-    joint FMR is at most the target (METHOD §4.7).
+    joint FMR is at most the target (docs/method.md §6.2).
 
     Parameters
     ----------
@@ -110,6 +114,8 @@ def calibrate(
         where None. Pairs of excluded people are left out.
     cohort
         A contract's cohort, to keep it; by default a new one is drawn from fresh randomness.
+    nobody
+        A contract's strangers, to keep them with their cohort; by default new ones are drawn.
     recorded
         Facts for the contract file, such as the pack's name and detector.
     dataset
@@ -152,6 +158,7 @@ def calibrate(
         source=source,
         options=chosen_options,
         cohort=cohort,
+        nobody=nobody,
         attributes=None if attributes is None else [attributes[index] for index in kept],
         pairs=_protocol_pairs(chosen_options, pairs, kept, plan, rng),
         facts={
@@ -165,8 +172,8 @@ def calibrate(
         },
         progress=progress,
     )
-    consistency, consistency_pairs = consistency_threshold(
-        data, plan.person_of, fmr=chosen_options.consistency_fmr, rng=rng
+    consistency = photo_consistency(
+        data, plan.person_of, photos=chosen_options.photos_per_enrollment, rng=rng
     )
     calibrations: list[Calibration] = []
     unresolved: list[str] = []
@@ -179,17 +186,29 @@ def calibrate(
         ten_folds += [folds] if folds else []
     contract = Contract(
         binding=binding,
-        recorded={**(recorded or {}), "photo_consistency_fmr": chosen_options.consistency_fmr},
+        recorded={
+            **(recorded or {}),
+            "photo_consistency_fmr": consistency.fmr.value,
+            "photo_consistency_refused": consistency.refused.value,
+        },
         calibrations=tuple(calibrations),
         default_level=_default_level(calibrations),
-        photo_consistency=consistency,
+        photo_consistency=consistency.threshold,
         template_foot_point_norm=honest_norms(bench.templates.foot_norms),
+        template_stranger_score=honest_score(
+            bench.nobody,
+            bench.templates,
+            halves=bench.halves,
+            metric=chosen_options.metric,
+            steps=chosen_options.steps,
+        ),
         cohort=bench.cohort,
+        nobody=bench.nobody,
     )
     return Calibrated(
         contract,
         CalibrationReport(
-            consistency_pairs=consistency_pairs,
+            consistency=consistency,
             unresolved=tuple(unresolved),
             suspicious=tuple(
                 suspicious_pairs(
@@ -210,15 +229,16 @@ def _lay_out(
     source: DecoySource,
     options: CalibrationOptions,
     cohort: SubspaceBatch | None,
+    nobody: Nobody | None,
     attributes: Sequence[Attributes] | None,
     pairs: tuple[Pair, ...],
     facts: Mapping[str, Json],
     progress: Progress,
 ) -> Bench:
-    """Enroll everybody, and draw the cohort where none is given."""
+    """Enroll everybody, and draw the cohort and the strangers where none are given."""
     service = Lifter(binding.strategy, source, binding.contract_id)
-    nobody = client_source(source)
-    client = Lifter(plain_strategy(binding.strategy), nobody, binding.contract_id)
+    generator = client_source(source)
+    client = Lifter(plain_strategy(binding.strategy), generator, binding.contract_id)
     progress("enrolling people", 0.0)
     means = enrolled_means(data, plan)
     with Keystream.seeded("calibration templates", options.seed) as stream:
@@ -228,21 +248,39 @@ def _lay_out(
             stream=stream,
             attributes=attributes and [attributes[photos[0]] for photos in plan.enrolled],
         )
+    halves = False
+    if cohort is None or nobody is None:
+        hidden = people_like(generator, means)
     if cohort is None:
         with Keystream.fresh() as stream:
             cohort = make_cohort(
-                nobody,
+                generator,
                 strategy=binding.strategy,
                 m=binding.m,
                 stream=stream,
                 size=COHORT_SIZE,
-                people=means,
+                hidden=hidden,
+            )
+    if nobody is None:
+        progress("drawing strangers", 0.0)
+        sources = strangers_like(generator, hidden, data, plan.person_of)
+        halves = len(sources) == 2
+        with Keystream.fresh() as stream:
+            nobody = make_nobody(
+                generator,
+                strangers=sources,
+                cohort=cohort,
+                metric=options.metric,
+                steps=options.steps,
+                stream=stream,
             )
     return Bench(
         descriptors=data,
         plan=plan,
         templates=templates,
         cohort=cohort,
+        nobody=nobody,
+        halves=halves,
         service=service,
         client=client,
         pairs=pairs,

@@ -11,6 +11,7 @@ from templates.canonical import Json
 from templates.contract import Calibration, Level
 from templates.distances import DEFAULT_STEPS, Metric
 from templates.errors import ContractError
+from templates.nobody import Nobody
 from templates.randomness import Keystream
 from templates.subspace import SubspaceBatch
 from verify.comparisons import (
@@ -54,8 +55,6 @@ class CalibrationOptions:
         FMR targets, powers of ten; those that the data cannot resolve are left out and reported.
     photos_per_enrollment
         Most photos averaged into one template.
-    consistency_fmr
-        Raw FMR at which ``photo_consistency`` is set.
     suspicious_above
         Raw cosine from which two people are reported as suspiciously alike. On LFW with ArcFace
         descriptors the cosine of different people passes 0.37 once in 100,000 pairs, and half of
@@ -74,7 +73,6 @@ class CalibrationOptions:
     probe_dims: tuple[int, ...] = (0,)
     targets: tuple[float, ...] = TARGETS
     photos_per_enrollment: int = 3
-    consistency_fmr: float = 1e-3
     suspicious_above: float = 0.5
     most_cells: int = 40_000_000
     lifted_probes: int = 2_000
@@ -88,12 +86,17 @@ class CalibrationOptions:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Bench:
-    """Everything that the calibrations of one run share."""
+    """Everything that the calibrations of one run share.
+
+    ``halves``: the strangers are of two sources (:func:`verify.strangers.strangers_like`).
+    """
 
     descriptors: NDArray[np.float32]
     plan: Plan
     templates: SubspaceBatch
     cohort: SubspaceBatch
+    nobody: Nobody
+    halves: bool
     service: Lifter
     client: Lifter
     pairs: tuple[Pair, ...]

@@ -2,7 +2,7 @@
 
 A *wolf* probe lies near everybody's template, and so near the cohort's as well. Its similarity to
 one subject must therefore exceed its mean similarity to the cohort by a calibrated number of the
-cohort's standard deviations (T-norm, METHOD §4.7).
+cohort's standard deviations (T-norm, docs/method.md §6.1).
 """
 
 from typing import TYPE_CHECKING
@@ -56,6 +56,17 @@ def client_source(source: DecoySource) -> DecoySource:
     return DecoyGenerator.fit(entries[np.lexsort(entries.T)])
 
 
+def people_like(source: DecoySource, people: NDArray[np.float32] | None) -> DecoySource:
+    """Return what draws descriptors that are spread like those of enrolled people (P, n).
+
+    Decoys are fitted to other people, and to single photos. So a generator is fitted to the people
+    where they are n or more; otherwise it is ``source``.
+    """
+    if people is not None and len(people) >= people.shape[1]:
+        return DecoyGenerator.fit(people)
+    return source
+
+
 def make_cohort(
     source: DecoySource,
     *,
@@ -63,13 +74,12 @@ def make_cohort(
     m: int,
     stream: Keystream,
     size: int = COHORT_SIZE,
-    people: NDArray[np.float32] | None = None,
+    hidden: DecoySource | None = None,
 ) -> SubspaceBatch:
     """Lift ``size`` descriptors of nobody, with decoys of nobody.
 
-    The hidden descriptors should be spread like those of the templates that a probe meets. Decoys
-    are fitted to other people, and to single photos; a wolf that knows the difference is nearer to
-    the templates than to such a cohort, and passes too often.
+    The hidden descriptors should be spread like those of the templates that a probe meets: a wolf
+    that knows a difference is nearer to the templates than to such a cohort, and passes too often.
 
     Parameters
     ----------
@@ -78,9 +88,8 @@ def make_cohort(
         generator is fitted first.
     strategy, m
         The contract's.
-    people : (P, n) float32
-        Descriptors of the people of the calibration, as they are enrolled. The cohort's are drawn
-        from a generator fitted to them, where they are n or more; from ``source`` otherwise.
+    hidden
+        What the hidden descriptors are drawn from (:func:`people_like`); ``source`` where None.
     stream
         Fresh for a service; seeded for experiments only, since the cohort is a secret.
 
@@ -90,10 +99,7 @@ def make_cohort(
         ``size`` templates, un-rotated.
     """
     nobody = client_source(source)
-    hidden = nobody
-    if people is not None and len(people) >= people.shape[1]:
-        hidden = DecoyGenerator.fit(people)
-    descriptors = hidden.draw(size, 1, stream=stream)[:, 0, :]
+    descriptors = (hidden or nobody).draw(size, 1, stream=stream)[:, 0, :]
     return lift(descriptors, strategy=plain_strategy(strategy), m=m, source=nobody, stream=stream)
 
 

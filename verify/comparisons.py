@@ -247,7 +247,7 @@ def honest_norms(norms: NDArray[np.float64]) -> tuple[float, float]:
     ‖p‖ of honest lifts is unimodal with thin tails (a sum over many decoys). The extremes of 1,000
     or more observations lie some 3 standard deviations out, so the widened range reaches about 6,
     and an honest client is refused less than once in a million. The lower bound stays positive:
-    a set through the coordinate origin is no lift of a unit vector (METHOD §4.7).
+    a set through the coordinate origin is no lift of a unit vector (docs/method.md §4.7).
     """
     low, high = float(norms.min()), float(norms.max())
     margin = max((high - low) / 2, 1e-3)

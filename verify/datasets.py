@@ -145,7 +145,7 @@ def parse_lfw_pairs(path: Path, text: str) -> list[NamedPair]:
     """Parse the text of LFW's ``pairs.txt``; ``path`` is for messages only.
 
     The header is ``folds<TAB>pairs per class and fold``; every fold then has that many lines
-    ``Name i j`` of one person and as many lines ``NameA i NameB j`` of two (FORMATS).
+    ``Name i j`` of one person and as many lines ``NameA i NameB j`` of two.
 
     Raises
     ------

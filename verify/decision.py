@@ -24,7 +24,8 @@ class Decision:
         What the thresholds belong to.
     similarity, distance, cohort_score
         Scores, for keys with the right to them: returned to anyone else they let an attacker
-        climb (METHOD §4.8). Left out of ``repr``, so that no log line holds them by accident.
+        climb (docs/method.md §4.8). Left out of ``repr``, so that no log line holds them by
+        accident.
     """
 
     accepted: bool

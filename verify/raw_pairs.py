@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from templates.errors import ContractError
-from verify.metrics import most_errors, threshold_at_fmr
 
 TILE = 1024
 MOST_PHOTOS = 8_000
@@ -22,27 +21,18 @@ class SuspiciousPair:
     cosine: float
 
 
-def consistency_threshold(
-    descriptors: NDArray[np.float32],
-    person_of: NDArray[np.int64],
-    *,
-    fmr: float,
-    rng: np.random.Generator,
-) -> tuple[float, int]:
-    """Raw cosine that at most a share ``fmr`` of all cross-identity photo pairs reaches.
+def impostor_cosines(
+    descriptors: NDArray[np.float32], person_of: NDArray[np.int64], *, rng: np.random.Generator
+) -> NDArray[np.float32]:
+    """Raw cosines of all pairs of photos of different people.
 
     Of more than ``MOST_PHOTOS`` photos a random subset of that many is compared, so that memory
     stays below 0.3 GiB.
 
-    Returns
-    -------
-    threshold, pairs
-        The cosine, and the number of pairs it was set on.
-
     Raises
     ------
     ContractError
-        Where there is no cross-identity pair.
+        Where there is no such pair.
     """
     if len(descriptors) > MOST_PHOTOS:
         kept = rng.choice(len(descriptors), MOST_PHOTOS, replace=False)
@@ -53,10 +43,7 @@ def consistency_threshold(
         raise ContractError(
             "photo consistency needs photos of at least two people: add people, or exclude fewer"
         )
-    # Only the upper tail decides; sorting all pairs in float64 would triple the memory.
-    tail = min(impostor.size, most_errors(fmr, impostor.size) + 2)
-    highest = np.partition(impostor, impostor.size - tail)[-tail:]
-    return threshold_at_fmr(highest, fmr, trials=impostor.size), impostor.size
+    return impostor
 
 
 def suspicious_pairs(

@@ -1,4 +1,4 @@
-"""Both thresholds of a level, at the same marginal quantile (METHOD §4.7).
+"""Both thresholds of a level, at the same marginal quantile (docs/method.md §6.2).
 
 Setting each test alone at the target FMR would halve the joint FMR and waste genuine users. So
 both thresholds are set at one marginal quantile q, and q is the largest at which the *joint* FMR

@@ -31,8 +31,8 @@ class Verifier:
     """Decides for one contract and one tenant. Holds no state between calls; threads may share it.
 
     Every decision needs both the similarity threshold and the cohort test of its level
-    (METHOD §4.7). Stored templates are rotated, the cohort is not, so the probe is turned for the
-    template only.
+    (docs/method.md §6). Stored templates are rotated, the cohort is not, so the probe is turned for
+    the template only.
 
     Parameters
     ----------
@@ -182,8 +182,8 @@ class Verifier:
         subspace = received.subspace
         if (subspace.n, subspace.m) != (binding.n, binding.m):
             raise InvalidTemplate("the stored template has dimensions other than the contract's")
-        if isinstance(stored, StandIn):
-            subspace = stored.mirrored(subspace)
+        if isinstance(stored, StandIn) and stored.lifted is not None:
+            subspace = stored.lifted
         return SubspaceBatch.of([subspace])
 
     def _decide(

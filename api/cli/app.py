@@ -6,11 +6,13 @@ do not import what the audit needs.
 
 import importlib
 from collections.abc import Iterator, Mapping
-from typing import Any
+from importlib.metadata import version
+from typing import Annotated, Any
 
 import typer
 import typer.main
 
+from api.cli.console import say
 from api.cli.errors import Commands
 
 MODULES = {
@@ -81,9 +83,25 @@ app = typer.Typer(
 )
 
 
+def _show_version(asked: bool) -> None:
+    if asked:
+        say(f"veilface {version('veilface')}")
+        raise typer.Exit
+
+
 @app.callback()
-def _root() -> None:
-    """Typer asks for a callback where it sees no command."""
+def _root(
+    _version: Annotated[
+        bool,
+        typer.Option(
+            "--version",
+            callback=_show_version,
+            is_eager=True,
+            help="Print name and version, and exit.",
+        ),
+    ] = False,
+) -> None:
+    """Take the options that stand before a command."""
 
 
 def main() -> None:

@@ -1,7 +1,7 @@
 """``veilface audit fairface``: what templates tell about gender, race and age."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -9,7 +9,7 @@ import numpy as np
 import typer
 
 from api.cli.audit_report import Out, Seed, conclude, default_of, limit_option
-from api.cli.console import demo_notice, message, progress
+from api.cli.console import demo_notice, message, share_done
 from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, extract
 from api.cli.errors import CommandError, UsageError
 from api.cli.evaluation_inputs import listed, named_file
@@ -188,16 +188,20 @@ def fairface(
         )
     if results is not None:
         verification_accuracy(results, schemes)
-    train, train_photos = _faces(root, "train", pack, wanted, aligned, settings, cache)
-    validation, photos = _faces(root, "val", pack, wanted, aligned, settings, cache)
+    labels, attacked_labels = _labels(root, "train"), _labels(root, "val")
+    if lifting is None:
+        lifting = min(PAPER_LIFTING, max(LEAST_LIFTING, int(LIFTING_SHARE * len(labels))))
+    # Only what takes part is embedded: a face costs a hundred times what an attack on it does.
+    labels = _some(labels, None if attack is None else lifting + attack, seed)
+    attacked_labels = _some(attacked_labels, attacked, seed)
+    train, train_photos = _faces(labels, pack, wanted, aligned, settings, cache)
+    validation, photos = _faces(attacked_labels, pack, wanted, aligned, settings, cache)
     duplicates = 0
     if drop_duplicates is not None:
         gone = near_duplicates(validation.descriptors, train.descriptors, cosine=drop_duplicates)
         validation = validation.take(np.setdiff1d(np.arange(len(validation)), gone))
         duplicates = len(gone)
         message(f"note: {duplicates} faces resemble a training face and are not attacked")
-    if lifting is None:
-        lifting = min(PAPER_LIFTING, max(LEAST_LIFTING, int(LIFTING_SHARE * len(train))))
     if attack is not None:
         # Which photos give no descriptor is not known beforehand.
         attack = min(attack, max(1, len(train) - lifting))
@@ -206,7 +210,14 @@ def fairface(
     )
     bench = prepare(parts, plan=plan, seed=seed)
     rows: list[AttributeRow] = []
-    with progress("attacking", sum(work_of(bench, scheme) for scheme in schemes)) as advance:
+    with share_done("attacking templates") as report_share:
+        total, done = sum(work_of(bench, scheme) for scheme in schemes), 0
+
+        def advance(work: int) -> None:
+            nonlocal done
+            done += work
+            report_share(done / total)
+
         for scheme in schemes:
             rows += run_scheme(bench, scheme, progress=advance)
     report = document(
@@ -288,21 +299,32 @@ def _schemes(
     ]
 
 
+def _labels(root: Path, part: str) -> dict[Path, Label]:
+    file = root / f"fairface_label_{part}.csv"
+    if not file.is_file():
+        raise CommandError(
+            f"{root} has no {file.name}; give the folder of FairFace, with its two label files"
+        )
+    return read_labels(file)
+
+
+def _some(labels: dict[Path, Label], most: int | None, seed: int) -> dict[Path, Label]:
+    """Choose at most so many photos at random, before any is embedded; all where None."""
+    if most is None or most >= len(labels):
+        return labels
+    photos = list(labels)
+    chosen = np.random.default_rng([seed, 3]).permutation(len(photos))[:most]
+    return {photos[index]: labels[photos[index]] for index in sorted(chosen.tolist())}
+
+
 def _faces(
-    root: Path,
-    part: str,
+    labels: Mapping[Path, Label],
     pack: ModelPack,
     attributes: Sequence[str],
     aligned: bool,
     settings: Settings,
     cache: Path | None,
 ) -> tuple[LabelledFaces, Extraction]:
-    file = root / f"fairface_label_{part}.csv"
-    if not file.is_file():
-        raise CommandError(
-            f"{root} has no {file.name}; give the folder of FairFace, with its two label files"
-        )
-    labels = read_labels(file)
     extraction = extract(pack, list(labels), aligned=aligned, settings=settings, cache=cache)
     found: list[Label] = [labels[path] for path in extraction.paths]
     faces = LabelledFaces.of_names(

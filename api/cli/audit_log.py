@@ -43,11 +43,14 @@ def verify(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Check every line; exit status 1 where one was altered, removed, added or moved.
+    """Check every line and the records that the log tells of; exit status 1 where one is wrong.
 
-    Needs: the database and its master key, under which the chain is computed: whoever can write
-    the database but has no master key cannot write a line that passes. The service may run
-    meanwhile.
+    A line that was altered, removed, added or moved is named; so are tenants, API keys and counts
+    of failed attempts that are not as the log tells, actors that were never created, and nonces
+    that served twice.
+
+    Needs: the database and its master key, under which chain and records are authenticated: whoever
+    can write the database but has no master key can write neither. The service may run meanwhile.
 
     Example: `veilface audit-log verify --anchor head.txt`
     """
@@ -57,6 +60,8 @@ def verify(
         progress("verifying the audit log", _length(store.audit_log)) as advance,
     ):
         found = store.audit_log.verify(anchor=kept, progress=advance)
+        records = store.check_records()
+    intact = found.intact and not records
     problems = [
         {"sequence": each.sequence, "through": each.through, "problem": each.what}
         for each in found.problems
@@ -64,24 +69,31 @@ def verify(
     if as_json:
         emit(
             {
-                "intact": found.intact,
+                "intact": intact,
                 "lines": found.lines,
                 "head": str(found.head),
                 "problems": problems,
                 "unlisted": found.unlisted,
+                "records": [{"problem": each.what, "about": each.about} for each in records],
             }
         )
-    elif found.intact:
+    elif intact:
         checked = "" if kept is None else f", and holds the head of line {kept.sequence}"
         say(f"The audit log is whole: {found.lines} lines{checked}.")
-    if not found.intact:
+        say("API keys, tenants and counts of failed attempts are as it tells.")
+    if not intact:
         for each in found.problems[:PROBLEMS_SHOWN]:
             through = "" if each.through in (None, each.sequence) else f" to {each.through}"
             message(f"line {each.sequence}{through}: {each.what}")
         more = len(problems) - PROBLEMS_SHOWN + found.unlisted
         if more > 0:
             message(f"… and {more} more")
-        message("error: the audit log was tampered with, or damaged")
+        for record in records[:PROBLEMS_SHOWN]:
+            message(f"{record.about}: {record.what}")
+        if len(records) > PROBLEMS_SHOWN:
+            message(f"… and {len(records) - PROBLEMS_SHOWN} more")
+        what = "the audit log was" if not found.intact else "records of the database were"
+        message(f"error: {what} tampered with, or damaged")
         raise typer.Exit(1)
 
 

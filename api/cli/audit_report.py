@@ -6,11 +6,14 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich.table import Table
 
-from api.cli.console import emit, say
+from api.cli.console import emit, say, show, table
+from attacks.outcomes import Scheme
 from attacks.report import Document
 from attacks.report_tables import markdown
 from attacks.verdict import LIMITS
+from templates.private_file import make_folder, replace_public
 
 FAILED = 1
 Out = Annotated[Path, typer.Option(help="Folder of the report.")]
@@ -46,13 +49,11 @@ def write_report(
     # Imported here: drawing loads a library that nothing else needs.
     from attacks.figures import write_figures
 
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     files = [out / "report.json", out / "report.md"]
     text = json.dumps(report, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
-    partial = out / ".report.json.part"
-    partial.write_text(text, encoding="utf-8")
-    partial.replace(files[0])
-    files[1].write_text(markdown(report), encoding="utf-8")
+    replace_public(files[0], text.encode())
+    replace_public(files[1], markdown(report).encode())
     return [*files, *write_figures(report, out, evaluation=evaluation)]
 
 
@@ -69,6 +70,7 @@ def conclude(
     if as_json:
         emit({**notice, "out": str(out), "files": [path.name for path in files], **report})
     else:
+        show(*verdict_tables(report))
         for sentence in report["headlines"]:
             say(sentence)
         for sentence in report["comparison_headlines"]:
@@ -77,3 +79,30 @@ def conclude(
         say("PASSED" if report["passed"] else "FAILED: a limit is exceeded.")
     if not report["passed"]:
         raise typer.Exit(FAILED)
+
+
+def verdict_tables(report: Document) -> list[Table]:
+    """Show how the strongest attacks stand against the limits; one table for each scheme."""
+    made = []
+    for verdict in report["verdicts"]:
+        title = f"Verdict on {Scheme.of(verdict)}" + (
+            ", for comparison" if verdict["comparison"] else ""
+        )
+        listing = table(
+            title, "property", "attacker has", "strongest attack", "reached (95 %)", "by chance",
+            "compared", "limit", "",
+        )  # fmt: skip
+        for cell in verdict["cells"]:
+            variant = f" ({cell['variant']})" if cell["variant"] else ""
+            listing.add_row(
+                cell["property"],
+                cell["knowledge"],
+                f"{cell['attack']}{variant}",
+                f"{cell['value']:.3g} ({cell['ci_low']:.2g}-{cell['ci_high']:.2g})",
+                f"{cell['chance']:.3g}",
+                f"{cell['compared']:.3g}",
+                "" if cell["most"] >= 1 else f"{cell['limit']} {cell['most']:.3g}",
+                cell["status"],
+            )
+        made.append(listing)
+    return made

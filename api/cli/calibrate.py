@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from api.cli.console import demo_notice, emit, message, progress, say, show, table
+from api.cli.console import demo_notice, emit, message, say, share_done, show, table
 from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, extract
 from api.cli.errors import CommandError, UsageError
 from api.cli.files import read_bounded, read_names
@@ -14,9 +14,11 @@ from api.cli.options import AsJson, takes_settings
 from api.opening import file_sealer, open_keyring
 from api.preparation import (
     DEFAULT_DIM,
+    DEFAULT_PROBE_DIM,
     acquired,
     acquired_json,
     calibrate_folder,
+    default_probe_dims,
     require_made_with,
 )
 from api.settings import Settings
@@ -82,12 +84,14 @@ def calibrate(
         int, typer.Option(min=1, max=128, help="Dimension m of stored templates.")
     ] = DEFAULT_DIM,
     probe_dims: Annotated[
-        str,
+        str | None,
         typer.Option(
-            help="Dimensions of lifted probes that clients may send, for example `2,4,8`. Raw "
-            "probes, such as photos, are always calibrated."
+            help="Dimensions of lifted probes that clients may send, for example `2,4,8`; `none` "
+            "for none, which is quicker. Raw probes, such as photos, are always calibrated. Unset: "
+            f"{DEFAULT_PROBE_DIM}, or --dim where that is smaller.",
+            show_default=False,
         ),
-    ] = "",
+    ] = None,
     metric: Annotated[Metric, typer.Option(help="The distance that decides.")] = Metric.SPHERICAL,
     protocol: Annotated[
         Protocol,
@@ -127,7 +131,7 @@ def calibrate(
     Example: `veilface calibrate lfw --pack buffalo_l --decoys decoys.veil --out contract.json
     --strategy adversarial --dim 32`
     """
-    dims = parse_dims(probe_dims)
+    dims = default_probe_dims(dim) if probe_dims is None else parse_dims(probe_dims)
     pack = bulk_pack(settings, flip=flip, why="a contract is bound to a model pack")
     if dim >= pack.info.n:
         raise UsageError(f"--dim must be below the {pack.info.n} numbers of a descriptor")
@@ -144,15 +148,7 @@ def calibrate(
     require_made_with(source, pack)
     exclude = frozenset() if exclude_people is None else read_names(exclude_people)
     extraction = extract(pack, labelled.paths, aligned=aligned, settings=settings, cache=cache)
-    with progress("calibrating", 100) as advance:
-        shown = 0
-
-        def report(_what: str, share: float) -> None:
-            nonlocal shown
-            step = max(0, int(100 * share) - shown)
-            shown += step
-            advance(step)
-
+    with share_done("calibrating") as report:
         done = calibrate_folder(
             labelled,
             extraction,
@@ -169,10 +165,9 @@ def calibrate(
             ),
             exclude=exclude,
             aliases={} if aliases is None else read_aliases(aliases),
-            progress=report,
+            progress=lambda _what, share: report(share),
         )
     path = out or settings.resolved_contract_file
-    path.parent.mkdir(parents=True, exist_ok=True)
     done.contract.save(path, sealer)
     found = None
     if strategy is not Strategy.RANDOM:
@@ -182,10 +177,10 @@ def calibrate(
             source,
             strategy=strategy,
             m=dim,
-            cosine=done.contract.photo_consistency,
+            cosine=done.report.consistency.match_cosine,
             seed=seed,
         )
-    for note in (concealment_note(strategy, dim), likeness_note(found)):
+    for note in (concealment_note(strategy, dim), likeness_note(found, strategy, dim)):
         if note:
             message(f"note: {note}")
     notice = demo_notice(pack.info.embedder_sha256, n=pack.info.n)
@@ -219,29 +214,34 @@ def concealment_note(strategy: Strategy, m: int) -> str | None:
     )
 
 
-def likeness_note(found: Rate | None) -> str | None:
+def likeness_note(found: Rate | None, strategy: Strategy, m: int) -> str | None:
     """Say that the decoys are spread unlike the people, where their statistics give faces away."""
     if found is None or found.value <= MOST_FOUND:
         return None
     return (
-        f"from {100 * found.value:.0f} % of the templates of these people, who has the decoy "
-        "generator finds the descriptor: the decoys are spread unlike these people. Build the "
-        "decoys from other people's photos of the same kind (thousands of them), or take "
-        "a larger --dim (docs/privacy.md)"
+        f"from {100 * found.value:.0f} % of the templates of these people ({found.errors} of "
+        f"{found.trials}, {strategy}, m = {m}), who has the decoy generator finds the descriptor: "
+        "the decoys are spread unlike these people. Build the decoys from thousands of other "
+        "people's photos of the same kind, then calibrate again: this line says what a change "
+        "gains (docs/privacy.md)"
     )
 
 
 def parse_dims(text: str) -> tuple[int, ...]:
-    """Read ``2,4,8``.
+    """Read ``2,4,8``, or ``none``.
 
     Raises
     ------
     UsageError
         Something else, or a dimension twice.
     """
+    if text.strip() == "none":
+        return ()
     parts = [part.strip() for part in text.split(",") if part.strip()]
-    if not all(part.isdecimal() and 1 <= int(part) <= 128 for part in parts):
-        raise UsageError("--probe-dims takes dimensions from 1 to 128, separated by commas")
+    if not parts or not all(part.isdecimal() and 1 <= int(part) <= 128 for part in parts):
+        raise UsageError(
+            "--probe-dims takes dimensions from 1 to 128, separated by commas, or none"
+        )
     dims = tuple(int(part) for part in parts)
     if len(set(dims)) != len(dims):
         raise UsageError("--probe-dims names a dimension twice")
@@ -298,15 +298,21 @@ def _tell(contract: Contract, report: CalibrationReport) -> None:
             say(f"  {pair.first},{pair.second}  {pair.cosine:.3f}")
         if len(report.suspicious) > MOST_SHOWN:
             message(f"note: {len(report.suspicious) - MOST_SHOWN} more; see --json")
+    consistency = report.consistency
     say(
-        f"Default level: {contract.default_level}. Photos of one enrollment must be alike to "
-        f"{contract.photo_consistency:.3f}, set on {report.consistency_pairs} pairs."
+        f"Default level: {contract.default_level}. Photos of one enrollment must agree to "
+        f"{contract.photo_consistency:.3f}: {shown_rate(consistency.refused)} of the genuine sets "
+        f"do not; {shown_rate(consistency.fmr)} of the pairs of two people do."
     )
 
 
 def _report_json(report: CalibrationReport) -> dict[str, Any]:
     return {
-        "consistency_pairs": report.consistency_pairs,
+        "photo_consistency": {
+            "threshold": report.consistency.threshold,
+            "fmr": report.consistency.fmr.to_json(),
+            "refused": report.consistency.refused.to_json(),
+        },
         "unresolved": list(report.unresolved),
         "suspicious_above": report.suspicious_above,
         "suspicious": [

@@ -8,10 +8,16 @@ from typing import Any
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    TaskProgressColumn,
+    TextColumn,
+    TimeRemainingColumn,
+)
 from rich.table import Table
-
-from models.demo import DEMO_DIMENSION, DEMO_NOTICE, is_demo_model
 
 Advance = Callable[[int], None]
 
@@ -54,6 +60,9 @@ def demo_notice(embedder_sha256: str, *, n: int) -> dict[str, str]:
 
     ``n`` is its dimension: a model of another one is not compared, which takes a second.
     """
+    # Imported here, since commands that touch no model shall not wait for its libraries.
+    from models.demo import DEMO_DIMENSION, DEMO_NOTICE, is_demo_model
+
     if n != DEMO_DIMENSION or not is_demo_model(embedder_sha256):
         return {}
     message(f"note: {DEMO_NOTICE}")
@@ -62,14 +71,25 @@ def demo_notice(embedder_sha256: str, *, n: int) -> dict[str, str]:
 
 @contextmanager
 def progress(description: str, total: int | None) -> Iterator[Advance]:
-    """Show a progress bar on stderr while the block runs; call the result with what was done."""
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-    )
-    console = Console(stderr=True)
-    with Progress(*columns, console=console, transient=not console.is_terminal) as bar:
+    """Show a progress bar on stderr while the block runs; call the result with what was done.
+
+    ``total`` counts things that a reader knows, such as photos. For work that has no such unit
+    there is :func:`share_done`.
+    """
+    with _bar(MofNCompleteColumn()) as bar:
         task = bar.add_task(description, total=total)
         yield lambda done: bar.advance(task, done)
+
+
+@contextmanager
+def share_done(description: str) -> Iterator[Callable[[float], None]]:
+    """Show per cent on stderr while the block runs; call the result with the share from 0 to 1."""
+    with _bar(TaskProgressColumn()) as bar:
+        task = bar.add_task(description, total=1.0)
+        yield lambda share: bar.update(task, completed=share)
+
+
+def _bar(amount: ProgressColumn) -> Progress:
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), amount, TimeRemainingColumn())
+    return Progress(*columns, console=console, transient=not console.is_terminal)

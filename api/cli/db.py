@@ -9,12 +9,12 @@ import typer
 from api.audit import operator
 from api.cli.console import emit, message, progress, say
 from api.cli.errors import UsageError
-from api.cli.files import write_private
 from api.cli.options import STORE, AsJson, Tenant, takes_settings
 from api.opening import checked_store, open_keyring, open_store, retention_of
 from api.receipts import receipt_json
 from api.settings import Settings
 from templates.errors import VeilfaceError
+from templates.private_file import replace_private
 from templates.store.database import Database
 from templates.store.migrate import current_revision, head_revision
 
@@ -23,7 +23,7 @@ app = typer.Typer(no_args_is_help=True)
 
 @app.callback()
 def db() -> None:
-    """Bring the database's schema up to date, check it, and clean up in it."""
+    """Bring the database's schema up to date, check it, clean up in it, and set up tenants."""
 
 
 @app.command()
@@ -32,23 +32,37 @@ def upgrade(*, settings: Settings, as_json: AsJson = False) -> None:
     """Migrate the database to the schema of this version.
 
     `serve` does this by itself at its start; run it before, where several machines start at once.
-    Safe to run again. Make a backup first.
+    Safe to run again. Stop every process of an earlier version first, and make a backup.
+
+    A database from before rows were authenticated is authenticated once, as it is: look through
+    `veilface keys list` first. API keys that the audit log does not know stay out, and are named.
 
     Example: `veilface db upgrade --database-url postgresql+psycopg://veilface@localhost/veilface`
     """
     store = open_store(settings, open_keyring(settings))
     try:
         before = _revision(settings)
-        store.upgrade()
+        adoption = store.upgrade()
         after = _revision(settings)
     finally:
         store.close()
     if as_json:
-        emit({"before": before, "after": after})
+        emit(
+            {
+                "before": before,
+                "after": after,
+                "authenticated": adoption.rows,
+                "refused_keys": list(adoption.refused),
+            }
+        )
     elif before == after:
         say(f"The schema is up to date: {after}.")
     else:
         say(f"Migrated from {before or 'an empty database'} to {after}.")
+    if adoption.rows and not as_json:
+        say(f"Authenticated the {adoption.rows} rows there were.")
+    for prefix in adoption.refused:
+        message(f"key {prefix} is not as the audit log tells: it is good for nothing; replace it")
 
 
 @app.command()
@@ -171,6 +185,46 @@ def purge(
         say(f"Erased {erased} subjects, and the records that had expired.")
 
 
+@app.command("template-enrollment")
+@takes_settings(*STORE, "default_tenant")
+def template_enrollment(
+    *,
+    settings: Settings,
+    tenant: Tenant = None,
+    allow: Annotated[
+        bool | None,
+        typer.Option(
+            "--allow/--forbid", help="Unset: say what holds; nothing changes.", show_default=False
+        ),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Allow a tenant's clients to enroll templates that they made themselves, or forbid it.
+
+    Forbidden unless you allow it. Nothing in a template tells whether it holds one person: whoever
+    has a key with `enroll` and `embeddings` can lay one template through as many people as it has
+    dimensions, and the service accepts all of them as that subject. Allow it where you trust the
+    holders of such keys as you would trust them to say who somebody is. It counts at once, in all
+    workers; templates that are stored stay. Imports of exports need no such leave: the service
+    sealed them.
+
+    Example: `veilface db template-enrollment --tenant default --allow`
+    """
+    name = tenant or settings.default_tenant
+    with checked_store(settings) as store:
+        if allow is None:
+            allowed = store.tenants.get(name).template_enrollment
+        else:
+            allowed = store.tenants.set_template_enrollment(
+                name, allow, by=operator()
+            ).template_enrollment
+    if as_json:
+        emit({"tenant": name, "template_enrollment": allowed})
+    else:
+        does = "takes" if allowed else "does not take"
+        say(f"Tenant {name} {does} templates that clients made.")
+
+
 @app.command("erase-tenant")
 @takes_settings(*STORE)
 def erase_tenant(
@@ -202,7 +256,7 @@ def erase_tenant(
     if out is None:
         emit(answer)
         return
-    write_private(out, json.dumps(answer, indent=2).encode())
+    replace_private(out, json.dumps(answer, indent=2).encode())
     counts = {each["item"]: each["count"] for each in receipt.claims["erased"]}
     say(f"Erased tenant {tenant}: {counts.get('subjects', 0)} subjects. Receipt: {out}")
 

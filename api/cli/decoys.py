@@ -116,7 +116,6 @@ def build(
             f"{FACES_PER_DIMENSION * source.n} or more"
         )
     path = out or settings.resolved_decoys_file
-    path.parent.mkdir(parents=True, exist_ok=True)
     if isinstance(source, DecoyGenerator):
         source.save(path)
     else:

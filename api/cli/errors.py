@@ -9,15 +9,15 @@ from pathlib import Path
 from typing import Any
 
 import typer
-from sqlalchemy.exc import SQLAlchemyError
 from typer.core import TyperGroup
 
 from api.cli.console import message
-from models.errors import ModelError
 from templates.errors import VeilfaceError
 
 FAILED = 1
 USAGE = 2
+NO_DECISION = 3
+_FAILED_STATUS = {"verify": NO_DECISION}  # where 1 is an answer
 
 
 class CommandError(VeilfaceError):
@@ -32,18 +32,30 @@ class Commands(TyperGroup):
     """The root command: it turns every exception into a sentence and an exit status."""
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the chosen command."""
+        """Run the chosen command; `verify` fails with a status that is no rejection."""
         try:
             return super().invoke(ctx)
         except (typer.Exit, typer.Abort, typer.TyperException, BrokenPipeError):
             raise
         except Exception as error:
             message(f"error: {sentence(error)}")
-            raise typer.Exit(USAGE if isinstance(error, UsageError) else FAILED) from None
+            failed = _FAILED_STATUS.get(ctx.invoked_subcommand, FAILED)
+            raise typer.Exit(USAGE if isinstance(error, UsageError) else failed) from None
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Find the chosen command; its name is known also where its import fails."""
+        ctx.invoked_subcommand = args[0]
+        return super().resolve_command(ctx, args)
 
 
 def sentence(error: Exception) -> str:
     """Say what is wrong, without a value that may be private."""
+    # Imported here: the database's and the models' libraries take seconds, and most commands fail
+    # without them, if at all.
+    from sqlalchemy.exc import SQLAlchemyError
+
+    from models.errors import ModelError
+
     match error:
         case VeilfaceError() | ModelError():
             return str(error)

@@ -29,6 +29,7 @@ from api.settings import Settings
 from templates.decoys import DecoyPool
 from templates.distances import Metric
 from templates.lifting import Strategy
+from templates.private_file import make_folder
 from verify.evaluation.backends import Backend, BackendError
 from verify.evaluation.evaluation import evaluate_set, prepare
 from verify.evaluation.group_rows import group_rows
@@ -197,7 +198,7 @@ def evaluate(
     if cache is not None and where.scheduler is not None:
         message("note: --cache is not used with a cluster; its workers keep no embeddings")
     kept = open_cache(cache, settings)
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     faces = [
         acquire_faces(pairs, descriptors, settings, aligned=aligned, cache=kept, backend=where)
         for pairs in sets

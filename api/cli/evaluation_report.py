@@ -9,6 +9,7 @@ from rich.table import Table
 from api.cli.console import table
 from api.cli.errors import CommandError
 from api.cli.files import read_bounded
+from templates.private_file import replace_public
 from verify.evaluation.rows import Json
 from verify.evaluation.tables import markdown, write_csv
 
@@ -44,11 +45,9 @@ def write_results(results: Json, out: Path, *, audit: Json | None) -> list[Path]
     for name in ("figure", "det", "roc", "frontier"):
         for suffix in (".png", ".svg"):
             (out / f"{name}{suffix}").unlink(missing_ok=True)
-    partial = out / ".results.json.part"
-    partial.write_text(text, encoding="utf-8")
-    partial.replace(files[0])
+    replace_public(files[0], text.encode())
     write_csv(results, files[1])
-    files[2].write_text(markdown(results), encoding="utf-8")
+    replace_public(files[2], markdown(results).encode())
     return [*files, *write_figures(results, out, audit=audit)]
 
 

@@ -1,9 +1,8 @@
-"""Reading and writing files under limits, and finding the photos of a folder."""
+"""Reading files under limits, and finding the photos of a folder."""
 
 from pathlib import Path
 
 from api.cli.errors import CommandError
-from templates.private_file import replace_private
 
 PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp"})
 
@@ -15,12 +14,6 @@ def read_bounded(path: Path, most: int) -> bytes:
     if len(data) > most:
         raise CommandError(f"{path} has more than {most} bytes; is it the right file?")
     return data
-
-
-def write_private(path: Path, data: bytes) -> None:
-    """Write a file that only its owner may read; one that is there is replaced."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    replace_private(path, data)
 
 
 def find_photos(folder: Path) -> list[Path]:

@@ -60,6 +60,14 @@ def create(
         int | None,
         typer.Option(min=1, max=36500, help="Days until it expires. Unset: never."),
     ] = None,
+    lowest_level: Annotated[
+        str | None,
+        typer.Option(
+            help="Lowest security level that it may ask for, as `fmr-1e-4`: it verifies at none "
+            "of a larger false match rate. Unset: the setting `lowest_level`.",
+            show_default=False,
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Make an API key and show it, once.
@@ -73,7 +81,14 @@ def create(
     with _store(settings) as store:
         store.tenants.create(name)
         expires = None if days is None else utc_now() + timedelta(days=days)
-        made = store.api_keys.create(name, right, label=label, expires_at=expires, by=operator())
+        made = store.api_keys.create(
+            name,
+            right,
+            label=label,
+            expires_at=expires,
+            lowest_level=lowest_level,
+            by=operator(),
+        )
     if as_json:
         emit({"token": made.token, **_described(made.key)})
     else:
@@ -100,12 +115,14 @@ def list_keys(
     if as_json:
         emit([_described(key) for key in found])
         return
-    listing = table("API keys", "prefix", "tenant", "rights", "label", "state", "last used")
+    columns = ("prefix", "tenant", "rights", "lowest level", "label", "state", "last used")
+    listing = table("API keys", *columns)
     for key in found:
         listing.add_row(
             key.prefix,
             key.tenant,
             ", ".join(sorted(key.rights)),
+            key.lowest_level or "any",
             key.label,
             _state(key),
             "never" if key.last_used_at is None else f"{key.last_used_at:%Y-%m-%d %H:%M}",
@@ -156,6 +173,7 @@ def replace(
 ) -> None:
     """Make a key with the rights of another one, which then expires; show the new one, once.
 
+    Tenant, label and lowest level are those of the old key too.
     Give the new key to whoever holds the old one before the hours are over. After a leak use
     `--grace-hours 0`. Exit status 1 where there is no valid key of this prefix.
 
@@ -247,10 +265,9 @@ def master(*, settings: Settings, as_json: AsJson = False) -> None:
     place, apart from the backups of the database: without it nothing stored can be read, and with
     it everything.
 
-    Example: `veilface keys master --master-key-file veilface-data/master.key`
+    Example: `veilface keys master --master-key-file /etc/veilface/master.key`
     """
     path = settings.resolved_master_key_file
-    path.parent.mkdir(parents=True, exist_ok=True)
     keyring = MasterKeyring.create(path)
     if as_json:
         emit({"file": str(path), "key_id": keyring.current})
@@ -443,6 +460,8 @@ def _store(settings: Settings, keyring: MasterKeyring | None = None) -> Iterator
 
 
 def _state(key: ApiKey) -> str:
+    if not key.authentic:
+        return "not authentic: `veilface audit-log verify`"
     if key.revoked_at is not None:
         return "revoked"
     if not key.is_valid_at(utc_now()):
@@ -458,6 +477,7 @@ def _described(key: ApiKey) -> dict[str, Any]:
         "prefix": key.prefix,
         "tenant": key.tenant,
         "rights": sorted(key.rights),
+        "lowest_level": key.lowest_level,
         "label": key.label,
         "created_at": iso(key.created_at),
         "expires_at": iso(key.expires_at),

@@ -10,7 +10,7 @@ import typer
 
 from api.cli.console import demo_notice, emit, say
 from api.cli.errors import CommandError, UsageError
-from api.cli.files import read_bounded, write_private
+from api.cli.files import read_bounded
 from api.cli.options import AsJson
 from enroll.enroller import MAX_PHOTOS, mean_descriptor
 from enroll.errors import InconsistentImages
@@ -22,6 +22,7 @@ from templates.canonical import parse_object
 from templates.decoys import DecoyGenerator
 from templates.errors import ContractError
 from templates.lifting import lift as lift_descriptors
+from templates.private_file import replace_private
 from templates.probe_signature import signed_probe
 from templates.randomness import Keystream
 from templates.store.api_keys import is_token
@@ -102,9 +103,10 @@ def lift(
     """Turn photos into a private template on this machine, without any secret of the service.
 
     Needs: the service's model pack, `GET /v1/contract` and `GET /v1/contract/generator` saved to
-    files. Send the result as `{"template": …}`; the key needs the right `embeddings`. Several
-    photos of one person are averaged before they are lifted. Never lift the same photo twice for
-    enrollment: two templates of one descriptor give it away.
+    files. Send the result as `{"template": …}`; the key needs the right `embeddings`, and to enroll
+    it the tenant must allow templates (`veilface db template-enrollment`). Several photos of one
+    person are averaged before they are lifted. Never lift the same photo twice for enrollment: two
+    templates of one descriptor give it away.
 
     A probe on stdout is signed for one request, with the API key in the variable
     `VEILFACE_API_KEY`; send it within a minute.
@@ -129,10 +131,7 @@ def lift(
     try:
         descriptor = mean_descriptor(rows, consistency=public.photo_consistency)
     except InconsistentImages as error:
-        named = ", ".join(photos[index].name for index in error.photos)
-        raise CommandError(
-            f"these photos do not look like the same person: {named}; give photos of one person"
-        ) from None
+        raise CommandError(error.sentence([photo.name for photo in photos])) from None
     with Keystream.fresh() as stream:
         batch = lift_descriptors(
             descriptor[None], strategy=binding.strategy, m=m, source=source, stream=stream
@@ -145,7 +144,7 @@ def lift(
         else:
             emit(signed_probe(token, subject, data, level=level))
         return
-    write_private(out, data)
+    replace_private(out, data)
     facts: dict[str, Any] = {
         "out": str(out),
         "bytes": len(data),

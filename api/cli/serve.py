@@ -2,6 +2,7 @@
 
 import socket
 from contextlib import nullcontext
+from functools import partial
 from typing import Annotated
 
 import typer
@@ -11,6 +12,7 @@ from api.cli.console import demo_notice, message, say
 from api.cli.errors import CommandError
 from api.cli.options import takes_settings
 from api.metrics import shared_directory
+from api.opening import key_beside_database
 from api.operations import tls_options
 from api.rate_limits import RateLimits
 from api.runtime import Runtime, bootstrap_token
@@ -50,19 +52,22 @@ def serve(
         say(f"API key with all rights of tenant {settings.default_tenant}, shown only now:")
         say(token)
     settings = _with_ports(settings)
-    scheme = "http" if settings.tls_certificate is None else "https"
-    message(f"Veilface listens on {scheme}://{_address(settings.host, settings.port)}")
-    if settings.operations_port is not None:
-        operations = _address(settings.operations_host, settings.operations_port)
-        message(f"Health and metrics are on http://{operations}")
     # Workers count together in a folder; a single process counts in its memory.
     counting = nullcontext() if settings.workers == 1 else shared_directory()
     try:
         with counting:
-            run_server(settings)
+            run_server(settings, on_ready=partial(_say_where, settings))
     except SystemExit as error:
         if error.code:
             raise CommandError("the service did not start; its log says why") from None
+
+
+def _say_where(settings: Settings) -> None:
+    if settings.operations_port is not None:
+        operations = _address(settings.operations_host, settings.operations_port)
+        message(f"Health and metrics are on http://{operations}")
+    scheme = "http" if settings.tls_certificate is None else "https"
+    message(f"Veilface listens on {scheme}://{_address(settings.host, settings.port)}")
 
 
 def _with_ports(settings: Settings) -> Settings:
@@ -93,9 +98,13 @@ def _opened_once(settings: Settings, *, check: bool) -> tuple[str | None, bool]:
     RateLimits.open(settings)
     open_audit_report(settings)
     runtime = Runtime.open(settings)
+    if warning := key_beside_database(settings):
+        message(f"warning: {warning}")
     try:
         binding = runtime.contract.binding
         token = None if check else bootstrap_token(runtime.store, settings)
+        if check and (warning := runtime.superseded_calibrations()) is not None:
+            message(f"warning: {warning}")
         return token, bool(demo_notice(binding.embedder_sha256, n=binding.n))
     finally:
         runtime.close()

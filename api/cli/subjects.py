@@ -10,6 +10,7 @@ from api.cli.console import demo_notice, emit, say
 from api.cli.errors import CommandError, UsageError
 from api.cli.files import read_bounded
 from api.cli.options import LOCAL, AsJson, Tenant, takes_settings
+from api.errors import ApiError
 from api.runtime import Runtime
 from api.settings import Settings
 from enroll.enroller import MAX_PHOTOS
@@ -83,11 +84,7 @@ def enroll(
         except PhotoRejected as error:
             raise CommandError(f"{photos[error.index].name}: {error.cause}") from None
         except InconsistentImages as error:
-            differing = ", ".join(photos[index].name for index in error.photos)
-            raise CommandError(
-                f"these photos do not look like the same person: {differing}; give clear photos "
-                "of one person"
-            ) from None
+            raise CommandError(error.sentence([photo.name for photo in photos])) from None
         stored = runtime.put(
             name,
             subject,
@@ -126,7 +123,11 @@ def verify(
     settings: Settings,
     level: Annotated[
         str | None,
-        typer.Option(help="Security level. Unset: the contract's default.", show_default=False),
+        typer.Option(
+            help="Security level, not below the setting `lowest_level`. Unset: the contract's "
+            "default.",
+            show_default=False,
+        ),
     ] = None,
     tenant: Tenant = None,
     face: Face = FacePolicy.SINGLE,
@@ -134,12 +135,15 @@ def verify(
 ) -> None:
     """Check whether a photo shows a person; exit status 0 accept, 1 reject.
 
-    Needs: what `serve` needs; the service may run meanwhile. Status 1 with a message that starts
-    with `error:` means that no decision was made. The decision stands in the audit log; it neither
-    counts for the subject's lockout nor is stopped by it.
+    Status 2 is wrong usage, a photo that is not there included; 3 means that no decision could be
+    made, and why stands on stderr. Needs: what `serve` needs; the service may run meanwhile. The
+    decision stands in the audit log; it neither counts for the subject's lockout nor is stopped by
+    it.
 
     Example: `veilface verify alice today.jpg --pack buffalo_l --level fmr-1e-4`
     """
+    if not photo.exists():
+        raise UsageError(f"there is no photo {photo}")
     data = read_bounded(photo, settings.max_image_bytes)
     runtime = Runtime.open(settings)
     try:
@@ -150,14 +154,20 @@ def verify(
             raise CommandError(f"tenant {name} has no subject of that name; enroll it first")
         found, room = read
         try:
+            level = runtime.levels.in_force(level)
+        except ApiError as error:
+            raise UsageError(error.message) from None
+        try:
             decision = room.verifier.decide_photo(
                 pack, data, found.wire, level=level, policy=face, limits=runtime.image_limits
             )
         except ModelError as error:
             raise CommandError(f"{photo.name}: {error}") from None
         outcome = "accept" if decision.accepted else "reject"
+        # Another action than the service's: what an operator tries is not counted by the lockout.
+        pseudonym = runtime.store.pseudonym(name, subject)
         runtime.store.audit_log.record(
-            Entry("verify", outcome, operator(), name, runtime.store.pseudonym(name, subject))
+            Entry("verify-locally", outcome, operator(), name, pseudonym)
         )
         binding = runtime.contract.binding
         notice = demo_notice(binding.embedder_sha256, n=binding.n)

@@ -6,7 +6,7 @@ from fastapi import APIRouter, Depends, Request
 from starlette.responses import Response
 
 from api.answers import answer
-from api.auth import caller, holding
+from api.auth import CallerDep, holding
 from api.deps import GateDep, RuntimeDep
 from api.errors import ApiError
 from api.openapi import EVERY_CALL, error_responses
@@ -19,20 +19,23 @@ router = APIRouter(prefix="/v1/contract", tags=["contract"])
 
 @router.get(
     "",
-    dependencies=[Depends(caller)],
     response_model=ContractAnswer,
     responses=error_responses(*EVERY_CALL),
     summary="The contract and its security levels",
 )
-async def get_contract(request: Request, runtime: RuntimeDep, gate: GateDep) -> Response:
+async def get_contract(
+    request: Request, caller: CallerDep, runtime: RuntimeDep, gate: GateDep
+) -> Response:
     """Any valid key may read it. The cohort is a secret and is not part of it."""
     public_key = await gate.query(runtime.store.receipt_public_key)
+    tenant = await gate.query(lambda: runtime.store.tenants.get(caller.tenant))
     return answer(
         request,
         {
             **runtime.contract.public(),
             "photos": runtime.pack is not None,
             "generator": isinstance(runtime.source, DecoyGenerator),
+            "template_enrollment": tenant.template_enrollment,
             "receipt_key": {
                 "algorithm": "Ed25519",
                 "key_id": key_fingerprint(public_key),

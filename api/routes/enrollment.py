@@ -1,6 +1,6 @@
 """Enrollment: photos, or a client's template."""
 
-import json
+from functools import partial
 from typing import Any
 
 from fastapi import APIRouter, Request
@@ -8,7 +8,15 @@ from starlette.responses import Response
 
 from api.audit import by
 from api.auth import Caller
-from api.bodies import Form, base64_field, content_type, reject_unknown, sent_form, sent_json
+from api.bodies import (
+    Form,
+    base64_field,
+    content_type,
+    parse_json,
+    reject_unknown,
+    sent_form,
+    sent_json,
+)
 from api.deps import (
     Enrolls,
     GateDep,
@@ -63,10 +71,12 @@ async def enroll(
     gate: GateDep,
     idempotency_key: IdempotencyDep,
 ) -> Response:
-    """Rights: `enroll`, and `embeddings` for a template.
+    """Rights: `enroll`, and `embeddings` for a template, which the tenant must allow.
 
     Either 1 to 10 photos, which must show one and the same person, or a private template that the
-    client lifted. All or nothing: a rejected set leaves the old enrollment untouched.
+    client lifted: nothing in it tells whether it holds one person, so it is refused unless the
+    operator allowed it (`template_enrollment` of `GET /v1/contract`). All or nothing: a rejected
+    set leaves the old enrollment untouched.
     """
     settings = runtime.settings
     query = query_of(request, ("face",))
@@ -78,6 +88,7 @@ async def enroll(
             return await _enroll_photos(request, caller, subject, form, query, idempotency_key)
         caller.require("embeddings")
         body = await sent_json(request, settings)
+        await gate.query(lambda: runtime.require_template_enrollment(caller.tenant))
         reject_unknown([*body, *query], ("template",))
         template = base64_field(body.get("template"), "template", code="invalid_template")
 
@@ -96,7 +107,7 @@ async def enroll(
             asked=[subject, template],
             subject=subject,
             work=work,
-            run=gate.compute,
+            run=partial(gate.compute, key=caller.prefix),
         )
 
 
@@ -137,7 +148,7 @@ async def _enroll_photos(
         ],
         subject=subject,
         work=work,
-        run=request.app.state.gate.compute,
+        run=partial(request.app.state.gate.compute, key=caller.prefix),
     )
 
 
@@ -152,7 +163,7 @@ def parse_attributes(text: str | None) -> Attributes:
     if text is None:
         return Attributes()
     try:
-        value = json.loads(text)
+        value = parse_json(text)
     except (ValueError, RecursionError):
         value = None
     if (

@@ -31,6 +31,7 @@ async def get_own_key(
             "prefix": caller.prefix,
             "tenant": caller.tenant,
             "rights": [str(right) for right in Right if str(right) in caller.rights],
+            "levels": runtime.levels.allowed(lowest_of_key=caller.lowest_level),
             "expires_at": None if key is None else iso_time(key.expires_at),
             "demo": runtime.settings.demo,
         },

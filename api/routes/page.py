@@ -18,6 +18,7 @@ from starlette.routing import BaseRoute, Route
 from api.answers import answer
 from api.demo_cast import ENROLLED_PHOTOS, PROBE_PHOTOS, Scale
 from api.errors import ApiError
+from api.rate_limits import address_of
 from models.synthetic import draw_face, encode_photo
 
 WEB = Path(__file__).resolve().parent.parent / "web"
@@ -122,7 +123,8 @@ async def demo_photo(request: Request) -> Response:
     if person is None or shot is None or int(person[1]) not in _drawn() or int(shot[1]) >= SHOTS:
         raise ApiError("not_found", "there is no such drawn person or photo")
     gate = request.app.state.gate
-    body = await gate.compute(functools.partial(_draw, int(person[1]), int(shot[1])))
+    address = address_of(request.client.host if request.client else "")
+    body = await gate.compute(functools.partial(_draw, int(person[1]), int(shot[1])), key=address)
     return Response(
         body,
         media_type="image/png",

@@ -85,10 +85,14 @@ async def check_photo(
             return {
                 "usable": True,
                 "code": None,
-                "message": "one face, large and clear enough",
+                "message": (
+                    "one face, large and clear enough"
+                    if face is not None
+                    else "an aligned crop of a face, clear enough"
+                ),
                 "details": {},
                 "box": None if face is None else [round(float(side), 1) for side in face.box],
                 "quality": quality.as_dict(),
             }
 
-        return answer(request, await gate.compute(work))
+        return answer(request, await gate.compute(work, key=caller.prefix))

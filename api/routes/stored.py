@@ -56,7 +56,7 @@ async def get_stored(
 
     # Reading a template orthonormalises its basis: it takes a slot as a decision does.
     async with gate.admitted(caller.prefix):
-        read = await gate.compute(work)
+        read = await gate.compute(work, key=caller.prefix)
     if read is None:
         raise ApiError("not_enrolled", "the tenant has no such subject")
     found, norm = read

@@ -1,6 +1,7 @@
 """Export and import of one subject, encrypted."""
 
 import base64
+from functools import partial
 
 from fastapi import APIRouter, Request
 from starlette.responses import Response
@@ -42,7 +43,7 @@ async def export_subject(
     """
     async with gate.admitted(caller.prefix):
         exported = await gate.compute(
-            lambda: runtime.export(caller.tenant, subject, by=by(request))
+            lambda: runtime.export(caller.tenant, subject, by=by(request)), key=caller.prefix
         )
     if exported is None:
         if caller.sees_enrollment:
@@ -65,7 +66,13 @@ async def export_subject(
         200: {"description": "An earlier enrollment was replaced."},
         201: {"model": ImportAnswer, "description": "The subject is new."},
         **error_responses(
-            *EVERY_CALL, *BODY, *IDEMPOTENT, "forbidden", "invalid_template", "contract_mismatch"
+            *EVERY_CALL,
+            *BODY,
+            *IDEMPOTENT,
+            "forbidden",
+            "invalid_template",
+            "contract_mismatch",
+            "export_superseded",
         ),
     },
     openapi_extra=IMPORT_BODY,
@@ -78,11 +85,22 @@ async def import_subject(
     gate: GateDep,
     idempotency_key: IdempotencyDep,
 ) -> Response:
-    """Right: `export`. The tenant's own rotation is put on the template."""
+    """Right: `export`. The tenant's own rotation is put on the template.
+
+    An export that is older than the subject's last enrollment or erasure is refused
+    (`export_superseded`), unless the body says `"restore": true` and the key has `admin` too.
+    """
     settings = runtime.settings
     async with gate.admitted(caller.prefix):
         body = await sent_json(request, settings)
-        reject_unknown(body, ("export",))
+        reject_unknown(body, ("export", "restore"))
+        restore = body.get("restore", False)
+        if not isinstance(restore, bool):
+            raise ApiError(
+                "validation_failed", "restore must be true or false", {"field": "restore"}
+            )
+        if restore:
+            caller.require("admin")
         data = base64_field(body.get("export"), "export", code="invalid_template")
         exported = await gate.query(
             lambda: open_export(
@@ -95,9 +113,16 @@ async def import_subject(
         subject = checked_subject_id(exported.subject_id)
         note_subject(request, runtime.store.pseudonym(caller.tenant, subject))
 
+        guard = runtime.store.transfers.guard(
+            caller.tenant, exported.stamp, restore=restore, by=by(request)
+        )
+
         def work() -> Outcome:
             epoch = runtime.epoch(caller.tenant)
-            enrollment = runtime.enroller(caller.tenant, epoch).from_template(exported.wire)
+            enroller = runtime.enroller(caller.tenant, epoch)
+            # A template that the service made of photos is no client's.
+            ours = exported.source == Source.PHOTOS
+            enrollment = (enroller.from_export if ours else enroller.from_template)(exported.wire)
             stored = runtime.put(
                 caller.tenant,
                 exported.subject_id,
@@ -106,6 +131,7 @@ async def import_subject(
                 source=Source(exported.source),
                 photos=exported.photos,
                 by=by(request),
+                guard=guard,
             )
             return Outcome(
                 201 if stored.created else 200,
@@ -121,9 +147,9 @@ async def import_subject(
             caller,
             idempotency_key,
             operation="import",
-            asked=[data],
+            asked=[data, "restore"] if restore else [data],
             subject=exported.subject_id,
             work=work,
-            run=gate.compute,
+            run=partial(gate.compute, key=caller.prefix),
             add={"subject_id": exported.subject_id},
         )

@@ -86,6 +86,8 @@ async def verify(
 ) -> Response:
     """Rights: `verify`, and `embeddings` for a probe that is no photo.
 
+    A level below the lowest that the deployment or the key allows is `forbidden`.
+
     A subject that does not exist is answered as one that does not match, in the same shape and
     with the same work, and so is one that was enrolled under another contract; only keys with
     `enroll` or `admin` are told `not_enrolled` or `contract_mismatch`. The distance is returned
@@ -95,11 +97,11 @@ async def verify(
     async with gate.admitted(caller.prefix):
         with step("body"):
             if content_type(request) == "multipart/form-data":
-                probe = await _photo_probe(request, runtime, query)
+                probe = await _photo_probe(request, runtime, caller, query)
             else:
                 probe = await _sent_probe(request, runtime, caller, subject, query)
         decision = await gate.compute(
-            partial(_decide, runtime, caller, subject, probe, by(request))
+            partial(_decide, runtime, caller, subject, probe, by(request)), key=caller.prefix
         )
     request.state.log["security_level"] = decision.level
     request.state.log["decision"] = "accept" if decision.accepted else "reject"
@@ -117,13 +119,15 @@ async def verify(
     return answer(request, body)
 
 
-async def _photo_probe(request: Request, runtime: Runtime, query: dict[str, str]) -> Probe:
+async def _photo_probe(
+    request: Request, runtime: Runtime, caller: Caller, query: dict[str, str]
+) -> Probe:
     pack = runtime.required_pack()
     settings = runtime.settings
     form = await sent_form(request, settings, max_images=1)
     photo = form.images("image")[0]
     reject_unknown(form.fields, ("level", "face"))
-    level = one_of(form.fields, query, "level")
+    level = _level(runtime, caller, one_of(form.fields, query, "level"))
     policy = face_policy(one_of(form.fields, query, "face"))
 
     embedded: list[NDArray[np.float32]] = []
@@ -153,7 +157,7 @@ async def _sent_probe(
         )
     if "face" in query:
         raise ApiError("validation_failed", "face applies to photos only", {"field": "face"})
-    level = one_of(body, query, "level")
+    asked = one_of(body, query, "level")
     sent: bytes | NDArray[np.float64]
     if "embedding" in body:
         kind, sent = "embedding", embedding_of(body["embedding"])
@@ -165,9 +169,10 @@ async def _sent_probe(
         key=caller.probe_key,
         key_prefix=caller.prefix,
         subject_id=subject,
-        level=level,
+        level=asked,
         window_s=settings.probe_window_s,
     )
+    level = _level(runtime, caller, asked)
 
     def decide(verifier: Verifier, stored: bytes | StandIn) -> Decision:
         with step("decide"):
@@ -176,6 +181,10 @@ async def _sent_probe(
             return verifier.decide_embedding(sent, stored, level=level)
 
     return Probe(kind, decide, nonce)
+
+
+def _level(runtime: Runtime, caller: Caller, asked: str | None) -> str:
+    return runtime.levels.in_force(asked, lowest_of_key=caller.lowest_level)
 
 
 def _decide(runtime: Runtime, caller: Caller, subject: str, probe: Probe, who: By) -> Decision:
@@ -217,12 +226,16 @@ def _compared(
 ) -> tuple[Verifier, bytes | StandIn]:
     """Return the subject's template, or that of nobody, and what compares with it."""
     template, tenant = attempt.template, caller.tenant
+    lifted = None
+    if "scores" in caller.rights and not caller.sees_enrollment:
+        # The distance will be told. Lifted for every subject, enrolled or not: the time tells.
+        lifted = runtime.stand_ins.lift(tenant, subject)
     if template is not None:
         return runtime.verifier(tenant, template.record.rotation_epoch), template.wire
     if caller.sees_enrollment:
         raise _why_not(runtime, tenant, subject)
     verifier = runtime.verifier(tenant, attempt.rotation_epoch)
-    return verifier, runtime.stand_ins.open(tenant, subject)
+    return verifier, runtime.stand_ins.open(lifted)
 
 
 def _why_not(runtime: Runtime, tenant: str, subject: str) -> Exception:

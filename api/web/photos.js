@@ -55,10 +55,12 @@ export function photoPicker({ most, capture, onchange }) {
       remove(photos[0]);
     }
     const photo = { blob: null, name, url: URL.createObjectURL(blob) };
+    photo.number = h("span", { class: "number", hidden: most === 1 });
     photo.said = h("span", { class: "seen", "data-state": "idle" }, "Checking…");
     photo.item = h(
       "li",
       {},
+      photo.number,
       h("img", { src: photo.url, alt: `Chosen photo, from ${name}` }),
       photo.said,
       h(
@@ -96,6 +98,8 @@ export function photoPicker({ most, capture, onchange }) {
   }
 
   function changed() {
+    // As the service's messages name them.
+    photos.forEach((photo, index) => (photo.number.textContent = `Photo ${index + 1}`));
     told.textContent = most > 1 ? `${photos.length} of ${most} photos chosen.` : "";
     onchange(ready());
   }
@@ -238,12 +242,12 @@ export function photoPicker({ most, capture, onchange }) {
     chosen: () => [...photos],
     // What the service said of single photos of an enrollment, by their places among those `sent`.
     blame(problem, sent) {
-      const { image, pairs } = problem.details;
+      const { image, photos: unlike } = problem.details;
       if (Number.isInteger(image) && sent[image]) {
-        mark(sent[image], sentence(problem.message.replace(/^photo \d+: /, "")), "bad");
+        mark(sent[image], sentence(problem.message.replace(/^photo \d+ of \d+: /, "")), "bad");
       }
-      for (const index of new Set((pairs ?? []).flat())) {
-        if (sent[index]) mark(sent[index], "Does not look like the same person as another photo.", "bad");
+      for (const index of unlike ?? []) {
+        if (sent[index]) mark(sent[index], "Does not look like the person on the other photos.", "bad");
       }
     },
     drop: (sent) => sent.filter((each) => photos.includes(each)).forEach(remove),

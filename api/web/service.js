@@ -98,8 +98,11 @@ export async function learn() {
   ]);
 }
 
-// Levels that a photo can be verified at.
+// Levels that a photo can be verified at with this key.
 export const levels = () =>
-  session.contract.calibrations.filter((each) => each.mode === "p2s").flatMap((each) => each.levels);
+  session.contract.calibrations
+    .filter((each) => each.mode === "p2s")
+    .flatMap((each) => each.levels)
+    .filter((each) => session.own.levels.includes(each.name));
 
 export const crops = () => !session.contract.recorded.detector;

@@ -2,6 +2,8 @@
 
 import { h } from "./dom.js";
 
+const DEMO = document.documentElement.dataset.demo === "yes";
+
 const REMEDIES = {
   unauthorized: "Check the API key: it may have been mistyped, revoked, or have expired.",
   forbidden: "Ask the operator for a key with this right.",
@@ -25,6 +27,7 @@ const REMEDIES = {
   store_unavailable: "Try again in a moment; tell the operator if it lasts.",
   model_unavailable: "This service takes no photos. Ask its operator.",
   idempotency_conflict: "Wait a moment and try again.",
+  export_superseded: "Export the subject again where it is enrolled.",
   internal_error: "Tell the operator the request id.",
   unreachable: "Check the connection, and that the service runs; then try again.",
 };
@@ -32,6 +35,8 @@ const REMEDIES = {
 // Where the service speaks to programs, the page speaks to people.
 const TITLES = {
   unauthorized: "The service does not accept this API key.",
+  // The service says for how long; the page counts that down, and one clock is enough.
+  locked_out: "Too many failed attempts on this person.",
 };
 
 const QUALITY = {
@@ -51,8 +56,10 @@ export const qualityWords = (details) =>
 export function guidance(check) {
   switch (check.code) {
     case null:
-      return "Good: one face, large and clear enough.";
+      // A pack without a detector takes crops of a face, and measures no box.
+      return check.box ? "Good: one face, large and clear enough." : "Good: clear enough.";
     case "no_face":
+      if (DEMO) return "No drawn face found. The demo model sees no other: choose a drawn person.";
       return "No face found. Look into the camera, upright.";
     case "multiple_faces":
       return `${check.details.faces ?? "Several"} faces found. Only one person may be in the picture.`;

@@ -5,11 +5,11 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from attacks.attributes.neighbours import nearest_neighbours
 from attacks.attributes.plan import AttributePlan
 from attacks.errors import AuditError
+from templates.blas import single_threaded
 from templates.canonical import Json
 from templates.lifting import Strategy, lift
 from templates.randomness import Keystream
@@ -130,7 +130,7 @@ def measure_cost(
     step = -(-templates // threads)
     parts = [batch[start : start + step] for start in range(0, templates, step)]
     spent = []
-    with threadpool_limits(1), ThreadPoolExecutor(threads) as pool:
+    with single_threaded(), ThreadPoolExecutor(threads) as pool:
         for _ in range(repeats):
             begun = time.perf_counter()
             for done in [

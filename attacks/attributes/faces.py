@@ -148,7 +148,7 @@ def split(
     attacked_most: int | None = None,
     seed: int,
 ) -> Split:
-    """Deal out the parts as the paper does (its §4.3; FORMATS "FairFace").
+    """Deal out the parts as in paper §4.3.
 
     Parameters
     ----------

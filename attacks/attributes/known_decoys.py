@@ -1,4 +1,4 @@
-"""What an attacker infers who holds the decoy pool (METHOD §4.2 and §4.5)."""
+"""What an attacker infers who holds the decoy pool (docs/method.md §4.2 and §4.5)."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ Flags = NDArray[np.bool_]
 
 TOUCH = 0.01
 """An entry nearer than this lies in the template: its decoys are at 1e-3 or less even in half
-precision, and the next entry is 0.8 away (METHOD §4.2)."""
+precision, and the next entry is 0.8 away (docs/method.md §4.2)."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -1,10 +1,10 @@
 """How much a list of predictions tells of the truth, and whether it tells more than chance.
 
-Accuracy below chance is leakage: whoever knows the rule turns it round (METHOD §4.5). But chance
-has several values. An attacker who deals out labels at random, a share q_c of class c, is right in
-Σ q_c p_c of the cases, which is below the majority's share whenever the classes differ in size. So
-whether predictions leak is asked of exactly these predictions: are they right more often, or less
-often, than the same ones dealt out at random?
+Accuracy below chance is leakage: whoever knows the rule turns it round (docs/method.md §4.5). But
+chance has several values. An attacker who deals out labels at random, a share q_c of class c, is
+right in Σ q_c p_c of the cases, which is below the majority's share whenever the classes differ in
+size. So whether predictions leak is asked of exactly these predictions: are they right more often,
+or less often, than the same ones dealt out at random?
 """
 
 import math

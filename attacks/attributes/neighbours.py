@@ -1,4 +1,4 @@
-"""The nearest of the attacker's faces to a template: the paper's attack (its §4.3).
+"""The nearest of the attacker's faces to a template: the attack of paper §4.3.
 
 A template and a face are compared by the point-to-subspace distance, as
 ``templates.distances.nearest`` does it: memory does not grow with the number of pairs.
@@ -66,7 +66,7 @@ def nearest_neighbours(
 
     References
     ----------
-    Paper eq. 1; METHOD §3.
+    Paper eq. 1; docs/method.md §3.1.
     """
     n = attacked.n if isinstance(attacked, SubspaceBatch) else attacked.shape[1]
     there = len(gallery) - (skip is not None)

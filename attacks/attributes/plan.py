@@ -54,7 +54,7 @@ class AttributePlan:
     held_out
         Share of the lifted faces that the attacker chooses settings and attackers by.
     threads
-        Templates are searched on so many cores; the figures do not depend on it.
+        Templates are searched on so many cores.
 
     Raises
     ------

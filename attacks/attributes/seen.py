@@ -1,7 +1,7 @@
 """What attackers compute from the templates of faces: lifted, searched, guessed, tile by tile.
 
 A tile's templates live no longer than the tile; as many tiles are in memory as cores work, and one
-that waits. Every tile is worked on by one core, so that figures do not depend on their number.
+that waits. Every tile is worked on by one core.
 """
 
 from collections import deque
@@ -12,7 +12,6 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from attacks.attributes.faces import LabelledFaces
 from attacks.attributes.features import Features, features_of
@@ -22,6 +21,7 @@ from attacks.attributes.neighbours import METRICS, Attacked, merged, nearest_nei
 from attacks.attributes.plan import Bench, Side
 from attacks.errors import AuditError
 from attacks.outcomes import GENERATED, POOLED, RAW_SCHEME, Scheme
+from templates.blas import single_threaded
 from templates.distances import Metric
 from templates.lifting import Strategy, lift
 from templates.randomness import Keystream
@@ -172,7 +172,7 @@ def _see(
 def _in_order(work: Iterable[Callable[[], Seen]], threads: int) -> Iterator[Seen]:
     """Do the work on so many cores; one piece more than there are cores is made ahead."""
     waiting: deque[Future[Seen]] = deque()
-    with threadpool_limits(1), ThreadPoolExecutor(threads) as pool:
+    with single_threaded(), ThreadPoolExecutor(threads) as pool:
         for piece in work:
             waiting.append(pool.submit(piece))
             if len(waiting) > threads:

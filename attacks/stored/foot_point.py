@@ -1,4 +1,4 @@
-"""The foot point: for a unit descriptor d, cos(d, p) = ‖p‖ exactly (METHOD §4.1)."""
+"""The foot point: for a unit descriptor d, cos(d, p) = ‖p‖ exactly (docs/method.md §4.1)."""
 
 import numpy as np
 from numpy.typing import NDArray

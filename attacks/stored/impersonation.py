@@ -1,4 +1,4 @@
-"""Decoy impersonation: a decoy's owner tries to log in where they are a decoy (METHOD §4.3)."""
+"""Impersonation: a decoy's owner tries to log in where they are a decoy (docs/method.md §4.3)."""
 
 import numpy as np
 from numpy.typing import NDArray

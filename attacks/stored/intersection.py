@@ -1,4 +1,4 @@
-"""Intersection: several templates of one descriptor meet in it (METHOD §4.6).
+"""Intersection: several templates of one descriptor meet in it (docs/method.md §4.6).
 
 Templates of different photos of one person do not meet, but come near each other in the person.
 """

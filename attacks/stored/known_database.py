@@ -1,4 +1,6 @@
-"""Known decoys: whoever holds the pool W finds a template's decoys and strips them (METHOD §4.2).
+"""Known decoys: whoever holds the pool W finds a template's decoys and strips them.
+
+See docs/method.md §4.2.
 
 A decoy lies in the subspace, at distance 0, and no other face does. What is left of the subspace
 when the decoys are known is one direction, and the hidden descriptor is where faces are likely in
@@ -73,7 +75,7 @@ def find_decoys(
 def remainder(
     template_foot: NDArray[np.float64], decoys: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Remove the span of decoys (k, n) from a foot point, as METHOD §4.2 does; not normalised."""
+    """Remove the span of decoys (k, n) from a foot point (docs/method.md §4.2); not normalised."""
     if not len(decoys):
         return template_foot
     rows = np.linalg.svd(decoys, full_matrices=False)[2]
@@ -274,7 +276,7 @@ def _search_details(
 def _remainder_details(
     scene: Scene, lift: RecordedLift, database: NDArray[np.float32], found: Found
 ) -> dict[str, Json]:
-    """Return what the plain removal of METHOD §4.2 reaches, for comparison."""
+    """Return what the plain removal of docs/method.md §4.2 reaches, for comparison."""
     cosines = []
     for row, chosen in enumerate(found.entries):
         template = lift.templates[row]

@@ -1,4 +1,6 @@
-"""Presentation: probes that are no photo of the subject: zero, central, wolf, replay (METHOD §4.7).
+"""Presentation: probes that are no photo of the subject: zero, central, wolf, replay.
+
+See docs/method.md §4.7.
 
 Wolves are chosen and improved on templates that the attacker lifts; the victims' templates and the
 service's cohort are met once, at the end.
@@ -26,7 +28,7 @@ from templates.errors import InvalidEmbedding
 from templates.randomness import Keystream
 from templates.rotation import rotate
 from templates.subspace import SubspaceBatch
-from verify.cohort import COHORT_SIZE, Probes, make_cohort
+from verify.cohort import COHORT_SIZE, Probes, make_cohort, people_like
 from verify.comparisons import through_wire
 from verify.metrics import rate
 
@@ -76,7 +78,7 @@ def attacker_bench(scene: Scene) -> Bench:
             m=scene.scheme.dim,
             stream=stream,
             size=COHORT_SIZE,
-            people=scene.attacker,
+            hidden=people_like(known, scene.attacker),
         )
     return Bench(
         targets=scene.lift(faces[:half], "attacker's targets"),

@@ -151,8 +151,8 @@ def _closest(
 ) -> tuple[Floats, Floats, Floats]:
     """Similarities (K,), the best v (K, m_E) and the nearest points (K, n) of the subspaces.
 
-    Found as METHOD §3 says, from both signs of the leading singular vector; or, where a v is
-    known, from there.
+    Found as docs/method.md §3.5 says, from both signs of the leading singular vector; or, where a v
+    is known, from there.
     """
     count = len(ground.feet)
     g = ground.radii[:, None] * (ground.rows @ foot).reshape(count, -1)

@@ -1,4 +1,4 @@
-"""Wolves: lifted probes that lie near every face, built from principal axes (METHOD §4.7)."""
+"""Wolves: lifted probes near every face, built from principal axes (docs/method.md §4.7)."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

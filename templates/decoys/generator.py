@@ -1,10 +1,10 @@
 """Decoys that belong to nobody, spread like real descriptors.
 
 The generator holds moments, not descriptors, and is given to clients that lift on their own
-(PRODUCT "Contract"). The moments still tell who holds a photo whether that person was in the fit,
-better than chance (docs/decoys.md "Whether it remembers people"). Every draw is fresh, so no decoy
-exists outside its one template, and it does not depend on the subject (METHOD §4.2 to §4.5).
-docs/decoys.md says how it was chosen.
+(docs/rest.md "The generator"). The moments still tell who holds a photo whether that person was in
+the fit, better than chance (docs/decoys.md "Whether it remembers people"). Every draw is fresh, so
+no decoy exists outside its one template, and it does not depend on the subject (docs/method.md §4.2
+to §4.5). docs/decoys.md says how it was chosen.
 """
 
 import hashlib
@@ -65,9 +65,9 @@ class DecoyGenerator:
 
     References
     ----------
-    METHOD §3 (a Gaussian with full covariance, which this refines), §4.5 (independence of the
-    subject's attributes). The bands are a Gaussian scale mixture: S. Lyu & E. P. Simoncelli,
-    "Modeling multiscale subbands of photographic images with fields of Gaussian scale
+    docs/method.md §4.5 and §7.3: independence of the subject's attributes, and a Gaussian with full
+    covariance, which this refines. The bands are a Gaussian scale mixture: S. Lyu & E. P.
+    Simoncelli, "Modeling multiscale subbands of photographic images with fields of Gaussian scale
     mixtures", PAMI 2009.
     """
 
@@ -124,7 +124,8 @@ class DecoyGenerator:
         ------
         DecoyError
             `unlike` or `sub_databases` is asked for: both are choices among labelled real
-            descriptors, and choosing by the subject's attributes would leak them (METHOD §4.5).
+            descriptors, and choosing by the subject's attributes would leak them (docs/method.md
+            §4.5).
         """
         if rows < 0 or k < 0:
             raise DecoyError(f"rows and k must not be negative; seen {rows} and {k}")

@@ -1,8 +1,8 @@
 """Real descriptors as decoys: a secret of the deployment, kept sealed.
 
-Who holds the pool can strip its decoys from a template (METHOD §4.2), and the people in it are
-accepted by every template that uses them (METHOD §4.3). `DecoyGenerator` has neither fault; the
-pool exists for the paper's strategies, hybrid+ and sub-databases among them.
+Who holds the pool can strip its decoys from a template (docs/method.md §4.2), and the people in it
+are accepted by every template that uses them (docs/method.md §4.3). `DecoyGenerator` has neither
+fault; the pool exists for the paper's strategies, hybrid+ and sub-databases among them.
 """
 
 import hashlib
@@ -151,7 +151,7 @@ class DecoyPool:
         ------
         DecoyError
             Fewer than `k` entries qualify, the pool has no labels, or `unlike` and
-            `sub_databases` are asked for together (no strategy of METHOD §2 does).
+            `sub_databases` are asked for together (no strategy of docs/method.md §2.1 does).
         """
         if rows < 0 or k < 0:
             raise DecoyError(f"rows and k must not be negative; seen {rows} and {k}")

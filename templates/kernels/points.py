@@ -90,7 +90,7 @@ def spherical_points(
     stride: int,
     count: int,
 ) -> int:
-    """Distances by sim = (e·p + s‖D e‖)/‖e‖ (METHOD §3), from the rows p and s D.
+    """Distances by sim = (e·p + s‖D e‖)/‖e‖ (docs/method.md §3.4), from the rows p and s D.
 
     Parameters
     ----------

@@ -1,4 +1,6 @@
-"""Spherical distances of pairs of subspaces from a tile of the cross-Gram matrix (METHOD §3).
+"""Spherical distances of pairs of subspaces from a tile of the cross-Gram matrix.
+
+See docs/method.md §3.5.
 
 With the rows [p; s D] and [q; t E] the tile holds p·q, g = s D q, h = t E p and B = s t D Eᵀ, and
 the similarity is p·q + max g·u + h·v + uᵀBv over unit u and v. The best u of a v is known, so with

@@ -4,7 +4,7 @@ Everything that a secret could be read from is encrypted; see ``docs/storage.md`
 """
 
 from templates.store.api_keys import ApiKey, NewApiKey, Right, probe_key
-from templates.store.attempts import Attempt, AttemptsStatus
+from templates.store.attempts import Attempt
 from templates.store.audit_chain import Anchor, Line, Problem, Verification
 from templates.store.audit_log import AuditLog, BrokenAuditLog, By, Entry
 from templates.store.erasure import Erasure
@@ -14,6 +14,7 @@ from templates.store.lockout import LockedOut, LockoutPolicy, Nonce, Replayed, S
 from templates.store.receipts import Receipt, verify_receipt
 from templates.store.repository import TemplateStore
 from templates.store.retention import Retention
+from templates.store.standing import AttemptsStatus
 from templates.store.subjects import (
     Source,
     StoredTemplate,

@@ -7,6 +7,7 @@ needs nothing else; the server keeps it sealed, because the hash must not double
 """
 
 import contextlib
+import functools
 import hashlib
 import hmac
 import os
@@ -22,8 +23,16 @@ import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
 from templates.errors import StoreError, StoreUnavailable
+from templates.levels import LEVEL_NAME
 from templates.sealing import MasterKeyring, derive_key, sealed_key_id
 from templates.store.audit_log import PROGRAM, TENANT_ERASE, AuditLog, By, Entry
+from templates.store.authenticity import (
+    LAST_KEY_LINE,
+    columns_of,
+    is_current,
+    row_mac,
+    warn,
+)
 from templates.store.database import Database
 from templates.store.identifiers import Clock, UnknownTenant
 from templates.store.schema import ApiKeyRow, AuditRow, TenantRow
@@ -51,7 +60,15 @@ class Right(StrEnum):
 
 @dataclass(frozen=True)
 class ApiKey:
-    """An API key without its secret."""
+    """An API key without its secret.
+
+    Attributes
+    ----------
+    lowest_level
+        Security level below which it does not verify; None for any.
+    authentic
+        Whether its row is as this program left it. Else it is as good as none.
+    """
 
     id: str
     prefix: str
@@ -62,10 +79,13 @@ class ApiKey:
     expires_at: datetime | None
     revoked_at: datetime | None
     last_used_at: datetime | None
+    lowest_level: str | None = None
+    authentic: bool = True
 
     def is_valid_at(self, time: datetime) -> bool:
-        """Whether the key is neither revoked nor expired."""
-        return self.revoked_at is None and (self.expires_at is None or time < self.expires_at)
+        """Whether the key is authentic, and neither revoked nor expired."""
+        in_time = self.expires_at is None or time < self.expires_at
+        return self.authentic and self.revoked_at is None and in_time
 
 
 @dataclass(frozen=True)
@@ -100,9 +120,12 @@ class ApiKeys:
         *,
         label: str = "",
         expires_at: datetime | None = None,
+        lowest_level: str | None = None,
         by: By = PROGRAM,
     ) -> NewApiKey:
         """Make a key of an existing tenant; the audit log names it by its prefix.
+
+        `lowest_level` is the name of a security level, of whatever contract is served.
 
         Raises
         ------
@@ -112,10 +135,18 @@ class ApiKeys:
         granted = _rights(rights)
         if len(label) > MAX_LABEL or not label.isprintable():
             raise StoreError(f"a label has at most {MAX_LABEL} printable characters")
+        if lowest_level is not None and not LEVEL_NAME.fullmatch(lowest_level):
+            raise StoreError("the lowest level of a key is the name of a level, such as fmr-1e-4")
         self._audit_log.prepare()
         return self._database.write(
             lambda each: self._insert(
-                each, tenant, granted, label=label, expires_at=expires_at, by=by
+                each,
+                tenant,
+                granted,
+                label=label,
+                expires_at=expires_at,
+                lowest_level=lowest_level,
+                by=by,
             )
         )
 
@@ -138,7 +169,13 @@ class ApiKeys:
                 return None
             self._tenants.ensure(connection, tenant)
             return self._insert(
-                connection, tenant, granted, label="bootstrap", expires_at=None, by=by
+                connection,
+                tenant,
+                granted,
+                label="bootstrap",
+                expires_at=None,
+                lowest_level=None,
+                by=by,
             )
 
         return self._database.write(work, lock="bootstrap")
@@ -146,19 +183,27 @@ class ApiKeys:
     def verify(self, token: str) -> ApiKey | None:
         """Return the key of a token, or None if it is unknown, wrong, expired or revoked.
 
-        The comparison takes the same time wherever the tokens differ, and an unknown prefix is
-        compared too.
+        A key whose row is not authentic is as good as unknown. The comparison
+        takes the same time wherever the tokens differ, and an unknown prefix is compared too.
         """
         match = _TOKEN.fullmatch(token)
         prefix = match[1] if match else ""
-        row = self._database.read(
-            lambda each: each.execute(_KEY_AND_HASH, {"prefix": prefix}).one_or_none()
-        )
+        self._audit_log.prepare()
+        try:
+            row = self._database.read(
+                lambda each: each.execute(_OF_PREFIX, {"prefix": prefix}).one_or_none()
+            )
+        except (ValueError, TypeError):
+            # SQLite keeps any value in any column.
+            warn("an API key's row is not authentic and was passed over", key_id=prefix)
+            return None
         expected = _NOBODYS_HASH if row is None else row.token_hash
         same = hmac.compare_digest(_token_hash(token), expected)
         if row is None or not same:
             return None
-        key, now = _api_key(row[:-1]), self._clock()
+        key, now = self._read(row), self._clock()
+        if not key.authentic:
+            warn("an API key's row is not authentic and was passed over", key_id=prefix)
         if not key.is_valid_at(now):
             return None
         self._note_use(key, now)
@@ -166,18 +211,20 @@ class ApiKeys:
 
     def get(self, prefix: str) -> ApiKey | None:
         """Return a key by its prefix, or None."""
+        self._audit_log.prepare()
         row = self._database.read(
-            lambda each: each.execute(_KEYS.where(ApiKeyRow.prefix == prefix)).one_or_none()
+            lambda each: each.execute(_OF_PREFIX, {"prefix": prefix}).one_or_none()
         )
-        return None if row is None else _api_key(row)
+        return None if row is None else self._read(row)
 
     def all(self, *, tenant: str | None = None) -> tuple[ApiKey, ...]:
         """Every key, or every key of a tenant, the oldest first."""
         query = _KEYS.order_by(ApiKeyRow.created_at, ApiKeyRow.prefix)
         if tenant is not None:
             query = query.where(TenantRow.name == tenant)
+        self._audit_log.prepare()
         rows = self._database.read(lambda each: each.execute(query).all())
-        return tuple(_api_key(row) for row in rows)
+        return tuple(self._read(row) for row in rows)
 
     def revoke(self, prefix: str, *, by: By = PROGRAM) -> bool:
         """Revoke a key for good; True unless it was unknown or revoked before.
@@ -187,32 +234,36 @@ class ApiKeys:
         self._audit_log.prepare()
 
         def work(connection: Connection) -> bool:
-            tenant = connection.execute(
-                sa.select(TenantRow.name)
-                .join(ApiKeyRow, ApiKeyRow.tenant_id == TenantRow.id)
-                .where(ApiKeyRow.prefix == prefix)
-            ).scalar_one_or_none()
-            statement = (
-                sa.update(ApiKeyRow)
-                .where(ApiKeyRow.prefix == prefix, ApiKeyRow.revoked_at.is_(None))
-                .values(revoked_at=self._clock())
+            row = connection.execute(_LOCKED, {"prefix": prefix}).one_or_none()
+            if row is None:
+                self._audit_log.append(connection, Entry("key-revoke", "unknown_key", by))
+                return False
+            revoked = row.revoked_at is None
+            outcome = "revoked" if revoked else "revoked_before"
+            self._change(
+                connection,
+                row,
+                Entry("key-revoke", outcome, by, row.tenant, detail=prefix),
+                revoked_at=self._clock() if revoked else row.revoked_at,
             )
-            revoked = connection.execute(statement).rowcount == 1
-            if tenant is None:
-                entry = Entry("key-revoke", "unknown_key", by)
-            else:
-                outcome = "revoked" if revoked else "revoked_before"
-                entry = Entry("key-revoke", outcome, by, tenant, detail=prefix)
-            self._audit_log.append(connection, entry)
             return revoked
 
         return self._database.write(work)
 
+    def revoke_all(self, connection: Connection, tenant: str, *, by: By) -> None:
+        """Revoke every key of a tenant inside a transaction that is open already."""
+        query = _KEYS.where(TenantRow.name == tenant, ApiKeyRow.revoked_at.is_(None))
+        rows = connection.execute(query.order_by(ApiKeyRow.id).with_for_update(of=ApiKeyRow)).all()
+        now = self._clock()
+        for row in rows:
+            entry = Entry("key-revoke", "revoked", by, tenant, detail=row.prefix)
+            self._change(connection, row, entry, revoked_at=now)
+
     def replace(self, prefix: str, *, grace: timedelta, by: By = PROGRAM) -> NewApiKey | None:
         """Make a key in place of another one, which stays valid for a while.
 
-        The new key has the tenant, rights, label and expiry of the old one, so replacing a key
-        does not prolong what was granted.
+        The new key has the tenant, rights, label, expiry and lowest level of the old one, so
+        replacing a key does not prolong or widen what was granted.
 
         Parameters
         ----------
@@ -234,27 +285,24 @@ class ApiKeys:
 
         def work(connection: Connection) -> NewApiKey | None:
             now = self._clock()
-            row = connection.execute(
-                _KEYS.where(ApiKeyRow.prefix == prefix).with_for_update(of=ApiKeyRow)
-            ).one_or_none()
-            old = None if row is None else _api_key(row)
+            row = connection.execute(_LOCKED, {"prefix": prefix}).one_or_none()
+            old = None if row is None else self._read(row)
             if old is None or not old.is_valid_at(now):
                 return None
-            connection.execute(
-                sa.update(ApiKeyRow)
-                .where(ApiKeyRow.id == old.id)
-                .values(expires_at=_sooner(old.expires_at, now, grace))
-            )
             new = self._insert(
                 connection,
                 old.tenant,
                 old.rights,
                 label=old.label,
                 expires_at=old.expires_at,
+                lowest_level=old.lowest_level,
                 by=by,
             )
-            self._audit_log.append(
-                connection, Entry("key-replace", "replaced", by, old.tenant, detail=prefix)
+            self._change(
+                connection,
+                row,
+                Entry("key-replace", "replaced", by, old.tenant, detail=prefix),
+                expires_at=_sooner(old.expires_at, now, grace),
             )
             return new
 
@@ -283,6 +331,7 @@ class ApiKeys:
         *,
         label: str,
         expires_at: datetime | None,
+        lowest_level: str | None,
         by: By,
     ) -> NewApiKey:
         tenant_id = connection.execute(
@@ -293,25 +342,64 @@ class ApiKeys:
         key_id, prefix, now = uuid.uuid4().hex, os.urandom(6).hex(), self._clock()
         token = f"vf_{prefix}_{os.urandom(32).hex()}"
         wrapped = self._keyring.seal(probe_key(token), purpose=PROBE_KEY_PURPOSE, bound_to=[key_id])
+        entry = Entry("key-create", "created", by, tenant, detail=prefix)
+        row: dict[str, Any] = {
+            "id": key_id,
+            "tenant_id": tenant_id,
+            "tenant": tenant,
+            "prefix": prefix,
+            "token_hash": _token_hash(token),
+            "rights": ",".join(sorted(rights)),
+            "label": label,
+            "created_at": now,
+            "expires_at": expires_at,
+            "revoked_at": None,
+            "lowest_level": lowest_level,
+            "line": self._audit_log.append(connection, entry),
+        }
+        mac = row_mac(self._audit_log.row_key(), ApiKeyRow, row)
+        del row["tenant"]
         connection.execute(
             sa.insert(ApiKeyRow).values(
-                id=key_id,
-                tenant_id=tenant_id,
-                prefix=prefix,
-                token_hash=_token_hash(token),
-                rights=",".join(sorted(rights)),
-                label=label,
-                wrapped_probe_key=wrapped,
-                wrapping_key=sealed_key_id(wrapped),
-                created_at=now,
-                expires_at=expires_at,
+                **row, mac=mac, wrapped_probe_key=wrapped, wrapping_key=sealed_key_id(wrapped)
             )
         )
-        key = ApiKey(key_id, prefix, tenant, rights, label, now, expires_at, None, None)
-        self._audit_log.append(
-            connection, Entry("key-create", "created", by, tenant, detail=prefix)
+        key = ApiKey(
+            key_id, prefix, tenant, rights, label, now, expires_at, None, None, lowest_level
         )
         return NewApiKey(key=key, token=token)
+
+    def _change(self, connection: Connection, row: Any, entry: Entry, **columns: object) -> None:
+        """Change columns of a row that is locked, and add the line that tells of it.
+
+        A row that is not authentic stays so: whatever else it holds must not be vouched for.
+        """
+        authentic = self._is_authentic(row)
+        columns["line"] = self._audit_log.append(connection, entry)
+        if authentic:
+            key = self._audit_log.row_key()
+            columns["mac"] = row_mac(key, ApiKeyRow, {**row._mapping, **columns})
+        statement = sa.update(ApiKeyRow).where(ApiKeyRow.prefix == row.prefix)
+        connection.execute(statement.values(columns))
+
+    def _is_authentic(self, row: Any) -> bool:
+        return is_current(self._audit_log.row_key(), ApiKeyRow, row._mapping)
+
+    def _read(self, row: Any) -> ApiKey:
+        authentic = self._is_authentic(row)
+        return ApiKey(
+            id=row.id,
+            prefix=row.prefix,
+            tenant=row.tenant,
+            rights=_granted(row.rights),
+            label=row.label,
+            created_at=row.created_at,
+            expires_at=row.expires_at,
+            revoked_at=row.revoked_at,
+            last_used_at=row.last_used_at,
+            lowest_level=row.lowest_level,
+            authentic=authentic,
+        )
 
     def _note_use(self, key: ApiKey, now: datetime) -> None:
         # To the minute, so that verifying does not turn every request into a write.
@@ -350,20 +438,14 @@ def probe_key(token: str) -> bytes:
     return derive_key(bytes.fromhex(match[2]), "probe-key")
 
 
-_KEYS = sa.select(
-    ApiKeyRow.id,
-    ApiKeyRow.prefix,
-    TenantRow.name,
-    ApiKeyRow.rights,
-    ApiKeyRow.label,
-    ApiKeyRow.created_at,
-    ApiKeyRow.expires_at,
-    ApiKeyRow.revoked_at,
+_KEYS: Any = sa.select(
+    *columns_of(ApiKeyRow),
+    TenantRow.name.label("tenant"),
+    LAST_KEY_LINE.label("last_line"),
     ApiKeyRow.last_used_at,
 ).join(TenantRow, TenantRow.id == ApiKeyRow.tenant_id)
-_KEY_AND_HASH = _KEYS.add_columns(ApiKeyRow.token_hash).where(
-    ApiKeyRow.prefix == sa.bindparam("prefix")
-)
+_OF_PREFIX = _KEYS.where(ApiKeyRow.prefix == sa.bindparam("prefix"))
+_LOCKED = _OF_PREFIX.with_for_update(of=ApiKeyRow)
 
 
 def _had_keys(connection: Connection) -> bool:
@@ -382,9 +464,10 @@ def _sooner(expires_at: datetime | None, now: datetime, grace: timedelta) -> dat
     return limit if expires_at is None else min(expires_at, limit)
 
 
-def _api_key(columns: Any) -> ApiKey:
-    key_id, prefix, tenant, rights, *rest = columns
-    return ApiKey(key_id, prefix, tenant, frozenset(map(Right, rights.split(","))), *rest)
+@functools.lru_cache(maxsize=256)
+def _granted(rights: str) -> frozenset[Right]:
+    """Rights of a row; those that there are, in one that somebody else wrote."""
+    return frozenset(right for right in Right if right in str(rights).split(","))
 
 
 def _rights(rights: Iterable[Right | str]) -> frozenset[Right]:

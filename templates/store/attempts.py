@@ -2,9 +2,13 @@
 
 Counts belong to the subject, never to an API key, and to a subject that is not enrolled just as to
 one that is: neither a second key nor the lock itself tells more, or allows more. They live in the
-database only, so that every worker counts the same and a restart forgets nothing.
+database only, so that every worker counts the same and a restart forgets nothing. What is counted
+is held against the audit log (``templates.store.standing``), and so is a nonce: removing either
+from its table changes nothing.
 """
 
+import hashlib
+import hmac
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import datetime, timedelta
@@ -15,16 +19,8 @@ import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
 from templates.errors import StoreError
-from templates.sealing import MasterKeyring
-from templates.store.attempt_queries import (
-    BEFORE,
-    FAILURES,
-    FIRST_FAILURE,
-    FORGET_FAILURES,
-    NEXT_FAILURE,
-    NOTE_USE,
-    STANDING,
-)
+from templates.sealing import MasterKeyring, encode_parts
+from templates.store.attempt_queries import BEFORE, FIRST_COUNTS, NEXT_COUNTS, NOTE_USE, STANDING
 from templates.store.audit_log import AuditLog, By, Entry
 from templates.store.database import Database
 from templates.store.deployment import insert_once
@@ -32,22 +28,22 @@ from templates.store.identifiers import Clock, UnknownTenant, checked_subject_id
 from templates.store.lockout import LockedOut, LockoutPolicy, Nonce, Replayed, Superseded
 from templates.store.receipts import ReceiptSigner
 from templates.store.schema import FailedAttemptsRow, UsedNonceRow
-from templates.store.subjects import SubjectTemplate, opened_template, subject_lock, tenant_row
+from templates.store.standing import (
+    UNKNOWN_RETENTION,
+    AttemptsStatus,
+    Subject,
+    counts_row,
+    standing,
+)
+from templates.store.subjects import (
+    TEMPLATE_COLUMNS,
+    SubjectTemplate,
+    opened_template,
+    subject_lock,
+)
 
-UNKNOWN_RETENTION = timedelta(days=90)
 NONCE_GRACE = timedelta(minutes=5)
 BATCH = 500
-
-
-@dataclass(frozen=True)
-class AttemptsStatus:
-    """Failures on a subject; `consecutive` counts from the last accept or reset on."""
-
-    consecutive: int
-    total: int
-    last_failed_at: datetime
-    locked_until: datetime | None
-    disabled_at: datetime | None
 
 
 @dataclass(frozen=True)
@@ -132,7 +128,7 @@ class Attempts:
             If the row was altered or moved, or its master key is missing.
         """
         about = self._about(tenant, subject_id, nonce, contract_id)
-        return self._opened(self._database.read(partial(_one, query=BEFORE, about=about)))
+        return self._opened(self._database.read(partial(self._before, about=about)))
 
     def conclude(
         self,
@@ -217,7 +213,7 @@ class Attempts:
         self._audit_log.prepare()
 
         def work(connection: Connection) -> D | LockedOut | Replayed:
-            attempt = self._opened(_one(connection, query=BEFORE, about=about))
+            attempt = self._opened(self._before(connection, about))
             decided = decide(attempt)
             refusal = self._record(
                 connection, about, decided.accepted, attempt.template_id, nonce, decided.level, by
@@ -237,17 +233,17 @@ class Attempts:
         bool
             False if there was none of these. The total stays.
         """
-        checked_subject_id(subject_id)
-        pseudonym = self._signer.pseudonym(tenant, subject_id)
-        self._audit_log.prepare()
+        about = self._about(tenant, subject_id)
 
         def work(connection: Connection) -> bool:
-            tenant_id, _ = tenant_row(connection, tenant)
-            lifted = _clear(connection, tenant_id, pseudonym)
+            row = _one(connection, query=STANDING, about=about)
+            status = self._standing(connection, row, about)
+            lifted = status is not None and status.holds_something
             outcome = "reset" if lifted else "nothing_held"
-            self._audit_log.append(
-                connection, Entry("lockout-reset", outcome, by, tenant, pseudonym)
-            )
+            entry = Entry("lockout-reset", outcome, by, tenant, about["pseudonym"])
+            line = self._audit_log.append(connection, entry)
+            if lifted and status is not None:
+                self._write_counts(connection, row, about, status.cleared(), line)
             return lifted
 
         return self._database.write(work, lock=subject_lock(tenant, subject_id))
@@ -255,8 +251,12 @@ class Attempts:
     def status(self, tenant: str, subject_id: str) -> AttemptsStatus | None:
         """What is counted of a subject; None if no attempt on it ever failed."""
         about = self._about(tenant, subject_id)
-        row = self._database.read(lambda each: each.execute(FAILURES, about).one_or_none())
-        return None if row is None else AttemptsStatus(*row)
+
+        def work(connection: Connection) -> AttemptsStatus | None:
+            row = connection.execute(STANDING, about).one_or_none()
+            return None if row is None else self._standing(connection, row, about)
+
+        return self._database.read(work)
 
     def expire(self) -> int:
         """Remove nonces that are past their time, and old counts of who is not enrolled.
@@ -291,6 +291,7 @@ class Attempts:
         nonce: Nonce | None = None,
         contract_id: str | None = None,
     ) -> dict[str, Any]:
+        self._audit_log.prepare()
         return {
             "tenant": tenant,
             "subject_id": subject_id,
@@ -298,16 +299,38 @@ class Attempts:
             "contract_id": contract_id,
             "key_prefix": None if nonce is None else nonce.key_prefix,
             "nonce_hash": None if nonce is None else nonce.hash,
+            "nonce_digest": None if nonce is None else self._digest(nonce),
         }
 
-    def _opened(self, row: Any) -> Attempt:
-        epoch, used, _, _, template_id, *template = row
-        if used:
+    def _digest(self, nonce: Nonce) -> str:
+        """What the audit log keeps of a nonce."""
+        message = encode_parts("nonce", nonce.key_prefix, nonce.hash)
+        return hmac.new(self._audit_log.row_key(), message, hashlib.sha256).hexdigest()
+
+    def _before(self, connection: Connection, about: dict[str, Any]) -> Any:
+        """Row of :data:`BEFORE`, where nothing refuses the attempt."""
+        row = _one(connection, query=BEFORE, about=about)
+        if row.used:
             raise Replayed
-        self._refuse_locked(row, self._clock())
-        return Attempt(
-            rotation_epoch=epoch,
-            template=None if template_id is None else opened_template(template, self._keyring),
+        self._refuse_locked(self._standing(connection, row, about), self._clock())
+        return row
+
+    def _opened(self, row: Any) -> Attempt:
+        template = row[: len(TEMPLATE_COLUMNS)]
+        found = None if row.template_id is None else opened_template(template, self._keyring)
+        return Attempt(rotation_epoch=row.current_epoch, template=found)
+
+    def _standing(
+        self, connection: Connection, row: Any, about: dict[str, Any]
+    ) -> AttemptsStatus | None:
+        return standing(
+            connection,
+            row,
+            Subject(about["tenant"], about["pseudonym"]),
+            line_key=self._audit_log.line_key(),
+            row_key=self._audit_log.row_key(),
+            policy=self._policy,
+            now=self._clock(),
         )
 
     def _record(
@@ -321,90 +344,108 @@ class Attempts:
         by: By,
     ) -> LockedOut | Replayed | None:
         row = _one(connection, query=STANDING, about=about)
-        tenant, pseudonym, contract_id = (
-            about[name] for name in ("tenant", "pseudonym", "contract_id")
-        )
+        status = self._standing(connection, row, about)
+        contract_id = about["contract_id"]
         if accepted and template_id is None:
             raise ValueError("a subject that is not enrolled cannot be accepted")
         outcome = "accept" if accepted else "reject"
         refusal: LockedOut | Replayed | None = None
+        counted: AttemptsStatus | None = None
         try:
-            _use(connection, nonce, row.api_key_id)
+            _use(connection, nonce, row)
             now = self._clock()
-            self._refuse_locked(row, now)
+            self._refuse_locked(status, now)
             of_contract = contract_id in (None, row.contract_id)
             if (row.template_id if of_contract else None) != template_id:
                 raise Superseded
             if accepted:
-                _accepted(connection, row, pseudonym, now)
+                counted = status.cleared() if status and status.holds_something else None
+                note = {"of_subject": row.subject_pk, "last_used_at": now}
+                connection.execute(NOTE_USE, note)
             else:
-                self._failed(connection, row, pseudonym, now)
+                counted = self._failed(status, now)
         except LockedOut as error:
             outcome, refusal = "locked_out", LockedOut(error.retry_after_s, recorded=True)
         except Replayed:
             outcome, refusal = "replayed", Replayed(recorded=True)
-        entry = Entry("verify", outcome, by, tenant, pseudonym, detail=level)
-        self._audit_log.append(connection, entry)
+        entry = Entry(
+            "verify",
+            outcome,
+            by,
+            about["tenant"],
+            about["pseudonym"],
+            detail=level,
+            nonce=None if outcome == "replayed" else about["nonce_digest"],
+        )
+        line = self._audit_log.append(connection, entry)
+        if counted is not None:
+            self._write_counts(connection, row, about, counted, line)
         return refusal
 
-    def _refuse_locked(self, row: Any, now: datetime) -> None:
-        if not self._policy.after:
+    def _refuse_locked(self, status: AttemptsStatus | None, now: datetime) -> None:
+        if not self._policy.after or status is None:
             return
-        if row.disabled_at is not None:
+        if status.disabled_at is not None:
             raise LockedOut(None)
-        if row.locked_until is not None and now < row.locked_until:
-            raise LockedOut((row.locked_until - now).total_seconds())
+        if status.locked_until is not None and now < status.locked_until:
+            raise LockedOut((status.locked_until - now).total_seconds())
 
-    def _failed(self, connection: Connection, row: Any, pseudonym: str, now: datetime) -> None:
-        first = row.consecutive is None
-        consecutive = 1 if first else row.consecutive + 1
+    def _failed(self, status: AttemptsStatus | None, now: datetime) -> AttemptsStatus:
+        consecutive = 1 if status is None else status.consecutive + 1
         lock = self._policy.lock(consecutive)
-        values = {
-            "consecutive": consecutive,
-            "total": 1 if first else row.total + 1,
-            "last_failed_at": now,
-            "locked_until": None if lock is None else now + lock,
-            "disabled_at": now if self._policy.disables(consecutive) else None,
-            # As the transaction finds it: an erasure since the decision must not leave a count
-            # that only another erasure would remove.
-            "known": row.subject_pk is not None,
-        }
-        if first:
-            whose = {"tenant_id": row.tenant_id, "pseudonym": pseudonym}
-            connection.execute(FIRST_FAILURE, {**whose, **values})
-        else:
-            whose = {"of_tenant": row.tenant_id, "of_pseudonym": pseudonym}
-            connection.execute(NEXT_FAILURE, {**whose, **values})
+        return AttemptsStatus(
+            consecutive=consecutive,
+            total=1 if status is None else status.total + 1,
+            last_failed_at=now,
+            locked_until=None if lock is None else now + lock,
+            disabled_at=now if self._policy.disables(consecutive) else None,
+        )
+
+    def _write_counts(
+        self,
+        connection: Connection,
+        row: Any,
+        about: dict[str, Any],
+        status: AttemptsStatus,
+        line: int,
+    ) -> None:
+        """Write the row of the subject's failures; only its holder of the lock does."""
+        values = counts_row(
+            self._audit_log.row_key(), row.tenant_id, about["pseudonym"], status, line
+        )
+        # As the transaction finds it: an erasure since the decision must not leave a count that
+        # only another erasure would remove.
+        values["known"] = row.subject_pk is not None
+        if row.counted_pseudonym is None:
+            connection.execute(FIRST_COUNTS, values)
+            return
+        whose = {"of_tenant": values.pop("tenant_id"), "of_pseudonym": values.pop("pseudonym")}
+        connection.execute(NEXT_COUNTS, {**whose, **values})
 
 
 def _one(connection: Connection, *, query: Any, about: dict[str, Any]) -> Any:
-    row = connection.execute(query, about).one_or_none()
+    try:
+        row = connection.execute(query, about).one_or_none()
+    except (ValueError, TypeError):
+        # SQLite keeps any value in any column.
+        raise StoreError(
+            "a row about this subject was altered: run `veilface audit-log verify`"
+        ) from None
     if row is None:
         raise UnknownTenant(f"there is no tenant {about['tenant']!r}")
     return row
 
 
-def _use(connection: Connection, nonce: Nonce | None, api_key_id: str | None) -> None:
+def _use(connection: Connection, nonce: Nonce | None, row: Any) -> None:
     if nonce is None:
         return
-    if api_key_id is None:
+    if row.api_key_id is None:
         raise StoreError("there is no API key of this prefix")
-    if not insert_once(
+    if row.used or not insert_once(
         connection,
         UsedNonceRow,
-        api_key_id=api_key_id,
+        api_key_id=row.api_key_id,
         nonce_hash=nonce.hash,
         expires_at=nonce.expires_at,
     ):
         raise Replayed
-
-
-def _accepted(connection: Connection, row: Any, pseudonym: str, now: datetime) -> None:
-    if row.consecutive is not None:
-        _clear(connection, row.tenant_id, pseudonym)
-    connection.execute(NOTE_USE, {"of_subject": row.subject_pk, "last_used_at": now})
-
-
-def _clear(connection: Connection, tenant_id: str, pseudonym: str) -> bool:
-    about = {"of_tenant": tenant_id, "of_pseudonym": pseudonym}
-    return connection.execute(FORGET_FAILURES, about).rowcount == 1

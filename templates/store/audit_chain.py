@@ -67,7 +67,10 @@ START = Anchor(0, bytes(HASH_BYTES))
 
 @dataclass(frozen=True)
 class Line:
-    """One line of the audit log, with the columns of its table."""
+    """One line of the audit log, with the columns of its table.
+
+    `nonce` is a keyed digest of the nonce that a decision used up; None for most lines.
+    """
 
     sequence: int
     at: datetime
@@ -78,6 +81,7 @@ class Line:
     outcome: str
     request_id: str | None
     detail: str | None
+    nonce: str | None = field(repr=False)
     previous_hash: bytes = field(repr=False)
     hash: bytes = field(repr=False)
 
@@ -147,13 +151,33 @@ class Verification:
 
 
 def line_hash(key: bytes, columns: Sequence[str | int | bytes | datetime | None]) -> bytes:
-    """Hash of a line: of all its columns but the hash itself, in the order of :class:`Line`."""
-    return hmac.digest(key, encode_parts("line", *map(_part, columns)), hashlib.sha256)
+    """Hash of a line: of all its columns but the hash itself, in the order of :class:`Line`.
+
+    A line without a nonce is hashed as it was before there were any: the number of parts tells.
+    """
+    *before, nonce, previous_hash = columns
+    hashed = (*before, previous_hash) if nonce is None else columns
+    return hmac.digest(key, encode_parts("line", *map(_part, hashed)), hashlib.sha256)
+
+
+def is_true_line(key: bytes, line: Line) -> bool:
+    """Whether a line is as it was written."""
+    *hashed, own_hash = (getattr(line, name) for name in Line.__dataclass_fields__)
+    return hmac.compare_digest(line_hash(key, hashed), own_hash)
 
 
 def head_mac(key: bytes, head: Anchor) -> bytes:
-    """MAC of the head row."""
-    return hmac.digest(key, encode_parts("head", head.sequence, head.hash), hashlib.sha256)
+    """MAC of the head row of a database whose rows are authenticated."""
+    return _head_mac(key, head, "head of authenticated rows")
+
+
+def is_head_before_authentication(key: bytes, head: Anchor, mac: bytes) -> bool:
+    """Whether the head row is a true one of a schema whose other rows carried no MAC."""
+    return hmac.compare_digest(_head_mac(key, head, "head"), mac)
+
+
+def _head_mac(key: bytes, head: Anchor, label: str) -> bytes:
+    return hmac.digest(key, encode_parts(label, head.sequence, head.hash), hashlib.sha256)
 
 
 def is_head(key: bytes, head: Anchor, mac: bytes) -> bool:
@@ -200,8 +224,7 @@ class Chain:
             line = Line.read(columns)
         except ValueError:
             return None
-        *hashed, own_hash = (getattr(line, name) for name in Line.__dataclass_fields__)
-        return line if hmac.compare_digest(line_hash(self._key, hashed), own_hash) else None
+        return line if is_true_line(self._key, line) else None
 
     def _follows(self, line: Line) -> bool:
         # Beside a gap or an altered line, which are reported, there is nothing to compare with.

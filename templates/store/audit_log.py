@@ -17,6 +17,7 @@ import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
 from templates.errors import StoreError
+from templates.sealing import derive_key
 from templates.store.audit_chain import (
     START,
     Anchor,
@@ -25,6 +26,7 @@ from templates.store.audit_chain import (
     Verification,
     head_mac,
     is_head,
+    is_head_before_authentication,
     line_hash,
     read_line,
 )
@@ -47,7 +49,7 @@ MAX_DETAIL = 64
 TENANT_ERASE = "tenant-erase"
 
 _BEGIN_LOCK = "veilface audit chain"
-_PSEUDONYM = re.compile(r"[0-9a-f]{64}")
+_DIGEST = re.compile(r"[0-9a-f]{64}")
 # Made once: building a statement costs more than running it, and every write appends a line.
 _ADD_LINE = sa.insert(AuditRow.__table__)  # type: ignore[arg-type]
 _MOVE_HEAD = sa.update(AuditHeadRow.__table__)  # type: ignore[arg-type]
@@ -105,6 +107,8 @@ class Entry:
         anything but 64 hexadecimal digits is refused.
     detail
         What else it was done with: the level of a verification, the prefix of a key.
+    nonce
+        Keyed digest, 64 hexadecimal digits, of the nonce that it used up.
     """
 
     action: str
@@ -113,15 +117,18 @@ class Entry:
     tenant: str | None = None
     pseudonym: str | None = None
     detail: str | None = None
+    nonce: str | None = None
 
     def __post_init__(self) -> None:
         checked_opaque_id(self.action, what="audit action")
         checked_opaque_id(self.outcome, what="audit outcome")
         if self.tenant is not None:
             checked_tenant_name(self.tenant)
-        if self.pseudonym is not None and _PSEUDONYM.fullmatch(self.pseudonym) is None:
+        if self.pseudonym is not None and _DIGEST.fullmatch(self.pseudonym) is None:
             raise InvalidIdentifier("the audit log names a subject by its pseudonym only")
         _checked_text(self.detail, MAX_DETAIL, "detail")
+        if self.nonce is not None and _DIGEST.fullmatch(self.nonce) is None:
+            raise InvalidIdentifier("the audit log keeps the digest of a nonce only")
 
 
 class AuditLog:
@@ -138,6 +145,7 @@ class AuditLog:
         self._secrets = secrets
         self._clock = clock
         self._key: bytes | None = None
+        self._row_key: bytes | None = None
 
     def begin(self) -> None:
         """Make the key of a chain that never began, and the MAC of its head; else do nothing.
@@ -165,6 +173,23 @@ class AuditLog:
             raise _without_key()  # which takes back the key that was made
         connection.execute(sa.update(AuditHeadRow).values(mac=head_mac(key, START)))
 
+    def authenticates_rows(self, connection: Connection) -> bool:
+        """Whether the head says that the rows of this database are authenticated.
+
+        One that is missing or forged does too: who reads it is told, and no row is vouched for.
+        """
+        head, mac = _only_head(_heads(connection))
+        return head is None or not is_head_before_authentication(self._opened_key(), head, mac)
+
+    def begin_authentication(self, connection: Connection) -> bool:
+        """Let the head say that rows are authenticated from now on; False if it said so before."""
+        head, mac = _only_head(_heads(connection, for_update=True))
+        key = self._opened_key()
+        if head is None or not is_head_before_authentication(key, head, mac):
+            return False
+        connection.execute(sa.update(AuditHeadRow).values(mac=head_mac(key, head)))
+        return True
+
     def prepare(self) -> None:
         """Open the key of the chain; to be called before a transaction that appends.
 
@@ -175,14 +200,37 @@ class AuditLog:
         SealError
             If the master key that wrapped it is missing.
         """
-        self._opened_key()
+        self.row_key()
 
-    def append(self, connection: Connection, entry: Entry) -> None:
-        """Add a line inside a transaction that is open already, as its last statement.
+    def line_key(self) -> bytes:
+        """Key of the chain.
+
+        Raises
+        ------
+        BrokenAuditLog
+            If it is gone.
+        """
+        return self._opened_key()
+
+    def row_key(self) -> bytes:
+        """Key of the MACs of rows, derived from the chain's: they are lost together.
+
+        Raises
+        ------
+        BrokenAuditLog
+            If the key of the chain is gone.
+        """
+        if self._row_key is None:
+            self._row_key = derive_key(self._opened_key(), "rows")
+        return self._row_key
+
+    def append(self, connection: Connection, entry: Entry) -> int:
+        """Add a line inside a transaction that is open already; returns its number.
 
         The lines of all processes are added one after the other, each waiting for the commit of
         the one before: whatever follows this call in the transaction makes every other write wait.
-        As everybody takes the head row last, no two of them wait for each other.
+        Nothing follows but rows that carry the number of their line, which the transaction has
+        locked before. As everybody takes the head row last, no two of them wait for each other.
 
         Raises
         ------
@@ -206,6 +254,7 @@ class AuditLog:
             entry.outcome,
             entry.by.request_id,
             entry.detail,
+            entry.nonce,
             last.hash,
         )
         new = Anchor(last.sequence + 1, line_hash(key, columns))
@@ -213,6 +262,7 @@ class AuditLog:
         connection.execute(_ADD_LINE, dict(zip(names, (*columns, new.hash), strict=True)))
         moved = {"sequence": new.sequence, "hash": new.hash, "mac": head_mac(key, new)}
         connection.execute(_MOVE_HEAD, moved)
+        return new.sequence
 
     def record(self, entry: Entry) -> None:
         """Add a line in a transaction of its own."""
@@ -288,9 +338,7 @@ class AuditLog:
         return self._key
 
     def _head(self, connection: Connection, key: bytes, *, for_update: bool = False) -> Anchor:
-        query = _head_query(connection.dialect.name, for_update)
-        rows = connection.execute(query).all()
-        head, mac = _only_head(rows[0] if len(rows) == 1 else (None, None, None))
+        head, mac = _only_head(_heads(connection, for_update=for_update))
         if head is None or not is_head(key, head, mac):
             raise BrokenAuditLog(
                 "the head of the audit log is missing or was altered: "
@@ -321,6 +369,12 @@ def _end(connection: Connection, *, after: int | None) -> _End:
     columns: list[Any] = [heads, held, sa.exists().where(later), *head]
     count, lines, more, *row = connection.execute(sa.select(*columns)).one()
     return _End(*_only_head(row if count == 1 else (None, None, None)), lines, more)
+
+
+def _heads(connection: Connection, *, for_update: bool = False) -> Sequence[Any]:
+    """The head row as it is stored; no values where there is not one."""
+    rows = connection.execute(_head_query(connection.dialect.name, for_update)).all()
+    return rows[0] if len(rows) == 1 else (None, None, None)
 
 
 def _only_head(row: Sequence[Any]) -> tuple[Anchor | None, bytes]:

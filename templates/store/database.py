@@ -58,7 +58,7 @@ class Database:
     def __init__(
         self, url: str, *, pool_size: int = 5, max_overflow: int = 10, timeout: float = 10.0
     ) -> None:
-        self.url = _checked_url(url)
+        self.url = checked_url(url)
         self.is_sqlite = self.url.get_backend_name() == "sqlite"
         self._pool_size = pool_size
         self._max_overflow = max_overflow
@@ -307,12 +307,24 @@ class _Process:
         )
 
 
-def _checked_url(text: str) -> URL:
+def checked_url(text: str) -> URL:
+    """Read a database URL, with the driver that is used; nothing is opened.
+
+    Raises
+    ------
+    StoreError
+        It cannot be read, or names no database that is supported. The text never quotes it: it
+        may hold a password.
+    """
     try:
         url = make_url(text)
-    except ArgumentError:
+        if not 0 < (url.port or 1) < 2**16:
+            raise ValueError
+    except (ArgumentError, ValueError):  # the latter of a port that is no number
         raise StoreError(
-            "the database URL cannot be read: write sqlite:///path or postgresql://user@host/name"
+            "the database URL cannot be read: write sqlite:///path or "
+            "postgresql://user@host:port/name, the port as a number up to 65535, and the "
+            "characters : / @ [ ] of a password as %3A %2F %40 %5B %5D"
         ) from None
     if url.drivername in ("postgresql", "postgres", "postgresql+psycopg"):
         return url.set(drivername="postgresql+psycopg")

@@ -3,20 +3,24 @@
 A write first claims its key, then runs, then leaves its answer. A claim that its worker did not
 finish (it was killed) lapses after a minute, so that the client's next try may run. Keys and
 requests are kept as HMAC-SHA256 under a secret of the deployment: a record does not tell whose
-photo was sent to somebody who holds the photo. Answers must hold no biometric data.
+photo was sent to somebody who holds the photo. Answers must hold no biometric data. An answer
+carries a MAC: one that somebody else wrote is not given, and the write runs.
 """
 
 import hashlib
 import hmac
 import uuid
 from dataclasses import dataclass, field
-from datetime import timedelta
+from datetime import datetime, timedelta
+from typing import Any
 
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
 from templates.errors import StoreError
 from templates.sealing import encode_parts
+from templates.store.audit_log import AuditLog
+from templates.store.authenticity import columns_of, is_authentic, row_mac, warn
 from templates.store.database import Database
 from templates.store.deployment import Secrets, insert_once
 from templates.store.identifiers import Clock, UnknownTenant
@@ -43,7 +47,9 @@ class Claim:
     tenant_id: str
     actor: str
     key_hash: bytes = field(repr=False)
+    request_hash: bytes = field(repr=False)
     token: str = field(repr=False)
+    expires_at: datetime
 
 
 @dataclass(frozen=True)
@@ -58,9 +64,15 @@ class Idempotency:
     """Repository of idempotency records."""
 
     def __init__(
-        self, database: Database, secrets: Secrets, signer: ReceiptSigner, clock: Clock
+        self,
+        database: Database,
+        secrets: Secrets,
+        signer: ReceiptSigner,
+        audit_log: AuditLog,
+        clock: Clock,
     ) -> None:
         self._database = database
+        self._audit_log = audit_log
         self._secrets = secrets
         self._signer = signer
         self._clock = clock
@@ -88,6 +100,7 @@ class Idempotency:
         """
         if not 1 <= len(key) <= MAX_KEY:
             raise StoreError(f"an idempotency key has 1 to {MAX_KEY} characters")
+        self._audit_log.prepare()
         secret = self._secrets.get(_SECRET)
         key_hash = hmac.digest(secret, encode_parts("key", key), hashlib.sha256)
         request_hash = hmac.digest(secret, encode_parts("request", request), hashlib.sha256)
@@ -100,37 +113,22 @@ class Idempotency:
             if tenant_id is None:
                 raise UnknownTenant(f"there is no tenant {tenant!r}")
             now = self._clock()
-            claim = Claim(tenant_id, actor, key_hash, uuid.uuid4().hex)
-            connection.execute(
-                sa.delete(IdempotencyRow).where(
-                    *_is(claim),
-                    sa.or_(
-                        IdempotencyRow.expires_at <= now,
-                        sa.and_(
-                            IdempotencyRow.status.is_(None), IdempotencyRow.claimed_until <= now
-                        ),
-                    ),
-                )
+            claim = Claim(
+                tenant_id, actor, key_hash, request_hash, uuid.uuid4().hex, now + RETENTION
             )
-            if insert_once(
-                connection,
-                IdempotencyRow,
-                tenant_id=tenant_id,
-                actor=actor,
-                key_hash=key_hash,
-                request_hash=request_hash,
-                pseudonym=pseudonym,
-                claim=claim.token,
-                claimed_until=now + CLAIM,
-                created_at=now,
-                expires_at=now + RETENTION,
-            ):
+            lapsed = sa.or_(
+                IdempotencyRow.expires_at <= now,
+                sa.and_(IdempotencyRow.status.is_(None), IdempotencyRow.claimed_until <= now),
+            )
+            connection.execute(sa.delete(IdempotencyRow).where(*_is(claim), lapsed))
+            if self._insert(connection, claim, pseudonym, now):
                 return claim
-            row = connection.execute(
-                sa.select(
-                    IdempotencyRow.request_hash, IdempotencyRow.status, IdempotencyRow.body
-                ).where(*_is(claim))
-            ).one()
+            row = connection.execute(_RECORD.where(*_is(claim))).one()
+            if row.status is not None and not self._is_authentic(row):
+                warn("an idempotency record is not authentic and was passed over", tenant=tenant)
+                connection.execute(sa.delete(IdempotencyRow).where(*_is(claim)))
+                self._insert(connection, claim, pseudonym, now)
+                return claim
             if not hmac.compare_digest(row.request_hash, request_hash):
                 raise IdempotencyConflict("this idempotency key was used for another request")
             if row.status is None or row.body is None:
@@ -139,14 +137,36 @@ class Idempotency:
 
         return self._database.write(work, lock=f"idempotency {tenant} {actor} {key_hash.hex()}")
 
+    def _insert(
+        self, connection: Connection, claim: Claim, pseudonym: str | None, now: datetime
+    ) -> bool:
+        return insert_once(
+            connection,
+            IdempotencyRow,
+            tenant_id=claim.tenant_id,
+            actor=claim.actor,
+            key_hash=claim.key_hash,
+            request_hash=claim.request_hash,
+            pseudonym=pseudonym,
+            claim=claim.token,
+            claimed_until=now + CLAIM,
+            created_at=now,
+            expires_at=claim.expires_at,
+        )
+
+    def _is_authentic(self, row: Any) -> bool:
+        return is_authentic(self._audit_log.row_key(), IdempotencyRow, row._mapping)
+
     def finish(self, claim: Claim, *, status: int, body: bytes) -> bool:
         """Leave the answer; False if the claim is gone (lapsed, or the subject was erased)."""
         if len(body) > MAX_BODY_BYTES:
             raise StoreError(f"an answer of more than {MAX_BODY_BYTES} bytes is not kept")
+        row = {**vars(claim), "claim": claim.token, "status": status, "body": body}
+        mac = row_mac(self._audit_log.row_key(), IdempotencyRow, row)
         statement = (
             sa.update(IdempotencyRow)
             .where(*_is(claim), IdempotencyRow.claim == claim.token)
-            .values(status=status, body=body)
+            .values(status=status, body=body, mac=mac)
         )
         return self._database.write(lambda each: each.execute(statement).rowcount == 1)
 
@@ -161,6 +181,9 @@ class Idempotency:
         """Remove records that are older than a day; returns how many."""
         expired = IdempotencyRow.expires_at <= self._clock()
         return self._database.remove(IdempotencyRow, expired, batch=BATCH)
+
+
+_RECORD: Any = sa.select(*columns_of(IdempotencyRow))
 
 
 def _is(claim: Claim) -> tuple[sa.ColumnElement[bool], ...]:

@@ -8,6 +8,7 @@ from sqlalchemy.engine import Connection
 
 from templates.sealing import MasterKeyring
 from templates.store import deployment, migrate, retention, rewrap
+from templates.store.adoption import Adoption, adopt
 from templates.store.api_keys import ApiKeys
 from templates.store.attempts import Attempts
 from templates.store.audit_log import PROGRAM, AuditLog, By
@@ -16,8 +17,10 @@ from templates.store.deployment import Secrets
 from templates.store.erasure import Erasure, Erasures
 from templates.store.idempotency import Idempotency
 from templates.store.identifiers import Clock, utc_now
+from templates.store.known_calibrations import KnownCalibrations
 from templates.store.lockout import LockoutPolicy
 from templates.store.receipts import Receipt, ReceiptSigner
+from templates.store.record_check import RecordProblem, check_records
 from templates.store.rerotation import Rerotation
 from templates.store.retention import RETENTION, Retention
 from templates.store.schema import (
@@ -34,6 +37,7 @@ from templates.store.stored_form import StoredForm, stored_form
 from templates.store.subjects import Subjects
 from templates.store.tenant_erasure import TenantErasures
 from templates.store.tenants import Tenants
+from templates.store.transfers import Transfers
 
 _LOCKOUT = LockoutPolicy()
 _TRIAL_ROW = 0  # the table's one row has number 1
@@ -45,7 +49,7 @@ class TemplateStore(Subjects):
 
     Subjects are reached directly (:meth:`put`, :meth:`get`, :meth:`list`, :meth:`erase`), the rest
     by its own part: `tenants`, `tenant_erasures`, `rerotation`, `api_keys`, `attempts`,
-    `idempotency`, `audit_log`, `secrets`.
+    `idempotency`, `transfers`, `known_calibrations`, `audit_log`, `secrets`.
     """
 
     def __init__(
@@ -65,23 +69,36 @@ class TemplateStore(Subjects):
         super().__init__(database, keyring, signer, audit_log, clock)
         self.attempts = Attempts(database, keyring, signer, audit_log, clock, lockout)
         self._erasures = Erasures(database, signer, audit_log, clock)
-        self.tenants = Tenants(database, keyring, clock)
-        self.tenant_erasures = TenantErasures(database, signer, audit_log, clock)
+        self.tenants = Tenants(database, keyring, audit_log, clock)
         self.rerotation = Rerotation(database, keyring, self.tenants, audit_log)
         self.api_keys = ApiKeys(database, keyring, self.tenants, audit_log, clock)
-        self.idempotency = Idempotency(database, self.secrets, signer, clock)
+        self.known_calibrations = KnownCalibrations(database, audit_log, clock)
+        self.transfers = Transfers(database, signer, audit_log, clock)
+        self.tenant_erasures = TenantErasures(
+            database, signer, audit_log, self.tenants, self.api_keys, clock
+        )
+        self.idempotency = Idempotency(database, self.secrets, signer, audit_log, clock)
 
-    def upgrade(self) -> None:
-        """Bring the schema to this program's version; safe when several workers start at once."""
+    def upgrade(self) -> Adoption:
+        """Bring the schema to this program's version; safe when several workers start at once.
+
+        Rows of a version that did not authenticate them are authenticated, once: see
+        :func:`adoption.adopt`.
+        """
         migrate.upgrade(self._database)
         deployment.mark_master_key(self._database, self._keyring, self._clock)
         self.check()
         self.audit_log.begin()
+        return adopt(self._database, self.audit_log)
 
     def check(self) -> None:
         """Raise, naming the remedy, unless schema and master key are the right ones."""
         migrate.check(self._database)
         deployment.check_master_key(self._database, self._keyring)
+
+    def check_records(self) -> tuple[RecordProblem, ...]:
+        """Hold the rows that decide against the audit log; see :func:`check_records`."""
+        return check_records(self._database, self.audit_log, self._clock())
 
     def close(self) -> None:
         """Close the idle connections of this process."""

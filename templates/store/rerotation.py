@@ -35,7 +35,6 @@ from templates.sealing import MasterKeyring, sealed_key_id
 from templates.store.audit_log import PROGRAM, AuditLog, By, Entry
 from templates.store.database import Database
 from templates.store.envelope import Envelope, Owner, close_envelope, open_envelope
-from templates.store.identifiers import UnknownTenant
 from templates.store.schema import RotationKeyRow, SubjectRow, TemplateRow, TenantRow
 from templates.store.tenants import RetiredRotation, Tenants
 
@@ -91,17 +90,12 @@ class Rerotation:
         self._audit_log.prepare()
 
         def work(connection: Connection) -> int:
-            renewed = connection.execute(
-                sa.update(TenantRow)
-                .where(TenantRow.name == tenant)
-                .values(rotation_epoch=TenantRow.rotation_epoch + 1)
-                .returning(TenantRow.id, TenantRow.rotation_epoch)
-            ).one_or_none()
-            if renewed is None:
-                raise UnknownTenant(f"there is no tenant {tenant!r}")
-            self._tenants.add_rotation_key(connection, renewed.id, renewed.rotation_epoch)
-            self._note(connection, "begun", tenant, renewed.rotation_epoch, by)
-            return int(renewed.rotation_epoch)
+            owner = self._tenants.locked(connection, tenant)
+            epoch = owner.rotation_epoch + 1
+            self._tenants.add_rotation_key(connection, owner.id, epoch)
+            entry = _entry("begun", tenant, epoch, by)
+            self._tenants.change(connection, owner, entry, rotation_epoch=epoch)
+            return epoch
 
         return self._database.write(work)
 

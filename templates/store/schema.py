@@ -4,6 +4,9 @@ Whatever is a secret is a sealed blob, and beside each blob that a master key se
 of that key (``wrapping_key``), so that a rotation finds the rows it still has to re-wrap. Rows
 that must outlive a subject (receipts, audit lines) name it by a keyed pseudonym only.
 
+A row that decides something carries ``mac``, and where the audit log tells of its changes ``line``,
+the number of the last line about it; see ``templates.store.authenticity``.
+
 What is not drawn here: triggers that refuse to change or remove a line of ``audit_log``
 (migration 0002). A migration that rebuilds that table on SQLite has to make them again.
 """
@@ -25,9 +28,27 @@ from sqlalchemy import (
     Text,
     TypeDecorator,
     UniqueConstraint,
+    false,
+    text,
     true,
 )
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
+
+# Which lines of the audit log a record is held against; each list has its index, and what is asked
+# with the same words uses it. The lines of a key name it in their detail.
+KEY_LINES = text("action IN ('key-create', 'key-replace', 'key-revoke')")
+TENANT_LINES = text(
+    "action IN ('tenant-settings', 'tenant-rotate', 'tenant-erase') "
+    "AND outcome NOT IN ('moved', 'retired', 'resumed', 'receipt_repeated')"
+)
+ATTEMPT_LINES = text(
+    "action IN ('verify', 'lockout-reset', 'erase') AND "
+    "outcome IN ('accept', 'reject', 'reset', 'erased', 'nothing_held', 'receipt_repeated')"
+)
+ENROLLMENT_LINES = text(
+    "outcome IN ('created', 'replaced', 'erased', 'nothing_held', 'receipt_repeated')"
+)
+NONCE_LINES = text("nonce IS NOT NULL")
 
 KEY_ID = String(16)
 PSEUDONYM = String(64)
@@ -36,6 +57,7 @@ UUID_HEX = String(32)
 # Ordered by code point on every database, so that a page cursor means the same on each of them.
 SUBJECT_ID = String(128).with_variant(String(128, collation="C"), "postgresql")
 SERIAL = BigInteger().with_variant(Integer, "sqlite")
+MAC = LargeBinary(32)
 
 
 class UtcDateTime(TypeDecorator[datetime]):
@@ -89,6 +111,9 @@ class TenantRow(Base):
     name: Mapped[str] = mapped_column(String(64), unique=True)
     rotation_epoch: Mapped[int] = mapped_column(Integer)
     created_at: Mapped[datetime] = mapped_column(UtcDateTime)
+    template_enrollment: Mapped[bool] = mapped_column(Boolean, server_default=false())
+    line: Mapped[int] = mapped_column(SERIAL, server_default="0")
+    mac: Mapped[bytes | None] = mapped_column(MAC)
 
 
 class TenantErasureRow(Base):
@@ -136,6 +161,9 @@ class ApiKeyRow(Base):
     expires_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
     revoked_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
     last_used_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
+    lowest_level: Mapped[str | None] = mapped_column(String(64))
+    line: Mapped[int] = mapped_column(SERIAL, server_default="0")
+    mac: Mapped[bytes | None] = mapped_column(MAC)
 
 
 class SubjectRow(Base):
@@ -196,6 +224,8 @@ class FailedAttemptsRow(Base):
     locked_until: Mapped[datetime | None] = mapped_column(UtcDateTime)
     disabled_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
     known: Mapped[bool] = mapped_column(Boolean, server_default=true())
+    line: Mapped[int] = mapped_column(SERIAL, server_default="0")
+    mac: Mapped[bytes | None] = mapped_column(MAC)
 
 
 class UsedNonceRow(Base):
@@ -241,24 +271,52 @@ class IdempotencyRow(Base):
     body: Mapped[bytes | None] = mapped_column(LargeBinary)
     created_at: Mapped[datetime] = mapped_column(UtcDateTime)
     expires_at: Mapped[datetime] = mapped_column(UtcDateTime, index=True)
+    mac: Mapped[bytes | None] = mapped_column(MAC)
+
+
+class KnownCalibrationsRow(Base):
+    """Calibrations of a contract that were served, in the order in which they came first."""
+
+    __tablename__ = "known_calibrations"
+
+    contract_id: Mapped[str] = mapped_column(String(64), primary_key=True)
+    position: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=False)
+    calibration_ids: Mapped[str] = mapped_column(Text)
+    created_at: Mapped[datetime] = mapped_column(UtcDateTime)
+    mac: Mapped[bytes | None] = mapped_column(MAC)
 
 
 class AuditRow(Base):
     """One line of the audit log, chained to the one before by its hash."""
 
     __tablename__ = "audit_log"
+    __table_args__ = (
+        *(
+            Index(name, column, "sequence", sqlite_where=which, postgresql_where=which)
+            for name, column, which in (
+                ("ix_audit_log_key_lines", "detail", KEY_LINES),
+                ("ix_audit_log_tenant_lines", "tenant", TENANT_LINES),
+                ("ix_audit_log_attempt_lines", "pseudonym", ATTEMPT_LINES),
+                ("ix_audit_log_enrollment_lines", "pseudonym", ENROLLMENT_LINES),
+            )
+        ),
+        Index(
+            "ix_audit_log_nonce", "nonce", sqlite_where=NONCE_LINES, postgresql_where=NONCE_LINES
+        ),
+    )
 
     sequence: Mapped[int] = mapped_column(SERIAL, primary_key=True, autoincrement=False)
-    at: Mapped[datetime] = mapped_column(UtcDateTime, index=True)
+    at: Mapped[datetime] = mapped_column(UtcDateTime)
     tenant: Mapped[str | None] = mapped_column(String(64))
     actor: Mapped[str | None] = mapped_column(String(64))
     action: Mapped[str] = mapped_column(String(64))
-    pseudonym: Mapped[str | None] = mapped_column(PSEUDONYM, index=True)
+    pseudonym: Mapped[str | None] = mapped_column(PSEUDONYM)
     outcome: Mapped[str] = mapped_column(String(64))
     request_id: Mapped[str | None] = mapped_column(String(64))
     detail: Mapped[str | None] = mapped_column(String(64))
     previous_hash: Mapped[bytes] = mapped_column(LargeBinary(32))
     hash: Mapped[bytes] = mapped_column(LargeBinary(32))
+    nonce: Mapped[str | None] = mapped_column(String(64))
 
 
 class AuditHeadRow(Base):

@@ -3,6 +3,7 @@
 import base64
 import binascii
 import uuid
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import datetime
 from enum import StrEnum
@@ -30,6 +31,8 @@ MAX_WIRE_BYTES = 4 * 1024 * 1024  # a float32 template of n = 4096, m = 128 has 
 MAX_PAGE = 1000
 
 _CURSOR_PURPOSE = "list-cursor"
+
+Guard = Callable[[Connection, str], Entry | None]
 
 
 class Source(StrEnum):
@@ -111,6 +114,7 @@ class Subjects:
         photos: int,
         template_id: str | None = None,
         rotation_epoch: int | None = None,
+        guard: Guard | None = None,
         by: By = PROGRAM,
     ) -> StoredTemplate:
         """Store a template, or replace the one there is, in one transaction.
@@ -128,6 +132,10 @@ class Subjects:
         rotation_epoch
             Epoch of the tenant's rotation that the template is in; the current one by default.
             Another one is refused: its key is, or will be, dropped.
+        guard
+            Called in the transaction with its connection and the subject's pseudonym, before
+            anything is written. What it raises takes the enrollment back; what it returns goes
+            into the audit log before the enrollment's own line.
         by
             Who enrolls, for the audit log.
 
@@ -155,6 +163,7 @@ class Subjects:
             epoch = current_epoch if rotation_epoch is None else rotation_epoch
             if epoch != current_epoch:
                 raise StoreBusy("the tenant's rotation was renewed meanwhile; send it again")
+            noted = None if guard is None else guard(connection, pseudonym)
             now = self._clock()
             known = subject_row_id(connection, tenant_id, subject_id)
             subject_pk = known or uuid.uuid4().hex
@@ -204,6 +213,8 @@ class Subjects:
                     created_at=now,
                 )
             )
+            if noted is not None:
+                self.audit_log.append(connection, noted)
             outcome = "created" if known is None else "replaced"
             self.audit_log.append(connection, Entry("enroll", outcome, by, tenant, pseudonym))
             return known is None

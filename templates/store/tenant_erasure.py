@@ -15,6 +15,7 @@ import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 from sqlalchemy.orm import InstrumentedAttribute
 
+from templates.store.api_keys import ApiKeys
 from templates.store.audit_log import PROGRAM, TENANT_ERASE, AuditLog, By, Entry
 from templates.store.database import Database
 from templates.store.deployment import insert_once
@@ -34,6 +35,7 @@ from templates.store.schema import (
     UsedNonceRow,
 )
 from templates.store.subjects import subject_lock
+from templates.store.tenants import AlteredTenant, Tenant, Tenants
 
 BATCH = 200
 
@@ -111,9 +113,17 @@ class TenantErasures:
     """The only way to erase a tenant."""
 
     def __init__(
-        self, database: Database, signer: ReceiptSigner, audit_log: AuditLog, clock: Clock
+        self,
+        database: Database,
+        signer: ReceiptSigner,
+        audit_log: AuditLog,
+        tenants: Tenants,
+        api_keys: ApiKeys,
+        clock: Clock,
     ) -> None:
         self._database = database
+        self._tenants = tenants
+        self._api_keys = api_keys
         self._signer = signer
         self._audit_log = audit_log
         self._clock = clock
@@ -201,17 +211,25 @@ class TenantErasures:
                 raise _unknown(tenant)
             self._note(connection, "receipt_repeated", tenant, by)
             return earlier
-        now = self._clock()
-        connection.execute(
-            sa.update(ApiKeyRow)
-            .where(ApiKeyRow.tenant_id == tenant_id, ApiKeyRow.revoked_at.is_(None))
-            .values(revoked_at=now)
-        )
         first = insert_once(
-            connection, TenantErasureRow, tenant_id=tenant_id, begun_at=now, removed={}
+            connection, TenantErasureRow, tenant_id=tenant_id, begun_at=self._clock(), removed={}
         )
-        self._note(connection, "begun" if first else "resumed", tenant, by)
+        # Before the first line: the head of the audit log is locked last.
+        owner = self._locked(connection, tenant) if first else None
+        self._api_keys.revoke_all(connection, tenant, by=by)
+        if owner is None:
+            self._note(connection, "begun" if first else "resumed", tenant, by)
+        else:
+            # Its row stays good until it goes: writes that are under way need it.
+            self._tenants.change(connection, owner, Entry(TENANT_ERASE, "begun", by, tenant))
         return tenant_id
+
+    def _locked(self, connection: Connection, tenant: str) -> Tenant | None:
+        """Return the tenant; None where its row is not authentic, and so must not be renewed."""
+        try:
+            return self._tenants.locked(connection, tenant)
+        except AlteredTenant:
+            return None
 
     def _remove_batch(self, tenant_id: str, tenant: str, records: _Records, batch: int) -> int:
         def work(connection: Connection) -> int:

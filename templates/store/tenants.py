@@ -8,7 +8,7 @@ memory, and an enrollment that was under way, cannot mistake one for the other.
 import json
 import os
 import uuid
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from typing import Any
 
@@ -16,23 +16,47 @@ import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
 from templates.sealing import MasterKeyring, sealed_key_id
+from templates.store.audit_log import PROGRAM, AuditLog, By, Entry
+from templates.store.authenticity import (
+    LAST_TENANT_LINE,
+    columns_of,
+    is_current,
+    last_line,
+    row_mac,
+    warn,
+)
 from templates.store.database import Database
 from templates.store.deployment import insert_once
 from templates.store.identifiers import Clock, UnknownTenant, checked_tenant_name
 from templates.store.receipts import tenant_receipt_name
-from templates.store.schema import ReceiptRow, RotationKeyRow, TenantRow
+from templates.store.schema import (
+    TENANT_LINES,
+    AuditRow,
+    ReceiptRow,
+    RotationKeyRow,
+    TenantRow,
+)
 
 ROTATION_PURPOSE = "tenant-rotation-key"
 
 
 @dataclass(frozen=True)
 class Tenant:
-    """A tenant; `rotation_epoch` is the epoch whose key new templates are rotated with."""
+    """A tenant.
+
+    Attributes
+    ----------
+    rotation_epoch
+        Epoch whose key new templates are rotated with.
+    template_enrollment
+        Whether clients may enroll templates that they made themselves.
+    """
 
     id: str
     name: str
     rotation_epoch: int
     created_at: datetime
+    template_enrollment: bool
 
 
 @dataclass(frozen=True)
@@ -43,6 +67,16 @@ class RotationKey:
     key: bytes = field(repr=False)
 
 
+class AlteredTenant(UnknownTenant):
+    """The row of the tenant is not as this program left it, so it is as good as none."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(
+            f"the row of tenant {name!r} was altered in the database, or put back to an earlier "
+            "state: run `veilface audit-log verify`, and restore the database from a backup"
+        )
+
+
 class RetiredRotation(UnknownTenant):
     """No rotation of this epoch any more: what was read in it was moved on since, read it again."""
 
@@ -50,42 +84,109 @@ class RetiredRotation(UnknownTenant):
 class Tenants:
     """Repository of tenants."""
 
-    def __init__(self, database: Database, keyring: MasterKeyring, clock: Clock) -> None:
+    def __init__(
+        self, database: Database, keyring: MasterKeyring, audit_log: AuditLog, clock: Clock
+    ) -> None:
         self._database = database
         self._keyring = keyring
+        self._audit_log = audit_log
         self._clock = clock
 
     def create(self, name: str) -> Tenant:
         """Return the tenant of this name, which is made, with its rotation key, if it is new."""
         checked_tenant_name(name)
+        self._audit_log.prepare()
         return self._database.write(lambda each: self.ensure(each, name))
 
     def ensure(self, connection: Connection, name: str) -> Tenant:
-        """:meth:`create` inside a transaction that is open already."""
-        tenant_id, now = uuid.uuid4().hex, self._clock()
-        epoch = 1 + _last_epoch_of_erased(connection, name)
-        made = insert_once(
-            connection, TenantRow, id=tenant_id, name=name, rotation_epoch=epoch, created_at=now
+        """:meth:`create` inside a transaction that is open already, its log prepared."""
+        tenant = Tenant(
+            id=uuid.uuid4().hex,
+            name=name,
+            rotation_epoch=1 + _last_epoch_of_erased(connection, name),
+            created_at=self._clock(),
+            template_enrollment=False,
         )
+        # An erased tenant of this name has left lines, and a row from before them is none of ours.
+        line = connection.execute(_LAST_LINE, {"name": name}).scalar() or 0
+        made = insert_once(connection, TenantRow, **self._row(tenant, line))
         if made:
-            self.add_rotation_key(connection, tenant_id, epoch)
-        return _tenant(connection.execute(_COLUMNS.where(TenantRow.name == name)).one())
+            self.add_rotation_key(connection, tenant.id, tenant.rotation_epoch)
+        return self._one(connection, name)
 
     def get(self, name: str) -> Tenant:
-        """Return a tenant, or raise :class:`UnknownTenant`."""
-        row = self._database.read(
-            lambda each: each.execute(_COLUMNS.where(TenantRow.name == name)).one_or_none()
-        )
-        if row is None:
-            raise UnknownTenant(f"there is no tenant {checked_tenant_name(name)!r}")
-        return _tenant(row)
+        """Return a tenant.
+
+        Raises
+        ------
+        UnknownTenant
+            Where there is none; :class:`AlteredTenant` where its row is not authentic.
+        """
+        self._audit_log.prepare()
+        return self._database.read(lambda each: self._one(each, name))
 
     def all(self) -> tuple[Tenant, ...]:
-        """Every tenant, by name."""
-        rows = self._database.read(
-            lambda each: each.execute(_COLUMNS.order_by(TenantRow.name)).all()
+        """Every tenant, by name; without those whose row is not authentic."""
+        self._audit_log.prepare()
+        rows = self._database.read(lambda each: each.execute(_ROWS.order_by(TenantRow.name)).all())
+        return tuple(_tenant(row) for row in rows if self._is_current(row))
+
+    def set_template_enrollment(self, name: str, allowed: bool, *, by: By = PROGRAM) -> Tenant:
+        """Allow clients of a tenant to enroll templates that they made themselves, or forbid it.
+
+        Raises
+        ------
+        UnknownTenant
+        """
+        self._audit_log.prepare()
+        outcome = "template-enrollment-on" if allowed else "template-enrollment-off"
+        entry = Entry("tenant-settings", outcome, by, checked_tenant_name(name))
+
+        def work(connection: Connection) -> Tenant:
+            tenant = self.locked(connection, name)
+            return self.change(connection, tenant, entry, template_enrollment=allowed)
+
+        return self._database.write(work)
+
+    def locked(self, connection: Connection, name: str) -> Tenant:
+        """Return a tenant, whose row no other transaction changes until this one ends.
+
+        Raises
+        ------
+        UnknownTenant
+            As :meth:`get`.
+        """
+        return self._one(connection, name, for_update=True)
+
+    def change(
+        self, connection: Connection, tenant: Tenant, entry: Entry, **columns: Any
+    ) -> Tenant:
+        """Change columns of a tenant that is :meth:`locked`, and add the line that tells of it."""
+        changed = replace(tenant, **columns)
+        line = self._audit_log.append(connection, entry)
+        connection.execute(
+            sa.update(TenantRow).where(TenantRow.id == tenant.id).values(self._row(changed, line))
         )
-        return tuple(_tenant(row) for row in rows)
+        return changed
+
+    def _one(self, connection: Connection, name: str, *, for_update: bool = False) -> Tenant:
+        query = _ROWS.where(TenantRow.name == name)
+        if for_update:
+            query = query.with_for_update(of=TenantRow, key_share=True)
+        row = connection.execute(query).one_or_none()
+        if row is None:
+            raise UnknownTenant(f"there is no tenant {checked_tenant_name(name)!r}")
+        if not self._is_current(row):
+            warn("a tenant's row is not authentic and was passed over", tenant=name)
+            raise AlteredTenant(name)
+        return _tenant(row)
+
+    def _is_current(self, row: Any) -> bool:
+        return is_current(self._audit_log.row_key(), TenantRow, row._mapping)
+
+    def _row(self, tenant: Tenant, line: int) -> dict[str, Any]:
+        row = {**vars(tenant), "line": line}
+        return {**row, "mac": row_mac(self._audit_log.row_key(), TenantRow, row)}
 
     def rotation_key(self, name: str, *, epoch: int | None = None) -> RotationKey:
         """Open the rotation key of a tenant, of the current epoch unless another is asked for."""
@@ -119,7 +220,8 @@ class Tenants:
         )
 
 
-_COLUMNS = sa.select(TenantRow.id, TenantRow.name, TenantRow.rotation_epoch, TenantRow.created_at)
+_ROWS: Any = sa.select(*columns_of(TenantRow), LAST_TENANT_LINE.label("last_line"))
+_LAST_LINE = last_line(AuditRow.tenant == sa.bindparam("name"), TENANT_LINES)
 
 
 def _last_epoch_of_erased(connection: Connection, name: str) -> int:
@@ -134,4 +236,4 @@ def _last_epoch_of_erased(connection: Connection, name: str) -> int:
 
 
 def _tenant(row: Any) -> Tenant:
-    return Tenant(*row)
+    return Tenant(**{name: getattr(row, name) for name in Tenant.__dataclass_fields__})

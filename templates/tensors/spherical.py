@@ -1,4 +1,4 @@
-"""Spherical distances on tensors (METHOD §3); ``templates.spherical`` is the reference.
+"""Spherical distances on tensors (docs/method.md §3.5); ``templates.spherical`` is the reference.
 
 The similarity of two subspaces is p·q plus the maximum of g·u + h·v + uᵀBv over unit u and v. The
 best u of a v is known, so with G = BᵀB and c = Bᵀg the objective is F(v) = h·v + λ with

@@ -58,7 +58,7 @@ def pairwise(
 
     References
     ----------
-    Paper eq. 1 to 9; METHOD §3 and §5.
+    Paper eq. 1 to 9; docs/method.md §3 and §5.
     """
     probes, templates = place(probes, templates, device)
     out = torch.empty(len(probes), len(templates), device=templates.device)

@@ -110,6 +110,11 @@ def bombs(max_pixels: int) -> Iterator[Case]:
     scans = encode(np.zeros((64, 64, 3), np.uint8), "JPEG", progressive=True)
     start, end = scans.index(b"\xff\xda"), scans.rindex(b"\xff\xd9")
     yield Case("JPEG of 5000 scans", scans[:start] + scans[start:end] * 5000 + b"\xff\xd9", DAMAGED)
+    side = int(max_pixels**0.5)
+    scans = encode(np.zeros((side, side, 3), np.uint8), "JPEG", progressive=True)
+    start, end = scans.rindex(b"\xff\xc4"), scans.rindex(b"\xff\xd9")
+    yield Case("JPEG of the most pixels in 90 scans", scans[:end] + scans[start:end] * 80
+               + b"\xff\xd9", DAMAGED)  # fmt: skip
     frames = [Image.new("RGB", (64, 64), (i, i, i)) for i in range(8)]
     for form in ("PNG", "WEBP"):
         out = io.BytesIO()

@@ -24,6 +24,7 @@ import httpx
 
 from tests.api.deployment import Deployment, bearer, deploy, images, photo
 from tests.api.test_server import Server, free_port
+from tests.patience import PATIENCE_S
 
 CONFIG = """\
 [checks]
@@ -66,7 +67,9 @@ def service(folder: Path, **settings: Any) -> Iterator[tuple[Server, Deployment]
     server = Server(deployment, folder)
     try:
         server.wait()
-        with httpx.Client(base_url=server.url, headers=bearer(deployment.token)) as client:
+        with httpx.Client(
+            base_url=server.url, headers=bearer(deployment.token), timeout=PATIENCE_S
+        ) as client:
             answer = client.put("/v1/subjects/alice/enrollment", files=images(photo(1)))
             assert answer.status_code == 201, answer.text
         yield server, deployment

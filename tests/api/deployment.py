@@ -23,6 +23,7 @@ from templates.lifting import Strategy
 from templates.randomness import Keystream
 from templates.rotation import ROTATION_VERSION
 from verify.cohort import make_cohort
+from verify.strangers import make_nobody
 
 N = 64
 M = 8
@@ -102,6 +103,18 @@ def make_contract(pack: ModelPack, source: DecoySource, **changes: Any) -> Contr
         Calibration("p2s", Metric.SPHERICAL, 0, DEFAULT_STEPS, levels, None),
         Calibration("s2s", Metric.SPHERICAL, PROBE_M, DEFAULT_STEPS, levels, (0.3, 0.95)),
     )
+    with Keystream.seeded("cohort") as stream:
+        cohort = make_cohort(source, strategy=binding.strategy, m=M, stream=stream, size=40)
+    with Keystream.seeded("strangers") as stream:
+        nobody = make_nobody(
+            source,
+            strangers=(source,),
+            cohort=cohort,
+            metric=Metric.SPHERICAL,
+            steps=DEFAULT_STEPS,
+            stream=stream,
+            size=100,
+        )
     return Contract(
         binding=binding,
         recorded={"pack": pack.info.name},
@@ -109,9 +122,9 @@ def make_contract(pack: ModelPack, source: DecoySource, **changes: Any) -> Contr
         default_level="fmr-1e-3",
         photo_consistency=0.5,
         template_foot_point_norm=(0.1, 0.8),
-        cohort=make_cohort(
-            source, strategy=binding.strategy, m=M, stream=Keystream.seeded("cohort"), size=40
-        ),
+        template_stranger_score=2.0,
+        cohort=cohort,
+        nobody=nobody,
     )
 
 
@@ -130,6 +143,14 @@ class Deployment:
         try:
             store.tenants.create(tenant)
             return store.api_keys.create(tenant, rights).token
+        finally:
+            store.close()
+
+    def allow_templates(self, tenant: str = "default", *, allowed: bool = True) -> None:
+        """Do what `veilface db template-enrollment --allow` does."""
+        store = open_store(self.settings, open_keyring(self.settings))
+        try:
+            store.tenants.set_template_enrollment(tenant, allowed)
         finally:
             store.close()
 

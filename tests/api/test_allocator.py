@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.patience import PATIENCE_S
+
 pytestmark = pytest.mark.skipif(
     platform.libc_ver()[0] != "glibc", reason="another C library has no arenas"
 )
@@ -42,7 +44,7 @@ def arenas(folder: Path, how: str) -> int:
         [sys.executable, "-c", COUNT, str(folder / "arenas"), how],
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=PATIENCE_S,
         cwd=Path(__file__).resolve().parents[2],
         check=True,
     )

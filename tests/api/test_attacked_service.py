@@ -20,6 +20,8 @@ from attacks.hill_climbing import in_process
 from attacks.outcomes import GENERATED, Scheme
 from attacks.scene import Scene
 from templates import wire
+from templates.sealing import MasterKeyring
+from templates.store import TemplateStore
 from tests.attacks.conftest import staged
 from tests.leaks import LeakSearch
 from tests.verify.synthetic import draw_people, make_generator, unit
@@ -130,6 +132,12 @@ def test_a_template_that_is_refused_is_said_and_nothing_stays(
     def refusing(folder: Path) -> Iterator[httpx.Client]:
         present = {file.name for file in folder.iterdir()}
         assert present == {"master.key", "contract.json", "decoys.veil", "veilface.toml"}
+        store = TemplateStore(
+            f"sqlite:///{folder / 'veilface.db'}", MasterKeyring.load(folder / "master.key")
+        )
+        store.upgrade()
+        store.tenants.create("default")
+        store.close()
         transport = httpx.MockTransport(lambda _: httpx.Response(409, json=answers))
         yield httpx.Client(transport=transport, base_url="http://service")
 

@@ -31,6 +31,7 @@ def service(both: tuple[Client, Deployment]) -> tuple[Client, Deployment]:
 
 def test_what_is_done_is_written_with_who_did_it(service: tuple[Client, Deployment]) -> None:
     client, deployment = service
+    deployment.allow_templates()
     store = client.app.state.runtime.store
     path = "/v1/subjects/alice"
     pseudonym = store.pseudonym("default", "alice")
@@ -45,7 +46,14 @@ def test_what_is_done_is_written_with_who_did_it(service: tuple[Client, Deployme
         ),
         ("verify", "reject", client.post(f"{path}/verify", files=images(rejected, name="image"))),
         ("export", "exported", client.get(f"{path}/export")),
-        ("enroll", "replaced", client.post("/v1/subjects/import", json={"export": exported})),
+        (
+            "import",
+            "restored",
+            restored := client.post(
+                "/v1/subjects/import", json={"export": exported, "restore": True}
+            ),
+        ),
+        ("enroll", "replaced", restored),
         ("erase", "erased", client.delete(path)),
         ("erase", "receipt_repeated", client.delete(path)),
         ("lockout-reset", "nothing_held", client.delete(f"{path}/lockout")),

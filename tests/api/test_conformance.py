@@ -10,9 +10,11 @@ import pytest
 
 from tests.api.conformance import run_all, schemathesis, service
 from tests.api.deployment import bearer
+from tests.patience import PATIENCE_S
+
+pytestmark = pytest.mark.long
 
 
-@pytest.mark.timeout(600)
 def test_the_service_answers_as_its_document_says(tmp_path: Path) -> None:
     with service(tmp_path) as (server, deployment):
         runs = run_all(server, deployment, tmp_path / "reports", examples=4, seed=20261122)
@@ -27,7 +29,7 @@ def test_a_service_that_lies_is_found(tmp_path: Path) -> None:
     # The server is another process, so its document is changed: it promises that the list of
     # subjects has a field that no answer has.
     with service(tmp_path) as (server, deployment):
-        document = httpx.get(f"{server.url}/v1/openapi.json").json()
+        document = httpx.get(f"{server.url}/v1/openapi.json", timeout=PATIENCE_S).json()
         document["paths"] = {"/v1/subjects": document["paths"]["/v1/subjects"]}
         answer = document["components"]["schemas"]["SubjectsAnswer"]
         answer["required"] = [*answer["required"], "total"]

@@ -3,7 +3,6 @@
 import stat
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ import pytest
 
 from api import demo_service
 from api.errors import StartError
+from tests.patience import wait_until
 
 
 def test_the_token_is_private_and_never_left_behind(
@@ -24,9 +24,7 @@ def test_the_token_is_private_and_never_left_behind(
         return start([sys.executable, "-c", script], **options)
 
     def fail_once_the_token_is_there(*_: object) -> None:
-        deadline = time.monotonic() + 20
-        while "vf_token" not in shown.read_text() and time.monotonic() < deadline:
-            time.sleep(0.01)
+        wait_until(lambda: "vf_token" in shown.read_text(), what="the token")
         modes.append(stat.S_IMODE(shown.stat().st_mode))
         raise StartError("the service was not ready")
 

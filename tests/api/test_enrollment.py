@@ -1,5 +1,6 @@
 import base64
 import json
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -62,13 +63,48 @@ def test_a_rejected_set_leaves_the_old_enrollment(client: Client) -> None:
     broken = client.put(path("bob"), files=images(photo(1), b"no picture"))
     assert assert_error(broken, 400, "unsupported_image")["image"] == 1
     mixed = client.put(path("bob"), files=images(photo(1), photo(1, 1), photo(2)))
-    assert assert_error(mixed, 422, "inconsistent_images") == {"pairs": [[0, 2], [1, 2]]}
+    assert assert_error(mixed, 422, "inconsistent_images") == {"photos": [2]}
+    said = mixed.json()["error"]["message"]
+    assert said.startswith("photo 3 does not look like the person on photos 1 and 2;")
     assert client.get("/v1/subjects/bob").json()["template_id"] == old
     new = client.put(path("carol-new"), files=images(photo(1), photo(2)))
-    assert_error(new, 422, "inconsistent_images")
+    assert assert_error(new, 422, "inconsistent_images") == {"photos": [0, 1]}
     assert_error(client.get("/v1/subjects/carol-new"), 404, "not_enrolled")
 
 
+@pytest.fixture
+def allowed(deployment: Deployment) -> Iterator[None]:
+    """Templates that clients made may be enrolled during one test."""
+    deployment.allow_templates()
+    yield
+    deployment.allow_templates(allowed=False)
+
+
+def test_a_template_is_refused_until_the_operator_allows_it(
+    both: tuple[Client, Deployment],
+) -> None:
+    client, deployment = both
+    body = {"template": b64(lifted(deployment))}
+    for sent in (body, {"template": "no template"}):
+        refused = client.put(path("lifted"), json=sent)
+        details = assert_error(refused, 403, "forbidden")
+        assert details == {"tenant_setting": "template_enrollment"}
+        assert "veilface db template-enrollment" in refused.json()["error"]["message"]
+    assert client.get("/v1/contract").json()["template_enrollment"] is False
+    deployment.allow_templates()
+    assert client.get("/v1/contract").json()["template_enrollment"] is True
+    assert_answer(client.put(path("lifted"), json=body), 201, EnrollmentAnswer)
+    # What one tenant is allowed, another one is not.
+    other = bearer(deployment.key("enroll", "embeddings", tenant="other"))
+    assert_error(client.put(path("lifted"), json=body, headers=other), 403, "forbidden")
+    exported = client.get("/v1/subjects/lifted/export").json()["export"]
+    deployment.allow_templates(allowed=False)
+    assert_error(client.put(path("lifted"), json=body), 403, "forbidden")
+    # An export is the service's own, sealed file.
+    assert client.post("/v1/subjects/import", json={"export": exported}).status_code == 200
+
+
+@pytest.mark.usefixtures("allowed")
 def test_a_template_enrolls(client: Client, deployment: Deployment) -> None:
     answer = client.put(path("lifted"), json={"template": b64(lifted(deployment))})
     body = assert_answer(answer, 201, EnrollmentAnswer)
@@ -80,6 +116,7 @@ def test_a_template_enrolls(client: Client, deployment: Deployment) -> None:
     assert probe.json()["decision"] == "accept"
 
 
+@pytest.mark.usefixtures("allowed")
 def test_broken_templates_are_refused(client: Client, deployment: Deployment) -> None:
     whole = lifted(deployment)
     cases = [
@@ -101,6 +138,7 @@ def test_broken_templates_are_refused(client: Client, deployment: Deployment) ->
     assert "template" in assert_error(extra, 422, "validation_failed")["known"]
 
 
+@pytest.mark.usefixtures("allowed")
 def test_a_template_needs_the_right_to_send_embeddings(
     client: Client, deployment: Deployment
 ) -> None:

@@ -16,7 +16,7 @@ PRODUCT_CODES = {
     403: {"forbidden"},
     404: {"not_enrolled", "not_found"},
     405: {"method_not_allowed"},
-    409: {"contract_mismatch", "idempotency_conflict"},
+    409: {"contract_mismatch", "idempotency_conflict", "export_superseded"},
     413: {"image_too_large", "request_too_large", "too_many_images"},
     422: {
         "no_face",
@@ -50,8 +50,8 @@ def test_the_codes_are_those_of_the_contract() -> None:
         (model_errors.FaceTooSmall("x"), "face_too_small"),
         (model_errors.LowQuality("x"), "low_quality"),
         (model_errors.PackError("x"), "model_unavailable"),
-        (PhotoRejected(3, model_errors.NoFace("x")), "no_face"),
-        (InconsistentImages([(0, 1)]), "inconsistent_images"),
+        (PhotoRejected(3, model_errors.NoFace("x"), count=5), "no_face"),
+        (InconsistentImages((1,), (0,)), "inconsistent_images"),
         (template_errors.InvalidTemplate("x"), "invalid_template"),
         (template_errors.InvalidEmbedding("x"), "invalid_embedding"),
         (template_errors.ContractMismatch("x"), "contract_mismatch"),
@@ -84,16 +84,23 @@ def test_every_exception_of_the_rooms_has_a_code() -> None:
             instance = kind.__new__(kind)
             Exception.__init__(instance, "x")
             instance.__dict__.update(
-                index=0, cause=model_errors.NoFace("x"), pairs=(), details={}, code="no_face"
+                index=0,
+                place="photo 1 of 1",
+                cause=model_errors.NoFace("x"),
+                apart=(1,),
+                others=(0,),
+                details={},
+                code="no_face",
             )
             assert api_error(instance) is not None, kind
 
 
 def test_a_photo_is_named_by_its_position() -> None:
-    known = api_error(PhotoRejected(3, model_errors.LowQuality("dark", details={"darkness": 1})))
+    dark = model_errors.LowQuality("dark", details={"darkness": 1})
+    known = api_error(PhotoRejected(3, dark, count=5))
     assert known is not None
     assert known.details == {"image": 3, "darkness": 1}
-    assert known.message.startswith("photo 3")
+    assert known.message == "photo 4 of 5: dark"  # programs count from 0, people from 1
 
 
 def test_a_failure_of_the_service_does_not_tell_where() -> None:

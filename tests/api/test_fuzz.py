@@ -69,6 +69,7 @@ def some_form(rng: random.Random) -> tuple[bytes, str]:
 def test_no_request_is_answered_with_500(client: Client, deployment: Deployment, seed: int) -> None:
     rng = random.Random(seed)
     template = b64(lifted(deployment))
+    deployment.allow_templates()
     for number in range(60):
         method, path = rng.choice(PATHS)
         subject = rng.choice(SUBJECTS) if rng.random() < 0.3 else "a"

@@ -1,8 +1,6 @@
 """Expired records go by themselves, and a purge that fails harms nobody."""
 
 import json
-import time
-from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -16,6 +14,7 @@ from templates.store import TemplateStore
 from templates.store.schema import IdempotencyRow, SubjectRow
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, deploy, images, photo
+from tests.patience import wait_until
 
 
 @pytest.fixture
@@ -34,13 +33,6 @@ def expire_all(store: TemplateStore) -> None:
     store._database.write(lambda each: each.execute(changed))
 
 
-def comes_true(condition: Callable[[], bool], *, within_s: float = 20.0) -> bool:
-    end = time.monotonic() + within_s
-    while not condition() and time.monotonic() < end:
-        time.sleep(0.02)
-    return condition()
-
-
 def claim(store: TemplateStore, key: str) -> None:
     store.idempotency.claim("default", actor="x", key=key, request=b"r")
 
@@ -50,11 +42,11 @@ def test_expired_records_go_at_the_start_and_later(own: Deployment) -> None:
     claim(store, "before the start")
     expire_all(store)
     with Client(create_app(own.settings)):
-        assert comes_true(lambda: records(store) == 0)
+        wait_until(lambda: records(store) == 0)
         claim(store, "while it runs")
         expire_all(store)
         claim(store, "still wanted")
-        assert comes_true(lambda: records(store) == 1)
+        wait_until(lambda: records(store) == 1)
     store.close()
 
 
@@ -64,7 +56,7 @@ def test_the_log_that_an_erasure_could_not_empty_is_emptied(own: Deployment) -> 
     claim(store, "a write")
     assert log.stat().st_size > 0
     with Client(create_app(own.settings)):
-        assert comes_true(lambda: log.stat().st_size == 0)
+        wait_until(lambda: log.stat().st_size == 0)
     store.close()
 
 
@@ -79,7 +71,7 @@ def test_a_purge_that_fails_is_a_log_line(
 
     monkeypatch.setattr(TemplateStore, "purge", fail)
     with Client(create_app(own.settings), headers=bearer(own.token)) as client:
-        assert comes_true(lambda: len(tried) >= 2)
+        wait_until(lambda: len(tried) >= 2)
         assert client.get("/v1/contract").status_code == 200
     lines = [json.loads(line) for line in capfd.readouterr().err.splitlines() if line[:1] == "{"]
     failed = [line for line in lines if line["event"] == "purge failed"]
@@ -102,6 +94,6 @@ def test_subjects_whose_time_is_over_go_by_themselves(
         month_ago = datetime.now(UTC) - timedelta(days=31)
         old = sa.update(SubjectRow).values(updated_at=month_ago)
         store._database.write(lambda each: each.execute(old.where(SubjectRow.subject_id == "old")))
-        assert comes_true(lambda: client.get("/v1/subjects/old").status_code == 404)
+        wait_until(lambda: client.get("/v1/subjects/old").status_code == 404)
         assert client.get("/v1/subjects/young").status_code == 200
         assert store.receipt("default", "old") is not None

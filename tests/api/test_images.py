@@ -120,6 +120,7 @@ def real(
         yield client
 
 
+@pytest.mark.long
 def test_real_faces_in_unusual_forms_match(real: Client, faces: list[np.ndarray[Any, Any]]) -> None:
     for case in unusual(faces[0]):
         answer = verify(real, case.data)
@@ -135,7 +136,7 @@ def test_scenes_without_one_usable_face(real: Client, faces: list[np.ndarray[Any
 def test_the_largest_face_is_taken_when_asked_for(
     real: Client, faces: list[np.ndarray[Any, Any]]
 ) -> None:
-    # FORMATS ranks faces by their area less their distance from the centre.
+    # Faces are ranked by their area less their distance from the centre.
     height, width = faces[0].shape[:2]
     small = np.asarray(Image.fromarray(faces[1]).resize((width * 2 // 3, height * 2 // 3)))
     scene = np.full((height * 5 // 2, width * 5 // 2, 3), 127, np.uint8)
@@ -153,6 +154,7 @@ def test_damaged_real_photos(real: Client, faces: list[np.ndarray[Any, Any]]) ->
     assert failures(real, cases) == []
 
 
+@pytest.mark.long
 def test_enrolling_awkward_photos_changes_nothing(
     real: Client, faces: list[np.ndarray[Any, Any]]
 ) -> None:

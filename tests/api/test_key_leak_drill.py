@@ -30,7 +30,7 @@ class Thief:
         folder.mkdir()
         self.token, self.folder = token, folder
         data = deployment.settings.data_dir
-        for file in data.iterdir():
+        for file in (*data.iterdir(), deployment.settings.resolved_master_key_file):
             if file.is_file():
                 shutil.copy2(file, folder)
         self.store = TemplateStore(

@@ -4,6 +4,7 @@ import threading
 from collections import Counter
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack
+from functools import partial
 from typing import Any
 
 import anyio
@@ -21,6 +22,7 @@ from api.limits import MAX_JSON_BYTES, Gate
 from tests.api.client import Client
 from tests.api.deployment import Deployment, images, photo
 from tests.api.shapes import assert_error
+from tests.patience import PATIENCE_S
 
 ENROLL, VERIFY = "/v1/subjects/limits/enrollment", "/v1/subjects/limits/verify"
 MIB = 1024 * 1024
@@ -133,7 +135,8 @@ def test_multipart_without_a_boundary_is_malformed(client: Client) -> None:
 @pytest.mark.parametrize(
     "body",
     [b"", b"{", b"[]", b"1", b"null", b'"x"', b"\xff\xfe", b"[" * 100_000, b'{"a":' * 50_000,
-     b'{"embedding": [1' + b"0" * 5000 + b"]}"],
+     b'{"embedding": [1' + b"0" * 5000 + b"]}", b'{"level":"fmr-1e-3","level":"fmr-1e-2"}',
+     b'{"template":"","template":""}', b'{"export": [{"a": 1, "\\u0061": 1}]}'],
 )  # fmt: skip
 def test_broken_json_is_malformed(client: Client, body: bytes) -> None:
     for method, path in (("PUT", ENROLL), ("POST", VERIFY), ("POST", "/v1/subjects/import")):
@@ -180,34 +183,36 @@ def test_a_body_that_does_not_arrive_is_given_up(client: Client, deployment: Dep
 def test_the_gate_turns_the_next_one_away() -> None:
     async def scenario() -> None:
         gate = Gate(slots=1, waiting=1)
-        async with gate.admitted("a"), gate.admitted("a"):
+        async with gate.admitted("a"), gate.admitted("b"):
             with pytest.raises(ApiError) as caught:
-                async with gate.admitted("a"):
+                async with gate.admitted("c"):
                     pass
             assert caught.value.code == "overloaded"
             assert caught.value.headers["Retry-After"]
-        async with gate.admitted("a"):
+        async with gate.admitted("c"):
             pass
 
     anyio.run(scenario)
 
 
 def test_one_key_leaves_places_to_the_others() -> None:
-    async def scenario() -> None:
-        gate = Gate(slots=1, waiting=3)
-        async with AsyncExitStack() as alone:
-            for _ in range(4):  # nobody else asks: all of them
-                await alone.enter_async_context(gate.admitted("a"))
-            with pytest.raises(ApiError):
-                await alone.enter_async_context(gate.admitted("b"))
-        async with AsyncExitStack() as shared:
-            for _ in range(3):
-                await shared.enter_async_context(gate.admitted("a"))
-            with pytest.raises(ApiError) as caught:
-                await shared.enter_async_context(gate.admitted("a"))
-            assert caught.value.code == "overloaded"
-            await shared.enter_async_context(gate.admitted("b"))
+    async def fill(key: str, inside: AsyncExitStack) -> int:
+        """Take places until there is none for this key."""
+        for taken in range(100):
+            try:
+                await inside.enter_async_context(gate.admitted(key))
+            except ApiError:
+                return taken
+        raise AssertionError("there is no bound")
 
+    async def scenario() -> None:
+        async with AsyncExitStack() as inside:
+            # Three quarters of what is left, to each that comes.
+            assert [await fill(key, inside) for key in "abcd"] == [30, 7, 2, 1]
+        async with AsyncExitStack() as inside:
+            assert await fill("a", inside) == 30
+
+    gate = Gate(slots=2, waiting=38)
     anyio.run(scenario)
 
 
@@ -236,7 +241,7 @@ def test_a_client_that_takes_no_answer_loses_its_place(
                 await anyio.sleep(60)
             untaken += len(message.get("body", b""))
 
-        with anyio.fail_after(5):
+        with anyio.fail_after(PATIENCE_S):
             await context(scope, receive, stuck)
 
     anyio.run(scenario)
@@ -250,7 +255,7 @@ def test_the_queue_for_the_database_has_an_end(monkeypatch: pytest.MonkeyPatch) 
 
     async def ask(gate: Gate) -> None:
         try:
-            await gate.query(lambda: go_on.wait(20))
+            await gate.query(lambda: go_on.wait(PATIENCE_S))
         except ApiError as error:
             outcomes.append(f"{error.code}, retry after {error.headers['Retry-After']}")
         else:
@@ -268,7 +273,7 @@ def test_the_queue_for_the_database_has_an_end(monkeypatch: pytest.MonkeyPatch) 
         await ask(gate)
 
     with anyio.from_thread.start_blocking_portal() as portal:
-        portal.start_task_soon(scenario).result(timeout=20)
+        portal.start_task_soon(scenario).result(timeout=PATIENCE_S)
     assert Counter(outcomes) == {"overloaded, retry after 1": 3, "answered": 8}
 
 
@@ -279,11 +284,11 @@ def test_large_json_is_parsed_in_a_thread(
     parsed_by: list[int] = []
     parse = json.loads
 
-    def loads(body: bytes) -> Any:
+    def parse_json(body: bytes) -> Any:
         parsed_by.append(threading.get_ident())
         return parse(body)
 
-    monkeypatch.setattr("api.bodies.json.loads", loads)
+    monkeypatch.setattr("api.bodies.parse_json", parse_json)
     body = b'{"template": "' + b"A" * size + b'"}'
 
     async def receive() -> dict[str, Any]:
@@ -315,7 +320,7 @@ def test_no_more_compute_at_once_than_there_are_slots() -> None:
         gate = Gate(slots=2, waiting=100)
         async with anyio.create_task_group() as group:
             for _ in range(8):
-                group.start_soon(gate.compute, work)
+                group.start_soon(partial(gate.compute, work, key="a"))
 
     anyio.run(scenario)
     assert most == 2
@@ -339,7 +344,7 @@ def test_a_body_of_more_values_than_any_request_has_is_not_parsed(
     """Small values take up to thirty times the memory of their text."""
     body = b'{"embedding":[' + unit * ((MAX_JSON_BYTES - 30) // len(unit)) + b"0]}"
     with monkeypatch.context() as patch:
-        patch.setattr("api.bodies.json.loads", None)
+        patch.setattr("api.bodies.parse_json", None)
         answer = client.post(VERIFY, content=body, headers={"Content-Type": "application/json"})
     assert_error(answer, 400, "malformed_request")
     assert "more than 16384 values" in answer.json()["error"]["message"]

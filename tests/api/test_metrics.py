@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ import httpx
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from api.app import environment_of
+from api.app import VERSION, environment_of
 from api.errors import ERROR_CODES
 from api.housekeeping import purge_regularly
 from api.limits import Gate
@@ -25,6 +26,7 @@ from templates.store.lockout import LockedOut
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, deploy, images, photo
 from tests.api.test_server import free_port
+from tests.patience import PATIENCE_S
 
 Labels = dict[str, str]
 Samples = dict[tuple[str, frozenset[tuple[str, str]]], float]
@@ -115,7 +117,7 @@ def test_the_text_is_what_prometheus_reads(client: Client) -> None:
     assert answer.headers["content-type"] == "text/plain; version=0.0.4; charset=utf-8"
     found = samples(answer.text)
     contract = client.app.state.runtime.contract.contract_id
-    assert value(found, "veilface_build_info", version="0.1.0", contract_id=contract) == 1
+    assert value(found, "veilface_build_info", version=VERSION, contract_id=contract) == 1
     assert value(found, "veilface_store_up") == 1
     assert value(found, "veilface_model_up") == 1
     assert value(found, "veilface_requests_in_flight") == 0
@@ -187,10 +189,10 @@ def test_who_waits_for_a_slot_is_seen() -> None:
 
     async def scenario() -> None:
         gate = Gate(slots=2, waiting=10)
-        with anyio.fail_after(20):
+        with anyio.fail_after(PATIENCE_S):
             async with anyio.create_task_group() as tasks:
                 for _ in range(5):
-                    tasks.start_soon(gate.compute, lambda: go_on.wait(20))
+                    tasks.start_soon(partial(gate.compute, lambda: go_on.wait(PATIENCE_S), key="a"))
                 while gate.waiting < 3 or gate.computing < 2:
                     await anyio.sleep(0.01)
                 assert (gate.computing, gate.waiting, waiting()) == (2, 3, 3)
@@ -206,16 +208,16 @@ def test_who_gives_up_waiting_is_not_counted_any_more() -> None:
 
     async def scenario() -> None:
         gate = Gate(slots=1, waiting=10)
-        with anyio.fail_after(20):
+        with anyio.fail_after(PATIENCE_S):
             async with anyio.create_task_group() as tasks:
-                tasks.start_soon(gate.compute, lambda: go_on.wait(20))
+                tasks.start_soon(partial(gate.compute, lambda: go_on.wait(PATIENCE_S), key="a"))
                 while not gate.computing:
                     await anyio.sleep(0.01)
                 with anyio.move_on_after(0.05):
-                    await gate.compute(lambda: None)
+                    await gate.compute(lambda: None, key="b")
                 assert (gate.computing, gate.waiting) == (1, 0)
                 go_on.set()
-            assert await gate.compute(lambda: "runs") == "runs"
+            assert await gate.compute(lambda: "runs", key="b") == "runs"
 
     with anyio.from_thread.start_blocking_portal() as portal:
         portal.call(scenario)
@@ -297,7 +299,7 @@ def test_any_worker_answers_for_all_and_nothing_falls_when_one_dies(tmp_path: Pa
         )
 
     def scraped() -> Samples:
-        return samples(httpx.get(f"{url}/metrics", timeout=30).text)
+        return samples(httpx.get(f"{url}/metrics", timeout=PATIENCE_S).text)
 
     def workers(found: Samples) -> set[str]:
         return {
@@ -317,7 +319,7 @@ def test_any_worker_answers_for_all_and_nothing_falls_when_one_dies(tmp_path: Pa
     try:
         until(lambda: len(workers(scraped())) == 2)
         for _ in range(20):
-            assert httpx.get(f"{url}/nowhere").status_code == 404
+            assert httpx.get(f"{url}/nowhere", timeout=PATIENCE_S).status_code == 404
         labels = {"route": "unmatched", "method": "GET", "status": "404"}
         for _ in range(8):  # either worker
             assert value(scraped(), "veilface_requests_total", **labels) == 20
@@ -331,7 +333,7 @@ def test_any_worker_answers_for_all_and_nothing_falls_when_one_dies(tmp_path: Pa
         assert value(found, "veilface_store_up") == 1
         assert [path.stat().st_mode & 0o077 for path in temporary.glob("veilface-*")] == [0]
         process.send_signal(signal.SIGTERM)
-        assert process.wait(timeout=30) == 0
+        assert process.wait(timeout=PATIENCE_S) == 0
         assert list(temporary.glob("veilface-metrics-*")) == []
     finally:
         process.kill()

@@ -1,8 +1,10 @@
 """Readiness that is honest, a port for operations, TLS, and a bound on what is in flight."""
 
 import datetime
+import http.client
 import ipaddress
 import json
+import re
 import signal
 import socket
 import ssl
@@ -22,6 +24,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 
+from api import healthcheck
 from api.app import create_app, environment_of
 from api.context import RequestContext
 from api.errors import StartError
@@ -34,6 +37,7 @@ from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, deploy, images, photo
 from tests.api.shapes import assert_error
 from tests.api.test_server import free_port
+from tests.patience import PATIENCE_S, wait_until
 
 READY = "/health/ready"
 
@@ -165,10 +169,7 @@ def test_recovery_is_seen_without_anybody_asking(
         time.sleep(0.3)
         assert STORE_UP._value.get() == 0
         take_writes(store, "master_key_check")
-        end = time.monotonic() + 10
-        while STORE_UP._value.get() == 0 and time.monotonic() < end:
-            time.sleep(0.02)
-        assert STORE_UP._value.get() == 1
+        wait_until(lambda: STORE_UP._value.get() == 1, what="the store's recovery")
     lines = [json.loads(line) for line in capfd.readouterr().err.splitlines()]
     said = [line["event"] for line in lines if line["event"].startswith("store")]
     assert said == ["store failed", "store is available again"]
@@ -311,17 +312,19 @@ def test_operations_are_on_their_port_only(tmp_path: Path) -> None:
             assert_error(client.get(path), 404, "not_found")
         beside = f"http://127.0.0.1:{client.app.state.operations_port}"
         for path in sorted(OPERATIONS_PATHS):
-            answer = httpx.get(f"{beside}{path}")
+            answer = httpx.get(f"{beside}{path}", timeout=PATIENCE_S)
             assert answer.status_code == 200
             assert answer.headers["x-content-type-options"] == "nosniff"
-        assert httpx.get(f"{beside}{READY}").json()["status"] == "ok"
+        assert httpx.get(f"{beside}{READY}", timeout=PATIENCE_S).json()["status"] == "ok"
         for path in ("/v1/contract", "/v1/openapi.json", "/docs"):
             assert_error(
-                httpx.get(f"{beside}{path}", headers=bearer(deployment.token)), 404, "not_found"
+                httpx.get(f"{beside}{path}", headers=bearer(deployment.token), timeout=PATIENCE_S),
+                404,
+                "not_found",
             )
         assert not any(path in client.app.openapi()["paths"] for path in OPERATIONS_PATHS)
     with pytest.raises(httpx.ConnectError):
-        httpx.get(f"{beside}/health/live")
+        httpx.get(f"{beside}/health/live", timeout=PATIENCE_S)
 
 
 def test_metrics_are_documented_where_they_are_served() -> None:
@@ -358,7 +361,7 @@ def serving(
             if process.poll() is not None:
                 break
             try:
-                if httpx.get(url, **options).status_code == 200:
+                if httpx.get(url, **options, timeout=PATIENCE_S).status_code == 200:
                     yield process
                     return
             except httpx.TransportError:
@@ -374,10 +377,13 @@ def test_workers_share_the_port_and_say_that_they_stop(tmp_path: Path) -> None:
     deployment = deploy(tmp_path, workers=2, port=port, operations_port=beside, compute_slots=1)
     ready = f"http://127.0.0.1:{beside}{READY}"
     with serving(tmp_path, deployment, ready) as process:
-        assert httpx.get(f"http://127.0.0.1:{port}/v1/openapi.json").status_code == 200
-        assert httpx.get(f"http://127.0.0.1:{port}{READY}").status_code == 404
-        log = (tmp_path / "log").read_text()
-        assert f"Health and metrics are on http://127.0.0.1:{beside}" in log
+        assert (
+            httpx.get(f"http://127.0.0.1:{port}/v1/openapi.json", timeout=PATIENCE_S).status_code
+            == 200
+        )
+        assert httpx.get(f"http://127.0.0.1:{port}{READY}", timeout=PATIENCE_S).status_code == 404
+        told = f"Health and metrics are on http://127.0.0.1:{beside}"
+        wait_until(lambda: told in (tmp_path / "log").read_text(), what="both workers ready")
         held: list[socket.socket] = []
         for _ in range(8):  # so that both workers have a request in progress
             raw = socket.create_connection(("127.0.0.1", port))
@@ -393,7 +399,7 @@ def test_workers_share_the_port_and_say_that_they_stop(tmp_path: Path) -> None:
         for _ in range(40):
             time.sleep(0.1)
             try:
-                answer = httpx.get(ready)
+                answer = httpx.get(ready, timeout=PATIENCE_S)
             except httpx.TransportError:
                 continue
             if answer.status_code == 503:
@@ -402,7 +408,7 @@ def test_workers_share_the_port_and_say_that_they_stop(tmp_path: Path) -> None:
         assert seen == {True}
         for raw in held:
             raw.close()
-        assert process.wait(timeout=30) == 0
+        assert process.wait(timeout=PATIENCE_S) == 0
     assert "Traceback" not in (tmp_path / "log").read_text()
 
 
@@ -441,28 +447,89 @@ def self_signed(folder: Path, *, mode: int = 0o600) -> tuple[Path, Path]:
     return paths
 
 
+HEALTHCHECK = Path(__file__).resolve().parents[2] / "deploy/Dockerfile"
+
+
+def container_says(deployment: Deployment) -> int:
+    """Exit status of the Dockerfile's HEALTHCHECK beside a service with these settings."""
+    (command,) = re.findall(r"^HEALTHCHECK .*\\\n +CMD (.*)$", HEALTHCHECK.read_text(), re.M)
+    python, *arguments = json.loads(command)
+    assert python == "python"
+    return subprocess.run(
+        [sys.executable, *arguments],
+        check=False,
+        # Where there is a proxy, it is none for the machine itself.
+        env={**environment_of(deployment.settings), "http_proxy": "http://127.0.0.1:9"},
+    ).returncode
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("tls", [False, True])
+@pytest.mark.parametrize("apart", [False, True])
+def test_the_containers_health_check_finds_the_service(
+    tmp_path: Path, tls: bool, apart: bool
+) -> None:
+    certificate, key = self_signed(tmp_path / "tls")
+    files = {"tls_certificate": certificate, "tls_key": key} if tls else {}
+    port, beside = free_port(), free_port()
+    if apart:
+        files["operations_port"] = beside
+    deployment = deploy(tmp_path, host="0.0.0.0", port=port, **files)
+    assert container_says(deployment) == 1
+    trust = ssl.create_default_context(cafile=str(certificate))
+    url = f"https://127.0.0.1:{port}" if tls else f"http://127.0.0.1:{port}"
+    ready = f"http://127.0.0.1:{beside}" if apart else url
+    with serving(tmp_path, deployment, f"{ready}{READY}", verify=trust):
+        assert container_says(deployment) == 0
+
+
+def test_the_health_check_reads_the_settings_as_the_service_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    declared = {name: Settings.model_fields[name].default for name in healthcheck.DEFAULTS}
+    assert declared == healthcheck.DEFAULTS
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "veilface.toml").write_text('host = "::"\nport = 9\ntls_certificate = "a"\n')
+    monkeypatch.setenv("VEILFACE_OPERATIONS_PORT", "")
+    monkeypatch.setenv("VEILFACE_PORT", "10")
+    asked = healthcheck.connection()
+    assert isinstance(asked, http.client.HTTPSConnection)
+    assert (asked.host, asked.port) == ("::1", 10)
+    monkeypatch.setenv("VEILFACE_CONFIG", str(tmp_path / "other.toml"))
+    (tmp_path / "other.toml").write_text("operations_port = 11\n")
+    asked = healthcheck.connection()
+    assert not isinstance(asked, http.client.HTTPSConnection)
+    assert (asked.host, asked.port) == ("127.0.0.1", 11)
+
+
 def test_the_service_speaks_tls(tmp_path: Path) -> None:
     certificate, key = self_signed(tmp_path / "tls")
     port = free_port()
     deployment = deploy(tmp_path, port=port, tls_certificate=certificate, tls_key=key)
     url, trust = f"https://127.0.0.1:{port}", ssl.create_default_context(cafile=str(certificate))
     with serving(tmp_path, deployment, f"{url}{READY}", verify=trust):
-        assert f"listens on {url}" in (tmp_path / "log").read_text()
-        answer = httpx.get(f"{url}/v1/contract", verify=trust, headers=bearer(deployment.token))
+        wait_until(
+            lambda: f"listens on {url}" in (tmp_path / "log").read_text(), what="the address"
+        )
+        answer = httpx.get(
+            f"{url}/v1/contract", verify=trust, headers=bearer(deployment.token), timeout=PATIENCE_S
+        )
         assert answer.status_code == 200
         assert answer.headers["strict-transport-security"] == "max-age=31536000"
         with pytest.raises(httpx.ConnectError):
-            httpx.get(f"{url}/health/live")  # nobody vouches for the certificate
+            httpx.get(
+                f"{url}/health/live", timeout=PATIENCE_S
+            )  # nobody vouches for the certificate
         with pytest.raises(httpx.TransportError):
-            httpx.get(f"http://127.0.0.1:{port}/health/live")
+            httpx.get(f"http://127.0.0.1:{port}/health/live", timeout=PATIENCE_S)
         old = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
         old.load_verify_locations(certificate)
         old.maximum_version = ssl.TLSVersion.TLSv1_2
         old.set_ciphers("AES128-SHA:AES256-SHA:ECDHE-ECDSA-AES256-SHA")
         with pytest.raises(httpx.ConnectError):
-            httpx.get(f"{url}/health/live", verify=old)
+            httpx.get(f"{url}/health/live", verify=old, timeout=PATIENCE_S)
         old.set_ciphers("ECDHE-ECDSA-AES128-GCM-SHA256")
-        assert httpx.get(f"{url}/health/live", verify=old).status_code == 200
+        assert httpx.get(f"{url}/health/live", verify=old, timeout=PATIENCE_S).status_code == 200
 
 
 def test_without_tls_no_header_asks_for_it(client: Client) -> None:

@@ -16,10 +16,11 @@ import httpx
 import pytest
 import uvicorn
 
-from api.app import environment_of, uvicorn_options
+from api.app import environment_of
 from api.supervisor import run_server
 from tests.api.deployment import Deployment, bearer, deploy, images, photo
 from tests.api.shapes import assert_error
+from tests.patience import PATIENCE_S
 
 RUN = """
 from api.settings import load_settings
@@ -61,7 +62,7 @@ class Server:
     def stop(self) -> int:
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGTERM)
-        return self.process.wait(timeout=30)
+        return self.process.wait(timeout=PATIENCE_S)
 
 
 @pytest.fixture(scope="module")
@@ -80,11 +81,14 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 @pytest.fixture(scope="module")
 def http(server: Server) -> Iterator[httpx.Client]:
     """A client of the service, in which subject ``a`` is enrolled."""
-    with httpx.Client(base_url=server.url, headers=bearer(server.deployment.token)) as client:
+    with httpx.Client(
+        base_url=server.url, headers=bearer(server.deployment.token), timeout=PATIENCE_S
+    ) as client:
         assert client.put("/v1/subjects/a/enrollment", files=images(photo(1))).status_code == 201
         yield client
 
 
+@pytest.mark.long
 def test_the_kernels_are_compiled_before_the_server_is_ready(tmp_path: Path) -> None:
     """A first start, with nothing in the compiler's cache."""
     kernels = tmp_path / "kernels"
@@ -93,7 +97,9 @@ def test_the_kernels_are_compiled_before_the_server_is_ready(tmp_path: Path) -> 
     try:
         server.wait()
         ready = sorted(path.name for path in kernels.rglob("*.nb[ci]"))
-        with httpx.Client(base_url=server.url, headers=bearer(deployment.token)) as client:
+        with httpx.Client(
+            base_url=server.url, headers=bearer(deployment.token), timeout=PATIENCE_S
+        ) as client:
             assert client.put("/v1/subjects/a/enrollment", files=images(photo(1))).is_success
             answer = client.post("/v1/subjects/a/verify", files=images(photo(1, 2), name="image"))
             assert answer.is_success
@@ -122,7 +128,7 @@ def test_the_settings_are_in_the_environment_while_workers_are_started(
     class Workers:
         gave_up = False
 
-        def __init__(self, config: uvicorn.Config, sockets: list[socket.socket]) -> None:
+        def __init__(self, config: uvicorn.Config, sockets: list[socket.socket], _: object) -> None:
             for each in sockets:
                 each.close()
 
@@ -144,7 +150,7 @@ def test_workers_share_the_database_and_nothing_else(server: Server) -> None:
             f"{server.url}/v1/subjects/a/verify",
             files=images(photo(person, 3), name="image"),
             headers=bearer(server.deployment.token),
-            timeout=30,
+            timeout=PATIENCE_S,
         )
         return str(answer.json()["decision"])
 
@@ -190,9 +196,8 @@ def test_a_client_that_goes_away_does_no_harm(server: Server, http: httpx.Client
 
 
 def test_headers_without_end_are_refused(server: Server) -> None:
-    assert uvicorn_options(server.deployment.settings)["http"] == "h11"  # the other has no bound
     with socket.create_connection(("127.0.0.1", server.deployment.settings.port)) as raw:
-        raw.settimeout(20)
+        raw.settimeout(PATIENCE_S)
         raw.sendall(b"GET /v1/contract HTTP/1.1\r\nHost: x\r\nX-Long: ")
         seen = b""
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):
@@ -205,7 +210,7 @@ def test_headers_without_end_are_refused(server: Server) -> None:
 
 def test_a_client_that_asks_first_is_told_at_once(server: Server) -> None:
     with socket.create_connection(("127.0.0.1", server.deployment.settings.port)) as raw:
-        raw.settimeout(20)
+        raw.settimeout(PATIENCE_S)
         raw.sendall(
             b"PUT /v1/subjects/a/enrollment HTTP/1.1\r\nHost: x\r\nExpect: 100-continue\r\n"
             b"Authorization: Bearer vf_x\r\nContent-Length: 100000000\r\n\r\n"
@@ -222,7 +227,7 @@ def test_stopping_finishes_what_runs_and_logs_only_json(server: Server) -> None:
         + b"\r\n--b--\r\n"
     )
     with socket.create_connection(("127.0.0.1", server.deployment.settings.port)) as raw:
-        raw.settimeout(30)
+        raw.settimeout(PATIENCE_S)
         raw.sendall(
             b"POST /v1/subjects/a/verify HTTP/1.1\r\nHost: x\r\n"
             + f"Authorization: Bearer {server.deployment.token}\r\n".encode()

@@ -2,8 +2,10 @@ import os
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
 from api.app import environment_of
+from api.cli import app
 from api.errors import StartError
 from api.settings import Settings, load_settings, settings_table
 
@@ -45,12 +47,40 @@ def test_config_variable_names_another_file(
         load_settings()
 
 
-def test_defaults_lie_in_the_data_folder(elsewhere: Path) -> None:
+def test_defaults_lie_in_the_data_folder_and_the_master_key_beside_it(elsewhere: Path) -> None:
     settings = load_settings(data_dir="here")
     assert settings.resolved_database_url == f"sqlite:///{elsewhere / 'here' / 'veilface.db'}"
-    assert settings.resolved_master_key_file == Path("here/master.key")
+    assert settings.resolved_master_key_file == Path("here-keys/master.key")
     assert settings.resolved_contract_file == Path("here/contract.json")
     assert settings.resolved_decoys_file == Path("here/decoys.veil")
+
+
+def test_a_data_folder_has_one_default_master_key_by_all_its_names(
+    elsewhere: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = elsewhere / "here"
+    (data / "deeper").mkdir(parents=True)
+    (elsewhere / "link").symlink_to("here")
+    for name in ("here", "link", data, data / "deeper" / ".."):
+        settings = load_settings(data_dir=name)
+        assert settings.resolved_master_key_file.absolute() == elsewhere / "here-keys/master.key"
+    monkeypatch.chdir(data)
+    assert load_settings(data_dir=".").resolved_master_key_file == (
+        elsewhere / "here-keys/master.key"
+    )
+
+
+def test_a_master_key_that_an_earlier_version_left_in_the_data_folder_is_used(
+    elsewhere: Path,
+) -> None:
+    beside, apart = elsewhere / "here/master.key", elsewhere / "here-keys/master.key"
+    beside.parent.mkdir()
+    beside.write_text("key")
+    settings = load_settings(data_dir="here")
+    assert settings.resolved_master_key_file.absolute() == beside
+    apart.parent.mkdir()
+    beside.rename(apart)  # the remedy that a start names, and no setting to change
+    assert settings.resolved_master_key_file.absolute() == apart
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="the system has no affinity")
@@ -103,6 +133,30 @@ def test_an_error_never_repeats_a_value(monkeypatch: pytest.MonkeyPatch) -> None
     with pytest.raises(StartError) as caught:
         load_settings()
     assert "hunter2" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "postgresql+psycopg://veilface:hunter2@host:54x2/name",
+        "postgresql+psycopg://veilface:hunter2@host:99999/name",
+        "postgresql+psycopg://veilface:hunter2@host:-1/name",
+        "postgresql+psycopg://veilface:hunter2@[::1/name",
+        "mysql://veilface:hunter2@host/name",
+        "sqlite:///",
+        "hunter2",
+    ],
+)
+def test_a_database_url_that_cannot_be_used_is_refused_by_name(
+    url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("VEILFACE_DATABASE_URL", url)
+    ran = CliRunner().invoke(app, ["keys", "list"])
+    said = ran.stderr
+    assert ran.exit_code == 1
+    assert said.startswith("error: setting database_url: ")
+    assert "sqlite://" in said
+    assert "hunter2" not in said
 
 
 @pytest.mark.parametrize("given", ["", "off", " off "])

@@ -3,7 +3,8 @@
 import gc
 import stat
 import weakref
-from collections.abc import MutableMapping
+from collections.abc import Callable, MutableMapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,14 @@ from sqlalchemy.engine import Connection
 
 from api.app import create_app
 from api.errors import StartError
-from api.opening import database_in_use, file_sealer, open_keyring, open_store, try_inference
+from api.opening import (
+    database_in_use,
+    file_sealer,
+    key_beside_database,
+    open_keyring,
+    open_store,
+    try_inference,
+)
 from api.runtime import Runtime
 from api.schemas import VerifyAnswer
 from api.settings import Settings
@@ -65,6 +73,30 @@ def test_the_master_key_is_made_once_and_private(tmp_path: Path) -> None:
     mode = stat.S_IMODE(settings.resolved_master_key_file.stat().st_mode)
     assert mode == 0o600
     assert open_keyring(settings).current == first.current
+    assert not settings.data_dir.exists()
+
+
+def test_a_master_key_beside_the_database_is_said(tmp_path: Path) -> None:
+    data, elsewhere = tmp_path / "data", tmp_path / "elsewhere"
+    data.mkdir()
+    default = Settings(data_dir=data)
+    assert key_beside_database(default) is None
+    (data / "master.key").write_text("of an earlier version")
+    said = str(key_beside_database(default))
+    assert str(data / "master.key") in said
+    assert "move it" in said
+    assert "\n" not in said
+    tmp_path.joinpath("link").symlink_to(data)
+    beside = {"master_key_file": tmp_path / "link" / "master.key"}
+    for url in (f"sqlite:///{data}/x.db", f"sqlite+pysqlite:///{data}/x.db"):
+        assert key_beside_database(Settings(data_dir=elsewhere, database_url=url, **beside))
+    for other in (
+        Settings(data_dir=data, database_url=f"sqlite:///{elsewhere}/x.db"),
+        Settings(data_dir=data, database_url="postgresql://u@127.0.0.1:1/x"),
+        Settings(data_dir=data, master_key_variable="KEY"),
+        Settings(data_dir=data, master_key_command="kms"),
+    ):
+        assert key_beside_database(other) is None
 
 
 def test_a_lost_master_key_is_not_replaced(fresh: Deployment) -> None:
@@ -231,6 +263,7 @@ def test_without_a_pack_templates_and_embeddings_work(fresh: Deployment) -> None
         probe = client.post(f"{base}/verify", files=images(photo(1), name="image"))
         assert_error(probe, 503, "model_unavailable")
         assert client.get("/v1/contract").json()["photos"] is False
+        fresh.allow_templates()
         put = client.put(f"{base}/enrollment", json={"template": b64(lifted(fresh))})
         assert put.status_code == 201
         descriptor = unit(np.random.default_rng([5, 0]).normal(size=(1, N)))[0]
@@ -250,6 +283,7 @@ def test_without_decoys_photos_are_verified_and_not_enrolled(fresh: Deployment) 
         )
         probe = client.post("/v1/subjects/a/verify", files=images(photo(1), name="image"))
         assert probe.json()["decision"] == "accept"
+        fresh.allow_templates()
         put = client.put("/v1/subjects/b/enrollment", json={"template": b64(lifted(fresh))})
         assert put.status_code == 201
 
@@ -303,7 +337,7 @@ def test_serving_keeps_no_second_copy_of_the_models(
         opened.append(weakref.ref(runtime))
         return runtime
 
-    def serving(_: Settings) -> None:
+    def serving(_: Settings, *, on_ready: Callable[[], None]) -> None:
         gc.collect()
         alive.extend(each() is not None for each in opened)
 
@@ -366,3 +400,40 @@ def test_a_template_of_an_older_contract_is_refused(fresh: Deployment) -> None:
         assert client.get("/v1/subjects/a").json()["current"] is False
         put = client.put("/v1/subjects/a/enrollment", files=images(photo(1)))
         assert put.status_code == 200
+
+
+def test_an_older_contract_of_the_same_id_is_told_of_and_served(
+    fresh: Deployment, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = fresh.settings.resolved_contract_file
+    older = path.read_bytes()
+
+    def check() -> tuple[int, bool]:
+        settings = fresh.settings
+        ran = run("serve", "--check", "--data-dir", settings.data_dir, "--pack", settings.pack)
+        return ran.status, "calibrations of the contract file are older" in ran.stderr
+
+    with Client(create_app(fresh.settings)):
+        pass
+    assert check() == (0, False)
+    level = fresh.contract.calibrations[0].levels[0]
+    p2s, s2s = fresh.contract.calibrations
+    stricter = replace(level, similarity_threshold=level.similarity_threshold + 0.05)
+    newer = replace(
+        fresh.contract,
+        calibrations=(
+            replace(p2s, levels=(stricter, *p2s.levels[1:]), calibration_id=""),
+            s2s,
+        ),
+    )
+    assert newer.contract_id == fresh.contract.contract_id
+    newer.save(path, file_sealer(open_keyring(fresh.settings)))
+    assert check() == (0, False)
+    with Client(create_app(fresh.settings)):
+        pass
+    path.write_bytes(older)
+    assert check() == (0, True)
+    capsys.readouterr()
+    with Client(create_app(fresh.settings), headers=bearer(fresh.token)) as client:
+        assert client.get("/v1/contract").status_code == 200
+    assert "the calibrations of the contract file are older ones" in capsys.readouterr().err

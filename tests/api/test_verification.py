@@ -163,11 +163,13 @@ def test_distances_do_not_tell_who_is_unknown(client: Client, deployment: Deploy
     assert distances[0] == distance("unknown-0")
     # Other tenants and other deployments give the same name another stand-in.
     assert distance("unknown-0", tenant="elsewhere") != distances[0]
-    other = StandIns(
-        deployment.contract, client.app.state.runtime.keyring, key=os.urandom(32)
-    ).open("default", "unknown-0")
-    own = client.app.state.runtime.stand_ins.open("default", "unknown-0")
-    assert (other.mirror != own.mirror).any()
+    other = StandIns(deployment.contract, client.app.state.runtime.keyring, key=os.urandom(32))
+    own = client.app.state.runtime.stand_ins
+    told, elsewhere = (each.lift("default", "unknown-0") for each in (own, other))
+    assert (told.foot != elsewhere.foot).any()
+    assert np.sqrt(
+        2 - 2 * (told.foot @ descriptor + told.radius * np.linalg.norm(told.basis @ descriptor))
+    ) == pytest.approx(distances[0], abs=1e-4)
 
 
 def test_embeddings_and_lifted_probes(client: Client, sender: str, deployment: Deployment) -> None:

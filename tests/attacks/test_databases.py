@@ -120,6 +120,7 @@ def of_axes(scene: Scene, spread: np.ndarray, seed: int) -> Scene:
     )
 
 
+@pytest.mark.long
 def test_two_databases_of_uneven_axes_are_linked_with_many_accounts(scene: Scene) -> None:
     people = of_axes(scene, np.geomspace(1.0, 0.05, scene.templates.n), seed=1)
     rows = link_databases(people, accounts=(300,), strangers=1000, permutations=200)
@@ -129,6 +130,7 @@ def test_two_databases_of_uneven_axes_are_linked_with_many_accounts(scene: Scene
     assert feet.measured.value > float(str(feet.details["null_95_percent"]))
 
 
+@pytest.mark.long
 def test_databases_of_even_axes_without_accounts_are_not_linked(scene: Scene) -> None:
     noise = of_axes(scene, np.ones(scene.templates.n), seed=2)
     nobody = replace(noise, victims=replace(noise.victims, fresh=noise.victims.enrolled[::-1]))

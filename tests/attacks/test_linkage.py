@@ -2,6 +2,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 from PIL import Image
 
 from attacks.linkage import SCORES, foot_lengths, link, nearest_similarities
@@ -56,6 +57,7 @@ def test_only_lengths_survive_a_rotation(scene: Scene) -> None:
     assert np.diagonal(apart).mean() < 0.9
 
 
+@pytest.mark.long
 def test_real_faces_link_without_a_rotation_and_not_with_it(
     scene: Scene, mbf_pack_dir: Path, lfw_aligned: Path
 ) -> None:

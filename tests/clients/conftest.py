@@ -48,7 +48,9 @@ def started(deployment: Deployment, folder: Path) -> Iterator[Running]:
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
     """A service with the tiny pack, on SQLite; five rejections lock a subject."""
     folder = tmp_path_factory.mktemp("service")
-    with started(deploy(folder), folder) as running:
+    deployment = deploy(folder)
+    deployment.allow_templates()
+    with started(deployment, folder) as running:
         yield running
 
 
@@ -57,6 +59,7 @@ def packless(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
     """A service that has no model pack at all."""
     folder = tmp_path_factory.mktemp("packless")
     deployment = deploy(folder)
+    deployment.allow_templates()
     settings = deployment.settings.model_copy(update={"pack": None})
     with started(dataclasses.replace(deployment, settings=settings), folder) as running:
         yield running

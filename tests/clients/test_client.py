@@ -16,6 +16,7 @@ from veilface_client import (
     AsyncClient,
     AsyncPrivateClient,
     Client,
+    Conflict,
     ConnectionFailed,
     Forbidden,
     LockedOut,
@@ -78,9 +79,12 @@ def test_export_and_import(service: Running, token: str) -> None:
         client.enroll("carl", photo(3))
         exported = client.export("carl")
         client.erase("carl")
-        imported = client.import_(exported)
+        with pytest.raises(Conflict) as refused:
+            client.import_(exported)
+        assert refused.value.code == "export_superseded"
+        imported = client.import_(exported, restore=True)
         assert (imported.subject_id, imported.replaced) == ("carl", False)
-        assert client.import_(exported.export).replaced
+        assert client.import_(exported.export, restore=True).replaced
         assert client.verify("carl", photo(3, 1))
         client.erase("carl")
 

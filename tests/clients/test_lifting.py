@@ -14,7 +14,6 @@ import stat
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ import httpx
 import pytest
 from pydantic import ValidationError
 
+from tests.patience import wait_until
 from veilface_client import (
     AsyncPrivateClient,
     ConnectionFailed,
@@ -440,7 +440,12 @@ def test_a_generator_of_another_contract(tmp_path: Path, make: Make) -> None:
         ("sys.exit('Traceback: vf_secret')", {}, LiftFailed, "did not say why"),
         ("print('[]'); sys.exit()", {}, LiftFailed, "something else"),
         ("print('{\"template\": 3}'); sys.exit()", {}, LiftFailed, "something else"),
-        ("import time; time.sleep(60)", {"lift_limit_s": 0.5}, LiftTimeout, "longer than 0.5 s"),
+        (
+            "import time; time.sleep(100000)",
+            {"lift_limit_s": 0.5},
+            LiftTimeout,
+            "longer than 0.5 s",
+        ),
         ("while True: print('x' * 65536)", {}, LiftFailed, "did not say why"),
     ],
 )
@@ -454,17 +459,15 @@ def test_a_command_that_fails(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(child_process, "MOST_OUTPUT", 2**20)
-    started = time.monotonic()
     with pytest.raises(LiftFailed, match=said) as failed:
         make(Changing(), Spy(tmp_path, then).command, **options).enroll("anna", b"photo")
     assert type(failed.value) is kind
     assert "vf_secret" not in str(failed.value)
-    assert time.monotonic() - started < 30
 
 
 GRANDCHILD = """
 import subprocess
-other = subprocess.Popen(["sleep", "60"], {options})
+other = subprocess.Popen(["sleep", "100000"], {options})
 open({file!r}, "w").write(str(other.pid))
 """
 
@@ -477,42 +480,29 @@ def runs(pid: int) -> bool:
         return False
 
 
-def ends(pid: int) -> bool:
-    """Whether it ends, within moments of being killed."""
-    for _ in range(200):
-        if not runs(pid):
-            return True
-        time.sleep(0.05)
-    return False
-
-
 def test_the_limit_is_that_of_everything_that_the_command_started(
     tmp_path: Path, make: Make
 ) -> None:
     """The command has ended, and somebody else holds its output."""
     file = tmp_path / "grandchild"
     spy = Spy(tmp_path, GRANDCHILD.format(options="", file=str(file)))
-    started = time.monotonic()
-    with pytest.raises(LiftTimeout, match="longer than 3 s"):
-        make(Changing(), spy.command, lift_limit_s=3).lift(b"photo")
-    assert 3 <= time.monotonic() - started < 15
-    assert ends(int(file.read_text()))
+    with pytest.raises(LiftTimeout, match="longer than 10 s"):
+        make(Changing(), spy.command, lift_limit_s=10).lift(b"photo")
+    wait_until(lambda: not runs(int(file.read_text())), what="the end of the grandchild")
 
 
 def test_nothing_that_the_command_started_outlives_it(tmp_path: Path, make: Make) -> None:
     file = tmp_path / "grandchild"
     options = "stdin=-3, stdout=-3, stderr=-3"
     spy = Spy(tmp_path, GRANDCHILD.format(options=options, file=str(file)))
-    started = time.monotonic()
     assert make(Changing(), spy.command).lift(b"photo")
-    assert time.monotonic() - started < 30
-    assert ends(int(file.read_text()))
+    wait_until(lambda: not runs(int(file.read_text())), what="the end of the grandchild")
 
 
 def test_a_thread_that_cannot_start(
     tmp_path: Path, make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    spy = Spy(tmp_path, "import time; time.sleep(60)")
+    spy = Spy(tmp_path, "import time; time.sleep(100000)")
     client = make(Changing(), spy.command)
     start = threading.Thread.start
     made: list[threading.Thread] = []
@@ -525,10 +515,8 @@ def test_a_thread_that_cannot_start(
 
     before = len(list(Path("/proc/self/fd").iterdir()))
     monkeypatch.setattr(threading.Thread, "start", third_fails)
-    started = time.monotonic()
     with pytest.raises(RuntimeError, match="new thread"):
         client.lift_enrollment([b"photo", b"another"])
-    assert time.monotonic() - started < 30
     assert len(list(Path("/proc/self/fd").iterdir())) == before
 
 
@@ -553,7 +541,7 @@ def test_too_many_open_files(
 
 
 def test_a_lift_that_nobody_waits_for_is_ended(tmp_path: Path) -> None:
-    spy = Spy(tmp_path, "import time; time.sleep(60)")
+    spy = Spy(tmp_path, "import time; time.sleep(100000)")
 
     async def scenario() -> None:
         async with AsyncPrivateClient(
@@ -572,18 +560,18 @@ def test_a_lift_that_nobody_waits_for_is_ended(tmp_path: Path) -> None:
                 with pytest.raises(asyncio.CancelledError):
                     await task
 
-    started = time.monotonic()
     asyncio.run(scenario())
-    # The end of the loop waits for its threads, and those for the command.
-    assert time.monotonic() - started < 30
-    assert all(ends(call["pid"]) for call in spy.calls)
+    # The end of the loop has waited for its threads, and those for the command.
+    wait_until(
+        lambda: not any(runs(call["pid"]) for call in spy.calls), what="the end of the lifts"
+    )
 
 
 def test_a_lift_that_is_given_up_before_it_starts(tmp_path: Path) -> None:
     leash = child_process.Leash()
     leash.pull()
     done = child_process.run(
-        lambda names: ["sleep", "60"],
+        lambda names: ["sleep", "100000"],
         [],
         environment=os.environ,
         folder=str(tmp_path),

@@ -64,6 +64,7 @@ def traffic(
     pack = ModelPack.load(mbf_pack_dir, threads=1)
     files, rows = somebody(lfw_photos, pack)
     deployment = deploy(folder, pack=mbf_pack_dir)
+    deployment.allow_templates()
     settings = deployment.settings.model_copy(update={"pack": None})
     with (
         started(dataclasses.replace(deployment, settings=settings), folder) as service,

@@ -108,7 +108,7 @@ def test_what_the_command_refuses_is_its_sentence(packless: Running) -> None:
     ):
         client.enroll("fritz", [photo(4), b"no picture"])
     assert failed.value.status == 1
-    assert failed.value.message.startswith("photo 1: ")
+    assert failed.value.message.startswith("photo 2: ")
 
 
 @pytest.mark.parametrize("level", [None, "fmr-1e-3"])

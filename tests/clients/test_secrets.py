@@ -15,6 +15,7 @@ import pytest
 import veilface_client
 from tests.api.deployment import photo
 from tests.clients.conftest import Running
+from tests.patience import PATIENCE_S
 from veilface_client import AsyncClient, Client, PrivateClient, VeilfaceError
 from veilface_client.results import Enrollable, Export, Generator, Probe
 
@@ -73,7 +74,7 @@ def test_a_key_that_cannot_be_sent_is_refused_without_being_repeated(wrong: str)
 def test_httpx_would_repeat_such_a_key(service: Running) -> None:
     """The reason for the check above; where this fails, the check may go."""
     with (
-        httpx.Client(headers={"Authorization": f"Bearer {TOKEN}\n"}) as plain,
+        httpx.Client(headers={"Authorization": f"Bearer {TOKEN}\n"}, timeout=PATIENCE_S) as plain,
         pytest.raises(httpx.HTTPError, match=SECRET),
     ):
         plain.get(service.url)

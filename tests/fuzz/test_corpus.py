@@ -12,10 +12,13 @@ from tests.fuzz.faulty import FAULTY
 from tests.fuzz.runner import Runner
 from tests.fuzz.targets import SHARES, TARGETS, target_of
 
-pytestmark = pytest.mark.skipif(
-    not Path("/proc/self/clear_refs").exists(),
-    reason="the memory of a process is read from /proc, which is absent",
-)
+pytestmark = [
+    pytest.mark.long,
+    pytest.mark.skipif(
+        not Path("/proc/self/clear_refs").exists(),
+        reason="the memory of a process is read from /proc, which is absent",
+    ),
+]
 CASES = 200
 
 

@@ -1,8 +1,16 @@
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models.boxes import MAX_CANDIDATES, Face, centre_rank, non_maximum_suppression, ranked
+from models.boxes import (
+    MAX_CANDIDATES,
+    Face,
+    centre_rank,
+    intersection_over_union,
+    non_maximum_suppression,
+    ranked,
+)
 
 
 def overlap(a, b) -> float:
@@ -24,6 +32,12 @@ def brute_force(boxes, scores, threshold) -> list[int]:
 box = st.tuples(*[st.integers(0, 60)] * 2, *[st.integers(1, 40)] * 2).map(
     lambda b: (b[0], b[1], b[0] + b[2], b[1] + b[3])
 )
+
+
+@given(box, box)
+def test_intersection_over_union_of_two(a, b):
+    value = intersection_over_union(np.array(a, np.float32), np.array(b, np.float32))
+    assert value == pytest.approx(overlap(a, b))
 
 
 @settings(max_examples=60)

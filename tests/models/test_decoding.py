@@ -288,6 +288,72 @@ def test_jpeg_with_thousands_of_scans_is_refused():
     assert code_of(data[:-2] + scan * 200 + b"\xff\xd9") == "unsupported_image"
 
 
+def in_scans(count: int, *, size: tuple[int, int] = (64, 64), between: bytes = b"") -> bytes:
+    """A progressive JPEG whose last scan is repeated; ``between`` stands before each repetition."""
+    data = encode(Image.new("RGB", size, (120, 90, 60)), "JPEG", progressive=True)
+    start = data.rindex(b"\xff\xc4", 0, data.rindex(b"\xff\xda"))
+    repeated = between + data[start:-2]
+    return data[:-2] + repeated * (count - data.count(b"\xff\xda")) + b"\xff\xd9"
+
+
+@pytest.fixture
+def undecoded(monkeypatch):
+    """Decoding would fail with another error."""
+
+    def load(self):
+        raise AssertionError("a pixel was decoded")
+
+    monkeypatch.setattr("PIL.JpegImagePlugin.JpegImageFile.load", load)
+
+
+@pytest.mark.usefixtures("undecoded")
+def test_many_scans_of_many_pixels_are_refused_before_a_pixel_is_decoded():
+    bomb = in_scans(90, size=(6000, 4000))
+    assert len(bomb) < 200_000
+    with pytest.raises(ImageError, match="24000000 pixels in more than 18 scans; save it again"):
+        decode_image(bomb)
+
+
+def test_an_ordinary_progressive_photo_of_the_most_pixels_is_decoded():
+    data = encode(Image.new("RGB", (6000, 4000)), "JPEG", progressive=True)
+    assert data.count(b"\xff\xda") == 10
+    assert decode_image(data).shape == (4000, 6000, 3)
+
+
+@pytest.mark.parametrize(("pixels", "scans"), [(64 * 64, 18), (2 * 64 * 64, 36), (10**9, 100)])
+def test_a_small_picture_may_have_more_scans_in_proportion(pixels, scans):
+    limits = ImageLimits(max_pixels=pixels)
+    assert decode_image(in_scans(scans), limits=limits).shape == (64, 64, 3)
+    assert code_of(in_scans(scans + 1), max_pixels=pixels) == "unsupported_image"
+
+
+@pytest.mark.parametrize(
+    "between",
+    [
+        b"\xff\xfe\x00\x04\xff\xd9",  # a comment that holds the mark of the end
+        b"\xff\xff\xff\xfe\x00\x04\xff\xd9",
+        b"\x00\xff\x00junk\xff\xd3",
+    ],
+)
+def test_scans_cannot_be_hidden(between):
+    image = decode_image(in_scans(14, between=between), limits=ImageLimits(max_pixels=64 * 64))
+    np.testing.assert_array_equal(
+        image, decode_image(in_scans(14), limits=ImageLimits(max_pixels=64 * 64))
+    )
+    assert code_of(in_scans(19, between=between), max_pixels=64 * 64) == "unsupported_image"
+
+
+def test_only_scans_of_the_picture_itself_count():
+    thumbnail = in_scans(90)
+    exif = b"\xff\xe1" + struct.pack(">H", 8 + len(thumbnail)) + b"Exif\0\0" + thumbnail
+    still = encode(Image.fromarray(picture(64, 64)), "JPEG", progressive=True)
+    film = b"\xff\xda" * 1000
+    photo = still[:2] + exif + still[2:] + in_scans(90) + film
+    np.testing.assert_array_equal(
+        decode_image(photo, limits=ImageLimits(max_pixels=64 * 64)), decode_image(still)
+    )
+
+
 def test_no_warning_leaves_the_decoder_from_a_large_picture():
     data = bomb(10_000, 9_500)  # above the size from which Pillow itself warns
     with warnings.catch_warnings(record=True) as seen:
@@ -339,7 +405,7 @@ def attempt(data: bytes) -> np.ndarray | ImageError:
         return error
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(st.sampled_from(SAMPLES), st.data())
 def test_nothing_else_escapes_on_flipped_bytes(sample, data):
     broken = bytearray(sample)
@@ -351,7 +417,7 @@ def test_nothing_else_escapes_on_flipped_bytes(sample, data):
     harmless(bytes(broken))
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(st.sampled_from(SAMPLES), st.floats(0, 1), st.binary(max_size=64))
 def test_nothing_else_escapes_on_cut_and_patched_bytes(sample, share, patch):
     cut = int(len(sample) * share)
@@ -359,7 +425,7 @@ def test_nothing_else_escapes_on_cut_and_patched_bytes(sample, share, patch):
     harmless(sample[:cut] + patch + sample[cut + len(patch) :])
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(
     st.binary(max_size=300),
     st.sampled_from([b"", b"\xff\xd8\xff\xe1", b"\x89PNG\r\n\x1a\n", b"RIFF\x40\0\0\0WEBPVP8X"]),

@@ -1,7 +1,9 @@
 import hashlib
 import subprocess
 import sys
+from collections.abc import Iterator
 
+import cv2
 import numpy as np
 import onnx
 import onnxruntime as ort
@@ -15,8 +17,11 @@ from models.demo import (
     demo_model_bytes,
     demo_model_sha256,
     is_demo_model,
+    require_face,
 )
-from models.synthetic import draw_face, draw_people
+from models.errors import NoFace
+from models.pack import ModelPack
+from models.synthetic import draw_face, draw_people, encode_photo
 
 PEOPLE, PHOTOS = 200, 4
 
@@ -53,8 +58,54 @@ def test_the_signature_routes_as_an_embedder():
     (made,) = graph.output
     assert [d.dim_value for d in given.type.tensor_type.shape.dim][1:] == [3, 112, 112]
     assert [d.dim_value for d in made.type.tensor_type.shape.dim][1:] == [DEMO_DIMENSION]
-    # FORMATS: subtraction and scaling together in the first eight nodes would mean 0..255 input.
+    # Subtraction and scaling together in the first eight nodes would mean 0..255 input.
     assert "Sub" not in [node.op_type for node in graph.node[:8]]
+
+
+def pacman(mouth: float, size: int = 720) -> np.ndarray:
+    """What Chromium's fake camera shows: a green field, a disc with a mouth, and a timer."""
+    picture = np.full((size, size, 3), (0, 136, 0), np.uint8)
+    middle, radius = (size // 2, size // 2), size // 4
+    cv2.ellipse(picture, middle, (radius, radius), 0, 0, 360 - mouth, (75, 255, 24), -1)
+    place = (size // 20, size // 12)
+    cv2.putText(picture, "00 44", place, cv2.FONT_HERSHEY_SIMPLEX, size / 600, (75, 255, 24), 2)
+    return cv2.resize(picture, (112, 112), interpolation=cv2.INTER_AREA)
+
+
+def other_pictures() -> Iterator[np.ndarray]:
+    rng = np.random.default_rng(0)
+    yield from (pacman(mouth) for mouth in range(0, 180, 15))
+    yield np.full((112, 112, 3), 128, np.uint8)
+    yield np.repeat(np.linspace(0, 255, 112, dtype=np.uint8), 112 * 3).reshape(112, 112, 3)
+    for cells in (3, 5, 8, 14, 28, 112):
+        for _ in range(20):
+            noise = rng.integers(0, 256, (cells, cells, 3)).astype(np.uint8)
+            yield cv2.resize(noise, (112, 112), interpolation=cv2.INTER_CUBIC)
+    for identity in range(40):
+        face = draw_face(identity)
+        yield from (face[::-1].copy(), np.roll(face, 20, axis=0), np.roll(face, 25, axis=1))
+
+
+def test_drawn_faces_and_nothing_else_are_taken_for_faces():
+    for face in draw_people(range(PEOPLE), range(2)):
+        require_face(face)
+    for picture in other_pictures():
+        with pytest.raises(NoFace, match="no drawn face was found"):
+            require_face(picture)
+
+
+def test_the_demo_pack_refuses_a_photo_without_a_face_and_no_other_pack_asks_it(
+    tmp_path, monkeypatch
+):
+    folder = build_demo_pack(tmp_path / "pack")
+    photo = encode_photo(pacman(60))
+    pack = ModelPack.load(folder)
+    pack.embed_photo(encode_photo(draw_face(3, size=240)))
+    with pytest.raises(NoFace):
+        pack.embed_photo(photo)
+    pack.embed_photo(photo, quality=None)  # as public protocols take every picture
+    monkeypatch.setattr("models.pack.is_demo_model", lambda _: False)
+    ModelPack.load(folder).embed_photo(photo)
 
 
 def test_the_file_is_the_same_in_another_process():
@@ -109,7 +160,7 @@ def test_raw_descriptors_separate_synthetic_people(descriptors):
 
 
 def test_adversarially_lifted_descriptors_still_separate(descriptors):
-    """METHOD §3 spherical point-to-subspace, m = 8, decoys from people who take no other part."""
+    """Spherical point to subspace (docs/method.md §3.4), m = 8, decoys from other people."""
     m = 8
     decoys, people = descriptors[:100, 0], descriptors[100:]
     rng = np.random.default_rng(5)

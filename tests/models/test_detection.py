@@ -1,11 +1,16 @@
+import io
+
+import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
-from models.boxes import Face
+from models.alignment import align
+from models.boxes import Face, ranked
 from models.decoding import decode_image
 from models.detection import RETRY_BORDER, canvas_sizes, find_faces, letterbox
-from models.errors import ModelError
-from models.pack import ModelPack
+from models.errors import ModelError, MultipleFaces
+from models.pack import FacePolicy, ModelPack
 from models.scrfd import Scrfd
 from models.yunet import OUTPUTS, YuNet, _trimmed
 
@@ -41,6 +46,23 @@ def test_letterbox_does_not_enlarge_unless_told():
     assert scale == 1.0
     np.testing.assert_array_equal(canvas[:10, :20], image)
     assert letterbox(image, (64, 64), enlarge=True)[1] == pytest.approx(3.2)
+
+
+@pytest.mark.parametrize("enlarge", [True, False])
+@pytest.mark.parametrize(
+    ("shape", "filled", "scale"),
+    [
+        ((1000, 679), (640, 434), 640 / 1000),  # 434.56 columns: cut, not rounded
+        ((679, 1000), (434, 640), 434 / 679),  # 434.56 rows, and the scale is that of 434
+        ((1000, 13), (640, 8), 640 / 1000),
+        ((13, 1000), (8, 640), 8 / 13),
+    ],
+)
+def test_letterbox_cuts_to_whole_pixels_as_insightface_does(shape, filled, scale, enlarge):
+    canvas, seen = letterbox(np.full((*shape, 3), 9, np.uint8), (640, 640), enlarge=enlarge)
+    assert seen == scale
+    rows, columns = (np.flatnonzero(canvas.any(axis=(axis, 2))) for axis in (1, 0))
+    assert (rows[-1] + 1, columns[-1] + 1) == filled
 
 
 @pytest.mark.parametrize("shape", [(1, 16_000), (16_000, 1), (1, 1)])
@@ -167,6 +189,121 @@ def test_yunet_canvas_is_whole_blocks_and_bounded(shape):
     assert all(side % 32 == 0 and 32 <= side <= 640 for side in size)
 
 
+class Sight:
+    """Sees faces, given as shares of the picture, of 8 to 450 pixels on the canvas; and blobs.
+
+    A blob is seen only in the enlarged picture that a canvas of 640 shows, as an ear is.
+    ``on_main`` has the scores of faces there, where they are not 0.9.
+    """
+
+    kind, score_threshold, recommended_score = "sight", 0.5, 0.6
+
+    def __init__(
+        self, *faces, blobs=(), sizes=((640, 640), (320, 320)), enlarge=True, on_main=None
+    ):
+        self.faces, self.blobs, self.sizes, self.enlarge = faces, blobs, sizes, enlarge
+        self.on_main = on_main or {}
+        self.passes = []
+
+    def canvas(self, image, size):
+        return size if self.enlarge else tuple(map(min, size, image.shape[:2]))
+
+    def detect_once(self, image, size):
+        self.passes.append(size[0])
+        height, width = image.shape[:2]
+        shape = np.array([width, height, width, height], np.float32)
+        scale = min(size[0] / height, size[1] / width, np.inf if self.enlarge else 1.0)
+        seen = [(face, self.on_main.get(face, 0.9)) for face in self.faces]
+        seen = [(face, score if size[0] == 640 else 0.8) for face, score in seen]
+        if size[0] == 640:
+            seen += [(blob, 0.9) for blob in self.blobs]
+        boxes = [(np.array(shares, np.float32) * shape, score) for shares, score in seen]
+        return [
+            Face(box, score, np.tile(box[:2], (5, 1)))
+            for box, score in boxes
+            if 8 <= (box[2:] - box[:2]).max() * scale <= 450 and score >= 0.5
+        ]
+
+
+TIGHT = (0.1, 0.05, 0.85, 0.95)
+MODEST = (0.3, 0.3, 0.6, 0.7)
+ASIDE = (0.65, 0.3, 0.9, 0.6)
+EAR = (0.02, 0.4, 0.2, 0.6)
+FAR = (0.9, 0.02, 0.93, 0.06)  # 13 pixels at 320
+
+
+def boxes_of(faces, shape):
+    height, width = shape
+    shares = [face.box / [width, height, width, height] for face in faces]
+    return sorted(tuple(round(float(share), 4) for share in box) for box in shares)
+
+
+@pytest.mark.parametrize("shape", [(250, 250), (320, 200), (800, 800), (4000, 3000)])
+@pytest.mark.parametrize("blobs", [(), (EAR,)])
+def test_a_face_that_fills_the_picture_is_found_whatever_else_is(shape, blobs):
+    detector = Sight(TIGHT, blobs=blobs)
+    faces = find_faces(detector, np.zeros((*shape, 3), np.uint8))
+    assert boxes_of(faces, shape) == [TIGHT]
+
+
+@pytest.mark.parametrize("shape", [(800, 800), (4000, 3000)])
+def test_a_small_face_beside_one_that_fills_the_picture_is_found(shape):
+    faces = find_faces(Sight(TIGHT, FAR, blobs=(EAR,)), np.zeros((*shape, 3), np.uint8))
+    assert boxes_of(faces, shape) == [TIGHT, FAR]
+
+
+def test_a_face_that_both_canvases_show_counts_once():
+    half = (0.0, 0.0, 0.09, 0.09)  # 29 pixels at 320: seen there, and small enough for 640
+    faces = find_faces(Sight(TIGHT, half), np.zeros((800, 800, 3), np.uint8))
+    assert boxes_of(faces, (800, 800)) == [half, TIGHT]
+
+
+@pytest.mark.parametrize("score", [0.0, 0.55])
+def test_a_face_that_the_main_canvas_is_not_sure_of_is_looked_at_again(score):
+    """It counts once, with the points of the near canvas; what is sure keeps those of the main."""
+    detector = Sight(MODEST, ASIDE, on_main={ASIDE: score})
+    faces = find_faces(detector, np.zeros((800, 800, 3), np.uint8))
+    assert boxes_of(faces, (800, 800)) == [MODEST, ASIDE]
+    assert [face.score for face in faces] == [0.9, 0.8]
+    assert detector.passes == [128, 640, 320]
+
+
+def test_a_blob_does_not_hide_a_face_that_the_main_canvas_misses():
+    detector = Sight(MODEST, blobs=(EAR,), on_main={MODEST: 0.0})
+    faces = find_faces(detector, np.zeros((800, 800, 3), np.uint8))
+    assert boxes_of(faces, (800, 800)) == [EAR, MODEST]
+
+
+@pytest.mark.parametrize(
+    ("faces", "shape", "passes"),
+    [
+        ([MODEST], (800, 800), [128, 640]),  # the points are those of the main canvas alone
+        ([MODEST, FAR], (800, 800), [128, 640]),
+        ([TIGHT], (800, 800), [128, 640, 320]),
+        ([TIGHT], (300, 200), [128, 320]),
+        ([], (800, 800), [128, 640, 320, 640]),
+    ],
+)
+def test_passes_that_a_picture_costs(faces, shape, passes):
+    detector = Sight(*faces)
+    find_faces(detector, np.zeros((*shape, 3), np.uint8))
+    assert detector.passes == passes
+
+
+@pytest.mark.parametrize(
+    ("sizes", "enlarge", "shape"),
+    [
+        (((320, 320),), True, (900, 900)),
+        (((640, 640),), True, (900, 900)),  # a graph of a fixed size
+        (((640, 640), (320, 320)), False, (480, 300)),
+    ],
+)
+def test_no_question_where_no_face_can_be_too_large_or_no_other_canvas_is(sizes, enlarge, shape):
+    detector = Sight(MODEST, sizes=sizes, enlarge=enlarge)
+    find_faces(detector, np.zeros((*shape, 3), np.uint8))
+    assert detector.passes == [sizes[0][0]]
+
+
 class Picky:
     """Finds a face only from the ``wanted``-th look on."""
 
@@ -180,6 +317,8 @@ class Picky:
         return size
 
     def detect_once(self, image, size):
+        if size[0] == 128:
+            return []
         self.seen.append((image, size))
         if len(self.seen) != self.wanted:
             return []
@@ -190,7 +329,7 @@ class Picky:
 
 @pytest.mark.parametrize("wanted", [1, 2, 3])
 @pytest.mark.parametrize("shape", [(100, 60), (1500, 1000)])
-def test_looks_again_small_and_then_in_a_border(wanted, shape):
+def test_looks_again_near_and_then_in_a_border(wanted, shape):
     image = np.full((*shape, 3), 255, np.uint8)
     detector = Picky(wanted)
     (face,) = find_faces(detector, image)
@@ -256,3 +395,73 @@ def test_real_detectors_find_a_face_that_fills_the_picture(name, shared_data, lf
     crops = sorted(lfw_aligned.glob("*/*_0001.jpg"))[:40:2]
     found = [bool(pack.detect(decode_image(path.read_bytes()))) for path in crops]
     assert sum(found) >= len(found) - 1
+
+
+def jpeg(pixels: np.ndarray) -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, "JPEG", quality=95)
+    return file.getvalue()
+
+
+def tight_and_bystander(photo: np.ndarray, face: Face, other: np.ndarray, margin: float):
+    """Cut ``face`` out with a margin, enlarge to 900 pixels, put ``other`` into a corner."""
+    reach = margin * max(face.width, face.height)
+    edges = np.clip(face.box + np.array([-reach, -reach, reach, reach]), 0, len(photo)).astype(int)
+    crop = photo[edges[1] : edges[3], edges[0] : edges[2]]
+    factor = 900 / max(crop.shape[:2])
+    size = (round(crop.shape[1] * factor), round(crop.shape[0] * factor))
+    crop = cv2.resize(crop, size, interpolation=cv2.INTER_CUBIC)
+    alone = crop.copy()
+    small = cv2.resize(other[50:200, 65:185], (72, 90), interpolation=cv2.INTER_AREA)
+    crop[:90, :72] = small
+    points = (face.keypoints - edges[:2]) * np.divide(size, (edges[2:] - edges[:2]))
+    return alone, crop, points
+
+
+def tight_photos(pack, photos, margins):
+    """Tight photos without and with a bystander, and the descriptor of the right crop of each."""
+    for index, photo in enumerate(photos):
+        faces = ranked(pack._detector.detect_once(photo, (320, 320)), photo.shape)
+        other = photos[(index + 1) % len(photos)]
+        for margin in margins:
+            alone, both, points = tight_and_bystander(photo, faces[0], other, margin)
+            for picture in (alone, both):
+                yield picture, pack.embed(align(picture, points, size=112)[None])[0]
+
+
+PACKS = ["w600k_mbf", "yunet_mobilefacenet128"]
+
+
+@pytest.mark.parametrize("name", PACKS)
+def test_a_bystander_is_never_taken_for_a_face_that_fills_the_photo(name, shared_data, lfw_photos):
+    """On one canvas of 640 SCRFD sees the bystander alone: the cosine is that of two strangers."""
+    pack = ModelPack.load(shared_data / "packs" / name, threads=1)
+    photos = [decode_image(p.read_bytes()) for p in sorted(lfw_photos.glob("*/*_0001.jpg"))[:3]]
+    pictures = list(tight_photos(pack, photos, margins=(0.05,)))
+    for number, (picture, right) in enumerate(pictures):
+        sample = pack.embed_photo(jpeg(picture), policy=FacePolicy.LARGEST)
+        assert sample.embedding @ right > 0.8
+        if number % 2:
+            with pytest.raises(MultipleFaces):
+                pack.embed_photo(jpeg(picture))
+        else:
+            pack.embed_photo(jpeg(picture))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("name", "off"), [("w600k_mbf", 0.05), ("yunet_mobilefacenet128", 0.45)])
+def test_tight_photos_give_the_descriptor_of_the_whole_photo(name, off, shared_data, lfw_photos):
+    """Cosines to the right crop: none of something else, few below 0.95, and nobody is missed.
+
+    YuNet's points move the descriptor by as much from one canvas to the next at any size.
+    """
+    pack = ModelPack.load(shared_data / "packs" / name, threads=1)
+    photos = [decode_image(p.read_bytes()) for p in sorted(lfw_photos.glob("*/*_0001.jpg"))]
+    cosines = np.array(
+        [
+            pack.embed(pack.align(picture, pack.detect(picture)[0])[None])[0] @ right
+            for picture, right in tight_photos(pack, photos, margins=(0.4, 0.3, 0.2, 0.1, 0.0))
+        ]
+    )
+    assert cosines.min() > 0.7
+    assert np.mean(cosines < 0.95) < off

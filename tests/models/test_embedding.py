@@ -31,7 +31,7 @@ def crops(count: int, seed: int = 0, size: int = 112) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, (count, size, size, 3), dtype=np.uint8)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(st.integers(1, 2 * MAX_BATCH + 3), st.integers(0, 99))
 def test_rows_are_the_normalised_output_whatever_the_batch(count, seed):
     pictures = crops(count, seed)

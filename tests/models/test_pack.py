@@ -41,6 +41,7 @@ def test_a_folder_with_graphs_that_are_not_needed(tmp_path):
     assert (info.name, info.n, info.detector) == ("mine", 147, None)
     assert info.embedder_sha256 == hashlib.sha256(pooling_embedder()).hexdigest()
     assert json.loads(json.dumps(info.preprocessing)) == {
+        "version": 2,
         "alignment": "arcface-112",
         "size": 112,
         "channel_order": "rgb",

@@ -19,8 +19,8 @@ from models.quality import (
     select_face,
 )
 
-# A head in millimetres: eyes, nose and mouth as FORMATS' template has them (1.8 mm per pixel), the
-# nose 22 mm in front. x to the right of the picture, y down, z towards the camera.
+# A head in millimetres: eyes, nose and mouth as the alignment template has them (1.8 mm per pixel),
+# the nose 22 mm in front. x to the right of the picture, y down, z towards the camera.
 HEAD = np.column_stack([(TEMPLATE_112 - TEMPLATE_112.mean(0)) * 1.8, [0, 0, 22, 0, 0]])
 GOOD = Quality(
     score=0.9, face_size=100.0, sharpness=3.0, brightness=120.0, yaw=0.0, pitch=0.0, roll=0.0
@@ -177,6 +177,16 @@ def test_every_face_that_could_be_used_counts():
     assert select_face([main, face(300)], single=False, limits=limits) is main
     with pytest.raises(MultipleFaces):
         select_face([main, face(1)], single=True, limits=None)
+
+
+@pytest.mark.parametrize("single", [True, False])
+def test_too_small_is_only_said_of_a_photo_that_has_no_face_large_enough(single):
+    """A speck that leads in rank neither is the face that is meant nor makes it a second one."""
+    speck, main, limits = face(11), face(400), QualityLimits()
+    assert select_face([speck, main], single=single, limits=limits) is main
+    assert select_face([speck, face(9)], single=single, limits=limits) is speck
+    with pytest.raises(MultipleFaces, match="2 faces"):
+        select_face([speck, main, face(30)], single=True, limits=limits)
 
 
 def test_a_share_of_the_area_lets_small_faces_pass():

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import psycopg
 
+from tests.patience import PATIENCE_S
 from tests.reliability.service import free_port
 
 ACCOUNT = "postgres"
@@ -89,7 +90,7 @@ class Cluster:
         """Stop it, ``fast`` (sessions are ended) or ``immediate`` (as by a crash)."""
         if self.runs:
             self._call("pg_ctl", "-D", "data", "-m", mode, "-w", "-t", "60", "stop")
-        deadline = time.monotonic() + 10
+        deadline = time.monotonic() + PATIENCE_S
         while self.runs:
             if time.monotonic() > deadline:
                 raise AssertionError("the PostgreSQL server does not stop")
@@ -108,7 +109,7 @@ class Cluster:
                 env={"PATH": os.environ.get("PATH", ""), "LC_ALL": "C.UTF-8"},
                 stdout=output,
                 stderr=subprocess.STDOUT,
-                timeout=120,
+                timeout=PATIENCE_S,
             )
             output.seek(0)
             if check and done.returncode:

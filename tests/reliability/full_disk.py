@@ -16,6 +16,7 @@ from typing import Any, Protocol
 import httpx
 
 from tests.api.deployment import deploy
+from tests.patience import PATIENCE_S
 from tests.reliability.evidence import examine, unexpected
 from tests.reliability.kill import QUIET
 from tests.reliability.load import Load, look_at_all, make_subjects, people_of
@@ -24,9 +25,6 @@ from tests.reliability.service import Service, free_port
 
 MOUNT_BYTES = 4 * 1024 * 1024
 FILE_LIMIT_BYTES = 12 * 1024
-ANSWERED_WITHIN_S = 15.0
-"""Longest that a request may take without space: a write may wait its turn behind another one."""
-RECOVERED_WITHIN_S = 10.0
 
 
 class Shortage(Protocol):
@@ -163,8 +161,6 @@ def full_disk_run(
         report.acknowledged_writes += each.writes and each.answered_well
         report.acknowledged_decisions += each.kind == "verify" and each.answered_well
         report.slowest_s = round(max(report.slowest_s, each.seconds), 2)
-    if report.slowest_s > ANSWERED_WITHIN_S:
-        report.violations.append(f"a request took {report.slowest_s} s")
     return report
 
 
@@ -189,8 +185,8 @@ def _await_ready(service: Service, freed: float, report: FullDiskReport) -> None
     """Every worker must get ready by itself; a fresh connection asks either of them."""
     in_a_row = 0
     while in_a_row < 10:
-        if time.monotonic() > freed + RECOVERED_WITHIN_S:
-            report.violations.append(f"not ready {RECOVERED_WITHIN_S} s after space was freed")
+        if time.monotonic() > freed + PATIENCE_S:
+            report.violations.append("not ready after space was freed")
             return
         in_a_row = in_a_row + 1 if service.is_ready() else 0
     report.recovered_after_s.append(round(time.monotonic() - freed, 2))
@@ -217,7 +213,7 @@ def _one_at_a_time(shortage: Shortage, clients: Clients, report: FullDiskReport)
             expect("verify without space", clients.verify(subject, person), well=False)
             expect("describe without space", clients.describe(subject), well=True)
             expect("contract without space", clients.contract(), well=True)
-        if httpx.get(f"{service.url}/health/live").status_code != 200:
+        if httpx.get(f"{service.url}/health/live", timeout=PATIENCE_S).status_code != 200:
             report.violations.append("not live without space")
         for _ in range(10):
             if service.is_ready():

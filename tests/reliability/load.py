@@ -6,6 +6,7 @@ import threading
 from collections.abc import Callable
 from types import TracebackType
 
+from tests.patience import PATIENCE_S
 from tests.reliability.operations import LOST, NOT_SENT, Clients, Operation
 
 PEOPLE_EACH = 3
@@ -84,7 +85,7 @@ class Load:
             self._most = most
             self._wrote.notify_all()
 
-    def wait_for(self, acknowledged: int, *, timeout: float = 120.0) -> None:
+    def wait_for(self, acknowledged: int, *, timeout: float = PATIENCE_S) -> None:
         """Return when so many writes have been acknowledged."""
         with self._wrote:
             done = self._wrote.wait_for(

@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 from models.pack import ModelPack
 from templates.probe_signature import signed_probe
 from tests.api.deployment import Deployment, bearer, images, photo
+from tests.patience import PATIENCE_S
 from tests.reliability.service import Service
 
 Kind = Literal["enroll", "erase", "verify", "describe", "contract"]
 
-TIMEOUT_S = 60.0
+TIMEOUT_S = PATIENCE_S
 SETTLES_S = 30.0
 """Seconds in which a database may still finish what a killed worker asked of it."""
 

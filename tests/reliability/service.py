@@ -17,8 +17,9 @@ import psutil
 
 from api.app import environment_of
 from tests.api.deployment import Deployment
+from tests.patience import PATIENCE_S
 
-START_S = 180.0
+START_S = PATIENCE_S
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -86,7 +87,8 @@ class Service:
     def is_ready(self) -> bool:
         """Whether a worker says that it is ready."""
         try:
-            return httpx.get(f"{self.url}/health/ready", timeout=30).status_code == 200
+            # Asked again: a worker that was killed may have taken the connection.
+            return httpx.get(f"{self.url}/health/ready", timeout=10).status_code == 200
         except httpx.TransportError:
             return False
 
@@ -117,10 +119,10 @@ class Service:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
-        deadline = time.monotonic() + 10
+        deadline = time.monotonic() + PATIENCE_S
         while _group_lives(self._process.pid):
             if time.monotonic() > deadline:
-                raise AssertionError("killed processes are still there after 10 s")
+                raise AssertionError("killed processes are still there")
             time.sleep(0.005)
         self._reader.join()
 
@@ -128,7 +130,7 @@ class Service:
         """SIGTERM, as an operator stops it."""
         self.up.clear()
         self.process.send_signal(signal.SIGTERM)
-        return self.process.wait(timeout=60)
+        return self.process.wait(timeout=PATIENCE_S)
 
     def tail(self) -> str:
         """The end of its log."""

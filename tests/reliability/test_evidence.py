@@ -101,7 +101,10 @@ def scene(lived: InProcess, tmp_path: Path) -> Scene:
     """A copy of it, to be spoilt."""
     deployment = lived.service.deployment
     shutil.copytree(deployment.settings.data_dir, tmp_path / "data")
-    settings = deployment.settings.model_copy(update={"data_dir": tmp_path / "data"})
+    keys = deployment.settings.resolved_master_key_file
+    settings = deployment.settings.model_copy(
+        update={"data_dir": tmp_path / "data", "master_key_file": keys}
+    )
     copied = dataclasses.replace(deployment, settings=settings)
     history, replays = copy.deepcopy((lived.history, lived.replays))
     return Scene(SimpleNamespace(deployment=copied), history, replays)

@@ -13,6 +13,8 @@ from tests.reliability.full_disk import (
     small_file_system,
 )
 
+pytestmark = pytest.mark.long
+
 
 def assert_sound(report: FullDiskReport) -> None:
     assert report.violations == []

@@ -6,6 +6,8 @@ import pytest
 
 from tests.reliability.kill import kill_run
 
+pytestmark = pytest.mark.long
+
 
 @pytest.mark.parametrize("database_url", ["sqlite", "postgres"], indirect=True)
 def test_killed_at_random_moments(

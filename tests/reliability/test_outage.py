@@ -2,8 +2,12 @@
 
 from pathlib import Path
 
+import pytest
+
 from tests.reliability.cluster import Cluster
 from tests.reliability.outage import outage_run
+
+pytestmark = pytest.mark.long
 
 
 def test_postgres_is_stopped_and_started_under_load(cluster: Cluster, tmp_path: Path) -> None:

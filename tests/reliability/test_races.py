@@ -6,6 +6,8 @@ import pytest
 
 from tests.reliability.races import lockout_run, race_run
 
+pytestmark = pytest.mark.long
+
 both = pytest.mark.parametrize("database_url", ["sqlite", "postgres"], indirect=True)
 
 

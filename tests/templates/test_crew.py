@@ -6,6 +6,7 @@ import threading
 import pytest
 
 from templates.crew import Crew
+from tests.patience import PATIENCE_S
 
 pytestmark = pytest.mark.skipif(
     not hasattr(os, "sched_getaffinity"), reason="the system places threads alone"
@@ -13,7 +14,7 @@ pytestmark = pytest.mark.skipif(
 
 
 def test_helpers_may_run_wherever_the_caller_may() -> None:
-    barrier = threading.Barrier(3, timeout=60)
+    barrier = threading.Barrier(3, timeout=PATIENCE_S)
 
     def work(_: int) -> set[int]:
         barrier.wait()
@@ -39,7 +40,7 @@ def test_a_forked_child_has_helpers_of_its_own() -> None:
         crew.map(str, range(8))
     child = os.fork()
     if not child:
-        barrier = threading.Barrier(2, timeout=60)
+        barrier = threading.Barrier(2, timeout=PATIENCE_S)
 
         def meet(_: int) -> None:
             barrier.wait()

@@ -224,14 +224,14 @@ def test_every_single_byte_flip_is_refused_or_gives_a_working_generator() -> Non
 
 
 @given(st.binary(max_size=400))
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 def test_noise_is_refused(data: bytes) -> None:
     with pytest.raises(DecoyError):
         DecoyGenerator.from_bytes(data)
 
 
 @given(cut=st.floats(0, 1, exclude_max=True), tail=st.binary(max_size=20))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_truncated_or_longer_bytes_are_refused(cut: float, tail: bytes) -> None:
     data = DecoyGenerator.fit(face_like(200, seed=1, n=4)).to_bytes()
     with pytest.raises(DecoyError):
@@ -431,7 +431,7 @@ def test_a_hostile_made_with_is_refused(value: object) -> None:
 
 
 @given(n=st.integers(2, 4096))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_bands_partition_the_minor_axes(n: int) -> None:
     edges = band_edges(n)
     assert edges[0] == leading_axes(n) >= 1

@@ -22,6 +22,8 @@ from templates.lifting import Strategy, lift
 from templates.randomness import Keystream
 from verify.metrics import fnmr_at_fmr
 
+pytestmark = pytest.mark.long
+
 FITTED = 600
 SUBJECTS = 60
 UNSEEN = 120

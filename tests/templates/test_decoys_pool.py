@@ -139,7 +139,7 @@ def test_unlike_needs_labels_and_one_entry_per_row(pool: DecoyPool) -> None:
 
 
 @given(count=st.integers(1, 120), data=st.data())
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_parts_are_disjoint_and_cover_the_pool(count: int, data: st.DataObject) -> None:
     parts_wanted = data.draw(st.integers(1, count))
     parts = DecoyPool(unit_rows(count, 4)).parts(parts_wanted)

@@ -218,7 +218,7 @@ def test_a_member_is_at_distance_zero(metric: str, dtype: str):
 
 @pytest.mark.parametrize("metric", METRICS)
 def test_parallel_sets_are_not_at_distance_zero(metric: str):
-    """A singular system does not mean that the sets meet (METHOD §3)."""
+    """A singular system does not mean that the sets meet (docs/method.md §3.2)."""
     a, b = pairs()["parallel"]
     distance = pairwise_distances(SubspaceBatch.of([a]), SubspaceBatch.of([b]), metric=metric)
     assert distance[0, 0] >= np.sqrt(0.4**2 + 0.5**2) * (1 - 1e-4)
@@ -260,7 +260,7 @@ def test_default_steps_reach_the_best_of_many_restarts(dtype: str):
     seen = pairwise_distances(a, b, metric="spherical", dtype=dtype)
     missing = best - similarity(seen)
     assert np.abs(missing).max() < (2e-6 if dtype == "float32" else 1e-6)
-    # METHOD §3 finds many pairs unfinished after 10 plain steps; the data must be that hard.
+    # docs/method.md §3.5: many pairs unfinished after 10 plain steps; the data must be that hard.
     few = best - similarity(pairwise_distances(a, b, metric="spherical", steps=3, dtype=dtype))
     assert (few > 1e-4).mean() > 0.3
 

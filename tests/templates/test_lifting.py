@@ -14,7 +14,7 @@ from templates.lifting import SUB_DATABASES, Strategy, draw_directions, lift, pa
 from templates.randomness import Keystream
 
 N = 48
-# (decoys, random directions) of m = 7, by METHOD §2.
+# (decoys, random directions) of m = 7, by docs/method.md §2.1.
 SHARES = {
     "random": (0, 7),
     "adversarial": (7, 0),

@@ -30,6 +30,7 @@ from templates.sealing import (
     sealed_key_id,
 )
 from templates.store import InvalidIdentifier, TemplateStore
+from tests.patience import PATIENCE_S, wait_until
 
 as_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a file away")
 STRANGER = 61234
@@ -449,10 +450,10 @@ def test_a_link_of_a_stranger_is_not_followed(tmp_path: Path) -> None:
     for use in (MasterKeyring.load, MasterKeyring.add_current):
         with pytest.raises(SealError, match=f"a link on the way .* user {STRANGER}"):
             use(tmp_path / "key")
-    replace_private(tmp_path / "out", b"private")
+    with pytest.raises(PermissionError, match=f"a link of user {STRANGER} on the way"):
+        replace_private(tmp_path / "out", b"private")
     assert (theirs / "out").read_bytes() == b"before"
-    status = (tmp_path / "out").lstat()
-    assert (status.st_uid, (tmp_path / "out").read_bytes()) == (0, b"private")
+    assert (tmp_path / "out").is_symlink()
 
 
 @as_root
@@ -624,27 +625,21 @@ def test_no_shell_reads_the_command(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "script",
     [
-        "sleep 60",
-        "exec >&-; sleep 60",  # its output is closed, and it does not end
-        "sleep 60 & exit 0",  # it ended, and a child of it holds its output open
+        "sleep 100000",
+        "exec >&-; sleep 100000",  # its output is closed, and it does not end
+        "sleep 100000 & exit 0",  # it ended, and a child of it holds its output open
         'trap "" TERM; while :; do sleep 1; done',
     ],
 )
 def test_a_slow_command_is_killed_with_all_that_it_started(tmp_path: Path, script: str) -> None:
     leader = tmp_path / "pid"
-    started = time.monotonic()
-    with pytest.raises(SealError, match=r"within 0\.5 seconds"):
+    with pytest.raises(SealError, match=r"within 2 seconds"):
         MasterKeyring.from_command(
-            ["/bin/sh", "-c", f'echo $$ >"$1"; {script}', "kms", str(leader)], timeout_s=0.5
+            ["/bin/sh", "-c", f'echo $$ >"$1"; {script}', "kms", str(leader)], timeout_s=2
         )
-    assert time.monotonic() - started < 10
     group = int(leader.read_text())
-    for _ in range(100):
-        # A killed orphan is there until the system's first process has waited for it.
-        if not alive(group):
-            break
-        time.sleep(0.05)
-    assert alive(group) == []
+    # A killed orphan is there until the system's first process has waited for it.
+    wait_until(lambda: not alive(group), what="the end of all that the command started")
 
 
 def alive(group: int) -> list[int]:
@@ -658,10 +653,8 @@ def alive(group: int) -> list[int]:
 
 
 def test_a_command_that_does_not_stop_writing_is_stopped() -> None:
-    started = time.monotonic()
     with pytest.raises(SealError, match="more than 65536 bytes"):
-        MasterKeyring.from_command(["/bin/sh", "-c", "yes"], timeout_s=60)
-    assert time.monotonic() - started < 30
+        MasterKeyring.from_command(["/bin/sh", "-c", "yes"], timeout_s=PATIENCE_S)
 
 
 def test_a_command_is_asked_again_for_an_unknown_key_but_not_often(

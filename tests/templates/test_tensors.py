@@ -14,6 +14,7 @@ from templates.errors import InvalidEmbedding, InvalidTemplate, TemplateError
 from templates.lifting import lift
 from templates.randomness import Keystream
 from templates.subspace import SubspaceBatch
+from tests.patience import PATIENCE_S
 from tests.templates.test_distances import faces, pairs, randoms, units
 
 torch = pytest.importorskip("torch", reason="torch is an optional extra")
@@ -385,7 +386,7 @@ def test_triton_kernels_agree_in_the_interpreter(tmp_path: Path):
         env=os.environ | {"TRITON_INTERPRET": "1"},
         cwd=ROOT,
         check=True,
-        timeout=120,
+        timeout=PATIENCE_S,
     )
     found = np.load(tmp_path / "found.npz")
     for name, a, b, metric, steps in fused_cases():

@@ -34,7 +34,7 @@ from verify.trials import enrolled_means, plan_trials
 def spherical(
     probe: NDArray[np.floating], foot: NDArray[np.floating], basis: NDArray[np.floating]
 ) -> float:
-    """Similarity of METHOD §3 in float64: e·p + s‖D e‖."""
+    """Similarity of docs/method.md §3.4 in float64: e·p + s‖D e‖."""
     e, p, d = (array.astype(np.float64) for array in (probe, foot, basis))
     return float(e @ p + np.sqrt(1 - p @ p) * np.linalg.norm(d @ e))
 

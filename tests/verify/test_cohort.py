@@ -11,7 +11,7 @@ from templates.distances import Metric, pairwise_distances, similarity
 from templates.lifting import Strategy
 from templates.randomness import Keystream
 from templates.subspace import SubspaceBatch
-from verify.cohort import cohort_statistics, make_cohort, rounded_cohort
+from verify.cohort import cohort_statistics, make_cohort, people_like, rounded_cohort
 
 N, M = 32, 4
 
@@ -32,8 +32,9 @@ def others() -> DecoyGenerator:
 def cohort(source: DecoyGenerator, people: np.ndarray | None) -> SubspaceBatch:
     with Keystream.seeded("cohort") as stream:
         return make_cohort(
-            source, strategy=Strategy.ADVERSARIAL, m=M, stream=stream, size=200, people=people
-        )
+            source, strategy=Strategy.ADVERSARIAL, m=M, stream=stream, size=200,
+            hidden=people_like(source, people),
+        )  # fmt: skip
 
 
 def nearness(templates: SubspaceBatch, probes: np.ndarray) -> float:

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -44,7 +44,6 @@ def joint_counts(similarities: NDArray[np.float32], scores: NDArray[np.float32])
     return [sum(rank <= k for rank in ranks) for k in range(len(ranks) + 1)]
 
 
-@settings(deadline=None)
 @given(
     st.lists(st.tuples(st.integers(-9, 9), st.integers(-9, 9)), min_size=1, max_size=40),
     st.sampled_from([0.0, 0.01, 0.1, 0.25, 0.5, 1.0]),

@@ -34,11 +34,28 @@ class FakeCamera:
         frame = _frame([Image.open(photo).convert("RGB") for photo in photos])
         if dark < 1:
             frame = frame.point([int(dark * value) for value in range(256)] * 3)
+        self._write(frame)
+
+    def shows_the_browsers_test_picture(self) -> None:
+        """Show what Chromium's fake camera shows by itself: a disc with a mouth, and a timer."""
+        self._write(browsers_test_picture(SIZE))
+
+    def _write(self, frame: Image.Image) -> None:
         out = io.BytesIO()
         frame.save(out, "JPEG", quality=92)
         partial = self.file.with_suffix(".part")
         partial.write_bytes(FRAMES * out.getvalue())
         partial.replace(self.file)
+
+
+def browsers_test_picture(size: tuple[int, int]) -> Image.Image:
+    """Draw the test picture of Chromium's fake camera."""
+    picture = Image.new("RGB", size, (0, 136, 0))
+    draw = ImageDraw.Draw(picture)
+    x, y, radius = size[0] // 2, size[1] // 2, size[1] // 4
+    draw.pieslice((x - radius, y - radius, x + radius, y + radius), 0, 237, fill=(75, 255, 24))
+    draw.text((x - 40, 20), "00:00:00 44", fill=(75, 255, 24))
+    return picture
 
 
 def _frame(photos: Sequence[Image.Image]) -> Image.Image:

@@ -15,6 +15,7 @@ import pytest
 from api.runtime import open_keyring, open_store
 from api.settings import Settings
 from tests.api.test_server import free_port
+from tests.patience import PATIENCE_S
 
 
 @dataclass
@@ -37,7 +38,7 @@ class Served:
     def client(self) -> httpx.Client:
         """A client with all rights."""
         return httpx.Client(
-            base_url=self.url, headers={"Authorization": f"Bearer {self.token}"}, timeout=30
+            base_url=self.url, headers={"Authorization": f"Bearer {self.token}"}, timeout=PATIENCE_S
         )
 
 
@@ -64,11 +65,11 @@ def serving(
         yield Served(url, token, settings, log)
     finally:
         process.terminate()
-        process.wait(timeout=30)
+        process.wait(timeout=PATIENCE_S)
 
 
 def _wait(process: "subprocess.Popen[bytes]", url: str, log: Path) -> None:
-    deadline = time.monotonic() + 120
+    deadline = time.monotonic() + PATIENCE_S
     while time.monotonic() < deadline:
         if process.poll() is not None:
             pytest.fail(log.read_text())

@@ -8,6 +8,8 @@ from tests.web.conftest import OpenVisit
 from tests.web.served import Served
 from tests.web.test_demo import choose
 
+pytestmark = pytest.mark.long
+
 VIEWS = ("Verify", "Enroll", "People", "Stored", "Service")
 
 

@@ -1,16 +1,22 @@
 """The demo deployment in the browser: a visitor without weights, and drawn people."""
 
+import io
 import re
 from http.client import HTTPConnection
 from urllib.parse import urlsplit
 
 import httpx
+import pytest
 from playwright.sync_api import expect
 
 from models.demo import DEMO_NOTICE
+from tests.patience import PATIENCE_S
+from tests.web.camera import FakeCamera, browsers_test_picture
 from tests.web.conftest import OpenVisit
 from tests.web.served import Served
 from tests.web.visit import Visit
+
+pytestmark = pytest.mark.long
 
 
 def choose(tab: Visit, person: str, shot: int) -> None:
@@ -55,7 +61,7 @@ def test_every_screen_is_marked(visit: OpenVisit, demo: Served) -> None:
 
 
 def test_drawn_photos_are_the_demos_only_and_always_the_same(demo: Served) -> None:
-    with httpx.Client(base_url=demo.url) as client:
+    with httpx.Client(base_url=demo.url, timeout=PATIENCE_S) as client:
         listed = client.get("/demo/people").json()
         assert listed["people"][0] == "person-1"
         path = "/demo/people/person-1/0.png"
@@ -104,7 +110,7 @@ def test_too_many_rejections_are_told_with_the_time_to_wait(visit: OpenVisit, de
             "/v1/subjects/locked/enrollment", files={"images": ("0.png", stranger)}
         )
         assert enrolled.is_success
-        other = httpx.get(f"{demo.url}/demo/people/person-101/0.png").content
+        other = httpx.get(f"{demo.url}/demo/people/person-101/0.png", timeout=PATIENCE_S).content
         for _ in range(5):
             client.post("/v1/subjects/locked/verify", files={"image": ("0.png", other)})
         tab = visit(demo)
@@ -114,5 +120,83 @@ def test_too_many_rejections_are_told_with_the_time_to_wait(visit: OpenVisit, de
         alert = tab.page.get_by_role("alert")
         expect(alert).to_contain_text("locked_out")
         expect(alert).to_contain_text(re.compile(r"Try again in \d+ s"))
+        assert len(re.findall(r"\d+ s\b", alert.inner_text())) == 1, "one clock"
         expect(alert).to_contain_text(re.compile(r"request [0-9a-f]{32}"))
         client.delete("/v1/subjects/locked")
+
+
+def test_the_test_picture_of_a_fake_camera_is_no_face(
+    visit: OpenVisit, demo: Served, camera: FakeCamera
+) -> None:
+    camera.shows_the_browsers_test_picture()
+    tab = visit(demo)
+    page = tab.page
+    page.get_by_label("Camera", exact=True).check()
+    page.get_by_role("button", name="Start camera").click()
+    tab.guided("No drawn face found")
+    page.get_by_role("button", name="Take photo").click()
+    expect(page.locator(".refused")).to_contain_text("Not taken. No drawn face found")
+    expect(page.locator(".tray li")).to_have_count(0)
+    drawn = demo.settings.data_dir / "people" / "person-2" / "0.png"
+    page.get_by_label("Files", exact=True).check()
+    camera.shows(drawn)
+    page.get_by_label("Camera", exact=True).check()
+    page.get_by_role("button", name="Start camera").click()
+    tab.guided("Good: clear enough")
+
+
+def test_photos_are_numbered_from_one_in_the_tray_and_in_messages(
+    visit: OpenVisit, demo: Served
+) -> None:
+    tab = visit(demo)
+    page = tab.page
+    tab.open("Enroll")
+    page.get_by_label("Person's id").fill("mixed")
+    choose(tab, "person-1", 1)
+    choose(tab, "person-101", 1)
+    numbers = page.locator(".tray .number")
+    expect(numbers).to_have_text(["Photo 1", "Photo 2"])
+    page.get_by_role("button", name="Enroll", exact=True).click()
+    alert = page.get_by_role("alert")
+    expect(alert).to_contain_text("Photos 1 and 2 do not look like the same person")
+
+    picture = io.BytesIO()
+    browsers_test_picture((240, 240)).save(picture, "PNG")
+    page.get_by_label("Files", exact=True).check()
+    page.locator("input[type=file]").set_input_files(
+        {"name": "green.png", "mimeType": "image/png", "buffer": picture.getvalue()}
+    )
+    page.get_by_role("button", name="Remove photo from person-1, photo 1").click()
+    expect(numbers).to_have_text(["Photo 1", "Photo 2"])
+    expect(page.locator(".tray .seen").last).to_contain_text("No drawn face found")
+    page.get_by_role("button", name="Enroll", exact=True).click()
+    expect(alert).to_contain_text("Photo 2 of 2: no drawn face was found")
+    expect(page.locator(".tray .seen").last).to_contain_text("No drawn face was found")
+    expect(page.locator(".tray .seen").first).not_to_contain_text("was found")
+
+
+def test_the_mark_covers_nothing_that_has_the_focus(visit: OpenVisit, demo: Served) -> None:
+    tab = visit(demo)
+    page = tab.page
+    tab.open("Service")
+    tab.open("Enroll")
+    choose(tab, "person-1", 1)
+    page.set_viewport_size({"width": 360, "height": 300})
+    page.get_by_role("button", name="Enroll", exact=True).focus()
+    visited = set()
+    for _ in range(40):
+        page.keyboard.press("Shift+Tab")
+        name, top, mark = page.evaluate(
+            """() => {
+              const active = document.activeElement;
+              const box = active.getBoundingClientRect();
+              const mark = document.querySelector(".demo-mark").getBoundingClientRect();
+              const inside = active.closest("main");
+              return [inside ? active.outerHTML.slice(0, 80) : "", box.top, mark.bottom];
+            }"""
+        )
+        if not name:
+            break
+        visited.add(name)
+        assert top >= mark, name
+    assert len(visited) > 5

@@ -3,11 +3,14 @@
 import contextlib
 from typing import Any
 
+import pytest
 from playwright.sync_api import Error, Page, Route, expect
 
 from tests.web.conftest import OpenVisit
 from tests.web.served import Served
 from tests.web.test_demo import choose
+
+pytestmark = pytest.mark.long
 
 DECISION = {
     "decision": "accept", "reason": "match", "level": "fmr-1e-2", "fmr": 0, "contract_id": "0" * 64,
@@ -92,7 +95,7 @@ def test_a_late_enrollment_is_of_the_photos_that_were_sent(visit: OpenVisit, dem
     expect(page.locator(".tray .seen[data-state=good]")).to_have_count(3)
     subject.evaluate("(input) => { input.value = 'bob'; input.form.requestSubmit(); }")
     # The first photo was sent, the third one was not.
-    refused = refusal("inconsistent_images", "they differ", pairs=[[0, 2]])
+    refused = refusal("inconsistent_images", "they differ", photos=[0, 2])
     waiting.fulfill(status=422, json=refused)
     expect(page.locator(".tray .seen[data-state=bad]")).to_have_count(1)
     assert len(enrollment.routes) == 1

@@ -12,6 +12,8 @@ from tests.web.camera import FakeCamera
 from tests.web.conftest import OTHER, WHO, OpenVisit
 from tests.web.served import Served
 
+pytestmark = pytest.mark.long
+
 
 def test_one_person_from_enrollment_to_erasure(
     visit: OpenVisit,

@@ -6,6 +6,8 @@ from playwright.sync_api import expect
 from tests.web.conftest import OpenVisit
 from tests.web.served import Served
 
+pytestmark = pytest.mark.long
+
 
 def test_the_key_is_kept_only_where_it_is_asked_for(visit: OpenVisit, demo: Served) -> None:
     tab = visit(demo)

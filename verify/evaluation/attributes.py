@@ -73,8 +73,8 @@ def resembling(
 ) -> NDArray[np.int64]:
     """Find the entries of a pool that may show people of a set.
 
-    A person in the pool lies in every template that their descriptor is a decoy of (METHOD §4.3):
-    people of the test set are excluded from the decoys before it is evaluated.
+    A person in the pool lies in every template that their descriptor is a decoy of (docs/method.md
+    §4.3): people of the test set are excluded from the decoys before it is evaluated.
 
     Parameters
     ----------

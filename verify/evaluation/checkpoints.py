@@ -3,10 +3,9 @@
 Only similarities of pairs are kept: they are what the results are about, and tell no descriptor.
 """
 
-import contextlib
 import hashlib
+import io
 import json
-import os
 import zipfile
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 
 from templates.decoys import Attributes
 from templates.lifting import Strategy
+from templates.private_file import make_folder, replace_public
 from verify.evaluation.runs import Run
 from verify.evaluation.units import LiftUnit, RawUnit, Unit
 
@@ -50,7 +50,7 @@ class Checkpoints:
         flipped: NDArray[np.float32] | None = None,
     ) -> None:
         self._folder = folder / FOLDER
-        self._folder.mkdir(parents=True, exist_ok=True)
+        make_folder(self._folder)
         self._base = base
         self._sources = sources
         self._attributes = [[each.gender, each.race] for each in attributes]
@@ -82,16 +82,10 @@ class Checkpoints:
     def save(self, unit: Unit, runs: Sequence[Run]) -> None:
         """Write the similarities of a unit, at once or not at all."""
         exact = [run.similarities for run in runs if run.search == "exact"]
-        file = self._file(unit)
-        partial = file.with_suffix(f".{os.getpid()}.part")
-        try:
-            with partial.open("wb") as stream:
-                np.savez(
-                    stream,
-                    allow_pickle=False,
-                    **{f"column_{i}": column for i, column in enumerate(exact)},
-                )
-            partial.replace(file)
-        finally:
-            with contextlib.suppress(FileNotFoundError):
-                partial.unlink()
+        stream = io.BytesIO()
+        np.savez(
+            stream,
+            allow_pickle=False,
+            **{f"column_{i}": column for i, column in enumerate(exact)},
+        )
+        replace_public(self._file(unit), stream.getvalue())

@@ -27,7 +27,7 @@ class Material:
     descriptors : (N, n) float32
         Unit rows of the photos that were acquired.
     flipped : (N, n) float32, optional
-        The same with the mirror image added (FORMATS "Test-time flip").
+        The same with the mirror image added.
     first, second : (P,) int64
         Pairs of rows.
     same : (P,) bool

@@ -228,7 +228,7 @@ def template_bytes(cell: Cell, n: int) -> int:
 
 
 def collision_floor(cell: Cell, source: Source | None) -> float | None:
-    """Probability that two independent lifts share a decoy (METHOD §4.4).
+    """Probability that two independent lifts share a decoy (docs/method.md §4.4).
 
     They then meet, whoever they are of: a floor of the false match rate in subspace-to-subspace
     comparisons. 0 for disjoint and for generated decoys. None for hybrid+, whose draws depend on

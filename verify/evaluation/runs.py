@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
+from templates.blas import single_threaded
 from verify.evaluation.material import Material
 from verify.evaluation.measures import Measures, measure
 from verify.evaluation.resampling import (
@@ -68,9 +68,10 @@ def run_unit(
 
     Notes
     -----
-    Products run on one thread: results do not depend on how many processors a worker has.
+    Products run on one thread each: workers share a machine, and several threads would round
+    differently.
     """
-    with threadpool_limits(1):
+    with single_threaded():
         if known is None:
             scores = score_unit(material, unit)
         else:

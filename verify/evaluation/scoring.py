@@ -177,7 +177,7 @@ def _sides(material: Material, unit: LiftUnit) -> tuple[DecoySource | None, Deco
 
 
 def split_pool(pool: DecoyPool, *, seed: int) -> tuple[DecoyPool, DecoyPool]:
-    """Split a pool into two halves at random, for enrollment and for probes (METHOD §4.4)."""
+    """Split a pool at random, half for enrollment, half for probes (docs/method.md §4.4)."""
     with Keystream.seeded("evaluation", "halves", pool.source_id, seed) as stream:
         order = stream.choose(len(pool), 1, len(pool))[0]
     half = len(pool) // 2

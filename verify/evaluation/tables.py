@@ -1,10 +1,12 @@
 """`results.json` as a flat CSV and as a report in Markdown."""
 
 import csv
+import io
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from templates.private_file import replace_public
 from verify.evaluation import group_tables
 from verify.evaluation.markdown_cells import (
     MISSING,
@@ -51,10 +53,11 @@ def write_csv(results: Mapping[str, Any], path: Path | str) -> None:
     timings = timings_by_key(results)
     lines = [_flat(row) | _flat_timing(timings.get(timing_key(row), {})) for row in results["rows"]]
     columns = list(dict.fromkeys(name for line in lines for name in line))
-    with Path(path).open("w", encoding="utf-8", newline="") as file:
-        writer = csv.DictWriter(file, columns, restval="", lineterminator="\r\n")
-        writer.writeheader()
-        writer.writerows({name: _inert(value) for name, value in line.items()} for line in lines)
+    file = io.StringIO(newline="")
+    writer = csv.DictWriter(file, columns, restval="", lineterminator="\r\n")
+    writer.writeheader()
+    writer.writerows({name: _inert(value) for name, value in line.items()} for line in lines)
+    replace_public(Path(path), file.getvalue().encode())
 
 
 def _inert(value: Any) -> Any:

@@ -5,8 +5,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
+from templates.blas import single_threaded
 from templates.distances import pairwise_distances
 from templates.lifting import Strategy, lift
 from templates.randomness import Keystream
@@ -37,7 +37,7 @@ def timings(material: Material, cells: Sequence[tuple[Cell, int | None]]) -> lis
     """
     rows = material.descriptors[np.arange(2 * _SIDE) % len(material.descriptors)]
     probes, others = rows[:_SIDE], rows[_SIDE:]
-    with threadpool_limits(1):
+    with single_threaded():
         raw = _median(lambda: probes @ others.T)
         found = []
         for cell, source in cells:

@@ -105,10 +105,14 @@ class AsyncSession:
         return await self._send(calls.export(subject))
 
     async def import_(
-        self, exported: str | results.Export, *, idempotency_key: str | None = None
+        self,
+        exported: str | results.Export,
+        *,
+        restore: bool = False,
+        idempotency_key: str | None = None,
     ) -> results.Imported:
         """Import what :meth:`export` returned."""
-        return await self._send(calls.import_(exported, key=idempotency_key))
+        return await self._send(calls.import_(exported, restore=restore, key=idempotency_key))
 
     async def ready(self) -> results.Health:
         """Ask once whether the service can answer."""

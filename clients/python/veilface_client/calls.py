@@ -188,10 +188,13 @@ def export(subject: str) -> Call[results.Export]:
     return Call("GET", path, lambda answer: parse(results.Export, answer))
 
 
-def import_(exported: str | results.Export, *, key: str | None) -> Call[results.Imported]:
+def import_(
+    exported: str | results.Export, *, restore: bool, key: str | None
+) -> Call[results.Imported]:
     """Import what was exported."""
     text = exported.export if isinstance(exported, results.Export) else exported
-    content = {"json": {"export": text}, "headers": idempotency(key)}
+    body = {"export": text, "restore": True} if restore else {"export": text}
+    content = {"json": body, "headers": idempotency(key)}
     return Call(
         "POST",
         "/v1/subjects/import",

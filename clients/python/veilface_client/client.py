@@ -120,10 +120,18 @@ class Session:
         return self._send(calls.export(subject))
 
     def import_(
-        self, exported: str | results.Export, *, idempotency_key: str | None = None
+        self,
+        exported: str | results.Export,
+        *,
+        restore: bool = False,
+        idempotency_key: str | None = None,
     ) -> results.Imported:
-        """Import what :meth:`export` returned. Right: ``export``."""
-        return self._send(calls.import_(exported, key=idempotency_key))
+        """Import what :meth:`export` returned. Right: ``export``.
+
+        One that is older than the subject's last enrollment or erasure is a :class:`Conflict`,
+        unless ``restore`` is set, which takes the right ``admin`` too.
+        """
+        return self._send(calls.import_(exported, restore=restore, key=idempotency_key))
 
     def ready(self) -> results.Health:
         """Ask once whether the service can answer; otherwise :class:`Unavailable`."""

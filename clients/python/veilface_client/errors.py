@@ -199,6 +199,7 @@ FAMILIES: dict[str, type[ServiceError]] = {
     "method_not_allowed": InvalidRequest,
     "contract_mismatch": ContractMismatch,
     "idempotency_conflict": IdempotencyConflict,
+    "export_superseded": Conflict,
     "image_too_large": PhotoRefused,
     "request_too_large": InvalidRequest,
     "too_many_images": InvalidRequest,

@@ -199,6 +199,6 @@ def _sentence(errors: bytes, names: Sequence[str]) -> str:
     if found is None:
         return "`veilface lift` failed, and did not say why"
     text = found[1]
-    for index, name in enumerate(names):
-        text = re.sub(rf"(?<![\w.]){re.escape(name)}(?=[:,;])", f"photo {index}", text)
+    for number, name in enumerate(names, start=1):
+        text = re.sub(rf"(?<![\w.]){re.escape(name)}(?=[:,;])", f"photo {number}", text)
     return text

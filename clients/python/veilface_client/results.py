@@ -152,6 +152,7 @@ class Contract(_Verbatim):
     default_level: str
     photos: bool
     generator: bool
+    template_enrollment: bool = True  # a service that does not say takes them
     receipt_key: ReceiptKey
 
 

@@ -16,6 +16,7 @@ from models.synthetic import draw_face, encode_photo
 
 DIM = 8
 PROBE_DIM = 4
+"""What `calibrate` takes where it is not told."""
 
 
 @dataclass(frozen=True)
@@ -77,16 +78,21 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> World:
     built = run("decoys", "build", decoy_faces, "--pack", pack, "--data-dir", data, "--json")
     assert built.status == 0, built.stderr
     calibrated = run(
-        *("calibrate", labelled, "--pack", pack, "--data-dir", data, "--dim", str(DIM)),
-        *("--probe-dims", str(PROBE_DIM), "--json"),
+        *("calibrate", labelled, "--pack", pack, "--data-dir", data, "--dim", str(DIM), "--json"),
     )
     assert calibrated.status == 0, calibrated.stderr
     return World(root, pack, decoy_faces, labelled, people, data, built.json, calibrated.json)
 
 
+def key_file(data: Path) -> Path:
+    """Where the commands make the master key of a data folder."""
+    return data.parent / f"{data.name}-keys" / "master.key"
+
+
 @pytest.fixture
 def data(world: World, tmp_path: Path) -> Path:
-    """A data folder of this test alone: contract, decoys and master key, no database yet."""
+    """A data folder of this test alone, and its master key: contract, decoys, no database yet."""
+    shutil.copytree(key_file(world.data).parent, key_file(tmp_path / "data").parent)
     return Path(shutil.copytree(world.data, tmp_path / "data"))
 
 

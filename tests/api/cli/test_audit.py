@@ -1,6 +1,8 @@
 """`veilface audit fairface` end to end on drawn faces and the demo model."""
 
 import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -97,6 +99,7 @@ def face_report(faces: FaceAudit) -> Any:
     return json.loads((faces.out / "report.json").read_text(encoding="utf-8"))
 
 
+@pytest.mark.long
 def test_an_audit_of_faces_writes_report_and_figures(faces: FaceAudit, face_report: Any) -> None:
     files = ["report.json", "report.md", *both(["figure", "frontier"])]
     assert sorted(file.name for file in faces.out.iterdir()) == sorted(files)
@@ -194,6 +197,7 @@ def test_an_evaluation_adds_the_frontier(face_report: Any) -> None:
     assert point["leakage"] == max(far)
 
 
+@pytest.mark.long
 def test_the_seed_gives_the_rows_and_a_kept_limit_is_status_0(
     faces: FaceAudit, face_report: Any
 ) -> None:
@@ -211,6 +215,48 @@ def test_the_seed_gives_the_rows_and_a_kept_limit_is_status_0(
     assert "frontier" not in report
     written = {file.name for file in (faces.root / "again").iterdir()}
     assert written == {"report.json", "report.md", *both(["figure"])}
+
+
+def test_only_the_photos_that_the_limits_ask_for_are_embedded(
+    faces: FaceAudit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shares: list[float] = []
+
+    @contextmanager
+    def recorded(_description: str) -> Iterator[Callable[[float], None]]:
+        yield shares.append
+
+    monkeypatch.setattr(audit_fairface, "share_done", recorded)
+    few = ("--attack", "100", "--attacked", "50", "--attackers", "knn", "--attributes", "gender")
+    ran = run(*faces.asked, *few, "--out", faces.root / "few", "--json")
+    assert ran.status in (0, 1), ran.stderr
+    acquired, settings = ran.json["failure_to_acquire"], ran.json["settings"]
+    assert (acquired["train"]["photos"], acquired["val"]["photos"]) == (200, 50)
+    assert (settings["lifting"], settings["attacked"]) == (100, 50 - settings["duplicates_dropped"])
+    assert settings["attack"] == 100 - acquired["train"]["failed"]
+    # A bar from 0 to 100 %, not a count of products of descriptors.
+    assert shares == sorted(shares)
+    assert len(shares) > 3
+    assert shares[0] < 0.5
+    assert shares[-1] == pytest.approx(1.0)
+
+
+def test_the_verdict_is_a_table_on_the_terminal(faces: FaceAudit, face_report: Any) -> None:
+    """Rows as in the report: the property, who the attacker was, what it reached, the limit."""
+    limit = face_report["verdicts"][0]["cells"][0]["compared"] / 2
+    ran = run(
+        *faces.asked, "--max-attribute-leakage", f"{limit:.6f}", "--out", faces.root / "table"
+    )
+    lines = ran.stdout.splitlines()
+    assert "Verdict on adversarial, m = 4, generated decoys" in lines[0]
+    (verdict,) = json.loads((faces.root / "table" / "report.json").read_text())["verdicts"]
+    (cell,) = verdict["cells"]
+    (row,) = [line for line in lines if "confidentiality" in line and "│" in line]
+    shown = [part.strip() for part in row.strip("│").split("│")]
+    assert shown[:2] == ["confidentiality", cell["knowledge"]]
+    assert shown[2].startswith(cell["attack"])
+    assert shown[3].startswith(f"{cell['value']:.3g} (")
+    assert shown[-2:] == [f"attribute-leakage {limit:.3g}", "fail"]
 
 
 def test_no_descriptor_stands_in_the_report_of_faces(faces: FaceAudit) -> None:

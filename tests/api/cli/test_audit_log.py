@@ -43,7 +43,11 @@ def test_a_whole_log_is_verified_and_shown(log):
     assert [line["sequence"] for line in shown] == list(range(1, len(shown) + 1))
     done = [(line["action"], line["outcome"]) for line in shown]
     assert ("key-create", "created") in done
-    assert done[-3:] == [("enroll", "created"), ("verify", "accept"), ("verify", "reject")]
+    assert done[-3:] == [
+        ("enroll", "created"),
+        ("verify-locally", "accept"),
+        ("verify-locally", "reject"),
+    ]
     assert all(line["actor"].startswith("operator:") for line in shown[-3:])
     assert "ann" not in json.dumps(shown)
     assert "whole" in log("audit-log", "verify").stdout
@@ -52,7 +56,7 @@ def test_a_whole_log_is_verified_and_shown(log):
 def test_lines_are_found_by_subject_and_number(log):
     everything = lines(log("audit-log", "show"))
     of_ann = lines(log("audit-log", "show", "--subject", "ann"))
-    assert [line["action"] for line in of_ann] == ["enroll", "verify", "verify"]
+    assert [line["action"] for line in of_ann] == ["enroll", "verify-locally", "verify-locally"]
     assert len({line["subject"] for line in of_ann}) == 1
     assert lines(log("audit-log", "show", "--subject", "bob")) == []
     assert lines(log("audit-log", "show", "--after", "1", "--limit", "1")) == everything[1:2]

@@ -103,6 +103,7 @@ def people_report(people: TemplateAudit) -> Any:
     return json.loads((people.out / "report.json").read_text(encoding="utf-8"))
 
 
+@pytest.mark.long
 def test_an_audit_of_templates_writes_report_and_figures(
     people: TemplateAudit, people_report: Any
 ) -> None:
@@ -177,6 +178,7 @@ def compared_report(people: TemplateAudit, compared: Ran) -> Any:
     return json.loads((people.root / "compared" / "report.json").read_text(encoding="utf-8"))
 
 
+@pytest.mark.long
 def test_the_seed_gives_the_outcomes_and_kept_limits_are_status_0(
     people: TemplateAudit, people_report: Any, compared: Ran, compared_report: Any
 ) -> None:

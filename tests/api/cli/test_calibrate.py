@@ -1,6 +1,6 @@
 import pytest
 
-from api.cli.calibrate import concealment_note, parse_dims, read_aliases
+from api.cli.calibrate import concealment_note, likeness_note, parse_dims, read_aliases
 from api.cli.errors import CommandError, UsageError
 from api.opening import file_sealer
 from models.demo import DEMO_NOTICE
@@ -8,12 +8,13 @@ from templates.contract import Contract
 from templates.decoys import DecoyGenerator
 from templates.lifting import Strategy
 from templates.sealing import MasterKeyring
-from tests.api.cli.conftest import DIM, PROBE_DIM, run
+from tests.api.cli.conftest import DIM, PROBE_DIM, key_file, run
+from verify.metrics import rate
 
 
 def test_the_contract_is_what_serve_loads(world):
     contract = Contract.load(
-        world.data / "contract.json", file_sealer(MasterKeyring.load(world.data / "master.key"))
+        world.data / "contract.json", file_sealer(MasterKeyring.load(key_file(world.data)))
     )
     assert contract.contract_id == world.calibrated["contract"]["contract_id"]
     assert contract.binding.m == DIM
@@ -51,7 +52,7 @@ def test_people_are_left_out_and_ten_fold_adds_a_level(world, veilface, data, tm
     assert "nearest to the origin shows the face" in " ".join(ran.stderr.split())
     assert "conceal" not in ran.stdout
     contract = Contract.load(
-        tmp_path / "contract.json", file_sealer(MasterKeyring.load(data / "master.key"))
+        tmp_path / "contract.json", file_sealer(MasterKeyring.load(key_file(data)))
     )
     facts = contract.calibration("p2s").calibrated_on
     assert facts["people"] == 48
@@ -81,6 +82,55 @@ def test_decoys_of_another_space_are_refused(world, veilface, data, tmp_path):
         assert ran.status == 1
         assert said in " ".join(ran.stderr.split())
     assert not (tmp_path / "contract.json").exists()
+
+
+@pytest.mark.parametrize("kind", ["generator", "pool"])
+def test_decoys_of_the_people_themselves_are_refused(world, veilface, tmp_path, kind):
+    own = tmp_path / "own.veil"
+    built = veilface(
+        *("decoys", "build", world.labelled, "--pack", world.pack, "--kind", kind, "--out", own)
+    )
+    assert built.status == 0, built.stderr
+    ran = veilface(
+        *("calibrate", world.labelled, "--pack", world.pack, "--decoys", own, "--dim", "8"),
+        *("--out", tmp_path / "contract.json"),
+    )
+    assert ran.status == 1
+    said = " ".join(ran.stderr.split())
+    assert "of these" in said
+    assert "Build the decoys from other people's photos of the same kind" in said
+    assert not (tmp_path / "contract.json").exists()
+
+
+def test_the_note_on_unlike_decoys_advises_only_what_helps():
+    """A larger dimension left 73 % of the templates open: faces of the same kind come first."""
+    note = likeness_note(rate(80, 100), Strategy.ADVERSARIAL, 64)
+    assert "from 80 % of the templates of these people (80 of 100, adversarial, m = 64)" in note
+    assert "other people's photos of the same kind" in note
+    assert "--dim" not in note
+    assert likeness_note(rate(10, 100), Strategy.ADVERSARIAL, 64) is None
+    assert likeness_note(None, Strategy.RANDOM, 64) is None
+
+
+def test_what_photos_of_one_enrollment_must_agree_to_is_told(world):
+    told = world.calibrated["photo_consistency"]
+    assert told["threshold"] == world.calibrated["contract"]["photo_consistency"]
+    # Ten sets of three photos of each of 50 people; pairs of photos of two of them.
+    assert told["refused"]["trials"] == 500
+    assert told["refused"]["errors"] <= 10
+    assert told["fmr"]["trials"] == 200 * 196 // 2
+
+
+def test_lifted_probes_are_left_out_where_they_are_not_wanted(world, veilface, data, tmp_path):
+    path = tmp_path / "contract.json"
+    ran = veilface(
+        *("calibrate", world.labelled, "--pack", world.pack, "--dim", "8", "--out", path),
+        *("--probe-dims", "none"),
+    )
+    assert ran.status == 0, ran.stderr
+    contract = Contract.load(path, file_sealer(MasterKeyring.load(key_file(data))))
+    assert [entry.mode for entry in contract.calibrations] == ["p2s"]
+    assert "do not" in ran.stdout
 
 
 def test_a_folder_of_another_layout_is_refused(world, veilface, tmp_path):
@@ -117,12 +167,12 @@ def test_templates_that_conceal_little_are_noted(strategy, m, noted):
         assert "use --strategy adversarial and --dim 64 or more" in note
 
 
-@pytest.mark.parametrize(("text", "dims"), [("", ()), ("2,4, 8", (2, 4, 8)), ("16", (16,))])
+@pytest.mark.parametrize(("text", "dims"), [("none", ()), ("2,4, 8", (2, 4, 8)), ("16", (16,))])
 def test_probe_dimensions_are_read(text, dims):
     assert parse_dims(text) == dims
 
 
-@pytest.mark.parametrize("text", ["0", "2;4", "a", "-1", "129"])
+@pytest.mark.parametrize("text", ["", "0", "2;4", "a", "-1", "129", "none,2"])
 def test_wrong_probe_dimensions_are_refused(text):
     with pytest.raises(UsageError):
         parse_dims(text)

@@ -1,4 +1,5 @@
 import base64
+import json
 import sqlite3
 
 import pytest
@@ -8,7 +9,7 @@ from templates.store import TemplateStore
 from templates.store.audit_log import By
 from templates.store.lockout import LockedOut
 from templates.store.migrate import head_revision
-from tests.api.cli.conftest import run
+from tests.api.cli.conftest import key_file, run
 from tests.templates.store.conftest import put
 
 
@@ -22,10 +23,34 @@ def test_upgrade_check_and_current(tmp_path):
         "needed": head_revision(),
     }
     upgraded = run("db", "upgrade", *where, "--json")
-    assert upgraded.json == {"before": None, "after": head_revision()}
+    assert upgraded.json == {
+        "before": None,
+        "after": head_revision(),
+        "authenticated": 0,
+        "refused_keys": [],
+    }
     assert "up to date" in run("db", "upgrade", *where).stdout
     assert run("db", "check", *where).status == 0
     assert head_revision() in run("db", "current", *where).stdout
+
+
+def test_enrollment_by_template_is_off_until_it_is_allowed(tmp_path):
+    where = ("--data-dir", tmp_path)
+    assert run("db", "upgrade", *where).status == 0
+    unknown = run("db", "template-enrollment", *where)
+    assert unknown.status == 1
+    assert "there is no tenant" in unknown.stderr
+    made = run("keys", "create", *where, "--tenant", "acme", "--right", "enroll")
+    assert made.status == 0
+    acme = ("db", "template-enrollment", *where, "--tenant", "acme")
+    assert run(*acme, "--json").json == {"tenant": "acme", "template_enrollment": False}
+    assert run(*acme, "--allow", "--json").json == {"tenant": "acme", "template_enrollment": True}
+    assert "takes templates" in run(*acme).stdout
+    assert "does not take templates" in run(*acme, "--forbid").stdout
+    assert run(*acme, "--json").json["template_enrollment"] is False
+    log = [json.loads(line) for line in run("audit-log", "show", *where).stdout.splitlines()]
+    outcomes = [line["outcome"] for line in log if line["action"] == "tenant-settings"]
+    assert outcomes == ["template-enrollment-on", "template-enrollment-off"]
 
 
 def test_compact_gives_the_space_of_erased_subjects_back(tmp_path):
@@ -35,7 +60,7 @@ def test_compact_gives_the_space_of_erased_subjects_back(tmp_path):
     assert "veilface db upgrade" in refused.stderr
     assert run("db", "upgrade", *where).status == 0
     store = TemplateStore(
-        f"sqlite:///{tmp_path / 'veilface.db'}", MasterKeyring.load(tmp_path / "master.key")
+        f"sqlite:///{tmp_path / 'veilface.db'}", MasterKeyring.load(key_file(tmp_path))
     )
     store.tenants.create("default")
     for number in range(20):
@@ -79,7 +104,7 @@ def opened(tmp_path):
     where = ("--data-dir", tmp_path)
     assert run("db", "upgrade", *where).status == 0
     store = TemplateStore(
-        f"sqlite:///{tmp_path / 'veilface.db'}", MasterKeyring.load(tmp_path / "master.key")
+        f"sqlite:///{tmp_path / 'veilface.db'}", MasterKeyring.load(key_file(tmp_path))
     )
     for name in ("default", "acme"):
         store.tenants.create(name)

@@ -8,7 +8,7 @@ from models.demo import DEMO_NOTICE
 from templates.contract import Binding
 from templates.decoys import DecoyGenerator, DecoyPool, load_source
 from templates.sealing import MasterKeyring
-from tests.api.cli.conftest import run
+from tests.api.cli.conftest import key_file, run
 
 RACES = ("White", "Black", "Indian")
 
@@ -62,7 +62,7 @@ def test_a_pool_is_sealed_and_keeps_the_labels(world, veilface, data, labelled_s
     assert "1 of 12 photos failed to acquire" in ran.stderr
     assert DEMO_NOTICE in ran.stderr
     assert stat.S_IMODE(out.stat().st_mode) == 0o600
-    sealer = file_sealer(MasterKeyring.load(data / "master.key"))
+    sealer = file_sealer(MasterKeyring.load(key_file(data)))
     pool = load_source(out, sealer)
     assert isinstance(pool, DecoyPool)
     assert pool.labelled

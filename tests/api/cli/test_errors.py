@@ -1,3 +1,5 @@
+import sys
+
 import pytest
 import typer
 from typer.testing import CliRunner
@@ -42,6 +44,22 @@ def test_an_error_is_one_sentence_and_a_status(error, said, status):
     assert said in result.stderr
     assert "Traceback" not in result.stderr
     assert result.stdout == ""
+
+
+@pytest.mark.parametrize("error", [ValueError(SECRET), MemoryError(), CommandError("no face")])
+def test_verify_does_not_fail_with_the_status_of_a_rejection(error):
+    app = failing_app(error)
+    app.command("verify")(app.registered_commands[0].callback)
+    assert CliRunner().invoke(app, ["verify"]).exit_code == 3
+    assert CliRunner().invoke(app, ["fail"]).exit_code == 1
+
+
+def test_a_command_that_cannot_be_imported_has_failed(monkeypatch):
+    monkeypatch.setitem(sys.modules, "api.cli.subjects", None)
+    for name, status in (("verify", 3), ("enroll", 1)):
+        ran = run(name, "ann", "x.jpg")
+        assert (ran.status, ran.stdout) == (status, "")
+        assert "a defect of veilface (ModuleNotFoundError" in ran.stderr
 
 
 def test_an_unexpected_error_shows_its_place_and_never_its_text():

@@ -35,6 +35,7 @@ def refused(*given: Any, **named: Any) -> Any:
     raise AssertionError("this work belongs to the cluster")
 
 
+@pytest.mark.long
 def test_a_cluster_gives_the_same_bits(bench, results, cluster, tmp_path, monkeypatch):
     before = {process.pid for process in psutil.Process().children(recursive=True)}
     # Workers are processes of their own: this one must neither embed nor compare.

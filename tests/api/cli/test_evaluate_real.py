@@ -15,6 +15,8 @@ from models.synthetic import encode_photo
 from tests.api.cli.conftest import Ran, run
 from tests.api.cli.test_evaluate import numbers
 
+pytestmark = pytest.mark.long
+
 FOLDS, PER_CLASS, PUBLISHED = 10, 4, 300
 DIMS = (2, 8)
 PLAN = (
@@ -141,7 +143,7 @@ def test_crops_are_recognised_as_aligned(part: Part) -> None:
 
 
 def test_lifted_rows_have_the_order_of_the_paper(part: Part) -> None:
-    """More decoys cost accuracy, and most of it where both sides are lifted (METHOD, section 3)."""
+    """More decoys cost accuracy, and most of it where both are lifted (docs/method.md §7.1)."""
     auc = {
         (row["strategy"], row["dim"], row["mode"], row["metric"]): row["auc"]
         for row in part.ran.json["rows"]

@@ -1,9 +1,7 @@
-import stat
-
 import pytest
 
 from api.cli.errors import CommandError
-from api.cli.files import find_photos, is_left_out, read_bounded, read_names, write_private
+from api.cli.files import find_photos, is_left_out, read_bounded, read_names
 
 
 def test_photos_are_found_at_any_depth_in_order(tmp_path):
@@ -39,11 +37,9 @@ def test_a_person_or_a_photo_is_left_out(tmp_path):
     assert not is_left_out(photo, tmp_path, frozenset({"Bo", "1.jpg"}))
 
 
-def test_a_large_file_is_refused_and_a_private_one_is_private(tmp_path):
-    path = tmp_path / "deep" / "template"
-    write_private(path, b"12345")
-    write_private(path, b"123456")
-    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+def test_a_large_file_is_refused(tmp_path):
+    path = tmp_path / "template"
+    path.write_bytes(b"123456")
     assert read_bounded(path, 6) == b"123456"
     with pytest.raises(CommandError, match="more than 5 bytes"):
         read_bounded(path, 5)

@@ -17,7 +17,7 @@ PROMISED = {
     *("decoys build", "models inspect", "db upgrade", "db check", "db compact", "db current"),
     *("keys create", "keys list", "keys revoke", "keys master", "keys rotate", "keys rewrap"),
     *("keys verify-receipt", "keys replace", "keys rotate-tenant"),
-    *("db unlock", "db purge", "db erase-tenant"),
+    *("db unlock", "db purge", "db erase-tenant", "db template-enrollment"),
     *("audit-log verify", "audit-log head", "audit-log show"),
     "bench distances",
 }

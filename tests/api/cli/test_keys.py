@@ -14,14 +14,12 @@ from templates.errors import SealError
 from templates.key_file import locked, read_key_file, write_key_file
 from templates.sealing import MasterKeyring
 from templates.store import TemplateStore
-from tests.api.cli.conftest import run
+from tests.api.cli.conftest import key_file, run
 
 
 @pytest.fixture
 def store(data):
-    opened = TemplateStore(
-        f"sqlite:///{data / 'veilface.db'}", MasterKeyring.load(data / "master.key")
-    )
+    opened = TemplateStore(f"sqlite:///{data / 'veilface.db'}", MasterKeyring.load(key_file(data)))
     opened.upgrade()
     yield opened
     opened.close()
@@ -49,6 +47,25 @@ def test_a_key_is_made_listed_and_revoked(veilface, store):
     assert again.status == 1
     assert again.json == {"prefix": prefix, "revoked": False}
     assert "revoked" in veilface("keys", "list").stdout
+
+
+def test_a_lowest_level_is_shown_and_kept_by_a_replacement(veilface, store):
+    made = veilface("keys", "create", "--right", "verify", "--lowest-level", "fmr-1e-4", "--json")
+    assert made.json["lowest_level"] == "fmr-1e-4"
+    replaced = veilface("keys", "replace", made.json["prefix"], "--json")
+    assert replaced.json["lowest_level"] == "fmr-1e-4"
+    assert store.api_keys.verify(replaced.json["token"]).lowest_level == "fmr-1e-4"
+    free = veilface("keys", "create", "--right", "verify", "--json")
+    listed = {key["prefix"]: key["lowest_level"] for key in veilface("keys", "list", "--json").json}
+    assert listed == {
+        made.json["prefix"]: "fmr-1e-4",
+        replaced.json["prefix"]: "fmr-1e-4",
+        free.json["prefix"]: None,
+    }
+    shown = veilface("keys", "list").stdout
+    assert "fmr-1e-4" in shown
+    assert "any" in shown
+    assert veilface("keys", "create", "--right", "verify", "--lowest-level", "?").status == 1
 
 
 def test_the_token_alone_is_on_stdout(veilface):
@@ -81,16 +98,16 @@ def test_the_master_key_is_made_once(tmp_path):
 def test_rotation_wraps_everything_again_and_retires_the_old_key(world, veilface, data):
     photos = world.photos(1, range(3))
     assert veilface("enroll", "ann", *photos, "--pack", world.pack).status == 0
-    old = (data / "master.key").read_text()
+    old = key_file(data).read_text()
     ran = veilface("keys", "rotate", "--retire", "--json")
     assert ran.status == 0, ran.stderr
     assert ran.json["rewrapped"] >= 3
     assert ran.json["retired"] == 1
     assert [name.rsplit("/", 1)[-1] for name in ran.json["resealed_files"]] == ["contract.json"]
-    new = (data / "master.key").read_text()
+    new = key_file(data).read_text()
     assert len(new.split()) == 1
     assert new != old
-    Contract.load(data / "contract.json", file_sealer(MasterKeyring.load(data / "master.key")))
+    Contract.load(data / "contract.json", file_sealer(MasterKeyring.load(key_file(data))))
     probe = world.photos(1, range(3, 4))
     assert veilface("verify", "ann", *probe, "--pack", world.pack).status == 0
     again = veilface("keys", "rewrap", "--json")
@@ -101,13 +118,13 @@ def test_a_rotation_without_retiring_keeps_both_keys(veilface, data):
     ran = veilface("keys", "rotate")
     assert ran.status == 0, ran.stderr
     assert "--retire" in ran.stdout
-    assert len((data / "master.key").read_text().split()) == 2
+    assert len(key_file(data).read_text().split()) == 2
 
 
 def test_a_key_that_came_first_during_a_rotation_keeps_the_others_in_the_file(
     veilface, data, store, monkeypatch
 ):
-    file, seal_again = data / "master.key", keys._seal_files_again
+    file, seal_again = key_file(data), keys._seal_files_again
 
     def rotate_meanwhile(*arguments):
         """Another program, which knows nothing of our lock, between the check and the drop."""
@@ -139,7 +156,7 @@ def test_one_rotation_runs_at_a_time(veilface, data, monkeypatch, command):
             ThreadPoolExecutor(1) as thread,
             pytest.raises(SealError, match="another rotation") as caught,
         ):
-            thread.submit(MasterKeyring.add_current, data / "master.key").result()
+            thread.submit(MasterKeyring.add_current, key_file(data)).result()
         other.append(caught.value)
         return []
 
@@ -147,33 +164,33 @@ def test_one_rotation_runs_at_a_time(veilface, data, monkeypatch, command):
     assert veilface("keys", command).status == 0
     assert len(other) == 1  # the lock was held over the whole command
     with ThreadPoolExecutor(1) as thread:
-        holding = locked(data / "master.key")
+        holding = locked(key_file(data))
         thread.submit(holding.__enter__).result()
-        before = (data / "master.key").read_bytes()
+        before = key_file(data).read_bytes()
         ran = veilface("keys", command, "--retire")
         thread.submit(holding.__exit__, None, None, None).result()
     assert ran.status == 1
     assert "another rotation" in ran.stderr
-    assert (data / "master.key").read_bytes() == before
+    assert key_file(data).read_bytes() == before
     assert veilface("keys", command, "--retire").status == 0
 
 
 def test_a_rotation_leaves_links_and_owners_as_they_are(veilface, data, tmp_path):
     real = tmp_path / "real"
     real.mkdir()
-    names = ("master.key", "contract.json")
-    for name in names:
-        (data / name).rename(real / name)
-        (data / name).symlink_to(real / name)
+    links = (key_file(data), data / "contract.json")
+    for link in links:
+        link.rename(real / link.name)
+        link.symlink_to(real / link.name)
     owner = 61234 if os.geteuid() == 0 else os.geteuid()
     for each in (real, *real.iterdir()):
         os.chown(each, owner, -1)
     ran = veilface("keys", "rotate", "--retire")
     assert ran.status == 0, ran.stderr
-    for name in names:
-        assert (data / name).is_symlink()
-        assert (real / name).stat().st_uid == owner
-        assert stat.S_IMODE((real / name).stat().st_mode) == 0o600
+    for link in links:
+        assert link.is_symlink()
+        assert (real / link.name).stat().st_uid == owner
+        assert stat.S_IMODE((real / link.name).stat().st_mode) == 0o600
     keyring = MasterKeyring.load(real / "master.key")
     assert len(keyring.key_ids) == 1
     Contract.load(real / "contract.json", file_sealer(keyring))
@@ -258,8 +275,8 @@ def test_stolen_templates_keep_their_rotation_until_they_are_enrolled_again(worl
 
 def test_master_keys_come_from_the_environment_or_a_command(veilface, data, monkeypatch, tmp_path):
     assert veilface("db", "upgrade").status == 0
-    text = (data / "master.key").read_text()
-    (data / "master.key").unlink()
+    text = key_file(data).read_text()
+    key_file(data).unlink()
     monkeypatch.setenv("SOME_VARIABLE", text)
     assert veilface("db", "check", "--master-key-variable", "SOME_VARIABLE").status == 0
     hook = tmp_path / "hook"

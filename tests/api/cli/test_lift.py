@@ -1,5 +1,6 @@
 import base64
 import json
+import os
 import stat
 import time
 
@@ -14,14 +15,16 @@ from templates.contract import Binding, Contract
 from templates.decoys import DecoyGenerator
 from templates.probe_signature import sign_probe
 from templates.sealing import MasterKeyring
-from tests.api.cli.conftest import DIM, PROBE_DIM, run
+from tests.api.cli.conftest import DIM, PROBE_DIM, key_file, run
+
+SERVICE = 61234
 
 
 @pytest.fixture
 def public(world, tmp_path):
     """The answer of GET /v1/contract, as a client has it."""
     contract = Contract.load(
-        world.data / "contract.json", file_sealer(MasterKeyring.load(world.data / "master.key"))
+        world.data / "contract.json", file_sealer(MasterKeyring.load(key_file(world.data)))
     )
     file = tmp_path / "public.json"
     file.write_text(json.dumps({**contract.public(), "photos": True, "request_id": "x"}))
@@ -59,6 +62,24 @@ def test_an_enrollment_holds_the_descriptor_of_the_photos(world, lift, tmp_path)
     residual = (mean - foot) - basis.T @ (basis @ (mean - foot))
     assert np.linalg.norm(residual) < 5e-3  # float16
     assert ran.json["kind"] == "enrollment"
+
+
+def test_a_link_that_somebody_else_put_in_the_place_is_not_followed(
+    world, lift, tmp_path, monkeypatch
+):
+    folder, target = tmp_path / "service", tmp_path / "passwd"
+    folder.mkdir()
+    target.write_bytes(b"before")
+    (folder / "me.veil").symlink_to(target)
+    if os.geteuid() == 0:
+        for path in (folder, folder / "me.veil"):
+            os.lchown(path, SERVICE, SERVICE)
+    else:
+        monkeypatch.setattr(os, "geteuid", lambda: SERVICE)
+    ran = lift(*world.photos(1, range(1)), "--out", folder / "me.veil")
+    assert (ran.status, ran.stdout) == (1, "")
+    assert "me.veil: there is a link of user" in ran.stderr
+    assert target.read_bytes() == b"before"
 
 
 def test_two_lifts_share_nothing_but_the_descriptor(world, lift, tmp_path):
@@ -121,7 +142,7 @@ def test_photos_of_two_people_are_refused_by_name(world, lift, tmp_path):
     photos = [*world.photos(1, range(1)), *world.photos(2, range(1, 2))]
     ran = lift(*photos, "--out", tmp_path / "x")
     assert ran.status == 1
-    assert "do not look like the same person: 0.png, 1.png" in ran.stderr
+    assert "0.png and 1.png do not look like the same person" in ran.stderr
 
 
 def test_a_changed_contract_is_refused(world, lift, public, tmp_path):

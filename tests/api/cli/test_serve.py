@@ -14,7 +14,8 @@ import httpx
 import pytest
 
 from models.demo import DEMO_NOTICE
-from tests.api.cli.conftest import run
+from tests.api.cli.conftest import key_file, run
+from tests.patience import PATIENCE_S
 
 
 @contextmanager
@@ -31,7 +32,7 @@ def started(
             stderr=errors,
         )
     try:
-        deadline = time.monotonic() + 60
+        deadline = time.monotonic() + PATIENCE_S
         while time.monotonic() < deadline and process.poll() is None:
             told = (folder / "err").read_text()
             if ready in told:
@@ -54,12 +55,14 @@ def test_the_first_start_prints_a_key_once_and_sigterm_stops_it(world, data, tmp
     with started(tmp_path, *common) as (process, url):
         told = (tmp_path / "out").read_text().split()
         (token,) = [word for word in told if word.startswith("vf_")]
-        answer = httpx.get(f"{url}/v1/contract", headers={"Authorization": f"Bearer {token}"})
+        answer = httpx.get(
+            f"{url}/v1/contract", headers={"Authorization": f"Bearer {token}"}, timeout=PATIENCE_S
+        )
         assert answer.status_code == 200
         assert answer.json()["notice"] == DEMO_NOTICE
-        assert httpx.get(f"{url}/v1/contract").status_code == 401
+        assert httpx.get(f"{url}/v1/contract", timeout=PATIENCE_S).status_code == 401
         process.send_signal(signal.SIGTERM)
-        assert process.wait(timeout=30) in (0, -signal.SIGTERM)
+        assert process.wait(timeout=PATIENCE_S) in (0, -signal.SIGTERM)
     log = (tmp_path / "err").read_text()
     assert DEMO_NOTICE in log
     assert token not in log
@@ -68,6 +71,49 @@ def test_the_first_start_prints_a_key_once_and_sigterm_stops_it(world, data, tmp
     again = run("serve", "--check", *common)
     assert again.status == 0
     assert "vf_" not in again.stdout
+    assert "warning" not in again.stderr
+
+
+def test_a_master_key_beside_the_database_is_used_with_a_warning(world, data):
+    check = ("serve", "--check", "--data-dir", data, "--pack", world.pack)
+    key_file(data).rename(data / "master.key")  # where an earlier version made it
+    ran = run(*check)
+    assert ran.status == 0, ran.stderr
+    (warning,) = [line for line in ran.stderr.splitlines() if line.startswith("warning: ")]
+    assert f"{data / 'master.key'} lies in the folder of the database" in warning
+    (data / "master.key").rename(key_file(data))
+    moved = run(*check)
+    assert moved.status == 0, moved.stderr
+    assert "warning" not in moved.stderr
+
+
+@pytest.mark.parametrize("workers", ["1", pytest.param("2", marks=pytest.mark.long)])
+def test_where_it_listens_is_said_when_connections_are_taken(world, data, tmp_path, workers):
+    process = subprocess.Popen(
+        [sys.executable, "-m", "api.cli", "serve", "--port", "0", "--operations-port", "0",
+         "--data-dir", str(data), "--pack", str(world.pack), "--workers", workers],
+        stderr=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        text=True,
+    )  # fmt: skip
+    try:
+        said: dict[str, str] = {}
+        started = 0
+        for line in process.stderr:
+            started += '"event": "started"' in line
+            for what in ("Health and metrics are on ", "listens on "):
+                if what in line:
+                    said[what] = line.split(what)[1].strip()
+            if "listens on " in said:
+                break
+        # At once: a connection that is refused raises.
+        operations, service = said["Health and metrics are on "], said["listens on "]
+        assert httpx.get(f"{operations}/health/ready", timeout=PATIENCE_S).status_code == 200
+        assert httpx.get(f"{service}/v1/contract", timeout=PATIENCE_S).status_code == 401
+        assert started == int(workers)
+    finally:
+        process.terminate()
+        process.communicate()
 
 
 def test_what_does_not_fit_stops_the_start_with_a_sentence(world, data, tmp_path):
@@ -116,8 +162,8 @@ def test_operations_get_a_free_port_too(world, data, tmp_path):
         tmp_path, "--data-dir", str(data), "--pack", str(world.pack), "--operations-port", "0",
         ready="Health and metrics are on ",
     ) as (_, url):  # fmt: skip
-        assert "veilface_build_info" in httpx.get(f"{url}/metrics").text
-        assert httpx.get(f"{url}/v1/contract").status_code == 404
+        assert "veilface_build_info" in httpx.get(f"{url}/metrics", timeout=PATIENCE_S).text
+        assert httpx.get(f"{url}/v1/contract", timeout=PATIENCE_S).status_code == 404
 
 
 def test_the_check_looks_at_the_key_of_tls_and_the_storage_of_limits(world, data, tmp_path):

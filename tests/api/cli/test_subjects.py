@@ -33,7 +33,6 @@ def test_what_stands_in_the_way_is_named(world, veilface, tmp_path):
     photo = world.photos(1, range(1))
     pack = ("--pack", world.pack)
     cases = [
-        (("verify", "nobody", *photo, *pack), 1, "has no subject of that name"),
         (("enroll", "ann", *photo, broken, *pack), 1, "broken.png"),
         (("enroll", "ann", *photo, tmp_path / "absent.png", *pack), 1, "No such file"),
         (("enroll", "ann", *photo, *world.photos(2, range(1)), *pack), 1, "same person"),
@@ -48,11 +47,38 @@ def test_what_stands_in_the_way_is_named(world, veilface, tmp_path):
         assert ran.stderr.startswith(("error: ", "note: "))
 
 
+def test_a_verification_without_a_decision_is_no_rejection(world, veilface, tmp_path):
+    veilface("enroll", "ann", *world.photos(1, range(3)), "--pack", world.pack)
+    broken = tmp_path / "broken.png"
+    broken.write_bytes(b"no picture")
+    ann = ("verify", "ann", *world.photos(1, range(3, 4)))
+    pack = ("--pack", world.pack)
+    absent = tmp_path / "absent"
+    cases = [
+        (("verify", "ann", absent, *pack), 2, "there is no photo"),
+        (ann, 2, "--pack"),
+        ((*ann, *pack, "--unknown-option"), 2, "No such option"),
+        (("verify", "nobody", *world.photos(1, range(1)), *pack), 3, "has no subject"),
+        (("verify", "ann", broken, *pack), 3, "broken.png"),
+        (("verify", "ann", tmp_path, *pack), 3, "Is a directory"),
+        ((*ann, "--pack", absent), 3, "does not exist"),
+        ((*ann, *pack, "--contract-file", absent), 3, "there is no contract file"),
+        ((*ann, *pack, "--tenant", "elsewhere"), 3, "no tenant"),
+        ((*ann, *pack, "--database-url", f"sqlite:///{absent}/no.db"), 3, "database"),
+        ((*ann, *pack, "--database-url", "postgresql://127.0.0.1:1/no"), 3, "database"),
+        ((*ann, *pack, "--onnx-threads", "-1"), 3, "onnx_threads"),
+    ]
+    for arguments, status, said in cases:
+        ran = veilface(*arguments)
+        assert (ran.status, ran.stdout) == (status, ""), (arguments, ran)
+        assert said in ran.stderr
+
+
 def test_an_unknown_level_names_those_there_are(world, veilface):
     veilface("enroll", "ann", *world.photos(1, range(3)), "--pack", world.pack)
     ran = veilface(
         *("verify", "ann", *world.photos(1, range(3, 4)), "--pack", world.pack),
         *("--level", "fmr-1e-9"),
     )
-    assert ran.status == 1
+    assert ran.status == 3
     assert "fmr-1e-2" in ran.stderr

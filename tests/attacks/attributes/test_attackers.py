@@ -61,6 +61,7 @@ def test_never_predicts_a_class_without_training_faces(name: str) -> None:
     assert np.argmax(scores, axis=1).max() <= 1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", TRAINED)
 def test_a_seed_gives_the_same_scores(name: str) -> None:
     known, unseen, _ = lesson(signal=True)

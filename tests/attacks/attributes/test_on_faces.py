@@ -1,4 +1,4 @@
-"""The claims of METHOD §3 and §4.5 on real faces, in small."""
+"""The claims of docs/method.md §7.2 and §4.5 on real faces, in small."""
 
 from pathlib import Path
 
@@ -14,6 +14,8 @@ from models.extraction import Extractor
 from models.pack import ModelPack
 from verify.evaluation.labels_file import read_labels
 from verify.fairface_labels import GENDERS, RACES
+
+pytestmark = pytest.mark.long
 
 TRAIN, VALIDATION = 400, 200
 CLASSES = {"gender": GENDERS, "race": RACES}

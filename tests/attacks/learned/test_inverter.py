@@ -45,6 +45,7 @@ def test_one_seed_gives_one_network(scene: Scene) -> None:
     np.testing.assert_array_equal(first(scene.templates), second(scene.templates))
 
 
+@pytest.mark.long
 def test_training_beats_the_foot_point_where_decoys_differ_from_faces(scene: Scene) -> None:
     """Faces on one half of the axes, decoys on the other: a network must tell them apart."""
     rng = np.random.default_rng(0)

@@ -48,6 +48,7 @@ def mirrored(scene: Scene) -> Scene:
     return replace(scene, victims=people)
 
 
+@pytest.mark.long
 def test_the_raw_descriptor_is_drawn_and_noise_is_not(
     mirrored: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:

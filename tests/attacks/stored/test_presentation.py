@@ -26,6 +26,7 @@ def found(decoys: str) -> dict[str, Outcome]:
     return {outcome.variant: outcome for outcome in presentation_attack(scene(decoys))}
 
 
+@pytest.mark.long
 def test_every_probe_is_judged_as_the_service_decides_and_reported_by_the_threshold_alone() -> None:
     outcomes = found("generator")
     judged = [name for name, outcome in outcomes.items() if outcome.judged]
@@ -52,6 +53,7 @@ def test_zero_and_central_probes_are_refused_before_the_decision() -> None:
     assert wolf.details["refused_by_the_input_checks"] == 1
 
 
+@pytest.mark.long
 def test_a_wolf_that_knows_the_pool_opens_many_templates() -> None:
     # Templates share the decoys of a pool; the cohort, made of nobody, has none of them.
     wolf = found("pool")["wolf, optimised"]

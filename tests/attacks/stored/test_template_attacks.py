@@ -1,9 +1,12 @@
+import pytest
+
 from attacks.outcomes import Scheme
 from attacks.scene import stage
 from attacks.stored import template_attacks
 from tests.attacks.stored.staging import cast, generator, noise, scene
 
 
+@pytest.mark.long
 def test_all_attacks_run_in_order_and_report_their_progress() -> None:
     staged = scene("generator")
     seen: list[tuple[str, float]] = []

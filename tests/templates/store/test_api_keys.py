@@ -249,3 +249,19 @@ def test_a_key_that_is_replaced_and_revoked_at_once_ends_revoked(store: Template
             assert keys.revoke(old.key.prefix)
             replacing.result()
         assert keys.verify(old.token) is None
+
+
+def test_a_key_keeps_its_lowest_level_and_so_does_the_one_that_replaces_it(
+    store: TemplateStore,
+) -> None:
+    made = store.api_keys.create("default", [Right.VERIFY], lowest_level="fmr-1e-5")
+    assert made.key.lowest_level == "fmr-1e-5"
+    assert store.api_keys.create("default", [Right.VERIFY]).key.lowest_level is None
+    found = store.api_keys.verify(made.token)
+    assert found is not None
+    assert found.lowest_level == "fmr-1e-5"
+    new = store.api_keys.replace(made.key.prefix, grace=timedelta(0))
+    assert new is not None
+    assert new.key.lowest_level == "fmr-1e-5"
+    with pytest.raises(StoreError, match="name of a level"):
+        store.api_keys.create("default", [Right.VERIFY], lowest_level="Not A Level")

@@ -121,6 +121,7 @@ def test_the_first_line_and_those_after_it(store: TemplateStore, clock: Clock) -
         outcome="reject",
         request_id="request-00000001",
         detail="high",
+        nonce=None,
         previous_hash=bytes(32),
         hash=one.hash,
     )
@@ -195,9 +196,14 @@ def test_two_lines_in_one_transaction(store: TemplateStore) -> None:
     assert store.audit_log.verify().intact
 
 
-def test_appending_unprepared_is_refused_and_does_not_hang(store: TemplateStore) -> None:
+def test_appending_unprepared_is_refused_and_does_not_hang(
+    database_url: str, keyring: MasterKeyring, store: TemplateStore
+) -> None:
+    store.close()
+    store = TemplateStore(database_url, keyring)
     with pytest.raises(RuntimeError, match="prepare"):
         store._database.write(lambda each: store.audit_log.append(each, entry(1)))
+    store.close()
 
 
 def test_the_chain_survives_a_rotation_of_the_master_key(
@@ -373,6 +379,7 @@ ALTERATIONS = {
     "outcome": "'accept'",
     "request_id": "'request-99999999'",
     "detail": "'low'",
+    "nonce": "'0123'",
     "previous_hash": "hash",
     "hash": "previous_hash",
 }
@@ -719,7 +726,7 @@ def test_a_column_without_a_value_is_named_and_not_stumbled_over(
     """As one leaves it who makes the column again without its NOT NULL."""
     if filled._database.is_sqlite:
         made = "(sequence INTEGER PRIMARY KEY, at, tenant, actor, action, pseudonym, outcome, "
-        made += "request_id, detail, previous_hash, hash)"
+        made += "request_id, detail, nonce, previous_hash, hash)"
         if table == "audit_head":
             made = "(id INTEGER PRIMARY KEY, sequence, hash, mac)"
         names = made.strip("()").replace(" INTEGER PRIMARY KEY", "")
@@ -854,7 +861,7 @@ def made_up_lines(count: int) -> Iterator[tuple[object, ...]]:
     previous, at = bytes(32), datetime(2026, 3, 1, tzinfo=UTC)
     for sequence in range(1, count + 1):
         columns = (sequence, at, "default", "key:x", "verify", f"{sequence:064x}", "reject")
-        columns_after = ("request-00000000", "high", previous)
+        columns_after = ("request-00000000", "high", None, previous)
         own = line_hash(KEY, (*columns, *columns_after))
         yield (sequence, "2026-03-01 00:00:00.000000", *columns[2:], *columns_after, own)
         previous = own

@@ -24,6 +24,7 @@ from templates.store.rerotation import _Turns
 from templates.store.schema import RotationKeyRow, SubjectRow, TemplateRow
 from templates.store.tenants import RetiredRotation
 from templates.subspace import AffineSubspace, SubspaceBatch
+from tests.patience import PATIENCE_S
 from tests.templates.store.conftest import CONTRACT, Clock, SlowSealing, template_id
 from tests.templates.store.test_erasure import found, pieces
 
@@ -423,7 +424,7 @@ def test_an_enrollment_under_way_is_waited_for_before_a_key_goes(
     people, slow_people = People(store, 1), People(service, 1)
     with ThreadPoolExecutor(2) as threads:
         writing = threads.submit(slow_people.enroll, "s000")
-        assert slow_sealing.sealed.wait(20)
+        assert slow_sealing.sealed.wait(PATIENCE_S)
 
         def renew() -> None:
             store.rerotation.begin("default")

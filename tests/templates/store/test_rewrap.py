@@ -11,6 +11,7 @@ from templates.store import TemplateStore, probe_key
 from templates.store.database import Database
 from templates.store.rewrap import WRAPPED_COLUMNS
 from templates.store.schema import Base, TemplateRow
+from tests.patience import PATIENCE_S
 from tests.templates.store.conftest import SlowSealing, put
 
 SUBJECTS = [f"s{number}" for number in range(12)]
@@ -155,7 +156,7 @@ def test_a_write_that_sealed_before_the_rotation_is_waited_for(
     service.pseudonym("default", "-")
     with ThreadPoolExecutor(2) as threads:
         writing = threads.submit(put, service, "ada", b"wire")
-        assert slow_sealing.sealed.wait(20)
+        assert slow_sealing.sealed.wait(PATIENCE_S)
         current = MasterKeyring.add_current(key_file)
         rotating = threads.submit(store.rewrap)
         early = wait([rotating], timeout=0.5).done

@@ -36,6 +36,7 @@ from templates.store.schema import (
     UsedNonceRow,
 )
 from templates.store.tenant_erasure import TenantErasure
+from tests.patience import PATIENCE_S
 from tests.templates.store.conftest import Clock, SlowSealing, put, template_id
 from tests.templates.store.test_erasure import count, found, pieces
 
@@ -310,7 +311,7 @@ def test_an_enrollment_under_way_goes_with_the_tenant(
     service.audit_log.prepare()
     with ThreadPoolExecutor(2) as threads:
         writing = threads.submit(put, service, "ada", b"wire")
-        assert slow_sealing.sealed.wait(20)
+        assert slow_sealing.sealed.wait(PATIENCE_S)
         erasing = threads.submit(store.tenant_erasures.erase, "default")
         early = wait([erasing], timeout=0.5).done
         slow_sealing.go_on.set()

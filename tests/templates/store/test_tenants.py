@@ -38,3 +38,17 @@ def test_secrets_are_made_once_and_differ_by_name(store: TemplateStore) -> None:
     assert store.secrets.get("export").hex() not in repr(store.secrets)
     with pytest.raises(StoreError):
         store.secrets.get("no spaces")
+
+
+def test_enrollment_by_template_is_off_until_it_is_allowed(store: TemplateStore) -> None:
+    assert not store.tenants.get("default").template_enrollment
+    assert store.tenants.set_template_enrollment("default", True).template_enrollment
+    assert store.tenants.get("default").template_enrollment
+    assert not store.tenants.get("other").template_enrollment
+    assert not store.tenants.set_template_enrollment("default", False).template_enrollment
+    assert [line.outcome for line in store.audit_log.lines()] == [
+        "template-enrollment-on",
+        "template-enrollment-off",
+    ]
+    with pytest.raises(UnknownTenant):
+        store.tenants.set_template_enrollment("nobody", True)

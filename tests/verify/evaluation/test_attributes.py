@@ -88,6 +88,7 @@ def embedded(pack: ModelPack, photos: dict[Path, Attributes]) -> Extraction:
     return Extractor(pack).extract(list(photos))
 
 
+@pytest.mark.long
 def test_real_faces_are_predicted_better_than_by_the_majority(
     mbf_pack_dir: Path, fairface: Path
 ) -> None:

@@ -176,7 +176,7 @@ def test_rows_beyond_float32_become_unit(tmp_path: Path) -> None:
 
 
 @given(st.binary(max_size=200))
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_random_files(tmp_path_factory: pytest.TempPathFactory, data: bytes) -> None:
     file = write(tmp_path_factory.getbasetemp() / "random.npz", data)
     with pytest.raises(DatasetError):
@@ -249,7 +249,7 @@ def slow_longest(wanted: str, paths: Sequence[str], telling: int | None) -> list
     st.lists(st.lists(st.sampled_from("abc"), min_size=1, max_size=5), max_size=6, unique_by=tuple),
     st.lists(st.sampled_from("abc"), min_size=1, max_size=4),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_the_longest_end_is_that_of_a_slow_search(
     kind: str, telling: int | None, paths: list[list[str]], wanted: list[str]
 ) -> None:

@@ -1,7 +1,6 @@
 """InsightFace ``.bin`` files."""
 
 import pickle
-import time
 from pathlib import Path
 
 import numpy as np
@@ -156,7 +155,7 @@ def test_a_truncated_file_or_one_with_more_behind_it(tmp_path: Path) -> None:
 
 
 @given(data=st.binary(max_size=100), suffix=st.sampled_from([".bin", ".csv", ".txt", ""]))
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_random_files_only_ever_raise_dataset_errors(
     tmp_path_factory: pytest.TempPathFactory, data: bytes, suffix: str
 ) -> None:
@@ -195,17 +194,17 @@ def test_notes_of_unusual_sets(tmp_path: Path) -> None:
 
 
 def test_a_photo_that_is_said_very_often_is_compared_once(tmp_path: Path) -> None:
-    """Two equal photos of 8 MiB, one of them named 20,000 times at two bytes each."""
+    """Two equal photos of 8 MiB, one of them named two million times at two bytes each.
+
+    Comparing them each time takes two million times the millisecond that 8 MiB take.
+    """
     photo = b"\x89PNG\r\n\x1a\n" + bytes(8 * 2**20)
     one = b"B" + len(photo).to_bytes(4, "little") + photo
-    pairs = 10_000
+    pairs = 1_000_000
     bins = b"(" + one + one + b"\x94" + b"h\x00" * (2 * pairs - 2) + b"l"
     (tmp_path / "often.bin").write_bytes(
         b"\x80\x04" + bins + b"(" + b"\x88\x89" * (pairs // 2) + b"l\x86."
     )
-    began = time.process_time()
     (benchmark,) = open_sets(tmp_path / "often.bin")
-    # Comparing them each time takes 20,000 times the millisecond that 8 MiB take.
-    assert time.process_time() - began < 5
     assert [picture.read() for picture in benchmark.pictures] == [photo]
     assert len(benchmark.same) == pairs

@@ -297,7 +297,7 @@ def test_agedb_an_empty_fold_is_refused(tmp_path: Path, part: object) -> None:
 
 
 @given(st.data())
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_agedb_an_altered_protocol_only_ever_raises_one_exception(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
 ) -> None:

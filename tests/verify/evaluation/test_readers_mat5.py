@@ -70,7 +70,7 @@ def test_a_file_cut_anywhere_is_refused(compressed: bool) -> None:
 
 
 @given(st.data())
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_an_altered_file_only_ever_raises_one_exception(data: st.DataObject) -> None:
     raw = bytearray(saved(agedb_splits("published", agedb_folds()[:1])))
     for _ in range(data.draw(st.integers(1, 6))):

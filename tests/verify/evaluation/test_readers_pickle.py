@@ -31,7 +31,7 @@ PLAIN = st.recursive(
 
 
 @given(PLAIN, st.integers(0, 5))
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 def test_plain_values_are_read_as_python_reads_them(value: object, protocol: int) -> None:
     data = pickle.dumps(value, protocol)
     assert read_pickle(data) == pickle.loads(data)
@@ -235,14 +235,14 @@ def test_a_pickle_cut_anywhere_is_refused() -> None:
 
 
 @given(st.binary(max_size=200))
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 def test_random_bytes_only_ever_raise_one_exception(data: bytes) -> None:
     with contextlib.suppress(RefusedPickle):
         read_pickle(data)
 
 
 @given(st.data())
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 def test_a_mutated_pickle_only_ever_raises_one_exception(data: st.DataObject) -> None:
     protocol = data.draw(st.integers(0, 5))
     raw = bytearray(pickle.dumps(([b"abc", np.zeros(4, np.uint8)], [True, np.bool_(1)]), protocol))

@@ -9,6 +9,7 @@ Hues are those of Okabe and Ito, which the colour-blind tell apart; nothing is t
 each has a hatch, a marker or a dash of its own, and they differ in lightness.
 """
 
+import io
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,6 +20,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
+
+from templates.private_file import replace_public
 
 GROUND = "#ffffff"
 INK = "#1b1f24"
@@ -76,9 +79,12 @@ def house_style() -> Iterator[None]:
 def write(figure: Figure, folder: Path, name: str) -> list[Path]:
     """Write ``name.png`` and ``name.svg``, the same bytes for the same figure."""
     paths = [folder / f"{name}.png", folder / f"{name}.svg"]
+    png, svg = io.BytesIO(), io.BytesIO()
     with house_style():
-        figure.savefig(paths[0], dpi=PNG_DPI, metadata={"Software": None})
-        figure.savefig(paths[1], metadata={"Date": None, "Creator": None})
+        figure.savefig(png, format="png", dpi=PNG_DPI, metadata={"Software": None})
+        figure.savefig(svg, format="svg", metadata={"Date": None, "Creator": None})
+    for path, drawn in zip(paths, (png, svg), strict=True):
+        replace_public(path, drawn.getvalue())
     return paths
 
 

@@ -21,7 +21,7 @@ _SIGNATURES = (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n")
 
 
 def read_bin(path: Path) -> VerificationSet:
-    """Read ``(bins, issame_list)``; pair i is ``bins[2 i]`` and ``bins[2 i + 1]`` (FORMATS).
+    """Read ``(bins, issame_list)``; pair i is ``bins[2 i]`` and ``bins[2 i + 1]``.
 
     Elements are encoded JPEG or PNG, as bytes, as byte arrays, or as arrays of uint8 with one side
     that is not 1: ``cv2.imencode`` returned a column before OpenCV 4.5.1. Either part may be an

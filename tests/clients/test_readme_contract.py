@@ -1,0 +1,48 @@
+"""The contract of the README's commands, with no option more, serves the private client."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from benchmarks.deployment import service
+from models.demo import build_demo_pack
+from tests.api.cli.conftest import draw
+from tests.clients.conftest import VEILFACE
+from tests.test_readme import BLOCKS, with_values
+from veilface_client import Client, PrivateClient
+
+
+@pytest.mark.long
+def test_who_is_enrolled_by_photos_is_verified_without_sending_one(tmp_path: Path) -> None:
+    pack = build_demo_pack(tmp_path / "pack")
+    faces = draw(tmp_path / "faces", range(5000, 5400), range(1))
+    people = draw(tmp_path / "people", range(6000, 6080), range(4))
+    anna = draw(tmp_path / "anna", range(1, 2), range(4)) / "person-1"
+    photos = [anna / f"{number}.png" for number in range(4)]
+    bin_folder = tmp_path / ".venv" / "bin"
+    bin_folder.mkdir(parents=True)
+    (bin_folder / "activate").write_text(f"export PATH={Path(sys.executable).parent}:$PATH\n")
+    values = {"PACK": str(pack), "FACES": str(faces), "PEOPLE": str(people)}
+    prepare, _ = with_values(BLOCKS[1], values).rsplit("\nveilface serve", 1)
+    env = {k: v for k, v in os.environ.items() if not k.startswith("VEILFACE_")}
+    env |= {"VEILFACE_DEMO": "true", "OMP_NUM_THREADS": "1"}
+    private = "PRIVATE=$(veilface keys create --right verify --right embeddings)"
+    script = f'{prepare}\n{private}\necho "$KEY"\necho "$PRIVATE"'
+    done = subprocess.run(
+        ["bash", "-euo", "pipefail", "-c", script],
+        cwd=tmp_path, env=env, text=True, capture_output=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    key, lifting = done.stdout.split()[-2:]
+    serving = env | {
+        "VEILFACE_PACK": str(pack),
+        "VEILFACE_DATA_DIR": str(tmp_path / "veilface-data"),
+    }
+    with service(serving, workers=1, log=tmp_path / "serve.log") as url:
+        with Client(url, key) as client:
+            client.enroll("anna", photos[:3])
+        with PrivateClient(url, lifting, pack=pack, command=VEILFACE) as client:
+            assert client.verify("anna", photos[3]).decision == "accept"

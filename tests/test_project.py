@@ -1,0 +1,93 @@
+"""The frame of the project: license, version, and the pages for those who change it."""
+
+import ast
+import hashlib
+import re
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).resolve().parent.parent
+DISTRIBUTIONS = [ROOT, ROOT / "clients" / "python"]
+PACKAGES = ["api", "attacks", "benchmarks", "enroll", "models", "templates", "verify"]
+# Of the text as the Apache Software Foundation publishes it.
+APACHE_2_0 = "cfc7749b96f63bd31c3c42b5c471bf756814053e847c10f3eb003417bc523d30"
+FRAME = ["LICENSE", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "docs/method.md"]
+CONTRIBUTING = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+TARGETS = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.M))
+CI = (ROOT / ".ci" / "run").read_text()
+
+
+def project(folder: Path) -> dict[str, Any]:
+    """The table ``project`` of a distribution."""
+    table: dict[str, Any] = tomllib.loads((folder / "pyproject.toml").read_text())["project"]
+    return table
+
+
+@pytest.mark.parametrize("folder", DISTRIBUTIONS, ids=lambda folder: str(folder.name))
+def test_each_distribution_carries_the_whole_license(folder: Path) -> None:
+    stated = project(folder)
+    assert (stated["license"], stated["license-files"]) == ("Apache-2.0", ["LICENSE"])
+    # PEP 639: an expression stands alone, without the older classifiers.
+    assert not [name for name in stated.get("classifiers", []) if name.startswith("License ::")]
+    assert hashlib.sha256((folder / "LICENSE").read_bytes()).hexdigest() == APACHE_2_0
+
+
+def test_no_module_states_the_version_again() -> None:
+    version = project(ROOT)["version"]
+    again = [
+        f"{path.relative_to(ROOT)}:{node.lineno}"
+        for package in PACKAGES
+        for path in (ROOT / package).rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Constant) and node.value == version
+    ]
+    assert again == []
+
+
+@pytest.mark.parametrize("page", FRAME)
+def test_the_readme_leads_to_the_page(page: str) -> None:
+    assert (ROOT / page).is_file()
+    assert f"]({page})" in (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def test_the_hooks_run_what_ci_runs_and_fetch_nothing() -> None:
+    config = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())
+    assert [entry["repo"] for entry in config["repos"]] == ["local"]
+    (hooks,) = (entry["hooks"] for entry in config["repos"])
+    assert {hook["entry"] for hook in hooks} == {"make lint", "make types"}
+    for hook in hooks:
+        assert hook["language"] == "system"
+        assert hook["entry"].removeprefix("make ") in TARGETS
+        assert re.search(rf"^{hook['entry']}$", CI, re.M)
+
+
+def test_contributors_are_told_what_exists() -> None:
+    block = re.search(r"```sh\n(.*?)```", CONTRIBUTING, re.S)
+    assert block is not None
+    commands = set(block[1].splitlines()) | set(re.findall(r"`(make [a-z-]+)`", CONTRIBUTING))
+    assert {command.removeprefix("make ") for command in commands} <= TARGETS
+    tests = "".join(
+        path.read_text(encoding="utf-8")
+        for path in (ROOT / "tests").rglob("*.py")
+        if path != Path(__file__)
+    )
+    variables = set(re.findall(r"\bVEILFACE_[A-Z_]+", CONTRIBUTING))
+    assert variables
+    assert [name for name in variables if f'"{name}"' not in tests] == []
+    for name in re.findall(r"`(tests/[\w./]+|templates\.[\w.]+)`", CONTRIBUTING):
+        file = name if name.endswith(".py") else f"{name.replace('.', '/')}.py"
+        assert (ROOT / file).exists()
+
+
+def test_the_changelog_has_the_form_that_it_names() -> None:
+    text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    versions = re.findall(r"^## (.*)$", text, re.M)
+    assert versions[0] == "[Unreleased]"
+    assert all(re.fullmatch(r"\[\d+\.\d+\.\d+\] - \d{4}-\d\d-\d\d", name) for name in versions[1:])
+    kinds = set(re.findall(r"^### (.*)$", text, re.M))
+    assert kinds
+    assert kinds <= {"Added", "Changed", "Deprecated", "Removed", "Fixed", "Security"}

@@ -1,0 +1,144 @@
+"""Every reference to a section leads to one that exists.
+
+- ``docs/method.md §4.7``: a numbered section of a page. Further ones follow by "and", "to" or a
+  comma.
+- ``§4.7`` alone: a section of the page that it stands in.
+- ``docs/rest.md "Signed probes"``: a heading of a page.
+- ``paper §4.3``: the paper that ``docs/method.md`` names.
+- ``RFC 9110 §15``, ``NIST SP 800-38D §8.3``, ``ISO/IEC 24745 §6``: other documents; not looked up.
+"""
+
+import io
+import re
+import tokenize
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+PAPER = {"1", "2", "3", "3.1", "3.2", "4", "4.1", "4.2", "4.3", "5", "6"}
+PAGE = r"(?:docs/)?(?P<page>[\w-]+)\.md"
+ELSEWHERE = r"RFC \d+|NIST SP [\w-]+|ISO/IEC [\d:-]+"
+SOURCE = rf"{PAGE}|(?P<paper>[Pp]aper)|(?P<elsewhere>{ELSEWHERE})"
+REFERENCE = re.compile(
+    rf"(?:(?P<source>{SOURCE}) |(?P<further>,? (?:and|to) |, ))?§(?P<number>\d[\d.]*\b|)"
+)
+# Documents that the code was written from, and that no reader of the repository has.
+NOT_HERE = re.compile(r"\b(?:METHOD|PRODUCT|FORMATS|STYLE)\b")
+
+
+def files() -> list[Path]:
+    """Sources and pages of the repository, without environments and caches."""
+    tops = [path for path in ROOT.iterdir() if not path.name.startswith(".") or path.name == ".ci"]
+    below = [path for top in tops if top.is_dir() for path in top.rglob("*")]
+    named = [path for path in (*tops, *below) if path.suffix in (".py", ".md")]
+    return sorted(path for path in named if path != Path(__file__))
+
+
+def joined(text: str) -> str:
+    """The text in one line, so that a reference may be wrapped, in a comment too."""
+    return re.sub(r"\s*\n\s*(?:# ?)?", " ", text)
+
+
+def headings(page: Path) -> list[str]:
+    """Headings of a page, without backticks."""
+    lines = page.read_text(encoding="utf-8").splitlines() if page.exists() else []
+    return [line.lstrip("#").strip().replace("`", "") for line in lines if line.startswith("#")]
+
+
+def numbers(page: Path) -> set[str]:
+    """Numbers of the sections of a page."""
+    found = (re.match(r"(\d+(?:\.\d+)*)\.? ", heading) for heading in headings(page))
+    return {number[1] for number in found if number}
+
+
+def unresolved(text: str, own: Path, docs: Path) -> Iterator[str]:
+    """References of a text that lead nowhere; ``own`` is where it stands."""
+    text = joined(text)
+    source: re.Match[str] | None = None
+    end = -1
+    for match in REFERENCE.finditer(text):
+        # One that only goes on has the source of the one before it.
+        if source is None or not match["further"] or end != match.start():
+            source = match
+        end = match.end()
+        number = match["number"].rstrip(".")
+        if source["page"]:
+            known = number in numbers(docs / f"{source['page']}.md")
+        elif source["paper"]:
+            known = number in PAPER
+        elif source["elsewhere"]:
+            known = bool(number)
+        else:
+            known = number in numbers(own) and own.suffix == ".md"
+        if not known:
+            yield text[max(0, match.start() - 30) : match.end()]
+    for match in re.finditer(r'docs/([\w-]+)\.md "([^"]+)"', text):
+        if match[2] not in headings(docs / f"{match[1]}.md"):
+            yield match[0]
+
+
+def prose(path: Path) -> Iterator[str]:
+    """What people read of a file: all of a page, comments and strings of a source."""
+    text = path.read_text(encoding="utf-8")
+    if path.suffix == ".md":
+        yield text
+        return
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        if token.type in (tokenize.COMMENT, tokenize.STRING):
+            yield token.string
+
+
+def test_every_reference_resolves() -> None:
+    listed = files()
+    assert len(listed) > 300
+    wrong = {
+        str(path.relative_to(ROOT)): missing
+        for path in listed
+        if (missing := [*unresolved(path.read_text(encoding="utf-8"), path, ROOT / "docs")])
+    }
+    assert wrong == {}
+
+
+def test_no_document_is_named_that_is_not_here() -> None:
+    named = [
+        f"{path.relative_to(ROOT)}: {text[:80]}"
+        for path in files()
+        for text in prose(path)
+        if NOT_HERE.search(text)
+    ]
+    assert named == []
+
+
+@pytest.mark.parametrize(
+    ("text", "missing"),
+    [
+        ("docs/page.md §1", 0),
+        ("docs/page.md §1.2 and §2, §1", 0),
+        ("[page.md §1.2](page.md#12-a)", 0),
+        ("# as docs/page.md\n# §1.2. It", 0),
+        ("paper §4.3; NIST SP 800-38D §8.3; RFC 9110 §15.5.1", 0),
+        ('docs/page.md "The last"', 0),
+        ("docs/page.md §3", 1),
+        ("docs/page.md §1 to §1.3", 1),
+        ("docs/gone.md §1", 1),
+        ("METHOD §1", 1),
+        ("§1", 1),
+        ("see §1, of docs/page.md §", 2),
+        ("paper §4.4", 1),
+        ("docs/page.md §1 in full, §2", 1),
+        ('docs/page.md "The first"', 1),
+    ],
+)
+def test_what_is_planted_is_found(text: str, missing: int, tmp_path: Path) -> None:
+    (tmp_path / "page.md").write_text(
+        "# Page\n\n## 1. One\n\n### 1.2 Two\n\n## 2. Two\n\n## The `last`\n"
+    )
+    assert len([*unresolved(text, tmp_path / "source.py", tmp_path)]) == missing
+
+
+def test_a_page_may_name_its_own_sections(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("## 1. One\n\nSee [§1](#1-one) and §2.\n")
+    assert len([*unresolved(page.read_text(), page, tmp_path)]) == 1

@@ -1,0 +1,86 @@
+"""A population of nobody whose descriptors are spread as faces' are: few long axes, many short."""
+
+import functools
+
+import numpy as np
+from numpy.typing import NDArray
+
+from templates.contract import Binding, Contract
+from templates.decoys import DecoyGenerator
+from templates.distances import DEFAULT_STEPS, Metric
+from templates.lifting import Strategy, lift
+from templates.randomness import Keystream
+from templates.rotation import ROTATION_VERSION
+from templates.subspace import SubspaceBatch
+from verify import CalibrationOptions, calibrate
+from verify.cohort import make_cohort, people_like
+from verify.strangers import make_nobody
+
+N, M = 64, 8
+PHOTOS = 3
+PEOPLE = 400
+Floats = NDArray[np.float32]
+
+
+def unit(rows: NDArray[np.floating]) -> Floats:
+    return (rows / np.linalg.norm(rows, axis=-1, keepdims=True)).astype(np.float32)
+
+
+def photos_of(people: int, photos: int, *, seed: int) -> Floats:
+    """(people, photos, N) unit descriptors; another seed is other people."""
+    rng = np.random.default_rng([11, seed])
+    axes = np.linalg.qr(np.random.default_rng(11).normal(size=(N, N)))[0]
+    deviations = np.arange(1, N + 1) ** -0.5
+    middle = 1.2 * axes[3] + 0.5 * axes[40]
+    persons = middle + (rng.normal(size=(people, 1, N)) * deviations) @ axes
+    return unit(persons + 0.35 * (rng.normal(size=(people, photos, N)) * deviations) @ axes)
+
+
+def enrolled(people: int, *, seed: int) -> Floats:
+    """Means of the photos of people, as they are enrolled, (people, N)."""
+    return unit(photos_of(people, PHOTOS, seed=seed).mean(axis=1))
+
+
+@functools.cache
+def decoys() -> DecoyGenerator:
+    return DecoyGenerator.fit(photos_of(800, 1, seed=1)[:, 0])
+
+
+def templates_of(descriptors: Floats, *, seed: int) -> SubspaceBatch:
+    with Keystream.seeded("population", seed) as stream:
+        return lift(descriptors, strategy=Strategy.ADVERSARIAL, m=M, source=decoys(), stream=stream)
+
+
+@functools.cache
+def contract() -> Contract:
+    """A contract, calibrated as `veilface calibrate` does; its secrets are drawn of a seed."""
+    hidden = people_like(decoys(), enrolled(PEOPLE, seed=2))
+    with Keystream.seeded("population", "secrets") as stream:
+        cohort = make_cohort(
+            decoys(), strategy=Strategy.ADVERSARIAL, m=M, stream=stream, hidden=hidden
+        )
+        nobody = make_nobody(
+            decoys(),
+            strangers=(hidden,),
+            cohort=cohort,
+            metric=Metric.SPHERICAL,
+            steps=DEFAULT_STEPS,
+            stream=stream,
+        )
+    return calibrate(
+        photos_of(PEOPLE, PHOTOS + 1, seed=2).reshape(-1, N),
+        [f"p{i}" for i in range(PEOPLE) for _ in range(PHOTOS + 1)],
+        binding=Binding(
+            embedder_sha256="ab" * 32,
+            preprocessing={"size": 112},
+            n=N,
+            strategy=Strategy.ADVERSARIAL,
+            m=M,
+            decoy_source_id=decoys().source_id,
+            rotation_version=ROTATION_VERSION,
+        ),
+        source=decoys(),
+        cohort=cohort,
+        nobody=nobody,
+        options=CalibrationOptions(targets=(1e-2, 1e-3), most_cells=100_000),
+    ).contract

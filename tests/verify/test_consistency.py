@@ -1,0 +1,53 @@
+"""The limit on photos of one enrollment: what it refuses, and whom it lets through."""
+
+import numpy as np
+import pytest
+
+from templates.agreement import weakest_split
+from templates.errors import ContractError
+from tests.verify.synthetic import People, draw_people
+from verify.consistency import Consistency, photo_consistency
+
+
+def limit(people: People, *, photos: int = 3, seed: int = 0) -> Consistency:
+    person_of = np.unique(people.names, return_inverse=True)[1]
+    rng = np.random.default_rng(seed)
+    return photo_consistency(people.descriptors, person_of, photos=photos, rng=rng)
+
+
+def test_genuine_sets_of_new_people_are_refused_as_rarely_as_it_says() -> None:
+    found = limit(draw_people(400, n=256, photos=(5,), noise=1.5, seed=1))
+    others = draw_people(400, n=256, photos=(3,), noise=1.5, seed=2).descriptors
+    others = others.reshape(400, 3, 256)
+    refused = np.mean([weakest_split(rows).agreement < found.threshold for rows in others])
+    assert found.refused.trials == 4000
+    assert found.refused.value <= 0.02
+    assert refused <= 0.04
+    assert found.match_cosine < found.threshold
+
+
+def test_mislabelled_photos_do_not_lower_it_below_what_strangers_reach() -> None:
+    people = draw_people(200, photos=(3,), noise=0.5, seed=3)
+    mislabelled = People(people.descriptors.copy(), people.names)
+    wrong = np.arange(0, 60, 3)  # of 20 people, a tenth
+    mislabelled.descriptors[wrong] = people.descriptors[wrong + 300]
+    assert limit(people).threshold > limit(mislabelled).threshold
+    assert limit(mislabelled).threshold == pytest.approx(limit(mislabelled).match_cosine)
+
+
+def test_strangers_set_it_where_photos_of_one_person_are_all_alike() -> None:
+    """Photos a second apart would ask for more than another day's photo of the person gives."""
+    people = draw_people(200, n=256, photos=(3,), noise=0.1, seed=4)
+    found = limit(people)
+    # Cosines of independent unit vectors are Gaussian with variance 1 / n: 4.75 deviations at 1e-6.
+    assert found.threshold == pytest.approx(4.75 / 16, rel=0.25)
+    assert found.refused.errors == 0
+
+
+def test_a_photo_that_everybody_has_only_once_gives_no_limit() -> None:
+    with pytest.raises(ContractError, match="two photos"):
+        limit(draw_people(20, photos=(1,)))
+
+
+def test_people_with_two_photos_do_where_nobody_has_three() -> None:
+    assert limit(draw_people(50, photos=(2,), noise=0.5)).refused.trials == 500

@@ -1,0 +1,82 @@
+"""Decoys of the very people of a calibration are found; decoys of others never are."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from templates.decoys import DecoyGenerator, DecoyPool
+from templates.errors import ContractError
+from tests.verify.synthetic import People, draw_people, unit
+from verify.own_decoys import memory, require_others
+
+
+def uneven(people: People, *, power: float = 0.5) -> People:
+    """The same people with variances that fall along the axes, as those of faces do."""
+    scale = np.arange(1, people.descriptors.shape[1] + 1) ** -power
+    return People(unit(people.descriptors * scale), people.names)
+
+
+def drawn(count: int, *, photos: int = 4, seed: int = 0, power: float = 0.5) -> People:
+    return uneven(draw_people(count, photos=(photos,), n=128, noise=0.8, seed=seed), power=power)
+
+
+def part(people: People, share: NDArray[np.bool_]) -> People:
+    return People(
+        people.descriptors[share], [n for n, s in zip(people.names, share, strict=True) if s]
+    )
+
+
+def refused(source: DecoyGenerator | DecoyPool, people: People) -> str | None:
+    try:
+        require_others(source, people.descriptors, people.names)
+    except ContractError as error:
+        return str(error)
+    return None
+
+
+@pytest.mark.parametrize("count", [30, 100, 500])
+def test_a_generator_of_these_people_is_refused(count: int) -> None:
+    people = drawn(count)
+    said = refused(DecoyGenerator.fit(people.descriptors), people)
+    assert said is not None
+    assert "made of the photos of these people" in said
+    assert "Build the decoys from other people's photos" in said
+
+
+@pytest.mark.parametrize("count", [100, 500, 2000])
+@pytest.mark.parametrize("calibrated", [20, 80, 300])
+@pytest.mark.parametrize("power", [0.3, 0.5, 0.6])
+def test_a_generator_of_others_is_not(count: int, calibrated: int, power: float) -> None:
+    """Of the same kind and of others, small and large sets, fewer faces than dimensions too."""
+    source = DecoyGenerator.fit(drawn(count, photos=1, seed=1).descriptors)
+    assert refused(source, drawn(calibrated, seed=2, power=power)) is None
+
+
+def test_a_part_of_the_people_of_the_fit_is_refused_where_faces_are_few() -> None:
+    people = drawn(100)
+    source = DecoyGenerator.fit(people.descriptors)
+    first = np.array(people.names) < people.names[4 * 30]
+    assert refused(source, part(people, first)) is not None
+
+
+def test_people_of_the_fit_do_not_correlate_along_its_axes() -> None:
+    """The axes are the eigenvectors of their covariance; by chance the measure is 1."""
+    people, others = drawn(200), drawn(200, photos=1, seed=3)
+    statistics = DecoyGenerator.fit(people.descriptors).statistics
+    assert memory(statistics, people.descriptors).correlation < 0.01
+    assert memory(statistics, others.descriptors).correlation > 1.0
+
+
+def test_a_pool_that_holds_the_people_is_refused_by_other_photos_of_them_too() -> None:
+    people = drawn(100)
+    even = np.arange(len(people.names)) % 2 == 0
+    said = refused(DecoyPool(part(people, even).descriptors), part(people, ~even))
+    assert said is not None
+    assert "the decoy pool seems to hold" in said
+    assert refused(DecoyPool(drawn(400, seed=5).descriptors), people) is None
+
+
+def test_one_acquaintance_in_a_pool_is_no_reason() -> None:
+    people = drawn(100)
+    entries = np.concatenate([drawn(400, seed=5).descriptors, people.descriptors[:1]])
+    assert refused(DecoyPool(entries), people) is None

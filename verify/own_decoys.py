@@ -1,0 +1,139 @@
+"""Whether decoys were made of the very people that a calibration measures.
+
+Such decoys resemble the enrolled people more than those of a deployment resemble its users: the
+calibration then measures something that nobody will see. A generator holds no descriptor and names
+nobody, but its axes and their variances fit the faces that it was made of better than any others.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from templates.decoys import DecoyGenerator, DecoyPool, DecoySource
+from templates.decoys.statistics import DescriptorStatistics
+from templates.errors import ContractError
+from verify.consistency import LAXEST_FMR, impostor_tail
+from verify.evaluation.attributes import resembling_rows
+from verify.raw_pairs import impostor_cosines
+
+LEAST_DEVIATIONS = 4
+"""Standard deviations below chance from which on axes correlate too little."""
+LEAST_ENERGY = 0.6
+"""Faces of one kind seen on axes of another, also of one gender, race and age, have more."""
+MOST_PEOPLE = 0.02
+SAME_PHOTO = 0.999
+"""Cosine of a photo to itself, encoded again."""
+
+_REMEDY = (
+    "such a calibration says nothing about people who are not among the decoys. Build the decoys "
+    "from other people's photos of the same kind, or leave these people out (`decoys build "
+    "--exclude`, `calibrate --exclude-people`)"
+)
+
+
+@dataclass(frozen=True)
+class Memory:
+    """How descriptors look in a generator's coordinates; both are low for those of its fit.
+
+    Parameters
+    ----------
+    correlation
+        Mean squared correlation of two axes, times the number of descriptors. The axes are those
+        along which the descriptors of the fit do not correlate at all; those of other people
+        correlate by chance alone to 1, of several photos each or of another kind to more.
+    least
+        What chance alone reaches all but surely.
+    energy
+        Mean square on the axes of the third quarter, by the generator's own variance there. That
+        variance was estimated on descriptors that had no part in the axes, so that it is 1 for new
+        people of the same kind, and more for most of another. Along the axes of the fit, which
+        were chosen for having little, its own descriptors have less.
+    """
+
+    correlation: float
+    least: float
+    energy: float
+
+
+def memory(statistics: DescriptorStatistics, descriptors: NDArray[np.floating]) -> Memory:
+    """Measure what a generator remembers of (N, n) unit descriptors."""
+    axes = statistics.axes.astype(np.float64)
+    deviations = np.maximum(np.linalg.norm(axes, axis=1), 1e-12)
+    centred = np.asarray(descriptors, dtype=np.float64) - statistics.mean
+    scores = centred @ (axes / deviations[:, None] ** 2).T
+    n = statistics.n
+    energy = float(np.mean(scores[:, n // 2 : 3 * n // 4] ** 2))
+    # The leading axes carry clusters, such as gender, which correlate in any part of the people.
+    scores = scores[:, n // 4 :]
+    scores -= scores.mean(axis=0)
+    scores /= np.maximum(np.linalg.norm(scores, axis=0), 1e-12)
+    squares = (scores.T @ scores) ** 2
+    pairs = squares.shape[0] * (squares.shape[0] - 1)
+    between = float(squares.sum() - np.trace(squares)) / pairs
+    # Of each unordered pair, a square of variance 2 where the mean is 1.
+    least = 1 - LEAST_DEVIATIONS * float(np.sqrt(2 / (pairs / 2)))
+    return Memory(correlation=len(scores) * between, least=least, energy=energy)
+
+
+def require_others(
+    source: DecoySource, descriptors: NDArray[np.float32], identities: Sequence[str]
+) -> None:
+    """Refuse decoys that were made of the people who are to be calibrated on.
+
+    Parameters
+    ----------
+    source
+        A generator, or a pool.
+    descriptors, identities : (N, n) float32 unit rows, N names
+        Of the calibration, without those that are left out of it.
+
+    Raises
+    ------
+    ContractError
+        A generator was fitted to these descriptors or most of them, or more than one in fifty
+        people have a pool entry that is as alike as two photos of one person are. Also where there
+        are no two people to compare.
+
+    Notes
+    -----
+    docs/decoys.md "Decoys of the people themselves" has the measurements behind the limits.
+    """
+    names, person = np.unique(np.asarray(identities, dtype=np.str_), return_inverse=True)
+    firsts = np.unique(person, return_index=True)[1]
+    if isinstance(source, DecoyGenerator):
+        seen = [memory(source.statistics, rows) for rows in (descriptors, descriptors[firsts])]
+        unmixed = any(each.correlation < each.least for each in seen)
+        if unmixed or seen[0].energy < LEAST_ENERGY:
+            raise ContractError(
+                "the decoys were made of the photos of these people, or of most of them: " + _REMEDY
+            )
+    elif isinstance(source, DecoyPool):
+        likeness = _likeness(descriptors, person, entries=len(source))
+        rows = resembling_rows(descriptors, source.entries[0], cosine=likeness)
+        known = len(np.unique(person[rows]))
+        if known > max(1, MOST_PEOPLE * len(names)):
+            raise ContractError(
+                f"the decoy pool seems to hold {known} of these {len(names)} people: {_REMEDY}"
+            )
+
+
+def _likeness(
+    descriptors: NDArray[np.float32], person: NDArray[np.int64], *, entries: int
+) -> float:
+    """Cosine from which on a pool entry is taken for a photo of a person of the calibration.
+
+    The median cosine of two photos of one person, or more where strangers are so alike that one
+    person in a hundred would have such an entry by chance.
+    """
+    order = np.argsort(person, kind="stable")
+    same = person[order][1:] == person[order][:-1]
+    pairs = order[:-1][same], order[1:][same]
+    genuine = np.einsum("ij,ij->i", descriptors[pairs[0]], descriptors[pairs[1]])
+    tail = impostor_tail(
+        impostor_cosines(descriptors, person, rng=np.random.default_rng(0)), lax_fmr=LAXEST_FMR
+    )
+    tries = entries * len(descriptors) / (person.max() + 1)
+    chance = min(tail.at(MOST_PEOPLE / 2 / tries), SAME_PHOTO)
+    return max(float(np.median(genuine)) if len(genuine) else SAME_PHOTO, chance)
