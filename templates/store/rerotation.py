@@ -12,9 +12,9 @@ taken before, with its rotation key and master key, keeps what it had.
 
 Each move rounds to the stored precision once more. In half precision at n = 512 and m = 16 the
 distance of a probe to the template then differs from the one before by 1.3·10⁻⁵ in the root mean
-square, and by 6·10⁻⁵ at most over 8,000 pairs (``tests/templates/store/test_rerotation.py``): as
-much as the first rounding costs. They add up like independent errors: after three moves the
-distance is 2.7·10⁻⁵ from that to the template before any rounding.
+square, and by 8·10⁻⁵ at most over 400,000 pairs: as much as the first rounding costs
+(``tests/templates/store/test_rerotation.py``). They add up like independent errors: after three
+moves the distance is 2.6·10⁻⁵ from that to the template before any rounding.
 """
 
 import time
