@@ -23,8 +23,8 @@ from pydantic_settings import (
     TomlConfigSettingsSource,
 )
 
-from api.errors import StartError
-from templates.levels import LEVEL_NAME
+from api.http.errors import StartError
+from templates.contract.levels import LEVEL_NAME
 
 ENV_PREFIX = "VEILFACE_"
 CONFIG_VARIABLE = "VEILFACE_CONFIG"

@@ -22,8 +22,8 @@ from attacks.recovery import fmr_of
 from attacks.scene import Scene
 from attacks.stored.nearest_neighbour import nearest_points
 from attacks.stored.presentation import honest_embedding, points_inside
-from templates.randomness import Keystream
-from templates.subspace import SubspaceBatch
+from templates.keys.randomness import Keystream
+from templates.space.subspace import SubspaceBatch
 from verify.comparisons import through_wire
 from verify.metrics import rate
 

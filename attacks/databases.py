@@ -16,8 +16,8 @@ from attacks.linkage import linkage_outcome, nearest_similarities, secret_rotati
 from attacks.outcomes import Knowledge, Outcome
 from attacks.scene import Scene
 from attacks.unlinkability import unlinkability
-from templates.randomness import Keystream
-from templates.subspace import SubspaceBatch
+from templates.keys.randomness import Keystream
+from templates.space.subspace import SubspaceBatch
 from verify.cohort import client_source
 
 ACCOUNTS = (0, 10, 30, 100)

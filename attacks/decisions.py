@@ -5,9 +5,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from templates.contract import Calibration, Contract, Level
+from templates.contract.document import Calibration, Contract, Level
 from templates.distances import paired_distances, pairwise_distances, similarity
-from templates.subspace import SubspaceBatch
+from templates.space.subspace import SubspaceBatch
 from verify.cohort import Probes, cohort_statistics
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from attacks.errors import AuditError
 from attacks.outcomes import GENERATED, Knowledge, Scheme
-from templates.canonical import Json
+from templates.contract.canonical import Json
 from verify.evaluation.row_labels import datasets_of, preferred_metric, raw_row
 
 Row = Mapping[str, Any]

@@ -18,9 +18,9 @@ from attacks.outcomes import Knowledge, Outcome, Property, Scheme
 from attacks.recovery import fmr_of
 from attacks.rehearsal import Floats, Prior
 from attacks.scene import Scene
-from templates.contract import Level
+from templates.contract.document import Level
 from templates.distances import pairwise_distances, similarity
-from templates.subspace import SubspaceBatch
+from templates.space.subspace import SubspaceBatch
 from verify.metrics import rate
 
 LOCKOUTS = (5, 50)

@@ -18,11 +18,11 @@ from attacks.outcomes import Knowledge, Outcome
 from attacks.recovery import recovery_outcome
 from attacks.scene import Scene
 from attacks.stored.face_statistics import FaceStatistics
-from templates.contract import Rate
+from templates.contract.document import Rate
 from templates.decoys import DecoySource
-from templates.lifting import Strategy, lift
-from templates.randomness import Keystream
-from templates.subspace import SubspaceBatch
+from templates.keys.randomness import Keystream
+from templates.space.lifting import Strategy, lift
+from templates.space.subspace import SubspaceBatch
 from verify.cohort import client_source, plain_strategy
 from verify.metrics import rate
 

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from attacks.outcomes import Knowledge, Outcome, Property
 from attacks.scene import Scene
 from attacks.unlinkability import Unlinkability, unlinkability
-from templates.canonical import Json
+from templates.contract.canonical import Json
 from templates.distances import Metric, pairwise_distances, similarity
-from templates.randomness import KEY_BYTES, Keystream
-from templates.rotation import tenant_rotation
-from templates.subspace import SubspaceBatch
+from templates.keys.randomness import KEY_BYTES, Keystream
+from templates.keys.rotation import tenant_rotation
+from templates.space.subspace import SubspaceBatch
 
 LIFTINGS = 4
 """Times that every victim is lifted for both tenants, with other decoys and other keys."""

@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, TypeAlias
 
-from templates.canonical import Json
-from templates.levels import Rate
+from templates.contract.canonical import Json
+from templates.contract.levels import Rate
 
 
 class Property(StrEnum):
@@ -55,7 +55,7 @@ class Scheme:
     Parameters
     ----------
     strategy
-        A ``templates.lifting.Strategy``, or ``raw``.
+        A ``templates.space.lifting.Strategy``, or ``raw``.
     decoys
         ``pool`` or ``generator``; None where the strategy takes none.
     dim

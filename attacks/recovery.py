@@ -10,8 +10,8 @@ from attacks.cast import Person
 from attacks.decisions import score
 from attacks.outcomes import Knowledge, Outcome, Property
 from attacks.scene import Scene
-from templates.canonical import Json
-from templates.contract import Level, Rate
+from templates.contract.canonical import Json
+from templates.contract.document import Level, Rate
 from verify.metrics import rate
 
 

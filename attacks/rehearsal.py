@@ -13,7 +13,7 @@ from attacks.errors import AuditError
 from attacks.recovery import fmr_of
 from attacks.scene import Scene
 from templates.distances import Metric, pairwise_distances, similarity
-from templates.subspace import SubspaceBatch
+from templates.space.subspace import SubspaceBatch
 
 REHEARSALS = 400
 MOST_FACES = 1500

@@ -27,9 +27,9 @@ from attacks.stored.presentation import (
     honest_lift,
     points_inside,
 )
-from templates.contract import Calibration
-from templates.rotation import rotate
-from templates.subspace import SubspaceBatch
+from templates.contract.document import Calibration
+from templates.keys.rotation import rotate
+from templates.space.subspace import SubspaceBatch
 from verify.cohort import Probes
 from verify.metrics import rate
 

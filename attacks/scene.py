@@ -9,16 +9,16 @@ from numpy.typing import NDArray
 from attacks.cast import ENROLLED_PHOTOS, Cast, Person
 from attacks.errors import AuditError
 from attacks.outcomes import POOLED, Scheme
-from templates.canonical import Json
-from templates.contract import Binding, Calibration, Contract, Level
+from templates.contract.canonical import Json
+from templates.contract.document import Binding, Calibration, Contract, Level
+from templates.contract.nobody import Nobody
 from templates.decoys import DecoyPool, DecoySource
 from templates.distances import DEFAULT_STEPS, Metric
 from templates.errors import Uncalibrated
-from templates.lifting import Strategy
-from templates.nobody import Nobody
-from templates.randomness import Keystream
-from templates.rotation import ROTATION_VERSION
-from templates.subspace import SubspaceBatch
+from templates.keys.randomness import Keystream
+from templates.keys.rotation import ROTATION_VERSION
+from templates.space.lifting import Strategy
+from templates.space.subspace import SubspaceBatch
 from verify import CalibrationOptions, calibrate
 from verify.cohort import client_source, make_cohort, people_like
 from verify.comparisons import Lifter

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from attacks.errors import AuditError
 from attacks.outcomes import Estimate
-from templates.canonical import Json
+from templates.contract.canonical import Json
 
 MOST_BINS = 100
 SCORES_PER_BIN = 10

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from attacks.outcomes import Knowledge, Outcome, Property, Scheme
-from templates.canonical import Json
+from templates.contract.canonical import Json
 
 
 class Status(StrEnum):

@@ -35,8 +35,8 @@ from models.extraction import Extractor
 from models.pack import ModelPack
 from templates.decoys import DecoyGenerator
 from templates.distances import Metric, count_within, pairwise_distances, similarity, warm_up
-from templates.lifting import Strategy, lift
-from templates.subspace import SubspaceBatch
+from templates.space.lifting import Strategy, lift
+from templates.space.subspace import SubspaceBatch
 from verify import labelled_folder
 
 _THRESHOLDS = 40

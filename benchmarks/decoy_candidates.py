@@ -18,7 +18,7 @@ from sklearn.mixture import GaussianMixture
 from templates.decoys import Attributes, DecoyGenerator, DecoyPool, DecoySource
 from templates.decoys.fitting import cross_fitted, mixture_features, principal_axes
 from templates.decoys.statistics import DescriptorStatistics
-from templates.randomness import Keystream
+from templates.keys.randomness import Keystream
 
 Array = npt.NDArray[np.float64]
 Sampler = Callable[[int, np.random.Generator], Array]

@@ -31,8 +31,8 @@ from models.extraction import Extractor
 from models.pack import ModelPack
 from templates.decoys import DecoyGenerator, DecoySource
 from templates.distances import paired_distances, pairwise_distances, similarity
-from templates.lifting import Strategy, lift
-from templates.randomness import Keystream
+from templates.keys.randomness import Keystream
+from templates.space.lifting import Strategy, lift
 from verify.datasets import read_lfw_pairs
 from verify.metrics import fnmr_at_fmr
 from verify.tenfold import Pair, pair_arrays, ten_fold

@@ -19,7 +19,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from api.distance_bench import (
+from api.cli.distance_bench import (
     Question,
     Row,
     face_like,
@@ -30,7 +30,7 @@ from api.distance_bench import (
 from templates import euclidean, spherical
 from templates.crossgram import Kind
 from templates.distances import DEFAULT_STEPS, Metric
-from templates.randomness import Keystream
+from templates.keys.randomness import Keystream
 from verify.evaluation.units import Mode
 
 _SLICE = 100

@@ -34,11 +34,11 @@ from benchmarks.deployment import database, service, veilface
 from models.cache import EmbeddingCache
 from models.extraction import Extractor
 from models.pack import FacePolicy, ModelPack
+from templates.contract.wire import encode
 from templates.decoys import DecoyGenerator
-from templates.lifting import Strategy, lift
-from templates.probe_signature import signed_probe
-from templates.sealing import KeyringSealer, MasterKeyring
-from templates.wire import encode
+from templates.keys.probe_signature import signed_probe
+from templates.keys.sealing import KeyringSealer, MasterKeyring
+from templates.space.lifting import Strategy, lift
 from verify.datasets import labelled_folder
 from verify.metrics import wilson
 

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from templates.distances import Metric, pairwise_distances, similarity
-from templates.subspace import SubspaceBatch
+from templates.space.subspace import SubspaceBatch
 from templates.tensors import SubspaceTensors, nearest, pairwise
 from templates.tensors.subspaces import fused, ieee_products, stacked, tile_bytes
 

@@ -27,13 +27,13 @@ from attacks.stored.wolves import axis_wolves
 from models.cache import EmbeddingCache
 from models.extraction import Extractor
 from models.pack import ModelPack
-from templates.contract import Binding, Contract
+from templates.contract.document import Binding, Contract
 from templates.decoys import DecoyGenerator
-from templates.lifting import Strategy, lift
-from templates.randomness import Keystream
-from templates.rotation import ROTATION_VERSION, tenant_rotation
-from templates.sealing import KeyringSealer, MasterKeyring
-from templates.subspace import SubspaceBatch
+from templates.keys.randomness import Keystream
+from templates.keys.rotation import ROTATION_VERSION, tenant_rotation
+from templates.keys.sealing import KeyringSealer, MasterKeyring
+from templates.space.lifting import Strategy, lift
+from templates.space.subspace import SubspaceBatch
 from verify import CalibrationOptions, calibrate, labelled_folder
 
 ATTACKED = 700

@@ -23,7 +23,7 @@ from models.cache import EmbeddingCache
 from models.extraction import Extractor
 from models.pack import ModelPack
 from templates.decoys import DecoyGenerator, DecoySource
-from templates.sealing import KeyringSealer, MasterKeyring
+from templates.keys.sealing import KeyringSealer, MasterKeyring
 from verify import labelled_folder
 
 VICTIMS, OWNERS = 400, 600

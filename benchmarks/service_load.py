@@ -41,8 +41,8 @@ from benchmarks.end_to_end import LiftingClient, Person, enroll_photos, people_o
 from benchmarks.request_overhead import bare_inference
 from models.decoding import decode_image
 from models.pack import FacePolicy, ModelPack
-from templates.probe_signature import probe_mac
-from templates.store.api_keys import probe_key
+from templates.keys.api_token import probe_key
+from templates.keys.probe_signature import probe_mac
 
 LEVEL = "fmr-1e-3"
 BOUNDARY = "veilface-load"

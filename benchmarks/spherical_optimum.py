@@ -24,9 +24,9 @@ from templates import spherical
 from templates.crossgram import matched_tiles
 from templates.decoys import DecoyGenerator, DecoyPool, DecoySource
 from templates.distances import DEFAULT_STEPS, Metric, paired_distances, similarity
-from templates.lifting import lift
-from templates.randomness import Keystream
-from templates.subspace import SubspaceBatch
+from templates.keys.randomness import Keystream
+from templates.space.lifting import lift
+from templates.space.subspace import SubspaceBatch
 
 _RESTARTS = 64
 _STEPS = 500

@@ -28,13 +28,13 @@ from attacks.stored.wolves import canonical
 from models.cache import EmbeddingCache
 from models.extraction import Extractor
 from models.pack import ModelPack
-from templates.contract import Binding, Contract
+from templates.contract.document import Binding, Contract
+from templates.contract.nobody import TILT
 from templates.decoys import DecoyGenerator
-from templates.lifting import Strategy, lift
-from templates.nobody import TILT
-from templates.randomness import Keystream
-from templates.rotation import ROTATION_VERSION
-from templates.subspace import AffineSubspace, SubspaceBatch
+from templates.keys.randomness import Keystream
+from templates.keys.rotation import ROTATION_VERSION
+from templates.space.lifting import Strategy, lift
+from templates.space.subspace import AffineSubspace, SubspaceBatch
 from verify import CalibrationOptions, calibrate, labelled_folder
 from verify.cohort import cohort_statistics
 

@@ -30,11 +30,11 @@ from enroll import InconsistentImages
 from enroll.enroller import mean_descriptor
 from models.extraction import Extractor
 from models.pack import ModelPack
-from templates.agreement import weakest_split
-from templates.contract import Contract
+from templates.contract.document import Contract
 from templates.decoys import DecoyGenerator
-from templates.lifting import lift
-from templates.randomness import Keystream
+from templates.keys.randomness import Keystream
+from templates.space.agreement import weakest_split
+from templates.space.lifting import lift
 from verify import labelled_folder
 from verify.metrics import rate
 

@@ -17,15 +17,15 @@ from models.decoding import DEFAULT_LIMITS, ImageLimits
 from models.errors import ModelError
 from models.pack import FacePolicy, ModelPack
 from models.quality import DEFAULT_QUALITY, QualityLimits
-from templates import wire
-from templates.agreement import weakest_split
-from templates.contract import Contract
+from templates.contract import wire
+from templates.contract.document import Contract
 from templates.decoys import Attributes, DecoySource
-from templates.embedding import unit_rows
 from templates.errors import ContractMismatch, InvalidTemplate
-from templates.lifting import Strategy, lift
-from templates.randomness import Keystream
-from templates.subspace import AffineSubspace
+from templates.keys.randomness import Keystream
+from templates.space.agreement import weakest_split
+from templates.space.embedding import unit_rows
+from templates.space.lifting import Strategy, lift
+from templates.space.subspace import AffineSubspace
 
 MAX_PHOTOS = 10
 WIRE_DTYPE: wire.WireDtype = "float16"
@@ -255,7 +255,7 @@ def mean_descriptor(rows: NDArray[np.float32], *, consistency: float) -> NDArray
     ------
     InconsistentImages
         Where the rows part into two groups that agree less than ``consistency``
-        (``templates.agreement``), or cancel.
+        (``templates.space.agreement``), or cancel.
     """
     mean = rows.astype(np.float64).mean(axis=0)
     norm = float(np.linalg.norm(mean))

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from templates.distances import DEFAULT_STEPS, Labels, Metric
 from templates.kernels.selection import count_within, keep_nearest
 from templates.rounded import RoundedSubspaces
-from templates.subspace import SubspaceBatch
+from templates.space.subspace import SubspaceBatch
 from templates.tiles import Floats, Probes, fill, paired_tile, traverse, whole
 
 Integers = NDArray[np.int64]

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from templates.errors import InvalidTemplate, LiftingError
-from templates.subspace import SubspaceBatch, span_basis
+from templates.space.subspace import SubspaceBatch, span_basis
 
 _POINT_TILE_BYTES = 4 << 20  # fits the second-level cache, where the squares are summed
 _PAIR_TILE_BYTES = 16 << 20

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from templates import euclidean, spherical
 from templates.crossgram import Floats, Kind
 from templates.errors import InvalidEmbedding, InvalidTemplate, TemplateError
-from templates.subspace import SubspaceBatch, is_finite
+from templates.space.subspace import SubspaceBatch, is_finite
 
 if TYPE_CHECKING:
     from torch import Tensor

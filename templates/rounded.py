@@ -16,7 +16,7 @@ from templates.distances import Metric
 from templates.errors import InvalidEmbedding
 from templates.kernels.lanes import LANES
 from templates.kernels.rounded import squares_inside
-from templates.subspace import SubspaceBatch, is_finite
+from templates.space.subspace import SubspaceBatch, is_finite
 
 _LARGEST = 127
 

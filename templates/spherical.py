@@ -21,7 +21,7 @@ from templates.crossgram import (
     pair_tiles,
     point_tiles,
 )
-from templates.subspace import SubspaceBatch
+from templates.space.subspace import SubspaceBatch
 
 NEAR = 0.1
 """Distances below this are computed again in float64: 2 − 2 sim cancels in float32."""

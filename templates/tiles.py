@@ -32,7 +32,7 @@ from templates.kernels.tiles import (
     spherical_tiles,
     square,
 )
-from templates.subspace import SubspaceBatch
+from templates.space.subspace import SubspaceBatch
 
 Floats = NDArray[np.float32]
 Probes = Floats | SubspaceBatch

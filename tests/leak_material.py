@@ -8,15 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from api.preparation import binding_for
+from api.process.preparation import binding_for
 from models.cache import EmbeddingCache
 from models.decoding import decode_image
 from models.extraction import Extractor
 from models.pack import FacePolicy, ModelPack
 from templates.decoys import DecoyPool
-from templates.lifting import Strategy
-from templates.randomness import Keystream
-from templates.sealing import KeyringSealer, MasterKeyring
+from templates.keys.randomness import Keystream
+from templates.keys.sealing import KeyringSealer, MasterKeyring
+from templates.space.lifting import Strategy
 from verify import CalibrationOptions, calibrate
 from verify.cohort import make_cohort
 

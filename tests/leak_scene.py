@@ -28,11 +28,11 @@ import sqlalchemy as sa
 from numpy.typing import NDArray
 from PIL import Image
 
-from templates.lifting import Strategy, lift
-from templates.rotation import tenant_rotation
-from templates.sealing import MasterKeyring
+from templates.contract.wire import decode, encode
+from templates.keys.rotation import tenant_rotation
+from templates.keys.sealing import MasterKeyring
+from templates.space.lifting import Strategy, lift
 from templates.store import TemplateStore
-from templates.wire import decode, encode
 from tests.api.client import signed
 from tests.leak_material import PEOPLE, PROBE_M, Material, Photo
 from tests.leak_places import (

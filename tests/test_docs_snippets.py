@@ -26,7 +26,7 @@ import typer.main
 import yaml
 
 from api.cli import app
-from api.opening import open_keyring, open_store
+from api.process.opening import open_keyring, open_store
 from api.settings import Settings
 from models.pack_file import read_pack_file
 from templates.store import By
@@ -132,7 +132,7 @@ PARSED = {
     ("docs/measurements.md", "veilface decoys build fairface/train --pack $PACK --kind pool "
      "--out pool.veil"): OWN_DATA,
     ("docs/operations.md", "veilface serve --host 0.0.0.0 --tls-certificate chain.pem "
-     "--tls-key key.pem"): "tests/api/test_operations.py starts a service with TLS",
+     "--tls-key key.pem"): "tests/api/process/test_operations.py starts a service with TLS",
     ("docs/privacy.md", "veilface audit fairface fairface --pack $PACK --lifting 1500 "
      "--attack 3500 --attacked 1500"): OWN_DATA,
 }  # fmt: skip

@@ -51,7 +51,7 @@ def test_no_arrow_goes_up_or_sideways(room: str) -> None:
 
 
 def test_commands_write_no_file_where_a_link_of_somebody_else_leads() -> None:
-    """What a command writes goes through ``templates/private_file.py``."""
+    """What a command writes goes through ``templates/keys/private_file.py``."""
     modules = [
         path
         for folder in ("api/cli", "enroll", "verify", "attacks", "templates/decoys")
@@ -111,7 +111,7 @@ def test_the_floors_are_those_of_the_architecture() -> None:
         ("enroll", "from verify.metrics import wilson", {"verify"}),
         ("enroll", "from templates import wire", set()),
         ("verify", "def f():\n    import api.settings", {"api"}),
-        ("verify", "import importlib\nimportlib.import_module('api.app')", {"api"}),
+        ("verify", "import importlib\nimportlib.import_module('api.http.app')", {"api"}),
         ("attacks", "import enroll, api", {"api"}),
         ("api", "import attacks, enroll, verify, models, templates", set()),
         ("models", "import numpy.api", set()),

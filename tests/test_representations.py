@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from templates.subspace import AffineSubspace, SubspaceBatch
+from templates.space.subspace import AffineSubspace, SubspaceBatch
 from verify.thresholds import Genuine
 
 ROOMS = ("templates", "enroll", "verify", "models")

@@ -6,14 +6,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from templates.canonical import Json
-from templates.contract import Binding, Calibration, Contract
+from templates.contract.canonical import Json
+from templates.contract.document import Binding, Calibration, Contract
+from templates.contract.nobody import Nobody
 from templates.decoys import Attributes, DecoySource
 from templates.errors import ContractError
-from templates.lifting import unit_descriptors
-from templates.nobody import Nobody
-from templates.randomness import Keystream
-from templates.subspace import SubspaceBatch
+from templates.keys.randomness import Keystream
+from templates.space.lifting import unit_descriptors
+from templates.space.subspace import SubspaceBatch
 from verify.calibration_mode import Bench, CalibrationOptions, calibrate_mode
 from verify.cohort import COHORT_SIZE, client_source, make_cohort, people_like, plain_strategy
 from verify.comparisons import Lifter, Progress, honest_norms

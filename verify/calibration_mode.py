@@ -7,13 +7,13 @@ from typing import Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from templates.canonical import Json
-from templates.contract import Calibration, Level
+from templates.contract.canonical import Json
+from templates.contract.document import Calibration, Level
+from templates.contract.nobody import Nobody
 from templates.distances import DEFAULT_STEPS, Metric
 from templates.errors import ContractError
-from templates.nobody import Nobody
-from templates.randomness import Keystream
-from templates.subspace import SubspaceBatch
+from templates.keys.randomness import Keystream
+from templates.space.subspace import SubspaceBatch
 from verify.comparisons import (
     Lifter,
     Progress,

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from templates.decoys import DecoyGenerator, DecoyPool, DecoySource
 from templates.distances import Metric, pairwise_distances, similarity
-from templates.lifting import Strategy, lift
-from templates.randomness import Keystream
-from templates.subspace import SubspaceBatch
+from templates.keys.randomness import Keystream
+from templates.space.lifting import Strategy, lift
+from templates.space.subspace import SubspaceBatch
 
 if TYPE_CHECKING:
     from templates.rounded import RoundedSubspaces

@@ -10,12 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from templates import wire
+from templates.contract import wire
 from templates.decoys import Attributes, DecoySource
 from templates.distances import Metric, paired_distances, pairwise_distances, similarity
-from templates.lifting import Strategy, lift
-from templates.randomness import Keystream
-from templates.subspace import SubspaceBatch
+from templates.keys.randomness import Keystream
+from templates.space.lifting import Strategy, lift
+from templates.space.subspace import SubspaceBatch
 from verify.cohort import Probes, cohort_statistics
 from verify.thresholds import Genuine, Impostors
 from verify.trials import Indices, Plan, impostor_groups

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from templates.agreement import weakest_split
-from templates.contract import Rate
+from templates.contract.document import Rate
 from templates.errors import ContractError
+from templates.space.agreement import weakest_split
 from verify.metrics import most_errors, rate, threshold_at_fmr
 from verify.raw_pairs import impostor_cosines
 
@@ -35,8 +35,8 @@ class Consistency:
     Parameters
     ----------
     threshold
-        Least agreement of the photos of one enrollment (``templates.agreement``); for two photos,
-        their raw cosine.
+        Least agreement of the photos of one enrollment (``templates.space.agreement``); for two
+        photos, their raw cosine.
     fmr
         Pairs of photos of different people that reach it.
     refused

@@ -4,8 +4,8 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from templates.bounded_file import read_at_most
 from templates.errors import VeilfaceError
+from templates.keys.bounded_file import read_at_most
 from verify.tenfold import FOLDS, Pair
 
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp"})

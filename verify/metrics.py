@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtri
 
-from templates.contract import Rate
+from templates.contract.document import Rate
 
 FloatArray = NDArray[np.float64]
 

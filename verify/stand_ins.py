@@ -12,9 +12,9 @@ decoys, as a real person was lifted with fresh decoys, so that
 
 from dataclasses import dataclass, field
 
-from templates.contract import Contract
-from templates.randomness import Keystream
-from templates.subspace import AffineSubspace
+from templates.contract.document import Contract
+from templates.keys.randomness import Keystream
+from templates.space.subspace import AffineSubspace
 from verify.cohort import plain_strategy
 
 

@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm, t
 
+from templates.contract.nobody import Nobody
 from templates.decoys import DecoyGenerator, DecoySource
 from templates.distances import Metric
 from templates.errors import ContractError, DecoyError
-from templates.nobody import Nobody
-from templates.randomness import Keystream
-from templates.subspace import SubspaceBatch
+from templates.keys.randomness import Keystream
+from templates.space.subspace import SubspaceBatch
 from verify.cohort import client_source, cohort_statistics
 
 STRANGERS = 2_000

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from templates.contract import Level, Rate
+from templates.contract.document import Level, Rate
 from templates.errors import ContractError
 from verify.metrics import between, most_errors, resolvable, subject_bootstrap
 

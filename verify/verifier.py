@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 from models.decoding import DEFAULT_LIMITS, ImageLimits
 from models.pack import FacePolicy, ModelPack
 from models.quality import DEFAULT_QUALITY, QualityLimits
-from templates import wire
-from templates.contract import Calibration, Contract, Level
+from templates.contract import wire
+from templates.contract.document import Calibration, Contract, Level
 from templates.distances import Metric, paired_distances, similarity
-from templates.embedding import unit_rows
 from templates.errors import ContractMismatch, InvalidTemplate
-from templates.subspace import AffineSubspace, SubspaceBatch
+from templates.space.embedding import unit_rows
+from templates.space.subspace import AffineSubspace, SubspaceBatch
 from verify.cohort import Probes, cohort_statistics
 from verify.decision import Decision
 from verify.stand_ins import StandIn

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from api.attacked_service import attacked_service
+from api.cli.attacked_service import attacked_service
 from attacks.cast import Cast
 from attacks.chosen_enrollment import chosen_enrollment
 from attacks.databases import link_databases
@@ -27,7 +27,7 @@ from attacks.stored import template_attacks
 from models.decoding import decode_image
 from models.extraction import Extraction
 from models.pack import ModelPack
-from templates import wire
+from templates.contract import wire
 
 PARTS = 10
 """Steps of the progress bar for each scheme."""

@@ -16,7 +16,7 @@ from api.cli.evaluation_inputs import listed, named_file
 from api.cli.fairface import Label, read_labels
 from api.cli.files import read_bounded
 from api.cli.options import AsJson, takes_settings
-from api.preparation import DEFAULT_DIM, acquired_json, recorded_of
+from api.process.preparation import DEFAULT_DIM, acquired_json, recorded_of
 from api.settings import Settings
 from attacks.attribute_outcomes import attribute_outcomes
 from attacks.attributes.attackers import TRAINED
@@ -30,7 +30,7 @@ from attacks.outcomes import GENERATED, Scheme
 from attacks.report import document
 from models.extraction import Extraction
 from models.pack import ModelPack
-from templates.lifting import Strategy
+from templates.space.lifting import Strategy
 from verify.fairface_labels import AGES, GENDERS, RACES
 
 CLASSES = {"gender": GENDERS, "race": RACES, "age": AGES}

@@ -10,9 +10,9 @@ from api.cli.console import emit, message, progress, say
 from api.cli.errors import UsageError
 from api.cli.files import read_bounded
 from api.cli.options import STORE, AsJson, takes_settings
-from api.opening import checked_store
+from api.http.values import iso_time
+from api.process.opening import checked_store
 from api.settings import Settings
-from api.values import iso_time
 from templates.store.audit_chain import Anchor, Line
 from templates.store.audit_log import AuditLog, BrokenAuditLog
 from templates.store.identifiers import InvalidIdentifier

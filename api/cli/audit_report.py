@@ -13,7 +13,7 @@ from attacks.outcomes import Scheme
 from attacks.report import Document
 from attacks.report_tables import markdown
 from attacks.verdict import LIMITS
-from templates.private_file import make_folder, replace_public
+from templates.keys.private_file import make_folder, replace_public
 
 FAILED = 1
 Out = Annotated[Path, typer.Option(help="Folder of the report.")]

@@ -16,8 +16,8 @@ from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, extract
 from api.cli.errors import CommandError, UsageError
 from api.cli.evaluation_inputs import listed
 from api.cli.options import AsJson, takes_settings
-from api.opening import file_sealer, open_keyring
-from api.preparation import (
+from api.process.opening import file_sealer, open_keyring
+from api.process.preparation import (
     DEFAULT_DIM,
     acquired_json,
     made_with,
@@ -31,10 +31,10 @@ from attacks.outcomes import GENERATED, POOLED, Outcome, Scheme
 from attacks.report import document
 from attacks.scene import owners_pool, stage
 from models.pack import ModelPack
-from templates.contract import Contract
+from templates.contract.document import Contract
 from templates.decoys import DecoyGenerator, DecoyPool, DecoySource, load_source
-from templates.lifting import Strategy
-from templates.sealing import Sealer
+from templates.keys.sealing import Sealer
+from templates.space.lifting import Strategy
 from verify import labelled_folder
 from verify.evaluation.attributes import resembling
 

@@ -9,10 +9,7 @@ import typer
 from rich.table import Table
 
 from api.cli.console import emit, progress, say, show, table
-from api.cli.errors import CommandError, UsageError
-from api.cli.evaluation_inputs import listed
-from api.cli.options import AsJson
-from api.distance_bench import (
+from api.cli.distance_bench import (
     MODES,
     Question,
     Row,
@@ -21,6 +18,9 @@ from api.distance_bench import (
     memory_needed,
     require_device,
 )
+from api.cli.errors import CommandError, UsageError
+from api.cli.evaluation_inputs import listed
+from api.cli.options import AsJson
 from templates.distances import DEFAULT_STEPS, Metric
 from templates.errors import TemplateError
 

@@ -11,8 +11,8 @@ from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, extract
 from api.cli.errors import CommandError, UsageError
 from api.cli.files import read_bounded, read_names
 from api.cli.options import AsJson, takes_settings
-from api.opening import file_sealer, open_keyring
-from api.preparation import (
+from api.process.opening import file_sealer, open_keyring
+from api.process.preparation import (
     DEFAULT_DIM,
     DEFAULT_PROBE_DIM,
     acquired,
@@ -23,10 +23,10 @@ from api.preparation import (
 )
 from api.settings import Settings
 from attacks.likelihood import share_found
-from templates.contract import Calibration, Contract, Rate
+from templates.contract.document import Calibration, Contract, Rate
 from templates.decoys import load_source
 from templates.distances import Metric
-from templates.lifting import Strategy
+from templates.space.lifting import Strategy
 from verify import CalibrationOptions, CalibrationReport, labelled_folder
 
 MOST_SHOWN = 20

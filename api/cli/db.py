@@ -6,15 +6,15 @@ from typing import Annotated
 
 import typer
 
-from api.audit import operator
 from api.cli.console import emit, message, progress, say
 from api.cli.errors import UsageError
 from api.cli.options import STORE, AsJson, Tenant, takes_settings
-from api.opening import checked_store, open_keyring, open_store, retention_of
-from api.receipts import receipt_json
+from api.http.audit import operator
+from api.http.receipts import receipt_json
+from api.process.opening import checked_store, open_keyring, open_store, retention_of
 from api.settings import Settings
 from templates.errors import VeilfaceError
-from templates.private_file import replace_private
+from templates.keys.private_file import replace_private
 from templates.store.database import Database
 from templates.store.migrate import current_revision, head_revision
 

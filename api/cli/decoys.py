@@ -13,8 +13,8 @@ from api.cli.errors import CommandError
 from api.cli.fairface import label_files, read_labels
 from api.cli.files import find_photos, is_left_out, read_names
 from api.cli.options import AsJson, takes_settings
-from api.opening import file_sealer, open_keyring
-from api.preparation import acquired, acquired_json, make_generator, make_pool
+from api.process.opening import file_sealer, open_keyring
+from api.process.preparation import acquired, acquired_json, make_generator, make_pool
 from api.settings import Settings
 from templates.decoys import Attributes, DecoyGenerator
 

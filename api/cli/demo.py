@@ -11,7 +11,7 @@ import typer
 
 from api.cli.console import emit, message, say, show, table
 from api.cli.options import AsJson
-from api.demo import Outcome, run_demo
+from api.demo.run import Outcome, run_demo
 from models.demo import DEMO_NOTICE
 
 

@@ -8,8 +8,8 @@ import typer
 
 from api.cli.console import message
 from api.cli.errors import CommandError, UsageError
-from api.opening import file_sealer, open_keyring
-from api.preparation import acquired
+from api.process.opening import file_sealer, open_keyring
+from api.process.preparation import acquired
 from api.settings import Settings
 from models.cache import EmbeddingCache
 from models.extraction import Extraction, Extractor

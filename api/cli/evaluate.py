@@ -28,8 +28,8 @@ from api.cli.options import AsJson, takes_settings
 from api.settings import Settings
 from templates.decoys import DecoyPool
 from templates.distances import Metric
-from templates.lifting import Strategy
-from templates.private_file import make_folder
+from templates.keys.private_file import make_folder
+from templates.space.lifting import Strategy
 from verify.evaluation.backends import Backend, BackendError
 from verify.evaluation.evaluation import evaluate_set, prepare
 from verify.evaluation.group_rows import group_rows

@@ -11,15 +11,15 @@ import numpy as np
 from api.cli.console import message, progress
 from api.cli.descriptors import bulk_pack
 from api.cli.errors import CommandError, UsageError
-from api.opening import file_sealer, open_keyring
-from api.preparation import recorded_of, require_made_with
+from api.process.opening import file_sealer, open_keyring
+from api.process.preparation import recorded_of, require_made_with
 from api.settings import Settings
 from models.cache import EmbeddingCache
 from models.pack import ModelPack
 from models.sessions import default_workers
 from templates.decoys import Attributes, DecoyGenerator, DecoyPool, load_source
 from templates.decoys.pool import POOL_MAGIC
-from templates.sealing import Sealer
+from templates.keys.sealing import Sealer
 from verify.evaluation.acquisition import (
     Acquired,
     PackSource,

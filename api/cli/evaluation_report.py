@@ -9,7 +9,7 @@ from rich.table import Table
 from api.cli.console import table
 from api.cli.errors import CommandError
 from api.cli.files import read_bounded
-from templates.private_file import replace_public
+from templates.keys.private_file import replace_public
 from verify.evaluation.rows import Json
 from verify.evaluation.tables import markdown, write_csv
 

@@ -10,20 +10,20 @@ from typing import Annotated, Any
 
 import typer
 
-from api.audit import operator
 from api.cli.console import emit, message, progress, say, show, table
 from api.cli.errors import CommandError, UsageError
 from api.cli.files import read_bounded
 from api.cli.options import STORE, AsJson, Tenant, takes_settings
-from api.opening import file_sealer, open_keyring, open_store, prepare_database
-from api.receipts import verify_answer
+from api.http.audit import operator
+from api.http.receipts import verify_answer
+from api.process.opening import file_sealer, open_keyring, open_store, prepare_database
 from api.settings import Settings
-from templates.canonical import parse_object
-from templates.contract import Contract
+from templates.contract.canonical import parse_object
+from templates.contract.document import Contract
 from templates.decoys import DecoyPool, load_source
 from templates.errors import StoreError
-from templates.key_file import locked
-from templates.sealing import MasterKeyring
+from templates.keys.key_file import locked
+from templates.keys.sealing import MasterKeyring
 from templates.store import TemplateStore
 from templates.store.api_keys import ApiKey, Right
 from templates.store.identifiers import utc_now

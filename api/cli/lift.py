@@ -16,16 +16,16 @@ from enroll.enroller import MAX_PHOTOS, mean_descriptor
 from enroll.errors import InconsistentImages
 from models.errors import ModelError
 from models.pack import FacePolicy, ModelPack
-from templates import wire
-from templates.binding import Binding
-from templates.canonical import parse_object
+from templates.contract import wire
+from templates.contract.binding import Binding
+from templates.contract.canonical import parse_object
 from templates.decoys import DecoyGenerator
 from templates.errors import ContractError
-from templates.lifting import lift as lift_descriptors
-from templates.private_file import replace_private
-from templates.probe_signature import signed_probe
-from templates.randomness import Keystream
-from templates.store.api_keys import is_token
+from templates.keys.api_token import is_token
+from templates.keys.private_file import replace_private
+from templates.keys.probe_signature import signed_probe
+from templates.keys.randomness import Keystream
+from templates.space.lifting import lift as lift_descriptors
 
 TOKEN_VARIABLE = "VEILFACE_API_KEY"  # noqa: S105 - a name, not a secret
 MAX_CONTRACT_BYTES = 256 * 2**20

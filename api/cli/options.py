@@ -14,7 +14,7 @@ from typing import Annotated, Any, ParamSpec, TypeVar
 import typer
 from pydantic.fields import FieldInfo
 
-from api.environment import variables_set
+from api.process.environment import variables_set
 from api.settings import CONFIG_VARIABLE, ENV_PREFIX, Settings, load_settings
 
 P = ParamSpec("P")

@@ -7,17 +7,17 @@ from typing import Annotated
 
 import typer
 
-from api.audit_report import open_audit_report
 from api.cli.console import demo_notice, message, say
 from api.cli.errors import CommandError
 from api.cli.options import takes_settings
-from api.metrics import shared_directory
-from api.opening import key_beside_database
-from api.operations import tls_options
-from api.rate_limits import RateLimits
-from api.runtime import Runtime, bootstrap_token
+from api.http.audit_report import open_audit_report
+from api.limits.rates import RateLimits
+from api.process.metrics import shared_directory
+from api.process.opening import key_beside_database
+from api.process.operations import tls_options
+from api.process.runtime import Runtime, bootstrap_token
+from api.process.supervisor import run_server
 from api.settings import Settings
-from api.supervisor import run_server
 
 
 def register(app: typer.Typer) -> None:

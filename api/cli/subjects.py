@@ -5,13 +5,13 @@ from typing import Annotated, Any
 
 import typer
 
-from api.audit import operator
 from api.cli.console import demo_notice, emit, say
 from api.cli.errors import CommandError, UsageError
 from api.cli.files import read_bounded
 from api.cli.options import LOCAL, AsJson, Tenant, takes_settings
-from api.errors import ApiError
-from api.runtime import Runtime
+from api.http.audit import operator
+from api.http.errors import ApiError
+from api.process.runtime import Runtime
 from api.settings import Settings
 from enroll.enroller import MAX_PHOTOS
 from enroll.errors import InconsistentImages, PhotoRejected

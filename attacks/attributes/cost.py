@@ -10,9 +10,9 @@ from attacks.attributes.neighbours import nearest_neighbours
 from attacks.attributes.plan import AttributePlan
 from attacks.errors import AuditError
 from templates.blas import single_threaded
-from templates.canonical import Json
-from templates.lifting import Strategy, lift
-from templates.randomness import Keystream
+from templates.contract.canonical import Json
+from templates.keys.randomness import Keystream
+from templates.space.lifting import Strategy, lift
 
 PAPER_FACES = 76_744
 PAPER_TEMPLATES = 10_954

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from attacks.attributes.faces import LabelledFaces
 from attacks.attributes.neighbours import Attacked, votes
 from templates.distances import Metric, Neighbours
-from templates.subspace import SubspaceBatch
+from templates.space.subspace import SubspaceBatch
 
 Floats = NDArray[np.float32]
 Codes = NDArray[np.int64]

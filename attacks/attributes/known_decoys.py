@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from attacks.attributes.neighbours import Advance, nearest_neighbours
 from templates.distances import Metric
-from templates.subspace import SubspaceBatch
+from templates.space.subspace import SubspaceBatch
 
 Floats = NDArray[np.float32]
 Codes = NDArray[np.int64]

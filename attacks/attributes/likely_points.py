@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from attacks.likelihood import likeliest_points, precision
 from templates.decoys.source import DecoySource
-from templates.randomness import Keystream
-from templates.subspace import SubspaceBatch
+from templates.keys.randomness import Keystream
+from templates.space.subspace import SubspaceBatch
 
 Floats = NDArray[np.float32]
 Form = NDArray[np.float64]

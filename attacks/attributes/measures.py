@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attacks.errors import AuditError
-from templates.canonical import Json
-from templates.levels import Rate
+from templates.contract.canonical import Json
+from templates.contract.levels import Rate
 from verify.metrics import rate
 
 Codes = NDArray[np.int64]

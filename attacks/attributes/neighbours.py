@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from attacks.errors import AuditError
 from templates.distances import Metric, Neighbours, nearest
-from templates.subspace import SubspaceBatch
+from templates.space.subspace import SubspaceBatch
 
 Floats = NDArray[np.float32]
 Codes = NDArray[np.int64]

@@ -15,7 +15,7 @@ from attacks.errors import AuditError
 from attacks.outcomes import GENERATED, POOLED, RAW_SCHEME, Scheme
 from templates.decoys import DecoyGenerator, DecoyPool
 from templates.decoys.source import DecoySource
-from templates.lifting import Strategy
+from templates.space.lifting import Strategy
 
 Codes = NDArray[np.int64]
 

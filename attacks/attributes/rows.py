@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from attacks.attributes.measures import Measures
 from attacks.outcomes import Knowledge, Scheme
-from templates.canonical import Json
+from templates.contract.canonical import Json
 from templates.distances import Metric
 
 

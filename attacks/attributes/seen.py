@@ -23,9 +23,9 @@ from attacks.errors import AuditError
 from attacks.outcomes import GENERATED, POOLED, RAW_SCHEME, Scheme
 from templates.blas import single_threaded
 from templates.distances import Metric
-from templates.lifting import Strategy, lift
-from templates.randomness import Keystream
-from templates.subspace import SubspaceBatch
+from templates.keys.randomness import Keystream
+from templates.space.lifting import Strategy, lift
+from templates.space.subspace import SubspaceBatch
 
 Codes = NDArray[np.int64]
 ByAttribute = dict[str, Codes]

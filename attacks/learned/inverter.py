@@ -18,7 +18,7 @@ from attacks.learned.extra import need
 from attacks.outcomes import Knowledge, Outcome
 from attacks.recovery import recovery_outcome
 from attacks.scene import Scene
-from templates.subspace import SubspaceBatch
+from templates.space.subspace import SubspaceBatch
 
 if TYPE_CHECKING:
     from torch import Tensor, nn

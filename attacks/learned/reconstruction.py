@@ -12,7 +12,7 @@ from attacks.learned.extra import need
 from attacks.outcomes import RAW_SCHEME, Knowledge, Outcome, Property
 from attacks.recovery import fmr_of
 from attacks.scene import Scene
-from templates.canonical import Json
+from templates.contract.canonical import Json
 from verify.metrics import rate
 
 Embed = Callable[[Images], NDArray[np.float32]]

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attacks.errors import AuditError
-from templates.subspace import SubspaceBatch, span_basis
+from templates.space.subspace import SubspaceBatch, span_basis
 
 
 @dataclass(frozen=True, eq=False, repr=False)

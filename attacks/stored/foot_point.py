@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from attacks.outcomes import Knowledge, Outcome
 from attacks.recovery import recovery_outcome
 from attacks.scene import Scene
-from templates.subspace import SubspaceBatch
+from templates.space.subspace import SubspaceBatch
 
 
 def foot_points(templates: SubspaceBatch) -> NDArray[np.float64]:

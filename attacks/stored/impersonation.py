@@ -8,10 +8,10 @@ from attacks.outcomes import POOLED, Knowledge, Outcome, Property
 from attacks.recovery import fmr_of
 from attacks.scene import Scene
 from attacks.stored.recording import decoy_count, recorded_lift
-from templates.canonical import Json
-from templates.contract import Rate
+from templates.contract.canonical import Json
+from templates.contract.document import Rate
 from templates.decoys import DecoyGenerator, DecoyPool
-from templates.subspace import SubspaceBatch
+from templates.space.subspace import SubspaceBatch
 from verify.metrics import rate, subject_bootstrap
 
 Pairs = NDArray[np.int64]

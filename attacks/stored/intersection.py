@@ -14,9 +14,9 @@ from attacks.outcomes import Knowledge, Outcome
 from attacks.recovery import recovery_outcome
 from attacks.scene import Scene
 from templates.decoys import Attributes
-from templates.lifting import Strategy, lift
-from templates.randomness import Keystream
-from templates.subspace import SubspaceBatch
+from templates.keys.randomness import Keystream
+from templates.space.lifting import Strategy, lift
+from templates.space.subspace import SubspaceBatch
 
 Array = NDArray[np.float64]
 

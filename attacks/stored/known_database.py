@@ -17,11 +17,11 @@ from attacks.recovery import recovery_outcome
 from attacks.scene import Scene
 from attacks.stored.face_statistics import FaceStatistics
 from attacks.stored.recording import RecordedLift, decoy_count, recorded_lift
-from templates.canonical import Json
+from templates.contract.canonical import Json
 from templates.decoys import DecoyPool
 from templates.distances import Metric, pairwise_distances
-from templates.randomness import Keystream
-from templates.subspace import SubspaceBatch
+from templates.keys.randomness import Keystream
+from templates.space.subspace import SubspaceBatch
 from verify.metrics import rate
 
 NOISES = (0.02, 0.05, 0.1, 0.3)

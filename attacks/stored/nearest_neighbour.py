@@ -12,10 +12,10 @@ from attacks.recovery import recovery_outcome
 from attacks.scene import Scene
 from attacks.stored.known_database import find_decoys
 from attacks.stored.recording import decoy_count
-from templates.canonical import Json
+from templates.contract.canonical import Json
 from templates.decoys import DecoyPool
 from templates.distances import Metric, pairwise_distances
-from templates.subspace import SubspaceBatch
+from templates.space.subspace import SubspaceBatch
 from verify.metrics import rate
 
 

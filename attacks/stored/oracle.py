@@ -11,7 +11,7 @@ from attacks.outcomes import Knowledge, Outcome, Property
 from attacks.recovery import fmr_of, score_guesses
 from attacks.scene import Scene
 from attacks.stored.nearest_neighbour import nearest_entries, nearest_points
-from templates.canonical import Json
+from templates.contract.canonical import Json
 
 NEIGHBOURS = (1, 2, 5, 10, 20, 50, 100)
 

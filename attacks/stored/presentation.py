@@ -20,14 +20,14 @@ from attacks.scene import Scene
 from attacks.stored.nearest_neighbour import nearest_points
 from attacks.stored.wolf_ascent import Ground, ascend_points, ascend_subspaces
 from attacks.stored.wolves import ALONG_MEAN, CENTRAL, axis_wolves, canonical
-from templates.canonical import Json
-from templates.contract import Calibration, Contract, Level, Rate
+from templates.contract.canonical import Json
+from templates.contract.document import Calibration, Contract, Level, Rate
 from templates.decoys import DecoyGenerator
-from templates.embedding import unit_rows
 from templates.errors import InvalidEmbedding
-from templates.randomness import Keystream
-from templates.rotation import rotate
-from templates.subspace import SubspaceBatch
+from templates.keys.randomness import Keystream
+from templates.keys.rotation import rotate
+from templates.space.embedding import unit_rows
+from templates.space.subspace import SubspaceBatch
 from verify.cohort import COHORT_SIZE, Probes, make_cohort, people_like
 from verify.comparisons import through_wire
 from verify.metrics import rate

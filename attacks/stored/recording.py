@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from attacks.outcomes import Scheme
 from attacks.scene import Scene
 from templates.decoys import Attributes, DecoySource
-from templates.lifting import Strategy
-from templates.randomness import Keystream
-from templates.subspace import SubspaceBatch
+from templates.keys.randomness import Keystream
+from templates.space.lifting import Strategy
+from templates.space.subspace import SubspaceBatch
 
 
 class RecordingSource:

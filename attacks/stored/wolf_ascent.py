@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from templates.contract import Level
-from templates.subspace import SubspaceBatch
+from templates.contract.document import Level
+from templates.space.subspace import SubspaceBatch
 
 Floats = NDArray[np.float32]
 

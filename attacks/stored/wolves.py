@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from templates.subspace import AffineSubspace
+from templates.space.subspace import AffineSubspace
 
 Array = NDArray[np.float64]
 

@@ -3,9 +3,9 @@
 import os
 from pathlib import Path
 
-from templates.bounded_file import read_at_most
 from templates.errors import DecoyError
-from templates.private_file import replace_private
+from templates.keys.bounded_file import read_at_most
+from templates.keys.private_file import replace_private
 
 
 def write_private(path: Path, data: bytes) -> None:

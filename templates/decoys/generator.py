@@ -26,7 +26,7 @@ from templates.decoys.statistics import (
     leading_axes,
 )
 from templates.errors import DecoyError
-from templates.randomness import Keystream
+from templates.keys.randomness import Keystream
 
 GENERATOR_FORMAT = "veilface decoy generator"
 GENERATOR_VERSION = 1
@@ -50,7 +50,7 @@ class DecoyGenerator:
     statistics
         As `fit` finds them.
     made_with
-        `templates.binding.embedding_id` of the pack that gave the descriptors of the fit.
+        `templates.contract.binding.embedding_id` of the pack that gave the descriptors of the fit.
 
     Raises
     ------
@@ -96,7 +96,7 @@ class DecoyGenerator:
         descriptors
             float32, shape (N, n), unit rows, N ≥ 100; several thousand give good decoys.
         made_with
-            `templates.binding.embedding_id` of the pack that gave them.
+            `templates.contract.binding.embedding_id` of the pack that gave them.
 
         Raises
         ------

@@ -5,7 +5,7 @@ from pathlib import Path
 from templates.decoys.generator import DecoyGenerator
 from templates.decoys.pool import POOL_MAGIC, DecoyPool
 from templates.errors import DecoyError
-from templates.sealing import Sealer
+from templates.keys.sealing import Sealer
 
 
 def load_source(path: Path, sealer: Sealer) -> DecoyPool | DecoyGenerator:

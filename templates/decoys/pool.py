@@ -18,8 +18,8 @@ from templates.decoys import container
 from templates.decoys.files import read_bounded, write_private
 from templates.decoys.source import MAX_DIMENSION, Attributes, checked_made_with, take_made_with
 from templates.errors import DecoyError
-from templates.randomness import Keystream
-from templates.sealing import Sealer
+from templates.keys.randomness import Keystream
+from templates.keys.sealing import Sealer
 
 POOL_MAGIC = b"VEILFACE DECOY POOL 1\n"
 POOL_CONTEXT = "veilface decoy pool 1"
@@ -44,7 +44,7 @@ class DecoyPool:
     labels
         One `Attributes` per row, or None. Needed for ``unlike``.
     made_with
-        `templates.binding.embedding_id` of the pack that gave the descriptors.
+        `templates.contract.binding.embedding_id` of the pack that gave the descriptors.
 
     Raises
     ------

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from templates.errors import DecoyError
-from templates.randomness import Keystream
+from templates.keys.randomness import Keystream
 
 MAX_DIMENSION = 4096
 """Largest descriptor dimension a source may have; the same bound as the wire format's."""
@@ -65,8 +65,8 @@ class DecoySource(Protocol):
     n
         Dimension of the descriptors.
     made_with
-        `templates.binding.embedding_id` of the pack whose descriptors the source was made of; None
-        where the maker did not say. Part of the canonical content.
+        `templates.contract.binding.embedding_id` of the pack whose descriptors the source was made
+        of; None where the maker did not say. Part of the canonical content.
     """
 
     source_id: str

@@ -3,7 +3,7 @@
 Everything that a secret could be read from is encrypted; see ``docs/storage.md``.
 """
 
-from templates.store.api_keys import ApiKey, NewApiKey, Right, probe_key
+from templates.store.api_keys import ApiKey, NewApiKey, Right
 from templates.store.attempts import Attempt
 from templates.store.audit_chain import Anchor, Line, Problem, Verification
 from templates.store.audit_log import AuditLog, BrokenAuditLog, By, Entry
@@ -62,6 +62,5 @@ __all__ = [
     "TenantErasure",
     "UnknownTenant",
     "Verification",
-    "probe_key",
     "verify_receipt",
 ]

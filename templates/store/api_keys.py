@@ -11,7 +11,6 @@ import functools
 import hashlib
 import hmac
 import os
-import re
 import uuid
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -22,9 +21,10 @@ from typing import Any
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
+from templates.contract.levels import LEVEL_NAME
 from templates.errors import StoreError, StoreUnavailable
-from templates.levels import LEVEL_NAME
-from templates.sealing import MasterKeyring, derive_key, sealed_key_id
+from templates.keys.api_token import TOKEN, probe_key
+from templates.keys.sealing import MasterKeyring, sealed_key_id
 from templates.store.audit_log import PROGRAM, TENANT_ERASE, AuditLog, By, Entry
 from templates.store.authenticity import (
     LAST_KEY_LINE,
@@ -41,7 +41,6 @@ from templates.store.tenants import Tenants
 PROBE_KEY_PURPOSE = "api-key-probe-key"
 MAX_LABEL = 128
 
-_TOKEN = re.compile(r"vf_([0-9a-f]{12})_([0-9a-f]{64})")
 _NOBODYS_HASH = os.urandom(32)
 _USE_IS_NOTED_EVERY = timedelta(minutes=1)
 
@@ -186,7 +185,7 @@ class ApiKeys:
         A key whose row is not authentic is as good as unknown. The comparison
         takes the same time wherever the tokens differ, and an unknown prefix is compared too.
         """
-        match = _TOKEN.fullmatch(token)
+        match = TOKEN.fullmatch(token)
         prefix = match[1] if match else ""
         self._audit_log.prepare()
         try:
@@ -417,25 +416,6 @@ class ApiKeys:
         # A full or busy disk must not refuse a good key.
         with contextlib.suppress(StoreUnavailable):
             self._database.write(lambda each: each.execute(statement))
-
-
-def is_token(text: str) -> bool:
-    """Tell whether a text has the format of a token; no database is asked."""
-    return _TOKEN.fullmatch(text) is not None
-
-
-def probe_key(token: str) -> bytes:
-    """Derive the 32-byte key that a client signs its probes with from its API token.
-
-    Raises
-    ------
-    StoreError
-        If the text is not a token.
-    """
-    match = _TOKEN.fullmatch(token)
-    if match is None:
-        raise StoreError("this is not an API token: one looks like vf_<prefix>_<secret>")
-    return derive_key(bytes.fromhex(match[2]), "probe-key")
 
 
 _KEYS: Any = sa.select(

@@ -19,7 +19,7 @@ import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
 from templates.errors import StoreError
-from templates.sealing import MasterKeyring, encode_parts
+from templates.keys.sealing import MasterKeyring, encode_parts
 from templates.store.attempt_queries import BEFORE, FIRST_COUNTS, NEXT_COUNTS, NOTE_USE, STANDING
 from templates.store.audit_log import AuditLog, By, Entry
 from templates.store.database import Database

@@ -17,7 +17,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from templates.errors import StoreError
-from templates.sealing import encode_parts
+from templates.keys.sealing import encode_parts
 from templates.store.identifiers import InvalidIdentifier
 
 HASH_BYTES = 32

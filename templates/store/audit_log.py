@@ -17,7 +17,7 @@ import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
 from templates.errors import StoreError
-from templates.sealing import derive_key
+from templates.keys.sealing import derive_key
 from templates.store.audit_chain import (
     START,
     Anchor,

@@ -11,7 +11,7 @@ from sqlalchemy.dialects.sqlite import insert as sqlite_insert
 from sqlalchemy.engine import Connection
 
 from templates.errors import SealError, StoreError
-from templates.sealing import MasterKeyring, sealed_key_id
+from templates.keys.sealing import MasterKeyring, sealed_key_id
 from templates.store.database import Database
 from templates.store.identifiers import Clock, checked_opaque_id
 from templates.store.schema import Base, MasterKeyCheckRow, SecretRow

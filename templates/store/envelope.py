@@ -14,7 +14,7 @@ from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
 from templates.errors import SealError
-from templates.sealing import NONCE_BYTES, TAG_BYTES, MasterKeyring, encode_parts
+from templates.keys.sealing import NONCE_BYTES, TAG_BYTES, MasterKeyring, encode_parts
 
 _VERSION = b"\x01"
 DATA_KEY_PURPOSE = "subject-data-key"

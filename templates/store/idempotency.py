@@ -18,7 +18,7 @@ import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
 from templates.errors import StoreError
-from templates.sealing import encode_parts
+from templates.keys.sealing import encode_parts
 from templates.store.audit_log import AuditLog
 from templates.store.authenticity import columns_of, is_authentic, row_mac, warn
 from templates.store.database import Database

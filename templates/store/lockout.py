@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 
 from templates.errors import StoreBusy, StoreError
-from templates.sealing import encode_parts
+from templates.keys.sealing import encode_parts
 
 _MAX_DOUBLINGS = 64
 

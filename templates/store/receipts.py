@@ -1,9 +1,10 @@
 """Signed erasure receipts.
 
-A receipt is a canonical JSON text (``templates.canonical``) and its Ed25519 signature (RFC 8032).
-It names the subject by a pseudonym, HMAC-SHA256 of tenant and subject id under a key of the
-deployment: whoever holds the subject id and asks the deployment can find the receipt, nobody else
-learns whom it is about. The receipt of a whole tenant is of another kind, and names the tenant.
+A receipt is a canonical JSON text (``templates.contract.canonical``) and its Ed25519 signature
+(RFC 8032). It names the subject by a pseudonym, HMAC-SHA256 of tenant and subject id under a key of
+the deployment: whoever holds the subject id and asks the deployment can find the receipt, nobody
+else learns whom it is about. The receipt of a whole tenant is of another kind, and names the
+tenant.
 """
 
 import base64
@@ -19,9 +20,9 @@ from typing import Any
 from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 
-from templates.canonical import canonical_json
+from templates.contract.canonical import canonical_json
 from templates.errors import StoreError
-from templates.sealing import encode_parts
+from templates.keys.sealing import encode_parts
 from templates.store.deployment import Secrets
 
 PSEUDONYM_SECRET = "pseudonym"  # noqa: S105 - a name, not a secret

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
-from templates.sealing import MasterKeyring
+from templates.keys.sealing import MasterKeyring
 from templates.store import deployment, migrate, retention, rewrap
 from templates.store.adoption import Adoption, adopt
 from templates.store.api_keys import ApiKeys

@@ -28,10 +28,10 @@ import sqlalchemy as sa
 from numpy.typing import NDArray
 from sqlalchemy.engine import Connection
 
-from templates import wire
+from templates.contract import wire
 from templates.errors import SealError, StoreError, TemplateError
-from templates.rotation import tenant_rotation
-from templates.sealing import MasterKeyring, sealed_key_id
+from templates.keys.rotation import tenant_rotation
+from templates.keys.sealing import MasterKeyring, sealed_key_id
 from templates.store.audit_log import PROGRAM, AuditLog, By, Entry
 from templates.store.database import Database
 from templates.store.envelope import Envelope, Owner, close_envelope, open_envelope

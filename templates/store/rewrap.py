@@ -18,7 +18,7 @@ import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 from sqlalchemy.orm import InstrumentedAttribute
 
-from templates.sealing import MasterKeyring, sealed_key_id
+from templates.keys.sealing import MasterKeyring, sealed_key_id
 from templates.store.api_keys import PROBE_KEY_PURPOSE
 from templates.store.database import Database
 from templates.store.deployment import CHECK_PURPOSE, SECRET_PURPOSE

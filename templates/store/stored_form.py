@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from datetime import datetime
 
-from templates.sealing import MasterKeyring
+from templates.keys.sealing import MasterKeyring
 from templates.store.database import Database
 from templates.store.identifiers import checked_subject_id
 from templates.store.schema import SubjectRow

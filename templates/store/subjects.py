@@ -13,7 +13,7 @@ import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
 from templates.errors import SealError, StoreBusy, StoreError
-from templates.sealing import MasterKeyring, sealed_key_id
+from templates.keys.sealing import MasterKeyring, sealed_key_id
 from templates.store.audit_log import PROGRAM, AuditLog, By, Entry
 from templates.store.database import Database
 from templates.store.envelope import Envelope, Owner, close_envelope, open_envelope

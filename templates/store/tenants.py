@@ -15,7 +15,7 @@ from typing import Any
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
-from templates.sealing import MasterKeyring, sealed_key_id
+from templates.keys.sealing import MasterKeyring, sealed_key_id
 from templates.store.audit_log import PROGRAM, AuditLog, By, Entry
 from templates.store.authenticity import (
     LAST_TENANT_LINE,
@@ -61,7 +61,7 @@ class Tenant:
 
 @dataclass(frozen=True)
 class RotationKey:
-    """The secret that a tenant's rotation is drawn from (``templates.rotation``)."""
+    """The secret that a tenant's rotation is drawn from (``templates.keys.rotation``)."""
 
     epoch: int
     key: bytes = field(repr=False)

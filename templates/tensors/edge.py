@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from templates.errors import InvalidEmbedding, InvalidTemplate, TemplateError
-from templates.subspace import SubspaceBatch
+from templates.space.subspace import SubspaceBatch
 from templates.tensors.subspaces import SubspaceTensors
 
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from templates.errors import InvalidTemplate
-from templates.subspace import SubspaceBatch
+from templates.space.subspace import SubspaceBatch
 
 TILE_BYTES = {"cpu": 8 << 20, "cuda": 128 << 20}
 """Size of the products that are made at a time; the whole computation holds a few times that."""

@@ -12,8 +12,8 @@ import numpy as np
 from anyio.from_thread import BlockingPortal, start_blocking_portal
 from fastapi import FastAPI
 
-from templates.probe_signature import sign_probe
-from templates.store.api_keys import is_token
+from templates.keys.api_token import is_token
+from templates.keys.probe_signature import sign_probe
 
 _VERIFY = re.compile(r"/v1/subjects/([^/]+)/verify")
 

@@ -23,7 +23,7 @@ from typing import Any
 import httpx
 
 from tests.api.deployment import Deployment, bearer, deploy, images, photo
-from tests.api.test_server import Server, free_port
+from tests.api.process.test_server import Server, free_port
 from tests.patience import PATIENCE_S
 
 CONFIG = """\

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from api.app import create_app
+from api.http.app import create_app
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, deploy
 from tests.databases import database_url, postgres_database, postgres_url  # noqa: F401

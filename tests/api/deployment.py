@@ -13,15 +13,21 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 from PIL import Image
 
-from api.runtime import bootstrap_token, file_sealer, open_keyring, open_store, prepare_database
+from api.process.runtime import (
+    bootstrap_token,
+    file_sealer,
+    open_keyring,
+    open_store,
+    prepare_database,
+)
 from api.settings import Settings
 from models.pack import ModelPack
-from templates.contract import Binding, Calibration, Contract, Level, Rate
+from templates.contract.document import Binding, Calibration, Contract, Level, Rate
 from templates.decoys import DecoyGenerator, DecoySource
 from templates.distances import DEFAULT_STEPS, Metric
-from templates.lifting import Strategy
-from templates.randomness import Keystream
-from templates.rotation import ROTATION_VERSION
+from templates.keys.randomness import Keystream
+from templates.keys.rotation import ROTATION_VERSION
+from templates.space.lifting import Strategy
 from verify.cohort import make_cohort
 from verify.strangers import make_nobody
 

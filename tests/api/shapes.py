@@ -4,8 +4,8 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from api.errors import ERROR_CODES
-from api.schemas import ErrorAnswer
+from api.http.errors import ERROR_CODES
+from api.http.schemas import ErrorAnswer
 
 
 def assert_error(answer: Any, status: int, code: str) -> dict[str, Any]:

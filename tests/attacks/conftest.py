@@ -6,10 +6,10 @@ import pytest
 from attacks.cast import Cast, make_cast
 from attacks.outcomes import GENERATED, Scheme
 from attacks.scene import Scene, stage
-from templates.binding import Binding
+from templates.contract.binding import Binding
 from templates.decoys import DecoyGenerator, DecoyPool
-from templates.lifting import Strategy
-from templates.rotation import ROTATION_VERSION
+from templates.keys.rotation import ROTATION_VERSION
+from templates.space.lifting import Strategy
 from tests.verify.synthetic import N, draw_people, make_generator
 from verify import CalibrationOptions, calibrate
 

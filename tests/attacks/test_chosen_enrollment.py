@@ -13,8 +13,8 @@ from attacks.chosen_enrollment import (
 from attacks.errors import AuditError
 from attacks.outcomes import Knowledge, Property
 from attacks.scene import Scene
-from templates.randomness import Keystream
-from templates.subspace import SubspaceBatch
+from templates.keys.randomness import Keystream
+from templates.space.subspace import SubspaceBatch
 from tests.verify.synthetic import N, random_rotation, unit
 
 

@@ -13,8 +13,8 @@ from attacks.databases import (
 from attacks.errors import AuditError
 from attacks.scene import Scene
 from templates.decoys import DecoyGenerator
-from templates.randomness import Keystream
-from templates.subspace import SubspaceBatch
+from templates.keys.randomness import Keystream
+from templates.space.subspace import SubspaceBatch
 from tests.verify.synthetic import random_rotation, unit
 
 N, M = 16, 2

@@ -8,7 +8,7 @@ from attacks.dictionary import dictionary_outcomes
 from attacks.outcomes import Knowledge, Outcome, Property
 from attacks.rehearsal import rehearse_scene
 from attacks.scene import Scene
-from templates.subspace import SubspaceBatch
+from templates.space.subspace import SubspaceBatch
 from tests.verify.synthetic import N
 
 

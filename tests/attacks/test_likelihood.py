@@ -15,8 +15,8 @@ from attacks.likelihood import (
 from attacks.outcomes import GENERATED, Scheme
 from attacks.scene import Scene
 from templates.decoys import DecoyGenerator
-from templates.randomness import Keystream
-from templates.subspace import SubspaceBatch
+from templates.keys.randomness import Keystream
+from templates.space.subspace import SubspaceBatch
 from tests.attacks.conftest import staged
 from tests.verify.synthetic import unit
 

@@ -10,7 +10,7 @@ from attacks.outcomes import POOLED, Knowledge, Outcome, Property, Scheme
 from attacks.scene import Scene
 from models.pack import ModelPack
 from templates.decoys import DecoyPool
-from templates.lifting import Strategy
+from templates.space.lifting import Strategy
 from tests.verify.synthetic import random_rotation
 from verify import labelled_folder
 from verify.comparisons import Lifter

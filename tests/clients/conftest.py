@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from api.app import environment_of
+from api.http.app import environment_of
 from benchmarks.deployment import service as serve
 from tests.api.deployment import Deployment, deploy
 

@@ -7,7 +7,7 @@ import pytest
 from pydantic import ValidationError
 
 import veilface_client
-from api.errors import ERROR_CODES
+from api.http.errors import ERROR_CODES
 from veilface_client import errors, results
 from veilface_client.errors import FAMILIES, ServiceError, UnexpectedAnswer, error_of
 from veilface_client.results import parse

@@ -8,7 +8,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from templates.probe_signature import sign_probe
+from templates.keys.probe_signature import sign_probe
 from tests.api.deployment import photo
 from tests.clients.conftest import VEILFACE, Running
 from tests.clients.proxy import Proxy

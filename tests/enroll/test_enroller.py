@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from enroll import Enroller, Enrollment, InconsistentImages, PhotoRejected
 from enroll.enroller import mean_descriptor
 from models.errors import NoFace
-from templates import wire
-from templates.agreement import weakest_split
-from templates.contract import Contract
+from templates.contract import wire
+from templates.contract.document import Contract
 from templates.decoys import Attributes, DecoyPool
 from templates.errors import ContractMismatch, InvalidEmbedding, InvalidTemplate, VeilfaceError
-from templates.lifting import Strategy, lift
-from templates.subspace import AffineSubspace
+from templates.space.agreement import weakest_split
+from templates.space.lifting import Strategy, lift
+from templates.space.subspace import AffineSubspace
 from tests.verify.synthetic import (
     M,
     N,

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import safetensors.numpy
 
-from templates.contract import Contract, _seal_context
+from templates.contract.document import Contract, _seal_context
 from templates.errors import ContractError
 from tests.fuzz.documents import deep, hostile, twisted, written
 from tests.fuzz.mutations import mutated
 from tests.fuzz.tensors import SEALER, hostile_tensors, repeatable
-from tests.templates.test_contract import make_contract
+from tests.templates.contract.test_contract import make_contract
 
 
 class Contracts:

@@ -48,7 +48,7 @@ def pictures() -> Sequence[Callable[[], bytes]]:
 
 def templates() -> Sequence[Callable[[], bytes]]:
     """A signalling NaN, of which NumPy warned when it was cast."""
-    from templates import wire
+    from templates.contract import wire
     from tests.fuzz.tensors import CONTRACT, container, subspace, taken_apart
 
     header, payload = taken_apart(
@@ -75,7 +75,7 @@ def pickles() -> Sequence[Callable[[], bytes]]:
 
 def contracts(folder: Path) -> Sequence[Callable[[], bytes]]:
     """Any file: 256 MiB were asked for. Products that overflow. Four million values."""
-    from templates.contract import _seal_context
+    from templates.contract.document import _seal_context
     from tests.fuzz.contracts import Contracts
     from tests.fuzz.tensors import SEALER, repeatable
 

@@ -80,8 +80,8 @@ def image(folder: Path) -> Target:
 
 
 def template(folder: Path) -> Target:
-    """``templates.wire``: templates and lifted probes of clients, and the store's own."""
-    from templates import wire
+    """``templates.contract.wire``: templates and lifted probes of clients, and the store's own."""
+    from templates.contract import wire
     from templates.errors import InvalidTemplate
     from tests.fuzz import found
     from tests.fuzz.tensors import Templates
@@ -100,10 +100,10 @@ def template(folder: Path) -> Target:
 
 def probe(folder: Path) -> Target:
     """``Verifier.decide_template``: a lifted probe on its way to a decision."""
-    from templates import wire
+    from templates.contract import wire
     from templates.errors import ContractMismatch, InvalidTemplate, Uncalibrated
     from tests.fuzz.tensors import Templates, subspace
-    from tests.templates.test_contract import M, N, make_contract
+    from tests.templates.contract.test_contract import M, N, make_contract
     from verify import Verifier
 
     contract = make_contract()
@@ -126,9 +126,9 @@ def probe(folder: Path) -> Target:
 
 
 def export(folder: Path) -> Target:
-    """``api.transfer.open_export`` and the template inside."""
-    from api.transfer import open_export
-    from templates import wire
+    """``api.http.transfer.open_export`` and the template inside."""
+    from api.http.transfer import open_export
+    from templates.contract import wire
     from templates.errors import ContractMismatch, InvalidTemplate
     from tests.fuzz.tensors import CONTRACT, KEY, TENANT, Exports
 
@@ -163,8 +163,8 @@ def bin_file(folder: Path) -> Target:
 
 
 def contract(folder: Path) -> Target:
-    """``templates.contract``: the contract file, its JSON and its sealed cohort."""
-    from templates.contract import Binding, Contract
+    """``templates.contract.document``: the contract file, its JSON and its sealed cohort."""
+    from templates.contract.document import Binding, Contract
     from templates.errors import ContractError, SealError
     from tests.fuzz import found
     from tests.fuzz.contracts import Contracts
@@ -189,7 +189,7 @@ def decoys(folder: Path) -> Target:
     """``templates.decoys``: generators that anybody may send, and sealed pools."""
     from templates.decoys.loading import load_source
     from templates.errors import DecoyError, SealError
-    from templates.randomness import Keystream
+    from templates.keys.randomness import Keystream
     from tests.fuzz.tensors import SEALER, Decoys
 
     file = folder / "case.decoys"
@@ -205,11 +205,11 @@ def decoys(folder: Path) -> Target:
 
 
 def body(folder: Path) -> Target:
-    """``api.bodies``: JSON and multipart bodies, up to the largest that are read."""
+    """``api.http.bodies``: JSON and multipart bodies, up to the largest that are read."""
     from starlette.requests import Request
 
-    from api.bodies import read_form, read_json
-    from api.errors import ApiError
+    from api.http.bodies import read_form, read_json
+    from api.http.errors import ApiError
     from tests.fuzz import found
     from tests.fuzz.bodies import Bodies
 

@@ -10,14 +10,14 @@ from unittest import mock
 import numpy as np
 from numpy.typing import NDArray
 
-from api.transfer import MAGIC, PURPOSE, Exported, ExportKey, seal_export
-from templates import wire
+from api.http.transfer import MAGIC, PURPOSE, Exported, ExportKey, seal_export
+from templates.contract import wire
 from templates.decoys import DecoyGenerator, DecoyPool
 from templates.decoys.pool import POOL_CONTEXT, POOL_MAGIC
 from templates.decoys.source import Attributes
-from templates.randomness import Keystream
-from templates.sealing import KeyringSealer, MasterKeyring
-from templates.subspace import AffineSubspace
+from templates.keys.randomness import Keystream
+from templates.keys.sealing import KeyringSealer, MasterKeyring
+from templates.space.subspace import AffineSubspace
 from tests.fuzz.documents import Raw, hostile
 from tests.fuzz.mutations import mutated, some, span
 
@@ -33,7 +33,7 @@ SPECIAL = (0.0, -0.0, 1.0, -1.0, 1.0001, 2.0, 1e-45, 1e-38, 6e4, 3e38, -3e38,
 
 def repeatable(rng: random.Random) -> Any:
     """While it holds, sealing takes its nonces from ``rng``: equal seeds give equal cases."""
-    return mock.patch("templates.sealing.os.urandom", rng.randbytes)
+    return mock.patch("templates.keys.sealing.os.urandom", rng.randbytes)
 
 
 def subspace(n: int, m: int, seed: int = 0, *, norm: float = 0.5) -> AffineSubspace:

@@ -12,8 +12,8 @@ from typing import Any, Protocol
 
 import sqlalchemy as sa
 
-from api.runtime import open_keyring, open_store
-from templates import wire
+from api.process.runtime import open_keyring, open_store
+from templates.contract import wire
 from templates.errors import VeilfaceError
 from templates.store import TemplateStore
 from templates.store.audit_chain import Line

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.pack import ModelPack
-from templates.probe_signature import signed_probe
+from templates.keys.probe_signature import signed_probe
 from tests.api.deployment import Deployment, bearer, images, photo
 from tests.patience import PATIENCE_S
 from tests.reliability.service import Service

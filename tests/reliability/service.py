@@ -15,7 +15,7 @@ from typing import Any
 import httpx
 import psutil
 
-from api.app import environment_of
+from api.http.app import environment_of
 from tests.api.deployment import Deployment
 from tests.patience import PATIENCE_S
 

@@ -13,8 +13,8 @@ from typing import Any, cast
 import pytest
 import sqlalchemy as sa
 
-from api.app import create_app
-from api.runtime import open_keyring, open_store
+from api.http.app import create_app
+from api.process.runtime import open_keyring, open_store
 from templates.store import TemplateStore
 from tests.api.client import Client
 from tests.api.deployment import Deployment, deploy

@@ -9,7 +9,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from api.app import IMPORT_S
+from api.http.app import IMPORT_S
 from tests.api.deployment import deploy
 from tests.patience import wait_until
 from tests.reliability.cluster import Cluster

@@ -5,13 +5,13 @@ import functools
 import numpy as np
 from numpy.typing import NDArray
 
-from templates.contract import Binding, Contract
+from templates.contract.document import Binding, Contract
 from templates.decoys import DecoyGenerator
 from templates.distances import DEFAULT_STEPS, Metric
-from templates.lifting import Strategy, lift
-from templates.randomness import Keystream
-from templates.rotation import ROTATION_VERSION
-from templates.subspace import SubspaceBatch
+from templates.keys.randomness import Keystream
+from templates.keys.rotation import ROTATION_VERSION
+from templates.space.lifting import Strategy, lift
+from templates.space.subspace import SubspaceBatch
 from verify import CalibrationOptions, calibrate
 from verify.cohort import make_cohort, people_like
 from verify.strangers import make_nobody

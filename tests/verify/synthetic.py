@@ -5,11 +5,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from templates.contract import Binding
+from templates.contract.document import Binding
 from templates.decoys import DecoyGenerator, DecoyPool
-from templates.lifting import Strategy
-from templates.rotation import ROTATION_VERSION
-from templates.subspace import AffineSubspace
+from templates.keys.rotation import ROTATION_VERSION
+from templates.space.lifting import Strategy
+from templates.space.subspace import AffineSubspace
 from verify import Calibrated, CalibrationOptions, calibrate
 
 N = 64

@@ -7,11 +7,11 @@ import pytest
 from numpy.typing import NDArray
 
 from enroll import Enroller
-from templates import wire
-from templates.contract import Contract
+from templates.contract import wire
+from templates.contract.document import Contract
 from templates.errors import ContractError, ContractMismatch, InvalidEmbedding
-from templates.randomness import Keystream
-from templates.subspace import SubspaceBatch
+from templates.keys.randomness import Keystream
+from templates.space.subspace import SubspaceBatch
 from tests.verify.synthetic import (
     People,
     calibrate_people,
@@ -316,7 +316,7 @@ def test_a_pool_contract_calibrates_and_its_clients_get_a_generator() -> None:
     entries = pool.draw(1, len(pool), stream=Keystream.seeded("y"))[0]
     assert (decoys @ entries.T).max() < 0.95  # none of the pool's people is among them
     people = draw_people(30)
-    from templates.lifting import Strategy
+    from templates.space.lifting import Strategy
 
     contract = calibrate(
         people.descriptors,
@@ -374,7 +374,7 @@ def test_lifted_probes_have_recorded_foot_point_norms(calibrated: Calibrated) ->
     assert lifted.foot_point_norm is not None
     low, high = lifted.foot_point_norm
     source = make_generator()
-    from templates.lifting import lift
+    from templates.space.lifting import lift
 
     probes: SubspaceBatch = lift(
         draw_people(200, photos=(1,), seed=31).descriptors,

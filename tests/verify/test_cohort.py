@@ -8,9 +8,9 @@ import pytest
 
 from templates.decoys import DecoyGenerator
 from templates.distances import Metric, pairwise_distances, similarity
-from templates.lifting import Strategy
-from templates.randomness import Keystream
-from templates.subspace import SubspaceBatch
+from templates.keys.randomness import Keystream
+from templates.space.lifting import Strategy
+from templates.space.subspace import SubspaceBatch
 from verify.cohort import cohort_statistics, make_cohort, people_like, rounded_cohort
 
 N, M = 32, 4

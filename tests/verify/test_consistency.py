@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from templates.agreement import weakest_split
 from templates.errors import ContractError
+from templates.space.agreement import weakest_split
 from tests.verify.synthetic import People, draw_people
 from verify.consistency import Consistency, photo_consistency
 

@@ -8,10 +8,10 @@ import pytest
 from numpy.typing import NDArray
 
 from models.pack import ModelPack
-from templates.contract import Binding
+from templates.contract.document import Binding
 from templates.decoys import DecoyGenerator
-from templates.lifting import Strategy
-from templates.rotation import ROTATION_VERSION
+from templates.keys.rotation import ROTATION_VERSION
+from templates.space.lifting import Strategy
 from verify import CalibrationOptions, calibrate, labelled_folder
 
 pytestmark = pytest.mark.long

@@ -10,7 +10,7 @@ from scipy.stats import norm, t
 from attacks.stored.wolves import canonical
 from templates.decoys import DecoyGenerator
 from templates.distances import Metric
-from templates.subspace import AffineSubspace, SubspaceBatch
+from templates.space.subspace import AffineSubspace, SubspaceBatch
 from tests.verify.population import M, N, contract, decoys, enrolled, photos_of, templates_of, unit
 from verify.stand_ins import lift_stand_in
 from verify.strangers import honest_score, strangers_like

@@ -11,12 +11,12 @@ from sklearn.metrics import roc_auc_score
 from sklearn.model_selection import cross_val_predict
 
 from attacks.stored.wolves import canonical
-from templates.contract import Binding, Contract
+from templates.contract.document import Binding, Contract
 from templates.decoys import DecoyGenerator
-from templates.lifting import Strategy, lift
-from templates.randomness import Keystream
-from templates.rotation import ROTATION_VERSION
-from templates.subspace import SubspaceBatch
+from templates.keys.randomness import Keystream
+from templates.keys.rotation import ROTATION_VERSION
+from templates.space.lifting import Strategy, lift
+from templates.space.subspace import SubspaceBatch
 from tests.verify.test_strangers import similarities
 from verify import CalibrationOptions, calibrate
 from verify.stand_ins import lift_stand_in

@@ -17,7 +17,7 @@ from benchmarks.two_people import (
 )
 from models.extraction import Extractor
 from models.pack import ModelPack
-from templates.contract import Contract
+from templates.contract.document import Contract
 from templates.decoys import DecoyGenerator
 from verify import labelled_folder
 

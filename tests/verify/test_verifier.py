@@ -10,12 +10,12 @@ import pytest
 from numpy.typing import NDArray
 
 from enroll import Enroller
-from templates import wire
-from templates.contract import Contract
+from templates.contract import wire
+from templates.contract.document import Contract
 from templates.decoys import DecoyGenerator
 from templates.errors import ContractMismatch, InvalidEmbedding, InvalidTemplate, Uncalibrated
-from templates.lifting import lift
-from templates.subspace import AffineSubspace
+from templates.space.lifting import lift
+from templates.space.subspace import AffineSubspace
 from tests.verify.synthetic import (
     M,
     N,

@@ -14,17 +14,17 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, expect, sync_playwright
 
-from api.demo import run_demo
-from api.demo_cast import Scale
-from api.opening import file_sealer, open_keyring
-from api.preparation import calibrate_folder, make_generator
+from api.demo.people import Scale
+from api.demo.run import run_demo
+from api.process.opening import file_sealer, open_keyring
+from api.process.preparation import calibrate_folder, make_generator
 from api.settings import Settings
 from models.extraction import Extractor
 from models.pack import ModelPack
 from templates.blas import single_threaded
-from templates.contract import Contract
-from templates.lifting import Strategy
-from tests.api.test_stored import report
+from templates.contract.document import Contract
+from templates.space.lifting import Strategy
+from tests.api.http.test_stored import report
 from tests.web.camera import FakeCamera
 from tests.web.served import Served, serving
 from tests.web.visit import Visit

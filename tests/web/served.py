@@ -12,9 +12,9 @@ from pathlib import Path
 import httpx
 import pytest
 
-from api.runtime import open_keyring, open_store
+from api.process.runtime import open_keyring, open_store
 from api.settings import Settings
-from tests.api.test_server import free_port
+from tests.api.process.test_server import free_port
 from tests.patience import PATIENCE_S
 
 

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from templates.decoys import Attributes
-from templates.lifting import Strategy
-from templates.private_file import make_folder, replace_public
+from templates.keys.private_file import make_folder, replace_public
+from templates.space.lifting import Strategy
 from verify.evaluation.runs import Run
 from verify.evaluation.units import LiftUnit, RawUnit, Unit
 

@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from templates.binding import MAX_M
+from templates.contract.binding import MAX_M
 from templates.decoys import DecoyPool
 from templates.distances import DEFAULT_STEPS, Metric
 from templates.errors import VeilfaceError
-from templates.lifting import Strategy
+from templates.space.lifting import Strategy
 from verify.evaluation.baselines import Hash
 from verify.evaluation.material import Source
 from verify.evaluation.units import RAW, RAW_FLIP, HashUnit, LiftUnit, Mode, RawUnit, Unit

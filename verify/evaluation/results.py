@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from models.extraction import Failure
-from templates.binding import Binding
+from templates.contract.binding import Binding
 from templates.decoys import DecoyPool
-from templates.lifting import Strategy
-from templates.rotation import ROTATION_VERSION
+from templates.keys.rotation import ROTATION_VERSION
+from templates.space.lifting import Strategy
 from verify.evaluation.backends import SOFTWARE
 from verify.evaluation.evaluation import Evaluated, Work
 from verify.evaluation.material import Source

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from templates import wire
+from templates.contract import wire
 from templates.decoys import DecoyPool
-from templates.lifting import Strategy
+from templates.space.lifting import Strategy
 from verify.evaluation.baselines import packed_bytes
 from verify.evaluation.material import Source
 from verify.evaluation.resampling import Interval, fmr_grid

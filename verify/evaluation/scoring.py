@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from templates.decoys import Attributes, DecoyPool, DecoySource
 from templates.distances import Metric, paired_distances, similarity
-from templates.lifting import Strategy, lift
-from templates.randomness import Keystream
-from templates.subspace import SubspaceBatch
+from templates.keys.randomness import Keystream
+from templates.space.lifting import Strategy, lift
+from templates.space.subspace import SubspaceBatch
 from verify.evaluation.baselines import hash_similarities
 from verify.evaluation.material import Material, Source
 from verify.evaluation.units import (

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from templates.private_file import replace_public
+from templates.keys.private_file import replace_public
 from verify.evaluation import group_tables
 from verify.evaluation.markdown_cells import (
     MISSING,

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from templates.blas import single_threaded
 from templates.distances import pairwise_distances
-from templates.lifting import Strategy, lift
-from templates.randomness import Keystream
+from templates.keys.randomness import Keystream
+from templates.space.lifting import Strategy, lift
 from verify.evaluation.baselines import hash_comparison, packed_bytes
 from verify.evaluation.material import Material
 from verify.evaluation.rows import Json, cell_json

@@ -5,7 +5,7 @@ from enum import StrEnum
 from typing import Literal
 
 from templates.distances import Metric
-from templates.lifting import Strategy
+from templates.space.lifting import Strategy
 from verify.evaluation.baselines import Hash
 
 RAW = "raw"
@@ -75,7 +75,7 @@ class LiftUnit:
     Parameters
     ----------
     strategy, m
-        As in :func:`templates.lifting.lift`.
+        As in :func:`templates.space.lifting.lift`.
     source
         Position of the decoy source among those of the evaluation; None for ``random``.
     shared

@@ -14,7 +14,7 @@ from attacks.learned import extra
 from models.pack import ModelPack
 from templates.decoys import DecoyGenerator
 from templates.decoys.fitting import MIN_DESCRIPTORS
-from templates.randomness import Keystream
+from templates.keys.randomness import Keystream
 from tests.api.cli.audit_bench import draw_fairface
 from tests.api.cli.conftest import Ran, World, run
 

@@ -7,13 +7,12 @@ import sys
 import numpy as np
 import pytest
 
-from api import distance_bench
-from api.cli import bench
-from api.distance_bench import Repeat, Row
+from api.cli import bench, distance_bench
+from api.cli.distance_bench import Repeat, Row
 from benchmarks import all_pairs, distances
 from templates.distances import DEFAULT_STEPS, Metric, pairwise_distances, similarity
 from tests.api.cli.conftest import run
-from tests.templates.test_distances import faces
+from tests.templates.distances.test_distances import faces
 from verify.evaluation.units import Mode
 
 TINY = ("bench", "distances", "--count", "9", "--n", "12,24", "--dim", "2,3", "--repeats", "3")

@@ -2,12 +2,12 @@ import pytest
 
 from api.cli.calibrate import concealment_note, likeness_note, parse_dims, read_aliases
 from api.cli.errors import CommandError, UsageError
-from api.opening import file_sealer
+from api.process.opening import file_sealer
 from models.demo import DEMO_NOTICE
-from templates.contract import Contract
+from templates.contract.document import Contract
 from templates.decoys import DecoyGenerator
-from templates.lifting import Strategy
-from templates.sealing import MasterKeyring
+from templates.keys.sealing import MasterKeyring
+from templates.space.lifting import Strategy
 from tests.api.cli.conftest import DIM, PROBE_DIM, key_file, run
 from verify.metrics import rate
 

@@ -4,7 +4,7 @@ import sqlite3
 
 import pytest
 
-from templates.sealing import MasterKeyring
+from templates.keys.sealing import MasterKeyring
 from templates.store import TemplateStore
 from templates.store.audit_log import By
 from templates.store.lockout import LockedOut

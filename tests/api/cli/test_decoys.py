@@ -3,11 +3,11 @@ import stat
 
 import pytest
 
-from api.opening import file_sealer
+from api.process.opening import file_sealer
 from models.demo import DEMO_NOTICE
-from templates.contract import Binding
+from templates.contract.document import Binding
 from templates.decoys import DecoyGenerator, DecoyPool, load_source
-from templates.sealing import MasterKeyring
+from templates.keys.sealing import MasterKeyring
 from tests.api.cli.conftest import key_file, run
 
 RACES = ("White", "Black", "Indian")

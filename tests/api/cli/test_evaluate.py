@@ -17,7 +17,7 @@ from PIL import Image
 from sklearn.model_selection import KFold
 
 from models.demo import DEMO_NOTICE
-from templates.subspace import SubspaceBatch
+from templates.space.subspace import SubspaceBatch
 from tests.api.cli.conftest import run
 from tests.api.cli.evaluation_bench import (
     CONTRACT,

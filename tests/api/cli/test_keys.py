@@ -7,12 +7,12 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from api.cli import keys
-from api.opening import file_sealer
-from api.receipts import receipt_json
-from templates.contract import Contract
+from api.http.receipts import receipt_json
+from api.process.opening import file_sealer
+from templates.contract.document import Contract
 from templates.errors import SealError
-from templates.key_file import locked, read_key_file, write_key_file
-from templates.sealing import MasterKeyring
+from templates.keys.key_file import locked, read_key_file, write_key_file
+from templates.keys.sealing import MasterKeyring
 from templates.store import TemplateStore
 from tests.api.cli.conftest import key_file, run
 

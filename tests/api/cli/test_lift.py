@@ -7,14 +7,14 @@ import time
 import numpy as np
 import pytest
 
-from api.opening import file_sealer
+from api.process.opening import file_sealer
 from models.demo import DEMO_NOTICE
 from models.pack import ModelPack
-from templates import wire
-from templates.contract import Binding, Contract
+from templates.contract import wire
+from templates.contract.document import Binding, Contract
 from templates.decoys import DecoyGenerator
-from templates.probe_signature import sign_probe
-from templates.sealing import MasterKeyring
+from templates.keys.probe_signature import sign_probe
+from templates.keys.sealing import MasterKeyring
 from tests.api.cli.conftest import DIM, PROBE_DIM, key_file, run
 
 SERVICE = 61234

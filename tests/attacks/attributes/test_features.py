@@ -5,9 +5,9 @@ import numpy as np
 from attacks.attributes.features import Axes, Features, features_of
 from attacks.attributes.neighbours import nearest_neighbours
 from templates.decoys import DecoyPool
-from templates.lifting import lift
-from templates.randomness import Keystream
-from templates.subspace import SubspaceBatch
+from templates.keys.randomness import Keystream
+from templates.space.lifting import lift
+from templates.space.subspace import SubspaceBatch
 from tests.attacks.attributes.people import faces
 
 GALLERY, VICTIMS, DECOYS = faces(200, seed=1), faces(12, seed=2), faces(40, seed=3)

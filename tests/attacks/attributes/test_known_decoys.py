@@ -5,9 +5,9 @@ import pytest
 
 from attacks.attributes.known_decoys import TOUCH, Decoys, find_decoys, never_seen, strip
 from templates.decoys import DecoyPool
-from templates.lifting import lift
-from templates.randomness import Keystream
-from templates.subspace import SubspaceBatch
+from templates.keys.randomness import Keystream
+from templates.space.lifting import lift
+from templates.space.subspace import SubspaceBatch
 from tests.attacks.attributes.people import faces
 
 POOL = DecoyPool(faces(150, seed=1, n=256).descriptors)

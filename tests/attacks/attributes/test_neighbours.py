@@ -16,8 +16,8 @@ from attacks.errors import AuditError
 from templates import tiles
 from templates.decoys import DecoyPool
 from templates.distances import Metric, Neighbours, pairwise_distances
-from templates.lifting import lift
-from templates.randomness import Keystream
+from templates.keys.randomness import Keystream
+from templates.space.lifting import lift
 from tests.attacks.attributes.people import faces
 
 GALLERY = faces(300, seed=1).descriptors

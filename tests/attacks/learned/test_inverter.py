@@ -8,7 +8,7 @@ from attacks.errors import AuditError
 from attacks.learned import invert, train
 from attacks.learned.inverter import Inverter
 from attacks.scene import Scene
-from templates.subspace import SubspaceBatch
+from templates.space.subspace import SubspaceBatch
 from tests.verify.synthetic import random_rotation
 
 pytest.importorskip("torch")
@@ -57,7 +57,7 @@ def test_training_beats_the_foot_point_where_decoys_differ_from_faces(scene: Sce
         return drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
 
     def lift(people: np.ndarray, epoch: int) -> SubspaceBatch:
-        from templates.randomness import Keystream
+        from templates.keys.randomness import Keystream
 
         with Keystream.seeded("apart", epoch) as stream:
             decoys = np.zeros((len(people), 4, 2 * half))

@@ -7,11 +7,11 @@ import numpy as np
 from attacks.cast import Cast, make_cast
 from attacks.outcomes import Outcome, Scheme
 from attacks.scene import Scene, owners_pool, stage
-from templates.canonical import Json
-from templates.contract import Binding, Rate
+from templates.contract.canonical import Json
+from templates.contract.document import Binding, Rate
 from templates.decoys import DecoyGenerator
-from templates.lifting import Strategy
-from templates.rotation import ROTATION_VERSION
+from templates.keys.rotation import ROTATION_VERSION
+from templates.space.lifting import Strategy
 from tests.verify.synthetic import draw_people
 from verify import CalibrationOptions, calibrate
 

@@ -5,8 +5,8 @@ import pytest
 
 from attacks.outcomes import Knowledge
 from attacks.stored.foot_point import foot_point_attack, foot_points
-from templates.lifting import lift
-from templates.randomness import Keystream
+from templates.keys.randomness import Keystream
+from templates.space.lifting import lift
 from tests.attacks.stored.staging import VICTIMS, cast, counts, noise, number, scene
 
 

@@ -13,7 +13,7 @@ from attacks.stored.known_database import (
 )
 from attacks.stored.recording import RecordingSource, recorded_lift
 from templates.decoys import DecoyPool
-from templates.randomness import Keystream
+from templates.keys.randomness import Keystream
 from tests.attacks.stored.staging import VICTIMS, M, cast, count, noise, number, scene, share
 
 

@@ -17,7 +17,7 @@ from attacks.stored.presentation import (
 from attacks.stored.wolf_ascent import Ground, ascend_points, ascend_subspaces
 from attacks.stored.wolves import axis_wolves
 from templates.distances import paired_distances
-from templates.subspace import SubspaceBatch
+from templates.space.subspace import SubspaceBatch
 from tests.attacks.stored.staging import VICTIMS, counts, noise, scene, share
 
 

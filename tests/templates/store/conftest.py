@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from templates.sealing import MasterKeyring
+from templates.keys.sealing import MasterKeyring
 from templates.store import Source, StoredTemplate, TemplateStore
 from templates.store.envelope import Envelope, close_envelope
 from tests.databases import database_url, postgres_database, postgres_url  # noqa: F401

@@ -7,7 +7,7 @@ from datetime import timedelta
 import pytest
 import sqlalchemy as sa
 
-from templates.sealing import MasterKeyring, encode_parts
+from templates.keys.sealing import MasterKeyring, encode_parts
 from templates.store import By, LockedOut, NewApiKey, Right, TemplateStore
 from templates.store.record_check import ACTOR_NEVER_CREATED, KEY_ALTERED, RecordProblem
 from tests.templates.store.conftest import Clock, put

@@ -9,8 +9,9 @@ import pytest
 import sqlalchemy as sa
 
 from templates.errors import StoreError
-from templates.sealing import MasterKeyring
-from templates.store import By, NewApiKey, Right, TemplateStore, UnknownTenant, probe_key
+from templates.keys.api_token import probe_key
+from templates.keys.sealing import MasterKeyring
+from templates.store import By, NewApiKey, Right, TemplateStore, UnknownTenant
 from templates.store.database import Database
 from templates.store.schema import ApiKeyRow
 from tests.templates.store.conftest import Clock

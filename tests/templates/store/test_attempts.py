@@ -12,7 +12,7 @@ import pytest
 import sqlalchemy as sa
 
 from templates.errors import StoreError
-from templates.sealing import MasterKeyring
+from templates.keys.sealing import MasterKeyring
 from templates.store import (
     Attempt,
     AttemptsStatus,

@@ -16,7 +16,7 @@ import pytest
 import sqlalchemy as sa
 
 from templates.errors import SealError, StoreError
-from templates.sealing import MasterKeyring
+from templates.keys.sealing import MasterKeyring
 from templates.store import (
     Anchor,
     BrokenAuditLog,

@@ -15,7 +15,7 @@ from typing import TextIO
 import pytest
 import sqlalchemy as sa
 
-from templates.sealing import MasterKeyring
+from templates.keys.sealing import MasterKeyring
 from templates.store import TemplateStore
 from templates.store.schema import ReceiptRow, SubjectRow, TemplateRow
 from tests.templates.store.conftest import put

@@ -10,7 +10,7 @@ import pytest
 import sqlalchemy as sa
 
 from templates.errors import StoreError, StoreUnavailable
-from templates.sealing import MasterKeyring
+from templates.keys.sealing import MasterKeyring
 from templates.store import TemplateStore
 from templates.store.database import Database
 from templates.store.schema import TenantRow

@@ -9,7 +9,7 @@ import sqlalchemy as sa
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
 from templates.errors import StoreError
-from templates.sealing import MasterKeyring
+from templates.keys.sealing import MasterKeyring
 from templates.store import Claim, Receipt, TemplateStore, verify_receipt
 from templates.store.database import Database
 from templates.store.receipts import key_fingerprint

@@ -7,7 +7,7 @@ import pytest
 import sqlalchemy as sa
 
 from templates.errors import SealError, StoreError
-from templates.sealing import MasterKeyring
+from templates.keys.sealing import MasterKeyring
 from templates.store import Retention, TemplateStore, migrate
 from templates.store.database import Database
 from templates.store.schema import Base, SubjectRow, TenantRow

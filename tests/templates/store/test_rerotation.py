@@ -12,20 +12,20 @@ import pytest
 import sqlalchemy as sa
 from numpy.typing import NDArray
 
-from templates import wire
+from templates.contract import wire
 from templates.distances import Metric, pairwise_distances
 from templates.errors import StoreError, StoreUnavailable
-from templates.lifting import lift
-from templates.randomness import Keystream
-from templates.rotation import rotate, tenant_rotation
-from templates.sealing import MasterKeyring
+from templates.keys.randomness import Keystream
+from templates.keys.rotation import rotate, tenant_rotation
+from templates.keys.sealing import MasterKeyring
+from templates.space.lifting import lift
+from templates.space.subspace import AffineSubspace, SubspaceBatch
 from templates.store import Source, TemplateStore, UnknownTenant
 from templates.store.audit_log import By
 from templates.store.database import Database
 from templates.store.rerotation import _Turns
 from templates.store.schema import RotationKeyRow, SubjectRow, TemplateRow
 from templates.store.tenants import RetiredRotation
-from templates.subspace import AffineSubspace, SubspaceBatch
 from tests.patience import PATIENCE_S
 from tests.templates.store.conftest import CONTRACT, Clock, SlowSealing, template_id
 from tests.templates.store.test_erasure import found, pieces

@@ -6,8 +6,9 @@ import pytest
 import sqlalchemy as sa
 
 from templates.errors import SealError
-from templates.sealing import MasterKeyring
-from templates.store import TemplateStore, probe_key
+from templates.keys.api_token import probe_key
+from templates.keys.sealing import MasterKeyring
+from templates.store import TemplateStore
 from templates.store.database import Database
 from templates.store.rewrap import WRAPPED_COLUMNS
 from templates.store.schema import Base, TemplateRow

@@ -10,7 +10,7 @@ import pytest
 import sqlalchemy as sa
 
 from templates.errors import StoreError
-from templates.sealing import MasterKeyring
+from templates.keys.sealing import MasterKeyring
 from templates.store import (
     By,
     Claim,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from templates.randomness import Keystream
+from templates.keys.randomness import Keystream
 from verify.evaluation.baselines import (
     Hash,
     biohashing,

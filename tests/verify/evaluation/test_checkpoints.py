@@ -8,7 +8,7 @@ import pytest
 
 from templates.decoys import Attributes
 from templates.distances import Metric
-from templates.lifting import Strategy
+from templates.space.lifting import Strategy
 from tests.verify.evaluation.materials import material
 from verify.evaluation.baselines import Hash
 from verify.evaluation.checkpoints import FOLDER, Checkpoints

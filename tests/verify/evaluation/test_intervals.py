@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from templates.distances import Metric
-from templates.lifting import Strategy
+from templates.space.lifting import Strategy
 from tests.verify.evaluation.materials import material
 from verify.evaluation.material import Material
 from verify.evaluation.resampling import fmr_grid, replicate_weights

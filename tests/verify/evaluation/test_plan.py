@@ -1,6 +1,6 @@
 import pytest
 
-from templates.lifting import Strategy
+from templates.space.lifting import Strategy
 from tests.verify.evaluation.materials import pool
 from verify.evaluation.plan import EvaluationError, Plan, units_of
 from verify.evaluation.units import HashUnit, LiftUnit, RawUnit

@@ -5,8 +5,8 @@ import pytest
 
 from templates.decoys import Attributes, DecoyGenerator, DecoyPool
 from templates.distances import Metric, similarity
-from templates.lifting import Strategy, lift
-from templates.randomness import Keystream
+from templates.keys.randomness import Keystream
+from templates.space.lifting import Strategy, lift
 from tests.verify.evaluation.materials import N, material, pool
 from verify.evaluation.baselines import Hash
 from verify.evaluation.material import Material

@@ -5,8 +5,8 @@ import pytest
 from numpy.typing import NDArray
 
 from templates.distances import Metric, pairwise_distances
-from templates.lifting import lift
-from templates.subspace import SubspaceBatch
+from templates.space.lifting import lift
+from templates.space.subspace import SubspaceBatch
 from tests.verify.evaluation.materials import N, material
 from verify.evaluation import timing
 from verify.evaluation.timing import timings

@@ -12,7 +12,7 @@ whether the descriptor's product with vector i exceeds a threshold, here 0 as in
 import numpy as np
 from numpy.typing import NDArray
 
-from templates.randomness import Keystream
+from templates.keys.randomness import Keystream
 from verify.evaluation.baselines.orthonormal import Flips, Matrix, orthonormal
 
 

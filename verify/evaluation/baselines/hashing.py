@@ -6,7 +6,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from templates.randomness import Keystream
+from templates.keys.randomness import Keystream
 from verify.evaluation.baselines import biohashing, mlp_hash
 from verify.evaluation.baselines.orthonormal import Flips, Matrix
 

@@ -28,7 +28,7 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
-from templates.randomness import Keystream
+from templates.keys.randomness import Keystream
 from verify.evaluation.baselines.orthonormal import Flips, Matrix, orthonormal
 
 HIDDEN_LAYERS = 3

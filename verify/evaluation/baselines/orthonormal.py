@@ -4,7 +4,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from templates.randomness import Keystream
+from templates.keys.randomness import Keystream
 
 Matrix = NDArray[np.float32]
 """Weights of a layer, of shape (inputs, outputs): a row of descriptors times it is the output."""

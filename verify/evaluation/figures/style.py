@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 
-from templates.private_file import replace_public
+from templates.keys.private_file import replace_public
 
 GROUND = "#ffffff"
 INK = "#1b1f24"

@@ -1,0 +1,1 @@
+"""``veilface demo``: the real service, with synthetic people."""

@@ -1,0 +1,400 @@
+"""The demo: the real service, with people who do not exist.
+
+Without weights it builds the demo model, draws faces, makes the decoys and the contract by the
+code of the commands, starts ``veilface serve`` as its own process, and talks to it over HTTP as
+any client would: enroll, verify, erase. With a pack and a folder of faces everything is real.
+
+What is printed is computed from the answers and from the database's file; :attr:`Outcome.faults`
+holds whatever did not go as promised.
+"""
+
+import base64
+import math
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+from api.demo.people import ENROLLED_PHOTOS, PROBE_PHOTOS, Cast, Scale, drawn_cast, found_cast
+from api.demo.service import running_service
+from api.demo.storage import KEY_FILE, Stored, read_stored, rows_of
+from api.http.errors import StartError
+from api.http.receipts import verify_answer
+from api.process.opening import file_sealer
+from api.process.preparation import calibrate_folder, default_probe_dims, make_generator
+from models.demo import build_demo_pack, is_demo_model
+from models.extraction import Extraction, Extractor
+from models.pack import ModelPack
+from templates.contract.document import Contract
+from templates.keys.sealing import MasterKeyring
+from templates.space.lifting import Strategy
+from verify import CalibrationOptions, LabelledFolder
+
+MARKER = "# Written by `veilface demo`, which replaces this folder when it runs again."
+# A run fails if the level's FMR makes so many accepted impostors less likely than this.
+LEAST_LIKELY = 0.001
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Person:
+    """One enrolled person, and how the service answered."""
+
+    name: str
+    genuine_accepted: int
+    genuine_trials: int
+    impostors_accepted: int
+    impostor_trials: int
+
+
+@dataclass(frozen=True)
+class LevelCount:
+    """What one security level did in the demo."""
+
+    level: str
+    fmr: float
+    genuine_accepted: int
+    genuine_trials: int
+    impostors_accepted: int
+    impostor_trials: int
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Everything that the demo found out."""
+
+    demo_model: bool
+    folder: Path
+    pack: str
+    contract_id: str
+    strategy: str
+    people: tuple[Person, ...]
+    levels: tuple[LevelCount, ...]
+    default_level: str
+    stored: tuple[Stored, ...]
+    erased: str
+    receipt: dict[str, Any]
+    rows_after_erasure: int
+    refused_photos: tuple[str, ...]
+    locks_lifted: int
+    seconds: float
+    faults: tuple[str, ...] = field(default=())
+
+
+def run_demo(
+    folder: Path,
+    *,
+    pack: Path | None = None,
+    faces: Path | None = None,
+    m: int = 16,
+    scale: Scale | None = None,
+    say: Say = lambda _: None,
+) -> Outcome:
+    """Run the demo and leave ``folder`` ready for ``veilface serve``.
+
+    Parameters
+    ----------
+    folder
+        Where the data go. An earlier demo there is replaced; any other folder that is not empty
+        is refused.
+    pack, faces
+        A model pack and a folder ``Person/photo.jpg`` for a real run; both or none.
+    m
+        Dimension of the templates.
+    scale
+        Numbers of people and photos that are drawn.
+    say
+        Called with what is being done.
+
+    Raises
+    ------
+    StartError
+        One sentence on what is missing.
+    """
+    started = time.monotonic()
+    if (pack is None) != (faces is None):
+        raise StartError("a real run needs both a model pack and a folder of faces")
+    size = scale or Scale()
+    _prepare_folder(folder)
+    with tempfile.TemporaryDirectory(prefix="veilface-demo-") as scratch:
+        if pack is None or faces is None:
+            say("building the demo model and drawing faces")
+            pack = build_demo_pack(folder / "pack")
+            cast, decoy_photos, labelled = drawn_cast(folder / "people", Path(scratch), size)
+        else:
+            cast, decoy_photos, labelled = found_cast(faces, size)
+        contract = _calibrate(folder, pack, decoy_photos, labelled, m=m, say=say)
+    _write_settings(folder, pack)
+    say("starting the service")
+    with running_service(folder) as client:
+        return _play(client, folder, pack, contract, cast, say=say, started=started)
+
+
+def _prepare_folder(folder: Path) -> None:
+    settings = folder / "veilface.toml"
+    if folder.exists() and any(folder.iterdir()):
+        ours = settings.is_file() and settings.read_text(encoding="utf-8").startswith(MARKER)
+        if not ours:
+            raise StartError(f"{folder} is not empty and no earlier demo; choose another folder")
+        shutil.rmtree(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    # Written first, so that a demo that is interrupted can be replaced.
+    settings.write_text(MARKER + "\n", encoding="utf-8")
+
+
+def _calibrate(
+    folder: Path,
+    pack_path: Path,
+    decoy_photos: Sequence[Path],
+    labelled: LabelledFolder,
+    *,
+    m: int,
+    say: Say,
+) -> Contract:
+    """Do what ``decoys build`` and ``calibrate`` do."""
+    pack = ModelPack.load(pack_path)
+    say(f"embedding {len(decoy_photos)} faces for the decoys")
+    generator = make_generator(_extract(pack, decoy_photos), pack)
+    generator.save(folder / "decoys.veil")
+    say(f"embedding {len(labelled)} photos of {labelled.people} people for the calibration")
+    extraction = _extract(pack, labelled.paths)
+    say("calibrating on private templates")
+    done = calibrate_folder(
+        labelled,
+        extraction,
+        pack=pack,
+        source=generator,
+        strategy=Strategy.ADVERSARIAL,
+        m=m,
+        options=CalibrationOptions(
+            photos_per_enrollment=ENROLLED_PHOTOS, probe_dims=(0, *default_probe_dims(m))
+        ),
+    )
+    keyring = MasterKeyring.create(folder / KEY_FILE)
+    done.contract.save(folder / "contract.json", file_sealer(keyring))
+    return done.contract
+
+
+def _extract(pack: ModelPack, photos: Sequence[Path]) -> Extraction:
+    extraction = Extractor(pack).extract(photos)
+    if not len(extraction.descriptors):
+        raise StartError("no photo gave a descriptor; are these photos of faces?")
+    return extraction
+
+
+def _write_settings(folder: Path, pack: Path) -> None:
+    def quoted(path: Path) -> str:
+        text = str(path.resolve()).replace("\\", "\\\\").replace('"', '\\"')
+        return f'"{text}"'
+
+    lines = [
+        MARKER,
+        f"data_dir = {quoted(folder)}",
+        "# Beside the database only here: a deployment keeps the two apart.",
+        f"master_key_file = {quoted(folder / KEY_FILE)}",
+        f"pack = {quoted(pack)}",
+    ]
+    if is_demo_model(ModelPack.load(pack, threads=1).info.embedder_sha256):
+        lines.append("demo = true")
+    (folder / "veilface.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _play(
+    client: httpx.Client,
+    folder: Path,
+    pack: Path,
+    contract: Contract,
+    cast: Cast,
+    *,
+    say: Say,
+    started: float,
+) -> Outcome:
+    say(f"enrolling {len(cast.enrolled)} people over HTTP")
+    refused: list[str] = []
+    faults: list[str] = []
+    enrolled: list[str] = []
+    for name, photos in cast.enrolled.items():
+        path = f"/v1/subjects/{name}/enrollment"
+        answer = _send(client, "PUT", path, photos[:ENROLLED_PHOTOS], face=cast.face)
+        if answer.status_code == httpx.codes.CREATED:
+            enrolled.append(name)
+        else:
+            faults.append(f"{name} was not enrolled: {_code(answer)}")
+    if not enrolled:
+        raise StartError("nobody could be enrolled: " + "; ".join(faults))
+    say("verifying genuine and impostor photos over HTTP")
+    levels = [level.name for level in contract.calibration("p2s").levels]
+    default = contract.default_level
+    attempts, locks = _attempts(client, cast, enrolled, levels, refused)
+    people = tuple(
+        Person(name, *_count(attempts, level=default, subject=name)) for name in cast.enrolled
+    )
+    counts = tuple(
+        LevelCount(level, _fmr(contract, level), *_count(attempts, level=level)) for level in levels
+    )
+    stored = read_stored(folder, enrolled)
+    say("erasing one person and checking the receipt")
+    erased = enrolled[0]
+    receipt, erasure_faults = _erase(client, erased, cast.enrolled[erased][-1])
+    rows = rows_of(folder, erased)
+    faults += erasure_faults + _faults(people, counts)
+    if rows:
+        faults.append(f"{rows} rows of {erased} are left in the database after the erasure")
+    binding = contract.binding
+    return Outcome(
+        demo_model=is_demo_model(binding.embedder_sha256),
+        folder=folder,
+        pack=pack.name,
+        contract_id=contract.contract_id,
+        strategy=f"{binding.strategy}, m = {binding.m}, n = {binding.n}",
+        people=people,
+        levels=counts,
+        default_level=default,
+        stored=stored,
+        erased=erased,
+        receipt=receipt,
+        rows_after_erasure=rows,
+        refused_photos=tuple(refused),
+        locks_lifted=locks,
+        seconds=time.monotonic() - started,
+        faults=tuple(faults),
+    )
+
+
+@dataclass(frozen=True)
+class _Attempt:
+    subject: str
+    genuine: bool
+    level: str
+    accepted: bool
+
+
+def _attempts(
+    client: httpx.Client,
+    cast: Cast,
+    enrolled: Sequence[str],
+    levels: Sequence[str],
+    refused: list[str],
+) -> tuple[list[_Attempt], int]:
+    """Show every probe photo to every enrolled subject, at every level.
+
+    An enrollment that was refused counts as failed genuine attempts of that person. So many
+    strangers lock every subject out; the lock is lifted as an operator would, and counted.
+    """
+    probes = [
+        (name, photo)
+        for name, photos in cast.enrolled.items()
+        for photo in photos[ENROLLED_PHOTOS : ENROLLED_PHOTOS + PROBE_PHOTOS]
+    ]
+    probes += list(cast.strangers.items())
+    found = [
+        _Attempt(name, True, level, False)
+        for name in cast.enrolled
+        if name not in enrolled
+        for level in levels
+        for _ in range(PROBE_PHOTOS)
+    ]
+    lifted = 0
+    for owner, photo in probes:
+        for subject in enrolled:
+            for level in levels:
+                path = f"/v1/subjects/{subject}/verify"
+                answer = _send(client, "POST", path, [photo], level=level, face=cast.face)
+                if answer.status_code == httpx.codes.LOCKED:
+                    lifted += _lift(client, subject)
+                    answer = _send(client, "POST", path, [photo], level=level, face=cast.face)
+                if answer.status_code != httpx.codes.OK:
+                    refusal = f"{owner}/{photo.name}: {_code(answer)}"
+                    if refusal not in refused:
+                        refused.append(refusal)
+                    # A genuine photo that cannot be used is a failed attempt of its owner.
+                    accepted = False
+                else:
+                    accepted = answer.json()["decision"] == "accept"
+                found.append(_Attempt(subject, owner == subject, level, accepted))
+    for subject in enrolled:
+        _lift(client, subject)
+    return found, lifted
+
+
+def _lift(client: httpx.Client, subject: str) -> int:
+    """Lift the lockout of a subject; 1 if there was one."""
+    answer = client.delete(f"/v1/subjects/{subject}/lockout")
+    return int(answer.status_code == httpx.codes.OK and bool(answer.json()["lifted"]))
+
+
+def _send(
+    client: httpx.Client, method: str, path: str, photos: Sequence[Path], **fields: str
+) -> httpx.Response:
+    name = "images" if method == "PUT" else "image"
+    files = [(name, (photo.name, photo.read_bytes())) for photo in photos]
+    answer = client.request(method, path, files=files, data=fields)
+    while answer.status_code == httpx.codes.TOO_MANY_REQUESTS:
+        time.sleep(int(answer.headers["Retry-After"]))
+        answer = client.request(method, path, files=files, data=fields)
+    return answer
+
+
+def _code(answer: httpx.Response) -> str:
+    try:
+        return str(answer.json()["error"]["code"])
+    except (ValueError, KeyError, TypeError):
+        return f"status {answer.status_code}"
+
+
+def _count(
+    attempts: Sequence[_Attempt], *, level: str, subject: str | None = None
+) -> tuple[int, int, int, int]:
+    """Genuine accepted, genuine trials, impostors accepted, impostor trials."""
+    mine = [a for a in attempts if a.level == level and subject in (None, a.subject)]
+    genuine = [a.accepted for a in mine if a.genuine]
+    impostors = [a.accepted for a in mine if not a.genuine]
+    return sum(genuine), len(genuine), sum(impostors), len(impostors)
+
+
+def _fmr(contract: Contract, name: str) -> float:
+    level = contract.calibration("p2s").level(name)
+    return level.fmr.value if level.target_fmr is None else level.target_fmr
+
+
+def _erase(client: httpx.Client, name: str, photo: Path) -> tuple[dict[str, Any], list[str]]:
+    faults = []
+    answer = client.delete(f"/v1/subjects/{name}")
+    if answer.status_code != httpx.codes.OK:
+        return {}, [f"{name} was not erased: {_code(answer)}"]
+    public = base64.b64decode(client.get("/v1/contract").json()["receipt_key"]["public_key"])
+    claims = verify_answer(answer.json(), public)
+    if not claims["held"]:
+        faults.append("the receipt says that nothing was held")
+    again = _send(client, "POST", f"/v1/subjects/{name}/verify", [photo])
+    if _code(again) != "not_enrolled":
+        faults.append(f"{name} still answers after the erasure: {_code(again)}")
+    return claims, faults
+
+
+def _faults(people: Sequence[Person], levels: Sequence[LevelCount]) -> list[str]:
+    faults = [
+        f"{person.name} was rejected in most genuine attempts"
+        for person in people
+        if 2 * person.genuine_accepted < person.genuine_trials
+    ]
+    for level in levels:
+        likelihood = at_least(level.impostors_accepted, level.impostor_trials, level.fmr)
+        if likelihood < LEAST_LIKELY:
+            faults.append(
+                f"level {level.level} accepted {level.impostors_accepted} of "
+                f"{level.impostor_trials} impostors, more than its FMR of {level.fmr:g} explains"
+            )
+    return faults
+
+
+def at_least(errors: int, trials: int, rate: float) -> float:
+    """Probability of ``errors`` or more among independent trials that err at ``rate``."""
+    fewer = (math.comb(trials, k) * rate**k * (1 - rate) ** (trials - k) for k in range(errors))
+    return max(0.0, 1.0 - math.fsum(fewer))

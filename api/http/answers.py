@@ -1,0 +1,44 @@
+"""Answers: JSON with a request id, and the one shape of errors."""
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from starlette.requests import Request
+from starlette.responses import Response
+
+from api.http.errors import ApiError
+from models.demo import DEMO_NOTICE
+
+
+class JsonAnswer(Response):
+    """JSON in ASCII, without NaN: any text that reached it can be sent."""
+
+    media_type = "application/json"
+
+    def render(self, content: Any) -> bytes:
+        """Return the body's bytes."""
+        return json.dumps(content, allow_nan=False, separators=(",", ":")).encode("ascii")
+
+
+def answer(
+    request: Request,
+    body: Mapping[str, Any],
+    *,
+    status: int = 200,
+    headers: Mapping[str, str] | None = None,
+) -> JsonAnswer:
+    """Return a success with the request id in its body."""
+    content = {**body, "request_id": request.state.request_id}
+    if request.app.state.settings.demo:
+        content["notice"] = DEMO_NOTICE
+    return JsonAnswer(content, status_code=status, headers=dict(headers or {}))
+
+
+def error_answer(error: ApiError, request_id: str) -> JsonAnswer:
+    """Return an error in the one shape."""
+    body = {
+        "error": {"code": error.code, "message": error.message, "details": dict(error.details)},
+        "request_id": request_id,
+    }
+    return JsonAnswer(body, status_code=error.status, headers=dict(error.headers))

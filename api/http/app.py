@@ -1,0 +1,307 @@
+"""The REST application: routes, handlers and the life of one worker."""
+
+import gc
+import logging
+import os
+import threading
+from collections.abc import AsyncIterator, Callable
+from contextlib import AsyncExitStack, asynccontextmanager
+from functools import partial
+from importlib.metadata import version
+from typing import Any
+
+import anyio
+import anyio.to_thread
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from starlette.exceptions import HTTPException
+from starlette.responses import Response
+
+from api.http.answers import error_answer
+from api.http.audit import note_refusal
+from api.http.audit_report import open_audit_report
+from api.http.context import RequestContext
+from api.http.errors import ApiError, StartError, api_error
+from api.http.openapi import DESCRIPTION, allowed_methods
+from api.http.protocol import Protocol
+from api.http.routes import (
+    contract,
+    enrollment,
+    health,
+    lockout,
+    own_key,
+    photo_check,
+    stored,
+    subjects,
+    transfer,
+    verification,
+)
+from api.http.routes.page import page_routes
+from api.limits.admission import Gate
+from api.limits.rates import RateLimits
+from api.process.allocator import keep_few_arenas
+from api.process.housekeeping import purge_regularly
+from api.process.logging import configure, log, uvicorn_log_config
+from api.process.metrics import count_lockout, join_shared_directory, set_build
+from api.process.opening import retention_of
+from api.process.operations import (
+    OPERATIONS_PATHS,
+    Readiness,
+    not_ready_once_told_to_stop,
+    operations_server,
+    tls_options,
+)
+from api.process.runtime import Runtime
+from api.process.supervised import end_with_supervisor, is_supervised, open_patiently, told_to_stop
+from api.settings import ENV_PREFIX, NO_PROXIES, Settings, load_settings
+from models.errors import ModelError
+from templates.blas import single_threaded
+from templates.distances import warm_up
+from templates.errors import VeilfaceError
+from verify.cohort import rounded_cohort
+
+VERSION = version("veilface")
+GRACE_S = 20
+IMPORT_S = 60
+"""Seconds in which a worker must show that it lives. It cannot before it has imported everything,
+and on a slow or busy machine uvicorn's five seconds would end each worker before it ever began."""
+
+
+def create_app(
+    settings: Settings, *, open_runtime: Callable[[Settings], Runtime] = Runtime.open
+) -> FastAPI:
+    """Make the application; what the settings name is opened when the server starts it."""
+
+    @asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        configure(settings.log_level)
+        async with AsyncExitStack() as running:
+            try:
+                await _open(app, settings, open_runtime, running)
+            except StartError as error:
+                # Its sentence is written for the operator and holds no secret.
+                log("start failed: " + str(error), severity=logging.ERROR)
+                raise
+            with not_ready_once_told_to_stop(app.state.readiness):
+                try:
+                    yield
+                finally:
+                    app.state.readiness.stopping = True
+
+    app = FastAPI(
+        title="Veilface",
+        version=VERSION,
+        description=DESCRIPTION,
+        lifespan=lifespan,
+        docs_url=None,
+        redoc_url=None,
+        openapi_url="/v1/openapi.json",
+        redirect_slashes=False,
+    )
+    app.state.settings = settings
+    for routes in (
+        own_key,
+        contract,
+        enrollment,
+        photo_check,
+        subjects,
+        stored,
+        verification,
+        lockout,
+        transfer,
+    ):
+        app.include_router(routes.router)
+    if settings.web_page:
+        app.router.routes.extend(page_routes(demo=settings.demo))
+    if settings.operations_port is None:
+        app.include_router(health.router)
+        _dress(app, settings, operations_paths=OPERATIONS_PATHS)
+    else:
+        _dress(app, settings, operations_paths=frozenset())
+    return app
+
+
+def _operations_app(app: FastAPI) -> FastAPI:
+    """Make the application of the operations port: the state of ``app``, and no other routes."""
+    beside = FastAPI(openapi_url=None, docs_url=None, redoc_url=None, redirect_slashes=False)
+    beside.state = app.state
+    beside.include_router(health.router)
+    _dress(beside, app.state.settings, operations_paths=OPERATIONS_PATHS)
+    return beside
+
+
+def _dress(app: FastAPI, settings: Settings, *, operations_paths: frozenset[str]) -> None:
+    app.add_middleware(
+        RequestContext,
+        max_in_flight=settings.max_in_flight,
+        operations_paths=operations_paths,
+        demo=settings.demo,
+        tls=settings.tls_certificate is not None,
+    )
+    for kind in (ApiError, VeilfaceError, ModelError):
+        app.add_exception_handler(kind, _known_error)
+    app.add_exception_handler(HTTPException, _framework_error)
+    app.add_exception_handler(RequestValidationError, _validation_error)
+
+
+async def _open(
+    app: FastAPI,
+    settings: Settings,
+    open_runtime: Callable[[Settings], Runtime],
+    running: AsyncExitStack,
+) -> None:
+    """Open what answers requests; ``running`` closes it again, the last one first."""
+    keep_few_arenas(settings.resolved_compute_slots)
+    # Requests compute beside each other, as many as there are slots. Threads of the matrix library
+    # would only wait for each other, and burn processor time while they do.
+    running.enter_context(single_threaded())
+    app.state.audit_report = open_audit_report(settings)
+    rate_limits = RateLimits.open(settings)
+    running.push_async_callback(rate_limits.close)
+    told = threading.Event()
+    with told_to_stop(told.set):
+        runtime = await anyio.to_thread.run_sync(
+            open_patiently, partial(open_runtime, settings), told
+        )
+    running.push_async_callback(_close, runtime)
+    gate = Gate(slots=settings.resolved_compute_slots, waiting=settings.queue_limit)
+    readiness = Readiness(runtime.store, runtime.pack, gate, runtime.keyring)
+    app.state.rate_limits, app.state.runtime = rate_limits, runtime
+    app.state.gate, app.state.readiness = gate, readiness
+    app.state.scrapes = anyio.CapacityLimiter(1)
+    await anyio.to_thread.run_sync(join_shared_directory)
+    set_build(version=VERSION, contract_id=runtime.contract.contract_id)
+    log(
+        "started",
+        version=VERSION,
+        pid=os.getpid(),
+        contract_id=runtime.contract.contract_id,
+        pack=None if runtime.pack is None else runtime.pack.info.name,
+    )
+    if (warning := await anyio.to_thread.run_sync(runtime.superseded_calibrations)) is not None:
+        log(warning, severity=logging.WARNING, contract_id=runtime.contract.contract_id)
+    await anyio.to_thread.run_sync(runtime.note_calibrations)
+    # No request is answered before this is done, so none waits for the compiler.
+    await anyio.to_thread.run_sync(warm_up)
+    await anyio.to_thread.run_sync(rounded_cohort, runtime.contract.cohort)
+    # What was made so far stays: looking through it for garbage would stop requests for 0.1 s.
+    gc.collect()
+    gc.freeze()
+    running.callback(gc.unfreeze)
+    tasks = await running.enter_async_context(anyio.create_task_group())
+    running.callback(tasks.cancel_scope.cancel)
+    tasks.start_soon(
+        partial(
+            purge_regularly,
+            runtime.store,
+            every_s=settings.purge_interval_s,
+            keep=retention_of(settings),
+            on_failure=readiness.note,
+        )
+    )
+    tasks.start_soon(readiness.watch)
+    if is_supervised():
+        tasks.start_soon(end_with_supervisor)
+    if settings.operations_port is not None:
+        app.state.operations_port = await running.enter_async_context(
+            operations_server(
+                _operations_app(app),
+                host=settings.operations_host,
+                port=settings.operations_port,
+            )
+        )
+
+
+async def _close(runtime: Runtime) -> None:
+    await anyio.to_thread.run_sync(runtime.close)
+    log("stopped", pid=os.getpid())
+
+
+def app_from_environment() -> FastAPI:
+    """Make the application in a worker process; the settings come from the environment."""
+    return create_app(load_settings())
+
+
+def uvicorn_options(settings: Settings) -> dict[str, Any]:
+    """Return the keyword arguments of ``uvicorn.run``.
+
+    With one worker the application itself is passed; several are started anew, and take the
+    settings from their environment, in which :func:`environment_of` has to stand.
+    """
+    options: dict[str, Any] = {
+        "host": settings.host,
+        "port": settings.port,
+        "log_config": uvicorn_log_config("warning" if settings.log_level == "info" else "info"),
+        "access_log": False,
+        "http": Protocol,
+        "server_header": False,
+        "date_header": True,
+        "timeout_graceful_shutdown": GRACE_S,
+        "timeout_worker_healthcheck": IMPORT_S,
+        "proxy_headers": settings.trusted_proxies != NO_PROXIES,
+        "forwarded_allow_ips": settings.trusted_proxies,
+        **tls_options(settings),
+    }
+    if settings.workers == 1:
+        return {"app": create_app(settings), **options}
+    return {
+        "app": "api.http.app:app_from_environment",
+        "factory": True,
+        "workers": settings.workers,
+        **options,
+    }
+
+
+def environment_of(settings: Settings) -> dict[str, str]:
+    """Write the settings as environment variables.
+
+    All of them, because a setting that equals its default may have been given as a flag, over
+    another value in the TOML file.
+    """
+    values = {name: getattr(settings, name) for name in Settings.model_fields}
+    return {
+        ENV_PREFIX + name.upper(): ",".join(value) if isinstance(value, tuple) else str(value)
+        for name, value in values.items()
+        if value is not None
+    }
+
+
+async def _known_error(request: Request, error: Exception) -> Response:
+    known = api_error(error)
+    if known is None:
+        raise error
+    request.app.state.readiness.note(error)
+    if known.code == "locked_out":
+        count_lockout(disabled=bool(known.details.get("disabled")))
+    request.state.log["code"] = known.code
+    request.state.log["error_type"] = None if error is known else type(error).__name__
+    await note_refusal(request, known, error)
+    return error_answer(known, request.state.request_id)
+
+
+async def _framework_error(request: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)  # noqa: S101 - registered for this type
+    code, message = {
+        404: ("not_found", "there is no such path"),
+        405: ("method_not_allowed", "this path does not take this method"),
+        413: ("request_too_large", "the request body is too large"),
+    }.get(error.status_code, ("malformed_request", "the request cannot be understood"))
+    headers = dict(error.headers or {})
+    if code == "method_not_allowed":
+        # The page's paths are not in the document; for them the framework knows.
+        allowed = allowed_methods(request.app.openapi(), request.url.path)
+        headers["Allow"] = ", ".join(allowed) or headers.get("Allow", "")
+    return await _known_error(request, ApiError(code, message, {}, headers))
+
+
+async def _validation_error(request: Request, error: Exception) -> Response:
+    assert isinstance(error, RequestValidationError)  # noqa: S101 - registered for this type
+    # Only the names of fields and the validator's own words: the input is not repeated.
+    problems = [
+        {"field": ".".join(map(str, problem["loc"][1:])), "problem": problem["type"]}
+        for problem in error.errors()
+    ]
+    return await _known_error(
+        request,
+        ApiError("validation_failed", "a parameter has a wrong value", {"problems": problems}),
+    )

@@ -1,0 +1,67 @@
+"""Who asks, for the audit log; and the lines of what was refused.
+
+What succeeds is written in the transaction that does it (``templates.store``). A refusal does
+nothing, so its line is written after it, and that it could not be written does not change the
+answer.
+"""
+
+import contextlib
+import getpass
+
+from starlette.requests import Request
+
+from api.http.errors import ApiError
+from templates.errors import StoreError
+from templates.store.audit_log import By, Entry
+
+ACTIONS = {
+    "enroll": "enroll",
+    "verify": "verify",
+    "erase_subject": "erase",
+    "export_subject": "export",
+    "get_stored": "inspect",
+    "import_subject": "import",
+    "unlock_subject": "unlock",
+}
+"""Routes whose refusals are written, by the name of their function, and the action of each."""
+
+UNWRITTEN = frozenset(
+    {"rate_limited", "overloaded", "store_unavailable", "model_unavailable", "internal_error"}
+)
+"""Codes that say nothing of the caller: the service's own state. Metrics and the log count them."""
+
+
+def by(request: Request) -> By:
+    """Name the API key and the request."""
+    return By(f"key:{request.state.log['key_id']}", request.state.request_id)
+
+
+def operator() -> By:
+    """Name who runs a command on this machine."""
+    with contextlib.suppress(OSError, KeyError, ImportError):
+        return By(f"operator:{getpass.getuser()}"[:64])
+    return By("operator")
+
+
+async def note_refusal(request: Request, error: ApiError, cause: Exception) -> None:
+    """Write the line of a refused call, where a known key made it.
+
+    `cause` is what was raised; the store marks what it has written itself (``recorded``).
+    """
+    fields = request.state.log
+    route = request.scope.get("route")
+    action = ACTIONS.get(getattr(route, "name", ""))
+    if action is None or "key_id" not in fields or error.code in UNWRITTEN:
+        return
+    if getattr(cause, "recorded", False):
+        return
+    entry = Entry(
+        action,
+        error.code,
+        by(request),
+        tenant=fields.get("tenant"),
+        pseudonym=getattr(request.state, "pseudonym", None),
+    )
+    log = request.app.state.runtime.store.audit_log
+    with contextlib.suppress(StoreError, ApiError):
+        await request.app.state.gate.query(lambda: log.record(entry))

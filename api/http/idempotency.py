@@ -1,0 +1,101 @@
+"""Writes that carry an Idempotency-Key: done once, answered as often as asked.
+
+Only successes are kept. A write that was refused changed nothing, so its key is given back and the
+client may send a better photo under the same key.
+"""
+
+import contextlib
+import hashlib
+import json
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from starlette.requests import Request
+from starlette.responses import Response
+
+from api.http.answers import answer
+from api.http.auth import Caller
+from api.process.runtime import Runtime
+from templates.errors import StoreError
+from templates.keys.sealing import encode_parts
+from templates.store.idempotency import Answer
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a write answers: it holds no subject id, because it is kept for a day."""
+
+    status: int
+    body: Mapping[str, Any]
+    replayed: bool = False
+
+
+async def once(
+    request: Request,
+    caller: Caller,
+    key: str | None,
+    *,
+    operation: str,
+    asked: Sequence[str | bytes],
+    subject: str | None,
+    work: Callable[[], Outcome],
+    run: Callable[[Callable[[], Outcome]], Awaitable[Outcome]],
+    add: Mapping[str, Any] | None = None,
+) -> Response:
+    """Do a write and answer it; with a key that was used before, answer what it answered then.
+
+    Parameters
+    ----------
+    operation, asked
+        What makes two requests the same. A multipart body is compared by its parts, because its
+        boundary differs between two sendings.
+    subject
+        Erasing this subject removes the record.
+    work
+        The write; runs in a thread.
+    run
+        Which threads: the gate's ``compute`` or ``query``.
+    add
+        Fields of the answer that are not kept.
+
+    Raises
+    ------
+    IdempotencyConflict
+        If the key belongs to another request, or its first request still runs.
+    """
+    runtime: Runtime = request.app.state.runtime
+
+    def guarded() -> Outcome:
+        if key is None:
+            return work()
+        records = runtime.store.idempotency
+        claim = records.claim(
+            caller.tenant,
+            actor=caller.prefix,
+            key=key,
+            request=hashlib.sha256(encode_parts(operation, *asked)).digest(),
+            subject_id=subject,
+        )
+        if isinstance(claim, Answer):
+            return Outcome(claim.status, json.loads(claim.body), replayed=True)
+        try:
+            outcome = work()
+        except BaseException:
+            with contextlib.suppress(StoreError):
+                records.release(claim)
+            raise
+        # The write is done; that its record could not be kept must not turn it into a failure.
+        with contextlib.suppress(StoreError):
+            records.finish(
+                claim, status=outcome.status, body=json.dumps(dict(outcome.body)).encode()
+            )
+        return outcome
+
+    outcome = await run(guarded)
+    return answer(
+        request,
+        {**outcome.body, **(add or {})},
+        status=outcome.status,
+        headers={"Idempotency-Replayed": "true"} if outcome.replayed else None,
+    )

@@ -1,0 +1,183 @@
+"""What OpenAPI says of errors and request bodies, derived from the one table of codes."""
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from api.http.errors import ERROR_CODES
+from api.http.schemas import (
+    HEX,
+    NONCE_EXAMPLE,
+    REQUEST_ID,
+    ErrorAnswer,
+    TemplateRequest,
+    VerifyRequest,
+)
+
+DESCRIPTION = """\
+Face authentication that never stores a face descriptor. Every error has one shape; the codes are
+listed with every call. `X-Request-ID` is accepted, and returned in the header and in the body.
+"""
+
+EVERY_CALL = (
+    "unauthorized",
+    "rate_limited",
+    "store_unavailable",
+    "overloaded",
+    "internal_error",
+)
+BODY = ("malformed_request", "request_too_large", "validation_failed")
+IDEMPOTENT = ("idempotency_conflict",)
+PHOTO = (
+    "unsupported_image",
+    "image_too_large",
+    "too_many_images",
+    "no_face",
+    "multiple_faces",
+    "face_too_small",
+    "low_quality",
+    "model_unavailable",
+)
+
+CHECKED_PHOTO = ("unsupported_image", "image_too_large", "too_many_images", "model_unavailable")
+
+
+def error_responses(*codes: str) -> dict[int | str, dict[str, Any]]:
+    """Document the codes of one call, grouped by status, each with an example."""
+    grouped: dict[int | str, dict[str, Any]] = {}
+    for code in sorted(set(codes), key=list(ERROR_CODES).index):
+        entry = ERROR_CODES[code]
+        response = grouped.setdefault(
+            entry.status,
+            {
+                "model": ErrorAnswer,
+                "description": "",
+                "content": {"application/json": {"examples": {}}},
+            },
+        )
+        shown = f"`{code}`: {entry.meaning}"
+        response["description"] = "\n\n".join(filter(None, (response["description"], shown)))
+        response["content"]["application/json"]["examples"][code] = {
+            "value": {
+                "error": {"code": code, "message": entry.meaning, "details": {}},
+                "request_id": REQUEST_ID,
+            }
+        }
+    return grouped
+
+
+def _text(description: str, **extra: Any) -> dict[str, Any]:
+    return {"type": "string", "description": description, **extra}
+
+
+LEVEL = _text(
+    "Security level; default from the contract, or the lowest allowed.", examples=["fmr-1e-3"]
+)
+FACE = _text(
+    "Which face counts when a photo shows several: none (`single`, the default: the photo is "
+    "refused), or the first by rank (`largest`), which is large and near the middle: area − "
+    "2·distance², in pixels, the distance from the middle of the picture.",
+    enum=["single", "largest"],
+)
+FILE = {"type": "string", "format": "binary"}
+SIGNATURE_EXAMPLE = {"nonce": NONCE_EXAMPLE, "timestamp": 1767225600, "hmac": HEX}
+
+
+def _body(multipart: dict[str, Any] | None, json_body: dict[str, Any]) -> dict[str, Any]:
+    content: dict[str, Any] = {"application/json": json_body}
+    if multipart is not None:
+        content = {"multipart/form-data": {"schema": multipart}, **content}
+    return {"requestBody": {"required": True, "content": content}}
+
+
+ENROLLMENT_BODY = _body(
+    {
+        "type": "object",
+        "required": ["images"],
+        "properties": {
+            "images": {"type": "array", "items": FILE, "minItems": 1, "maxItems": 10},
+            "attributes": _text(
+                "JSON object with `gender` and `race`; used for lifting only, never stored.",
+                examples=['{"gender": "Female", "race": "Indian"}'],
+            ),
+            "face": FACE,
+        },
+    },
+    {
+        "schema": TemplateRequest.model_json_schema(),
+        "examples": {"template": {"value": {"template": "kAAAAAAAAAB7Li4u"}}},
+    },
+)
+VERIFY_BODY = _body(
+    {
+        "type": "object",
+        "required": ["image"],
+        "properties": {"image": FILE, "level": LEVEL, "face": FACE},
+    },
+    {
+        "schema": VerifyRequest.model_json_schema(),
+        "examples": {
+            "embedding": {
+                "value": {"embedding": [0.6, -0.8], "level": "fmr-1e-3", **SIGNATURE_EXAMPLE}
+            },
+            "template": {"value": {"template": "kAAAAAAAAAB7Li4u", **SIGNATURE_EXAMPLE}},
+        },
+    },
+)
+CHECK_BODY = {
+    "requestBody": {
+        "required": True,
+        "content": {
+            "multipart/form-data": {
+                "schema": {
+                    "type": "object",
+                    "required": ["image"],
+                    "properties": {"image": FILE, "face": FACE},
+                }
+            }
+        },
+    }
+}
+IMPORT_BODY = _body(
+    None,
+    {
+        "schema": {
+            "type": "object",
+            "required": ["export"],
+            "properties": {
+                "export": _text("`export` of an export call."),
+                "restore": {
+                    "type": "boolean",
+                    "default": False,
+                    "description": "Import it though the subject was erased or enrolled again "
+                    "since; needs the right `admin`.",
+                },
+            },
+        },
+        "examples": {"import": {"value": {"export": "VkZYMS4uLg=="}}},
+    },
+)
+
+
+def allowed_methods(document: Mapping[str, Any], path: str) -> list[str]:
+    """Return the methods of a path, by the OpenAPI document; the framework names one route's only.
+
+    Where two paths fit, the one that is written out is meant: `/v1/subjects/import`.
+    """
+    fitting = [
+        template
+        for template in document["paths"]
+        if re.fullmatch(re.sub(r"\{[^}]*\}", "[^/]+", template), path)
+    ]
+    for template in sorted(fitting, key=lambda each: each.count("{")):
+        return sorted(method.upper() for method in document["paths"][template])
+    return []
+
+
+def codes_table() -> str:
+    """Write the table of ``docs/errors.md`` from the one table of codes."""
+    rows = ["| status | code | meaning |", "|---|---|---|"]
+    rows += [
+        f"| {entry.status} | `{entry.code}` | {entry.meaning} |" for entry in ERROR_CODES.values()
+    ]
+    return "\n".join(rows) + "\n"

@@ -1,0 +1,75 @@
+"""The contract in force, and the decoy generator for clients that lift."""
+
+import base64
+
+from fastapi import APIRouter, Depends, Request
+from starlette.responses import Response
+
+from api.http.answers import answer
+from api.http.auth import CallerDep, holding
+from api.http.deps import GateDep, RuntimeDep
+from api.http.errors import ApiError
+from api.http.openapi import EVERY_CALL, error_responses
+from api.http.receipts import key_fingerprint
+from api.http.schemas import ContractAnswer
+from templates.decoys import DecoyGenerator
+
+router = APIRouter(prefix="/v1/contract", tags=["contract"])
+
+
+@router.get(
+    "",
+    response_model=ContractAnswer,
+    responses=error_responses(*EVERY_CALL),
+    summary="The contract and its security levels",
+)
+async def get_contract(
+    request: Request, caller: CallerDep, runtime: RuntimeDep, gate: GateDep
+) -> Response:
+    """Any valid key may read it. The cohort is a secret and is not part of it."""
+    public_key = await gate.query(runtime.store.receipt_public_key)
+    tenant = await gate.query(lambda: runtime.store.tenants.get(caller.tenant))
+    return answer(
+        request,
+        {
+            **runtime.contract.public(),
+            "photos": runtime.pack is not None,
+            "generator": isinstance(runtime.source, DecoyGenerator),
+            "template_enrollment": tenant.template_enrollment,
+            "receipt_key": {
+                "algorithm": "Ed25519",
+                "key_id": key_fingerprint(public_key),
+                "public_key": base64.b64encode(public_key).decode("ascii"),
+            },
+        },
+    )
+
+
+@router.get(
+    "/generator",
+    dependencies=[Depends(holding("embeddings"))],
+    response_class=Response,
+    responses={
+        200: {
+            "description": "The generator's file: safetensors. `X-Decoy-Source-ID` names it.",
+            "content": {
+                "application/octet-stream": {"schema": {"type": "string", "format": "binary"}}
+            },
+        },
+        **error_responses(*EVERY_CALL, "forbidden", "not_found"),
+    },
+    summary="The decoy generator, for clients that lift",
+)
+async def get_generator(runtime: RuntimeDep, gate: GateDep) -> Response:
+    """Right: `embeddings`. A pool of real descriptors is never given away."""
+    source = runtime.source
+    if not isinstance(source, DecoyGenerator):
+        raise ApiError(
+            "not_found",
+            "this deployment has no decoy generator to give; a decoy pool stays secret",
+        )
+    return Response(
+        await gate.query(source.to_bytes),
+        media_type="application/octet-stream",
+        headers={"X-Decoy-Source-ID": source.source_id},
+    )

@@ -1,0 +1,220 @@
+"""Enrollment: photos, or a client's template."""
+
+from functools import partial
+from typing import Any
+
+from fastapi import APIRouter, Request
+from starlette.responses import Response
+
+from api.http.audit import by
+from api.http.auth import Caller
+from api.http.bodies import (
+    Form,
+    base64_field,
+    content_type,
+    parse_json,
+    reject_unknown,
+    sent_form,
+    sent_json,
+)
+from api.http.deps import (
+    Enrolls,
+    GateDep,
+    IdempotencyDep,
+    RuntimeDep,
+    SubjectDep,
+    query_of,
+)
+from api.http.errors import ApiError
+from api.http.idempotency import Outcome, once
+from api.http.openapi import BODY, ENROLLMENT_BODY, EVERY_CALL, IDEMPOTENT, PHOTO, error_responses
+from api.http.schemas import EnrollmentAnswer
+from api.http.values import face_policy, one_of
+from api.process.runtime import Runtime
+from enroll import Enrollment
+from models.quality import Quality
+from templates.decoys import Attributes
+from templates.store.audit_log import By
+from templates.store.subjects import Source
+
+router = APIRouter(prefix="/v1/subjects", tags=["subjects"])
+
+CODES = (
+    *EVERY_CALL,
+    *BODY,
+    *PHOTO,
+    *IDEMPOTENT,
+    "too_many_images",
+    "forbidden",
+    "invalid_template",
+    "contract_mismatch",
+    "inconsistent_images",
+)
+
+
+@router.put(
+    "/{subject_id}/enrollment",
+    response_model=EnrollmentAnswer,
+    responses={
+        200: {"description": "An earlier enrollment was replaced."},
+        201: {"model": EnrollmentAnswer, "description": "The subject is new."},
+        **error_responses(*CODES),
+    },
+    openapi_extra=ENROLLMENT_BODY,
+    summary="Enroll a subject, or replace its enrollment",
+)
+async def enroll(
+    request: Request,
+    caller: Enrolls,
+    subject: SubjectDep,
+    runtime: RuntimeDep,
+    gate: GateDep,
+    idempotency_key: IdempotencyDep,
+) -> Response:
+    """Rights: `enroll`, and `embeddings` for a template, which the tenant must allow.
+
+    Either 1 to 10 photos, which must show one and the same person, or a private template that the
+    client lifted: nothing in it tells whether it holds one person, so it is refused unless the
+    operator allowed it (`template_enrollment` of `GET /v1/contract`). All or nothing: a rejected
+    set leaves the old enrollment untouched.
+    """
+    settings = runtime.settings
+    query = query_of(request, ("face",))
+    async with gate.admitted(caller.prefix):
+        if content_type(request) == "multipart/form-data":
+            runtime.required_pack()
+            runtime.require_decoys()
+            form = await sent_form(request, settings, max_images=settings.max_images)
+            return await _enroll_photos(request, caller, subject, form, query, idempotency_key)
+        caller.require("embeddings")
+        body = await sent_json(request, settings)
+        await gate.query(lambda: runtime.require_template_enrollment(caller.tenant))
+        reject_unknown([*body, *query], ("template",))
+        template = base64_field(body.get("template"), "template", code="invalid_template")
+
+        def work() -> Outcome:
+            epoch = runtime.epoch(caller.tenant)
+            enrollment = runtime.enroller(caller.tenant, epoch).from_template(template)
+            return _stored(
+                runtime, caller.tenant, subject, epoch, enrollment, Source.TEMPLATE, by(request)
+            )
+
+        return await once(
+            request,
+            caller,
+            idempotency_key,
+            operation="enroll-template",
+            asked=[subject, template],
+            subject=subject,
+            work=work,
+            run=partial(gate.compute, key=caller.prefix),
+        )
+
+
+async def _enroll_photos(
+    request: Request,
+    caller: Caller,
+    subject: str,
+    form: Form,
+    query: dict[str, str],
+    idempotency_key: str | None,
+) -> Response:
+    runtime: Runtime = request.app.state.runtime
+    pack, photos = runtime.required_pack(), form.images("images")
+    reject_unknown(form.fields, ("attributes", "face"))
+    policy = face_policy(one_of(form.fields, query, "face"))
+    attributes = parse_attributes(form.fields.get("attributes"))
+
+    def work() -> Outcome:
+        epoch = runtime.epoch(caller.tenant)
+        enrollment = runtime.enroller(caller.tenant, epoch).from_photos(
+            pack, photos, attributes=attributes, policy=policy, limits=runtime.image_limits
+        )
+        return _stored(
+            runtime, caller.tenant, subject, epoch, enrollment, Source.PHOTOS, by(request)
+        )
+
+    return await once(
+        request,
+        caller,
+        idempotency_key,
+        operation="enroll-photos",
+        asked=[
+            subject,
+            str(policy),
+            attributes.gender or "",
+            attributes.race or "",
+            *photos,
+        ],
+        subject=subject,
+        work=work,
+        run=partial(request.app.state.gate.compute, key=caller.prefix),
+    )
+
+
+def parse_attributes(text: str | None) -> Attributes:
+    """Read the form field ``attributes``; it is used for lifting and then forgotten.
+
+    Raises
+    ------
+    ApiError
+        ``validation_failed``; the message never repeats the input.
+    """
+    if text is None:
+        return Attributes()
+    try:
+        value = parse_json(text)
+    except (ValueError, RecursionError):
+        value = None
+    if (
+        not isinstance(value, dict)
+        or not set(value) <= {"gender", "race"}
+        or not all(
+            isinstance(label, str) and 0 < len(label) <= 64 and label.isprintable()
+            for label in value.values()
+        )
+    ):
+        raise ApiError(
+            "validation_failed",
+            "attributes must be a JSON object with texts for gender and race, or one of them",
+            {"field": "attributes"},
+        )
+    return Attributes(gender=value.get("gender"), race=value.get("race"))
+
+
+def _quality(quality: object) -> dict[str, Any]:
+    return quality.as_dict() if isinstance(quality, Quality) else {}
+
+
+def _stored(
+    runtime: Runtime,
+    tenant: str,
+    subject: str,
+    epoch: int,
+    enrollment: Enrollment,
+    source: Source,
+    who: By,
+) -> Outcome:
+    stored = runtime.put(
+        tenant,
+        subject,
+        epoch,
+        enrollment,
+        source=source,
+        photos=len(enrollment.per_photo),
+        by=who,
+    )
+    body: dict[str, Any] = {
+        "template_id": stored.template_id,
+        "contract_id": enrollment.contract_id,
+        "replaced": not stored.created,
+        "images": [
+            {
+                "index": result.index,
+                "status": "used",
+                "quality": _quality(result.quality),
+            }
+            for result in enrollment.per_photo
+        ],
+    }
+    return Outcome(201 if stored.created else 200, body)

@@ -1,0 +1,66 @@
+"""The lockout of one subject, for operators' desks: look at it, and lift it."""
+
+from fastapi import APIRouter, Request
+from starlette.responses import Response
+
+from api.http.answers import answer
+from api.http.audit import by
+from api.http.deps import Administers, GateDep, IdempotencyDep, RuntimeDep, SubjectDep
+from api.http.errors import ApiError
+from api.http.openapi import EVERY_CALL, error_responses
+from api.http.schemas import LockoutAnswer, UnlockAnswer
+from api.http.values import iso_time
+
+router = APIRouter(prefix="/v1/subjects", tags=["subjects"])
+
+
+@router.get(
+    "/{subject_id}/lockout",
+    response_model=LockoutAnswer,
+    responses=error_responses(*EVERY_CALL, "forbidden", "not_found", "validation_failed"),
+    summary="Failed attempts on a subject",
+)
+async def get_lockout(
+    request: Request, caller: Administers, subject: SubjectDep, runtime: RuntimeDep, gate: GateDep
+) -> Response:
+    """Right: `admin`. A subject that does not exist is counted like one that does.
+
+    `not_found` where no verification failed since the last accept or reset.
+    """
+    found = await gate.query(lambda: runtime.store.attempts.status(caller.tenant, subject))
+    if found is None or (found.consecutive == 0 and found.disabled_at is None):
+        raise ApiError("not_found", "there are no failed attempts on this subject")
+    return answer(
+        request,
+        {
+            "consecutive_failures": found.consecutive,
+            "last_failed_at": iso_time(found.last_failed_at),
+            "locked_until": iso_time(found.locked_until),
+            "disabled_at": iso_time(found.disabled_at),
+        },
+    )
+
+
+@router.delete(
+    "/{subject_id}/lockout",
+    response_model=UnlockAnswer,
+    responses=error_responses(*EVERY_CALL, "forbidden", "validation_failed"),
+    summary="Lift the lockout of a subject",
+)
+async def unlock_subject(
+    request: Request,
+    caller: Administers,
+    subject: SubjectDep,
+    runtime: RuntimeDep,
+    gate: GateDep,
+    _idempotency_key: IdempotencyDep,
+) -> Response:
+    """Right: `admin`. Forgets the failed attempts, and enables a subject that was disabled.
+
+    Idempotent by itself: an `Idempotency-Key` is accepted and changes nothing. Make sure first
+    that it was the subject who failed: after this, an attacker may try again too.
+    """
+    lifted = await gate.query(
+        lambda: runtime.store.attempts.reset(caller.tenant, subject, by=by(request))
+    )
+    return answer(request, {"lifted": lifted})

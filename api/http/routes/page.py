@@ -1,0 +1,146 @@
+"""The web page: its files, from memory, and in the demo the drawn people to try it with.
+
+Not part of the REST contract, so not in its document. What the page does, it does by calls that
+are: whoever has a key may do the same without it.
+"""
+
+import functools
+import hashlib
+import re
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.routing import BaseRoute, Route
+
+from api.demo.people import ENROLLED_PHOTOS, PROBE_PHOTOS, Scale
+from api.http.answers import answer
+from api.http.errors import ApiError
+from api.limits.rates import address_of
+from models.synthetic import draw_face, encode_photo
+
+WEB = Path(__file__).resolve().parents[2] / "web"
+TYPES = {
+    ".html": "text/html; charset=utf-8",
+    ".css": "text/css; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+    ".svg": "image/svg+xml",
+}
+HEADERS = {
+    # Asked for again each time, and answered 304 while it is the same: after an update of the
+    # service no browser runs yesterday's script against today's calls.
+    "Cache-Control": "no-cache",
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
+    "img-src 'self' blob:; connect-src 'self'; frame-ancestors 'none'; base-uri 'none'; "
+    "form-action 'none'; require-trusted-types-for 'script'; trusted-types 'none'",
+    "Permissions-Policy": "camera=(self), microphone=(), geolocation=(), display-capture=()",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+}
+DEMO_MARK = ('data-demo="no"', 'data-demo="yes"')
+
+FIRST_STRANGER = 101
+SHOTS = ENROLLED_PHOTOS + PROBE_PHOTOS
+_PERSON = re.compile(r"person-([1-9][0-9]{0,3})")
+_SHOT = re.compile(r"(0|[1-9])\.png")
+
+Endpoint = Callable[[Request], Awaitable[Response]]
+
+
+@dataclass(frozen=True)
+class Served:
+    """One file of the page."""
+
+    body: bytes = field(repr=False)
+    media_type: str
+    etag: str
+
+    @classmethod
+    def of(cls, body: bytes, suffix: str) -> "Served":
+        """Name a file by its content."""
+        return cls(body, TYPES[suffix], f'"{hashlib.sha256(body).hexdigest()[:32]}"')
+
+    def answer(self, request: Request) -> Response:
+        """Return the file, or that the browser's copy is still the same."""
+        headers = {**HEADERS, "ETag": self.etag}
+        held = [each.strip().removeprefix("W/") for each in
+                request.headers.get("if-none-match", "").split(",")]  # fmt: skip
+        if self.etag in held or "*" in held:
+            return Response(status_code=304, headers=headers)
+        return Response(self.body, media_type=self.media_type, headers=headers)
+
+
+def page_routes(*, demo: bool) -> list[BaseRoute]:
+    """Return the routes of the page; those of the drawn people only with the demo model."""
+    html = (WEB / "index.html").read_text(encoding="utf-8")
+    index = Served.of((html.replace(*DEMO_MARK) if demo else html).encode(), ".html")
+    assets = {
+        path.name: Served.of(path.read_bytes(), path.suffix)
+        for path in sorted(WEB.iterdir())
+        if path.suffix in TYPES and path.name != "index.html"
+    }
+
+    async def page(request: Request) -> Response:
+        return index.answer(request)
+
+    async def asset(request: Request) -> Response:
+        found = assets.get(request.path_params["name"])
+        if found is None:
+            raise ApiError("not_found", "there is no such path")
+        return found.answer(request)
+
+    routes: list[BaseRoute] = [_route("/", page), _route("/assets/{name}", asset)]
+    if demo:
+        routes += [
+            _route("/demo/people", demo_people),
+            _route("/demo/people/{person}/{shot}", demo_photo),
+        ]
+    return routes
+
+
+def _route(path: str, endpoint: Endpoint) -> Route:
+    async def named(request: Request) -> Response:
+        # What log lines and metrics call it, as FastAPI does for its own routes.
+        request.scope["route"] = route
+        return await endpoint(request)
+
+    route = Route(path, named, methods=["GET"])
+    return route
+
+
+async def demo_people(request: Request) -> Response:
+    """List the drawn people, those whom `veilface demo` enrolls first."""
+    names = [f"person-{number}" for number in _drawn()]
+    return answer(request, {"people": names, "shots": SHOTS})
+
+
+async def demo_photo(request: Request) -> Response:
+    """Draw one photo of one of them; the same path gives the same bytes."""
+    person = _PERSON.fullmatch(request.path_params["person"])
+    shot = _SHOT.fullmatch(request.path_params["shot"])
+    if person is None or shot is None or int(person[1]) not in _drawn() or int(shot[1]) >= SHOTS:
+        raise ApiError("not_found", "there is no such drawn person or photo")
+    gate = request.app.state.gate
+    address = address_of(request.client.host if request.client else "")
+    body = await gate.compute(functools.partial(_draw, int(person[1]), int(shot[1])), key=address)
+    return Response(
+        body,
+        media_type="image/png",
+        headers={**HEADERS, "Cache-Control": "private, max-age=3600"},
+    )
+
+
+@functools.cache
+def _draw(person: int, shot: int) -> bytes:
+    # Fewer than a hundred pictures of 20 KB: all of them may stay.
+    return encode_photo(draw_face(person, shot))
+
+
+def _drawn() -> list[int]:
+    scale = Scale()
+    return [
+        *range(1, 1 + scale.enrolled),
+        *range(FIRST_STRANGER, FIRST_STRANGER + scale.strangers),
+    ]

@@ -1,0 +1,98 @@
+"""Would this photo do? The detector and the limits of enrollment, and nothing after them."""
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Request
+from starlette.responses import Response
+
+from api.http.answers import answer
+from api.http.auth import Caller, CallerDep
+from api.http.bodies import content_type, reject_unknown, sent_form
+from api.http.deps import GateDep, RuntimeDep, query_of
+from api.http.errors import ApiError, plain_details
+from api.http.openapi import BODY, CHECK_BODY, CHECKED_PHOTO, EVERY_CALL, error_responses
+from api.http.schemas import PhotoCheckAnswer
+from api.http.values import face_policy, one_of
+from api.process.metrics import step
+from models.errors import FaceError
+
+router = APIRouter(prefix="/v1/photos", tags=["photos"])
+
+
+async def sending_photos(caller: CallerDep) -> Caller:
+    """Demand one of the rights to send a photo.
+
+    Raises
+    ------
+    ApiError
+        ``forbidden``.
+    """
+    if not caller.rights & {"enroll", "verify"}:
+        raise ApiError(
+            "forbidden",
+            "this API key lacks the rights enroll and verify, and one of them is needed",
+            {"missing": ["enroll", "verify"]},
+        )
+    return caller
+
+
+SendsPhotos = Annotated[Caller, Depends(sending_photos)]
+
+
+@router.post(
+    "/check",
+    response_model=PhotoCheckAnswer,
+    responses=error_responses(*EVERY_CALL, *BODY, *CHECKED_PHOTO, "forbidden"),
+    openapi_extra=CHECK_BODY,
+    summary="Would this photo do?",
+)
+async def check_photo(
+    request: Request, caller: SendsPhotos, runtime: RuntimeDep, gate: GateDep
+) -> Response:
+    """Right: `enroll` or `verify`. For guidance before a camera: finds the face, measures it.
+
+    The same detector and the same limits as enrollment, and no embedding: nothing is compared,
+    and nothing is kept. A photo that would be refused for its face is answered with 200 and
+    `usable` false.
+    """
+    settings = runtime.settings
+    query = query_of(request, ("face",))
+    async with gate.admitted(caller.prefix):
+        if content_type(request) != "multipart/form-data":
+            raise ApiError("malformed_request", "send the photo as multipart/form-data")
+        pack = runtime.required_pack()
+        with step("body"):
+            form = await sent_form(request, settings, max_images=1)
+        photo = form.images("image")[0]
+        reject_unknown(form.fields, ("face",))
+        policy = face_policy(one_of(form.fields, query, "face"))
+
+        def work() -> dict[str, Any]:
+            try:
+                with step("check"):
+                    _, quality, face = pack.crop_photo(
+                        photo, policy=policy, limits=runtime.image_limits
+                    )
+            except FaceError as refusal:
+                return {
+                    "usable": False,
+                    "code": refusal.code,
+                    "message": str(refusal),
+                    "details": plain_details(refusal.details),
+                    "box": None,
+                    "quality": {},
+                }
+            return {
+                "usable": True,
+                "code": None,
+                "message": (
+                    "one face, large and clear enough"
+                    if face is not None
+                    else "an aligned crop of a face, clear enough"
+                ),
+                "details": {},
+                "box": None if face is None else [round(float(side), 1) for side in face.box],
+                "quality": quality.as_dict(),
+            }
+
+        return answer(request, await gate.compute(work, key=caller.prefix))

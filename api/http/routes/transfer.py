@@ -1,0 +1,155 @@
+"""Export and import of one subject, encrypted."""
+
+import base64
+from functools import partial
+
+from fastapi import APIRouter, Request
+from starlette.responses import Response
+
+from api.http.answers import answer
+from api.http.audit import by
+from api.http.bodies import base64_field, reject_unknown, sent_json
+from api.http.deps import Exports, GateDep, IdempotencyDep, RuntimeDep, SubjectDep, note_subject
+from api.http.errors import ApiError
+from api.http.idempotency import Outcome, once
+from api.http.openapi import BODY, EVERY_CALL, IDEMPOTENT, IMPORT_BODY, error_responses
+from api.http.schemas import ExportAnswer, ImportAnswer
+from api.http.transfer import open_export
+from templates.store.identifiers import checked_subject_id
+from templates.store.subjects import Source
+
+router = APIRouter(prefix="/v1/subjects", tags=["transfer"])
+
+
+@router.get(
+    "/{subject_id}/export",
+    response_model=ExportAnswer,
+    responses=error_responses(
+        *EVERY_CALL,
+        "forbidden",
+        "not_enrolled",
+        "not_found",
+        "validation_failed",
+        "contract_mismatch",
+    ),
+    summary="Export a subject, encrypted",
+)
+async def export_subject(
+    request: Request, caller: Exports, subject: SubjectDep, runtime: RuntimeDep, gate: GateDep
+) -> Response:
+    """Right: `export`. The template is un-rotated inside the encryption.
+
+    Only keys with `enroll` or `admin` are told `not_enrolled`; others get `not_found`.
+    """
+    async with gate.admitted(caller.prefix):
+        exported = await gate.compute(
+            lambda: runtime.export(caller.tenant, subject, by=by(request)), key=caller.prefix
+        )
+    if exported is None:
+        if caller.sees_enrollment:
+            raise ApiError("not_enrolled", "the tenant has no such subject")
+        raise ApiError("not_found", "there is nothing to export")
+    return answer(
+        request,
+        {
+            "export": base64.b64encode(exported).decode("ascii"),
+            "contract_id": runtime.contract.contract_id,
+            "key_id": runtime.export_key.key_id,
+        },
+    )
+
+
+@router.post(
+    "/import",
+    response_model=ImportAnswer,
+    responses={
+        200: {"description": "An earlier enrollment was replaced."},
+        201: {"model": ImportAnswer, "description": "The subject is new."},
+        **error_responses(
+            *EVERY_CALL,
+            *BODY,
+            *IDEMPOTENT,
+            "forbidden",
+            "invalid_template",
+            "contract_mismatch",
+            "export_superseded",
+        ),
+    },
+    openapi_extra=IMPORT_BODY,
+    summary="Import a subject that was exported",
+)
+async def import_subject(
+    request: Request,
+    caller: Exports,
+    runtime: RuntimeDep,
+    gate: GateDep,
+    idempotency_key: IdempotencyDep,
+) -> Response:
+    """Right: `export`. The tenant's own rotation is put on the template.
+
+    An export that is older than the subject's last enrollment or erasure is refused
+    (`export_superseded`), unless the body says `"restore": true` and the key has `admin` too.
+    """
+    settings = runtime.settings
+    async with gate.admitted(caller.prefix):
+        body = await sent_json(request, settings)
+        reject_unknown(body, ("export", "restore"))
+        restore = body.get("restore", False)
+        if not isinstance(restore, bool):
+            raise ApiError(
+                "validation_failed", "restore must be true or false", {"field": "restore"}
+            )
+        if restore:
+            caller.require("admin")
+        data = base64_field(body.get("export"), "export", code="invalid_template")
+        exported = await gate.query(
+            lambda: open_export(
+                data,
+                key=runtime.export_key,
+                tenant=caller.tenant,
+                contract_id=runtime.contract.contract_id,
+            )
+        )
+        subject = checked_subject_id(exported.subject_id)
+        note_subject(request, runtime.store.pseudonym(caller.tenant, subject))
+
+        guard = runtime.store.transfers.guard(
+            caller.tenant, exported.stamp, restore=restore, by=by(request)
+        )
+
+        def work() -> Outcome:
+            epoch = runtime.epoch(caller.tenant)
+            enroller = runtime.enroller(caller.tenant, epoch)
+            # A template that the service made of photos is no client's.
+            ours = exported.source == Source.PHOTOS
+            enrollment = (enroller.from_export if ours else enroller.from_template)(exported.wire)
+            stored = runtime.put(
+                caller.tenant,
+                exported.subject_id,
+                epoch,
+                enrollment,
+                source=Source(exported.source),
+                photos=exported.photos,
+                by=by(request),
+                guard=guard,
+            )
+            return Outcome(
+                201 if stored.created else 200,
+                {
+                    "template_id": stored.template_id,
+                    "contract_id": enrollment.contract_id,
+                    "replaced": not stored.created,
+                },
+            )
+
+        return await once(
+            request,
+            caller,
+            idempotency_key,
+            operation="import",
+            asked=[data, "restore"] if restore else [data],
+            subject=exported.subject_id,
+            work=work,
+            run=partial(gate.compute, key=caller.prefix),
+            add={"subject_id": exported.subject_id},
+        )

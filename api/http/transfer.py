@@ -1,0 +1,184 @@
+"""Export and import of one subject.
+
+An export is::
+
+    "VEILEXP1" | contract id (32 bytes) | sealed blob
+
+The sealed blob (``MasterKeyring.seal``: AES-256-GCM, with the id of its key in front) opens only
+with the same contract id, and where the deployment's own key sealed it, only for the same tenant.
+It holds::
+
+    length of the header (4 bytes, big-endian) | header (canonical JSON) | wire bytes
+
+The header tells when the export was made (:class:`templates.store.transfers.Stamp`), so that an old
+one does not undo an erasure or another enrollment; in exports of earlier versions it does not.
+
+The template inside is un-rotated, float32: another tenant's rotation can be put on it, and no
+second rounding to half precision takes place.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+
+from api.http.errors import StartError
+from templates.contract.canonical import Fields, Json, canonical_json, parse_object
+from templates.errors import ContractError, ContractMismatch, InvalidTemplate, SealError
+from templates.keys.sealing import MasterKeyring
+from templates.store.audit_chain import Anchor
+from templates.store.identifiers import InvalidIdentifier
+from templates.store.subjects import Source
+from templates.store.transfers import Stamp
+
+MAGIC = b"VEILEXP1"
+CONTRACT_ID_BYTES = 32
+LENGTH_BYTES = 4
+MAX_HEADER_BYTES = 4096
+PURPOSE = "export"
+
+
+@dataclass(frozen=True)
+class ExportKey:
+    """The key of exports: an operator's file, or a secret of this deployment.
+
+    Parameters
+    ----------
+    keyring
+        Seals with its first key, opens with all of them.
+    tenant_bound
+        True for the deployment's own key: one tenant's export does not open for another.
+    """
+
+    keyring: MasterKeyring
+    tenant_bound: bool
+
+    @classmethod
+    def from_file(cls, path: Path) -> "ExportKey":
+        """Load an operator's key file, in the format of the master key file.
+
+        Raises
+        ------
+        StartError
+            If the file cannot be used.
+        """
+        try:
+            return cls(MasterKeyring.load(path), tenant_bound=False)
+        except SealError as error:
+            raise StartError(f"the export key cannot be used: {error}") from error
+
+    @classmethod
+    def from_secret(cls, secret: bytes) -> "ExportKey":
+        """Make the key from a 32-byte secret of the deployment."""
+        return cls(MasterKeyring([secret], source="the deployment's export key"), tenant_bound=True)
+
+    @property
+    def key_id(self) -> str:
+        """Id of the key that seals."""
+        return self.keyring.current
+
+    def _bound_to(self, contract_id: str, tenant: str) -> Sequence[str]:
+        return [contract_id, tenant if self.tenant_bound else ""]
+
+
+@dataclass(frozen=True)
+class Exported:
+    """One subject as it travels: ``wire`` is an un-rotated template.
+
+    ``stamp`` is None in an export of an earlier version.
+    """
+
+    subject_id: str
+    contract_id: str
+    source: str
+    photos: int
+    wire: bytes = field(repr=False)
+    stamp: Stamp | None = None
+
+
+def seal_export(exported: Exported, *, key: ExportKey, tenant: str) -> bytes:
+    """Encrypt one subject."""
+    fields: dict[str, Json] = {
+        "subject_id": exported.subject_id,
+        "contract_id": exported.contract_id,
+        "source": exported.source,
+        "photos": exported.photos,
+    }
+    if exported.stamp is not None:
+        fields |= {
+            "exported_at": exported.stamp.at.isoformat(),
+            "audit_line": str(exported.stamp.line),
+        }
+    header = canonical_json(fields)
+    plain = len(header).to_bytes(LENGTH_BYTES, "big") + header + exported.wire
+    sealed = key.keyring.seal(
+        plain, purpose=PURPOSE, bound_to=key._bound_to(exported.contract_id, tenant)
+    )
+    return MAGIC + bytes.fromhex(exported.contract_id) + sealed
+
+
+def open_export(data: bytes, *, key: ExportKey, tenant: str, contract_id: str) -> Exported:
+    """Decrypt an export that a client sent.
+
+    Raises
+    ------
+    InvalidTemplate
+        If it is no export, was altered, or was sealed with another key or for another tenant.
+    ContractMismatch
+        If it belongs to another contract than ``contract_id``.
+    """
+    start = len(MAGIC) + CONTRACT_ID_BYTES
+    if len(data) < start or not data.startswith(MAGIC):
+        raise InvalidTemplate("this is no export of Veilface")
+    theirs = data[len(MAGIC) : start].hex()
+    if theirs != contract_id:
+        raise ContractMismatch(
+            f"the export belongs to contract {theirs[:16]}, the service to {contract_id[:16]}; "
+            "the subject must enroll again"
+        )
+    try:
+        plain = key.keyring.open(
+            data[start:], purpose=PURPOSE, bound_to=key._bound_to(contract_id, tenant)
+        )
+    except SealError:
+        raise InvalidTemplate(
+            "the export does not open: it was altered, or sealed with another export key or for "
+            "another tenant"
+        ) from None
+    return _parse(plain, contract_id)
+
+
+def _parse(plain: bytes, contract_id: str) -> Exported:
+    """Read what was sealed. Whoever has the key may still have sealed nonsense."""
+    length = int.from_bytes(plain[:LENGTH_BYTES], "big")
+    if not 0 < length <= MAX_HEADER_BYTES or len(plain) <= LENGTH_BYTES + length:
+        raise InvalidTemplate("the export's header has an impossible length")
+    try:
+        parsed = parse_object(plain[LENGTH_BYTES : LENGTH_BYTES + length], what="the header")
+        fields = Fields(parsed, what="the export's header")
+        exported = Exported(
+            subject_id=fields.text("subject_id"),
+            contract_id=fields.text("contract_id"),
+            source=fields.text("source"),
+            photos=fields.integer("photos"),
+            wire=plain[LENGTH_BYTES + length :],
+            stamp=_stamp(fields) if "exported_at" in parsed else None,
+        )
+        fields.done()
+    except (ContractError, InvalidIdentifier) as error:
+        raise InvalidTemplate(f"the export's header is broken: {error}") from None
+    if exported.contract_id != contract_id:
+        raise InvalidTemplate("the export names one contract outside and another one inside")
+    if exported.source not in list(Source) or not 0 <= exported.photos <= 10:
+        raise InvalidTemplate("the export's header is not one of a subject")
+    return exported
+
+
+def _stamp(fields: Fields) -> Stamp:
+    try:
+        at = datetime.fromisoformat(fields.text("exported_at"))
+    except ValueError:
+        raise ContractError("the export's header: 'exported_at' is not a time") from None
+    if at.tzinfo is None:
+        raise ContractError("the export's header: 'exported_at' is not a time")
+    return Stamp(at, Anchor.parse(fields.text("audit_line")))

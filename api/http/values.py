@@ -1,0 +1,72 @@
+"""Fields of a request, checked and turned into the values of the rooms below."""
+
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from api.http.bodies import text_field
+from api.http.errors import ApiError
+from models.pack import FacePolicy
+from templates.errors import InvalidEmbedding
+
+MAX_EMBEDDING = 4096
+
+
+def iso_time(value: datetime | None) -> str | None:
+    """Write a time in UTC to the second, as ``2026-01-31T12:00:00Z``."""
+    if value is None:
+        return None
+    return value.astimezone(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
+
+
+def one_of(fields: Mapping[str, Any], query: Mapping[str, str], name: str) -> str | None:
+    """Return a field that may stand in the body or in the query.
+
+    Raises
+    ------
+    ApiError
+        ``validation_failed`` if it is no short text, or stands in both and differs.
+    """
+    inside = text_field(fields.get(name), name)
+    outside = text_field(query.get(name), name)
+    if inside is not None and outside is not None and inside != outside:
+        raise ApiError(
+            "validation_failed", f"{name} differs between body and query", {"field": name}
+        )
+    return outside if inside is None else inside
+
+
+def face_policy(value: str | None) -> FacePolicy:
+    """Return which face counts when a photo shows several.
+
+    Raises
+    ------
+    ApiError
+        ``validation_failed``.
+    """
+    if value is None:
+        return FacePolicy.SINGLE
+    if value not in list(FacePolicy):
+        raise ApiError("validation_failed", "face must be single or largest", {"field": "face"})
+    return FacePolicy(value)
+
+
+def embedding_of(value: Any) -> NDArray[np.float64]:
+    """Return a list of JSON numbers as an array, (k,); the verifier checks length and norm.
+
+    Raises
+    ------
+    InvalidEmbedding
+        If it is no list, is too long, or holds something that is no number.
+    """
+    if not isinstance(value, list) or not 0 < len(value) <= MAX_EMBEDDING:
+        raise InvalidEmbedding(f"an embedding is a list of 1 to {MAX_EMBEDDING} numbers")
+    if not all(type(number) in (int, float) for number in value):
+        raise InvalidEmbedding("an embedding holds something that is no number")
+    try:
+        return np.array(value, dtype=np.float64)
+    except OverflowError:
+        raise InvalidEmbedding("an embedding holds a number that is not finite") from None

@@ -1,0 +1,1 @@
+"""What a request may cost: admission before allocation, and rate limits."""

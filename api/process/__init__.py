@@ -1,0 +1,1 @@
+"""One server process: settings to opened things, workers, logs, metrics, health."""

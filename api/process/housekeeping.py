@@ -1,0 +1,58 @@
+"""What a worker does between requests: it removes what has expired, subjects and records."""
+
+import logging
+import random
+from collections.abc import Callable
+
+import anyio
+import anyio.to_thread
+
+from api.process.logging import log
+from api.process.metrics import PURGE_FAILURES
+from templates.store import TemplateStore
+from templates.store.retention import Retention
+
+PURGE_WAIT_S = 0.25
+"""Longest that emptying SQLite's log may make a request's write wait for readers."""
+
+FOR_EVER = Retention()
+
+
+async def purge_regularly(
+    store: TemplateStore,
+    *,
+    every_s: float,
+    keep: Retention = FOR_EVER,
+    on_failure: Callable[[Exception], None] = lambda _: None,
+) -> None:
+    """Purge at once and then every ``every_s`` seconds, until it is cancelled.
+
+    A failure is one log line: the next round tries again. Rounds vary by a tenth, so that workers
+    that started together do not purge together.
+
+    Parameters
+    ----------
+    store, every_s
+        What is purged, and the time between two rounds.
+    keep
+        How long subjects are kept.
+    on_failure
+        Is told the error of a round that failed.
+    """
+
+    def purge() -> None:
+        if not keep.keeps_all:
+            # Before the rest: it is emptied from the log of the same round.
+            store.erase_expired(keep)
+        store.purge(wait=PURGE_WAIT_S)
+
+    # A thread of its own: requests in the default limiter do not delay it, nor it them.
+    limiter = anyio.CapacityLimiter(1)
+    while True:
+        try:
+            await anyio.to_thread.run_sync(purge, limiter=limiter)
+        except Exception as error:
+            PURGE_FAILURES.inc()
+            on_failure(error)
+            log("purge failed", severity=logging.WARNING, error_type=type(error).__name__)
+        await anyio.sleep(every_s * random.uniform(0.9, 1.1))

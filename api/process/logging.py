@@ -1,0 +1,114 @@
+"""Log lines: one JSON object a line, to stderr, from a list of fields that may be there.
+
+A line never holds a subject id, a token, a byte of a photo or template, or a number of an
+embedding. That is why nothing of an exception but its type is written, and why a request is named
+by its route's template (`/v1/subjects/{subject_id}/verify`) and never by its path. A subject
+appears as a pseudonym only, an HMAC under a key that is kept sealed in the store.
+"""
+
+import datetime
+import json
+import logging
+import sys
+from typing import Any
+
+LOGGER = "veilface"
+FIELDS = frozenset(
+    {
+        "request_id",
+        "method",
+        "route",
+        "status",
+        "code",
+        "duration_ms",
+        "tenant",
+        "key_id",
+        "subject",
+        "decision",
+        "security_level",
+        "error_type",
+        "receipt_id",
+        "contract_id",
+        "version",
+        "pack",
+        "pid",
+    }
+)
+
+
+class JsonLines(logging.Formatter):
+    """Formats a record as one JSON object; of an exception it keeps the type only."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the line."""
+        line: dict[str, Any] = {
+            "time": datetime.datetime.fromtimestamp(record.created, datetime.UTC).isoformat(
+                timespec="milliseconds"
+            ),
+            "level": record.levelname.lower(),
+            "logger": record.name,
+            "event": record.getMessage() if record.exc_info is None else str(record.msg),
+        }
+        line.update(getattr(record, "fields", {}))
+        if record.exc_info and record.exc_info[0] is not None:
+            line["error_type"] = record.exc_info[0].__name__
+        return json.dumps(line)
+
+
+class _ToStderr(logging.StreamHandler[Any]):
+    """Writes to whatever ``sys.stderr`` is at that moment."""
+
+    def __init__(self) -> None:
+        super().__init__(sys.stderr)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.stream = sys.stderr
+        super().emit(record)
+
+
+def log(event: str, *, severity: int = logging.INFO, **fields: Any) -> None:
+    """Write one line.
+
+    Parameters
+    ----------
+    event
+        A fixed text, never built from input.
+    fields
+        Named in ``FIELDS``; None is left out.
+    """
+    unknown = set(fields) - FIELDS
+    if unknown:
+        raise ValueError(f"log fields that are not declared: {sorted(unknown)}")
+    kept = {name: value for name, value in fields.items() if value is not None}
+    logging.getLogger(LOGGER).log(severity, event, extra={"fields": kept})
+
+
+def configure(level: str) -> None:
+    """Send our lines to stderr from now on; calling it again only changes the level."""
+    logger = logging.getLogger(LOGGER)
+    logger.setLevel(level.upper())
+    if not any(isinstance(handler, _ToStderr) for handler in logger.handlers):
+        handler = _ToStderr()
+        handler.setFormatter(JsonLines())
+        logger.addHandler(handler)
+
+
+def uvicorn_log_config(level: str) -> dict[str, Any]:
+    """Logging configuration for uvicorn: the same JSON lines, and no access log."""
+    return {
+        "version": 1,
+        "disable_existing_loggers": False,
+        "formatters": {"json": {"()": "api.process.logging.JsonLines"}},
+        "handlers": {
+            "stderr": {
+                "class": "logging.StreamHandler",
+                "formatter": "json",
+                "stream": "ext://sys.stderr",
+            }
+        },
+        "loggers": {
+            "uvicorn": {"handlers": ["stderr"], "level": level.upper(), "propagate": False},
+            "uvicorn.error": {"level": level.upper()},
+            "uvicorn.access": {"handlers": [], "level": "CRITICAL", "propagate": False},
+        },
+    }

@@ -1,0 +1,351 @@
+"""What answers a request, opened once in each process, for the service and the command line.
+
+::
+
+    settings ─▶ open_keyring ─▶ open_store           enough for keys and db
+                     └────────▶ open_contract ┐
+                                open_decoys   ├─▶ Runtime.enroller / .verifier (tenant, epoch)
+                                open_pack     ┘
+"""
+
+import contextlib
+import threading
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from api.http.errors import ApiError
+from api.http.levels import Levels
+from api.http.stand_ins import STAND_IN_SECRET, StandIns
+from api.http.transfer import Exported, ExportKey, seal_export
+from api.process.opening import (
+    file_sealer,
+    open_contract,
+    open_decoys,
+    open_keyring,
+    open_pack,
+    open_store,
+    prepare_database,
+    try_inference,
+)
+from api.settings import Settings
+from enroll import Enroller, Enrollment
+from enroll.enroller import WIRE_DTYPE
+from models.decoding import ImageLimits
+from models.pack import ModelPack
+from templates.contract import wire
+from templates.contract.document import Contract
+from templates.decoys import Attributes, DecoyGenerator, DecoyPool
+from templates.errors import DecoyError, StoreBusy
+from templates.keys.randomness import Keystream
+from templates.keys.rotation import tenant_rotation
+from templates.keys.sealing import MasterKeyring
+from templates.space.lifting import Strategy
+from templates.store import TemplateStore
+from templates.store.audit_log import By
+from templates.store.subjects import Guard, Source, StoredTemplate, SubjectTemplate
+from templates.store.tenants import RetiredRotation
+from verify import Verifier
+
+__all__ = [
+    "Runtime",
+    "bootstrap_token",
+    "file_sealer",
+    "open_contract",
+    "open_decoys",
+    "open_keyring",
+    "open_pack",
+    "open_store",
+    "prepare_database",
+    "try_inference",
+]
+
+READS = 3
+"""Looks at a template whose rotation may be dropped between the looks at the two."""
+
+SUPERSEDED_CALIBRATIONS = (
+    "the calibrations of the contract file are older ones: others of the same contract were served "
+    "since; put the newer contract file back, or calibrate again"
+)
+
+TENANTS_KEPT = 64
+"""Tenants whose rotations a process keeps: 2 MB each where n = 512."""
+
+
+def _lacking(what: str) -> ApiError:
+    return ApiError(
+        "model_unavailable",
+        f"this service runs without a {what}: send templates, or ask its operator",
+        {},
+        {"Retry-After": "60"},
+    )
+
+
+class NoDecoys:
+    """The decoy source of a service that has none: it enrolls clients' templates only."""
+
+    def __init__(self, contract: Contract) -> None:
+        self.source_id = contract.binding.decoy_source_id
+        self.n = contract.binding.n
+        self.made_with: str | None = None
+
+    def draw(
+        self,
+        rows: int,  # noqa: ARG002 - the protocol's
+        k: int,  # noqa: ARG002
+        *,
+        stream: Keystream,  # noqa: ARG002
+        unlike: Sequence[Attributes] | None = None,  # noqa: ARG002
+        sub_databases: int | None = None,  # noqa: ARG002
+    ) -> NDArray[np.float32]:
+        """Refuse: photos cannot be lifted without decoys."""
+        raise DecoyError("the service has no decoys file, so it cannot enroll photos")
+
+
+@dataclass(frozen=True, eq=False)
+class InRotation:
+    """What works with one epoch of one tenant's rotation, (n, n)."""
+
+    rotation: NDArray[np.float64] = field(repr=False)
+    enroller: Enroller
+    verifier: Verifier
+
+
+@dataclass(eq=False)
+class Runtime:
+    """Everything that answers a request, opened once in each process."""
+
+    settings: Settings
+    keyring: MasterKeyring
+    store: TemplateStore
+    contract: Contract
+    source: DecoyPool | DecoyGenerator | None
+    pack: ModelPack | None
+    export_key: ExportKey
+    _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
+    _tenants: OrderedDict[tuple[str, int], InRotation] = field(
+        default_factory=OrderedDict, repr=False
+    )
+
+    def __post_init__(self) -> None:
+        self.levels = Levels(self.contract, lowest=self.settings.lowest_level)
+        self.stand_ins = StandIns(
+            self.contract, self.keyring, key=self.store.secrets.get(STAND_IN_SECRET)
+        )
+
+    @classmethod
+    def open(cls, settings: Settings) -> "Runtime":
+        """Open everything that the settings name, and run one inference where there is a pack.
+
+        Raises
+        ------
+        StartError
+            One sentence on the first thing that is wrong.
+        """
+        keyring = open_keyring(settings)
+        contract = open_contract(settings, keyring)
+        source = open_decoys(settings, keyring, contract)
+        pack = open_pack(settings, contract)
+        if pack is not None:
+            try_inference(pack)
+        store = open_store(settings, keyring)
+        prepare_database(store)
+        # Obtained now, so that no request waits for it, nor fails on it.
+        store.pseudonym(settings.default_tenant, "-")
+        store.receipt_public_key()
+        if settings.export_key_file is not None:
+            export_key = ExportKey.from_file(settings.export_key_file)
+        else:
+            export_key = ExportKey.from_secret(store.secrets.get("export"))
+        return cls(settings, keyring, store, contract, source, pack, export_key)
+
+    def superseded_calibrations(self) -> str | None:
+        """Return what to tell the operator of a contract file that is older than one served."""
+        if not self.store.known_calibrations.are_superseded(*self._calibrations):
+            return None
+        return SUPERSEDED_CALIBRATIONS
+
+    def note_calibrations(self) -> None:
+        """Remember the contract's calibrations as served."""
+        self.store.known_calibrations.note(*self._calibrations)
+
+    @property
+    def _calibrations(self) -> tuple[str, list[str]]:
+        contract = self.contract
+        return contract.contract_id, [each.calibration_id for each in contract.calibrations]
+
+    def epoch(self, tenant: str) -> int:
+        """Return the epoch of the rotation that the tenant's new templates are in."""
+        return self.store.tenants.get(tenant).rotation_epoch
+
+    def enroller(self, tenant: str, epoch: int) -> Enroller:
+        """Return the tenant's enroller for one epoch of its rotation."""
+        return self._of(tenant, epoch).enroller
+
+    def verifier(self, tenant: str, epoch: int) -> Verifier:
+        """Return the tenant's verifier for one epoch of its rotation."""
+        return self._of(tenant, epoch).verifier
+
+    def read(
+        self, tenant: str, subject: str, *, contract_id: str | None = None
+    ) -> tuple[SubjectTemplate, InRotation] | None:
+        """Return a subject's template and what works with its rotation; None if there is none.
+
+        ``contract_id`` as for ``TemplateStore.get``.
+        """
+        for _ in range(READS):
+            found = self.store.get(tenant, subject, contract_id=contract_id)
+            if found is None:
+                return None
+            with contextlib.suppress(RetiredRotation):
+                return found, self._of(tenant, found.record.rotation_epoch)
+            # Between the two looks it was turned into a newer rotation.
+        raise StoreBusy("the tenant's rotation is being renewed; send it again")
+
+    def _of(self, tenant: str, epoch: int) -> InRotation:
+        named = (tenant, epoch)
+        with self._lock:
+            found = self._tenants.get(named)
+            if found is not None:
+                self._tenants.move_to_end(named)
+                return found
+        # Outside of the lock: it takes a query and a QR decomposition.
+        key = self.store.tenants.rotation_key(tenant, epoch=epoch).key
+        rotation = tenant_rotation(key, self.contract.binding.n)
+        made = InRotation(
+            rotation=rotation,
+            enroller=Enroller(
+                self.contract, self.source or NoDecoys(self.contract), rotation=rotation
+            ),
+            verifier=Verifier(self.contract, rotation=rotation),
+        )
+        with self._lock:
+            self._tenants[named] = made
+            while len(self._tenants) > TENANTS_KEPT:
+                self._tenants.popitem(last=False)
+        return made
+
+    def require_decoys(self) -> None:
+        """Refuse to lift where there are no decoys and the strategy needs some.
+
+        Raises
+        ------
+        ApiError
+            ``model_unavailable``.
+        """
+        if self.source is None and self.contract.binding.strategy is not Strategy.RANDOM:
+            raise _lacking("decoys file")
+
+    def require_template_enrollment(self, tenant: str) -> None:
+        """Refuse a template that a client made, unless the operator lets the tenant enroll them.
+
+        Asked of the database every time, so that a change counts at once in all workers.
+
+        Raises
+        ------
+        ApiError
+            ``forbidden``.
+        """
+        if not self.store.tenants.get(tenant).template_enrollment:
+            raise ApiError(
+                "forbidden",
+                "this tenant does not take templates that clients made: enroll photos, or ask the "
+                "operator to allow it (`veilface db template-enrollment --allow`)",
+                {"tenant_setting": "template_enrollment"},
+            )
+
+    @property
+    def image_limits(self) -> ImageLimits:
+        """What a photo may cost before it is decoded, by the settings."""
+        return ImageLimits(
+            max_bytes=self.settings.max_image_bytes, max_pixels=self.settings.max_image_pixels
+        )
+
+    def required_pack(self) -> ModelPack:
+        """Return the pack.
+
+        Raises
+        ------
+        ApiError
+            ``model_unavailable``.
+        """
+        if self.pack is None:
+            raise _lacking("model pack")
+        return self.pack
+
+    def put(
+        self,
+        tenant: str,
+        subject: str,
+        epoch: int,
+        enrollment: Enrollment,
+        *,
+        source: Source,
+        photos: int,
+        by: By,
+        guard: Guard | None = None,
+    ) -> StoredTemplate:
+        """Store an enrollment in place of an earlier one; `guard` as for ``TemplateStore.put``."""
+        binding = self.contract.binding
+        return self.store.put(
+            tenant,
+            subject,
+            enrollment.wire,
+            contract_id=enrollment.contract_id,
+            n=binding.n,
+            m=binding.m,
+            dtype=WIRE_DTYPE,
+            source=source,
+            photos=photos,
+            template_id=enrollment.template_id,
+            rotation_epoch=epoch,
+            guard=guard,
+            by=by,
+        )
+
+    def export(self, tenant: str, subject: str, *, by: By) -> bytes | None:
+        """Return one subject, un-rotated and encrypted; None if there is none.
+
+        Its line stands in the audit log before it is returned.
+
+        Raises
+        ------
+        ContractMismatch
+            If the stored template belongs to another contract: its dimension may not even fit.
+        """
+        read = self.read(tenant, subject)
+        if read is None:
+            return None
+        found, room = read
+        binding = self.contract.binding
+        binding.require_contract(found.record.contract_id, what="the stored template")
+        stored = wire.decode(found.wire, max_n=binding.n, max_m=binding.m)
+        # A rotation's inverse is its transpose.
+        plain = stored.subspace.rotated(room.rotation.T)
+        exported = Exported(
+            subject_id=subject,
+            contract_id=self.contract.contract_id,
+            source=str(found.record.source),
+            photos=found.record.photos,
+            wire=wire.encode(plain, contract_id=self.contract.contract_id, dtype="float32"),
+            stamp=self.store.transfers.stamp(
+                tenant, subject, template_id=found.record.template_id, by=by
+            ),
+        )
+        return seal_export(exported, key=self.export_key, tenant=tenant)
+
+    def close(self) -> None:
+        """Let go of the database's connections."""
+        self.store.close()
+
+
+def bootstrap_token(store: TemplateStore, settings: Settings) -> str | None:
+    """Make the first tenant and its first API key, with all rights; None if there is a key.
+
+    The token is shown once, by whoever calls this, and kept nowhere.
+    """
+    made = store.api_keys.bootstrap(tenant=settings.default_tenant)
+    return None if made is None else made.token

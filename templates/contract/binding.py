@@ -1,0 +1,202 @@
+"""What makes two templates comparable: the part of a contract that its id hashes."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+from templates.contract.canonical import Fields, Json, digest, free_object
+from templates.contract.levels import SHA256_HEX
+from templates.errors import ContractError, ContractMismatch
+from templates.space.lifting import Strategy
+
+MAX_N = 4096
+MAX_M = 128
+
+
+def embedding_id(*, embedder_sha256: str, preprocessing: Mapping[str, object]) -> str:
+    """Name the space that descriptors lie in: equal for equal weights and equal preprocessing.
+
+    Decoys hide a descriptor only if they lie in its space; this id is how a decoy source says
+    which one that is (``DecoySource.made_with``).
+
+    Parameters
+    ----------
+    embedder_sha256
+        SHA-256 of the embedder's ONNX file, 64 hexadecimal digits.
+    preprocessing
+        Its version, alignment template, size, channel order, mean, scale and flip.
+
+    Returns
+    -------
+    str
+        SHA-256 of the canonical JSON of both, 64 hexadecimal digits.
+
+    Raises
+    ------
+    ContractError
+        Where the preprocessing is not plain JSON.
+    """
+    plain = free_object(preprocessing, what="the preprocessing")
+    return digest({"embedder_sha256": embedder_sha256, "preprocessing": plain})
+
+
+@dataclass(frozen=True)
+class Binding:
+    """What makes two templates comparable; its hash is the ``contract_id``.
+
+    Parameters
+    ----------
+    embedder_sha256
+        SHA-256 of the embedder's ONNX file, 64 hexadecimal digits.
+    preprocessing
+        Its version, alignment template, size, channel order, mean, scale and flip.
+    n
+        Descriptor dimension.
+    strategy, m
+        Lifting strategy and subspace dimension of stored templates.
+    decoy_source_id
+        SHA-256 of the decoy source's canonical content.
+    rotation_version
+        Version of the tenant-rotation derivation.
+    """
+
+    embedder_sha256: str
+    preprocessing: Mapping[str, Json]
+    n: int
+    strategy: Strategy
+    m: int
+    decoy_source_id: str
+    rotation_version: str
+
+    def __post_init__(self) -> None:
+        if not SHA256_HEX.fullmatch(self.embedder_sha256):
+            raise ContractError("the embedder's hash must be 64 lower-case hexadecimal digits")
+        if not SHA256_HEX.fullmatch(self.decoy_source_id):
+            raise ContractError("the decoy source's id must be 64 lower-case hexadecimal digits")
+        if not 2 <= self.n <= MAX_N:
+            raise ContractError(f"the descriptor dimension must lie in 2 to {MAX_N}")
+        if not 1 <= self.m <= min(MAX_M, self.n - 1):
+            raise ContractError(f"the subspace dimension must lie in 1 to min({MAX_M}, n - 1)")
+        if not 1 <= len(self.rotation_version) <= 64:
+            raise ContractError("the rotation version must be a text of 1 to 64 characters")
+        preprocessing = free_object(self.preprocessing, what="the preprocessing")
+        object.__setattr__(self, "preprocessing", preprocessing)
+        object.__setattr__(self, "strategy", Strategy(self.strategy))
+
+    @cached_property
+    def contract_id(self) -> str:
+        """SHA-256 of the canonical JSON, 64 hexadecimal digits; computed once."""
+        return digest(self.to_json())
+
+    @property
+    def embedding_id(self) -> str:
+        """:func:`embedding_id` of the contract's embedder and preprocessing."""
+        return embedding_id(embedder_sha256=self.embedder_sha256, preprocessing=self.preprocessing)
+
+    def to_json(self) -> dict[str, Json]:
+        """JSON form: exactly what is hashed."""
+        return {
+            "embedder_sha256": self.embedder_sha256,
+            "preprocessing": dict(self.preprocessing),
+            "n": self.n,
+            "strategy": str(self.strategy),
+            "m": self.m,
+            "decoy_source_id": self.decoy_source_id,
+            "rotation_version": self.rotation_version,
+        }
+
+    def require_embedder(
+        self, *, embedder_sha256: str, preprocessing: Mapping[str, object], n: int
+    ) -> None:
+        """Refuse a pack whose embeddings this contract does not describe.
+
+        Raises
+        ------
+        ContractMismatch
+            Naming both sides.
+        """
+        if n != self.n:
+            raise ContractMismatch(
+                f"the contract is for descriptors of {self.n} numbers, the pack gives {n}; "
+                "use the pack that the contract was calibrated with"
+            )
+        if embedder_sha256 != self.embedder_sha256:
+            raise ContractMismatch(
+                f"the contract is bound to embedder {self.embedder_sha256[:16]}…, the pack's is "
+                f"{embedder_sha256[:16]}…; use the pack that the contract was calibrated with"
+            )
+        theirs = free_object(preprocessing, what="the pack's preprocessing")
+        if theirs != self.preprocessing:
+            keys = sorted(theirs.keys() | self.preprocessing.keys())
+            differing = [key for key in keys if theirs.get(key) != self.preprocessing.get(key)]
+            sides = "; ".join(
+                f"{key}: contract {self.preprocessing.get(key)}, pack {theirs.get(key)}"
+                for key in differing
+            )
+            raise ContractMismatch(
+                f"the pack preprocesses otherwise than the contract: {sides}; use the pack and "
+                "the settings that it was calibrated with, or, after an upgrade that changed the "
+                "version, build the decoys, calibrate and enroll anew"
+            )
+
+    def require_source(self, *, source_id: str, made_with: str | None = None) -> None:
+        """Refuse a decoy source other than the contract's, or of another descriptor space.
+
+        Parameters
+        ----------
+        source_id
+            The source's id.
+        made_with
+            The source's ``made_with``; None, as of a source made in code, is not held against
+            the binding.
+
+        Raises
+        ------
+        ContractMismatch
+            Naming both sides.
+        """
+        if made_with is not None and made_with != self.embedding_id:
+            raise ContractMismatch(
+                "the decoys are descriptors of another model or another preprocessing (made with "
+                f"{made_with[:16]}…, the contract's is {self.embedding_id[:16]}…), and hide "
+                "nothing; build the decoys with this pack and the same --flip, and calibrate "
+                "with them"
+            )
+        if source_id != self.decoy_source_id:
+            raise ContractMismatch(
+                f"the contract is bound to the decoy source {self.decoy_source_id[:16]}…, this one "
+                f"is {source_id[:16]}…; use the file that the contract was calibrated with"
+            )
+
+    def require_contract(self, contract_id: str, *, what: str) -> None:
+        """Refuse a template of another contract.
+
+        Raises
+        ------
+        ContractMismatch
+            Naming both sides.
+        """
+        if contract_id != self.contract_id:
+            raise ContractMismatch(
+                f"{what} belongs to the contract {contract_id[:16]}…, the service runs "
+                f"{self.contract_id[:16]}…; enroll or lift again under the service's contract"
+            )
+
+    @classmethod
+    def from_json(cls, value: object) -> "Binding":
+        """Parse hostile JSON."""
+        fields = Fields(value, what="the binding")
+        strategy = fields.text("strategy")
+        if strategy not in list(Strategy):
+            raise ContractError(f"the strategy must be one of {[*map(str, Strategy)]}")
+        binding = cls(
+            embedder_sha256=fields.text("embedder_sha256"),
+            preprocessing=fields.free("preprocessing"),
+            n=fields.integer("n"),
+            strategy=Strategy(strategy),
+            m=fields.integer("m"),
+            decoy_source_id=fields.text("decoy_source_id"),
+            rotation_version=fields.text("rotation_version"),
+        )
+        fields.done()
+        return binding

@@ -1,0 +1,472 @@
+"""Encryption at rest: the master keys, and what is sealed directly under them.
+
+A master key never encrypts anything itself. HKDF-SHA256 derives one AES-256-GCM key per purpose
+from it, so that a blob of one purpose cannot stand in for a blob of another. A sealed blob is::
+
+    version (1 byte) | key id (8) | nonce (12) | ciphertext and tag (len(plaintext) + 16)
+
+Nonces are random; a purpose key may seal 2**32 blobs (NIST SP 800-38D §8.3), which no deployment
+of this size reaches. The associated data holds the header and the parts that the caller binds the
+blob to, each with its length in front, so that no two lists of parts have the same encoding.
+"""
+
+import hashlib
+import os
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NoReturn, Protocol, Self
+
+from cryptography.exceptions import InvalidTag
+from cryptography.hazmat.primitives.ciphers.aead import AESGCM
+from cryptography.hazmat.primitives.hashes import SHA256
+from cryptography.hazmat.primitives.kdf.hkdf import HKDF
+
+from templates.errors import SealError
+from templates.keys.key_command import keys_of_command
+from templates.keys.key_file import (
+    KEY_BYTES,
+    Stamp,
+    check_folder,
+    check_keys,
+    keys_in,
+    locked,
+    read_key_file,
+    stamp_of,
+    write_key_file,
+)
+
+KEY_ID_BYTES = 8
+NONCE_BYTES = 12
+TAG_BYTES = 16
+OVERHEAD_BYTES = 1 + KEY_ID_BYTES + NONCE_BYTES + TAG_BYTES
+
+ASK_AGAIN_S = 10.0
+"""Seconds between two runs of a key command that blobs under unknown keys ask for."""
+
+_VERSION = 1
+_MAX_PLAINTEXT_BYTES = 2**31 - 1 - OVERHEAD_BYTES  # the limit of one call of the AES-GCM library
+
+
+class Sealer(Protocol):
+    """Turns bytes into sealed bytes and back; whoever lacks the key learns only the length."""
+
+    def seal(self, plaintext: bytes, *, context: str) -> bytes:
+        """Encrypt `plaintext` so that it opens only with the same `context`."""
+        ...
+
+    def open(self, sealed: bytes, *, context: str) -> bytes:
+        """Decrypt; raise :class:`SealError` for another key, context or any altered byte."""
+        ...
+
+
+def encode_parts(*parts: str | bytes | int) -> bytes:
+    """Encode parts as associated data, injectively: count, then type, length and bytes of each.
+
+    Parameters
+    ----------
+    *parts
+        Text is taken as UTF-8, a whole number in decimal. The type is part of the encoding.
+    """
+    encoded = [len(parts).to_bytes(4, "big")]
+    for part in parts:
+        match part:
+            case str():
+                kind, body = b"t", part.encode()
+            case bytes():
+                kind, body = b"b", part
+            case int():
+                kind, body = b"i", str(part).encode()
+        encoded += [kind, len(body).to_bytes(8, "big"), body]
+    return b"".join(encoded)
+
+
+def derive_key(key: bytes, label: str) -> bytes:
+    """Derive 32 bytes for one purpose from a uniformly random key (HKDF-SHA256, RFC 5869)."""
+    return HKDF(SHA256(), KEY_BYTES, salt=None, info=b"veilface/1/" + label.encode()).derive(key)
+
+
+class MasterKeyring:
+    """The master keys of a deployment; the first seals, all of them open.
+
+    Use :meth:`load`, :meth:`create`, :meth:`from_command` or :meth:`from_environment`. A keyring
+    that came from a file follows the file: when it changes, the keys are read again at the next
+    seal, or when a blob names a key that is not in memory. So a running service picks up a rotation
+    without a restart. A command is run again only for a blob whose key is not in memory, and the
+    environment of a process never changes.
+
+    Parameters
+    ----------
+    keys
+        32 random bytes each, the current one first.
+    source
+        What to call the place they came from in error texts.
+
+    Raises
+    ------
+    SealError
+        For no key, a repeated key, a key of another length, or one that is visibly not random.
+    """
+
+    def __init__(self, keys: Sequence[bytes], *, source: str = "the master keyring") -> None:
+        self._source = source
+        self._path: Path | None = None
+        self._stamp: Stamp | None = None
+        self._not_followed: str | None = None
+        self._command: _Command | None = None
+        self._lock = threading.Lock()
+        self._keys = _Keys(keys, source=source)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read a key file: one base64 key of 32 bytes on a line, the current one first.
+
+        Raises
+        ------
+        SealError
+            If the file is absent, readable by group or others, or holds anything else.
+        """
+        path = Path(path)
+        keys, stamp = read_key_file(path)
+        keyring = cls(keys, source=f"the key file {path}")
+        keyring._path, keyring._stamp = path, stamp
+        return keyring
+
+    @classmethod
+    def create(cls, path: str | Path) -> Self:
+        """Write a new key file with one random key, mode 0600, and load it.
+
+        The file appears whole or not at all, and an existing one is never touched, so of several
+        processes that try at once exactly one succeeds.
+
+        Raises
+        ------
+        SealError
+            If the file exists already or cannot be written.
+        """
+        path = Path(path)
+        check_folder(path)
+        write_key_file(path, [os.urandom(KEY_BYTES)], replace=False)
+        return cls.load(path)
+
+    @classmethod
+    def from_environment(cls, name: str) -> Self:
+        """Read the keys from an environment variable, in the form of a key file.
+
+        A space or a comma may stand in the place of a line break.
+
+        Raises
+        ------
+        SealError
+            If the variable is not set, or holds anything but good keys.
+        """
+        source = f"the environment variable {name}"
+        text = os.environ.get(name)
+        if text is None:
+            raise SealError(
+                f"{source} is not set: give it the master keys in base64, the current one first"
+            )
+        return cls(keys_in("\n".join(text.replace(",", " ").split()), source=source), source=source)
+
+    @classmethod
+    def from_command(cls, argv: Sequence[str], timeout_s: float = 30) -> Self:
+        """Ask a command, such as the client of a KMS, for the keys.
+
+        It writes one base64 key of 32 bytes on a line, the current one first. It is run now, and
+        again when a blob names a key that is not in memory, at most once in :data:`ASK_AGAIN_S`.
+
+        Parameters
+        ----------
+        argv
+            Program and arguments; no shell is between.
+        timeout_s
+            Seconds until it is killed.
+
+        Raises
+        ------
+        SealError
+            If it fails, takes too long or writes anything but good keys.
+        """
+        command = _Command(argv, timeout_s)
+        keyring = cls(command.ask(), source=command.source)
+        keyring._command = command
+        return keyring
+
+    @staticmethod
+    def add_current(path: str | Path) -> str:
+        """Put a new random key in front of a key file's keys; returns its key id.
+
+        The file is replaced in one step. Afterwards re-wrap the store, then :meth:`drop_retired`.
+
+        Raises
+        ------
+        SealError
+            If the file cannot be used or replaced, or somebody else changes it at this moment.
+        """
+        path = Path(path)
+        with locked(path):
+            keys, _ = read_key_file(path)
+            fresh = os.urandom(KEY_BYTES)
+            write_key_file(path, [fresh, *keys], replace=True)
+        return _key_id(fresh).hex()
+
+    @staticmethod
+    def drop_retired(path: str | Path, *, keep: str) -> int:
+        """Keep only the first key of a key file; returns how many were dropped.
+
+        Whatever is still sealed under a dropped key is lost: ask
+        ``TemplateStore.wrapping_keys()`` first.
+
+        Parameters
+        ----------
+        path
+            The key file.
+        keep
+            Id of the key that everything was found to be sealed under. It must still be the
+            first one.
+
+        Raises
+        ------
+        SealError
+            If another key is the first one by now, the file cannot be used or replaced, or
+            somebody else changes it at this moment. Then no key is dropped.
+        """
+        path = Path(path)
+        with locked(path):
+            keys, _ = read_key_file(path)
+            if (first := _key_id(keys[0]).hex()) != keep:
+                raise SealError(
+                    f"the first key of the key file {path} is {first}, but what was checked is "
+                    f"sealed under {keep}; the file changed meanwhile, and no key was dropped: "
+                    "run `veilface keys rewrap --retire`"
+                )
+            if len(keys) > 1:
+                write_key_file(path, keys[:1], replace=True)
+        return len(keys) - 1
+
+    @property
+    def current(self) -> str:
+        """Key id, 16 hexadecimal digits, of the key that seals."""
+        self._follow_file()
+        return self._keys.ids[0].hex()
+
+    @property
+    def key_ids(self) -> tuple[str, ...]:
+        """Ids of all keys, the current one first."""
+        self._follow_file()
+        return tuple(key_id.hex() for key_id in self._keys.ids)
+
+    @property
+    def stale_reason(self) -> str | None:
+        """Why the keys in memory may be old ones: the file or command that failed, and how.
+
+        They stay in use meanwhile. None where nothing failed, as far as it was tried.
+        """
+        self._follow_file()
+        if self._command is not None:
+            return None if self._command.failure is None else str(self._command.failure)
+        return self._not_followed
+
+    def seal(
+        self, plaintext: bytes, *, purpose: str, bound_to: Sequence[str | bytes | int]
+    ) -> bytes:
+        """Encrypt under the current key.
+
+        Parameters
+        ----------
+        plaintext
+            At most 2 GiB.
+        purpose
+            Label of the derived key, for instance ``"subject-key"``.
+        bound_to
+            What the blob belongs to; it opens only with the same parts.
+        """
+        if len(plaintext) > _MAX_PLAINTEXT_BYTES:
+            raise SealError(f"{len(plaintext)} bytes are too many to seal at once (2 GiB at most)")
+        self._follow_file()
+        keys = self._keys
+        header = bytes([_VERSION]) + keys.ids[0]
+        nonce = os.urandom(NONCE_BYTES)
+        cipher = AESGCM(keys.derived(keys.ids[0], purpose))
+        return header + nonce + cipher.encrypt(nonce, plaintext, _bind(header, purpose, bound_to))
+
+    def open(
+        self,
+        sealed: bytes,
+        *,
+        purpose: str,
+        bound_to: Sequence[str | bytes | int],
+        refresh: bool = True,
+    ) -> bytes:
+        """Decrypt what :meth:`seal` made with the same purpose and parts.
+
+        Parameters
+        ----------
+        sealed, purpose, bound_to
+            The blob, and what it was sealed with.
+        refresh
+            False for a blob that anybody may have made up: an unknown key in it does not run the
+            key command, which others would wait for. A key file is followed either way.
+
+        Raises
+        ------
+        SealError
+            If the blob names an unknown key, belongs to something else, or was altered.
+        """
+        key_id = sealed_key_id(sealed)
+        raw_id = bytes.fromhex(key_id)
+        if raw_id not in self._keys.ids:
+            self._follow_file()
+            if refresh:
+                self._follow_command(raw_id)
+        keys = self._keys
+        if raw_id not in keys.ids:
+            known = ", ".join(each.hex() for each in keys.ids)
+            raise SealError(
+                f"sealed under master key {key_id}, but {self._source} has only {known}: "
+                f"put the missing key back as a further line{self._last_failure()}"
+            )
+        header, nonce = sealed[: 1 + KEY_ID_BYTES], sealed[1 + KEY_ID_BYTES :][:NONCE_BYTES]
+        cipher = AESGCM(keys.derived(raw_id, purpose))
+        try:
+            return cipher.decrypt(
+                nonce,
+                sealed[1 + KEY_ID_BYTES + NONCE_BYTES :],
+                _bind(header, purpose, bound_to),
+            )
+        except InvalidTag:
+            raise SealError(
+                f"sealed data ({purpose}) does not open: it was altered, or belongs elsewhere"
+            ) from None
+
+    def rewrap(
+        self, sealed: bytes, *, purpose: str, bound_to: Sequence[str | bytes | int]
+    ) -> bytes:
+        """Open a blob and seal it again under the current key."""
+        plaintext = self.open(sealed, purpose=purpose, bound_to=bound_to)
+        return self.seal(plaintext, purpose=purpose, bound_to=bound_to)
+
+    def _follow_file(self) -> None:
+        if self._path is None:
+            return
+        # A file that is broken at this moment must not stop a service that has its keys: a blob
+        # under a key that is not in memory still fails, with the id of that key.
+        try:
+            if stamp_of(self._path.stat()) != self._stamp:
+                with self._lock:
+                    keys, stamp = read_key_file(self._path)
+                    self._keys, self._stamp = _Keys(keys, source=self._source), stamp
+        except OSError as error:
+            self._not_followed = f"{self._source} cannot be read: {error.strerror}"
+        except SealError as error:
+            self._not_followed = str(error)
+        else:
+            self._not_followed = None
+
+    def _follow_command(self, wanted: bytes) -> None:
+        if self._command is None:
+            return
+        with self._lock:
+            # Others may have asked while this thread waited.
+            if wanted not in self._keys.ids and (keys := self._command.ask_again()):
+                self._keys = _Keys(keys, source=self._source)
+
+    def _last_failure(self) -> str:
+        failure = None if self._command is None else self._command.failure
+        return "" if failure is None else f" (asked again, {failure})"
+
+    def __repr__(self) -> str:
+        return f"MasterKeyring({', '.join(each.hex() for each in self._keys.ids)})"
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError("a master keyring is not serialised: load it where it is needed")
+
+
+class KeyringSealer:
+    """A :class:`Sealer` under a master keyring, for files: decoy pools, cohorts, caches.
+
+    Parameters
+    ----------
+    keyring
+        The master keys.
+    purpose
+        Label of the derived key. Readers and writers of one file must agree on it.
+    """
+
+    def __init__(self, keyring: MasterKeyring, *, purpose: str = "file") -> None:
+        self._keyring = keyring
+        self._purpose = f"sealer/{purpose}"
+
+    def seal(self, plaintext: bytes, *, context: str) -> bytes:
+        """Encrypt `plaintext`, bound to `context`."""
+        return self._keyring.seal(plaintext, purpose=self._purpose, bound_to=[context])
+
+    def open(self, sealed: bytes, *, context: str) -> bytes:
+        """Decrypt; :class:`SealError` for another key or context, or an altered byte."""
+        return self._keyring.open(sealed, purpose=self._purpose, bound_to=[context])
+
+    def __repr__(self) -> str:
+        return f"KeyringSealer({self._keyring!r}, purpose={self._purpose!r})"
+
+
+def sealed_key_id(sealed: bytes) -> str:
+    """Id, 16 hexadecimal digits, of the master key that a blob was sealed under."""
+    if len(sealed) < OVERHEAD_BYTES:
+        raise SealError(f"sealed data has at least {OVERHEAD_BYTES} bytes, this has {len(sealed)}")
+    if sealed[0] != _VERSION:
+        raise SealError(f"sealed data of version {sealed[0]}, this program reads {_VERSION}")
+    return sealed[1 : 1 + KEY_ID_BYTES].hex()
+
+
+class _Command:
+    """A key command, when it was last run, and how that failed."""
+
+    def __init__(self, argv: Sequence[str], timeout_s: float) -> None:
+        self._argv = tuple(argv)
+        self._timeout_s = timeout_s
+        self._asked_at = 0.0
+        self.failure: SealError | None = None
+        self.source = f"the key command {self._argv[0] if self._argv else ''}"
+
+    def ask(self) -> list[bytes]:
+        try:
+            return keys_of_command(self._argv, timeout_s=self._timeout_s)
+        finally:
+            self._asked_at = time.monotonic()
+
+    def ask_again(self) -> list[bytes]:
+        """Keys, or none where it was run just before, or failed: those in memory stay good."""
+        if time.monotonic() - self._asked_at < ASK_AGAIN_S:
+            return []
+        self.failure = None
+        try:
+            return self.ask()
+        except SealError as error:
+            self.failure = error
+            return []
+
+
+class _Keys:
+    """An immutable set of checked keys, and the keys derived from them so far."""
+
+    def __init__(self, keys: Sequence[bytes], *, source: str) -> None:
+        check_keys(keys, source=source)
+        self._masters = {_key_id(key): key for key in keys}
+        self._derived: dict[tuple[bytes, str], bytes] = {}
+        self.ids = tuple(self._masters)
+
+    def derived(self, key_id: bytes, purpose: str) -> bytes:
+        found = self._derived.get((key_id, purpose))
+        if found is None:
+            found = derive_key(self._masters[key_id], f"seal/{purpose}")
+            self._derived[key_id, purpose] = found
+        return found
+
+
+def _bind(header: bytes, purpose: str, bound_to: Sequence[str | bytes | int]) -> bytes:
+    return header + encode_parts(purpose, *bound_to)
+
+
+def _key_id(key: bytes) -> bytes:
+    return hashlib.sha256(derive_key(key, "key-id")).digest()[:KEY_ID_BYTES]

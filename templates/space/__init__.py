@@ -1,0 +1,1 @@
+"""The mathematics of a template: affine subspaces, their dual form, and lifting."""

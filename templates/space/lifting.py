@@ -1,0 +1,300 @@
+"""From descriptors to private templates: the strategies of paper §3.2, §4.2 and §4.3."""
+
+from collections.abc import Sequence
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from templates.decoys.source import Attributes, DecoySource
+from templates.errors import InvalidEmbedding, LiftingError
+from templates.keys.randomness import Keystream
+from templates.space.subspace import SubspaceBatch, span_basis
+
+SUB_DATABASES = 16
+"""Parts that the sub-strategies split the database into (paper §4.2)."""
+
+UNIT_TOLERANCE = 1e-3
+# Two decoys, or a decoy and the descriptor, nearer than this are one photo twice: they would add
+# a direction of noise. Real descriptors of different photos are 0.1 apart or more.
+_SAME = 1e-3
+_REDRAWS = 16
+_TILE_BYTES = 64 << 20
+
+
+class Strategy(StrEnum):
+    """How the directions of a subspace are chosen (docs/method.md §2.1)."""
+
+    RANDOM = "random"
+    ADVERSARIAL = "adversarial"
+    HYBRID = "hybrid"
+    HYBRID_PLUS = "hybrid+"
+    SUB_ADVERSARIAL = "sub-adversarial"
+    SUB_HYBRID = "sub-hybrid"
+
+    def decoys(self, m: int) -> int:
+        """Number of decoys among ``m`` directions: all, half (rounded down) or none."""
+        if self is Strategy.RANDOM:
+            return 0
+        return m if self in (Strategy.ADVERSARIAL, Strategy.SUB_ADVERSARIAL) else m // 2
+
+    @property
+    def sub_databases(self) -> int | None:
+        """Number of sub-databases to draw from, or None for the whole database."""
+        split = self in (Strategy.SUB_ADVERSARIAL, Strategy.SUB_HYBRID)
+        return SUB_DATABASES if split else None
+
+
+def unit_descriptors(descriptors: ArrayLike) -> NDArray[np.float64]:
+    """Check descriptors and renormalise them in float64.
+
+    Parameters
+    ----------
+    descriptors : array_like, shape (N, n)
+
+    Returns
+    -------
+    ndarray of float64, shape (N, n)
+        Unit rows.
+
+    Raises
+    ------
+    InvalidEmbedding
+        The shape is wrong, a number is not finite, or a norm differs from 1 by more than 1e-3.
+    """
+    rows = np.asarray(descriptors)
+    if rows.ndim != 2 or rows.shape[1] < 2 or not np.issubdtype(rows.dtype, np.floating):
+        raise InvalidEmbedding(
+            f"expected floating-point descriptors of shape (N, n), "
+            f"seen {rows.dtype} of shape {rows.shape}"
+        )
+    rows = rows.astype(np.float64)
+    if not np.isfinite(rows).all():
+        raise InvalidEmbedding("a descriptor holds a number that is not finite")
+    norms = np.linalg.norm(rows, axis=1, keepdims=True)
+    if (np.abs(norms - 1) > UNIT_TOLERANCE).any():
+        raise InvalidEmbedding(
+            f"a descriptor is not of unit length within {UNIT_TOLERANCE:g}: normalise it first"
+        )
+    return np.asarray(rows / norms)
+
+
+def lift(
+    descriptors: ArrayLike,
+    *,
+    strategy: Strategy | str,
+    m: int,
+    source: DecoySource | None = None,
+    stream: Keystream | None = None,
+    attributes: Sequence[Attributes] | None = None,
+) -> SubspaceBatch:
+    """Lift descriptors to private templates.
+
+    Parameters
+    ----------
+    descriptors : array_like, shape (N, n)
+        Unit rows (tolerance 1e-3). A person's photos are averaged first and lifted once: two
+        lifts of one descriptor meet in it (docs/method.md §4.6).
+    strategy : Strategy
+    m : int
+        Subspace dimension, 1 ≤ m < n; 2 or more for the hybrid strategies.
+    source : DecoySource, optional
+        Required by every strategy but random.
+    stream : Keystream, optional
+        For experiments. By default every template gets a fresh key, dropped afterwards.
+    attributes : sequence of Attributes, optional
+        One per descriptor; required by hybrid+ and refused by the others.
+
+    Returns
+    -------
+    SubspaceBatch
+        Functions of the sets and of fresh randomness only (see ``SubspaceBatch.through``).
+
+    Raises
+    ------
+    InvalidEmbedding
+        A descriptor is not a finite unit vector.
+    LiftingError
+        The request cannot be met.
+    DecoyError
+        The source lacks what the strategy needs.
+    """
+    points = unit_descriptors(descriptors)
+    strategy = _check(points, strategy, m, source, attributes)
+    if stream is not None:
+        return _lift(points, strategy, m, source, stream, attributes)
+    feet = np.empty(points.shape, dtype=np.float32)
+    bases = np.empty((len(points), m, points.shape[1]), dtype=np.float32)
+    for row in range(len(points)):
+        one = slice(row, row + 1)
+        with Keystream.fresh() as fresh:
+            chosen = None if attributes is None else attributes[row : row + 1]
+            template = _lift(points[one], strategy, m, source, fresh, chosen)
+        feet[one], bases[one] = template.feet, template.bases
+    return SubspaceBatch(feet, bases)
+
+
+def draw_directions(
+    descriptors: ArrayLike,
+    *,
+    strategy: Strategy | str,
+    m: int,
+    source: DecoySource | None = None,
+    stream: Keystream,
+    attributes: Sequence[Attributes] | None = None,
+) -> NDArray[np.float64]:
+    """Draw the directions that span the subspaces, before they are orthonormalised.
+
+    For the evaluation's paper-faithful mode; see :func:`lift` for the parameters and errors.
+    Whoever holds the directions knows the descriptor: they do not leave memory.
+
+    Returns
+    -------
+    ndarray of float64, shape (N, m, n)
+    """
+    points = unit_descriptors(descriptors)
+    strategy = _check(points, strategy, m, source, attributes)
+    return _directions(points, strategy, m, source, stream, attributes)
+
+
+def paper_basis(
+    points: ArrayLike, directions: ArrayLike, *, stream: Keystream
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Describe ``points[i] + span(directions[i])`` as in paper §3.2.
+
+    Parameters
+    ----------
+    points : array_like, shape (N, n)
+    directions : array_like, shape (N, m, n)
+    stream : Keystream
+
+    Returns
+    -------
+    origins : ndarray of float64, shape (N, n)
+        d₀, the projection of e ~ U([−1, 1])ⁿ on the set.
+    bases : ndarray of float64, shape (N, m, n)
+        The projections of eᵢ ~ U([−1, 1])ⁿ minus d₀, orthonormalised.
+
+    Raises
+    ------
+    LiftingError
+        The directions are linearly dependent.
+    """
+    span = span_basis(np.asarray(directions, dtype=np.float64))
+    start = np.asarray(points, dtype=np.float64)
+    count, m, n = span.shape
+    drawn = stream.uniform((count, m + 1, n), -1.0, 1.0)
+    inside = (drawn - start[:, None]) @ span.transpose(0, 2, 1) @ span
+    projections = start[:, None] + inside
+    origins = np.ascontiguousarray(projections[:, 0])
+    return origins, span_basis(projections[:, 1:] - origins[:, None])
+
+
+def _check(
+    points: NDArray[np.float64],
+    strategy: Strategy | str,
+    m: int,
+    source: DecoySource | None,
+    attributes: Sequence[Attributes] | None,
+) -> Strategy:
+    """Check the request before anything is drawn or allocated."""
+    count, n = points.shape
+    try:
+        strategy = Strategy(strategy)
+    except ValueError:
+        names = ", ".join(Strategy)
+        raise LiftingError(f"unknown lifting strategy; choose one of {names}") from None
+    if not 1 <= m < n:
+        raise LiftingError(f"m = {m} is out of range: 1 <= m < n = {n}")
+    if strategy is not Strategy.RANDOM:
+        if strategy.decoys(m) == 0:
+            raise LiftingError(f"{strategy} lifting with m = {m} has no decoy: use m >= 2")
+        if source is None:
+            raise LiftingError(f"{strategy} lifting needs a decoy source")
+        if source.n != n:
+            raise LiftingError(f"decoys of {source.n} numbers do not fit descriptors of {n}")
+    if strategy is Strategy.HYBRID_PLUS:
+        if attributes is None or len(attributes) != count:
+            raise LiftingError("hybrid+ lifting needs the attributes of every descriptor")
+    elif attributes is not None:
+        raise LiftingError(f"{strategy} lifting does not use attributes: leave them out")
+    return strategy
+
+
+def _lift(
+    points: NDArray[np.float64],
+    strategy: Strategy,
+    m: int,
+    source: DecoySource | None,
+    stream: Keystream,
+    attributes: Sequence[Attributes] | None,
+) -> SubspaceBatch:
+    count, n = points.shape
+    feet = np.empty((count, n), dtype=np.float32)
+    bases = np.empty((count, m, n), dtype=np.float32)
+    step = max(1, _TILE_BYTES // (8 * m * n))
+    for first in range(0, count, step):
+        tile = slice(first, min(first + step, count))
+        chosen = None if attributes is None else attributes[tile]
+        directions = _directions(points[tile], strategy, m, source, stream, chosen)
+        batch = SubspaceBatch.through(points[tile], directions, stream=stream)
+        feet[tile], bases[tile] = batch.feet, batch.bases
+    return SubspaceBatch(feet, bases)
+
+
+def _directions(
+    points: NDArray[np.float64],
+    strategy: Strategy,
+    m: int,
+    source: DecoySource | None,
+    stream: Keystream,
+    attributes: Sequence[Attributes] | None,
+) -> NDArray[np.float64]:
+    count, n = points.shape
+    k = strategy.decoys(m)
+    directions = np.empty((count, m, n))
+    if k and source is not None:
+        unlike = attributes if strategy is Strategy.HYBRID_PLUS else None
+        directions[:, :k] = _decoys(points, k, source, stream, unlike, strategy.sub_databases)
+        directions[:, :k] -= points[:, None]
+    if k < m:
+        directions[:, k:] = stream.uniform((count, m - k, n), -1.0, 1.0)
+    return directions
+
+
+def _decoys(
+    points: NDArray[np.float64],
+    k: int,
+    source: DecoySource,
+    stream: Keystream,
+    unlike: Sequence[Attributes] | None,
+    sub_databases: int | None,
+) -> NDArray[np.float32]:
+    """Draw decoys, and draw again where one photo came twice or is the subject's own."""
+    decoys = source.draw(len(points), k, stream=stream, unlike=unlike, sub_databases=sub_databases)
+    repeated = np.flatnonzero(_repeats(points, decoys))
+    if repeated.size:
+        decoys = decoys.copy()  # the array is the source's
+    for _ in range(_REDRAWS):
+        if not repeated.size:
+            return decoys
+        again = None if unlike is None else [unlike[row] for row in repeated.tolist()]
+        decoys[repeated] = source.draw(
+            len(repeated), k, stream=stream, unlike=again, sub_databases=sub_databases
+        )
+        repeated = repeated[_repeats(points[repeated], decoys[repeated])]
+    raise LiftingError(
+        "the decoy source keeps drawing the same photo twice, or the subject's own: "
+        "remove duplicates from it, or ask for fewer decoys"
+    )
+
+
+def _repeats(points: NDArray[np.float64], decoys: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Rows in which two of the decoys and the descriptor nearly coincide, shape (N,)."""
+    count, k, _ = decoys.shape
+    if k == 0:
+        return np.zeros(count, dtype=np.bool_)
+    members = np.concatenate([points[:, None], decoys], axis=1)
+    cosines = members @ members.transpose(0, 2, 1)
+    cosines[:, np.arange(k + 1), np.arange(k + 1)] = -1
+    return np.asarray((2 - 2 * cosines).min(axis=(1, 2)) < _SAME**2)

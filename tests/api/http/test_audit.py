@@ -1,0 +1,158 @@
+"""Every call that does something, or is refused to, leaves a line; none of them names a face."""
+
+from typing import Any
+
+import pytest
+
+from templates.keys.probe_signature import signed_probe
+from templates.store.audit_chain import Line
+from templates.store.audit_log import AuditLog
+from tests.api.client import Client
+from tests.api.deployment import Deployment, bearer, images, photo
+from tests.api.http.test_enrollment import b64, lifted
+
+
+def lines(client: Client, after: int = 0) -> list[Line]:
+    log: AuditLog = client.app.state.runtime.store.audit_log
+    return list(log.lines(after=after))
+
+
+def last(client: Client) -> Line:
+    return lines(client)[-1]
+
+
+@pytest.fixture
+def service(both: tuple[Client, Deployment]) -> tuple[Client, Deployment]:
+    client, _ = both
+    answer = client.put("/v1/subjects/alice/enrollment", files=images(photo(1), photo(1, 1)))
+    assert answer.status_code == 201
+    return both
+
+
+def test_what_is_done_is_written_with_who_did_it(service: tuple[Client, Deployment]) -> None:
+    client, deployment = service
+    deployment.allow_templates()
+    store = client.app.state.runtime.store
+    path = "/v1/subjects/alice"
+    pseudonym = store.pseudonym("default", "alice")
+    rejected = photo(2, 5)
+    exported = client.get(f"{path}/export").json()["export"]
+    calls: list[tuple[str, str, Any]] = [
+        ("enroll", "replaced", client.put(f"{path}/enrollment", files=images(photo(1)))),
+        (
+            "enroll",
+            "replaced",
+            client.put(f"{path}/enrollment", json={"template": b64(lifted(deployment))}),
+        ),
+        ("verify", "reject", client.post(f"{path}/verify", files=images(rejected, name="image"))),
+        ("export", "exported", client.get(f"{path}/export")),
+        (
+            "import",
+            "restored",
+            restored := client.post(
+                "/v1/subjects/import", json={"export": exported, "restore": True}
+            ),
+        ),
+        ("enroll", "replaced", restored),
+        ("erase", "erased", client.delete(path)),
+        ("erase", "receipt_repeated", client.delete(path)),
+        ("lockout-reset", "nothing_held", client.delete(f"{path}/lockout")),
+    ]
+    answers = [answer for _, _, answer in calls]
+    assert all(answer.is_success for answer in answers)
+    written = [line for line in lines(client) if line.pseudonym == pseudonym]
+    # The fixture's enrollment and the export above come first.
+    assert [(line.action, line.outcome) for line in written[2:]] == [
+        (action, outcome) for action, outcome, _ in calls
+    ]
+    prefix = deployment.token[3:15]
+    for line, answer in zip(written[2:], answers, strict=True):
+        assert line.actor == f"key:{prefix}"
+        assert line.tenant == "default"
+        assert line.request_id == answer.headers["x-request-id"]
+
+
+def test_refusals_are_written_with_their_code(service: tuple[Client, Deployment]) -> None:
+    client, deployment = service
+    path = "/v1/subjects/alice"
+    verifier = deployment.key("verify", "embeddings")
+    probe = client.app.state.runtime.pack.embed_photo(photo(1, 5)).embedding
+    body = signed_probe(verifier, "alice", probe)
+
+    def send(**options: Any) -> Any:
+        return client.post(f"{path}/verify", headers=bearer(verifier), sign=False, **options)
+
+    cases: list[tuple[str, str, Any]] = [
+        ("enroll", "forbidden", lambda: client.put(f"{path}/enrollment", headers=bearer(verifier))),
+        ("erase", "forbidden", lambda: client.delete(path, headers=bearer(verifier))),
+        ("export", "forbidden", lambda: client.get(f"{path}/export", headers=bearer(verifier))),
+        ("unlock", "forbidden", lambda: client.delete(f"{path}/lockout", headers=bearer(verifier))),
+        ("verify", "unsupported_image", lambda: send(files=images(b"no picture", name="image"))),
+        ("verify", "unauthorized", lambda: send(json={**body, "hmac": "0" * 64})),
+        ("verify", "accept", lambda: send(json=body)),
+        ("verify", "replayed", lambda: send(json=body)),
+    ]
+    for _ in range(5):
+        cases.append(("verify", "reject", lambda: send(files=images(photo(2, 5), name="image"))))
+    cases.append(("verify", "locked_out", lambda: send(files=images(photo(1), name="image"))))
+    for action, outcome, call in cases:
+        before = last(client).sequence
+        answer = call()
+        new = lines(client, after=before)
+        assert [(line.action, line.outcome) for line in new] == [(action, outcome)], answer.text
+        assert new[0].request_id == answer.headers["x-request-id"]
+
+
+def test_strangers_and_readers_write_nothing(service: tuple[Client, Deployment]) -> None:
+    client, _ = service
+    before = last(client).sequence
+    nobody = bearer("vf_000000000000_" + "0" * 64)
+    for call in (
+        lambda: client.get("/v1/subjects/alice"),
+        lambda: client.get("/v1/subjects"),
+        lambda: client.get("/v1/contract"),
+        lambda: client.get("/health/ready"),
+        lambda: client.delete("/v1/subjects/alice", headers=nobody),
+        lambda: client.put("/v1/subjects/alice/enrollment", headers=nobody),
+    ):
+        call()
+    assert last(client).sequence == before
+
+
+def test_the_chain_of_all_this_is_whole(service: tuple[Client, Deployment]) -> None:
+    client, _ = service
+    for person in (1, 2, 1):
+        client.post("/v1/subjects/alice/verify", files=images(photo(person, 3), name="image"))
+    found = client.app.state.runtime.store.audit_log.verify()
+    assert found.intact
+    assert found.lines >= 4
+
+
+def test_a_decision_that_cannot_be_recorded_is_not_told(
+    service: tuple[Client, Deployment], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from templates.errors import StoreUnavailable
+
+    client, _ = service
+    log = client.app.state.runtime.store.audit_log
+
+    def full(*_: object) -> None:
+        raise StoreUnavailable("the SQLite database does not answer: database or disk is full")
+
+    before = last(client).sequence
+    with monkeypatch.context() as patch:
+        patch.setattr(log, "append", full)
+        for method, path, options in (
+            ("POST", "/v1/subjects/alice/verify", {"files": images(photo(1, 4), name="image")}),
+            ("PUT", "/v1/subjects/alice/enrollment", {"files": images(photo(2))}),
+            ("DELETE", "/v1/subjects/alice", {}),
+            ("GET", "/v1/subjects/alice/export", {}),
+        ):
+            answer = client.request(method, path, **options)
+            assert answer.status_code == 503
+            assert answer.json()["error"]["code"] == "store_unavailable"
+            assert int(answer.headers["retry-after"]) > 0
+            assert "accept" not in answer.text
+    assert last(client).sequence == before
+    accepted = client.post("/v1/subjects/alice/verify", files=images(photo(1, 4), name="image"))
+    assert accepted.json()["decision"] == "accept"

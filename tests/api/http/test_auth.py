@@ -1,0 +1,142 @@
+import pytest
+
+from api.process.runtime import bootstrap_token, open_keyring, open_store
+from tests.api.client import Client
+from tests.api.deployment import Deployment, bearer, images, photo
+from tests.api.shapes import assert_error
+
+CALLS = [
+    ("PUT", "/v1/subjects/a/enrollment", "enroll"),
+    ("POST", "/v1/subjects/a/verify", "verify"),
+    ("GET", "/v1/subjects", "enroll"),
+    ("GET", "/v1/subjects/a", "enroll"),
+    ("DELETE", "/v1/subjects/a", "erase"),
+    ("GET", "/v1/subjects/a/export", "export"),
+    ("POST", "/v1/subjects/import", "export"),
+    ("GET", "/v1/contract/generator", "embeddings"),
+    ("GET", "/v1/contract", None),
+]
+RIGHTS = {"enroll", "verify", "erase", "export", "scores", "embeddings", "admin"}
+
+
+@pytest.fixture(scope="module")
+def keys(deployment: Deployment) -> dict[str, str]:
+    """For each right, a key that has every other one."""
+    return {right: deployment.key(*(RIGHTS - {right})) for right in RIGHTS}
+
+
+@pytest.mark.parametrize(("method", "path", "right"), CALLS)
+def test_every_call_needs_its_right(
+    client: Client, keys: dict[str, str], method: str, path: str, right: str | None
+) -> None:
+    for headers in (
+        {"Authorization": ""},
+        {"Authorization": "Bearer"},
+        {"Authorization": "Bearer nonsense"},
+        {"Authorization": "Basic dXNlcjpwYXNz"},
+        {"Authorization": "Bearer vf_000000000000_" + "0" * 64},
+        {"Authorization": "Bearer " + "x" * 5000},
+        {"Authorization": "", "X-API-Key": "vf_x"},
+    ):
+        answer = client.request(method, path, headers=headers)
+        assert_error(answer, 401, "unauthorized")
+        assert answer.headers["www-authenticate"] == "Bearer"
+    if right is None:
+        assert client.request(method, path, headers=bearer(keys["admin"])).status_code == 200
+        return
+    answer = client.request(method, path, headers=bearer(keys[right]))
+    assert assert_error(answer, 403, "forbidden") == {"missing": [right]}
+
+
+def test_rights_are_asked_before_the_body_is_read(client: Client, keys: dict[str, str]) -> None:
+    answer = client.put(
+        "/v1/subjects/a/enrollment",
+        content=b"x",
+        headers={**bearer(keys["enroll"]), "Content-Length": str(10**12)},
+    )
+    assert_error(answer, 403, "forbidden")
+
+
+def test_both_headers_are_taken(client: Client, deployment: Deployment) -> None:
+    token = deployment.key("verify")
+    for headers in (
+        bearer(token),
+        {"Authorization": f"bearer {token}"},
+        {"Authorization": "", "X-API-Key": token},
+    ):
+        assert client.get("/v1/contract", headers=headers).status_code == 200
+
+
+def test_a_revoked_key_stops_at_once(client: Client, deployment: Deployment) -> None:
+    token = deployment.key("verify")
+    assert client.get("/v1/contract", headers=bearer(token)).status_code == 200
+    store = open_store(deployment.settings, open_keyring(deployment.settings))
+    assert store.api_keys.revoke(token.split("_")[1])
+    store.close()
+    assert_error(client.get("/v1/contract", headers=bearer(token)), 401, "unauthorized")
+
+
+def test_a_wrong_secret_of_a_known_prefix_is_refused(
+    client: Client, deployment: Deployment
+) -> None:
+    token = deployment.token
+    changed = token[:-1] + ("0" if token[-1] != "0" else "1")
+    assert_error(client.get("/v1/contract", headers=bearer(changed)), 401, "unauthorized")
+
+
+def test_there_is_one_bootstrap_key(deployment: Deployment) -> None:
+    store = open_store(deployment.settings, open_keyring(deployment.settings))
+    assert bootstrap_token(store, deployment.settings) is None
+    store.close()
+
+
+def test_health_needs_no_key(client: Client) -> None:
+    for path in ("/health/live", "/health/ready"):
+        assert client.get(path, headers={"Authorization": ""}).status_code == 200
+
+
+def test_a_key_of_photos_only_works(client: Client, deployment: Deployment) -> None:
+    app = bearer(deployment.key("enroll", "verify"))
+    put = client.put("/v1/subjects/app/enrollment", files=images(photo(4)), headers=app)
+    assert put.status_code == 201
+    probe = client.post(
+        "/v1/subjects/app/verify", files=images(photo(4, 1), name="image"), headers=app
+    )
+    assert probe.json()["decision"] == "accept"
+
+
+@pytest.mark.parametrize(
+    "token",
+    ["x", "vf_", "vf_" + "0" * 77, "vf_000000000000_" + "F" * 64, "vf_000000000000_" + "0" * 65],
+)
+def test_what_is_no_token_costs_no_query(
+    client: Client, monkeypatch: pytest.MonkeyPatch, token: str
+) -> None:
+    store = client.app.state.runtime.store
+    asked: list[str] = []
+    monkeypatch.setattr(store.api_keys, "verify", asked.append)
+    assert_error(client.get("/v1/contract", headers=bearer(token)), 401, "unauthorized")
+    assert asked == []
+    good = "vf_000000000000_" + "0" * 64
+    assert_error(client.get("/v1/contract", headers=bearer(good)), 401, "unauthorized")
+    assert asked == [good]
+
+
+def test_embeddings_are_refused_before_the_body_is_read(
+    client: Client, keys: dict[str, str]
+) -> None:
+    for method, path in (
+        ("PUT", "/v1/subjects/a/enrollment"),
+        ("POST", "/v1/subjects/a/verify"),
+    ):
+        answer = client.request(
+            method,
+            path,
+            content=b"x",
+            headers={
+                **bearer(keys["embeddings"]),
+                "Content-Type": "application/json",
+                "Content-Length": str(10**12),
+            },
+        )
+        assert assert_error(answer, 403, "forbidden") == {"missing": ["embeddings"]}

@@ -1,0 +1,145 @@
+"""The documentation and OpenAPI are held against the application (as datasette does)."""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fastapi.routing import APIRoute
+
+from api.http.app import create_app
+from api.http.errors import ERROR_CODES
+from api.http.openapi import codes_table
+from api.settings import Settings
+from tests.api.client import Client
+
+DOCS = Path(__file__).resolve().parents[3] / "docs"
+PRODUCT_CALLS = {
+    ("PUT", "/v1/subjects/{subject_id}/enrollment"),
+    ("POST", "/v1/subjects/{subject_id}/verify"),
+    ("GET", "/v1/subjects"),
+    ("GET", "/v1/subjects/{subject_id}"),
+    ("DELETE", "/v1/subjects/{subject_id}"),
+    ("GET", "/v1/subjects/{subject_id}/export"),
+    ("POST", "/v1/subjects/import"),
+    ("GET", "/v1/contract"),
+    ("GET", "/v1/contract/generator"),
+    ("GET", "/health/live"),
+    ("GET", "/health/ready"),
+    ("GET", "/metrics"),
+}
+
+
+@pytest.fixture(scope="module")
+def document() -> dict[str, Any]:
+    return create_app(Settings()).openapi()
+
+
+def operations(document: dict[str, Any]) -> dict[tuple[str, str], dict[str, Any]]:
+    return {
+        (method.upper(), path): operation
+        for path, entry in document["paths"].items()
+        for method, operation in entry.items()
+    }
+
+
+def test_the_calls_of_the_contract_exist(document: dict[str, Any]) -> None:
+    assert set(operations(document)) >= PRODUCT_CALLS
+
+
+def test_rest_md_names_every_call(document: dict[str, Any]) -> None:
+    text = (DOCS / "rest.md").read_text(encoding="utf-8")
+    for method, path in operations(document):
+        assert f"`{method} {path}`" in text
+
+
+def test_rest_md_names_no_call_that_does_not_exist(document: dict[str, Any]) -> None:
+    text = (DOCS / "rest.md").read_text(encoding="utf-8")
+    named = set(re.findall(r"\| `(GET|PUT|POST|DELETE) (/[^`?]*)`", text))
+    assert named == set(operations(document))
+
+
+def test_errors_md_has_the_table_of_codes() -> None:
+    assert codes_table() in (DOCS / "errors.md").read_text(encoding="utf-8")
+
+
+def test_documents_name_no_code_that_does_not_exist() -> None:
+    words = set(re.findall(r"`([a-z]+_[a-z_]+)`", (DOCS / "errors.md").read_text()))
+    known = set(ERROR_CODES) | {
+        "request_id", "limit_bytes", "low_quality", "field", "known", "problems", "lowest_level",
+        "tenant_setting", "template_enrollment",
+    }  # fmt: skip
+    assert words <= known
+
+
+def test_every_operation_is_described(document: dict[str, Any]) -> None:
+    for name, operation in operations(document).items():
+        assert operation["summary"], name
+        assert operation["description"], name
+        assert operation["tags"], name
+        assert "200" in operation["responses"], name
+
+
+def test_every_operation_documents_its_codes_with_examples(document: dict[str, Any]) -> None:
+    seen = set()
+    for (method, path), operation in operations(document).items():
+        codes = {}
+        for status, response in operation["responses"].items():
+            if int(status) < 400:
+                continue
+            content = response["content"]["application/json"]
+            assert content["schema"] == {"$ref": "#/components/schemas/ErrorAnswer"}
+            for code, example in content["examples"].items():
+                assert ERROR_CODES[code].status == int(status)
+                assert example["value"]["error"]["code"] == code
+                assert f"`{code}`" in response["description"]
+                codes[code] = status
+        assert "internal_error" in codes
+        if path.startswith("/v1"):
+            assert {"unauthorized", "store_unavailable"} <= set(codes)
+        if "{subject_id}" in path:
+            assert "validation_failed" in codes
+        if method in ("PUT", "DELETE") or path.endswith("/import"):
+            # DELETE is idempotent by itself: the header is taken, and no answer is kept.
+            assert ("idempotency_conflict" in codes) == (method != "DELETE")
+            parameters = [entry["name"] for entry in operation["parameters"]]
+            assert "idempotency-key" in [name.lower() for name in parameters]
+        seen |= set(codes)
+    # The last two have no operation of their own: they are the framework's.
+    assert set(ERROR_CODES) - seen == {"method_not_allowed"}
+
+
+def test_security_is_declared(document: dict[str, Any]) -> None:
+    assert set(document["components"]["securitySchemes"]) == {"bearer", "apiKey"}
+    for (_, path), operation in operations(document).items():
+        if path.startswith("/health") or path == "/metrics":
+            assert "security" not in operation
+        else:
+            schemes = {name for entry in operation["security"] for name in entry}
+            assert schemes == {"bearer", "apiKey"}
+
+
+def test_bodies_are_documented_with_both_content_types(document: dict[str, Any]) -> None:
+    calls = operations(document)
+    for name in list(PRODUCT_CALLS)[:0] or [
+        ("PUT", "/v1/subjects/{subject_id}/enrollment"),
+        ("POST", "/v1/subjects/{subject_id}/verify"),
+    ]:
+        content = calls[name]["requestBody"]["content"]
+        assert set(content) == {"multipart/form-data", "application/json"}
+        assert content["application/json"]["examples"]
+    assert calls["POST", "/v1/subjects/import"]["requestBody"]["content"]["application/json"]
+
+
+def test_the_document_is_served_and_is_json(client: Client) -> None:
+    answer = client.get("/v1/openapi.json", headers={"Authorization": ""})
+    assert answer.status_code == 200
+    assert json.loads(answer.text)["info"]["title"] == "Veilface"
+
+
+def test_every_route_is_documented() -> None:
+    app = create_app(Settings())
+    for route in app.routes:
+        if isinstance(route, APIRoute):
+            assert route.include_in_schema, route.path

@@ -1,0 +1,188 @@
+import base64
+import json
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from api.http.errors import ApiError
+from api.http.routes.enrollment import parse_attributes
+from api.http.schemas import EnrollmentAnswer, VerifyAnswer
+from templates.contract import wire
+from templates.keys.randomness import Keystream
+from templates.space.lifting import Strategy, lift
+from tests.api.client import Client
+from tests.api.deployment import Deployment, M, N, bearer, images, photo, unit
+from tests.api.shapes import assert_answer, assert_error
+
+
+def lifted(deployment: Deployment, *, seed: int = 0, m: int = M, contract_id: str = "") -> bytes:
+    """A client's template of a random descriptor."""
+    descriptor = unit(np.random.default_rng([5, seed]).normal(size=(1, N)))
+    batch = lift(
+        descriptor,
+        strategy=Strategy.ADVERSARIAL,
+        m=m,
+        source=deployment.source,
+        stream=Keystream.seeded("client", seed),
+    )
+    return wire.encode(batch[0], contract_id=contract_id or deployment.contract.contract_id)
+
+
+def b64(data: bytes) -> str:
+    return base64.b64encode(data).decode()
+
+
+def path(subject: str) -> str:
+    return f"/v1/subjects/{subject}/enrollment"
+
+
+def test_photos_enroll_on_both_databases(both: tuple[Client, Deployment]) -> None:
+    client, deployment = both
+    first = assert_answer(
+        client.put(path("alice"), files=images(photo(1, 0), photo(1, 1), photo(1, 2))),
+        201,
+        EnrollmentAnswer,
+    )
+    assert first["contract_id"] == deployment.contract.contract_id
+    assert [entry["index"] for entry in first["images"]] == [0, 1, 2]
+    assert first["replaced"] is False
+    again = assert_answer(client.put(path("alice"), files=images(photo(2))), 200, EnrollmentAnswer)
+    assert again["replaced"] is True
+    assert again["template_id"] != first["template_id"]
+    # The replacement is what counts now.
+    for person, decision in ((1, "reject"), (2, "accept")):
+        answer = client.post(
+            "/v1/subjects/alice/verify", files=images(photo(person, 9), name="image")
+        )
+        assert assert_answer(answer, 200, VerifyAnswer)["decision"] == decision
+
+
+def test_a_rejected_set_leaves_the_old_enrollment(client: Client) -> None:
+    old = client.put(path("bob"), files=images(photo(1))).json()["template_id"]
+    broken = client.put(path("bob"), files=images(photo(1), b"no picture"))
+    assert assert_error(broken, 400, "unsupported_image")["image"] == 1
+    mixed = client.put(path("bob"), files=images(photo(1), photo(1, 1), photo(2)))
+    assert assert_error(mixed, 422, "inconsistent_images") == {"photos": [2]}
+    said = mixed.json()["error"]["message"]
+    assert said.startswith("photo 3 does not look like the person on photos 1 and 2;")
+    assert client.get("/v1/subjects/bob").json()["template_id"] == old
+    new = client.put(path("carol-new"), files=images(photo(1), photo(2)))
+    assert assert_error(new, 422, "inconsistent_images") == {"photos": [0, 1]}
+    assert_error(client.get("/v1/subjects/carol-new"), 404, "not_enrolled")
+
+
+@pytest.fixture
+def allowed(deployment: Deployment) -> Iterator[None]:
+    """Templates that clients made may be enrolled during one test."""
+    deployment.allow_templates()
+    yield
+    deployment.allow_templates(allowed=False)
+
+
+def test_a_template_is_refused_until_the_operator_allows_it(
+    both: tuple[Client, Deployment],
+) -> None:
+    client, deployment = both
+    body = {"template": b64(lifted(deployment))}
+    for sent in (body, {"template": "no template"}):
+        refused = client.put(path("lifted"), json=sent)
+        details = assert_error(refused, 403, "forbidden")
+        assert details == {"tenant_setting": "template_enrollment"}
+        assert "veilface db template-enrollment" in refused.json()["error"]["message"]
+    assert client.get("/v1/contract").json()["template_enrollment"] is False
+    deployment.allow_templates()
+    assert client.get("/v1/contract").json()["template_enrollment"] is True
+    assert_answer(client.put(path("lifted"), json=body), 201, EnrollmentAnswer)
+    # What one tenant is allowed, another one is not.
+    other = bearer(deployment.key("enroll", "embeddings", tenant="other"))
+    assert_error(client.put(path("lifted"), json=body, headers=other), 403, "forbidden")
+    exported = client.get("/v1/subjects/lifted/export").json()["export"]
+    deployment.allow_templates(allowed=False)
+    assert_error(client.put(path("lifted"), json=body), 403, "forbidden")
+    # An export is the service's own, sealed file.
+    assert client.post("/v1/subjects/import", json={"export": exported}).status_code == 200
+
+
+@pytest.mark.usefixtures("allowed")
+def test_a_template_enrolls(client: Client, deployment: Deployment) -> None:
+    answer = client.put(path("lifted"), json={"template": b64(lifted(deployment))})
+    body = assert_answer(answer, 201, EnrollmentAnswer)
+    assert body["images"] == []
+    described = client.get("/v1/subjects/lifted").json()
+    assert (described["enrolled_by"], described["photos"]) == ("template", 0)
+    descriptor = unit(np.random.default_rng([5, 0]).normal(size=(1, N)))[0]
+    probe = client.post("/v1/subjects/lifted/verify", json={"embedding": descriptor.tolist()})
+    assert probe.json()["decision"] == "accept"
+
+
+@pytest.mark.usefixtures("allowed")
+def test_broken_templates_are_refused(client: Client, deployment: Deployment) -> None:
+    whole = lifted(deployment)
+    cases = [
+        ("", 400, "invalid_template"),
+        ("not base64!", 400, "invalid_template"),
+        (b64(whole[:-1]), 400, "invalid_template"),
+        (b64(whole + b"\x00"), 400, "invalid_template"),
+        (b64(b"\x00" * 100), 400, "invalid_template"),
+        (b64(lifted(deployment, m=M - 1)), 400, "invalid_template"),
+        (b64(lifted(deployment, contract_id="0" * 64)), 409, "contract_mismatch"),
+        (7, 422, "validation_failed"),
+        (None, 422, "validation_failed"),
+        ([], 422, "validation_failed"),
+    ]
+    for template, status, code in cases:
+        assert_error(client.put(path("x"), json={"template": template}), status, code)
+    assert_error(client.put(path("x"), json={}), 422, "validation_failed")
+    extra = client.put(path("x"), json={"template": b64(whole), "attributes": {}})
+    assert "template" in assert_error(extra, 422, "validation_failed")["known"]
+
+
+@pytest.mark.usefixtures("allowed")
+def test_a_template_needs_the_right_to_send_embeddings(
+    client: Client, deployment: Deployment
+) -> None:
+    token = deployment.key("enroll")
+    answer = client.put(
+        path("x"), json={"template": b64(lifted(deployment))}, headers=bearer(token)
+    )
+    assert assert_error(answer, 403, "forbidden") == {"missing": ["embeddings"]}
+    photos = client.put(path("by-photo"), files=images(photo(3)), headers=bearer(token))
+    assert photos.status_code == 201
+
+
+def test_fields_are_checked(client: Client) -> None:
+    cases = [
+        {"files": images(photo(1), name="image")},
+        {"files": images(photo(1)), "data": {"lvl": "x"}},
+        {"files": images(photo(1)), "data": {"face": "biggest"}},
+        {"files": images(photo(1)), "data": {"face": ""}},
+        {"files": images(photo(1)), "data": {"attributes": "{"}},
+        {"files": images(photo(1)), "data": {"attributes": '{"age": "20"}'}},
+        {"files": images(photo(1)), "data": {"attributes": '{"gender": 1}'}},
+        {"files": images(photo(1)), "data": {"attributes": "[" * 4000}},
+        {"data": {"images": "text"}, "files": images(photo(1), name="other")},
+        {"files": images(photo(1)), "params": {"level": "x"}},
+        {"files": images(photo(1)), "params": {"face": "largest"}, "data": {"face": "single"}},
+    ]
+    for case in cases:
+        assert_error(client.put(path("x"), **case), 422, "validation_failed")  # type: ignore[arg-type]
+    for content_type in ("text/plain", "application/x-www-form-urlencoded", "image/png"):
+        answer = client.put(path("x"), content=photo(1), headers={"Content-Type": content_type})
+        assert_error(answer, 400, "malformed_request")
+
+
+def test_attributes_and_face_are_accepted(client: Client) -> None:
+    answer = client.put(
+        path("attributes"),
+        files=images(photo(1)),
+        data={"attributes": json.dumps({"gender": "Female", "race": "Indian"}), "face": "largest"},
+    )
+    assert answer.status_code == 201
+    assert "Indian" not in json.dumps(client.get("/v1/subjects/attributes").json())
+
+
+def test_attributes_never_stand_in_an_error() -> None:
+    with pytest.raises(ApiError) as caught:
+        parse_attributes('{"gender": "Female", "secret": "Indian"}')
+    assert "Indian" not in str(caught.value.message)

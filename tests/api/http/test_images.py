@@ -1,0 +1,175 @@
+"""Malformed and awkward photos through the API: the right code each, no 5xx, bounded memory."""
+
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from api.http.app import create_app
+from tests.api.awkward import Case, bombs, damaged, encode, no_pictures, scenes, unusual
+from tests.api.client import Client
+from tests.api.deployment import (
+    bearer,
+    deploy,
+    images,
+    picture,
+)
+from tests.api.shapes import assert_error
+
+MAX_PIXELS = 4_000_000
+MEMORY_BOUND = 250 * 2**20
+
+
+def code_of(answer: Any) -> str:
+    """``ok`` or the error's code; every error must have the one shape."""
+    if answer.status_code in (200, 201):
+        return "ok"
+    code = str(answer.json()["error"]["code"])
+    assert_error(answer, answer.status_code, code)
+    assert answer.status_code < 500
+    return code
+
+
+def verify(client: Client, sent: bytes, **options: Any) -> Any:
+    return client.post("/v1/subjects/a/verify", files=images(sent, name="image"), **options)
+
+
+def failures(client: Client, cases: list[Case]) -> list[str]:
+    """What was answered to cases that may not be answered so."""
+    wrong = []
+    for case in cases:
+        code = code_of(verify(client, case.data))
+        if code not in case.codes:
+            wrong.append(f"{case.name}: {code}, expected {sorted(case.codes)}")
+    return wrong
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Client]:
+    """With the tiny pack, which takes any square picture for an aligned face."""
+    deployment = deploy(
+        tmp_path_factory.mktemp("plain"), max_image_pixels=MAX_PIXELS, lockout_after=0
+    )
+    with Client(create_app(deployment.settings), headers=bearer(deployment.token)) as client:
+        put = client.put("/v1/subjects/a/enrollment", files=images(encoded(picture(1))))
+        assert put.status_code == 201
+        yield client
+
+
+def encoded(pixels: np.ndarray[Any, Any]) -> bytes:
+    return encode(pixels, "PNG")
+
+
+def test_pictures_that_cannot_be_read(plain: Client) -> None:
+    cases = [*damaged(picture(1)), *no_pictures(), *bombs(MAX_PIXELS)]
+    assert len(cases) + len(list(unusual(picture(1)))) >= 200
+    assert failures(plain, cases) == []
+
+
+def test_forms_of_one_picture(plain: Client) -> None:
+    assert failures(plain, list(unusual(picture(1)))) == []
+
+
+def test_memory_is_bounded(plain: Client) -> None:
+    status, refs = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+    if not refs.exists():
+        pytest.skip("the peak of this process's memory is read from /proc, which is absent")
+
+    def kilobytes(name: str) -> int:
+        line = next(x for x in status.read_text().splitlines() if x.startswith(name))
+        return int(line.split()[1])
+
+    cases = list(bombs(MAX_PIXELS))
+    failures(plain, cases)
+    refs.write_text("5")  # the peak starts again from what is held now
+    before = kilobytes("VmRSS")
+    for _ in range(3):
+        failures(plain, cases)
+    assert (kilobytes("VmHWM") - before) * 1024 < MEMORY_BOUND
+
+
+@pytest.fixture(scope="module")
+def faces(lfw_photos: Path) -> list[np.ndarray[Any, Any]]:
+    """One photo each of two people, and a second one of the first."""
+    people = sorted(path for path in lfw_photos.iterdir() if path.is_dir())
+    files = [sorted(people[0].iterdir())[0], sorted(people[1].iterdir())[0]]
+    files.append(sorted(people[0].iterdir())[1])
+    return [np.asarray(Image.open(path).convert("RGB")) for path in files]
+
+
+@pytest.fixture(scope="module")
+def real(
+    tmp_path_factory: pytest.TempPathFactory,
+    mbf_pack_dir: Path,
+    faces: list[np.ndarray[Any, Any]],
+) -> Iterator[Client]:
+    """With a real detector and a real embedder; the thresholds are not calibrated."""
+    deployment = deploy(
+        tmp_path_factory.mktemp("real"),
+        pack=mbf_pack_dir,
+        max_image_pixels=MAX_PIXELS,
+        lockout_after=0,
+    )
+    with Client(create_app(deployment.settings), headers=bearer(deployment.token)) as client:
+        put = client.put("/v1/subjects/a/enrollment", files=images(encoded(faces[0])))
+        assert put.status_code == 201, put.text
+        yield client
+
+
+@pytest.mark.long
+def test_real_faces_in_unusual_forms_match(real: Client, faces: list[np.ndarray[Any, Any]]) -> None:
+    for case in unusual(faces[0]):
+        answer = verify(real, case.data)
+        assert answer.status_code == 200, (case.name, answer.text)
+        # A mirror image or a grey one is still the same person.
+        assert answer.json()["decision"] == "accept", case.name
+
+
+def test_scenes_without_one_usable_face(real: Client, faces: list[np.ndarray[Any, Any]]) -> None:
+    assert failures(real, list(scenes(faces[0], faces[1]))) == []
+
+
+def test_the_largest_face_is_taken_when_asked_for(
+    real: Client, faces: list[np.ndarray[Any, Any]]
+) -> None:
+    # Faces are ranked by their area less their distance from the centre.
+    height, width = faces[0].shape[:2]
+    small = np.asarray(Image.fromarray(faces[1]).resize((width * 2 // 3, height * 2 // 3)))
+    scene = np.full((height * 5 // 2, width * 5 // 2, 3), 127, np.uint8)
+    top, left = height * 3 // 4, width * 3 // 4
+    scene[top : top + height, left : left + width] = faces[0]
+    scene[: small.shape[0], : small.shape[1]] = small
+    data = encoded(scene)
+    assert code_of(verify(real, data)) == "multiple_faces"
+    answer = verify(real, data, data={"face": "largest"})
+    assert answer.json()["decision"] == "accept"
+
+
+def test_damaged_real_photos(real: Client, faces: list[np.ndarray[Any, Any]]) -> None:
+    cases = list(damaged(faces[0]))[::3]
+    assert failures(real, cases) == []
+
+
+@pytest.mark.long
+def test_enrolling_awkward_photos_changes_nothing(
+    real: Client, faces: list[np.ndarray[Any, Any]]
+) -> None:
+    before = real.get("/v1/subjects/a").json()
+    seen: Counter[str] = Counter()
+    for case in scenes(faces[0], faces[1]):
+        answer = real.put("/v1/subjects/a/enrollment", files=images(encoded(faces[0]), case.data))
+        code = code_of(answer)
+        assert code in case.codes
+        assert answer.json()["error"]["details"]["image"] == 1
+        seen[code] += 1
+        if case.name == "out of focus":
+            assert "blur" in answer.json()["error"]["details"]
+        if case.name == "in the dark":
+            assert "darkness" in answer.json()["error"]["details"]
+    assert {"no_face", "multiple_faces", "low_quality"} <= set(seen)
+    after = real.get("/v1/subjects/a").json()
+    assert {**before, "request_id": ""} == {**after, "request_id": ""}

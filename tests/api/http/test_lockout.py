@@ -1,0 +1,185 @@
+"""Guessing through the API stops at the lockout, whoever guesses and whomever."""
+
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from api.http.app import create_app
+from api.http.schemas import LockoutAnswer, UnlockAnswer, VerifyAnswer
+from templates.keys.probe_signature import signed_probe
+from tests.api.client import Client
+from tests.api.deployment import Deployment, bearer, deploy, images, photo
+from tests.api.shapes import assert_answer, assert_error
+
+AFTER = 5
+
+
+def enroll(client: Client, subject: str = "alice", person: int = 1) -> None:
+    answer = client.put(
+        f"/v1/subjects/{subject}/enrollment", files=images(photo(person), photo(person, 1))
+    )
+    assert answer.status_code == 201, answer.text
+
+
+def attempt(client: Client, token: str, person: int, subject: str = "alice") -> Any:
+    return client.post(
+        f"/v1/subjects/{subject}/verify",
+        files=images(photo(person, 9), name="image"),
+        headers=bearer(token),
+    )
+
+
+def fail(client: Client, token: str, times: int, subject: str = "alice") -> None:
+    for _ in range(times):
+        answer = attempt(client, token, 2, subject)
+        assert assert_answer(answer, 200, VerifyAnswer)["decision"] == "reject"
+
+
+def test_a_subject_locks_and_the_right_face_waits_too(both: tuple[Client, Deployment]) -> None:
+    client, deployment = both
+    enroll(client)
+    token = deployment.key("verify")
+    fail(client, token, AFTER)
+    for person in (1, 2):
+        answer = attempt(client, token, person)
+        assert assert_error(answer, 423, "locked_out") == {"disabled": False}
+        assert 1 <= int(answer.headers["retry-after"]) <= 30
+
+
+def test_an_unknown_subject_locks_in_the_same_words(both: tuple[Client, Deployment]) -> None:
+    client, deployment = both
+    enroll(client)
+    token = deployment.key("verify")
+    for subject in ("alice", "nobody"):
+        fail(client, token, AFTER, subject)
+    known, unknown = (attempt(client, token, 1, name).json() for name in ("alice", "nobody"))
+    del known["request_id"], unknown["request_id"]
+    assert known == unknown
+
+
+def test_the_count_is_the_subjects_not_the_keys(both: tuple[Client, Deployment]) -> None:
+    client, deployment = both
+    enroll(client)
+    enroll(client, "bob", 3)
+    keys = [deployment.key("verify") for _ in range(AFTER)]
+    for token in keys:
+        fail(client, token, 1)
+    fresh = deployment.key("verify")
+    assert_error(attempt(client, fresh, 1), 423, "locked_out")
+    assert attempt(client, keys[0], 3, "bob").json()["decision"] == "accept"
+
+
+def test_an_accept_sets_the_count_back(both: tuple[Client, Deployment]) -> None:
+    client, deployment = both
+    enroll(client)
+    token = deployment.key("verify")
+    for _ in range(3):
+        fail(client, token, AFTER - 1)
+        assert attempt(client, token, 1).json()["decision"] == "accept"
+
+
+def test_what_is_no_comparison_does_not_count(both: tuple[Client, Deployment]) -> None:
+    client, deployment = both
+    enroll(client)
+    token = deployment.key("verify", "embeddings")
+    path = "/v1/subjects/alice/verify"
+    for _ in range(2 * AFTER):
+        client.post(path, files=images(b"no picture", name="image"), headers=bearer(token))
+        client.post(path, json={"embedding": [1.0]}, headers=bearer(token))
+        client.post(path, json={"embedding": [0.0] * 64}, headers=bearer(token))
+    assert attempt(client, token, 1).json()["decision"] == "accept"
+
+
+def test_attempts_at_once_are_answered_no_more_often(both: tuple[Client, Deployment]) -> None:
+    client, deployment = both
+    enroll(client)
+    token = deployment.key("verify", "embeddings")
+    stranger = client.app.state.runtime.pack.embed_photo(photo(2, 5)).embedding
+    answers: list[Any] = []
+    start = threading.Barrier(24)
+
+    def one() -> None:
+        start.wait()
+        body = signed_probe(token, "alice", stranger)
+        answers.append(client.post("/v1/subjects/alice/verify", json=body, headers=bearer(token)))
+
+    threads = [threading.Thread(target=one) for _ in range(24)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    statuses = sorted(answer.status_code for answer in answers)
+    assert statuses == [200] * AFTER + [423] * (24 - AFTER)
+
+
+def test_the_lock_outlives_a_restart_and_an_operator_lifts_it(
+    both: tuple[Client, Deployment],
+) -> None:
+    client, deployment = both
+    enroll(client)
+    token, desk = deployment.key("verify"), deployment.key("admin")
+    fail(client, token, AFTER)
+    path = "/v1/subjects/alice/lockout"
+    with Client(create_app(deployment.settings)) as other:
+        assert_error(attempt(other, token, 1), 423, "locked_out")
+        seen = assert_answer(other.get(path, headers=bearer(desk)), 200, LockoutAnswer)
+        assert seen["consecutive_failures"] == AFTER
+        assert seen["locked_until"] is not None
+        assert seen["disabled_at"] is None
+        assert_error(other.delete(path, headers=bearer(token)), 403, "forbidden")
+        lifted: list[Any] = []
+        for _ in range(2):
+            lifted.append(other.delete(path, headers=bearer(desk)))
+        assert [assert_answer(each, 200, UnlockAnswer)["lifted"] for each in lifted] == [
+            True,
+            False,
+        ]
+        assert_error(other.get(path, headers=bearer(desk)), 404, "not_found")
+    assert attempt(client, token, 1).json()["decision"] == "accept"
+
+
+def test_a_disabled_subject_waits_for_an_operator(tmp_path: Path) -> None:
+    own = deploy(tmp_path, lockout_after=3, lockout_first_s=0.001, lockout_longest_s=0.001,
+                 lockout_disable_at=6)  # fmt: skip
+    with Client(create_app(own.settings), headers=bearer(own.token)) as client:
+        enroll(client)
+        token = own.key("verify")
+        fail(client, token, 6)
+        answer = attempt(client, token, 1)
+        assert assert_error(answer, 423, "locked_out") == {"disabled": True}
+        assert int(answer.headers["retry-after"]) > 0
+        assert client.delete("/v1/subjects/alice/lockout").status_code == 200
+        assert attempt(client, token, 1).json()["decision"] == "accept"
+
+
+def test_it_can_be_switched_off(tmp_path: Path) -> None:
+    own = deploy(tmp_path, lockout_after=0)
+    with Client(create_app(own.settings), headers=bearer(own.token)) as client:
+        enroll(client)
+        fail(client, own.key("verify"), 4 * AFTER)
+
+
+@pytest.mark.parametrize("scores", [True, False])
+def test_hill_climbing_ends_at_the_lockout(both: tuple[Client, Deployment], scores: bool) -> None:
+    """The climber of the audit, over REST: it gets five answers, and none of them is an accept."""
+    client, deployment = both
+    enroll(client)
+    token = deployment.key("verify", "embeddings", *(["scores"] if scores else []))
+    rng, answered = np.random.default_rng(0), 0
+    best, best_score = rng.normal(size=64), -np.inf
+    for _ in range(50):
+        step = best + 0.3 * rng.normal(size=64)
+        probe = (step / np.linalg.norm(step)).astype(np.float32)
+        body = signed_probe(token, "alice", probe)
+        answer = client.post("/v1/subjects/alice/verify", json=body, headers=bearer(token))
+        if answer.status_code == 423:
+            continue
+        answered += 1
+        seen = assert_answer(answer, 200, VerifyAnswer)
+        assert seen["decision"] == "reject"
+        if scores and -seen["distance"] > best_score:
+            best, best_score = step, -seen["distance"]
+    assert answered == AFTER

@@ -1,0 +1,176 @@
+"""The page's files: where they are served, with which headers, and where they are not."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from api.http.app import create_app
+from api.http.routes.page import WEB
+from api.settings import Settings
+from tests.api.client import Client
+from tests.api.deployment import bearer, deploy
+from tests.api.shapes import assert_error
+
+POLICY = {
+    "default-src": "'none'",
+    "script-src": "'self'",
+    "style-src": "'self'",
+    "img-src": "'self' blob:",
+    "connect-src": "'self'",
+    "frame-ancestors": "'none'",
+    "base-uri": "'none'",
+    "form-action": "'none'",
+    "require-trusted-types-for": "'script'",
+    "trusted-types": "'none'",
+}
+MOST_BYTES = 80 * 1024
+MARKUP = re.compile(
+    r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|eval\(|new Function|style="
+)
+
+
+def test_the_page_and_its_policy(client: Client) -> None:
+    answer = client.get("/", headers={"Authorization": ""})
+    assert answer.status_code == 200
+    assert answer.headers["content-type"] == "text/html; charset=utf-8"
+    stated = dict(
+        part.strip().split(" ", 1) for part in answer.headers["content-security-policy"].split(";")
+    )
+    assert stated == POLICY
+    assert "camera=(self)" in answer.headers["permissions-policy"]
+    assert answer.headers["x-content-type-options"] == "nosniff"
+    assert answer.headers["referrer-policy"] == "no-referrer"
+    assert answer.headers["x-request-id"]
+    assert 'data-demo="no"' in answer.text
+
+
+def test_everything_that_the_page_names_is_served(client: Client) -> None:
+    seen: set[str] = set()
+    waiting = ["/"]
+    while waiting:
+        path = waiting.pop()
+        seen.add(path)
+        answer = client.get(path)
+        assert answer.status_code == 200, path
+        kind = {".js": "text/javascript; charset=utf-8", ".css": "text/css; charset=utf-8",
+                ".svg": "image/svg+xml"}.get(Path(path).suffix)  # fmt: skip
+        assert kind is None or answer.headers["content-type"] == kind
+        named = set(re.findall(r'(?:href|src)="(/[^"]*)"', answer.text) if path == "/" else ())
+        named |= {f"/assets/{name}" for name in re.findall(r'from "\./([^"]+)"', answer.text)}
+        waiting += sorted(named - seen)
+    assert seen == {"/"} | {
+        f"/assets/{file.name}" for file in WEB.iterdir() if file.name != "index.html"
+    }
+
+
+def test_the_files_are_small_and_name_nobody_else() -> None:
+    texts = {file.name: file.read_text(encoding="utf-8") for file in WEB.iterdir()}
+    assert sum(len(text.encode()) for text in texts.values()) <= MOST_BYTES
+    for name, text in texts.items():
+        foreign = re.findall(r"https?://[^\s\"')]+", text)
+        assert [url for url in foreign if not url.startswith("http://www.w3.org/")] == [], name
+        # No text becomes markup or code, and no style stands in the markup.
+        assert not MARKUP.search(text), name
+
+
+def test_a_browsers_copy_is_asked_for_again_and_not_sent_again(client: Client) -> None:
+    for path in ("/", "/assets/main.js", "/assets/page.css"):
+        first = client.get(path)
+        assert first.headers["cache-control"] == "no-cache"
+        etag = first.headers["etag"]
+        again = client.get(path, headers={"If-None-Match": f'"other", W/{etag}'})
+        assert (again.status_code, again.content) == (304, b"")
+        assert again.headers["etag"] == etag
+        assert client.get(path, headers={"If-None-Match": '"other"'}).status_code == 200
+        head = client.request("HEAD", path)
+        assert (head.status_code, head.content) == (200, b"")
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["/assets/", "/assets/index.html", "/assets/none.js", "/assets/..%2fapp.py", "/assets/%00",
+     "/index.html", "/favicon.ico", "/demo/people", "/demo/people/person-1/0.png"],
+)  # fmt: skip
+def test_what_is_no_file_of_the_page_is_the_contracts_404(client: Client, path: str) -> None:
+    answer = client.get(path)
+    assert_error(answer, 404, "not_found")
+    assert answer.headers["cache-control"] == "no-store"
+    assert answer.headers["content-security-policy"] == "default-src 'none'; frame-ancestors 'none'"
+    assert "permissions-policy" not in answer.headers
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["/assets/../app.py", "/assets/../../web/main.js", "/assets/..", "/assets//main.js",
+     "/assets/./main.js", "//assets/main.js", "/assets/\x00", "/assets/..\\app.py"],
+)  # fmt: skip
+def test_a_path_that_climbs_finds_nothing(client: Client, path: str) -> None:
+    # HTTP clients resolve the dots before they send: so it is given to the application as it is.
+    assert raw(client, "/assets/main.js") == 200
+    assert raw(client, path) == 404
+
+
+def raw(client: Client, path: str) -> int:
+    """Ask for a path that nobody has normalised; return the status."""
+    scope = {
+        "type": "http", "asgi": {"version": "3.0"}, "http_version": "1.1", "method": "GET",
+        "scheme": "http", "path": path, "raw_path": path.encode(), "root_path": "",
+        "query_string": b"", "headers": [(b"host", b"test")], "client": ("127.0.0.1", 1),
+        "server": ("test", 80), "state": {},
+    }  # fmt: skip
+    statuses: list[int] = []
+
+    async def receive() -> dict[str, Any]:
+        return {"type": "http.request", "body": b"", "more_body": False}
+
+    async def send(message: Any) -> None:
+        if message["type"] == "http.response.start":
+            statuses.append(message["status"])
+
+    async def ask() -> None:
+        await client.app(scope, receive, send)
+
+    client._portal.call(ask)
+    return statuses[0]
+
+
+def test_the_page_takes_no_other_method(client: Client) -> None:
+    answer = client.post("/")
+    assert_error(answer, 405, "method_not_allowed")
+    assert set(answer.headers["allow"].split(", ")) == {"GET", "HEAD"}
+
+
+def test_the_page_can_be_switched_off(tmp_path: Path) -> None:
+    deployment = deploy(tmp_path, web_page=False)
+    with Client(create_app(deployment.settings), headers=bearer(deployment.token)) as client:
+        for path in ("/", "/assets/main.js", "/assets/page.css", "/demo/people"):
+            assert_error(client.get(path), 404, "not_found")
+        assert client.get("/v1/key").status_code == 200
+
+
+def test_the_calls_keep_their_headers(client: Client) -> None:
+    answer = client.get("/v1/contract")
+    assert answer.headers["cache-control"] == "no-store"
+    assert answer.headers["content-security-policy"] == "default-src 'none'; frame-ancestors 'none'"
+    assert "permissions-policy" not in answer.headers
+
+
+def test_the_page_is_no_part_of_the_contract() -> None:
+    paths = create_app(Settings(demo=True)).openapi()["paths"]
+    assert not [path for path in paths if path == "/" or path.startswith(("/assets", "/demo"))]
+
+
+def test_the_demo_is_marked_before_anybody_signs_in(tmp_path: Path) -> None:
+    deployment = deploy(tmp_path, demo=True)
+    with Client(create_app(deployment.settings)) as client:
+        page = client.get("/")
+        assert 'data-demo="yes"' in page.text
+        assert "demo model: not for authentication" in page.text
+        listed = client.get("/demo/people").json()
+        assert listed["notice"] == "demo model: not for authentication"
+        assert client.get("/demo/people/person-101/4.png").headers["content-type"] == "image/png"
+        assert_error(client.get("/demo/people/person-9/0.png"), 404, "not_found")
+        assert_error(client.get("/demo/people/person-1/5.png"), 404, "not_found")
+        assert_error(client.get("/demo/people/100000/0.png"), 404, "not_found")

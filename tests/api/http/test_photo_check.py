@@ -1,0 +1,149 @@
+"""POST /v1/photos/check: enrollment's detector and limits, no embedding, nothing kept."""
+
+import io
+import sqlite3
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from api.http.app import create_app
+from api.http.schemas import PhotoCheckAnswer
+from models.embedding import Embedder
+from tests.api.client import Client
+from tests.api.deployment import Deployment, bearer, deploy, images, photo
+from tests.api.shapes import assert_answer, assert_error
+
+PATH = "/v1/photos/check"
+
+
+def grey(level: int) -> bytes:
+    """A picture of the right shape without any detail."""
+    out = io.BytesIO()
+    Image.new("RGB", (112, 112), (level, level, level)).save(out, "PNG")
+    return out.getvalue()
+
+
+def test_a_photo_that_would_do(client: Client) -> None:
+    body = assert_answer(
+        client.post(PATH, files=images(photo(1), name="image")), 200, PhotoCheckAnswer
+    )
+    assert body["usable"] is True
+    assert body["code"] is None
+    assert body["box"] is None  # this pack has no detector
+    assert body["quality"]["sharpness"] > 0.5
+
+
+def test_a_photo_that_would_not_do_says_what_an_enrollment_says(client: Client) -> None:
+    body = assert_answer(
+        client.post(PATH, files=images(grey(5), name="image")), 200, PhotoCheckAnswer
+    )
+    refused = client.put("/v1/subjects/dark/enrollment", files=images(grey(5)))
+    details = assert_error(refused, 422, "low_quality")
+    assert body["usable"] is False
+    assert body["code"] == "low_quality"
+    assert set(body["details"]) == {"blur", "darkness"}
+    assert {"image": 0, **body["details"]} == details
+
+
+def test_it_embeds_nothing_and_keeps_nothing(
+    client: Client, deployment: Deployment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def never(*_: Any, **__: Any) -> np.ndarray:
+        raise AssertionError("a check embedded the photo")
+
+    def rows() -> dict[str, list[Any]]:
+        with sqlite3.connect(deployment.settings.data_dir / "veilface.db") as database:
+            return {
+                table: database.execute(f"SELECT count(*) FROM {table}").fetchall()
+                for table in ("subjects", "templates", "audit_log", "failed_attempts")
+            }
+
+    before = rows()
+    monkeypatch.setattr(Embedder, "embed", never)
+    for one in (photo(2), grey(5)):
+        assert client.post(PATH, files=images(one, name="image")).status_code == 200
+    assert rows() == before
+
+
+def test_who_may_ask(client: Client, deployment: Deployment) -> None:
+    for rights, status in (("enroll", 200), ("verify", 200), ("erase", 403), ("admin", 403)):
+        answer = client.post(
+            PATH, files=images(photo(1), name="image"), headers=bearer(deployment.key(rights))
+        )
+        assert answer.status_code == status
+    assert assert_error(answer, 403, "forbidden") == {"missing": ["enroll", "verify"]}
+    nobody = client.post(PATH, files=images(photo(1), name="image"), headers={"Authorization": ""})
+    assert_error(nobody, 401, "unauthorized")
+
+
+@pytest.mark.parametrize(
+    ("request_of", "status", "code"),
+    [
+        ({"files": images(b"no picture", name="image")}, 400, "unsupported_image"),
+        ({"files": images(photo(1), photo(1), name="image")}, 413, "too_many_images"),
+        ({"files": images(photo(1), name="images")}, 422, "validation_failed"),
+        ({"files": images(photo(1), name="image"), "data": {"level": "x"}}, 422,
+         "validation_failed"),
+        ({"files": images(photo(1), name="image"), "params": {"faces": "x"}}, 422,
+         "validation_failed"),
+        ({"files": images(photo(1), name="image"), "data": {"face": "x"}}, 422,
+         "validation_failed"),
+        ({"json": {"image": "x"}}, 400, "malformed_request"),
+        ({"content": b"x", "headers": {"Content-Type": "multipart/form-data"}}, 400,
+         "malformed_request"),
+    ],
+)  # fmt: skip
+def test_what_is_no_photo_is_an_error_as_elsewhere(
+    client: Client, request_of: dict[str, Any], status: int, code: str
+) -> None:
+    headers = {**client.headers, **request_of.pop("headers", {})}
+    assert_error(client.post(PATH, headers=headers, **request_of), status, code)
+
+
+def test_limits_of_size_hold(tmp_path: Path) -> None:
+    deployment = deploy(tmp_path, max_image_bytes=2048, rate_limit_key="4/minute")
+    with Client(create_app(deployment.settings), headers=bearer(deployment.token)) as client:
+        big = client.post(PATH, files=images(b"x" * 4096, name="image"))
+        assert_error(big, 413, "image_too_large")
+        for _ in range(3):
+            client.get("/v1/key")
+        limited = client.post(PATH, files=images(photo(1), name="image"))
+        assert_error(limited, 429, "rate_limited")
+        assert int(limited.headers["retry-after"]) > 0
+
+
+def test_a_service_without_a_pack_says_so(tmp_path: Path) -> None:
+    deployment = deploy(tmp_path)
+    settings = deployment.settings.model_copy(update={"pack": None})
+    with Client(create_app(settings), headers=bearer(deployment.token)) as client:
+        answer = client.post(PATH, files=images(photo(1), name="image"))
+        assert_error(answer, 503, "model_unavailable")
+
+
+def test_a_real_face_has_its_box(tmp_path: Path, yunet_pack_dir: Path, lfw_photos: Path) -> None:
+    deployment = deploy(tmp_path, pack=yunet_pack_dir)
+    face = (lfw_photos / "Ashanti" / "Ashanti_0001.jpg").read_bytes()
+    two = Image.new("RGB", (500, 250))
+    for left, name in ((0, "Ashanti"), (250, "Antonio_Palocci")):
+        two.paste(Image.open(lfw_photos / name / f"{name}_0001.jpg"), (left, 0))
+    out = io.BytesIO()
+    two.save(out, "JPEG", quality=95)
+    with Client(create_app(deployment.settings), headers=bearer(deployment.token)) as client:
+
+        def check(data: bytes, **fields: str) -> dict[str, Any]:
+            answer = client.post(PATH, files=images(data, name="image"), data=fields)
+            return assert_answer(answer, 200, PhotoCheckAnswer)
+
+        x1, y1, x2, y2 = check(face)["box"]
+        # LFW's pictures are centred on the face.
+        assert 0 <= x1 < 125 < x2 <= 250
+        assert 0 <= y1 < 125 < y2 <= 250
+        several = check(out.getvalue())
+        assert several["code"] == "multiple_faces"
+        assert several["details"] == {"faces": 2}
+        assert several["box"] is None
+        assert check(out.getvalue(), face="largest")["usable"] is True
+        assert check(grey(120))["code"] == "no_face"

@@ -1,0 +1,271 @@
+import base64
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from api.http.app import create_app
+from api.http.errors import StartError
+from api.http.schemas import ExportAnswer, ImportAnswer
+from api.http.transfer import MAGIC, Exported, ExportKey, open_export, seal_export
+from api.process.runtime import Runtime
+from templates.contract import wire
+from templates.errors import ContractMismatch, InvalidTemplate
+from templates.keys.sealing import MasterKeyring
+from tests.api.client import Client
+from tests.api.deployment import Deployment, bearer, deploy, images, photo
+from tests.api.shapes import assert_answer, assert_error
+
+CONTRACT = "ab" * 32
+
+
+def exported(client: Client, subject: str, person: int = 1) -> str:
+    put = client.put(f"/v1/subjects/{subject}/enrollment", files=images(photo(person)))
+    assert put.status_code in (200, 201)
+    body = assert_answer(client.get(f"/v1/subjects/{subject}/export"), 200, ExportAnswer)
+    return str(body["export"])
+
+
+def verdict(client: Client, subject: str, person: int) -> str:
+    answer = client.post(
+        f"/v1/subjects/{subject}/verify", files=images(photo(person, 9), name="image")
+    )
+    return str(answer.json()["decision"])
+
+
+def test_there_and_back(both: tuple[Client, Deployment]) -> None:
+    client, _ = both
+    data = exported(client, "travels")
+    client.delete("/v1/subjects/travels")
+    restored = {"export": data, "restore": True}
+    body = assert_answer(client.post("/v1/subjects/import", json=restored), 201, ImportAnswer)
+    assert (body["subject_id"], body["replaced"]) == ("travels", False)
+    assert verdict(client, "travels", 1) == "accept"
+    assert verdict(client, "travels", 2) == "reject"
+    described = client.get("/v1/subjects/travels").json()
+    assert (described["enrolled_by"], described["photos"]) == ("photos", 1)
+    again = client.post("/v1/subjects/import", json=restored)
+    assert assert_answer(again, 200, ImportAnswer)["replaced"] is True
+
+
+def send(client: Client, data: str, token: str | None = None, **more: object) -> Any:
+    headers = {} if token is None else bearer(token)
+    return client.post("/v1/subjects/import", json={"export": data, **more}, headers=headers)
+
+
+def test_an_old_export_undoes_no_erasure(both: tuple[Client, Deployment]) -> None:
+    client, _ = both
+    data = exported(client, "erased")
+    assert client.delete("/v1/subjects/erased").status_code == 200
+    for _ in range(2):
+        assert_error(send(client, data), 409, "export_superseded")
+    assert_error(client.get("/v1/subjects/erased"), 404, "not_enrolled")
+
+
+def test_an_old_export_undoes_no_enrollment(both: tuple[Client, Deployment]) -> None:
+    """The thief enrolled his face, took an export, and the subject enrolled again."""
+    client, _ = both
+    data = exported(client, "anna", person=2)
+    exported(client, "anna", person=1)
+    now = client.get("/v1/subjects/anna").json()["template_id"]
+    assert_error(send(client, data), 409, "export_superseded")
+    assert client.get("/v1/subjects/anna").json()["template_id"] == now
+    assert verdict(client, "anna", 2) == "reject"
+
+
+def test_the_export_of_what_is_enrolled_now_comes_back(both: tuple[Client, Deployment]) -> None:
+    client, _ = both
+    exported(client, "anna", person=2)
+    assert send(client, exported(client, "anna", person=1)).status_code == 200
+    assert verdict(client, "anna", 1) == "accept"
+
+
+def test_an_erased_tenant_is_not_brought_back(both: tuple[Client, Deployment]) -> None:
+    client, deployment = both
+    token = deployment.key("enroll", "export", tenant="other")
+    client.headers.update(bearer(token))
+    data = exported(client, "anna")
+    client.app.state.runtime.store.tenant_erasures.erase("other")
+    again = deployment.key("enroll", "export", tenant="other")
+    assert_error(send(client, data, again), 409, "export_superseded")
+
+
+def test_an_operator_restores_knowingly(both: tuple[Client, Deployment]) -> None:
+    client, deployment = both
+    data = exported(client, "anna")
+    assert client.delete("/v1/subjects/anna").status_code == 200
+    mover = deployment.key("enroll", "export")
+    assert_error(send(client, data, mover, restore=True), 403, "forbidden")
+    assert_error(send(client, data, restore="yes"), 422, "validation_failed")
+    assert_error(send(client, data, mover, restore=False), 409, "export_superseded")
+    assert send(client, data, restore=True).status_code == 201
+    assert verdict(client, "anna", 1) == "accept"
+    store = client.app.state.runtime.store
+    pseudonym = store.pseudonym("default", "anna")
+    lines = [line for line in store.audit_log.lines() if line.pseudonym == pseudonym]
+    about = [(line.action, line.outcome) for line in lines]
+    assert about[-3:-1] == [("import", "restored"), ("enroll", "created")]
+
+
+def test_times_decide_between_deployments(tmp_path: Path) -> None:
+    """Erased in the second deployment after the export of the first, and exported again."""
+    key_file = tmp_path / "export.key"
+    MasterKeyring.create(key_file)
+    first = deploy(tmp_path / "one", export_key_file=key_file)
+    second = deploy(tmp_path / "two", export_key_file=key_file)
+    with (
+        Client(create_app(first.settings), headers=bearer(first.token)) as one,
+        Client(create_app(second.settings), headers=bearer(second.token)) as two,
+    ):
+        early = exported(one, "moves")
+        assert send(two, early).status_code == 201
+        assert two.delete("/v1/subjects/moves").status_code == 200
+        assert_error(send(two, early), 409, "export_superseded")
+        late = one.get("/v1/subjects/moves/export").json()["export"]
+        assert send(two, late).status_code == 201
+
+
+def test_an_export_without_a_time_is_older_than_anything(client: Client) -> None:
+    """One that an earlier version made: it moves in where nobody ever was."""
+    runtime: Runtime = client.app.state.runtime
+    inside = open_export(
+        base64.b64decode(exported(client, "old")),
+        key=runtime.export_key,
+        tenant="default",
+        contract_id=runtime.contract.contract_id,
+    )
+    for subject, status in (("old", 409), ("new", 201)):
+        timeless = replace(inside, subject_id=subject, stamp=None)
+        blob = seal_export(timeless, key=runtime.export_key, tenant="default")
+        assert send(client, base64.b64encode(blob).decode()).status_code == status
+
+
+def test_what_travels_is_not_rotated_and_not_what_is_stored(
+    client: Client, deployment: Deployment
+) -> None:
+    runtime: Runtime = client.app.state.runtime
+    data = base64.b64decode(exported(client, "plain"))
+    inside = open_export(
+        data, key=runtime.export_key, tenant="default", contract_id=deployment.contract.contract_id
+    )
+    plain = wire.decode(inside.wire).subspace
+    pack = runtime.pack
+    assert pack is not None
+    own = pack.embed_photo(photo(1)).embedding
+    assert plain.contains(own[None], tol=0.02).all()
+    stored = runtime.store.get("default", "plain")
+    assert stored is not None
+    assert not wire.decode(stored.wire).subspace.contains(own[None], tol=0.02).any()
+    assert inside.wire not in data
+
+
+def test_the_deployments_own_key_keeps_tenants_apart(
+    client: Client, deployment: Deployment
+) -> None:
+    data = exported(client, "bound")
+    other = bearer(deployment.key("export", tenant="other"))
+    answer = client.post("/v1/subjects/import", json={"export": data}, headers=other)
+    assert_error(answer, 400, "invalid_template")
+
+
+def test_two_deployments_with_one_key_file_exchange(tmp_path: Path) -> None:
+    key_file = tmp_path / "export.key"
+    MasterKeyring.create(key_file)
+    first = deploy(tmp_path / "one", export_key_file=key_file)
+    second = deploy(tmp_path / "two", export_key_file=key_file)
+    strange = deploy(tmp_path / "three")
+    # The same pack, decoys and options give the same contract id; the cohorts do not matter.
+    assert first.contract.contract_id == second.contract.contract_id
+    with Client(create_app(first.settings), headers=bearer(first.token)) as client:
+        data = exported(client, "moves")
+    with Client(create_app(second.settings), headers=bearer(second.token)) as client:
+        assert client.post("/v1/subjects/import", json={"export": data}).status_code == 201
+        assert verdict(client, "moves", 1) == "accept"
+        assert verdict(client, "moves", 2) == "reject"
+    with Client(create_app(strange.settings), headers=bearer(strange.token)) as client:
+        answer = client.post("/v1/subjects/import", json={"export": data})
+        assert_error(answer, 400, "invalid_template")
+
+
+def test_hostile_imports(client: Client, deployment: Deployment) -> None:
+    data = base64.b64decode(exported(client, "victim"))
+    before = client.get("/v1/subjects/victim").json()["template_id"]
+
+    def send(blob: bytes) -> object:
+        return client.post("/v1/subjects/import", json={"export": base64.b64encode(blob).decode()})
+
+    for blob in (b"", MAGIC, data[:20], data[:45], data[:-1], data + b"\x00", b"\x00" + data):
+        assert_error(send(blob), 400, "invalid_template")
+    for at in range(len(MAGIC) + 32, len(data), max(1, len(data) // 25)):
+        flipped = bytearray(data)
+        flipped[at] ^= 1
+        assert_error(send(bytes(flipped)), 400, "invalid_template")
+    foreign = data[: len(MAGIC)] + bytes(32) + data[len(MAGIC) + 32 :]
+    assert_error(send(foreign), 409, "contract_mismatch")
+    for export in (None, 5, [], {}):
+        assert_error(
+            client.post("/v1/subjects/import", json={"export": export}), 422, "validation_failed"
+        )
+    assert_error(client.post("/v1/subjects/import", json={"export": "*"}), 400, "invalid_template")
+    assert_error(
+        client.post("/v1/subjects/import", json={"export": "", "subject_id": "x"}),
+        422,
+        "validation_failed",
+    )
+    assert client.get("/v1/subjects/victim").json()["template_id"] == before
+
+
+def test_what_the_key_holder_sealed_is_still_checked(
+    client: Client, deployment: Deployment
+) -> None:
+    runtime: Runtime = client.app.state.runtime
+    contract_id = deployment.contract.contract_id
+    for subject, source, photos, body, code in (
+        ("a/b", "photos", 1, b"x", "validation_failed"),
+        ("ok", "photos", 1, b"x", "invalid_template"),
+        ("ok", "magic", 1, b"x", "invalid_template"),
+        ("ok", "photos", -1, b"x", "invalid_template"),
+        ("ok", "photos", 1, b"", "invalid_template"),
+    ):
+        blob = seal_export(
+            Exported(subject, contract_id, source, photos, body),
+            key=runtime.export_key,
+            tenant="default",
+        )
+        answer = client.post(
+            "/v1/subjects/import", json={"export": base64.b64encode(blob).decode()}
+        )
+        assert_error(answer, 422 if code == "validation_failed" else 400, code)
+
+
+def test_export_key_binds_contract_and_tenant() -> None:
+    key = ExportKey.from_secret(os.urandom(32))
+    blob = seal_export(Exported("s", CONTRACT, "photos", 1, b"wire"), key=key, tenant="t")
+    opened = open_export(blob, key=key, tenant="t", contract_id=CONTRACT)
+    assert opened == Exported("s", CONTRACT, "photos", 1, b"wire")
+    assert "wire" not in repr(opened).replace("Exported", "").split("photos")[-1]
+    with pytest.raises(InvalidTemplate):
+        open_export(blob, key=key, tenant="u", contract_id=CONTRACT)
+    with pytest.raises(ContractMismatch):
+        open_export(blob, key=key, tenant="t", contract_id="cd" * 32)
+    moved = MAGIC + bytes.fromhex("cd" * 32) + blob[len(MAGIC) + 32 :]
+    with pytest.raises(InvalidTemplate):
+        open_export(moved, key=key, tenant="t", contract_id="cd" * 32)
+
+
+def test_a_bad_export_key_file_stops_the_start(tmp_path: Path) -> None:
+    path = tmp_path / "export.key"
+    path.write_text("x")
+    with pytest.raises(StartError, match="export key"):
+        ExportKey.from_file(path)
+
+
+def test_export_needs_its_right_and_a_subject(client: Client, deployment: Deployment) -> None:
+    assert_error(client.get("/v1/subjects/nobody/export"), 404, "not_enrolled")
+    # Who is enrolled is told by this code to keys with enroll or admin only.
+    blind = bearer(deployment.key("export", "verify", "erase"))
+    assert_error(client.get("/v1/subjects/nobody/export", headers=blind), 404, "not_found")
+    assert json.loads(client.get("/v1/subjects/nobody/export").text)["error"]["details"] == {}

@@ -1,0 +1,437 @@
+"""Limits per API key and per address, in the process and in a real Redis."""
+
+import json
+import os
+import secrets
+import shutil
+import signal
+import socket
+import subprocess
+import time
+from collections import Counter
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import anyio
+import httpx
+import limits
+import pytest
+import redis
+import uvicorn
+from fastapi import FastAPI
+
+from api.http.app import create_app, uvicorn_options
+from api.http.errors import ApiError, StartError
+from api.limits import rates as rate_limits
+from api.limits.rates import InProcess, InRedis, RateLimits, Storage, address_of
+from api.process.metrics import RATE_LIMITED, RATE_STORAGE_FAILURES
+from api.settings import Settings, load_settings
+from tests.api.deployment import Deployment, bearer, deploy
+from tests.api.shapes import assert_error
+
+REDIS = os.environ.get("VEILFACE_TEST_REDIS_URL", "redis://127.0.0.1:6379/0")
+Make = Callable[[], Storage]
+
+
+@pytest.fixture(scope="session")
+def redis_server() -> str:
+    client = redis.Redis.from_url(REDIS, socket_connect_timeout=3)
+    try:
+        client.ping()
+    except redis.RedisError as error:
+        pytest.skip(f"no Redis server answers ({type(error).__name__})")
+    finally:
+        client.close()
+    return REDIS
+
+
+@pytest.fixture
+def prefix(redis_server: str) -> Iterator[str]:
+    """A prefix of this test's own; its keys go at the end."""
+    name = f"veilface-test-{secrets.token_hex(6)}"
+    yield name
+    with redis.Redis.from_url(redis_server) as client:
+        for key in client.scan_iter(f"{name}:*"):
+            client.delete(key)
+
+
+@pytest.fixture(params=["process", "redis"])
+def make(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Make:
+    """Makes a storage; two in Redis share their counts."""
+    if request.param == "process":
+        return InProcess
+    url, prefix = request.getfixturevalue("redis_server"), request.getfixturevalue("prefix")
+    # On a busy machine Redis may answer late, and would be taken for one that is away.
+    monkeypatch.setattr(rate_limits, "STORAGE_TIMEOUT_S", 30.0)
+    return lambda: InRedis(url, prefix=prefix)
+
+
+@asynccontextmanager
+async def limited(storage: Storage, *, key: str | None = None) -> AsyncIterator[RateLimits]:
+    made = RateLimits(key=None if key is None else limits.parse(key), address=None, storage=storage)
+    try:
+        yield made
+    finally:
+        await made.close()
+
+
+async def refusal(count: Awaitable[None]) -> ApiError | None:
+    try:
+        await count
+    except ApiError as error:
+        return error
+    return None
+
+
+@pytest.mark.parametrize(
+    ("host", "counted"),
+    [
+        ("192.0.2.7", "192.0.2.7"),
+        ("2001:db8:1:2:3:4:5:6", "2001:db8:1:2::/64"),
+        ("2001:db8:1:2::", "2001:db8:1:2::/64"),
+        ("2001:db8:1:3::", "2001:db8:1:3::/64"),
+        ("fe80::1%eth0", "fe80::/64"),
+        ("::ffff:192.0.2.7", "192.0.2.7"),
+        ("", "unknown"),
+        ("_hidden", "unknown"),
+        ("192.0.2.7, 10.0.0.1", "unknown"),
+    ],
+)
+def test_an_address_is_counted_by_what_one_client_has(host: str, counted: str) -> None:
+    assert address_of(host) == counted
+
+
+def test_the_next_one_is_refused_and_told_how_long_to_wait(make: Make) -> None:
+    async def scenario() -> None:
+        before = RATE_LIMITED.labels("key")._value.get()
+        async with limited(make(), key="3/2 second") as rates:
+            for _ in range(3):
+                await rates.count_key("a")
+            refused = await refusal(rates.count_key("a"))
+            assert refused is not None
+            assert (refused.code, refused.details) == ("rate_limited", {"limit": "key"})
+            wait = refused.headers["Retry-After"]
+            assert wait.isdecimal()
+            assert 1 <= int(wait) <= 4
+            assert await refusal(rates.count_key("b")) is None
+            assert RATE_LIMITED.labels("key")._value.get() == before + 1
+            await anyio.sleep(int(wait) + 0.1)
+            assert await refusal(rates.count_key("a")) is None
+
+    anyio.run(scenario)
+
+
+def test_the_wait_is_right_in_the_first_millisecond_of_a_window() -> None:
+    """All at once, Redis' clock standing still: it counts whole milliseconds."""
+
+    class Standing(InProcess):
+        def __init__(self) -> None:
+            super().__init__()
+            self._counters.get_sliding_window = self._window  # type: ignore[method-assign]
+            self.asked = 0
+
+        async def _window(self, key: str, expiry: int) -> tuple[int, float, int, float]:
+            self.asked += 1
+            return 0, 0.0, 3, 2.0 * expiry - (0.0 if self.asked == 1 else 0.002)
+
+    async def scenario() -> None:
+        async with limited(Standing(), key="3/100 second") as rates:
+            for _ in range(3):
+                await rates.count_key("a")
+            refused = await refusal(rates.count_key("a"))
+            assert refused is not None
+            assert refused.headers["Retry-After"] == "100"
+
+    anyio.run(scenario)
+
+
+def test_exactly_as_many_pass_as_may_however_many_come_at_once(make: Make) -> None:
+    outcomes: Counter[str] = Counter()
+
+    async def count(rates: RateLimits) -> None:
+        refused = await refusal(rates.count_key("a"))
+        outcomes["passed" if refused is None else refused.code] += 1
+
+    async def scenario() -> None:
+        async with limited(make(), key="50/day") as rates, anyio.create_task_group() as tasks:
+            for _ in range(200):
+                tasks.start_soon(count, rates)
+
+    anyio.run(scenario)
+    assert outcomes == {"passed": 50, "rate_limited": 150}
+
+
+def test_workers_share_a_limit_in_redis_and_not_without_it(make: Make) -> None:
+    async def scenario() -> list[bool]:
+        async with limited(make(), key="4/day") as one, limited(make(), key="4/day") as other:
+            return [await refusal(each.count_key("a")) is None for each in (one, other) * 4]
+
+    passed = anyio.run(scenario)
+    assert sum(passed) == (8 if make is InProcess else 4)
+
+
+def test_no_limit_asks_nothing() -> None:
+    class Never(InProcess):
+        async def hit(self, *_: Any) -> float | None:
+            raise AssertionError
+
+    async def scenario() -> None:
+        async with limited(Never()) as rates:
+            await rates.count_key("a")
+            await rates.count_address({"client": ("192.0.2.1", 1)})
+
+    anyio.run(scenario)
+
+
+def test_many_addresses_do_not_fill_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("api.limits.rates.MAX_COUNTERS", 100)
+    monkeypatch.setattr("api.limits.rates.SHARES", 8)
+    storage, limit = InProcess(), limits.parse("5/day")
+
+    async def scenario() -> None:
+        for number in range(100):
+            assert await storage.hit(limit, "address", f"early-{number}") is None
+        passed = [
+            await storage.hit(limit, "address", f"late-{number}") is None for number in range(1000)
+        ]
+        # Late ones share the few counters that are left, so the flood is limited as a whole.
+        assert sum(passed) == 5 * 8
+        assert len(storage._counters.expirations) == 108
+        assert len(storage._counters.storage) <= 108
+
+    anyio.run(scenario)
+
+
+def test_old_counters_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    storage, limit = InProcess(), limits.parse("5/second")
+
+    async def scenario() -> None:
+        for number in range(50):
+            await storage.hit(limit, "address", str(number))
+        assert len(storage._counters.expirations) >= 50
+        await anyio.sleep(2.1)
+        await storage.hit(limit, "address", "new")
+        assert len(storage._counters.expirations) == 1
+        assert len(storage._counters.storage) == 1
+
+    anyio.run(scenario)
+
+
+class OwnRedis:
+    """A Redis server of this test's own, which can be killed."""
+
+    def __init__(self, folder: Path) -> None:
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            self.port = int(probe.getsockname()[1])
+        self._folder = folder
+        self.url = f"redis://127.0.0.1:{self.port}/0"
+        self.process: subprocess.Popen[bytes] | None = None
+
+    def start(self) -> None:
+        self.process = subprocess.Popen(
+            ["redis-server", "--port", str(self.port), "--save", "", "--dir", str(self._folder)],
+            stdout=subprocess.DEVNULL,
+        )
+        with redis.Redis.from_url(self.url) as client:
+            for _ in range(200):
+                try:
+                    client.ping()
+                    return
+                except redis.RedisError:
+                    time.sleep(0.05)
+        raise AssertionError("the Redis server did not start")
+
+    def kill(self) -> None:
+        if self.process is not None:
+            self.process.kill()
+            self.process.wait()
+            self.process = None
+
+
+@pytest.fixture
+def own_redis(tmp_path: Path) -> Iterator[OwnRedis]:
+    if shutil.which("redis-server") is None:
+        pytest.skip("there is no redis-server to start and kill")
+    server = OwnRedis(tmp_path)
+    try:
+        yield server
+    finally:
+        server.kill()
+
+
+def events(text: str) -> list[str]:
+    return [json.loads(line)["event"] for line in text.splitlines()]
+
+
+def test_while_redis_is_away_each_worker_counts_for_itself(
+    own_redis: OwnRedis, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("api.limits.rates.RETRY_STORAGE_S", 0.3)
+
+    async def passed(rates: RateLimits, times: int) -> int:
+        return sum([await refusal(rates.count_key("a")) is None for _ in range(times)])
+
+    async def scenario() -> None:
+        from api.process.logging import configure
+
+        configure("info")
+        failures = RATE_STORAGE_FAILURES._value.get()
+        async with limited(InRedis(own_redis.url), key="10/day") as rates:
+            assert await passed(rates, 4) == 4
+            own_redis.kill()
+            assert await passed(rates, 15) == 10
+            await anyio.sleep(0.4)
+            assert await passed(rates, 3) == 0  # it is tried again, in vain, and the limit holds
+            assert RATE_STORAGE_FAILURES._value.get() == failures + 1
+            own_redis.start()
+            await anyio.sleep(0.4)
+            assert await passed(rates, 15) == 10  # a fresh server has counted nothing
+        assert events(capfd.readouterr().err) == [
+            "rate limit storage failed",
+            "rate limit storage answers again",
+        ]
+
+    own_redis.start()
+    anyio.run(scenario)
+
+
+def test_a_redis_that_hangs_does_not_hold_a_request(
+    own_redis: OwnRedis, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def scenario() -> None:
+        async with limited(InRedis(own_redis.url), key="10/day") as rates:
+            await rates.count_key("a")
+            assert own_redis.process is not None
+            own_redis.process.send_signal(signal.SIGSTOP)
+            try:
+                for _ in range(5):  # returns although Redis never answers
+                    await rates.count_key("a")
+            finally:
+                own_redis.process.send_signal(signal.SIGCONT)
+
+    own_redis.start()
+    anyio.run(scenario)
+
+
+@pytest.mark.parametrize(
+    "url",
+    ["http://user:hunter2@host", "redis//:hunter2@host", "redis://user:hunter2@host:port/x"],
+)
+def test_no_message_repeats_a_password(url: str) -> None:
+    with pytest.raises(StartError, match="rate_limit_storage") as caught:
+        RateLimits.open(load_settings(rate_limit_storage=url))
+    assert "hunter2" not in str(caught.value)
+    assert caught.value.__suppress_context__
+
+
+def test_without_the_client_library_redis_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "redis.asyncio", None)
+    with pytest.raises(StartError, match=r"veilface\[redis\]"):
+        RateLimits.open(load_settings(rate_limit_storage="redis://127.0.0.1"))
+
+
+# The service
+
+
+@asynccontextmanager
+async def served(settings: Settings) -> AsyncIterator[FastAPI]:
+    app = create_app(settings)
+    async with app.router.lifespan_context(app):
+        yield app
+
+
+async def sent(app: Any, path: str, *, host: str = "192.0.2.1", **headers: str) -> httpx.Response:
+    transport = httpx.ASGITransport(app, client=(host, 1234))
+    async with httpx.AsyncClient(transport=transport, base_url="http://test") as client:
+        return await client.get(path, headers=headers)
+
+
+@pytest.fixture(scope="module")
+def tight(tmp_path_factory: pytest.TempPathFactory) -> Deployment:
+    return deploy(
+        tmp_path_factory.mktemp("tight"), rate_limit_key="4/day", rate_limit_address="6/day"
+    )
+
+
+def test_an_address_is_refused_before_its_key_is_looked_up(
+    tight: Deployment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def scenario() -> None:
+        async with served(tight.settings) as app:
+            store = app.state.runtime.store
+            looked_up: list[str] = []
+            verify = store.api_keys.verify
+            monkeypatch.setattr(
+                store.api_keys, "verify", lambda token: looked_up.append(token) or verify(token)
+            )
+            unknown = bearer(f"vf_{0:012}_{0:064}")
+            answers = [await sent(app, "/v1/contract", **unknown) for _ in range(8)]
+            assert [each.status_code for each in answers] == [401] * 6 + [429] * 2
+            assert len(looked_up) == 6
+            details = assert_error(answers[-1], 429, "rate_limited")
+            assert details == {"limit": "address"}
+            assert int(answers[-1].headers["retry-after"]) >= 1
+            assert answers[-1].headers["x-content-type-options"] == "nosniff"
+            # Any path counts, and a client elsewhere has a count of his own.
+            assert_error(await sent(app, "/nowhere"), 429, "rate_limited")
+            assert (await sent(app, "/nowhere", host="192.0.2.2")).status_code == 404
+            # Health is exempt, so that a busy neighbour does not get the service restarted.
+            for path in ("/health/live", "/health/ready", "/metrics"):
+                assert (await sent(app, path)).status_code == 200
+
+    anyio.run(scenario)
+
+
+def test_a_key_is_counted_wherever_it_is_used_from(tight: Deployment) -> None:
+    other = tight.key("verify")
+
+    async def scenario() -> None:
+        async with served(tight.settings) as app:
+            answers = [
+                await sent(app, "/v1/contract", host=f"192.0.2.{number}", **bearer(tight.token))
+                for number in range(6)
+            ]
+            assert [each.status_code for each in answers] == [200] * 4 + [429] * 2
+            assert assert_error(answers[-1], 429, "rate_limited") == {"limit": "key"}
+            assert (await sent(app, "/v1/contract", **bearer(other))).status_code == 200
+
+    anyio.run(scenario)
+
+
+@pytest.mark.parametrize(
+    ("trusted", "from_host", "passing"),
+    [
+        ("127.0.0.1", "127.0.0.1", 9),
+        ("10.0.0.0/8,192.0.2.1", "10.1.2.3", 9),
+        ("127.0.0.1", "192.0.2.9", 6),
+        ("none", "127.0.0.1", 6),
+    ],
+)
+def test_forwarded_addresses_are_believed_from_proxies_only(
+    tight: Deployment, trusted: str, from_host: str, passing: int
+) -> None:
+    settings = tight.settings.model_copy(update={"trusted_proxies": trusted})
+
+    async def scenario() -> None:
+        config = uvicorn.Config(**{**uvicorn_options(settings), "log_config": None})
+        config.load()
+        app = config.app
+        assert isinstance(app, FastAPI)
+        async with app.router.lifespan_context(app):
+            codes = [
+                (
+                    await sent(
+                        config.loaded_app,
+                        "/nowhere",
+                        host=from_host,
+                        **{"X-Forwarded-For": f"198.51.100.{number}"},
+                    )
+                ).status_code
+                for number in range(9)
+            ]
+        assert codes == [404] * passing + [429] * (9 - passing)
+
+    anyio.run(scenario)

@@ -1,0 +1,439 @@
+"""A start that cannot work ends in one sentence; one that works needs little."""
+
+import gc
+import stat
+import weakref
+from collections.abc import Callable, MutableMapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import anyio
+import numpy as np
+import onnx
+import pytest
+from sqlalchemy.engine import Connection
+
+from api.http.app import create_app
+from api.http.errors import StartError
+from api.http.schemas import VerifyAnswer
+from api.process.opening import (
+    database_in_use,
+    file_sealer,
+    key_beside_database,
+    open_keyring,
+    open_store,
+    try_inference,
+)
+from api.process.runtime import Runtime
+from api.settings import Settings
+from models.pack import ModelPack
+from templates.decoys import DecoyGenerator
+from templates.keys.sealing import MasterKeyring
+from templates.space.subspace import SubspaceBatch
+from templates.store.database import Database
+from tests.api.cli.conftest import run
+from tests.api.client import Client
+from tests.api.deployment import (
+    Deployment,
+    N,
+    bearer,
+    deploy,
+    images,
+    make_contract,
+    photo,
+    unit,
+    write_pack,
+)
+from tests.api.http.test_enrollment import b64, lifted
+from tests.api.shapes import assert_answer, assert_error
+
+
+@pytest.fixture
+def fresh(tmp_path: Path) -> Deployment:
+    return deploy(tmp_path)
+
+
+def changed(deployment: Deployment, **changes: Any) -> Settings:
+    return deployment.settings.model_copy(update=changes)
+
+
+def refused(settings: Settings) -> str:
+    with pytest.raises(StartError) as caught:
+        Runtime.open(settings)
+    sentence = str(caught.value)
+    assert "\n" not in sentence
+    assert "Traceback" not in sentence
+    return sentence
+
+
+def test_the_master_key_is_made_once_and_private(tmp_path: Path) -> None:
+    settings = Settings(data_dir=tmp_path / "data")
+    first = open_keyring(settings)
+    mode = stat.S_IMODE(settings.resolved_master_key_file.stat().st_mode)
+    assert mode == 0o600
+    assert open_keyring(settings).current == first.current
+    assert not settings.data_dir.exists()
+
+
+def test_a_master_key_beside_the_database_is_said(tmp_path: Path) -> None:
+    data, elsewhere = tmp_path / "data", tmp_path / "elsewhere"
+    data.mkdir()
+    default = Settings(data_dir=data)
+    assert key_beside_database(default) is None
+    (data / "master.key").write_text("of an earlier version")
+    said = str(key_beside_database(default))
+    assert str(data / "master.key") in said
+    assert "move it" in said
+    assert "\n" not in said
+    tmp_path.joinpath("link").symlink_to(data)
+    beside = {"master_key_file": tmp_path / "link" / "master.key"}
+    for url in (f"sqlite:///{data}/x.db", f"sqlite+pysqlite:///{data}/x.db"):
+        assert key_beside_database(Settings(data_dir=elsewhere, database_url=url, **beside))
+    for other in (
+        Settings(data_dir=data, database_url=f"sqlite:///{elsewhere}/x.db"),
+        Settings(data_dir=data, database_url="postgresql://u@127.0.0.1:1/x"),
+        Settings(data_dir=data, master_key_variable="KEY"),
+        Settings(data_dir=data, master_key_command="kms"),
+    ):
+        assert key_beside_database(other) is None
+
+
+def test_a_lost_master_key_is_not_replaced(fresh: Deployment) -> None:
+    fresh.settings.resolved_master_key_file.unlink()
+    assert "missing, but the database holds data" in refused(fresh.settings)
+    assert not fresh.settings.resolved_master_key_file.exists()
+
+
+def test_another_master_key_is_refused(fresh: Deployment, tmp_path: Path) -> None:
+    other = Settings(data_dir=tmp_path / "other")
+    open_keyring(other)
+    assert "contract file" in refused(
+        changed(fresh, master_key_file=other.resolved_master_key_file)
+    )
+
+
+def test_a_readable_master_key_is_refused(fresh: Deployment) -> None:
+    fresh.settings.resolved_master_key_file.chmod(0o644)
+    assert "chmod 600" in refused(fresh.settings)
+
+
+def test_no_contract(fresh: Deployment) -> None:
+    fresh.settings.resolved_contract_file.unlink()
+    assert "veilface calibrate" in refused(fresh.settings)
+
+
+def test_a_broken_contract(fresh: Deployment) -> None:
+    path = fresh.settings.resolved_contract_file
+    path.write_text("{}")
+    assert str(path) in refused(fresh.settings)
+
+
+def test_an_edited_contract(fresh: Deployment) -> None:
+    path = fresh.settings.resolved_contract_file
+    path.write_text(path.read_text().replace("0.75", "0.05"))
+    assert "contract file" in refused(fresh.settings)
+
+
+def test_another_pack_is_named_beside_the_contract(fresh: Deployment, tmp_path: Path) -> None:
+    other = write_pack(tmp_path / "other")
+    model = onnx.load(other / "tiny.onnx")
+    model.producer_name = "somebody else"
+    onnx.save(model, other / "tiny.onnx")
+    sentence = refused(changed(fresh, pack=other))
+    assert ModelPack.load(other).info.embedder_sha256[:16] in sentence
+    assert fresh.contract.binding.embedder_sha256[:16] in sentence
+
+
+def test_no_pack_where_one_is_named(fresh: Deployment, tmp_path: Path) -> None:
+    assert "absent" in refused(changed(fresh, pack=tmp_path / "absent"))
+
+
+def test_an_absent_accelerator_is_an_error(fresh: Deployment) -> None:
+    assert "cuda" in refused(changed(fresh, providers=("cuda",))).lower()
+
+
+def test_a_pack_that_fails_on_its_first_picture(
+    fresh: Deployment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert fresh.settings.pack is not None
+    pack = ModelPack.load(fresh.settings.pack, threads=1)
+    try_inference(pack)
+    monkeypatch.setattr(pack, "embed", lambda crops: np.zeros((1, N), np.float32))
+    with pytest.raises(StartError, match="unit vector"):
+        try_inference(pack)
+
+
+def test_decoys_of_another_contract(fresh: Deployment) -> None:
+    rng = np.random.default_rng(99)
+    other = DecoyGenerator.fit(unit(rng.normal(size=(300, N))))
+    other.save(fresh.settings.resolved_decoys_file)
+    assert "decoys file" in refused(fresh.settings)
+
+
+def test_decoys_that_are_named_and_absent(fresh: Deployment, tmp_path: Path) -> None:
+    assert "nowhere" in refused(changed(fresh, decoys_file=tmp_path / "nowhere"))
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "postgresql://user:hunter2@127.0.0.1:1/x",
+        "mysql://user:hunter2@host/x",
+        "not a url hunter2",
+        "sqlite:////proc/no/such/place.db",
+        "sqlite://",
+    ],
+)
+def test_a_wrong_database_is_one_sentence_without_the_password(
+    fresh: Deployment, tmp_path: Path, url: str
+) -> None:
+    assert "hunter2" not in refused(changed(fresh, database_url=url))
+    if "hunter2" in url:  # asked before a first master key is made; an absent file is empty
+        with pytest.raises(StartError) as caught:
+            open_keyring(changed(fresh, database_url=url, master_key_file=tmp_path / "absent"))
+        assert "hunter2" not in str(caught.value)
+        assert not (tmp_path / "absent").exists()
+
+
+def test_a_database_of_another_program(fresh: Deployment, tmp_path: Path) -> None:
+    path = tmp_path / "not-a-database"
+    path.write_bytes(b"hello" * 1000)
+    assert "database" in refused(changed(fresh, database_url=f"sqlite:///{path}"))
+
+
+def test_whether_a_database_is_in_use(both: tuple[Client, Deployment], tmp_path: Path) -> None:
+    _, deployment = both
+    assert database_in_use(deployment.settings.resolved_database_url)
+    assert not database_in_use(f"sqlite:///{tmp_path / 'none.db'}")
+    assert not (tmp_path / "none.db").exists()
+
+
+def test_another_applications_rows_do_not_count(tmp_path: Path, database_url: str) -> None:
+    database = Database(database_url)
+
+    def another_application(connection: Connection) -> None:
+        connection.exec_driver_sql("CREATE TABLE orders (id integer)")
+        connection.exec_driver_sql("INSERT INTO orders VALUES (1)")
+
+    database.write(another_application)
+    settings = Settings(data_dir=tmp_path / "data", database_url=database_url)
+    assert not database_in_use(database_url)
+    store = open_store(settings, open_keyring(settings))
+    store.upgrade()
+    assert database_in_use(database_url)
+    store.close()
+    database.close()
+
+
+def test_a_database_that_is_down_is_not_blamed_on_the_key_file(tmp_path: Path) -> None:
+    settings = Settings(data_dir=tmp_path / "data", database_url="postgresql://u@127.0.0.1:1/x")
+    with pytest.raises(StartError, match="database cannot be asked") as caught:
+        open_keyring(settings)
+    assert "cannot be used" not in str(caught.value)
+    settings.resolved_master_key_file.parent.mkdir(parents=True)
+    settings.resolved_master_key_file.write_text("nonsense")
+    with pytest.raises(StartError, match=r"master key file .* cannot be used"):
+        open_keyring(settings)
+
+
+def test_of_two_first_starts_at_once_the_second_takes_the_firsts_key(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = Settings(data_dir=tmp_path / "data")
+    made: list[str] = []
+
+    def meanwhile(_: str) -> bool:
+        path = settings.resolved_master_key_file
+        path.parent.mkdir(parents=True)
+        made.append(MasterKeyring.create(path).current)
+        return False
+
+    monkeypatch.setattr("api.process.opening.database_in_use", meanwhile)
+    assert [open_keyring(settings).current] == made
+
+
+def test_without_a_pack_templates_and_embeddings_work(fresh: Deployment) -> None:
+    app = create_app(changed(fresh, pack=None))
+    with Client(app, headers=bearer(fresh.token)) as client:
+        base = "/v1/subjects/a"
+        assert_error(
+            client.put(f"{base}/enrollment", files=images(photo(1))), 503, "model_unavailable"
+        )
+        probe = client.post(f"{base}/verify", files=images(photo(1), name="image"))
+        assert_error(probe, 503, "model_unavailable")
+        assert client.get("/v1/contract").json()["photos"] is False
+        fresh.allow_templates()
+        put = client.put(f"{base}/enrollment", json={"template": b64(lifted(fresh))})
+        assert put.status_code == 201
+        descriptor = unit(np.random.default_rng([5, 0]).normal(size=(1, N)))[0]
+        answer = client.post(f"{base}/verify", json={"embedding": descriptor.tolist()})
+        assert answer.json()["decision"] == "accept"
+
+
+def test_without_decoys_photos_are_verified_and_not_enrolled(fresh: Deployment) -> None:
+    with Client(create_app(fresh.settings), headers=bearer(fresh.token)) as client:
+        client.put("/v1/subjects/a/enrollment", files=images(photo(1)))
+    fresh.settings.resolved_decoys_file.unlink()
+    with Client(create_app(fresh.settings), headers=bearer(fresh.token)) as client:
+        assert_error(
+            client.put("/v1/subjects/b/enrollment", files=images(photo(1))),
+            503,
+            "model_unavailable",
+        )
+        probe = client.post("/v1/subjects/a/verify", files=images(photo(1), name="image"))
+        assert probe.json()["decision"] == "accept"
+        fresh.allow_templates()
+        put = client.put("/v1/subjects/b/enrollment", json={"template": b64(lifted(fresh))})
+        assert put.status_code == 201
+
+
+def test_a_failed_start_is_logged_in_one_sentence(
+    fresh: Deployment, capfd: pytest.CaptureFixture[str]
+) -> None:
+    fresh.settings.resolved_contract_file.unlink()
+    with pytest.raises(StartError), Client(create_app(fresh.settings)):
+        pass
+    assert "start failed: there is no contract file" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("error", [RuntimeError("hunter2"), StartError("no contract")])
+def test_the_server_is_not_handed_the_text_of_a_failed_start(
+    fresh: Deployment, capfd: pytest.CaptureFixture[str], error: Exception
+) -> None:
+    """As uvicorn starts an application: what is sent to it ends in the log."""
+    sent: list[MutableMapping[str, Any]] = []
+
+    def fail(_: Settings) -> Runtime:
+        raise error
+
+    async def receive() -> MutableMapping[str, Any]:
+        return {"type": "lifespan.startup"}
+
+    async def send(message: MutableMapping[str, Any]) -> None:
+        sent.append(message)
+
+    async def start() -> None:
+        await create_app(fresh.settings, open_runtime=fail)({"type": "lifespan"}, receive, send)
+
+    with pytest.raises(type(error)):
+        anyio.run(start)
+    assert sent == [{"type": "lifespan.startup.failed"}]
+    logged = capfd.readouterr().err
+    assert "hunter2" not in logged
+    assert type(error).__name__ in logged
+
+
+def test_serving_keeps_no_second_copy_of_the_models(
+    fresh: Deployment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The command opens everything to check it; the workers open it anew."""
+    opened: list[weakref.ref[Runtime]] = []
+    alive: list[bool] = []
+    really_open = Runtime.open
+
+    def remembered(settings: Settings) -> Runtime:
+        runtime = really_open(settings)
+        opened.append(weakref.ref(runtime))
+        return runtime
+
+    def serving(_: Settings, *, on_ready: Callable[[], None]) -> None:
+        gc.collect()
+        alive.extend(each() is not None for each in opened)
+
+    monkeypatch.setattr(Runtime, "open", remembered)
+    monkeypatch.setattr("api.cli.serve.run_server", serving)
+    folders = ("--data-dir", fresh.settings.data_dir, "--pack", str(fresh.settings.pack))
+    ran = run("serve", "--port", "0", *folders)
+    assert ran.status == 0, ran.stderr
+    assert alive == [False]
+
+
+def test_the_cohort_is_rounded_before_the_service_is_ready(
+    fresh: Deployment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rounded: list[SubspaceBatch] = []
+    monkeypatch.setattr("api.http.app.rounded_cohort", rounded.append)
+    app = create_app(fresh.settings)
+    with Client(app):
+        assert rounded == [app.state.runtime.contract.cohort]
+
+
+def test_recalibration_keeps_the_templates(fresh: Deployment) -> None:
+    with Client(create_app(fresh.settings), headers=bearer(fresh.token)) as client:
+        client.put("/v1/subjects/a/enrollment", files=images(photo(1)))
+    assert fresh.settings.pack is not None
+    again = make_contract(ModelPack.load(fresh.settings.pack, threads=1), fresh.source)
+    again.save(fresh.settings.resolved_contract_file, file_sealer(open_keyring(fresh.settings)))
+    assert again.contract_id == fresh.contract.contract_id
+    with Client(create_app(fresh.settings), headers=bearer(fresh.token)) as client:
+        probe = client.post("/v1/subjects/a/verify", files=images(photo(1), name="image"))
+        assert probe.json()["decision"] == "accept"
+
+
+def test_a_template_of_an_older_contract_is_refused(fresh: Deployment) -> None:
+    with Client(create_app(fresh.settings), headers=bearer(fresh.token)) as client:
+        client.put("/v1/subjects/a/enrollment", files=images(photo(1)))
+    assert fresh.settings.pack is not None
+    other = make_contract(
+        ModelPack.load(fresh.settings.pack, threads=1), fresh.source, rotation_version="other"
+    )
+    other.save(fresh.settings.resolved_contract_file, file_sealer(open_keyring(fresh.settings)))
+    with Client(create_app(fresh.settings), headers=bearer(fresh.token)) as client:
+        probe = client.post("/v1/subjects/a/verify", files=images(photo(1), name="image"))
+        assert_error(probe, 409, "contract_mismatch")
+        # A key that may not know who is enrolled is answered as for a subject that does not exist.
+        blind = bearer(fresh.key("verify"))
+        answers = []
+        for subject in ("a", "nobody"):
+            answer = client.post(
+                f"/v1/subjects/{subject}/verify",
+                files=images(photo(1), name="image"),
+                headers=blind,
+            )
+            body = assert_answer(answer, 200, VerifyAnswer)
+            del body["request_id"]
+            answers.append(body)
+        assert answers[0] == answers[1]
+        assert (answers[0]["decision"], answers[0]["reason"]) == ("reject", "no_match")
+        assert_error(client.get("/v1/subjects/a/export"), 409, "contract_mismatch")
+        assert client.get("/v1/subjects/a").json()["current"] is False
+        put = client.put("/v1/subjects/a/enrollment", files=images(photo(1)))
+        assert put.status_code == 200
+
+
+def test_an_older_contract_of_the_same_id_is_told_of_and_served(
+    fresh: Deployment, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = fresh.settings.resolved_contract_file
+    older = path.read_bytes()
+
+    def check() -> tuple[int, bool]:
+        settings = fresh.settings
+        ran = run("serve", "--check", "--data-dir", settings.data_dir, "--pack", settings.pack)
+        return ran.status, "calibrations of the contract file are older" in ran.stderr
+
+    with Client(create_app(fresh.settings)):
+        pass
+    assert check() == (0, False)
+    level = fresh.contract.calibrations[0].levels[0]
+    p2s, s2s = fresh.contract.calibrations
+    stricter = replace(level, similarity_threshold=level.similarity_threshold + 0.05)
+    newer = replace(
+        fresh.contract,
+        calibrations=(
+            replace(p2s, levels=(stricter, *p2s.levels[1:]), calibration_id=""),
+            s2s,
+        ),
+    )
+    assert newer.contract_id == fresh.contract.contract_id
+    newer.save(path, file_sealer(open_keyring(fresh.settings)))
+    assert check() == (0, False)
+    with Client(create_app(fresh.settings)):
+        pass
+    path.write_bytes(older)
+    assert check() == (0, True)
+    capsys.readouterr()
+    with Client(create_app(fresh.settings), headers=bearer(fresh.token)) as client:
+        assert client.get("/v1/contract").status_code == 200
+    assert "the calibrations of the contract file are older ones" in capsys.readouterr().err

@@ -1,0 +1,572 @@
+"""The contract: ids, the file, and everything that must not pass as a file."""
+
+import base64
+import dataclasses
+import errno
+import functools
+import hashlib
+import json
+import os
+import stat
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import safetensors.numpy
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from templates.contract import document as contract_module
+from templates.contract.canonical import MAX_ITEMS, MAX_PARTS, canonical_json, too_many_parts
+from templates.contract.document import (
+    MAX_CALIBRATIONS,
+    Binding,
+    Calibration,
+    Contract,
+    Level,
+    Rate,
+)
+from templates.contract.levels import MAX_LEVELS
+from templates.contract.nobody import Nobody
+from templates.decoys import DecoyGenerator
+from templates.distances import Metric
+from templates.errors import ContractError, ContractMismatch, SealError, Uncalibrated
+from templates.keys.randomness import Keystream
+from templates.keys.sealing import KeyringSealer, MasterKeyring
+from templates.space.lifting import Strategy, lift
+from templates.space.subspace import SubspaceBatch
+
+N, M = 16, 3
+SEALER = KeyringSealer(MasterKeyring([os.urandom(32)]))
+RATE = Rate(errors=2, trials=1000, ci_low=0.0005, ci_high=0.007)
+
+
+def make_binding(**changes: Any) -> Binding:
+    fields: dict[str, Any] = {
+        "embedder_sha256": "ab" * 32,
+        "preprocessing": {"size": 112, "mean": (127.5, 127.5, 127.5), "flip": False},
+        "n": N,
+        "strategy": Strategy.RANDOM,
+        "m": M,
+        "decoy_source_id": "cd" * 32,
+        "rotation_version": "1",
+    }
+    return Binding(**{**fields, **changes})
+
+
+def make_cohort(seed: int = 0, *, n: int = N, m: int = M) -> SubspaceBatch:
+    with Keystream.seeded("cohort", seed) as stream:
+        rows = stream.normal((5, n))
+        rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+        return lift(rows, strategy=Strategy.RANDOM, m=m, stream=stream)
+
+
+@functools.cache
+def make_nobody(n: int = N) -> Nobody:
+    rows = np.random.default_rng(4).normal(size=(200, n)).astype(np.float32)
+    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+    numbers = np.linspace(0.1, 0.2, 6, dtype=np.float32)
+    return Nobody(rows[:6], numbers, numbers, DecoyGenerator.fit(rows))
+
+
+def make_calibration(**changes: Any) -> Calibration:
+    fields: dict[str, Any] = {
+        "mode": "p2s",
+        "metric": Metric.SPHERICAL,
+        "probe_m": 0,
+        "steps": 50,
+        "levels": (
+            Level("fmr-1e-2", 1e-2, 0.35, 2.0, RATE, RATE),
+            Level("accuracy", None, 0.4, 3.0, RATE, RATE),
+        ),
+        "foot_point_norm": None,
+        "calibrated_on": {"people": 80, "share": 1.0},
+    }
+    return Calibration(**{**fields, **changes})
+
+
+LIFTED = {"mode": "s2s", "probe_m": 2, "foot_point_norm": (0.2, 0.9)}
+
+
+def make_contract(**changes: Any) -> Contract:
+    fields: dict[str, Any] = {
+        "binding": make_binding(),
+        "recorded": {"pack": "tiny", "detector": {"kind": "scrfd", "input": (640, 640)}},
+        "calibrations": (make_calibration(), make_calibration(**LIFTED)),
+        "default_level": "fmr-1e-2",
+        "photo_consistency": 0.25,
+        "template_foot_point_norm": (0.1, 0.8),
+        "template_stranger_score": 1.5,
+        "cohort": make_cohort(),
+        "nobody": make_nobody(),
+    }
+    return Contract(**{**fields, **changes})
+
+
+# --- ids -----------------------------------------------------------------------------------
+
+
+def test_contract_id_is_the_hash_of_the_canonical_json() -> None:
+    written = (
+        '{"decoy_source_id":"' + "cd" * 32 + '","embedder_sha256":"' + "ab" * 32 + '","m":3,"n":16,'
+        '"preprocessing":{"flip":false,"mean":[127.5,127.5,127.5],"size":112},'
+        '"rotation_version":"1","strategy":"random"}'
+    )
+    assert make_binding().contract_id == hashlib.sha256(written.encode("utf-8")).hexdigest()
+
+
+def test_contract_id_depends_on_values_not_on_how_they_are_written() -> None:
+    preprocessing = {"mean": [127.5] * 3, "flip": False, "size": 112.0}
+    assert make_binding(preprocessing=preprocessing) == make_binding()
+    assert make_binding(preprocessing=preprocessing).contract_id == make_binding().contract_id
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"embedder_sha256": "ac" * 32},
+        {"preprocessing": {"size": 112, "mean": (127.5, 127.5, 127.5), "flip": True}},
+        {"n": 17},
+        {"strategy": Strategy.HYBRID},
+        {"m": 4},
+        {"decoy_source_id": "ce" * 32},
+        {"rotation_version": "2"},
+    ],
+    ids=lambda changes: next(iter(changes)),
+)
+def test_every_part_of_the_binding_changes_the_id(changes: dict[str, Any]) -> None:
+    assert make_binding(**changes).contract_id != make_binding().contract_id
+
+
+def test_recalibrating_keeps_the_contract_id_and_changes_the_calibration_id() -> None:
+    first = make_contract()
+    levels = (Level("fmr-1e-2", 1e-2, 0.36, 2.0, RATE, RATE),)
+    again = make_contract(calibrations=(make_calibration(levels=levels),))
+    other_cohort = make_contract(cohort=make_cohort(1))
+    ids = {entry.calibrations[0].calibration_id for entry in (first, again, other_cohort)}
+    assert len(ids) == 3
+    assert len({entry.contract_id for entry in (first, again, other_cohort)}) == 1
+    assert make_contract().calibrations[0].calibration_id in ids
+
+
+def test_canonical_json_agrees_with_sorted_compact_json() -> None:
+    value = {"é": [1, 2.5, True, None], "a": {"z": "\n", "b": -0.125}}
+    expected = json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
+    assert canonical_json(value) == expected.encode("utf-8")
+    for broken in (float("nan"), float("inf"), "\ud800", object(), 2**60, b"x", {1: 2}):
+        with pytest.raises(ContractError):
+            canonical_json({"x": broken})
+    deep: Any = 0
+    for _ in range(50):
+        deep = [deep]
+    with pytest.raises(ContractError, match="too deep"):
+        canonical_json(deep)
+
+
+# --- values --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"embedder_sha256": "AB" * 32},
+        {"decoy_source_id": "cd"},
+        {"n": 1},
+        {"n": 5000},
+        {"m": 0},
+        {"m": N},
+        {"rotation_version": ""},
+        {"preprocessing": {"mean": float("nan")}},
+    ],
+)
+def test_impossible_bindings_are_refused(changes: dict[str, Any]) -> None:
+    with pytest.raises(ContractError):
+        make_binding(**changes)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"mode": "s2s"},
+        {"probe_m": 2},
+        {"foot_point_norm": (0.1, 0.2)},
+        {**LIFTED, "foot_point_norm": (0.9, 0.2)},
+        {"steps": 0},
+        {"levels": ()},
+        {"levels": (Level("a", 1e-2, 0, 0, RATE, RATE),) * 2},
+        {"mode": "raw"},
+    ],
+)
+def test_impossible_calibrations_are_refused(changes: dict[str, Any]) -> None:
+    with pytest.raises(ContractError):
+        make_calibration(**changes)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"photo_consistency": 1.5},
+        {"template_foot_point_norm": (0.8, 0.1)},
+        {"template_stranger_score": float("nan")},
+        {"nobody": dataclasses.replace(make_nobody(), people=make_nobody().people[:1])},
+        {"nobody": dataclasses.replace(make_nobody(), people=2 * make_nobody().people)},
+        {"nobody": dataclasses.replace(make_nobody(), people=np.nan * make_nobody().people)},
+        {"nobody": dataclasses.replace(make_nobody(), means=make_nobody().means[:5])},
+        {"nobody": dataclasses.replace(make_nobody(), means=2 + make_nobody().means)},
+        {"nobody": dataclasses.replace(make_nobody(), spreads=0 * make_nobody().spreads)},
+        {"nobody": make_nobody(N + 1)},
+        {"default_level": "fmr-1e-9"},
+        {"calibrations": ()},
+        {"calibrations": (make_calibration(), make_calibration(steps=9))},
+        {"calibrations": (make_calibration(calibration_id="0" * 64),)},
+        {"cohort": make_cohort(n=17)},
+        {"cohort": make_cohort(m=4)},
+        {"cohort": make_cohort()[0:1]},
+        {"cohort": SubspaceBatch(make_cohort().feet * np.nan, make_cohort().bases)},
+        {"cohort": SubspaceBatch(make_cohort().feet, make_cohort().bases * np.float32(1.01))},
+        {"cohort": SubspaceBatch(make_cohort().feet[::-1], make_cohort().bases)},
+    ],
+)
+def test_contradictions_are_refused(changes: dict[str, Any]) -> None:
+    with pytest.raises(ContractError):
+        make_contract(**changes)
+
+
+@pytest.mark.parametrize("counts", [(3, 2, 0.0, 1.0), (-1, 2, 0.0, 1.0), (1, 2, 0.7, 0.2)])
+def test_impossible_rates_are_refused(counts: tuple[int, int, float, float]) -> None:
+    with pytest.raises(ContractError):
+        Rate(*counts)
+
+
+def test_calibrations_are_found_or_the_choice_is_named() -> None:
+    contract = make_contract()
+    assert contract.calibration("p2s").probe_m == 0
+    assert contract.calibration("s2s", Metric.SPHERICAL, 2).mode == "s2s"
+    with pytest.raises(Uncalibrated, match="s2s spherical m=2"):
+        contract.calibration("s2s", None, 4)
+    with pytest.raises(Uncalibrated):
+        contract.calibration("p2s", Metric.EUCLIDEAN)
+    assert contract.calibration("p2s").level("accuracy").target_fmr is None
+    with pytest.raises(Uncalibrated, match="fmr-1e-2, accuracy"):
+        contract.calibration("p2s").level("fmr-1e-3")
+
+
+def test_mismatches_name_both_sides() -> None:
+    binding = make_binding()
+    same = {"embedder_sha256": "ab" * 32, "preprocessing": dict(binding.preprocessing), "n": N}
+    binding.require_embedder(**same)
+    binding.require_source(source_id="cd" * 32)
+    binding.require_contract(binding.contract_id, what="it")
+    with pytest.raises(ContractMismatch, match=r"abab.*pack's is efef"):
+        binding.require_embedder(**{**same, "embedder_sha256": "ef" * 32})
+    preprocessing = {**binding.preprocessing, "size": 96, "x": 1}
+    with pytest.raises(ContractMismatch, match=r"size: contract 112, pack 96; x: contract None"):
+        binding.require_embedder(**{**same, "preprocessing": preprocessing})
+    later = {**binding.preprocessing, "version": 2}
+    with pytest.raises(ContractMismatch, match=r"version: contract None, pack 2; .*enroll anew"):
+        binding.require_embedder(**{**same, "preprocessing": later})
+    with pytest.raises(ContractMismatch, match=r"cdcd.*0000"):
+        binding.require_source(source_id="00" * 32)
+    binding.require_source(source_id="cd" * 32, made_with=binding.embedding_id)
+    with pytest.raises(ContractMismatch, match="build the decoys with this pack and the same --fl"):
+        binding.require_source(source_id="cd" * 32, made_with="00" * 32)
+    with pytest.raises(ContractMismatch, match=r"it belongs to the contract 1111.*runs"):
+        binding.require_contract("1" * 64, what="it")
+
+
+def test_the_embedding_id_names_the_weights_and_the_preprocessing() -> None:
+    binding = make_binding()
+    text = json.dumps(
+        {"embedder_sha256": "ab" * 32, "preprocessing": dict(binding.preprocessing)},
+        sort_keys=True,
+        separators=(",", ":"),
+    )
+    assert binding.embedding_id == hashlib.sha256(text.encode()).hexdigest()
+    assert dataclasses.replace(binding, m=binding.m - 1).embedding_id == binding.embedding_id
+    flipped = {**binding.preprocessing, "flip": "another"}
+    assert dataclasses.replace(binding, preprocessing=flipped).embedding_id != binding.embedding_id
+    assert (
+        dataclasses.replace(binding, embedder_sha256="ef" * 32).embedding_id != binding.embedding_id
+    )
+
+
+# --- the file ------------------------------------------------------------------------------
+
+
+def saved(tmp_path: Path, contract: Contract | None = None) -> Path:
+    path = tmp_path / "contract.json"
+    (contract or make_contract()).save(path, SEALER)
+    return path
+
+
+def test_a_file_keeps_everything(tmp_path: Path) -> None:
+    contract = make_contract()
+    loaded = Contract.load(saved(tmp_path, contract), SEALER)
+    assert loaded.public() == contract.public()
+    assert loaded.calibrations == contract.calibrations
+    assert loaded.binding == contract.binding
+    np.testing.assert_array_equal(loaded.cohort.feet, contract.cohort.feet)
+    np.testing.assert_array_equal(loaded.cohort.bases, contract.cohort.bases)
+
+
+def test_the_file_is_private_and_alone(tmp_path: Path) -> None:
+    path = saved(tmp_path)
+    saved(tmp_path)
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert [entry.name for entry in tmp_path.iterdir()] == ["contract.json"]
+
+
+def test_a_failed_write_leaves_the_old_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = saved(tmp_path)
+    before = path.read_bytes()
+
+    def fail(_: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("os.fsync", fail)
+    with pytest.raises(OSError, match="No space left"):
+        make_contract(photo_consistency=0.5).save(path, SEALER)
+    assert path.read_bytes() == before
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_the_cohort_is_sealed_and_never_public(tmp_path: Path) -> None:
+    contract = make_contract()
+    text = saved(tmp_path, contract).read_bytes()
+    patterns = [
+        array[0].astype(dtype).tobytes()
+        for array in (contract.cohort.feet, contract.cohort.bases, contract.nobody.people)
+        for dtype in ("<f4", "<f2", "<f8")
+    ]
+    raw = text + base64.b64decode(json.loads(text)["cohort"])
+    assert not any(pattern in raw for pattern in patterns)
+    # Positive control: the same search finds a number that was planted.
+    assert any(pattern in raw + contract.cohort.feet.tobytes() for pattern in patterns)
+    public = json.dumps(contract.public())
+    assert "cohort" not in contract.public()
+    assert repr(float(contract.cohort.feet[0, 0])) not in public
+    assert "cohort=" not in repr(contract)
+
+
+def test_another_master_key_does_not_open_it(tmp_path: Path) -> None:
+    other = KeyringSealer(MasterKeyring([os.urandom(32)]))
+    with pytest.raises(SealError, match="master key is not the one"):
+        Contract.load(saved(tmp_path), other)
+
+
+def reloaded(path: Path, document: Any) -> Contract:
+    path.write_text(json.dumps(document))
+    return Contract.load(path, SEALER)
+
+
+def test_edited_thresholds_do_not_load(tmp_path: Path) -> None:
+    path = saved(tmp_path)
+    document = json.loads(path.read_text())
+    document["calibrations"][0]["levels"][0]["similarity_threshold"] = -1.0
+    with pytest.raises(SealError, match="the file was edited"):
+        reloaded(path, document)
+    # An attacker can recompute the public ids, but not the seal over them.
+    edited = Calibration.from_json(document["calibrations"][0]).identified(
+        contract_id=document["contract_id"], cohort_id=document["cohort_id"]
+    )
+    document["calibrations"][0] = edited.to_json()
+    with pytest.raises(SealError, match="the file was edited"):
+        reloaded(path, document)
+
+
+def test_formatting_may_change(tmp_path: Path) -> None:
+    path = saved(tmp_path)
+    document = json.loads(path.read_text())
+    path.write_text(json.dumps(dict(reversed(document.items())), indent=7))
+    assert Contract.load(path, SEALER).contract_id == make_contract().contract_id
+
+
+MUTATIONS: list[tuple[str, Any]] = [
+    ("format", "other"),
+    ("version", 1),
+    ("version", True),
+    ("contract_id", "0" * 64),
+    ("cohort", "!!!"),
+    ("cohort", 3),
+    ("cohort", ""),
+    ("cohort_size", 6),
+    ("cohort_id", "0" * 64),
+    ("photo_consistency", "0.25"),
+    ("photo_consistency", 1e400),
+    ("photo_consistency", None),
+    ("template_foot_point_norm", [0.1]),
+    ("template_foot_point_norm", [0.1, True]),
+    ("template_stranger_score", "1.5"),
+    ("template_stranger_score", 1e400),
+    ("calibrations", {}),
+    ("calibrations", [[]]),
+    ("binding", []),
+    ("binding", {}),
+    ("recorded", []),
+    ("recorded", {"a": {"b": {"c": {"d": {"e": {}}}}}}),
+    ("recorded", {"a": "x" * 5000}),
+    ("recorded", {"a": "\ud800"}),
+    ("default_level", "nope"),
+    ("default_level", 10**30),
+    ("surprise", 1),
+]
+
+
+@pytest.mark.parametrize(("key", "value"), MUTATIONS)
+def test_broken_files_are_refused(tmp_path: Path, key: str, value: Any) -> None:
+    path = saved(tmp_path)
+    document = json.loads(path.read_text())
+    with pytest.raises((ContractError, SealError)):
+        reloaded(path, document | {key: value})
+
+
+@pytest.mark.parametrize("key", sorted(json.loads(canonical_json(make_contract().public()))))
+def test_missing_keys_are_refused(tmp_path: Path, key: str) -> None:
+    path = saved(tmp_path)
+    document = json.loads(path.read_text())
+    del document[key]
+    with pytest.raises((ContractError, SealError)):
+        reloaded(path, document)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"[]",
+        b"null",
+        b"\xff\xfe",
+        b"{",
+        b'{"format": NaN}',
+        b'{"format": "a", "format": "b"}',
+        b"[" * 100_000,
+        b'{"a":' * 100_000,
+        b'{"version": ' + b"9" * 5000 + b"}",
+    ],
+    ids=range(10),
+)
+def test_what_is_no_json_object_is_refused(tmp_path: Path, data: bytes) -> None:
+    path = tmp_path / "contract.json"
+    path.write_bytes(data)
+    with pytest.raises(ContractError):
+        Contract.load(path, SEALER)
+
+
+def test_size_is_bounded_before_parsing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = saved(tmp_path)
+    monkeypatch.setattr(contract_module, "MAX_FILE_BYTES", path.stat().st_size - 1)
+    with pytest.raises(ContractError, match="larger than"):
+        Contract.load(path, SEALER)
+
+
+def test_an_absent_file_names_the_remedy(tmp_path: Path) -> None:
+    with pytest.raises(ContractError, match="veilface calibrate"):
+        Contract.load(tmp_path / "none.json", SEALER)
+    with pytest.raises(ContractError):
+        Contract.load(tmp_path, SEALER)
+
+
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner),
+    max_leaves=6,
+)
+
+
+@settings(
+    max_examples=150,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+@given(st.data())
+def test_no_edit_of_a_value_is_accepted(tmp_path: Path, data: st.DataObject) -> None:
+    path = saved(tmp_path)
+    document = json.loads(path.read_text())
+    place: Any = document
+    while True:
+        keys = sorted(place) if isinstance(place, dict) else list(range(len(place)))
+        key = data.draw(st.sampled_from(keys))
+        if isinstance(place[key], dict | list) and place[key] and data.draw(st.booleans()):
+            place = place[key]
+            continue
+        break
+    value = data.draw(json_values)
+    if value == place[key]:
+        return
+    place[key] = value
+    with pytest.raises((ContractError, SealError)):
+        reloaded(path, document)
+
+
+def test_a_cohort_that_is_no_cohort_is_refused(tmp_path: Path) -> None:
+    path = saved(tmp_path)
+    document = json.loads(path.read_text())
+    sealed = document.pop("cohort")
+    context = contract_module._seal_context(document)
+    good = SEALER.open(base64.b64decode(sealed), context=context)
+    feet, bases = np.zeros((5, N), np.float32), np.zeros((5, M, N), np.float32)
+    endless = np.full_like(bases, 3e38)
+    endless[:, :, ::2] *= -1
+    rest = make_nobody().tensors()
+    whole = safetensors.numpy.load(good)
+    for plain in (
+        b"",
+        safetensors.numpy.save(whole | {"people": rest["people"].astype(np.float64)}),
+        safetensors.numpy.save(whole | {"people": rest["people"][0]}),
+        safetensors.numpy.save(whole | {"people": rest["people"][:5]}),
+        safetensors.numpy.save(whole | {"generator": rest["generator"][:-1]}),
+        safetensors.numpy.save(whole | {"generator": rest["generator"].astype(np.float32)}),
+        safetensors.numpy.save(whole | {"spreads": rest["spreads"].astype(np.float16)}),
+        good[:-1],
+        safetensors.numpy.save({"feet": feet}),
+        safetensors.numpy.save({"feet": feet, "bases": bases[:4]} | rest),
+        safetensors.numpy.save({"feet": feet.astype(np.float64), "bases": bases} | rest),
+        safetensors.numpy.save({"feet": feet, "bases": bases, "more": feet} | rest),
+        safetensors.numpy.save({"feet": np.array(1, dtype=np.float32), "bases": bases} | rest),
+        safetensors.numpy.save({"feet": feet, "bases": bases} | rest),
+        # Products of these overflow, to infinities whose difference no tolerance refuses.
+        safetensors.numpy.save({"feet": feet, "bases": endless} | rest),
+        safetensors.numpy.save({"feet": feet + np.float32(3e38), "bases": endless} | rest),
+    ):
+        text = base64.b64encode(SEALER.seal(plain, context=context)).decode()
+        with pytest.raises(ContractError):
+            reloaded(path, document | {"cohort": text})
+
+
+def test_frozen() -> None:
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        make_contract().photo_consistency = 0.0  # type: ignore[misc]
+
+
+def test_a_file_of_more_values_than_any_contract_has_is_not_parsed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = saved(tmp_path)
+    document = json.loads(path.read_text())
+    wide = tmp_path / "wide.json"
+    wide.write_text(json.dumps(document | {"recorded": {"a": [[]] * MAX_PARTS}}))
+    with monkeypatch.context() as patch:
+        patch.setattr("templates.canonical.json.loads", None)
+        with pytest.raises(ContractError, match="more than 100000 values"):
+            Contract.load(wide, SEALER)
+    assert Contract.load(path, SEALER).contract_id == document["contract_id"]
+
+
+def test_the_largest_contract_has_fewer_values_than_are_read() -> None:
+    levels = tuple(Level(f"level-{i}", 1e-2, 0.3, 2.0, RATE, RATE) for i in range(MAX_LEVELS))
+    entries = tuple(
+        make_calibration(mode="s2s", probe_m=m, foot_point_norm=(0.2, 0.9), levels=levels)
+        for m in range(1, MAX_CALIBRATIONS + 1)
+    )
+    binding = make_binding(n=MAX_CALIBRATIONS + 2)
+    largest = make_contract(
+        binding=binding,
+        calibrations=entries,
+        cohort=make_cohort(n=binding.n),
+        nobody=make_nobody(binding.n),
+        default_level="level-0",
+        recorded={str(i): i for i in range(MAX_ITEMS)},
+    )
+    assert not too_many_parts(json.dumps(largest.public()).encode(), MAX_PARTS // 2)

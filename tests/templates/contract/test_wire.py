@@ -1,0 +1,379 @@
+import json
+import re
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import safetensors.numpy
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from templates.contract.wire import (
+    MAX_HEADER_BYTES,
+    WireDtype,
+    WireTemplate,
+    decode,
+    encode,
+    encoded_size,
+    size_limit,
+)
+from templates.distances import Metric, pairwise_distances
+from templates.errors import InvalidTemplate
+from templates.keys.randomness import Keystream
+from templates.space.lifting import lift
+from templates.space.subspace import AffineSubspace, SubspaceBatch
+
+CONTRACT = "0123456789abcdef" * 4
+DTYPES: tuple[WireDtype, ...] = ("float16", "float32")
+
+
+def template(n: int = 24, m: int = 5, seed: int = 0) -> AffineSubspace:
+    stream = Keystream.seeded("wire", seed)
+    descriptor = stream.normal((1, n))
+    descriptor /= np.linalg.norm(descriptor)
+    return lift(descriptor, strategy="random", m=m, stream=stream)[0]
+
+
+def packed(header: object, payload: bytes = b"") -> bytes:
+    text = header if isinstance(header, bytes) else json.dumps(header).encode()
+    return struct.pack("<Q", len(text)) + text + payload
+
+
+def parts(data: bytes) -> tuple[dict, bytes]:
+    length = struct.unpack("<Q", data[:8])[0]
+    return json.loads(data[8 : 8 + length]), data[8 + length :]
+
+
+@given(
+    n=st.integers(2, 60),
+    m_part=st.floats(0, 1),
+    dtype=st.sampled_from(DTYPES),
+    seed=st.integers(0, 10**6),
+)
+def test_round_trip_keeps_the_set(n: int, m_part: float, dtype: WireDtype, seed: int):
+    m = 1 + int(m_part * (n - 2))
+    original = template(n, m, seed)
+    data = encode(original, contract_id=CONTRACT, dtype=dtype)
+    assert len(data) == encoded_size(n, m, dtype)
+    read = decode(data)
+    assert (read.contract_id, read.dtype) == (CONTRACT, dtype)
+    read.subspace.validate(1e-6)
+    # The projections on both sets, which do not depend on the basis.
+    points = Keystream.seeded(seed, "points").normal((4, n))
+    atol = {"float16": 2e-3, "float32": 1e-6}[dtype] * np.sqrt(m) * np.abs(points).max()
+    np.testing.assert_allclose(
+        read.subspace.project(points), original.project(points), atol=4 * atol
+    )
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_reading_removes_the_rounding_of_the_wire(dtype: WireDtype):
+    data = encode(template(128, 16), contract_id=CONTRACT, dtype=dtype)
+    raw = safetensors.numpy.load(data)["basis"].astype(np.float64)
+    read = decode(data).subspace
+    defect = np.abs(read.basis @ read.basis.T - np.eye(16)).max()
+    assert defect < 3e-7
+    if dtype == "float16":
+        assert np.abs(raw @ raw.T - np.eye(16)).max() > 3e-5
+
+
+@pytest.mark.parametrize("m", [3, 300])
+def test_rows_at_the_edge_of_the_tolerance_are_orthonormalised(m: int):
+    """Many rows that all lean the same way are further from orthonormal than any pair of them."""
+    n, lean = 400, 1.8e-3
+    rows = np.linalg.qr(np.random.default_rng(m).standard_normal((n, m + 1)))[0].T
+    gram = (1 - lean) * np.eye(m) + lean
+    leaning = np.linalg.cholesky(gram) @ rows[1:]
+    tensors = {"foot": (0.4 * rows[0]).astype("<f2"), "basis": leaning.astype("<f2")}
+    metadata = {"format": "veilface-template", "version": "1", "contract_id": CONTRACT}
+    data = safetensors.numpy.save(tensors, metadata=metadata)
+    basis = decode(data, max_m=m).subspace.basis.astype(np.float64)
+    np.testing.assert_allclose(basis @ basis.T, np.eye(m), atol=1e-6)
+    np.testing.assert_allclose(basis.T @ basis, rows[1:].T @ rows[1:], atol=2e-3)
+
+
+@pytest.mark.parametrize(("m", "near_zero"), [(4, 1e-3), (16, 4e-4)])
+def test_float16_moves_distances_by_little(m: int, near_zero: float):
+    stream = Keystream.seeded("f16")
+    points = stream.normal((40, 512))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    templates = lift(points, strategy="random", m=m, stream=stream)
+    read = SubspaceBatch.of([decode(encode(t, contract_id=CONTRACT)).subspace for t in templates])
+    for metric in Metric:
+        before = pairwise_distances(points, templates, metric=metric, dtype=np.float64)
+        after = pairwise_distances(points, read, metric=metric, dtype=np.float64)
+        own = np.eye(40, dtype=bool)
+        assert 1e-5 < after[own].max() < near_zero  # as docs/formats.md says
+        assert 1e-6 < np.abs(after - before)[~own].max() < 1e-4
+
+
+def test_equal_templates_give_equal_bytes():
+    one, two = (encode(template(), contract_id=CONTRACT) for _ in range(2))
+    assert one == two
+    assert one != encode(template(seed=1), contract_id=CONTRACT)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_the_library_reads_what_we_write(dtype: WireDtype):
+    original = template()
+    tensors = safetensors.numpy.load(encode(original, contract_id=CONTRACT, dtype=dtype))
+    assert tensors["basis"].dtype == np.dtype(dtype)
+    np.testing.assert_array_equal(tensors["basis"], original.basis.astype(dtype))
+    np.testing.assert_array_equal(tensors["foot"], original.foot.astype(dtype))
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_we_read_what_the_library_writes(dtype: WireDtype):
+    original = template()
+    tensors = {"foot": original.foot.astype(dtype), "basis": original.basis.astype(dtype)}
+    metadata = {"format": "veilface-template", "version": "1", "contract_id": CONTRACT}
+    data = safetensors.numpy.save(tensors, metadata=metadata)
+    assert parts(data)[0]["basis"]["data_offsets"][0] == 0  # the library puts the basis first
+    read = decode(data)
+    ours = decode(encode(original, contract_id=CONTRACT, dtype=dtype))
+    np.testing.assert_array_equal(read.subspace.basis, ours.subspace.basis)
+    np.testing.assert_array_equal(read.subspace.foot, ours.subspace.foot)
+
+
+def test_documented_sizes_are_true():
+    text = (Path(__file__).parents[3] / "docs" / "formats.md").read_text()
+    rows = re.findall(r"^\| (\d+) \| (\d+) \| ([\d,]+) \| ([\d,]+) \|$", text, re.MULTILINE)
+    assert len(rows) >= 5
+    for n, m, half, single in rows:
+        assert encoded_size(int(n), int(m), "float16") == int(half.replace(",", ""))
+        assert encoded_size(int(n), int(m), "float32") == int(single.replace(",", ""))
+    example = re.search(r"```json\n(.*?)```", text, re.DOTALL)
+    assert example is not None
+    documented = json.loads(example.group(1).replace("<64 lower-case hex digits>", CONTRACT))
+    assert documented == parts(encode(template(512, 32), contract_id=CONTRACT))[0]
+
+
+def test_what_cannot_be_written_is_refused():
+    good = template()
+    with pytest.raises(InvalidTemplate, match="contract id"):
+        encode(good, contract_id=CONTRACT.upper())
+    with pytest.raises(InvalidTemplate, match="float16 or float32"):
+        encode(good, contract_id=CONTRACT, dtype="float64")  # type: ignore[arg-type]
+    with pytest.raises(InvalidTemplate, match="not orthonormal"):
+        encode(AffineSubspace(good.foot, good.basis * 1.1), contract_id=CONTRACT)
+
+
+# --- hostile input -----------------------------------------------------------------------------
+
+
+def changed(path: tuple[str, ...], value: object) -> bytes:
+    """A template whose header has another value at ``path``."""
+    header, payload = parts(encode(template(), contract_id=CONTRACT))
+    target = header
+    for name in path[:-1]:
+        target = target[name]
+    if value is None:
+        del target[path[-1]]
+    else:
+        target[path[-1]] = value
+    return packed(header, payload)
+
+
+HEADERS = {
+    "other format": (("__metadata__", "format"), "pt"),
+    "other version": (("__metadata__", "version"), "2"),
+    "version as a number": (("__metadata__", "version"), 1),
+    "no contract": (("__metadata__", "contract_id"), None),
+    "short contract": (("__metadata__", "contract_id"), CONTRACT[:-1]),
+    "contract with a newline": (("__metadata__", "contract_id"), CONTRACT + "\n"),
+    "contract not a string": (("__metadata__", "contract_id"), [CONTRACT]),
+    "extra metadata": (("__metadata__", "note"), "x"),
+    "no metadata": (("__metadata__",), None),
+    "metadata as a list": (("__metadata__",), []),
+    "no foot": (("foot",), None),
+    "extra tensor": (("more",), {"dtype": "F16", "shape": [0], "data_offsets": [0, 0]}),
+    "extra member": (("foot", "strides"), [1]),
+    "integers": (("foot", "dtype"), "I16"),
+    "double": (("foot", "dtype"), "F64"),
+    "unequal dtypes": (("foot", "dtype"), "F32"),
+    "dtype as a list": (("foot", "dtype"), ["F16"]),
+    "foot of rank 2": (("foot", "shape"), [1, 24]),
+    "basis of rank 1": (("basis", "shape"), [120]),
+    "unequal n": (("foot", "shape"), [25]),
+    "huge n": (("basis", "shape"), [5, 2**40]),
+    "huge shape": (("basis", "shape"), [10**30, 10**30]),
+    "negative": (("basis", "shape"), [-5, -24]),
+    "zero m": (("basis", "shape"), [0, 24]),
+    "boolean": (("basis", "shape"), [True, 24]),
+    "float": (("basis", "shape"), [5.0, 24]),
+    "exponent": (("basis", "shape"), [5e0, 24]),
+    "not a number": (("basis", "shape"), [float("nan"), 24]),
+    "shape as a string": (("basis", "shape"), "ab"),
+    "overlap": (("basis", "data_offsets"), [0, 240]),
+    "gap": (("basis", "data_offsets"), [50, 290]),
+    "reversed": (("foot", "data_offsets"), [48, 0]),
+    "beyond the end": (("basis", "data_offsets"), [48, 10**9]),
+}
+
+
+@pytest.mark.parametrize("name", HEADERS)
+def test_each_wrong_header_is_refused(name: str):
+    path, value = HEADERS[name]
+    with pytest.raises(InvalidTemplate, match=r"^template refused: "):
+        decode(changed(path, value))
+
+
+def test_malformed_containers_are_refused():
+    good = encode(template(), contract_id=CONTRACT)
+    header, payload = parts(good)
+    text = json.dumps(header).encode()
+    twice = text.replace(b'{"dtype"', b'{"dtype": "F16", "dtype"', 1)
+    both_feet = text[:-1] + b', "foot": ' + json.dumps(header["foot"]).encode() + b"}"
+    deep = b'{"a":' + b"[" * 4000  # deeper than the parser recurses
+    for data, reason in (
+        (b"", "no header"),
+        (good[:7], "no header"),
+        (struct.pack("<Q", 2**63) + good[8:], "no header"),
+        (struct.pack("<Q", MAX_HEADER_BYTES + 1) + bytes(MAX_HEADER_BYTES + 1), "no header"),
+        (struct.pack("<Q", 4000) + good[8:300], "truncated"),
+        (packed(twice, payload), "names a member twice"),
+        (packed(both_feet, payload), "names a member twice"),
+        (packed(b"[]", payload), "not a JSON object"),
+        (packed(b" " + text, payload), "not a JSON object"),
+        (packed(b"{", payload), "not JSON"),
+        (packed(b"{\xff\xfe}", payload), "not JSON"),
+        (packed(deep, payload), "not JSON"),
+        (packed(b'{"a": ' + b"9" * 4080 + b"}", payload), "exactly the members"),
+        (packed(b'{"a": NaN}', payload), "not an integer"),
+        (packed(text, payload[:-1]), "do not fill the payload"),
+        (packed(text, payload + b"\0"), "do not fill the payload"),
+        (good + b"\0" * 8, "do not fill the payload"),
+    ):
+        with pytest.raises(InvalidTemplate, match=reason):
+            decode(data)
+
+
+def test_size_is_refused_before_anything_is_read():
+    with pytest.raises(InvalidTemplate, match="more than"):
+        decode(bytes(size_limit(4096, 128) + 1))
+    good = encode(template(24, 5), contract_id=CONTRACT)
+    assert decode(good, max_n=24, max_m=5).subspace.n == 24
+    for limits in ({"max_n": 23, "max_m": 5}, {"max_n": 24, "max_m": 4}):
+        with pytest.raises(InvalidTemplate, match="out of range"):
+            decode(good, **limits)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_wrong_numbers_are_refused(dtype: WireDtype):
+    good = template()
+    header, _ = parts(encode(good, contract_id=CONTRACT, dtype=dtype))
+
+    def with_numbers(foot: np.ndarray, basis: np.ndarray) -> bytes:
+        return packed(header, foot.astype(dtype).tobytes() + basis.astype(dtype).tobytes())
+
+    decode(with_numbers(good.foot, good.basis))
+    nan, infinite, zero = good.basis.copy(), good.basis.copy(), good.basis.copy()
+    nan[2, 3], infinite[0, 0], zero[1] = np.nan, -np.inf, 0
+    largest = np.full_like(good.foot, 6e4 if dtype == "float16" else 3e38)
+    for foot, basis, reason in (
+        (good.foot, nan, "not finite"),
+        (good.foot, infinite, "not finite"),
+        (good.foot * np.nan, good.basis, "not finite"),
+        (largest, good.basis, "larger than 1"),
+        (good.foot, good.basis * 1.01, "not orthonormal"),
+        (good.foot, zero, "not orthonormal"),
+        (good.foot, good.basis[[0, 0, 1, 2, 3]], "not orthonormal"),
+        (good.foot + 0.01 * good.basis[0], good.basis, "not orthogonal"),
+        (good.foot * (1.01 / good.foot_norm), good.basis, "outside the unit ball"),
+    ):
+        with pytest.raises(InvalidTemplate, match=reason):
+            decode(with_numbers(foot, basis))
+
+
+def test_a_set_through_the_origin_is_a_template():
+    """The format admits it; the contract's range of foot-point norms is the caller's check."""
+    good = template()
+    central = AffineSubspace(np.zeros_like(good.foot), good.basis)
+    assert decode(encode(central, contract_id=CONTRACT)).subspace.foot_norm == 0
+
+
+def read_or_refused(data: bytes) -> WireTemplate | None:
+    try:
+        read = decode(data, max_n=64, max_m=16)
+    except InvalidTemplate as error:
+        refusal = error
+    else:
+        read.subspace.validate(1e-6)
+        return read
+    assert str(refusal).startswith("template refused: ")
+    assert len(str(refusal)) < 200
+    assert refusal.__cause__ is None
+    return None
+
+
+GOOD = {dtype: encode(template(), contract_id=CONTRACT, dtype=dtype) for dtype in DTYPES}
+
+
+@settings(max_examples=300)
+@given(data=st.binary(max_size=300))
+def test_random_bytes_are_refused(data: bytes):
+    assert read_or_refused(data) is None
+
+
+@settings(max_examples=300)
+@given(text=st.binary(max_size=200), payload=st.binary(max_size=100))
+def test_random_headers_are_refused(text: bytes, payload: bytes):
+    assert read_or_refused(packed(b"{" + text, payload)) is None
+
+
+@settings(max_examples=400)
+@given(
+    dtype=st.sampled_from(DTYPES),
+    flips=st.lists(st.integers(0, 8 * len(GOOD["float16"]) - 1), min_size=1, max_size=4),
+)
+def test_bit_flips_never_escape(dtype: WireDtype, flips: list[int]):
+    data = bytearray(GOOD[dtype])
+    for flip in flips:
+        data[flip // 8] ^= 1 << flip % 8
+    read_or_refused(bytes(data))
+
+
+@settings(max_examples=200)
+@given(dtype=st.sampled_from(DTYPES), part=st.floats(0, 1, exclude_max=True))
+def test_truncations_are_refused(dtype: WireDtype, part: float):
+    assert read_or_refused(GOOD[dtype][: int(part * len(GOOD[dtype]))]) is None
+
+
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=10),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=6), inner),
+    max_leaves=8,
+)
+
+
+@settings(max_examples=300)
+@given(
+    path=st.sampled_from(
+        [(name,) for name in ("__metadata__", "foot", "basis")]
+        + [(t, k) for t in ("foot", "basis") for k in ("dtype", "shape", "data_offsets")]
+        + [("__metadata__", k) for k in ("format", "version", "contract_id")]
+    ),
+    value=json_values.filter(lambda value: value is not None),
+)
+def test_any_json_in_the_header_is_refused(path: tuple[str, ...], value: object):
+    assert read_or_refused(changed(path, value)) is None
+
+
+@settings(max_examples=200)
+@given(payload=st.binary(min_size=288, max_size=288))
+def test_random_numbers_are_refused(payload: bytes):
+    header, _ = parts(GOOD["float16"])
+    assert read_or_refused(packed(header, payload)) is None
+
+
+@pytest.mark.parametrize(
+    ("dtype", "number"), [("float16", b"\x01\x7c"), ("float32", b"\x01\x00\x80\x7f")]
+)
+def test_a_signalling_nan_is_refused_and_not_warned_of(dtype: WireDtype, number: bytes):
+    data = encode(template(), contract_id=CONTRACT, dtype=dtype)
+    start = len(data) - len(parts(data)[1])
+    for at in (start, len(data) - len(number)):
+        broken = data[:at] + number + data[at + len(number) :]
+        with pytest.raises(InvalidTemplate, match="not finite"):
+            decode(broken)

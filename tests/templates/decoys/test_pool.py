@@ -1,0 +1,384 @@
+"""The sealed pool of real descriptors."""
+
+import itertools
+import traceback
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from templates.decoys import (
+    Attributes,
+    DecoyGenerator,
+    DecoyPool,
+    DecoySource,
+    container,
+    load_source,
+)
+from templates.decoys.pool import POOL_CONTEXT, POOL_MAGIC
+from templates.errors import DecoyError, SealError
+from templates.keys.randomness import Keystream
+from templates.keys.sealing import KeyringSealer, MasterKeyring
+
+GENDERS = ("Female", "Male")
+RACES = ("Black", "East Asian", "Indian", "White")
+
+
+def unit_rows(count: int, n: int, seed: int = 0) -> NDArray[np.float32]:
+    x = np.random.default_rng(seed).normal(size=(count, n))
+    return (x / np.linalg.norm(x, axis=1, keepdims=True)).astype(np.float32)
+
+
+def cross_labels(count: int) -> list[Attributes]:
+    every = itertools.cycle(itertools.product(GENDERS, RACES))
+    return [Attributes(*next(every)) for _ in range(count)]
+
+
+@pytest.fixture(scope="module")
+def pool() -> DecoyPool:
+    return DecoyPool(unit_rows(80, 16), labels=cross_labels(80))
+
+
+@pytest.fixture
+def sealer(tmp_path: Path) -> KeyringSealer:
+    return KeyringSealer(MasterKeyring.create(tmp_path / "master.key"))
+
+
+def indices(pool_rows: NDArray[np.float32], drawn: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Which entry each drawn row is, by exact comparison."""
+    number = {row.tobytes(): i for i, row in enumerate(pool_rows)}
+    flat = drawn.reshape(-1, drawn.shape[-1])
+    return np.array([number[row.tobytes()] for row in flat]).reshape(drawn.shape[:-1])
+
+
+def test_draws_are_entries_and_never_repeat_inside_a_row(pool: DecoyPool) -> None:
+    drawn = pool.draw(200, 20, stream=Keystream.seeded("pool"))
+    assert drawn.shape == (200, 20, 16)
+    assert drawn.dtype == np.float32
+    assert drawn.flags.c_contiguous
+    chosen = indices(unit_rows(80, 16), drawn)
+    assert all(len(set(row)) == 20 for row in chosen.tolist())
+    # Every entry is drawn about 50 times of 4,000; a binomial count outside 15 … 95 is a fault.
+    counts = np.bincount(chosen.ravel(), minlength=80)
+    assert counts.min() > 15
+    assert counts.max() < 95
+
+
+def test_the_whole_pool_can_be_drawn_and_no_more(pool: DecoyPool) -> None:
+    chosen = indices(unit_rows(80, 16), pool.draw(1, 80, stream=Keystream.seeded(1)))
+    assert sorted(chosen[0].tolist()) == list(range(80))
+    with pytest.raises(DecoyError, match="81 decoys are needed, but only 80"):
+        pool.draw(1, 81, stream=Keystream.seeded(1))
+
+
+def test_draws_depend_on_the_stream_only(pool: DecoyPool) -> None:
+    first = pool.draw(3, 5, stream=Keystream.seeded("a"))
+    assert np.array_equal(first, pool.draw(3, 5, stream=Keystream.seeded("a")))
+    assert not np.array_equal(first, pool.draw(3, 5, stream=Keystream.seeded("b")))
+
+
+def test_empty_requests_give_empty_arrays(pool: DecoyPool) -> None:
+    assert pool.draw(0, 4, stream=Keystream.seeded(1)).shape == (0, 4, 16)
+    assert pool.draw(4, 0, stream=Keystream.seeded(1)).shape == (4, 0, 16)
+    with pytest.raises(DecoyError, match="negative"):
+        pool.draw(-1, 4, stream=Keystream.seeded(1))
+
+
+@pytest.mark.parametrize(
+    "subject",
+    [
+        Attributes("Male", "White"),
+        Attributes("Male", None),
+        Attributes(None, "Indian"),
+        Attributes(None, None),
+        Attributes("Male", "a race the pool does not know"),
+    ],
+)
+def test_unlike_differs_in_gender_and_in_race(pool: DecoyPool, subject: Attributes) -> None:
+    labels = cross_labels(80)
+    drawn = pool.draw(50, 8, stream=Keystream.seeded("unlike"), unlike=[subject] * 50)
+    chosen = indices(unit_rows(80, 16), drawn)
+    seen = {labels[i] for i in chosen.ravel().tolist()}
+    allowed = {
+        Attributes(g, r)
+        for g in GENDERS
+        for r in RACES
+        if g != subject.gender and r != subject.race
+    }
+    assert seen == allowed
+    assert all(len(set(row)) == 8 for row in chosen.tolist())
+
+
+def test_unlike_follows_each_row(pool: DecoyPool) -> None:
+    labels = cross_labels(80)
+    subjects = [Attributes(g, r) for g in GENDERS for r in RACES]
+    drawn = pool.draw(8, 6, stream=Keystream.seeded("rows"), unlike=subjects)
+    for subject, row in zip(subjects, indices(unit_rows(80, 16), drawn).tolist(), strict=True):
+        assert all(labels[i].gender != subject.gender for i in row)
+        assert all(labels[i].race != subject.race for i in row)
+
+
+def test_an_entry_of_unknown_gender_is_not_of_another_gender() -> None:
+    labels = [Attributes(None, "White")] * 10 + [Attributes("Female", "White")] * 10
+    pool = DecoyPool(unit_rows(20, 8), labels=labels)
+    drawn = pool.draw(5, 10, stream=Keystream.seeded(1), unlike=[Attributes("Male", "Black")] * 5)
+    assert indices(unit_rows(20, 8), drawn).min() >= 10
+    with pytest.raises(DecoyError, match="only 10 entries"):
+        pool.draw(1, 11, stream=Keystream.seeded(1), unlike=[Attributes("Male", "Black")])
+
+
+def test_unlike_needs_labels_and_one_entry_per_row(pool: DecoyPool) -> None:
+    plain = DecoyPool(unit_rows(20, 8))
+    with pytest.raises(DecoyError, match="needs a decoy pool with gender and race labels"):
+        plain.draw(1, 2, stream=Keystream.seeded(1), unlike=[Attributes("Male", "White")])
+    with pytest.raises(DecoyError, match="1 attributes for 2 rows"):
+        pool.draw(2, 2, stream=Keystream.seeded(1), unlike=[Attributes("Male", "White")])
+
+
+@given(count=st.integers(1, 120), data=st.data())
+@settings(max_examples=40)
+def test_parts_are_disjoint_and_cover_the_pool(count: int, data: st.DataObject) -> None:
+    parts_wanted = data.draw(st.integers(1, count))
+    parts = DecoyPool(unit_rows(count, 4)).parts(parts_wanted)
+    assert len(parts) == parts_wanted
+    assert sorted(np.concatenate(parts).tolist()) == list(range(count))
+    sizes = [len(part) for part in parts]
+    assert max(sizes) - min(sizes) <= 1
+
+
+def test_the_split_is_a_function_of_the_pool_and_looks_random(pool: DecoyPool) -> None:
+    again = DecoyPool(unit_rows(80, 16), labels=cross_labels(80))
+    other = DecoyPool(unit_rows(80, 16, seed=1))
+    for mine, same in zip(pool.parts(4), again.parts(4), strict=True):
+        assert np.array_equal(mine, same)
+    assert not np.array_equal(pool.parts(4)[0], other.parts(4)[0])
+    assert not np.array_equal(pool.parts(1)[0], np.arange(80))
+
+
+def test_all_decoys_of_a_row_come_from_one_part(pool: DecoyPool) -> None:
+    drawn = pool.draw(60, 5, stream=Keystream.seeded("parts"), sub_databases=16)
+    part_of = {i: p for p, part in enumerate(pool.parts(16)) for i in part.tolist()}
+    rows = [{part_of[i] for i in row} for row in indices(unit_rows(80, 16), drawn).tolist()]
+    assert all(len(parts) == 1 for parts in rows)
+    assert len(set.union(*rows)) > 8
+    with pytest.raises(DecoyError, match="only 5 entries are in each of 16"):
+        pool.draw(1, 6, stream=Keystream.seeded(1), sub_databases=16)
+    with pytest.raises(DecoyError, match="cannot be split"):
+        pool.draw(1, 1, stream=Keystream.seeded(1), sub_databases=81)
+
+
+def test_unlike_and_sub_databases_exclude_each_other(pool: DecoyPool) -> None:
+    with pytest.raises(DecoyError, match="not both"):
+        pool.draw(1, 1, stream=Keystream.seeded(1), unlike=[Attributes()], sub_databases=2)
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        np.ones((3, 4), np.float32),
+        np.zeros((3, 4), np.float32),
+        np.full((3, 4), np.nan, np.float32),
+        np.full((3, 4), np.inf, np.float32),
+        np.ones(4, np.float32) / 2,
+        np.empty((0, 4), np.float32),
+        np.ones((3, 1), np.float32),
+    ],
+)
+def test_rows_that_are_no_descriptors_are_refused(rows: NDArray[np.float32]) -> None:
+    with pytest.raises(DecoyError):
+        DecoyPool(rows)
+
+
+def test_draws_are_unit_and_a_loaded_pool_keeps_its_id() -> None:
+    rough = unit_rows(50, 16) * np.linspace(0.9991, 1.0009, 50, dtype=np.float32)[:, None]
+    pool = DecoyPool(rough)
+    drawn = pool.draw(1, 50, stream=Keystream.seeded(1))[0]
+    norms = np.linalg.norm(drawn.astype(np.float64), axis=1)
+    np.testing.assert_allclose(norms, 1.0, rtol=0, atol=2.0**-23)
+    ordered = drawn[np.argsort((drawn @ rough.T).argmax(axis=1))]
+    assert DecoyPool(ordered).source_id == pool.source_id
+
+
+def test_a_broken_container_does_not_chain_the_parsers_words() -> None:
+    header = b'{"a secret of the header": not JSON}'
+    with pytest.raises(DecoyError) as caught:
+        container.decode(len(header).to_bytes(8, "little") + header, what="pool", max_bytes=999)
+    text = "".join(traceback.format_exception(caught.value))
+    assert "DecoyError" in text
+    assert "JSONDecodeError" not in text
+    assert caught.value.__suppress_context__
+
+
+def test_labels_must_fit() -> None:
+    with pytest.raises(DecoyError, match="2 labels for 3 descriptors"):
+        DecoyPool(unit_rows(3, 4), labels=[Attributes()] * 2)
+    with pytest.raises(DecoyError, match="labels must be"):
+        DecoyPool(unit_rows(1, 4), labels=[Attributes("x" * 65, None)])
+    with pytest.raises(DecoyError, match="labels must be"):
+        DecoyPool(unit_rows(300, 4), labels=[Attributes(None, str(i)) for i in range(300)])
+
+
+def test_the_caller_cannot_change_the_pool_afterwards() -> None:
+    rows = unit_rows(5, 4)
+    pool = DecoyPool(rows)
+    rows[:] = 0
+    assert np.allclose(np.linalg.norm(pool.draw(1, 5, stream=Keystream.seeded(1)), axis=2), 1)
+
+
+def test_the_id_names_descriptors_and_labels() -> None:
+    rows = unit_rows(10, 4)
+    labels = [Attributes("Male", "White")] * 10
+    ids = {
+        DecoyPool(rows).source_id,
+        DecoyPool(rows[::-1]).source_id,
+        DecoyPool(rows, labels=labels).source_id,
+        DecoyPool(rows, labels=[*labels[:9], Attributes("Male", None)]).source_id,
+    }
+    assert len(ids) == 4
+    assert DecoyPool(rows.astype(np.float64)).source_id in ids
+
+
+def test_the_entries_are_those_that_were_given_and_cannot_be_changed() -> None:
+    rows, labels = unit_rows(12, 8), cross_labels(12)
+    seen, names = DecoyPool(rows, labels=labels).entries
+    assert np.array_equal(seen, rows)
+    assert names == tuple(labels)
+    with pytest.raises(ValueError, match="read-only"):
+        seen[0, 0] = 1
+    with pytest.raises(ValueError, match="WRITEABLE"):
+        seen.flags.writeable = True
+    assert DecoyPool(rows).entries[1] is None
+
+
+@pytest.mark.parametrize("labelled", [True, False])
+def test_a_subset_keeps_rows_labels_and_what_made_them(labelled: bool) -> None:
+    rows, labels = unit_rows(30, 8), cross_labels(30)
+    pool = DecoyPool(rows, labels=labels if labelled else None, made_with="5a" * 32)
+    kept = np.array([29, 3, 7])
+    part = pool.subset(kept)
+    direct = DecoyPool(
+        rows[kept],
+        labels=[labels[i] for i in (29, 3, 7)] if labelled else None,
+        made_with="5a" * 32,
+    )
+    assert part.source_id == direct.source_id
+    assert part.entries[1] == direct.entries[1]
+    assert np.array_equal(part.entries[0], rows[kept])
+    assert pool.subset(range(30)).source_id == pool.source_id
+
+
+@pytest.mark.parametrize(
+    ("positions", "said"),
+    [
+        ([], "at least one entry"),
+        ([0, 12], "numbered from 0 to 11"),
+        ([-1], "numbered from 0 to 11"),
+        ([0.5], "numbered from 0 to 11"),
+        ([1, 2, 1], "named twice"),
+    ],
+)
+def test_a_subset_of_other_than_entries_is_refused(positions: list[int], said: str) -> None:
+    with pytest.raises(DecoyError, match=said):
+        DecoyPool(unit_rows(12, 8)).subset(positions)
+
+
+@pytest.mark.parametrize("labelled", [True, False])
+def test_save_and_load(tmp_path: Path, sealer: KeyringSealer, labelled: bool) -> None:
+    labels = [*cross_labels(28), Attributes(None, "White"), Attributes("Male", None)]
+    pool = DecoyPool(unit_rows(30, 8), labels=labels if labelled else None)
+    path = tmp_path / "decoys.veil"
+    pool.save(path, sealer)
+    loaded = load_source(path, sealer)
+    assert isinstance(loaded, DecoyPool)
+    assert isinstance(loaded, DecoySource)
+    assert loaded.source_id == pool.source_id
+    assert loaded.labelled is labelled
+    stream, same = Keystream.seeded(1), Keystream.seeded(1)
+    assert np.array_equal(pool.draw(4, 6, stream=stream), loaded.draw(4, 6, stream=same))
+    if labelled:
+        unlike = [Attributes("Male", "White")] * 4
+        ours = pool.draw(4, 3, stream=stream, unlike=unlike)
+        assert np.array_equal(ours, loaded.draw(4, 3, stream=same, unlike=unlike))
+
+
+def test_the_file_is_private_and_shows_no_descriptor(tmp_path: Path, sealer: KeyringSealer) -> None:
+    rows = unit_rows(30, 8)
+    path = tmp_path / "decoys.veil"
+    DecoyPool(rows, labels=cross_labels(30)).save(path, sealer)
+    data = path.read_bytes()
+    assert path.stat().st_mode & 0o777 == 0o600
+    assert data.startswith(POOL_MAGIC)
+    assert not any(row.tobytes() in data for row in rows)
+    assert b"East Asian" not in data
+    # Positive control: the plaintext under the seal holds both.
+    plain = sealer.open(data[len(POOL_MAGIC) :], context=POOL_CONTEXT)
+    assert all(row.tobytes() in plain for row in rows)
+    assert b"East Asian" in plain
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["decoys.veil", "master.key"]
+
+
+@pytest.mark.parametrize("labelled", [True, False])
+def test_what_made_the_descriptors_is_sealed_with_them(
+    tmp_path: Path, sealer: KeyringSealer, labelled: bool
+) -> None:
+    labels = cross_labels(20) if labelled else None
+    ids = set()
+    for made_with in (None, "5a" * 32, "5b" * 32):
+        pool = DecoyPool(unit_rows(20, 8), labels=labels, made_with=made_with)
+        pool.save(tmp_path / "p", sealer)
+        loaded = load_source(tmp_path / "p", sealer)
+        assert loaded.made_with == made_with
+        assert loaded.source_id == pool.source_id
+        ids.add(pool.source_id)
+    assert len(ids) == 3
+    with pytest.raises(DecoyError, match="made_with must be 64"):
+        DecoyPool(unit_rows(20, 8), made_with="5A" * 32)
+
+
+@pytest.mark.parametrize("value", [None, 1, "5A" * 32])
+def test_a_hostile_made_with_under_the_seal_is_refused(
+    tmp_path: Path, sealer: KeyringSealer, value: object
+) -> None:
+    fields = {"format": "veilface decoy pool", "version": 1, "made_with": value}
+    data = container.encode(fields, {"descriptors": unit_rows(20, 8)})  # type: ignore[arg-type]
+    (tmp_path / "p").write_bytes(POOL_MAGIC + sealer.seal(data, context=POOL_CONTEXT))
+    with pytest.raises(DecoyError, match="made_with must be 64"):
+        load_source(tmp_path / "p", sealer)
+
+
+def test_broken_files_are_refused(tmp_path: Path, sealer: KeyringSealer) -> None:
+    path = tmp_path / "decoys.veil"
+    DecoyPool(unit_rows(30, 8)).save(path, sealer)
+    good = path.read_bytes()
+    (tmp_path / "other").mkdir()
+    stranger = KeyringSealer(MasterKeyring.create(tmp_path / "other" / "master.key"))
+    with pytest.raises(SealError):
+        DecoyPool.load(path, stranger)
+    for broken in (good[:-1], good[:-1] + bytes([good[-1] ^ 1]), POOL_MAGIC):
+        path.write_bytes(broken)
+        with pytest.raises(SealError):
+            load_source(path, sealer)
+    for broken in (b"", b"VEILFACE DECOY POOL 2\n" + good):
+        path.write_bytes(broken)
+        with pytest.raises(DecoyError):
+            load_source(path, sealer)
+    with pytest.raises(DecoyError, match="not a decoy pool"):
+        DecoyPool.load(path, sealer)
+    with pytest.raises(DecoyError, match=r"cannot read missing\.veil"):
+        load_source(tmp_path / "missing.veil", sealer)
+
+
+def test_sealed_content_is_still_checked(tmp_path: Path, sealer: KeyringSealer) -> None:
+    """A seal says who wrote it, not that it is a pool."""
+    generator = DecoyGenerator.fit(unit_rows(200, 8))
+    path = tmp_path / "decoys.veil"
+    path.write_bytes(POOL_MAGIC + sealer.seal(generator.to_bytes(), context=POOL_CONTEXT))
+    with pytest.raises(DecoyError, match="not a decoy pool"):
+        load_source(path, sealer)
+
+
+def test_no_number_of_a_descriptor_is_in_a_representation(pool: DecoyPool) -> None:
+    assert repr(pool) == f"DecoyPool(80 labelled entries, n=16, id {pool.source_id[:12]})"

@@ -1,0 +1,461 @@
+import functools
+import itertools
+import tracemalloc
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import scipy.linalg
+import scipy.optimize
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from templates import crossgram, tiles
+from templates.distances import (
+    DEFAULT_STEPS,
+    Metric,
+    paired_distances,
+    pairwise_distances,
+    similarity,
+)
+from templates.errors import InvalidEmbedding, InvalidTemplate, TemplateError
+from templates.keys.randomness import Keystream
+from templates.space.lifting import lift
+from templates.space.subspace import AffineSubspace, SubspaceBatch
+
+N = 24
+METRICS = [str(metric) for metric in Metric]
+DTYPES = ["float32", "float64"]
+
+
+def units(stream: Keystream, count: int, n: int = N) -> np.ndarray:
+    rows = stream.normal((count, n))
+    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+
+
+def through(members: np.ndarray, seed: int = 0) -> AffineSubspace:
+    """The set that holds all members."""
+    return AffineSubspace.through(
+        members[0], members[1:] - members[0], stream=Keystream.seeded("through", seed)
+    )
+
+
+def randoms(count: int, m: int, seed: int, n: int = N) -> SubspaceBatch:
+    stream = Keystream.seeded("randoms", seed)
+    return lift(units(stream, count, n), strategy="random", m=m, stream=stream)
+
+
+def faces(count: int, m: int, seed: int, n: int = 128) -> SubspaceBatch:
+    """Adversarial lifts among descriptors that are spread like faces: a mean, a steep spectrum."""
+    stream = Keystream.seeded("faces", seed)
+    scales = 1 / np.sqrt(1 + np.arange(n) / 8)
+    rows = stream.normal((count * (m + 1), n)) * scales + 0.3 * (np.arange(n) == 0)
+    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+    members = rows.reshape(count, m + 1, n)
+    return SubspaceBatch.through(members[:, 0], members[:, 1:] - members[:, :1], stream=stream)
+
+
+# --- independent computations, in float64 ------------------------------------------------------
+
+
+def brute_euclidean(a: AffineSubspace, b: AffineSubspace) -> float:
+    """Least squares by singular values; directions equal up to float32 storage count once."""
+    gap = b.foot.astype(np.float64) - a.foot
+    rows = np.vstack([a.basis, b.basis]).astype(np.float64)
+    solution = scipy.linalg.lstsq(rows.T, gap, cond=1e-6)[0]
+    return float(np.linalg.norm(gap - rows.T @ solution))
+
+
+def brute_spherical(a: AffineSubspace, b: AffineSubspace, restarts: int = 8) -> float:
+    """Quasi-Newton minimisation over both spheres from random starts."""
+    p, q = a.foot.astype(np.float64), b.foot.astype(np.float64)
+    d, e = a.basis.astype(np.float64), b.basis.astype(np.float64)
+
+    def gap(x: np.ndarray) -> float:
+        u, v = x[: a.m] / np.linalg.norm(x[: a.m]), x[a.m :] / np.linalg.norm(x[a.m :])
+        return float(np.sum((p + a.radius * d.T @ u - q - b.radius * e.T @ v) ** 2))
+
+    starts = Keystream.seeded("restarts").normal((restarts, a.m + b.m))
+    options = {"gtol": 1e-10}
+    best = min(
+        scipy.optimize.minimize(gap, start, method="BFGS", options=options).fun for start in starts
+    )
+    return float(np.sqrt(best))
+
+
+def brute_point(point: np.ndarray, b: AffineSubspace, metric: str) -> float:
+    offset = point - b.foot.astype(np.float64)
+    basis = b.basis.astype(np.float64)
+    inside = basis.T @ scipy.linalg.lstsq(basis.T, offset)[0]
+    if metric == "euclidean":
+        return float(np.linalg.norm(offset - inside))
+    # The nearest point of the sphere around the foot point lies towards the projection.
+    nearest = b.foot + b.radius * inside / np.linalg.norm(inside)
+    return float(np.linalg.norm(point - nearest))
+
+
+BRUTE: dict[str, Callable[[AffineSubspace, AffineSubspace], float]] = {
+    "euclidean": brute_euclidean,
+    "spherical": brute_spherical,
+}
+
+
+def pairs() -> dict[str, tuple[AffineSubspace, AffineSubspace]]:
+    """Pairs of subspaces in every relation that matters."""
+    stream = Keystream.seeded("pairs")
+    x = units(stream, 14)
+    axes = scipy.linalg.qr(stream.normal((N, N)))[0]
+
+    def of(foot: np.ndarray, basis: np.ndarray) -> AffineSubspace:
+        return AffineSubspace(foot, basis)
+
+    tilt = np.cos(1e-3) * axes[0] + np.sin(1e-3) * axes[1]
+    crossing = 0.5 * axes[9] + 0.3 * (np.cos(0.01) * axes[1] - np.sin(0.01) * axes[0])
+    crossed = np.cos(0.01) * axes[0] + np.sin(0.01) * axes[1]
+    plane = np.stack([axes[0], axes[1], axes[2]])
+    slight = np.cos(2e-5) * axes[0] + np.sin(2e-5) * axes[1]
+    return {
+        "random": (through(x[:4]), through(x[4:8])),
+        "unequal dimensions": (through(x[:3]), through(x[4:10])),
+        "lines": (through(x[:2]), through(x[2:4])),
+        "shared decoy": (through(x[:4]), through(x[3:7])),
+        "two shared decoys": (through(x[:5]), through(x[3:8])),
+        "contained": (through(x[:6]), through(x[1:4])),
+        "identical": (through(x[:4]), through(x[:4], seed=1)),
+        "orthogonal": (of(0.4 * axes[8], axes[:3]), of(0.5 * axes[9], axes[3:6])),
+        "parallel": (of(0.4 * axes[8], axes[:3]), of(0.5 * axes[9], axes[:3])),
+        "parallel, other basis": tuple(
+            AffineSubspace.through(foot, plane, stream=Keystream.seeded("plane", seed))
+            for seed, foot in enumerate((0.4 * axes[8], 0.5 * axes[9]))
+        ),
+        # The closest points are 30 away from the foot points: float32 products do not do.
+        "crossing far away": (of(0.4 * axes[8], axes[:1]), of(crossing, crossed[None])),
+        "one shared direction": (of(0.4 * axes[8], axes[:3]), of(0.5 * axes[9], axes[2:5])),
+        "nearly parallel": (of(0.4 * axes[8], axes[:1]), of(0.5 * axes[9], tilt[None])),
+        "very nearly parallel": (
+            of(0.4 * axes[8], axes[[0, 4]]),
+            of(0.5 * axes[9], np.stack([slight, axes[5]])),
+        ),
+        "central": (of(np.zeros(N), axes[:3]), through(x[:4])),
+        "close": (of(0.4 * axes[8], axes[:2]), of(0.4 * axes[8] + 0.02 * axes[9], axes[2:4])),
+    }
+
+
+MEETING = {"shared decoy", "two shared decoys", "contained", "identical"}
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("metric", METRICS)
+@pytest.mark.parametrize("name", pairs())
+def test_subspace_pairs_agree_with_brute_force(name: str, metric: str, dtype: str):
+    a, b = pairs()[name]
+    expected = BRUTE[metric](a, b)
+    for one, two in ((a, b), (b, a)):
+        seen = pairwise_distances(
+            SubspaceBatch.of([one]), SubspaceBatch.of([two]), metric=metric, dtype=dtype
+        )
+        assert seen.dtype == dtype
+        if name in MEETING:
+            assert 0 <= seen[0, 0] < (1e-6 if metric == "euclidean" else 1e-5)
+        else:
+            assert seen[0, 0] == pytest.approx(expected, rel=1e-4 if expected > 0.1 else 1e-3)
+
+
+@functools.cache
+def brute_table(metric: str) -> np.ndarray:
+    a, b = faces(3, 3, seed=1, n=16), faces(4, 2, seed=2, n=16)
+    return np.array([[BRUTE[metric](x, y) for y in b] for x in a])
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("metric", METRICS)
+def test_random_subspaces_agree_with_brute_force(metric: str, dtype: str):
+    a, b = faces(3, 3, seed=1, n=16), faces(4, 2, seed=2, n=16)
+    seen = pairwise_distances(a, b, metric=metric, dtype=dtype)
+    expected = brute_table(metric)
+    rtol = 1e-4 if dtype == "float32" else 1e-6
+    np.testing.assert_allclose(seen, expected, rtol=rtol)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("metric", METRICS)
+def test_points_agree_with_brute_force(metric: str, dtype: str):
+    stream = Keystream.seeded("points")
+    points = units(stream, 30)
+    templates = lift(units(stream, 12), strategy="random", m=5, stream=stream)
+    # Points of the sets, and points at 0.01 and 0.09 from one, where squares cancel.
+    near = [templates[i].project(points[i]) for i in range(6)]
+    near = [x / np.linalg.norm(x) for x in near]
+    member = templates.feet[0] + templates.radii[0] * templates.bases[0, 0].astype(np.float64)
+    for step in (0.01, 0.09):
+        moved = member + step * units(stream, 1)[0]
+        near.append(moved / np.linalg.norm(moved))
+    points = np.vstack([points, *near])
+    seen = pairwise_distances(points.astype(dtype), templates, metric=metric, dtype=dtype)
+    expected = np.array(
+        [[brute_point(x, t, metric) for t in templates] for x in points.astype(dtype)]
+    )
+    assert seen.dtype == dtype
+    assert expected.min() < 0.02
+    rtol, atol = (2e-5, 2e-6) if dtype == "float32" else (1e-7, 1e-7)
+    np.testing.assert_allclose(seen, expected, rtol=rtol, atol=atol)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("metric", METRICS)
+def test_a_member_is_at_distance_zero(metric: str, dtype: str):
+    stream = Keystream.seeded("members")
+    members = units(stream, 9)
+    template = SubspaceBatch.of([through(members)])
+    distances = pairwise_distances(members.astype(dtype), template, metric=metric, dtype=dtype)
+    assert (distances >= 0).all()
+    assert distances.max() < 1e-6
+    probes = lift(members, strategy="random", m=4, stream=stream)
+    distances = pairwise_distances(probes, template, metric=metric, dtype=dtype)
+    assert (distances >= 0).all()
+    assert distances.max() < (1e-6 if metric == "euclidean" else 2e-4)
+
+
+@pytest.mark.parametrize("metric", METRICS)
+def test_parallel_sets_are_not_at_distance_zero(metric: str):
+    """A singular system does not mean that the sets meet (docs/method.md §3.2)."""
+    a, b = pairs()["parallel"]
+    distance = pairwise_distances(SubspaceBatch.of([a]), SubspaceBatch.of([b]), metric=metric)
+    assert distance[0, 0] >= np.sqrt(0.4**2 + 0.5**2) * (1 - 1e-4)
+
+
+# --- convergence of the spherical iteration ----------------------------------------------------
+
+
+def hard_pairs() -> tuple[SubspaceBatch, SubspaceBatch]:
+    return faces(5, 16, seed=3), faces(6, 16, seed=4)
+
+
+@functools.cache
+def restarted_similarities(restarts: int) -> np.ndarray:
+    """Best of many random restarts of the plain alternation, 2000 steps, in float64."""
+    a, b = hard_pairs()
+    out = np.empty((len(a), len(b)))
+    for i, x in enumerate(a):
+        for j, y in enumerate(b):
+            p, q = x.foot.astype(np.float64), y.foot.astype(np.float64)
+            d, e = x.basis.astype(np.float64), y.basis.astype(np.float64)
+            g, h = x.radius * d @ q, y.radius * e @ p
+            middle = x.radius * y.radius * d @ e.T
+            v = Keystream.seeded("restart", i, j).normal((y.m, restarts))
+            for _ in range(2000):
+                u = g[:, None] + middle @ v
+                u /= np.linalg.norm(u, axis=0)
+                v = h[:, None] + middle.T @ u
+                v /= np.linalg.norm(v, axis=0)
+            values = g @ u + h @ v + np.sum(u * (middle @ v), axis=0)
+            out[i, j] = p @ q + values.max()
+    return out
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_default_steps_reach_the_best_of_many_restarts(dtype: str):
+    a, b = hard_pairs()
+    best = restarted_similarities(64)
+    seen = pairwise_distances(a, b, metric="spherical", dtype=dtype)
+    missing = best - similarity(seen)
+    assert np.abs(missing).max() < (2e-6 if dtype == "float32" else 1e-6)
+    # docs/method.md §3.5: many pairs unfinished after 10 plain steps; the data must be that hard.
+    few = best - similarity(pairwise_distances(a, b, metric="spherical", steps=3, dtype=dtype))
+    assert (few > 1e-4).mean() > 0.3
+
+
+@pytest.mark.parametrize("kind", ["faces", "crossing"])
+def test_more_steps_never_lower_the_similarity(kind: str):
+    # Subspaces of R⁸ with m = 5 cross; the extrapolation overshoots on many of them.
+    a, b = {
+        "faces": (faces(10, 8, seed=5), faces(10, 6, seed=6)),
+        "crossing": (randoms(40, 5, seed=1, n=8), randoms(40, 5, seed=2, n=8)),
+    }[kind]
+    similarities = [
+        similarity(pairwise_distances(a, b, metric="spherical", steps=steps, dtype=np.float64))
+        for steps in (1, 2, 3, 4, 5, 6, 7, 8, 13, 30, DEFAULT_STEPS, 200)
+    ]
+    far = similarities[-1] < 0.99  # nearer pairs get steps of their own in float64
+    assert far.sum() > 80
+    for before, after in itertools.pairwise(similarities):
+        assert (after[far] >= before[far] - 1e-12).all()
+    assert (similarities[-1] > similarities[0] + 1e-4)[far].any()
+
+
+def test_a_pair_has_one_distance_whatever_stands_beside_it():
+    a, b = faces(12, 8, seed=7), faces(9, 8, seed=8)
+    for metric in METRICS:
+        whole = pairwise_distances(a, b, metric=metric)
+        for i, j in ((0, 0), (5, 3), (11, 8)):
+            alone = pairwise_distances(a[i : i + 1], b[j : j + 1], metric=metric)
+            assert alone[0, 0] == pytest.approx(whole[i, j], abs=5e-6)
+
+
+# --- algebra -----------------------------------------------------------------------------------
+
+
+@settings(max_examples=25)
+@given(
+    m=st.integers(1, 6),
+    k=st.integers(1, 6),
+    seed=st.integers(0, 10**6),
+    metric=st.sampled_from(METRICS),
+)
+def test_distances_obey_the_order_of_the_sets(m: int, k: int, seed: int, metric: str):
+    stream = Keystream.seeded(seed)
+    x, y = units(stream, 3), units(stream, 4)
+    a = lift(x, strategy="random", m=m, stream=stream)
+    b = lift(y, strategy="random", m=k, stream=stream)
+    options = {"metric": metric, "dtype": np.float64}
+    subspaces = pairwise_distances(a, b, **options)
+    points = pairwise_distances(x, b, **options)
+    raw = np.linalg.norm(x[:, None] - y[None], axis=2)
+    assert np.isfinite(subspaces).all()
+    assert (subspaces <= points + 1e-6).all()
+    assert (points <= raw + 1e-6).all()
+    np.testing.assert_allclose(pairwise_distances(b, a, **options), subspaces.T, atol=1e-6)
+    euclidean = pairwise_distances(a, b, metric="euclidean", dtype=np.float64)
+    assert (euclidean <= subspaces + 1e-6).all()
+    # A larger set is nearer: the first m directions of a, and those with more.
+    if m > 1:
+        smaller = SubspaceBatch(a.feet, a.bases[:, :-1])
+        assert (subspaces <= pairwise_distances(smaller, b, **options) + 1e-6).all()
+
+
+@pytest.mark.parametrize("metric", METRICS)
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_paired_is_the_diagonal_of_pairwise(metric: str, dtype: str):
+    a, b = faces(15, 4, seed=9), faces(15, 7, seed=10)
+    options = {"metric": metric, "dtype": dtype}
+    for probes in (a, units(Keystream.seeded(1), 15, 128).astype(dtype)):
+        paired = paired_distances(probes, b, **options)
+        assert paired.dtype == dtype
+        assert paired.shape == (15,)
+        expected = np.diagonal(pairwise_distances(probes, b, **options))
+        np.testing.assert_allclose(paired, expected, atol=2e-6)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("metric", METRICS)
+def test_tiles_bound_the_memory_and_do_not_show(
+    metric: str, dtype: str, monkeypatch: pytest.MonkeyPatch
+):
+    a, b = randoms(150, 6, seed=11), randoms(150, 7, seed=12)
+    points = units(Keystream.seeded(2), 900).astype(np.float32)
+
+    def everything() -> list[np.ndarray]:
+        options = {"metric": metric, "dtype": dtype, "threads": 1}
+        found = [pairwise_distances(probes, b, **options) for probes in (points, a)]
+        return [*found, paired_distances(a, b, metric=metric, dtype=dtype)]
+
+    whole = everything()
+    for module, name, size in (
+        (crossgram, "_POINT_TILE_BYTES", 1 << 16),
+        (crossgram, "_PAIR_TILE_BYTES", 1 << 16),
+        (crossgram, "_GATHER_BYTES", 1 << 16),
+        (tiles, "_TILE_SIDE", 64),
+        (tiles, "_BLOCK_BYTES", 1 << 16),
+        (tiles, "_PAIRED_BYTES", 1 << 16),
+    ):
+        monkeypatch.setattr(module, name, size)
+    tracemalloc.start()
+    tiled = everything()
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    for one, two in zip(whole, tiled, strict=True):
+        np.testing.assert_allclose(two, one, atol=5e-6)
+    results = sum(distances.nbytes for distances in tiled)
+    # The cross-Gram matrix of the subspaces alone would be 5 MB.
+    assert 4 * 150 * 7 * 150 * 8 > 5e6
+    assert peak < 2 * results + (1 << 21)
+
+
+# --- odd and hostile input ---------------------------------------------------------------------
+
+
+def test_zero_probe_is_as_far_as_the_method_says():
+    templates = faces(4, 5, seed=13)
+    zero = np.zeros((1, 128), dtype=np.float32)
+    np.testing.assert_allclose(
+        pairwise_distances(zero, templates, metric="euclidean")[0], templates.foot_norms, rtol=1e-6
+    )
+    for distances in (
+        pairwise_distances(zero, templates, metric="spherical")[0],
+        paired_distances(np.repeat(zero, 4, axis=0), templates, metric="spherical"),
+    ):
+        np.testing.assert_allclose(distances, np.sqrt(2), rtol=1e-6)
+
+
+def test_spherical_distance_sees_only_the_direction_of_a_point():
+    templates = faces(6, 5, seed=14)
+    points = units(Keystream.seeded(3), 8, 128)
+    points[0] = templates.feet[0] + templates.radii[0] * templates.bases[0, 0]
+    once = pairwise_distances(points, templates, metric="spherical", dtype=np.float64)
+    twice = pairwise_distances(3 * points, templates, metric="spherical", dtype=np.float64)
+    np.testing.assert_allclose(twice, once, atol=1e-9)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1.5, 40.0])
+def test_a_set_outside_the_sphere_gains_nothing(scale: float):
+    axes = np.eye(N)
+    outside = SubspaceBatch((scale * axes[5])[None], axes[None, :3])
+    templates = randoms(20, 4, seed=15)
+    points = units(Keystream.seeded(4), 20)
+    foot = axes[5][None].astype(np.float32)
+    expected = pairwise_distances(foot, templates, metric="spherical")
+    for distances in (
+        pairwise_distances(outside, templates, metric="spherical"),
+        pairwise_distances(templates, outside, metric="spherical").T,
+    ):
+        np.testing.assert_allclose(distances, expected, atol=1e-5)
+    np.testing.assert_allclose(
+        pairwise_distances(points, outside, metric="spherical")[:, 0],
+        np.linalg.norm(points - axes[5], axis=1),
+        rtol=1e-5,
+    )
+
+
+@pytest.mark.parametrize("metric", METRICS)
+def test_wrong_probes_and_templates_are_refused(metric: str):
+    templates = randoms(3, 4, seed=16)
+    points = units(Keystream.seeded(5), 2)
+    broken, other = points.copy(), randoms(2, 4, seed=17, n=N + 1)
+    broken[0, 0] = np.nan
+    feet = templates.feet.copy()
+    feet[1, 1] = np.inf
+    for measure in (pairwise_distances, paired_distances):
+        with pytest.raises(InvalidEmbedding, match="not finite"):
+            measure(broken, templates, metric=metric)
+        with pytest.raises(InvalidEmbedding, match="shape"):
+            measure(points[:, :-1], templates, metric=metric)
+        with pytest.raises(InvalidEmbedding, match="shape"):
+            measure(points[0], templates, metric=metric)
+        with pytest.raises(InvalidTemplate, match="does not fit"):
+            measure(other, templates, metric=metric)
+        with pytest.raises(InvalidTemplate, match="not finite"):
+            measure(points, SubspaceBatch(feet, templates.bases), metric=metric)
+        with pytest.raises(TemplateError, match="float32 or float64"):
+            measure(points, templates, metric=metric, dtype=np.float16)
+        with pytest.raises(TemplateError, match="at least one step"):
+            measure(points, templates, metric=metric, steps=0)
+        with pytest.raises(ValueError, match="is not a valid Metric"):
+            measure(points, templates, metric="cosine")
+    with pytest.raises(TemplateError, match="do not pair"):
+        paired_distances(points, templates, metric=metric)
+
+
+@pytest.mark.parametrize("metric", METRICS)
+def test_empty_sides_give_empty_results(metric: str):
+    templates = randoms(3, 4, seed=18)
+    none = np.zeros((0, N), dtype=np.float32)
+    assert pairwise_distances(none, templates, metric=metric).shape == (0, 3)
+    assert pairwise_distances(templates, templates[:0], metric=metric).shape == (3, 0)
+    assert paired_distances(none, templates[:0], metric=metric).shape == (0,)
+    assert paired_distances(templates[:0], templates[:0], metric=metric).shape == (0,)
+
+
+def test_similarity_is_the_cosine_of_unit_points():
+    x, y = units(Keystream.seeded(6), 2)
+    assert similarity(float(np.linalg.norm(x - y))) == pytest.approx(x @ y)
+    np.testing.assert_allclose(similarity(np.array([0.0, np.sqrt(2), 2.0])), [1, 0, -1], atol=1e-12)

@@ -1,0 +1,488 @@
+import functools
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from templates import distances as entrance
+from templates.distances import Metric, pairwise_distances, similarity
+from templates.errors import InvalidEmbedding, InvalidTemplate, TemplateError
+from templates.keys.randomness import Keystream
+from templates.space.lifting import lift
+from templates.space.subspace import SubspaceBatch
+from tests.patience import PATIENCE_S
+from tests.templates.distances.test_distances import faces, pairs, randoms, units
+
+torch = pytest.importorskip("torch", reason="torch is an optional extra")
+
+from torch.utils._python_dispatch import TorchDispatchMode  # noqa: E402
+
+from templates.tensors import (  # noqa: E402
+    SubspaceTensors,
+    counts_within,
+    euclidean,
+    nearest,
+    pairwise,
+    spherical,
+    subspaces,
+    tiles,
+)
+
+ROOT = Path(__file__).parents[3]
+SHAPES = [(1, 1, 64), (3, 3, 128), (8, 5, 64), (5, 8, 512), (1, 6, 128), (16, 16, 128), (20, 3, 64)]
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def tensors(batch: SubspaceBatch) -> SubspaceTensors:
+    return SubspaceTensors.of(batch, "cpu")
+
+
+def distances(
+    probes: SubspaceBatch | np.ndarray, templates: SubspaceBatch, **options
+) -> np.ndarray:
+    lifted = isinstance(probes, SubspaceBatch)
+    mine = tensors(probes) if lifted else torch.tensor(probes.astype(np.float32))
+    return pairwise(mine, tensors(templates), **options).numpy()
+
+
+def reference(
+    probes: SubspaceBatch | np.ndarray, templates: SubspaceBatch, **options
+) -> np.ndarray:
+    options = {"steps": 300, "dtype": np.float64} | options
+    if not isinstance(probes, SubspaceBatch):
+        probes = probes.astype(np.float32)
+    return pairwise_distances(probes, templates, **options)
+
+
+# --- agreement with the reference in float64 ---------------------------------------------------
+
+
+@pytest.mark.parametrize("metric", Metric)
+@pytest.mark.parametrize("shape", SHAPES)
+def test_subspaces_and_points_agree_with_the_reference(shape: tuple[int, ...], metric: Metric):
+    m, k, n = shape
+    a, b = faces(12, m, seed=1, n=n), faces(15, k, seed=2, n=n)
+    seen = distances(a, b, metric=metric)
+    assert seen.dtype == np.float32
+    missing = similarity(reference(a, b, metric=metric)) - similarity(seen.astype(np.float64))
+    # A proof leaves 2e-6 open; the rest is rounding.
+    assert missing.max() < 3e-6
+    assert missing.min() > -1e-6
+    points = units(Keystream.seeded("tensors"), 20, n)
+    np.testing.assert_allclose(
+        distances(points, b, metric=metric), reference(points, b, metric=metric), rtol=2e-6
+    )
+
+
+@pytest.mark.parametrize("metric", Metric)
+@pytest.mark.parametrize("name", pairs())
+def test_every_relation_of_two_subspaces(name: str, metric: Metric):
+    a, b = (SubspaceBatch.of([subspace]) for subspace in pairs()[name])
+    for one, two in ((a, b), (b, a)):
+        expected = reference(one, two, metric=metric)
+        seen = distances(one, two, metric=metric)
+        assert (seen >= 0).all()
+        np.testing.assert_allclose(seen, expected, rtol=3e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("metric", Metric)
+def test_shared_decoys_are_computed_from_differences(metric: Metric):
+    """All pairs share a decoy, so all distances are 0 and no product in float32 can say so."""
+    stream = Keystream.seeded("shared")
+    members, decoys = units(stream, 16, 64), units(stream, 32, 64).reshape(16, 2, 64)
+    decoys[:, 0] = decoys[0, 0]
+    batch = SubspaceBatch.through(members, decoys - members[:, None], stream=stream)
+    seen = distances(batch[:8], batch[8:], metric=metric)
+    assert (seen >= 0).all()
+    assert seen.max() < 1e-5
+
+
+@pytest.mark.parametrize("metric", Metric)
+def test_points_near_and_on_a_set(metric: Metric):
+    templates = faces(5, 6, seed=3)
+    inside = templates.feet + templates.radii[:, None] * templates.bases[:, 0]
+    points = np.concatenate([inside, inside + 0.03 * units(Keystream.seeded(1), 5, 128)])
+    expected = reference(points, templates, metric=metric)
+    assert (expected < 0.1).sum() == 10
+    np.testing.assert_allclose(
+        distances(points, templates, metric=metric), expected, rtol=2e-6, atol=1e-7
+    )
+
+
+@pytest.mark.parametrize("scale", [1.5, 40.0, 1e25])
+@pytest.mark.parametrize("metric", Metric)
+def test_sets_outside_the_sphere_and_squares_that_overflow(metric: Metric, scale: float):
+    axes = np.eye(64)
+    outside = SubspaceBatch((scale * axes[5])[None], axes[None, :3])
+    templates = faces(6, 4, seed=4, n=64)
+    points = np.vstack([units(Keystream.seeded(2), 4, 64), np.zeros((1, 64))])
+    for probes, others in ((outside, templates), (templates, outside), (points, outside)):
+        np.testing.assert_allclose(
+            distances(probes, others, metric=metric),
+            reference(probes, others, metric=metric),
+            rtol=3e-6,
+        )
+
+
+# --- the spherical iteration -------------------------------------------------------------------
+
+
+@functools.cache
+def problems() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Random problems with several local maxima, and the best of many restarts in float64."""
+    stream = Keystream.seeded("problems")
+    count, m, k, restarts = 400, 4, 3, 48
+    g, h = 0.3 * stream.normal((count, m)), 0.3 * stream.normal((count, k))
+    b = 0.5 * stream.normal((count, m, k))
+    g, h, b = (part.astype(np.float32).astype(np.float64) for part in (g, h, b))
+    v = stream.normal((count, restarts, k))
+    for _ in range(400):
+        u = v @ b.transpose(0, 2, 1) + g[:, None]
+        value = np.linalg.norm(u, axis=2) + np.einsum("kri,ki->kr", v, h)
+        v = (u / np.linalg.norm(u, axis=2, keepdims=True)) @ b + h[:, None]
+        v /= np.linalg.norm(v, axis=2, keepdims=True)
+    return g, h, b, value.max(axis=1)
+
+
+def test_what_is_proven_is_the_global_maximum():
+    g, h, b, best = problems()
+    problem = spherical._Problem(*(torch.tensor(part, dtype=torch.float32) for part in (g, h, b)))
+    values, v, proven = (part.numpy() for part in spherical.prove(problem, 8, 8))
+    assert 0.5 < proven.mean() < 1
+    assert np.abs(best - values)[proven].max() < 4e-6
+    assert (values < best + 1e-6).all()
+    assert (best - values)[~proven].max() > 1e-3  # a local maximum, and no proof was made up
+    v = v.astype(np.float64)
+    np.testing.assert_allclose(np.linalg.norm(v, axis=1), 1, atol=1e-6)
+    u = np.linalg.norm(g + np.einsum("kij,kj->ki", b, v), axis=1)
+    np.testing.assert_allclose(values, u + np.einsum("ki,ki->k", h, v), atol=1e-6)
+
+
+def test_steps_raise_the_similarity_and_never_above_the_truth():
+    a, b = faces(10, 16, seed=5), faces(11, 16, seed=6)
+    truth = similarity(reference(a, b, metric="spherical"))
+    before = np.full(truth.shape, -1.0)
+    for steps in (1, 2, 4, 8, 9, 20, 50):
+        seen = similarity(distances(a, b, metric=Metric.SPHERICAL, steps=steps).astype(np.float64))
+        assert (seen <= truth + 1e-6).all()
+        assert (seen >= before - 1e-6).all()
+        if steps == 4:
+            assert (truth - seen > 1e-4).mean() > 0.3
+        before = seen
+    assert (truth - before).max() < 3e-6
+
+
+# --- tiles, memory, streams --------------------------------------------------------------------
+
+
+class Largest(TorchDispatchMode):
+    """Remember the size of the largest tensor that any operation returned."""
+
+    def __init__(self):
+        super().__init__()
+        self.bytes = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        result = func(*args, **(kwargs or {}))
+        for part in result if isinstance(result, (tuple, list)) else [result]:
+            if isinstance(part, torch.Tensor):
+                self.bytes = max(self.bytes, part.numel() * part.element_size())
+        return result
+
+
+@pytest.mark.parametrize("metric", Metric)
+@pytest.mark.parametrize("lifted", [True, False])
+def test_tiles_bound_the_memory_and_do_not_show(
+    metric: Metric, lifted: bool, monkeypatch: pytest.MonkeyPatch
+):
+    tile = 1 << 16
+    options = {"metric": metric, "steps": 20}
+    for rows, columns in ((60, 70) if lifted else (300, 200), (2, 2000)):
+        templates = tensors(randoms(columns, 5, seed=8))
+        points = units(Keystream.seeded(3), rows).astype(np.float32)
+        probes = tensors(randoms(rows, 4, seed=7)) if lifted else torch.tensor(points)
+        with Largest() as unbounded:
+            whole = pairwise(probes, templates, **options)
+        with monkeypatch.context() as patch:
+            patch.setitem(subspaces.TILE_BYTES, "cpu", tile)
+            tiled = pairwise(probes, templates, **options)
+            with Largest() as bounded:
+                nearest(probes, templates, k=3, **options)
+                counts_within(probes, templates, np.array([0.5, 1.0]), **options)
+        torch.testing.assert_close(tiled, whole, atol=5e-6, rtol=0)
+        # The stacked rows of all templates are large even where there are few pairs.
+        assert bounded.bytes <= 3 * tile < unbounded.bytes
+
+
+def lattice() -> tuple[np.ndarray, SubspaceBatch]:
+    """Points and templates whose products are exact, so that equal distances are equal numbers."""
+    axes = np.eye(16)
+    points = np.vstack([axes[:8], (axes[8] + axes[9] + axes[10] + axes[11])[None] / 2])
+    feet = np.vstack([0.5 * axes[(3 * i) % 8 : (3 * i) % 8 + 1] for i in range(23)])
+    bases = np.stack([axes[[8 + i % 4, 12 + i % 3]] for i in range(23)])
+    return points, SubspaceBatch(feet, bases)
+
+
+@pytest.mark.parametrize("k", [1, 4, 30])
+@pytest.mark.parametrize("metric", Metric)
+def test_nearest_sorts_ties_by_index_and_leaves_labels_out(
+    metric: Metric, k: int, monkeypatch: pytest.MonkeyPatch
+):
+    points, templates = lattice()
+    labels = np.arange(9) % 3, np.arange(23) % 4
+    expected = np.round(reference(points, templates, metric=metric), 5)
+    assert len(np.unique(expected[0])) < 8
+    monkeypatch.setitem(subspaces.TILE_BYTES, "cpu", 512)
+    for left_out in (None, labels):
+        table = expected.copy()
+        if left_out is not None:
+            table[labels[0][:, None] == labels[1]] = np.inf
+        table = np.pad(table, ((0, 0), (0, 10)), constant_values=np.inf)
+        order = np.argsort(table, axis=1, kind="stable")[:, :k]
+        table = np.take_along_axis(table, order, axis=1)
+        indices, found = nearest(
+            torch.tensor(points.astype(np.float32)),
+            tensors(templates),
+            k=k,
+            metric=metric,
+            labels=left_out and tuple(torch.tensor(part) for part in left_out),
+        )
+        assert indices.dtype == torch.int64
+        np.testing.assert_array_equal(indices, np.where(np.isinf(table), -1, order))
+        np.testing.assert_allclose(found, table, atol=1e-5)
+
+
+@pytest.mark.parametrize("metric", Metric)
+def test_nearest_and_counts_are_those_of_the_matrix(
+    metric: Metric, monkeypatch: pytest.MonkeyPatch
+):
+    a, b = tensors(faces(40, 4, seed=9)), tensors(faces(37, 3, seed=10))
+    labels = torch.arange(40) % 7, torch.arange(37) % 5
+    monkeypatch.setitem(subspaces.TILE_BYTES, "cpu", 1 << 14)
+    matrix = pairwise(a, b, metric=metric).numpy()
+    indices, found = (part.numpy() for part in nearest(a, b, k=5, metric=metric))
+    order = np.argsort(matrix, axis=1, kind="stable")[:, :5]
+    np.testing.assert_array_equal(indices, order)
+    np.testing.assert_array_equal(found, np.take_along_axis(matrix, order, axis=1))
+    # Thresholds that are distances tell "up to" from "below".
+    thresholds = np.sort(np.concatenate([matrix.ravel()[::100], [0, 0.7, 5]])).astype(np.float64)
+    for left_out in (None, labels):
+        kept = matrix.ravel()
+        if left_out is not None:
+            kept = matrix[(labels[0][:, None] != labels[1]).numpy()]
+        expected = [(kept <= threshold).sum() for threshold in thresholds]
+        seen = counts_within(a, b, thresholds, metric=metric, labels=left_out)
+        assert seen.dtype == torch.int64
+        np.testing.assert_array_equal(seen, expected)
+    assert seen[-1] < matrix.size
+
+
+@pytest.mark.parametrize("metric", Metric)
+def test_empty_sides_give_empty_results(metric: Metric):
+    a = tensors(faces(3, 2, seed=11))
+    assert pairwise(a[:0], a, metric=metric).shape == (0, 3)
+    assert pairwise(a, a[:0], metric=metric).shape == (3, 0)
+    indices, found = nearest(a, a[:0], k=2, metric=metric)
+    assert (indices == -1).all()
+    assert torch.isinf(found).all()
+    assert counts_within(a, a[:0], np.array([9.0]), metric=metric).tolist() == [0]
+
+
+# --- precision of the products -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("setting", ["older", "newer"])
+def test_products_are_float32_and_the_setting_is_restored(
+    setting: str, monkeypatch: pytest.MonkeyPatch
+):
+    matmul, seen = torch.backends.cuda.matmul, []
+    make = tiles._distances
+
+    def spy(*arguments):
+        seen.append((torch.get_float32_matmul_precision(), torch.is_autocast_enabled("cpu")))
+        return make(*arguments)
+
+    monkeypatch.setattr(tiles, "_distances", spy)
+    a = tensors(faces(3, 2, seed=12))
+    if setting == "newer" and not hasattr(matmul, "fp32_precision"):
+        pytest.skip("this torch has only the older setting")
+    try:
+        if setting == "older":
+            torch.set_float32_matmul_precision("high")
+        else:
+            matmul.fp32_precision = "tf32"
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            pairwise(a, a, metric=Metric.EUCLIDEAN)
+        assert seen == [("highest", False)]
+        if setting == "older":
+            assert torch.get_float32_matmul_precision() == "high"
+        else:
+            assert matmul.fp32_precision == "tf32"
+    finally:
+        torch.set_float32_matmul_precision("highest")
+
+
+def test_tensors_hold_what_the_batch_held():
+    batch = faces(4, 3, seed=13)
+    whole = tensors(batch)
+    assert (len(whole), whole.n, whole.m, whole.device.type) == (4, 128, 3, "cpu")
+    part = whole[1:3]
+    np.testing.assert_array_equal(part.bases, batch.bases[1:3])
+    np.testing.assert_array_equal(whole[torch.tensor([2, 0])].feet, batch.feet[[2, 0]])
+    with pytest.raises(InvalidTemplate, match="do not fit"):
+        SubspaceTensors(whole.feet[:2], whole.bases)
+    with pytest.raises(InvalidTemplate, match="float32"):
+        SubspaceTensors(whole.feet.double(), whole.bases.double())
+
+
+# --- Triton ------------------------------------------------------------------------------------
+
+
+def fused_cases() -> Iterator[tuple[str, SubspaceBatch, SubspaceBatch, Metric, int]]:
+    for m, k in ((1, 1), (3, 2), (2, 5), (12, 9)):
+        for metric in Metric:
+            yield f"{m} {k} {metric}", faces(5, m, 14, 64), faces(7, k, 15, 64), metric, 50
+    yield "few steps", faces(5, 8, 16, 64), faces(5, 8, 17, 64), Metric.SPHERICAL, 3
+    for name in ("two shared decoys", "parallel", "orthogonal", "crossing far away"):
+        a, b = (SubspaceBatch.of([subspace]) for subspace in pairs()[name])
+        for metric in Metric:
+            yield f"{name} {metric}", a, b, metric, 50
+
+
+def in_the_interpreter(out: str) -> None:
+    """Save the distances that the kernels find; without them there are none."""
+    torch.set_num_threads(1)
+    euclidean.schur = spherical.prove = spherical.maximise = None  # type: ignore[assignment]
+    assert subspaces.fused(torch.device("cpu"), 17) is None
+    with np.errstate(all="ignore"):  # lanes without a pair
+        found = {
+            name: distances(a, b, metric=metric, steps=steps)
+            for name, a, b, metric, steps in fused_cases()
+        }
+    np.savez(out, **found)
+
+
+def test_triton_kernels_agree_in_the_interpreter(tmp_path: Path):
+    pytest.importorskip("triton", reason="torch's wheels for Linux bring triton")
+    subprocess.run(
+        [
+            sys.executable,
+            "-c",
+            "import sys; from tests.templates.distances.test_tensors import in_the_interpreter; "
+            "in_the_interpreter(sys.argv[1])",
+            str(tmp_path / "found.npz"),
+        ],
+        env=os.environ | {"TRITON_INTERPRET": "1"},
+        cwd=ROOT,
+        check=True,
+        timeout=PATIENCE_S,
+    )
+    found = np.load(tmp_path / "found.npz")
+    for name, a, b, metric, steps in fused_cases():
+        unfused = distances(a, b, metric=metric, steps=steps)
+        np.testing.assert_allclose(found[name], unfused, rtol=3e-6, atol=1e-6, err_msg=name)
+        if steps == 50:
+            expected = reference(a, b, metric=metric)
+            np.testing.assert_allclose(found[name], expected, rtol=3e-6, atol=1e-6, err_msg=name)
+
+
+def test_torch_alone_does_where_there_is_no_triton(monkeypatch: pytest.MonkeyPatch):
+    a = faces(3, 2, seed=18)
+    monkeypatch.setenv("TRITON_INTERPRET", "1")
+    monkeypatch.setitem(sys.modules, "templates.tensors.fused", None)
+    assert subspaces.fused(torch.device("cpu"), 2) is None
+    seen = distances(a, a, metric=Metric.EUCLIDEAN)
+    np.testing.assert_allclose(seen, reference(a, a, metric="euclidean"), rtol=2e-6, atol=1e-6)
+
+
+def test_triton_kernels_compile_for_a_gpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """To machine code for Hopper, which needs no such GPU."""
+    triton = pytest.importorskip("triton", reason="torch's wheels for Linux bring triton")
+    compiler = pytest.importorskip("triton.backends.compiler")
+    monkeypatch.setenv("TRITON_CACHE_DIR", str(tmp_path))
+    monkeypatch.delenv("TRITON_INTERPRET", raising=False)
+    from templates.tensors import fused
+
+    pointers = {"proofs": "*i8", "pairs": "*i64"}
+    constants = {"m": 3, "M": 4, "BLOCK": 32}
+    for kernel in (fused._schur_kernel, fused._prove_kernel, fused._maximise_kernel):
+        kinds = dict.fromkeys(kernel.arg_names, "*fp32")
+        kinds |= {name: kind for name, kind in pointers.items() if name in kinds}
+        kinds |= {name: "i32" for name in fused._INTEGERS if name in kinds}
+        kinds |= dict.fromkeys(constants, "constexpr")
+        source = triton.compiler.ASTSource(fn=kernel, signature=kinds, constexprs=constants)
+        target = compiler.GPUTarget("cuda", 90, 32)
+        options = {"num_warps": 1, "enable_fp_fusion": True}
+        compiled = triton.compile(source, target=target, options=options)
+        assert f".entry {kernel.__name__}" in compiled.asm["ptx"]
+        assert compiled.asm["cubin"]
+
+
+# --- the one entrance --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("metric", list(Metric))
+def test_a_device_gives_what_the_processor_gives(metric: Metric) -> None:
+    stream = Keystream.seeded("entrance")
+    rows = stream.normal((70, 64))
+    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+    a = lift(rows[:30], strategy="random", m=3, stream=stream)
+    b = lift(rows[30:], strategy="random", m=5, stream=stream)
+    labels = np.arange(30) % 4, np.arange(40) % 3
+    for probes in (a, rows[:30]):
+        options = {"metric": metric}
+        there = entrance.pairwise_distances(probes, b, device="cpu", **options)
+        here = entrance.pairwise_distances(probes, b, **options)
+        assert isinstance(there, np.ndarray)
+        np.testing.assert_allclose(there, here, atol=2e-5)
+        for of_templates in (False, True):
+            options = {"metric": metric, "k": 4, "of_templates": of_templates, "labels": labels}
+            there = entrance.nearest(probes, b, device="cpu", **options)
+            here = entrance.nearest(probes, b, **options)
+            np.testing.assert_array_equal(there.indices, here.indices)
+            np.testing.assert_allclose(there.distances, here.distances, atol=2e-5)
+        limits = [1.3, 0.2, 0.8]
+        np.testing.assert_array_equal(
+            entrance.count_within(probes, b, limits, metric=metric, labels=labels, device="cpu"),
+            entrance.count_within(probes, b, limits, metric=metric, labels=labels),
+        )
+    held = SubspaceTensors.of(b, "cpu")
+    kept = entrance.pairwise_distances(torch.tensor(rows[:30]), held, metric=metric)
+    assert isinstance(kept, torch.Tensor)
+    np.testing.assert_allclose(
+        kept.numpy(), entrance.pairwise_distances(rows[:30], b, metric=metric), atol=2e-5
+    )
+
+
+def test_what_a_device_cannot_do_is_said() -> None:
+    rows = np.eye(24)[:4]
+    templates = lift(rows, strategy="random", m=2)
+    with pytest.raises(TemplateError, match="cannot use the device nowhere"):
+        entrance.pairwise_distances(rows, templates, metric="euclidean", device="nowhere")
+    with pytest.raises(TemplateError, match="arrays or a batch"):
+        entrance.pairwise_distances(torch.tensor(rows), templates, metric="euclidean")
+    with pytest.raises(InvalidEmbedding, match="not finite"):
+        entrance.pairwise_distances(
+            np.full((1, 24), np.nan), templates, metric="euclidean", device="cpu"
+        )
+    with pytest.raises(InvalidEmbedding, match="shape"):
+        entrance.nearest(rows[:, :5], templates, k=1, metric="euclidean", device="cpu")
+    with pytest.raises(InvalidTemplate, match="does not fit"):
+        entrance.count_within(
+            lift(np.eye(25)[:4], strategy="random", m=2),
+            templates,
+            [1.0],
+            metric="euclidean",
+            device="cpu",
+        )

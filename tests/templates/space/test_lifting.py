@@ -1,0 +1,258 @@
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+import scipy.linalg
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from templates.decoys import Attributes, DecoyPool
+from templates.errors import DecoyError, InvalidEmbedding, LiftingError
+from templates.keys.randomness import Keystream
+from templates.space import lifting
+from templates.space.lifting import SUB_DATABASES, Strategy, draw_directions, lift, paper_basis
+
+N = 48
+# (decoys, random directions) of m = 7, by docs/method.md §2.1.
+SHARES = {
+    "random": (0, 7),
+    "adversarial": (7, 0),
+    "hybrid": (3, 4),
+    "hybrid+": (3, 4),
+    "sub-adversarial": (7, 0),
+    "sub-hybrid": (3, 4),
+}
+
+
+def units(stream: Keystream, count: int, n: int = N) -> np.ndarray:
+    rows = stream.normal((count, n))
+    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+
+
+class Listed:
+    """A source that gives the listed decoys and records what it was asked."""
+
+    source_id = "0" * 64
+
+    def __init__(self, *draws: np.ndarray) -> None:
+        self.n = draws[0].shape[-1]
+        self.draws = list(draws)
+        self.asked: list[tuple[int, int, Sequence[Attributes] | None, int | None]] = []
+        self.streams: list[Keystream] = []
+
+    def draw(self, rows, k, *, stream, unlike=None, sub_databases=None):
+        self.asked.append((rows, k, unlike, sub_databases))
+        self.streams.append(stream)
+        decoys = self.draws.pop(0) if len(self.draws) > 1 else self.draws[0]
+        return np.broadcast_to(decoys[..., :k, :], (rows, k, self.n)).astype(np.float32)
+
+
+@pytest.fixture
+def pool() -> DecoyPool:
+    labels = [Attributes("Male" if i % 2 else "Female", "ABC"[i % 3]) for i in range(640)]
+    return DecoyPool(units(Keystream.seeded("pool"), 640).astype(np.float32), labels=labels)
+
+
+def lifted(descriptors: np.ndarray, strategy: str, pool: DecoyPool, **options):
+    if strategy == "hybrid+":
+        options.setdefault("attributes", [Attributes("Male", "A")] * len(descriptors))
+    source = None if strategy == "random" else pool
+    return lift(descriptors, strategy=strategy, m=7, source=source, **options)
+
+
+@pytest.mark.parametrize("strategy", [str(strategy) for strategy in Strategy])
+def test_template_holds_the_descriptor_and_its_decoys(strategy: str, pool: DecoyPool):
+    descriptors = units(Keystream.seeded("people"), 12)
+    entries = pool.draw(1, 640, stream=Keystream.seeded("all"))[0]
+    for template, descriptor in zip(lifted(descriptors, strategy, pool), descriptors, strict=True):
+        template.validate(1e-6)
+        assert template.m == 7
+        assert template.contains(descriptor)
+        assert int(template.contains(entries, tol=1e-4).sum()) == SHARES[strategy][0]
+
+
+@pytest.mark.parametrize("strategy", [str(strategy) for strategy in Strategy])
+def test_source_is_asked_for_what_the_strategy_needs(strategy: str):
+    decoys = units(Keystream.seeded("decoys"), 7)
+    source = Listed(decoys)
+    descriptors = units(Keystream.seeded("people"), 3)
+    attributes = [Attributes("Female", "B")] * 3 if strategy == "hybrid+" else None
+    directions = draw_directions(
+        descriptors,
+        strategy=strategy,
+        m=7,
+        source=source,
+        stream=Keystream.seeded(1),
+        attributes=attributes,
+    )
+    k, random = SHARES[strategy]
+    sub_databases = 16 if strategy.startswith("sub") else None
+    assert source.asked == ([(3, k, attributes, sub_databases)] if k else [])
+    expected = decoys[None, :k].astype(np.float32) - descriptors[:, None]
+    np.testing.assert_allclose(directions[:, :k], expected, atol=1e-12)
+    assert directions.shape[1] - k == random
+
+
+def test_random_directions_are_uniform_on_the_cube():
+    directions = draw_directions(
+        units(Keystream.seeded(1), 60), strategy="random", m=30, stream=Keystream.seeded(2)
+    )
+    assert stats.kstest(directions.ravel(), "uniform", (-1, 2)).pvalue > 1e-3
+
+
+def test_hybrid_plus_takes_decoys_unlike_the_subject(pool: DecoyPool):
+    descriptors = units(Keystream.seeded("people"), 10)
+    entries = pool.draw(1, 640, stream=Keystream.seeded("all"))[0]
+    like = DecoyPool(entries)  # without labels
+    labels = [Attributes("Female", "C")] * 10
+    templates = lift(descriptors, strategy="hybrid+", m=8, source=pool, attributes=labels)
+    # Entry i of the fixture is Male if odd and of race ABC[i % 3].
+    stored = units(Keystream.seeded("pool"), 640)
+    for template in templates:
+        inside = np.flatnonzero(template.contains(stored, tol=1e-4))
+        assert len(inside) == 4
+        assert (inside % 2 == 1).all()
+        assert (inside % 3 != 2).all()
+    with pytest.raises(DecoyError, match="labels"):
+        lift(descriptors, strategy="hybrid+", m=8, source=like, attributes=labels)
+
+
+def test_sub_database_of_a_template_is_one_of_sixteen(pool: DecoyPool):
+    stored = units(Keystream.seeded("pool"), 640)
+    parts = [set(part.tolist()) for part in pool.parts(SUB_DATABASES)]
+    used = set()
+    for template in lifted(units(Keystream.seeded(3), 40), "sub-adversarial", pool):
+        inside = set(np.flatnonzero(template.contains(stored, tol=1e-4)).tolist())
+        of = [number for number, part in enumerate(parts) if inside <= part]
+        assert len(of) == 1
+        used.update(of)
+    assert len(used) > 8
+
+
+def test_lifts_of_two_descriptors_that_span_one_set_are_equal():
+    """A template is a function of the set and of fresh randomness: of nothing else."""
+    members = units(Keystream.seeded("set"), 6)
+    templates = []
+    for first in range(6):
+        source = Listed(np.delete(members, first, axis=0))
+        stream = Keystream.seeded("fresh")
+        template = lift(
+            members[first : first + 1], strategy="adversarial", m=5, source=source, stream=stream
+        )
+        templates.append(template[0])
+    for template in templates[1:]:
+        # The decoys pass through float32, so the sets agree to its rounding.
+        np.testing.assert_allclose(template.foot, templates[0].foot, atol=2e-6)
+        np.testing.assert_allclose(template.basis, templates[0].basis, atol=2e-6)
+
+
+def test_two_lifts_differ_and_meet_in_the_descriptor(pool: DecoyPool):
+    descriptor = units(Keystream.seeded("people"), 1)
+    one, two = (lifted(descriptor, "adversarial", pool)[0] for _ in range(2))
+    assert np.abs(one.foot - two.foot).max() > 1e-3
+    assert one.contains(descriptor).all()
+    assert two.contains(descriptor).all()
+
+
+def test_every_template_gets_its_own_key_which_is_destroyed():
+    source = Listed(units(Keystream.seeded("decoys"), 4))
+    lift(units(Keystream.seeded(1), 3), strategy="adversarial", m=4, source=source)
+    assert len(set(map(id, source.streams))) == 3
+    for stream in source.streams:
+        with pytest.raises(ValueError, match="destroyed"):
+            stream.token(1)
+
+
+def test_a_seeded_batch_does_not_depend_on_the_tile(
+    pool: DecoyPool, monkeypatch: pytest.MonkeyPatch
+):
+    descriptors = units(Keystream.seeded("people"), 9)
+    monkeypatch.setattr(lifting, "_TILE_BYTES", 2 * 8 * 7 * N)
+    templates = lifted(descriptors, "hybrid", pool, stream=Keystream.seeded(1))
+    again = lifted(descriptors, "hybrid", pool, stream=Keystream.seeded(1))
+    np.testing.assert_array_equal(again.bases, templates.bases)
+    assert len(templates) == 9
+    assert all(t.contains(d) for t, d in zip(templates, descriptors, strict=True))
+
+
+def test_a_photo_drawn_twice_is_drawn_again():
+    decoys = units(Keystream.seeded("decoys"), 4)
+    descriptors = units(Keystream.seeded("people"), 2)
+    twice = decoys[[0, 1, 1, 2]]
+    own = np.vstack([decoys[:3], descriptors[1]])
+    for bad in (twice, own):
+        source = Listed(np.stack([decoys, bad]), decoys)
+        templates = lift(
+            descriptors, strategy="adversarial", m=4, source=source, stream=Keystream.seeded(1)
+        )
+        assert [asked[0] for asked in source.asked] == [2, 1]  # only the bad row
+        assert all(template.contains(decoys, tol=1e-4).all() for template in templates)
+    with pytest.raises(LiftingError, match="same photo twice"):
+        lift(descriptors, strategy="adversarial", m=4, source=Listed(twice))
+
+
+@given(m=st.integers(1, 11), seed=st.integers(0, 10**6))
+def test_every_dimension_from_1_to_n_minus_1_works(m: int, seed: int):
+    descriptors = units(Keystream.seeded(seed), 2, n=12)
+    templates = lift(descriptors, strategy="random", m=m, stream=Keystream.seeded(seed, 1))
+    for template, descriptor in zip(templates, descriptors, strict=True):
+        template.validate(1e-6)
+        assert template.contains(descriptor, tol=1e-4)
+
+
+def test_requests_that_cannot_be_met_are_refused(pool: DecoyPool):
+    good = units(Keystream.seeded("people"), 2)
+    for options, reason in (
+        ({"strategy": "random", "m": 0}, "out of range"),
+        ({"strategy": "random", "m": N}, "out of range"),
+        ({"strategy": "nonsense", "m": 2}, "unknown lifting strategy"),
+        ({"strategy": "adversarial", "m": 2}, "needs a decoy source"),
+        ({"strategy": "hybrid", "m": 1, "source": pool}, "no decoy"),
+        ({"strategy": "hybrid+", "m": 4, "source": pool}, "needs the attributes"),
+        ({"strategy": "hybrid", "m": 4, "source": pool, "attributes": []}, "leave them out"),
+        ({"strategy": "hybrid", "m": 4, "source": Listed(units(Keystream.seeded(1), 4, 9))}, "fit"),
+    ):
+        with pytest.raises(LiftingError, match=reason):
+            lift(good, **options)
+
+
+def test_descriptors_must_be_finite_unit_vectors():
+    good = units(Keystream.seeded("people"), 2)
+    near = lift(good * 1.0009, strategy="random", m=3)
+    assert all(t.contains(d, 1e-6) for t, d in zip(near, good, strict=True))  # renormalised
+    nan, infinite = good.copy(), good.copy()
+    nan[1, 0], infinite[0, 1] = np.nan, np.inf
+    for bad, reason in (
+        (good * 1.002, "unit length"),
+        (good * 0, "unit length"),
+        (nan, "not finite"),
+        (infinite, "not finite"),
+        (good[0], "shape"),
+        (np.eye(4, dtype=np.int64), "floating-point"),
+    ):
+        with pytest.raises(InvalidEmbedding, match=reason):
+            lift(bad, strategy="random", m=2)
+
+
+def test_an_empty_batch_gives_an_empty_batch():
+    assert len(lift(np.zeros((0, N)), strategy="random", m=3, stream=Keystream.seeded(1))) == 0
+    assert len(lift(np.zeros((0, N)), strategy="random", m=3)) == 0
+
+
+def test_paper_basis_describes_the_set_as_the_paper_does():
+    points = units(Keystream.seeded("people"), 3)
+    directions = draw_directions(points, strategy="random", m=5, stream=Keystream.seeded(1))
+    origins, bases = paper_basis(points, directions, stream=Keystream.seeded("e"))
+    drawn = Keystream.seeded("e").uniform((3, 6, N), -1.0, 1.0)
+    for i in range(3):
+        coefficients = scipy.linalg.lstsq(directions[i].T, (drawn[i] - points[i]).T)[0]
+        projections = points[i] + (directions[i].T @ coefficients).T
+        np.testing.assert_allclose(origins[i], projections[0], atol=1e-9)
+        np.testing.assert_allclose(bases[i] @ bases[i].T, np.eye(5), atol=1e-9)
+        # The same direction space, in the order of the re-based vectors.
+        first = projections[1] - projections[0]
+        np.testing.assert_allclose(bases[i][0], first / np.linalg.norm(first), atol=1e-9)
+        inside = directions[i] @ bases[i].T @ bases[i]
+        np.testing.assert_allclose(inside, directions[i], atol=1e-9)
+        assert np.linalg.norm(origins[i] - points[i]) > 0.1
