@@ -25,7 +25,7 @@ import typer
 import typer.main
 import yaml
 
-from api.cli import app
+from api.cli.app import COMMANDS, app, load
 from api.process.opening import open_keyring, open_store
 from api.settings import Settings
 from models.pack_file import read_pack_file
@@ -156,7 +156,6 @@ DRAWINGS = {
     ("docs/rest.md", "veilface-probe-1"),
 }
 OUTLINES = {"docs/architecture.md"}
-COMMANDS = frozenset(typer.main.get_command(app).commands)  # type: ignore[attr-defined]
 
 
 @dataclass(frozen=True)
@@ -283,7 +282,8 @@ def descend(words: list[str]) -> tuple[Any, list[str], list[str]]:
     command, name, rest = typer.main.get_command(app), ["veilface"], list(words)
     while hasattr(command, "commands") and rest and rest[0] in command.commands:
         name.append(rest[0])
-        command = command.commands[rest.pop(0)]
+        command = load(rest[0]) if len(name) == 2 else command.commands[rest[0]]
+        del rest[0]
     return command, name, rest
 
 

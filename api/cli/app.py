@@ -1,75 +1,74 @@
-"""All commands, put together. The modules of a command are imported when it is asked for.
+"""All commands, put together. The module of a command is imported when the command is run.
 
-So ``veilface lift``, which a client may call for each probe, and the workers of ``veilface serve``
-do not import what the audit needs.
+So ``veilface --help`` is there at once, and ``veilface lift``, which a client may call for each
+probe, and the workers of ``veilface serve`` do not import what the audit needs.
 """
 
-import importlib
-from collections.abc import Iterator, Mapping
-from importlib.metadata import version
+from importlib import import_module
 from typing import Annotated, Any
 
 import typer
 import typer.main
+from typer.core import TyperCommand
 
 from api.cli.console import say
 from api.cli.errors import Commands
 
-MODULES = {
-    "demo": "demo",
-    "serve": "serve",
-    "enroll": "subjects",
-    "verify": "subjects",
-    "lift": "lift",
-    "calibrate": "calibrate",
-    "evaluate": "evaluate",
-    "audit": "audit",
-    "decoys": "decoys",
-    "keys": "keys",
-    "models": "models",
-    "db": "db",
-    "audit-log": "audit_log",
-    "bench": "bench",
+COMMANDS = {
+    "demo": "Enroll, verify and erase people through the real service, in under a minute.",
+    "serve": "Start the REST service.",
+    "enroll": "Enroll a person from photos, or replace the enrollment.",
+    "verify": "Check whether a photo shows a person; exit status 0 accept, 1 reject.",
+    "lift": "Turn photos into a private template on this machine, without any secret of the "
+    "service.",
+    "calibrate": "Measure private templates of labelled people, and write the contract file.",
+    "evaluate": "Evaluate face verification with private templates: the LFW / CFP / AgeDB "
+    "protocol.",
+    "audit": "Attack private templates, and judge what an attacker achieves against your limits.",
+    "decoys": "Make the decoys that hide a descriptor inside its private template.",
+    "keys": "Make, replace and revoke API keys, rotate keys and rotations, verify receipts of "
+    "erasure.",
+    "models": "Look into model packs (the weights you supply).",
+    "db": "Bring the database's schema up to date, check it, clean up in it, and set up tenants.",
+    "audit-log": "Verify and read the audit log, in which each line is chained to the one before.",
+    "bench": "Measure how fast this machine is, as ratios to what it cannot do without.",
 }
-"""Module of each command, within ``api.cli``: with ``register`` or, for a group, ``app``."""
+"""The first paragraph of each command's help."""
 
-_LOOKS: dict[str, Any] = {
-    "add_completion": False,
-    "rich_markup_mode": "markdown",
-    "pretty_exceptions_enable": False,
-}
+_MODULES = {"enroll": "subjects", "verify": "subjects", "audit-log": "audit_log"}
+
+_LOOKS: dict[str, Any] = {"rich_markup_mode": "markdown", "pretty_exceptions_enable": False}
 
 
-class OnDemand(Mapping[str, Any]):
-    """The commands by name, each imported when it is looked up."""
-
-    def __init__(self) -> None:
-        self._found: dict[str, Any] = {}
-
-    def __getitem__(self, name: str) -> Any:
-        if name not in self._found:
-            module = importlib.import_module(f"api.cli.{MODULES[name]}")
-            around = typer.Typer(**_LOOKS)
-            if hasattr(module, "register"):
-                module.register(around)
-            else:
-                around.add_typer(module.app, name=name)
-            self._found[name] = typer.main.get_group(around).commands[name]
-        return self._found[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(MODULES)
-
-    def __len__(self) -> int:
-        return len(MODULES)
+def load(name: str) -> Any:
+    """Import a command."""
+    module = import_module(f"api.cli.{_MODULES.get(name, name)}")
+    around = typer.Typer(**_LOOKS)
+    if hasattr(module, "register"):
+        module.register(around)
+    else:
+        around.add_typer(module.app, name=name)
+    return typer.main.get_group(around).commands[name]
 
 
 class Veilface(Commands):
-    """The root command."""
+    """The root command: it lists the commands without importing them."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
-        self.commands = OnDemand()  # type: ignore[assignment]  # nothing adds to it
+        self.commands = {name: TyperCommand(name, help=line) for name, line in COMMANDS.items()}
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Find the chosen command, and import it."""
+        name, command, rest = super().resolve_command(ctx, args)
+        return name, command and load(name), rest
+
+    def get_params(self, ctx: Any) -> Any:
+        """Give every flag a default: Typer imports pydantic to convert a value that is none."""
+        params = super().get_params(ctx)
+        for param in params:
+            param.default = False
+        return params
 
 
 app = typer.Typer(
@@ -85,6 +84,8 @@ app = typer.Typer(
 
 def _show_version(asked: bool) -> None:
     if asked:
+        from importlib.metadata import version
+
         say(f"veilface {version('veilface')}")
         raise typer.Exit
 

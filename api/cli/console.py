@@ -1,23 +1,19 @@
-"""Where the command line speaks: results on stdout, everything else on stderr."""
+"""Where the command line speaks: results on stdout, everything else on stderr.
+
+Rich is imported where something is drawn: most commands fail, or speak, without it.
+"""
 
 import json
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import typer
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    ProgressColumn,
-    TaskProgressColumn,
-    TextColumn,
-    TimeRemainingColumn,
-)
-from rich.table import Table
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+    from rich.table import Table
 
 Advance = Callable[[int], None]
 
@@ -39,16 +35,20 @@ def say(text: str) -> None:
     typer.echo(text)
 
 
-def table(title: str, *columns: str) -> Table:
+def table(title: str, *columns: str) -> "Table":
     """Make an empty table; numbers are the caller's to align."""
+    from rich.table import Table
+
     made = Table(title=title, title_justify="left", title_style="bold")
     for column in columns:
         made.add_column(column, overflow="fold")
     return made
 
 
-def show(*tables: Table) -> None:
+def show(*tables: "Table") -> None:
     """Write tables to stdout."""
+    from rich.console import Console
+
     width = None if sys.stdout.isatty() else _WIDTH_OF_A_FILE
     console = Console(file=sys.stdout, width=width)
     for each in tables:
@@ -76,7 +76,7 @@ def progress(description: str, total: int | None) -> Iterator[Advance]:
     ``total`` counts things that a reader knows, such as photos. For work that has no such unit
     there is :func:`share_done`.
     """
-    with _bar(MofNCompleteColumn()) as bar:
+    with _bar("MofNCompleteColumn") as bar:
         task = bar.add_task(description, total=total)
         yield lambda done: bar.advance(task, done)
 
@@ -84,12 +84,20 @@ def progress(description: str, total: int | None) -> Iterator[Advance]:
 @contextmanager
 def share_done(description: str) -> Iterator[Callable[[float], None]]:
     """Show per cent on stderr while the block runs; call the result with the share from 0 to 1."""
-    with _bar(TaskProgressColumn()) as bar:
+    with _bar("TaskProgressColumn") as bar:
         task = bar.add_task(description, total=1.0)
         yield lambda share: bar.update(task, completed=share)
 
 
-def _bar(amount: ProgressColumn) -> Progress:
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), amount, TimeRemainingColumn())
-    return Progress(*columns, console=console, transient=not console.is_terminal)
+def _bar(amount: str) -> "Progress":
+    from rich import console, progress
+
+    terminal = console.Console(stderr=True)
+    return progress.Progress(
+        progress.TextColumn("{task.description}"),
+        progress.BarColumn(),
+        getattr(progress, amount)(),
+        progress.TimeRemainingColumn(),
+        console=terminal,
+        transient=not terminal.is_terminal,
+    )

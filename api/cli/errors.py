@@ -5,6 +5,7 @@ show what they were given. So only messages of our own exceptions are passed on.
 """
 
 import traceback
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,15 @@ FAILED = 1
 USAGE = 2
 NO_DECISION = 3
 _FAILED_STATUS = {"verify": NO_DECISION}  # where 1 is an answer
+EXTRAS = {
+    "decoys": ("sklearn",),
+    "evaluate": ("joblib", "matplotlib", "sklearn"),
+    "audit": ("matplotlib", "sklearn"),
+    "cluster": ("distributed",),
+    "redis": ("redis",),
+    "torch": ("skimage", "torch"),
+}
+"""What each extra of pyproject.toml brings that the commands import."""
 
 
 class CommandError(VeilfaceError):
@@ -48,24 +58,43 @@ class Commands(TyperGroup):
         return super().resolve_command(ctx, args)
 
 
+def require_extra(extra: str) -> None:
+    """Refuse at once what would otherwise fail after hours.
+
+    Raises
+    ------
+    CommandError
+        A package of the extra is missing.
+    """
+    for package in EXTRAS[extra]:
+        if find_spec(package) is None:
+            raise CommandError(_missing(package, extra))
+
+
+def _missing(package: str, extra: str) -> str:
+    return f'{package} is not installed, and needed here: pip install "veilface[{extra}]"'
+
+
 def sentence(error: Exception) -> str:
     """Say what is wrong, without a value that may be private."""
-    # Imported here: the database's and the models' libraries take seconds, and most commands fail
-    # without them, if at all.
-    from sqlalchemy.exc import SQLAlchemyError
-
-    from models.errors import ModelError
-
+    # By name: the libraries of databases and models take seconds to import, and whoever has their
+    # errors has them already.
+    kinds = {f"{kind.__module__}.{kind.__name__}" for kind in type(error).__mro__}
+    if isinstance(error, VeilfaceError) or "models.errors.ModelError" in kinds:
+        return str(error)
+    if "sqlalchemy.exc.SQLAlchemyError" in kinds:
+        return f"the database does not do what was asked ({type(error).__name__})"
     match error:
-        case VeilfaceError() | ModelError():
-            return str(error)
-        case SQLAlchemyError():
-            return f"the database does not do what was asked ({type(error).__name__})"
         case OSError():
             reason = error.strerror or type(error).__name__
             return f"{error.filename}: {reason}" if error.filename else reason
         case MemoryError():
             return "not enough memory: give fewer photos, or use a machine with more"
+        case ModuleNotFoundError(name=str(module)):
+            package = module.partition(".")[0]
+            for extra, packages in EXTRAS.items():
+                if package in packages:
+                    return _missing(package, extra)
     last = traceback.extract_tb(error.__traceback__)[-1]
     place = f"{Path(last.filename).name}:{last.lineno}"
     return f"a defect of veilface ({type(error).__name__} at {place}): please report it"

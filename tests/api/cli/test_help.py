@@ -5,9 +5,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import typer.main
 
-from api.cli import app
+from api.cli.app import COMMANDS, load
 from tests.api.cli.conftest import run
 
 DOCS = Path(__file__).resolve().parents[3] / "docs" / "cli.md"
@@ -23,19 +22,24 @@ PROMISED = {
 }
 
 
-def commands(group: Any, *path: str) -> Iterator[tuple[tuple[str, ...], Any]]:
-    for name, command in group.commands.items():
-        if hasattr(command, "commands"):
-            yield from commands(command, *path, name)
-        else:
-            yield (*path, name), command
+def leaves(command: Any, *path: str) -> Iterator[tuple[tuple[str, ...], Any]]:
+    if not hasattr(command, "commands"):
+        yield path, command
+        return
+    for name, each in command.commands.items():
+        yield from leaves(each, *path, name)
 
 
-ALL = dict(commands(typer.main.get_command(app)))
+ALL = {path: leaf for name in COMMANDS for path, leaf in leaves(load(name), name)}
 
 
 def test_the_commands_are_those_promised():
     assert {" ".join(path) for path in ALL} == PROMISED
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_list_of_commands_says_what_each_says_of_itself(name):
+    assert load(name).help.split("\n\n")[0].replace("\n", " ") == COMMANDS[name]
 
 
 @pytest.mark.parametrize("path", ALL, ids=" ".join)
