@@ -56,7 +56,7 @@ sbom: | $(UV)
 
 lock: | $(UV)
 	$(UV) pip compile --quiet --upgrade pyproject.toml --universal --generate-hashes --python-version 3.11 -o requirements.lock
-	$(UV) pip compile --quiet pyproject.toml --group dev --universal --generate-hashes --python-version 3.11 -c requirements.lock -o requirements-dev.lock
+	$(UV) pip compile --quiet pyproject.toml --extra all --group dev --universal --generate-hashes --python-version 3.11 -c requirements.lock -o requirements-dev.lock
 	$(UV) pip compile --quiet pyproject.toml --extra redis --universal --generate-hashes --python-version 3.11 -c requirements.lock -o deploy/requirements.lock
 	echo hatchling | $(UV) pip compile --quiet --upgrade - --universal --generate-hashes --python-version 3.11 -o deploy/build.lock
 

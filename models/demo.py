@@ -20,12 +20,12 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-import onnx
 import onnxruntime as ort
 from numpy.typing import NDArray
-from onnx import ModelProto, NodeProto, TensorProto, helper, numpy_helper
 
+from models import onnx_file
 from models.errors import NoFace
+from models.onnx_file import Attribute, Graph, Model, Node, Tensor, message
 from models.synthetic import draw_people
 
 DEMO_NOTICE = "demo model: not for authentication"
@@ -83,13 +83,11 @@ def demo_model_bytes() -> bytes:
         "average": np.asarray(-_average_features(), np.float32),
         "window": _window(),
         "signs": _signs(_DIRECTIONS * _CELLS * _CELLS, DEMO_DIMENSION),
-        "scale": np.asarray(1 / 64, np.float32),
+        "scale": np.asarray([1 / 64], np.float32),
     }
-    final = _model(
+    return _model(
         [*_features(), *_projection()], "embedding", dimension=DEMO_DIMENSION, constants=constants
     )
-    onnx.checker.check_model(final, full_check=True)
-    return bytes(final.SerializeToString())
 
 
 @cache
@@ -141,39 +139,39 @@ def _undirected(features: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.asarray(edges - (edges * weight).sum(axis=(1, 2), keepdims=True) / weight.sum())
 
 
-def _features() -> list[NodeProto]:
+def _features() -> list[bytes]:
     """Edges by direction and cell, relative to the contrast around: (N, 8, 27, 27).
 
     The first eight nodes hold no subtraction: a pack loader must not take the division by the
     contrast for an input normalisation inside the graph.
     """
-    make = helper.make_node
     return [
-        make("Conv", ["image", "edges"], ["slopes"], pads=[_REACH] * 4),
-        make("Relu", ["slopes"], ["rising"]),
-        make("AveragePool", ["rising"], ["cells"], kernel_shape=[_CELL] * 2, strides=[_STRIDE] * 2),
-        make("ReduceSumSquare", ["cells"], ["energy"], axes=[1], keepdims=1),
-        make("AveragePool", ["energy"], ["around"], kernel_shape=[3, 3], pads=[1] * 4),
-        make("Add", ["around", "flat"], ["floored"]),
-        make("Sqrt", ["floored"], ["contrast"]),
-        make("Div", ["cells", "contrast"], ["features"]),
+        _node("Conv", ["image", "edges"], ["slopes"], pads=[_REACH] * 4),
+        _node("Relu", ["slopes"], ["rising"]),
+        _node(
+            "AveragePool", ["rising"], ["cells"], kernel_shape=[_CELL] * 2, strides=[_STRIDE] * 2
+        ),
+        _node("ReduceSumSquare", ["cells"], ["energy"], axes=[1], keepdims=1),
+        _node("AveragePool", ["energy"], ["around"], kernel_shape=[3, 3], pads=[1] * 4),
+        _node("Add", ["around", "flat"], ["floored"]),
+        _node("Sqrt", ["floored"], ["contrast"]),
+        _node("Div", ["cells", "contrast"], ["features"]),
     ]
 
 
-def _projection() -> list[NodeProto]:
+def _projection() -> list[bytes]:
     """Damp what differs from the average face, weigh it by the window and project it."""
-    make = helper.make_node
     return [
-        make("Add", ["features", "average"], ["difference"]),
-        make("Abs", ["difference"], ["size"]),
-        make("Sqrt", ["size"], ["root"]),
-        make("Sign", ["difference"], ["sign"]),
-        make("Mul", ["root", "sign"], ["damped"]),
-        make("Mul", ["damped", "window"], ["seen"]),
-        make("Flatten", ["seen"], ["flattened"], axis=1),
-        make("Cast", ["signs"], ["directions"], to=TensorProto.FLOAT),
-        make("MatMul", ["flattened", "directions"], ["projected"]),
-        make("Mul", ["projected", "scale"], ["embedding"]),
+        _node("Add", ["features", "average"], ["difference"]),
+        _node("Abs", ["difference"], ["size"]),
+        _node("Sqrt", ["size"], ["root"]),
+        _node("Sign", ["difference"], ["sign"]),
+        _node("Mul", ["root", "sign"], ["damped"]),
+        _node("Mul", ["damped", "window"], ["seen"]),
+        _node("Flatten", ["seen"], ["flattened"], axis=1),
+        _node("Cast", ["signs"], ["directions"], to=onnx_file.FLOAT),
+        _node("MatMul", ["flattened", "directions"], ["projected"]),
+        _node("Mul", ["projected", "scale"], ["embedding"]),
     ]
 
 
@@ -194,9 +192,7 @@ def _feature_session() -> ort.InferenceSession:
     model = _model(_features(), "features", dimension=None, constants=_feature_constants())
     options = ort.SessionOptions()
     options.intra_op_num_threads = 1  # the order of a sum must not depend on the number of cores
-    return ort.InferenceSession(
-        model.SerializeToString(), options, providers=["CPUExecutionProvider"]
-    )
+    return ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])
 
 
 @cache
@@ -234,30 +230,60 @@ def _rounded(values: NDArray[np.float64]) -> NDArray[np.float32]:
     return np.asarray(np.round(values / _GRID) * _GRID, np.float32)
 
 
+def _node(kind: str, inputs: list[str], outputs: list[str], **attributes: int | list[int]) -> bytes:
+    return message(
+        *((Node.INPUT, name) for name in inputs),
+        *((Node.OUTPUT, name) for name in outputs),
+        (Node.OP_TYPE, kind),
+        *((Node.ATTRIBUTE, _attribute(*item)) for item in sorted(attributes.items())),
+    )
+
+
+def _attribute(name: str, value: int | list[int]) -> bytes:
+    if isinstance(value, int):
+        kind, values = 2, [(Attribute.INT, value)]
+    else:
+        kind, values = 7, [(Attribute.INTS, each) for each in value]
+    return message((Attribute.NAME, name), *values, (Attribute.TYPE, kind))
+
+
+def _constant(name: str, values: NDArray[np.generic]) -> bytes:
+    return message(
+        *((Tensor.DIMS, size) for size in values.shape),
+        (Tensor.DATA_TYPE, onnx_file.INT8 if values.dtype == np.int8 else onnx_file.FLOAT),
+        (Tensor.NAME, name),
+        (Tensor.RAW_DATA, values.astype(values.dtype.newbyteorder("<")).tobytes()),
+    )
+
+
+def _value(name: str, shape: list[str | int]) -> bytes:
+    """Name and type of an input or output; a size is field 1, and the name of an open one 2."""
+    sizes = [(1, message((2 if isinstance(size, str) else 1, size))) for size in shape]
+    tensor = message((1, onnx_file.FLOAT), (2, message(*sizes)))
+    return message((1, name), (2, message((1, tensor))))
+
+
 def _model(
-    nodes: list[NodeProto],
+    nodes: list[bytes],
     output: str,
     *,
     dimension: int | None,
     constants: Mapping[str, NDArray[np.generic]],
-) -> ModelProto:
-    shape: list[str | int | None] = (
-        ["N", _DIRECTIONS, _CELLS, _CELLS] if dimension is None else ["N", dimension]
+) -> bytes:
+    shape = ["N", _DIRECTIONS, _CELLS, _CELLS] if dimension is None else ["N", dimension]
+    graph = message(
+        *((Graph.NODE, node) for node in nodes),
+        (Graph.NAME, "veilface-demo"),
+        *((Graph.INITIALIZER, _constant(name, values)) for name, values in constants.items()),
+        (Graph.INPUT, _value("image", ["N", 3, _SIDE, _SIDE])),
+        (Graph.OUTPUT, _value(output, shape)),
     )
-    graph = helper.make_graph(
-        nodes,
-        "veilface-demo",
-        [helper.make_tensor_value_info("image", TensorProto.FLOAT, ["N", 3, _SIDE, _SIDE])],
-        [helper.make_tensor_value_info(output, TensorProto.FLOAT, shape)],
-        [numpy_helper.from_array(np.ascontiguousarray(a), name) for name, a in constants.items()],
+    return message(
+        (Model.IR_VERSION, _IR_VERSION),
+        (Model.PRODUCER_NAME, "veilface"),
+        (Model.PRODUCER_VERSION, "1"),
+        (Model.DOC_STRING, DEMO_NOTICE),
+        (Model.GRAPH, graph),
+        (Model.OPSET_IMPORT, message((1, ""), (2, _OPSET))),
+        (Model.METADATA_PROPS, message((1, "notice"), (2, DEMO_NOTICE))),
     )
-    model = helper.make_model(
-        graph,
-        ir_version=_IR_VERSION,
-        opset_imports=[helper.make_opsetid("", _OPSET)],
-        producer_name="veilface",
-        producer_version="1",
-        doc_string=DEMO_NOTICE,
-    )
-    helper.set_model_props(model, {"notice": DEMO_NOTICE})
-    return model

@@ -4,10 +4,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 
-import onnx
-from onnx import ModelProto, TensorProto, ValueInfoProto
-
+from models import onnx_file
 from models.errors import PackError
+from models.onnx_file import Attribute, Graph, Message, Model, Node
 from models.yunet import OUTPUTS as YUNET_OUTPUTS
 
 # Graphs whose first nodes both subtract and scale bring their own normalisation
@@ -75,53 +74,58 @@ def read_signature(model: bytes, *, name: str) -> Signature:
         If the bytes are no ONNX model, or its weights lie in another file.
     """
     try:
-        proto: ModelProto = onnx.load_model_from_string(model)
-    # protobuf raises its own unrelated class.
-    except Exception:
+        return _signature(Message(model), name)
+    except ValueError:
         raise PackError(f"{name} is not a readable ONNX model; fetch the file again.") from None
-    graph = proto.graph
-    if not graph.node:
+
+
+def _signature(model: Message, name: str) -> Signature:
+    graphs = model.messages(Model.GRAPH)
+    if len(graphs) != 1 or not (nodes := graphs[0].messages(Graph.NODE)):
         raise PackError(f"{name} is not a readable ONNX model: its graph is empty.")
-    if any(tensor.data_location == TensorProto.EXTERNAL for tensor in _tensors(proto)):
+    graph = graphs[0]
+    if any(
+        tensor.number(onnx_file.Tensor.DATA_LOCATION) == onnx_file.EXTERNAL
+        for tensor in _tensors(model)
+    ):
         raise PackError(
             f"{name} keeps its weights in another file; convert it to a single .onnx file, so"
             " that its hash covers the weights."
         )
     # Up to IR version 3 the weights were listed among the inputs as well.
-    weights = {tensor.name for tensor in graph.initializer}
+    weights = {each.text(onnx_file.Tensor.NAME) for each in graph.messages(Graph.INITIALIZER)}
+    inputs = map(_tensor, graph.messages(Graph.INPUT))
     return Signature(
-        inputs=tuple(_tensor(value) for value in graph.input if value.name not in weights),
-        outputs=tuple(_tensor(value) for value in graph.output),
-        first_nodes=tuple(node.op_type for node in graph.node[:FIRST_NODES]),
+        inputs=tuple(each for each in inputs if each.name not in weights),
+        outputs=tuple(map(_tensor, graph.messages(Graph.OUTPUT))),
+        first_nodes=tuple(node.text(Node.OP_TYPE) for node in nodes[:FIRST_NODES]),
     )
 
 
-def _tensors(proto: ModelProto) -> Iterator[TensorProto]:
+def _tensors(model: Message) -> Iterator[Message]:
     """Every tensor of a model: weights, constants of nodes, those of nested graphs."""
-    graphs = [proto.graph]
-    nodes = [node for function in proto.functions for node in function.node]
+    graphs = model.messages(Model.GRAPH)
+    nodes = model.messages(Model.FUNCTIONS, onnx_file.FUNCTION_NODE)
     while graphs or nodes:
         if graphs:
             graph = graphs.pop()
-            yield from graph.initializer
-            for sparse in graph.sparse_initializer:
-                yield sparse.values
-                yield sparse.indices
-            nodes.extend(graph.node)
+            yield from graph.messages(Graph.INITIALIZER)
+            # Values and indices of sparse weights.
+            yield from graph.messages(Graph.SPARSE_INITIALIZER, 1)
+            yield from graph.messages(Graph.SPARSE_INITIALIZER, 2)
+            nodes.extend(graph.messages(Graph.NODE))
             continue
-        for attribute in nodes.pop().attribute:
-            yield attribute.t
-            yield from attribute.tensors
-            if attribute.HasField("g"):
-                graphs.append(attribute.g)
-            graphs.extend(attribute.graphs)
+        for attribute in nodes.pop().messages(Node.ATTRIBUTE):
+            yield from attribute.messages(Attribute.TENSOR)
+            yield from attribute.messages(Attribute.TENSORS)
+            graphs += attribute.messages(Attribute.GRAPH) + attribute.messages(Attribute.GRAPHS)
 
 
-def _tensor(value: ValueInfoProto) -> Tensor:
-    dims = value.type.tensor_type.shape.dim
+def _tensor(value: Message) -> Tensor:
+    # A value's type (2) is a tensor's (1), whose shape (2) has dimensions (1) with a size (1).
     return Tensor(
-        name=value.name,
-        shape=tuple(d.dim_value if d.HasField("dim_value") else None for d in dims),
+        name=value.text(1),
+        shape=tuple(dim.number(1) for dim in value.messages(2, 1, 2, 1)),
     )
 
 

@@ -11,7 +11,7 @@ import typer
 from api.cli.audit_report import Out, Seed, conclude, default_of, limit_option
 from api.cli.console import demo_notice, message, share_done
 from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, extract
-from api.cli.errors import CommandError, UsageError
+from api.cli.errors import CommandError, UsageError, require_extra
 from api.cli.evaluation_inputs import listed, named_file
 from api.cli.fairface import Label, read_labels
 from api.cli.files import read_bounded
@@ -161,6 +161,7 @@ def fairface(
 
     Example: `veilface audit fairface fairface --pack buffalo_l --out audit`
     """
+    require_extra("audit")
     pack = bulk_pack(settings, flip=flip, why="an audit attacks descriptors of a model pack")
     wanted = listed(attributes, _attribute, "--attributes", expected=f"of {', '.join(CLASSES)}")
     strategies = listed(strategy, _strategy, "--strategy", expected=f"of {', '.join(STRATEGIES)}")

@@ -13,7 +13,7 @@ from api.cli.audit_attacks import PARTS, Drawings, attacks_on, operating
 from api.cli.audit_report import Out, Seed, conclude, default_of, limit_option
 from api.cli.console import demo_notice, message, progress
 from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, extract
-from api.cli.errors import CommandError, UsageError
+from api.cli.errors import CommandError, UsageError, require_extra
 from api.cli.evaluation_inputs import listed
 from api.cli.options import AsJson, takes_settings
 from api.process.opening import file_sealer, open_keyring
@@ -182,6 +182,7 @@ def templates(
 
     Example: `veilface audit templates lfw --pack buffalo_l --decoys decoys.veil --out audit`
     """
+    require_extra("audit")
     if fit_decoys and (decoys is not None or contract is not None):
         raise UsageError("--fit-decoys fits decoys of its own: give no --decoys and no --contract")
     if learned or reconstruction:

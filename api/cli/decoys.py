@@ -9,7 +9,7 @@ import typer
 
 from api.cli.console import demo_notice, emit, message, say
 from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, extract
-from api.cli.errors import CommandError
+from api.cli.errors import CommandError, require_extra
 from api.cli.fairface import label_files, read_labels
 from api.cli.files import find_photos, is_left_out, read_names
 from api.cli.options import AsJson, takes_settings
@@ -90,6 +90,8 @@ def build(
 
     Example: `veilface decoys build fairface/train --pack buffalo_l --out decoys.veil`
     """
+    if kind is Kind.GENERATOR:
+        require_extra("decoys")
     pack = bulk_pack(settings, flip=flip, why="decoys are descriptors of a model pack")
     chosen = find_photos(photos)
     found = len(chosen)

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from api.cli.console import emit, message, say, show, table
+from api.cli.errors import require_extra
 from api.cli.options import AsJson
 from api.demo.run import Outcome, run_demo
 from models.demo import DEMO_NOTICE
@@ -54,6 +55,8 @@ def demo(
     Example: `veilface demo`, or with real weights and faces
     `veilface demo --pack buffalo_l --faces lfw`
     """
+    if faces is not None:
+        require_extra("decoys")
     outcome = run_demo(
         folder, pack=pack, faces=faces, m=dim, say=lambda text: message(f"... {text}")
     )

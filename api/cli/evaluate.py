@@ -8,7 +8,7 @@ import typer
 
 from api.cli.console import demo_notice, emit, message, progress, say, show
 from api.cli.descriptors import BULK, Cache, Flip
-from api.cli.errors import UsageError
+from api.cli.errors import UsageError, require_extra
 from api.cli.evaluation_inputs import (
     Descriptors,
     Faces,
@@ -166,6 +166,7 @@ def evaluate(
 
     Example: `veilface evaluate lfw.bin --pack buffalo_l --decoys decoys.veil --out lfw-results`
     """
+    require_extra("evaluate")
     try:
         where = Backend.parse(backend, jobs=jobs or default_jobs())
     except BackendError as error:

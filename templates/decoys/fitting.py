@@ -1,14 +1,9 @@
-"""Fitting the decoy generator's statistics to real descriptors.
-
-Kept apart from `generator`, so that a client that only draws decoys does not load scikit-learn.
-"""
+"""Fitting the decoy generator's statistics to real descriptors."""
 
 import warnings
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.exceptions import ConvergenceWarning
-from sklearn.mixture import GaussianMixture
 
 from templates.decoys.statistics import DescriptorStatistics, band_edges, leading_axes
 from templates.errors import DecoyError
@@ -20,6 +15,8 @@ _COMPONENTS = 4
 _PER_COMPONENT = 500
 """A component describes at least hundreds of people on average: it is a crowd, not a person."""
 _UNIT_TOLERANCE = 1e-3
+_REGULARISATION = 1e-5
+"""Added to variances: the log energies vary by about 0.1, and it must be far below its square."""
 
 
 def fit_statistics(descriptors: NDArray[np.floating]) -> DescriptorStatistics:
@@ -62,13 +59,13 @@ def fit_statistics(descriptors: NDArray[np.floating]) -> DescriptorStatistics:
         raise DecoyError("the descriptors to fit hardly differ from each other")
     # An axis on which nothing varies stays an axis on which nothing varies.
     whitened = coordinates / np.maximum(deviations, 1e-12)
-    mixture = _mixture(mixture_features(whitened))
+    weights, centres, covariances = _mixture(mixture_features(whitened))
     return DescriptorStatistics(
         mean=mean.astype(np.float32),
         axes=(axes[:n] * deviations[:, None]).astype(np.float32),
-        weights=mixture.weights_.astype(np.float32),
-        centres=mixture.means_.astype(np.float32),
-        spreads=np.linalg.cholesky(mixture.covariances_).astype(np.float32),
+        weights=weights.astype(np.float32),
+        centres=centres.astype(np.float32),
+        spreads=np.linalg.cholesky(covariances).astype(np.float32),
     )
 
 
@@ -120,12 +117,22 @@ def mixture_features(whitened: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.hstack([whitened[:, : leading_axes(n)], log_energies])
 
 
-def _mixture(features: NDArray[np.float64]) -> GaussianMixture:
+def _mixture(features: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+    """Weights (c,), centres (c, q) and covariances (c, q, q) of Gaussian components."""
     components = int(np.clip(len(features) // _PER_COMPONENT, 1, _COMPONENTS))
-    # The log energies vary by about 0.1: scikit-learn's additive regularisation must be far
-    # below the square of that. The seed fixes the start of the expectation-maximisation only.
-    mixture = GaussianMixture(components, reg_covar=1e-5, max_iter=300, n_init=3, random_state=0)
+    if components == 1:  # known in closed form, so that the demo needs no scikit-learn
+        covariance = np.cov(features, rowvar=False, bias=True)
+        regular = covariance + _REGULARISATION * np.eye(len(covariance))
+        return np.ones(1), features.mean(axis=0)[None], regular[None]
+    from sklearn.exceptions import ConvergenceWarning
+    from sklearn.mixture import GaussianMixture
+
+    # The seed fixes the start of the expectation-maximisation only.
+    mixture = GaussianMixture(
+        components, reg_covar=_REGULARISATION, max_iter=300, n_init=3, random_state=0
+    )
     with warnings.catch_warnings():
         # A mixture a step short of its optimum is as good a generator.
         warnings.simplefilter("ignore", ConvergenceWarning)
-        return mixture.fit(features)
+        mixture.fit(features)
+    return mixture.weights_, mixture.means_, mixture.covariances_

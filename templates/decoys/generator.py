@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from templates.decoys import container
 from templates.decoys.files import read_bounded, write_private
+from templates.decoys.fitting import fit_statistics
 from templates.decoys.source import MAX_DIMENSION, Attributes, checked_made_with, take_made_with
 from templates.decoys.statistics import (
     MAX_COMPONENTS,
@@ -104,9 +105,6 @@ class DecoyGenerator:
             Too few descriptors, or descriptors that are not finite unit vectors or lie in a small
             subspace.
         """
-        # Imported here, because it loads scikit-learn, which a client that draws does not need.
-        from templates.decoys.fitting import fit_statistics
-
         return cls(fit_statistics(descriptors), made_with=made_with)
 
     def draw(

@@ -1,10 +1,14 @@
+import contextlib
+
 import numpy as np
 import onnx
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from onnx import TensorProto, helper
 
 from models.errors import PackError
-from models.signature import Role, classify, read_signature
+from models.signature import FIRST_NODES, Role, Signature, Tensor, classify, read_signature
 from tests.models import graphs
 
 
@@ -125,6 +129,48 @@ def test_weights_in_another_file_are_refused(place):
         read_signature(proto.SerializeToString(), name="x.onnx")
 
 
+def as_onnx_reads_it(model: bytes) -> Signature:
+    graph = onnx.load_model_from_string(model).graph
+    weights = {tensor.name for tensor in graph.initializer}
+
+    def tensors(values) -> tuple[Tensor, ...]:
+        return tuple(
+            Tensor(
+                value.name,
+                tuple(
+                    size.dim_value if size.HasField("dim_value") else None
+                    for size in value.type.tensor_type.shape.dim
+                ),
+            )
+            for value in values
+            if value.name not in weights
+        )
+
+    kinds = tuple(node.op_type for node in graph.node[:FIRST_NODES])
+    return Signature(tensors(graph.input), tensors(graph.output), kinds)
+
+
+MADE = [
+    graphs.scrfd_shapes(),
+    graphs.yunet_shapes(),
+    graphs.pooling_embedder(inside=True),
+    graphs.shaped([("data", [0, -1, 2**40])], [("e", [1])]),
+]
+
+
+@pytest.mark.parametrize("model", MADE)
+def test_what_is_read_is_what_the_onnx_package_reads(model):
+    assert read_signature(model, name="x") == as_onnx_reads_it(model)
+
+
+@given(st.sampled_from(MADE), st.data())
+def test_a_broken_model_is_read_or_refused(model, data):
+    place = data.draw(st.integers(0, len(model) - 1))
+    broken = model[:place] + data.draw(st.binary(max_size=12)) + model[place + 3 :]
+    with contextlib.suppress(PackError):
+        read_signature(broken, name="some.onnx")
+
+
 def test_real_packs(mbf_pack_dir, yunet_pack_dir, shared_data):
     seen = {
         path.name: (
@@ -133,6 +179,7 @@ def test_real_packs(mbf_pack_dir, yunet_pack_dir, shared_data):
         )
         for folder in (mbf_pack_dir, yunet_pack_dir, shared_data / "packs" / "liveness")
         for path in folder.glob("*.onnx")
+        if read_signature(path.read_bytes(), name="x") == as_onnx_reads_it(path.read_bytes())
     }
     assert seen == {
         "det_500m_kps.onnx": (Role.SCRFD, False),

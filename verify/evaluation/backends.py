@@ -11,9 +11,6 @@ from importlib.metadata import version
 from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
-import joblib
-from joblib.externals.loky import get_reusable_executor
-
 from templates.errors import VeilfaceError
 from verify.evaluation.material import Parcel, fresh_key
 
@@ -87,6 +84,8 @@ def spread(
     if backend.scheduler is None and backend.jobs == 1:
         yield from ((index, function(shared, item)) for index, item in enumerate(items))
         return
+    import joblib
+
     key = fresh_key()
     parcel = Parcel.pack(shared, key)
     here = version(SOFTWARE)
@@ -154,6 +153,9 @@ def _forget() -> None:
 
 @contextmanager
 def _local(jobs: int) -> Iterator[None]:
+    import joblib
+    from joblib.externals.loky import get_reusable_executor
+
     try:
         with joblib.parallel_config(backend="loky", n_jobs=jobs):
             yield
@@ -164,11 +166,13 @@ def _local(jobs: int) -> Iterator[None]:
 
 @contextmanager
 def _cluster(scheduler: str, parcel: Parcel) -> Iterator[None]:
+    import joblib
+
     try:
         from distributed import Client
     except ImportError:
         raise BackendError(
-            "a Dask cluster needs the package distributed: install veilface[cluster]"
+            'a Dask cluster needs the package distributed: pip install "veilface[cluster]"'
         ) from None
     try:
         client = Client(  # type: ignore[no-untyped-call]

@@ -1,10 +1,13 @@
+import re
 import sys
+import tomllib
+from pathlib import Path
 
 import pytest
 import typer
 from typer.testing import CliRunner
 
-from api.cli.errors import CommandError, Commands, UsageError, sentence
+from api.cli.errors import EXTRAS, CommandError, Commands, UsageError, sentence
 from models.errors import PackError
 from templates.errors import SealError
 from tests.api.cli.conftest import run
@@ -60,6 +63,54 @@ def test_a_command_that_cannot_be_imported_has_failed(monkeypatch):
         ran = run(name, "ann", "x.jpg")
         assert (ran.status, ran.stdout) == (status, "")
         assert "a defect of veilface (ModuleNotFoundError" in ran.stderr
+
+
+ROOT = Path(__file__).resolve().parents[3]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+MODULES = {"scikit-image": "skimage", "scikit-learn": "sklearn"}
+
+
+def names(requirements: list[str]) -> set[str]:
+    """Modules that are installed, or the extra that is meant by ``veilface[extra]``."""
+    found = {re.match(r"veilface\[.*|[\w-]+", each)[0] for each in requirements}  # type: ignore[index]
+    return {MODULES.get(name, name) for name in found}
+
+
+def test_every_extra_brings_what_its_commands_need():
+    stated = PROJECT["optional-dependencies"]
+    assert names(stated.pop("all")) == {f"veilface[{','.join(sorted(stated))}]"}
+    assert names(stated["cluster"]) == {"distributed", "veilface[evaluate]"}
+    stated["cluster"] = ["distributed"]
+    assert {extra: names(packages) for extra, packages in stated.items()} == {
+        extra: set(packages) for extra, packages in EXTRAS.items()
+    }
+    assert not names(PROJECT["dependencies"]) & {each for some in EXTRAS.values() for each in some}
+
+
+@pytest.mark.parametrize(
+    ("words", "package", "extra"),
+    [
+        (("evaluate", "lfw.bin"), "matplotlib", "evaluate"),
+        (("evaluate", "lfw.bin"), "joblib", "evaluate"),
+        (("audit", "templates", "people"), "sklearn", "audit"),
+        (("audit", "fairface", "faces"), "matplotlib", "audit"),
+        (("decoys", "build", "faces"), "sklearn", "decoys"),
+        (("demo", "--pack", "pack", "--faces", "faces"), "sklearn", "decoys"),
+    ],
+)
+def test_a_missing_extra_is_named_before_any_work(monkeypatch, words, package, extra):
+    monkeypatch.setitem(sys.modules, package, None)
+    ran = run(*words)
+    assert (ran.status, ran.stdout) == (1, "")
+    assert ran.stderr == (
+        f'error: {package} is not installed, and needed here: pip install "veilface[{extra}]"\n'
+    )
+
+
+def test_a_package_that_is_missed_later_is_named_too():
+    result = CliRunner().invoke(failing_app(ModuleNotFoundError(name="torch.nn")), ["fail"])
+    assert result.exit_code == 1
+    assert result.stderr.endswith('pip install "veilface[torch]"\n')
 
 
 def test_an_unexpected_error_shows_its_place_and_never_its_text():

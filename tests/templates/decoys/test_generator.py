@@ -10,8 +10,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.stats import ks_2samp
+from sklearn.mixture import GaussianMixture
 
-from templates.decoys import Attributes, DecoyGenerator, DecoySource, container, load_source
+from templates.decoys import (
+    Attributes,
+    DecoyGenerator,
+    DecoySource,
+    container,
+    fitting,
+    load_source,
+)
 from templates.decoys.generator import GENERATOR_FORMAT, MAX_GENERATOR_BYTES
 from templates.decoys.statistics import (
     DescriptorStatistics,
@@ -199,9 +207,15 @@ def test_the_id_is_the_same_in_another_process(fitted: DecoyGenerator) -> None:
         assert done.stdout.decode().strip() == fitted.source_id
 
 
-def test_drawing_does_not_load_the_fitting_library() -> None:
-    program = "import sys, templates.decoys; assert 'sklearn' not in sys.modules"
-    subprocess.run([sys.executable, "-c", program], check=True)
+def test_one_component_is_what_scikit_learn_fits() -> None:
+    """Fewer than 1,000 descriptors are one component, in closed form."""
+    features = np.random.default_rng(3).normal(size=(999, 7)) * np.linspace(0.1, 3, 7) + 0.5
+    expected = GaussianMixture(1, reg_covar=1e-5).fit(features)
+    weights, centres, covariances = fitting._mixture(features)
+    assert weights.tolist() == [1.0]
+    np.testing.assert_allclose(centres, expected.means_)
+    np.testing.assert_allclose(covariances, expected.covariances_, rtol=1e-9, atol=1e-12)
+    assert len(fitting._mixture(np.repeat(features, 2, axis=0))[0]) == 3
 
 
 def test_every_single_byte_flip_is_refused_or_gives_a_working_generator() -> None:
