@@ -5,10 +5,15 @@ VENV := .venv/bin
 
 PYTEST = $(VENV)/pytest --numprocesses=logical --maxprocesses=8 --dist=worksteal $(PYTEST_ARGS)
 
-.PHONY: demo test test-all lint types audit sbom lock clean
+.PHONY: demo extras test test-all lint types audit sbom lock clean
 
 demo: .venv/core
 	$(VENV)/veilface demo
+
+# What the service does without and some commands need: `make extras EXTRAS=decoys,evaluate`.
+EXTRAS ?= all
+extras: .venv/core
+	$(UV) pip install --quiet --python $(VENV)/python --constraint requirements-dev.lock -e ".[$(EXTRAS)]"
 
 # What guards behaviour, in minutes.
 test: .venv/dev

@@ -270,7 +270,9 @@ def _model(
     dimension: int | None,
     constants: Mapping[str, NDArray[np.generic]],
 ) -> bytes:
-    shape = ["N", _DIRECTIONS, _CELLS, _CELLS] if dimension is None else ["N", dimension]
+    shape: list[str | int] = (
+        ["N", _DIRECTIONS, _CELLS, _CELLS] if dimension is None else ["N", dimension]
+    )
     graph = message(
         *((Graph.NODE, node) for node in nodes),
         (Graph.NAME, "veilface-demo"),

@@ -12,7 +12,7 @@ import yaml
 
 ROOT = Path(__file__).resolve().parent.parent
 DISTRIBUTIONS = [ROOT, ROOT / "clients" / "python"]
-PACKAGES = ["api", "attacks", "benchmarks", "enroll", "models", "templates", "verify"]
+PACKAGES = ["api", "attacks", "benchmarks", "clients", "enroll", "models", "templates", "verify"]
 # Of the text as the Apache Software Foundation publishes it.
 APACHE_2_0 = "cfc7749b96f63bd31c3c42b5c471bf756814053e847c10f3eb003417bc523d30"
 FRAME = ["LICENSE", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "docs/method.md"]
@@ -37,7 +37,7 @@ def test_each_distribution_carries_the_whole_license(folder: Path) -> None:
 
 
 def test_no_module_states_the_version_again() -> None:
-    version = project(ROOT)["version"]
+    (version,) = {project(folder)["version"] for folder in DISTRIBUTIONS}
     again = [
         f"{path.relative_to(ROOT)}:{node.lineno}"
         for package in PACKAGES
