@@ -23,7 +23,7 @@ ImageCode = Literal["unsupported_image", "image_too_large"]
 
 
 class ModelError(Exception):
-    """Base of all errors that the models room raises on purpose."""
+    """Base of all errors that ``models`` raises on purpose."""
 
 
 class ImageError(ModelError):

@@ -133,9 +133,9 @@ DISABLED_RETRY_AFTER_S = 86_400
 
 
 def api_error(error: Exception) -> ApiError | None:
-    """Give an exception of the rooms below its code; None for one that is not expected.
+    """Give an exception of the packages below its code; None for one that is not expected.
 
-    The text of a client's mistake is passed on: the rooms below hold no number of a descriptor or
+    The text of a client's mistake is passed on: the packages below hold no number of an embedding or
     template and no key in their messages. The text of a failure of the service is not, because
     it may name a file or a host.
     """

@@ -1,4 +1,4 @@
-"""Fields of a request, checked and turned into the values of the rooms below."""
+"""Fields of a request, checked and turned into the values of the packages below."""
 
 from collections.abc import Mapping
 from datetime import UTC, datetime

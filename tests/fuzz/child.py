@@ -45,7 +45,7 @@ LOOK_AFTER_S = 0.0005
 """A case that took less cannot have touched enough memory to matter."""
 
 _ROOT = Path(__file__).resolve().parents[2]
-_OURS = tuple(str(_ROOT / room) for room in ("api", "models", "templates", "tests", "verify"))
+_OURS = tuple(str(_ROOT / name) for name in ("api", "models", "templates", "tests", "verify"))
 _VARYING = re.compile(r"[0-9a-f]{8,}|[0-9]+|'[^']*'|\"[^\"]*\"|b'.*'")
 
 
