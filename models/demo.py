@@ -128,8 +128,8 @@ def require_face(crop: NDArray[np.uint8]) -> None:
     )
     if both < _LEAST_ALIKE * np.sqrt(own * other) or own == 0:
         raise NoFace(
-            "no drawn face was found, and the demo model sees no other: send one, upright and "
-            "aligned, as the demo draws them"
+            "no cartoon face was found, and the demo model sees no others: send one that the demo "
+            "drew, upright and aligned"
         )
 
 
