@@ -1,4 +1,4 @@
-"""FNMR and FMR of the running service on real photos, beside raw embeddings on the same attempts.
+"""FRR and FMR of the running service on real photos, beside raw embeddings on the same attempts.
 
 Builds the decoys and the contract with the command line, starts ``veilface serve`` with two
 workers, enrolls photos 1-3 of every person over HTTP, then verifies photos 4-5 against the person

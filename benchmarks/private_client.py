@@ -1,4 +1,4 @@
-"""FNMR and FMR of the real private client against a server without a pack, beside photos.
+"""FRR and FMR of the real private client against a server without a pack, beside photos.
 
 One contract, two services. The first has the model pack: photos 1-3 of every person are sent to it,
 then photos 4-5 against the person (genuine) and against other people (impostor), as in

@@ -85,7 +85,7 @@ class MultipleFaces(FaceError):
 
 
 class FaceTooSmall(FaceError):
-    """The face has too few pixels."""
+    """The face is too small in the photo."""
 
     code = "face_too_small"
 

@@ -389,7 +389,7 @@ def _locate(path: Path) -> tuple[_Location, PackFile]:
 def _read(path: Path, stated: PackFile) -> _Graph:
     try:
         if path.stat().st_size > _MAX_MODEL_BYTES:
-            raise PackError(f"{path} has more than {_MAX_MODEL_BYTES} bytes; it is no face model.")
+            raise PackError(f"{path} is larger than {_MAX_MODEL_BYTES} bytes: not a face model.")
         model = path.read_bytes()
     except OSError as error:
         raise PackError(f"{path} cannot be read: {error.strerror}.") from error

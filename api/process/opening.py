@@ -208,8 +208,7 @@ def open_contract(settings: Settings, keyring: MasterKeyring) -> Contract:
     path = settings.resolved_contract_file
     if not path.is_file():
         raise StartError(
-            f"there is no contract file {path}; `veilface calibrate` writes one "
-            "(setting contract_file)"
+            f"no contract file {path}; `veilface calibrate` writes one (setting contract_file)"
         )
     try:
         return Contract.load(path, file_sealer(keyring))
