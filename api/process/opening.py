@@ -208,7 +208,8 @@ def open_contract(settings: Settings, keyring: MasterKeyring) -> Contract:
     path = settings.resolved_contract_file
     if not path.is_file():
         raise StartError(
-            f"no contract file {path}; `veilface calibrate` writes one (setting contract_file)"
+            f"there is no contract file {path}; `veilface calibrate` writes one "
+            "(setting contract_file)"
         )
     try:
         return Contract.load(path, file_sealer(keyring))
