@@ -1,4 +1,4 @@
-"""The demo model: a face descriptor without training, built here as an ONNX graph.
+"""The demo model: a face embedding without training, built here as an ONNX graph.
 
 It lets ``veilface demo`` and the tests run the whole service on a clone that has no weights. It
 looks at the direction of edges around each place of the picture (a histogram of oriented

@@ -13,7 +13,7 @@
         ├── FaceTooSmall
         └── LowQuality(details)
 
-Messages name the cause and the remedy. They never hold a pixel or a number of a descriptor.
+Messages name the cause and the remedy. They never hold a pixel or a number of an embedding.
 """
 
 from collections.abc import Mapping
