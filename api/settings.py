@@ -60,7 +60,7 @@ class Settings(BaseSettings):
 
     data_dir: Path = Field(
         Path("veilface-data"),
-        description="Folder for everything that Veilface keeps, but for the master key.",
+        description="Folder for everything that Veilface keeps except the master key.",
     )
     database_url: str | None = Field(
         None,
@@ -247,7 +247,7 @@ class Settings(BaseSettings):
         description="Largest photo, in pixels; checked before decoding, which takes up to 17 "
         "bytes a pixel.",
     )
-    max_images: int = Field(10, ge=1, le=10, description="Most photos in one enrollment.")
+    max_images: int = Field(10, ge=1, le=10, description="Maximum number of photos per enrollment.")
     default_tenant: str = Field(
         "default",
         pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$",
@@ -274,7 +274,7 @@ class Settings(BaseSettings):
         None,
         description="The `report.json` that `veilface audit templates` or `veilface audit "
         "fairface` wrote: its figures are shown to whoever asks what is stored. Unset: the page "
-        "says that the deployment was not audited.",
+        "says that the deployment has not been audited.",
     )
     demo: bool = Field(False, description="Say in every answer that the pack is the demo model.")
 
@@ -386,7 +386,7 @@ class Settings(BaseSettings):
             try:
                 words = shlex.split(value)
             except ValueError:
-                raise ValueError("is no command line: a quotation is not closed") from None
+                raise ValueError("is not a command line: a quotation mark is not closed") from None
             if not words:
                 raise ValueError("is empty")
         return value

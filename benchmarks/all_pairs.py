@@ -1,11 +1,11 @@
 """All pairs of photos of different people: the time, the memory, and the false match rates.
 
-Every photo is lifted (adversarial, generated decoys), and every descriptor is compared with every
+Every photo is lifted (adversarial, generated decoys), and every embedding is compared with every
 template. A photo's decoys come from a generator that was fitted to the other half of the people,
 or from the file of ``--decoys``. Nothing but the counts of pairs up to each threshold is kept.
 
 Memory is the largest resident size of the process before the count and after it. It includes the
-interpreter, the libraries, the descriptors and the templates, and after the count also all that
+interpreter, the libraries, the embeddings and the templates, and after the count also all that
 the count needs. Where the system lets a process reset it (Linux), lifting is not in it.
 
 Thresholds are 40 similarities from the one that 15 % of a sample of the pairs reach, upwards. At
@@ -47,7 +47,7 @@ _CHUNK = 256
 
 
 class People(NamedTuple):
-    """Descriptors of photos, and whose they are."""
+    """Embeddings of photos, and whose they are."""
 
     descriptors: NDArray[np.float32]
     labels: NDArray[np.int64]
@@ -61,8 +61,11 @@ def read(source: Path, pack: Path | None) -> People:
     else:
         folder = labelled_folder(source)
         name_of = dict(zip(folder.paths, folder.identities, strict=True))
-        found = Extractor(ModelPack.load(pack), aligned=True).extract(folder.paths)
-        descriptors, names = found.descriptors, np.array([name_of[path] for path in found.paths])
+        extraction = Extractor(ModelPack.load(pack), aligned=True).extract(folder.paths)
+        descriptors, names = (
+            extraction.descriptors,
+            np.array([name_of[path] for path in extraction.paths]),
+        )
     labels = np.unique(names, return_inverse=True)[1]
     return People(np.ascontiguousarray(descriptors, dtype=np.float32), labels.astype(np.int64))
 
@@ -96,9 +99,9 @@ def thresholds(people: People, templates: SubspaceBatch, metric: Metric) -> NDAr
     """Similarities that ascend from the 85 % quantile of a sample of the pairs."""
     every = max(1, len(people.labels) // _SAMPLE)
     some = SubspaceBatch(templates.feet[::every], templates.bases[::every])
-    found = similarity(pairwise_distances(people.descriptors[::every], some, metric=metric))
+    similarities = similarity(pairwise_distances(people.descriptors[::every], some, metric=metric))
     different = people.labels[::every, None] != people.labels[None, ::every]
-    low = float(np.quantile(found[different], 0.85))
+    low = float(np.quantile(similarities[different], 0.85))
     return low + np.linspace(0, _SPAN, _THRESHOLDS)
 
 
@@ -146,7 +149,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int)
     given = parser.parse_args()
     if given.source.is_dir() != (given.pack is not None):
-        parser.error("a folder needs --pack, and an .npz has descriptors already")
+        parser.error("a folder needs --pack, and an .npz has embeddings already")
     people = read(given.source, given.pack)
     templates = lifted(people, given.dim, given.decoys)
     count, n = people.descriptors.shape
@@ -166,14 +169,14 @@ def main() -> None:
     seconds = time.perf_counter() - start
     after = peak_bytes()
     pairs = impostor_pairs(people.labels)
-    held = (people.descriptors.nbytes + templates.feet.nbytes + templates.bases.nbytes) / 2**20
+    resident = (people.descriptors.nbytes + templates.feet.nbytes + templates.bases.nbytes) / 2**20
     whole = 4 * count**2 / 2**20
     print(
         f"{count} photos of {len(np.unique(people.labels))} people, n = {n}, m = {given.dim}, "
         f"{given.metric}, point to subspace, {len(similarities)} thresholds\n"
         f"{pairs:,} pairs of different people: {seconds:.1f} s, {seconds / count**2 * 1e9:.0f} ns "
         f"for each of the {count**2:,} pairs\n"
-        f"peak memory {before / 2**20:.0f} MiB before the count ({held:.0f} of them descriptors "
+        f"peak memory {before / 2**20:.0f} MiB before the count ({resident:.0f} of them embeddings "
         f"and templates), {after / 2**20:.0f} after it; the matrix of distances would take "
         f"{whole:.0f}\n"
     )

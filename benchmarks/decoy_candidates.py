@@ -1,6 +1,6 @@
 """Generators that were compared before `DecoyGenerator` became what it is.
 
-Each is fitted to real descriptors and draws as many of nobody's; the product ships one of them.
+Each is fitted to real embeddings and draws as many of nobody's; the product ships one of them.
 The experiments use NumPy's generator: nothing here makes a template that anybody keeps.
 """
 
@@ -26,7 +26,7 @@ Sampler = Callable[[int, np.random.Generator], Array]
 
 @dataclass(frozen=True)
 class FitData:
-    """What a candidate may learn from; ``norms`` are those of the descriptors before scaling."""
+    """What a candidate may learn from; ``norms`` are those of the embeddings before scaling."""
 
     descriptors: npt.NDArray[np.float32]
     classes: npt.NDArray[np.int64]
@@ -34,7 +34,7 @@ class FitData:
 
     @property
     def x(self) -> Array:
-        """The descriptors in float64."""
+        """The embeddings in float64."""
         return self.descriptors.astype(np.float64)
 
 
@@ -67,7 +67,7 @@ class SampledSource:
 
 
 def gaussian(data: FitData) -> Sampler:
-    """Full covariance of the descriptors (docs/method.md §7.3)."""
+    """Full covariance of the embeddings (docs/method.md §7.3)."""
     x = data.x
     return _affine(x.mean(axis=0), _root(np.cov(x, rowvar=False)))
 
@@ -79,7 +79,7 @@ def gaussian_of_unscaled(data: FitData) -> Sampler:
 
 
 def gaussian_cross_fitted(data: FitData) -> Sampler:
-    """Variances along the principal axes estimated on descriptors that did not find the axes."""
+    """Variances along the principal axes estimated on embeddings that did not find the axes."""
     x = data.x
     axes = principal_axes(x)
     deviations = np.sqrt(np.mean(cross_fitted(x, axes) ** 2, axis=0))

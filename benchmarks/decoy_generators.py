@@ -1,7 +1,7 @@
-"""Which decoy generator: told apart from real descriptors, accuracy, leakage, memorisation.
+"""Which decoy generator: told apart from real embeddings, accuracy, leakage, memorisation.
 
 Every figure of docs/decoys.md. Generators are fitted to 3,500 FairFace training faces and compared
-with faces of other people. Descriptors stay in memory; ``--embeddings`` reads an .npz computed
+with faces of other people. Embeddings stay in memory; ``--embeddings`` reads an .npz computed
 elsewhere instead (keys ``lfw``, ``lfw_paths``, ``fairface_train``, ``fairface_train_paths``,
 ``fairface_val``, ``fairface_val_paths``, optionally ``fairface_train_norm``).
 
@@ -45,7 +45,7 @@ SAME_PERSON = 0.5
 
 @dataclass(frozen=True)
 class Faces:
-    """Descriptors of all sets, FairFace classes as gender × race."""
+    """Embeddings of all sets, FairFace classes as gender × race."""
 
     lfw: Rows
     pairs: list[Pair]
@@ -69,7 +69,7 @@ def _each_once(rows: Rows) -> Rows:
 
 
 def load(data: Path, embeddings: Path | None) -> Faces:
-    """Read or compute the descriptors; split FairFace's training faces by a fixed permutation."""
+    """Read or compute the embeddings; split FairFace's training faces by a fixed permutation."""
     lfw_root, fairface = data / "lfw" / "aligned112", data / "fairface"
     norms = None
     if embeddings is not None:
@@ -85,12 +85,14 @@ def load(data: Path, embeddings: Path | None) -> Faces:
         crops = Extractor(pack, aligned=True).extract(sorted(lfw_root.glob("*/*.jpg")))
         lfw, lfw_paths = crops.descriptors, crops.paths
         photos = Extractor(pack)
-        found = [photos.extract(sorted((fairface / s).glob("*.jpg"))) for s in ("train", "val")]
-        train, val = (one.descriptors for one in found)
+        extractions = [
+            photos.extract(sorted((fairface / s).glob("*.jpg"))) for s in ("train", "val")
+        ]
+        train, val = (one.descriptors for one in extractions)
         train_names, val_names = (
-            [p.relative_to(fairface).as_posix() for p in one.paths] for one in found
+            [p.relative_to(fairface).as_posix() for p in one.paths] for one in extractions
         )
-        failures = sum(len(one.failures) for one in found)
+        failures = sum(len(one.failures) for one in extractions)
     labels = dict(_labels(fairface / "fairface_label_train.csv"))
     labels |= dict(_labels(fairface / "fairface_label_val.csv"))
     train_labels = [labels[name] for name in train_names]

@@ -1,4 +1,4 @@
-"""How well generated descriptors are told from real ones, by an attacker who has the generator."""
+"""How well generated embeddings are told from real ones, by an attacker who has the generator."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ class Coordinates:
 
     @classmethod
     def of(cls, rows: Rows) -> "Coordinates":
-        """Moments of the fitted descriptors, which the generator gives away."""
+        """Moments of the fitted embeddings, which the generator gives away."""
         x = rows.astype(np.float64)
         values, vectors = np.linalg.eigh(np.cov(x, rowvar=False))
         return cls(x.mean(axis=0), vectors[:, ::-1].T, np.sqrt(np.maximum(values[::-1], 1e-12)))
@@ -43,7 +43,7 @@ class Coordinates:
 def classifiers(
     frame: Coordinates,
 ) -> dict[str, tuple[Callable[[Array], Array], Callable[[], object]]]:
-    """Name → (features of descriptors, classifier)."""
+    """Name → (features of embeddings, classifier)."""
 
     def scaled(estimator: object) -> object:
         return make_pipeline(StandardScaler(), estimator)

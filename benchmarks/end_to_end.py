@@ -1,4 +1,4 @@
-"""FNMR and FMR of the running service on real photos, beside raw embeddings on the same attempts.
+"""FRR and FMR of the running service on real photos, beside raw embeddings on the same attempts.
 
 Builds the decoys and the contract with the command line, starts ``veilface serve`` with two
 workers, enrolls photos 1-3 of every person over HTTP, then verifies photos 4-5 against the person
@@ -61,7 +61,7 @@ class Person:
 
 
 @dataclass
-class Outcome:
+class AttemptCounts:
     """Counts of one run; rates come with 95 % Wilson intervals."""
 
     genuine_rejected: int = 0
@@ -94,12 +94,12 @@ def rate(errors: int, trials: int) -> dict[str, object]:
 
 def people_of(folder: Path) -> list[Person]:
     """People of ``folder/Name/*.jpg`` with at least one photo beyond those enrolled."""
-    found = []
+    people = []
     for person in sorted(p for p in folder.iterdir() if p.is_dir()):
         photos = sorted(person.glob("*.jpg"))
         if len(photos) > PHOTOS_ENROLLED:
-            found.append(Person(person.name, photos[:PHOTOS_ENROLLED], photos[PHOTOS_ENROLLED:]))
-    return found
+            people.append(Person(person.name, photos[:PHOTOS_ENROLLED], photos[PHOTOS_ENROLLED:]))
+    return people
 
 
 def impostor_attempts(people: Sequence[Person], each: int) -> Iterator[tuple[Person, Path]]:
@@ -156,7 +156,7 @@ class LiftingClient:
         )
 
     def template(self, photos: Sequence[Path], m: int) -> str:
-        """Base64 of the wire bytes: the photos' mean descriptor, lifted once to dimension m."""
+        """Base64 of the wire bytes: the photos' mean embedding, lifted once to dimension m."""
         samples = [
             self.pack.embed_photo(p.read_bytes(), policy=FacePolicy.LARGEST).embedding
             for p in photos
@@ -168,18 +168,18 @@ class LiftingClient:
         return base64.b64encode(encode(lifted[0], contract_id=self.contract_id)).decode()
 
 
-def decide(outcome: Outcome, answer: httpx.Response, *, genuine: bool) -> None:
+def decide(counts: AttemptCounts, answer: httpx.Response, *, genuine: bool) -> None:
     """Count one answer; a genuine attempt that gets no decision is a rejection."""
     accepted = answer.status_code == 200 and answer.json()["decision"] == "accept"
     if answer.status_code != 200:
         code = answer.json()["error"]["code"]
-        outcome.other_answers[f"{answer.status_code} {code}"] += 1
+        counts.other_answers[f"{answer.status_code} {code}"] += 1
     if genuine:
-        outcome.genuine += 1
-        outcome.genuine_rejected += not accepted
+        counts.genuine += 1
+        counts.genuine_rejected += not accepted
     else:
-        outcome.impostor += 1
-        outcome.impostor_accepted += accepted
+        counts.impostor += 1
+        counts.impostor_accepted += accepted
 
 
 def attempt_all(
@@ -192,9 +192,9 @@ def attempt_all(
     lifting: LiftingClient | None,
     probe_dim: int,
     clients: int,
-) -> Outcome:
+) -> AttemptCounts:
     """Enroll everybody, then verify every genuine and impostor attempt."""
-    outcome = Outcome()
+    counts = AttemptCounts()
     probes: dict[Path, bytes] = {}
     if lifting:
         probes = {
@@ -224,15 +224,15 @@ def attempt_all(
     with ThreadPoolExecutor(clients) as pool:
         for person, answer in zip(people, pool.map(enroll, people), strict=True):
             if answer.status_code not in (200, 201):
-                outcome.refused_enrollments[person.name] = answer.json()["error"]["code"]
+                counts.refused_enrollments[person.name] = answer.json()["error"]["code"]
         genuine = [(person.name, photo) for person in people for photo in person.probes]
         for answer in pool.map(verify, genuine):
-            decide(outcome, answer, genuine=True)
-        enrolled = [p for p in people if p.name not in outcome.refused_enrollments]
+            decide(counts, answer, genuine=True)
+        enrolled = [p for p in people if p.name not in counts.refused_enrollments]
         others = [(person.name, photo) for person, photo in impostor_attempts(enrolled, impostors)]
         for answer in pool.map(verify, others):
-            decide(outcome, answer, genuine=False)
-    return outcome
+            decide(counts, answer, genuine=False)
+    return counts
 
 
 def raw_outcome(
@@ -244,7 +244,7 @@ def raw_outcome(
     impostors: int,
     cache: EmbeddingCache | None,
 ) -> dict[str, object]:
-    """The same attempts with raw descriptors and a cosine threshold at the same FMR target.
+    """The same attempts with raw embeddings and a cosine threshold at the same FMR target.
 
     The threshold comes from all cross-identity pairs of the calibration faces, people of the
     attempts left out, as the service's own does.
@@ -269,15 +269,15 @@ def raw_outcome(
         mean = means[person.name]
         return bool(probes[photo] @ (mean / np.linalg.norm(mean)) > threshold)
 
-    outcome = Outcome()
+    counts = AttemptCounts()
     for person in people:
         for photo in person.probes:
-            outcome.genuine += 1
-            outcome.genuine_rejected += not accepted(person, photo)
+            counts.genuine += 1
+            counts.genuine_rejected += not accepted(person, photo)
     for person, photo in impostor_attempts(people, impostors):
-        outcome.impostor += 1
-        outcome.impostor_accepted += accepted(person, photo)
-    return {"cosine_threshold": round(threshold, 4)} | outcome.summary()
+        counts.impostor += 1
+        counts.impostor_accepted += accepted(person, photo)
+    return {"cosine_threshold": round(threshold, 4)} | counts.summary()
 
 
 def predicted_attributes(
@@ -393,7 +393,7 @@ def main() -> None:
             )
         )
         attempted = time.perf_counter()
-        outcome = attempt_all(
+        counts = attempt_all(
             client,
             people,
             level=args.level,
@@ -414,7 +414,7 @@ def main() -> None:
             "database": args.database,
             "level": args.level,
             "workers": args.workers,
-            "service": outcome.summary(),
+            "service": counts.summary(),
             "raw": raw_outcome(
                 pack,
                 people,

@@ -1,7 +1,7 @@
 """How many templates a wolf probe opens, with and without the cohort test, and what a thief can do.
 
 Templates of LFW people are attacked with lifted probes that lie near every face: principal axes of
-face descriptors through the origin, and the same axes with a plausible foot point along the mean
+face embeddings through the origin, and the same axes with a plausible foot point along the mean
 face. The attacker learns them from FairFace, the contract is calibrated on LFW people who are not
 attacked. The input checks of the service are switched off here, so that the figures are those of
 the decision alone; how many wolves the checks would refuse is counted beside them.
@@ -41,7 +41,7 @@ ATTACKED = 700
 
 @dataclass(frozen=True)
 class Faces:
-    """Unit descriptors with the names of their people."""
+    """Unit embeddings with the names of their people."""
 
     descriptors: npt.NDArray[np.float32]
     names: npt.NDArray[np.str_]

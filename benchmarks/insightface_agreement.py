@@ -1,4 +1,4 @@
-"""Key points, crops and descriptors beside those of the `insightface` package, at an equal canvas.
+"""Key points, crops and embeddings beside those of the `insightface` package, at an equal canvas.
 
 The package is no dependency, not even of development: it asks for `opencv-python`, which replaces
 the headless OpenCV in place and needs a display's libraries. Install it in an environment of its
@@ -59,12 +59,12 @@ def main() -> None:
             image = squeezed(photo, across, down)
             pictures += 1
             bgr = np.ascontiguousarray(image[:, :, ::-1])
-            found, keypoints = detector.detect(bgr, max_num=1)
+            boxes, keypoints = detector.detect(bgr, max_num=1)
             assert pack._detector is not None
             faces = ranked(pack._detector.detect_once(image, pack._detector.sizes[0]), image.shape)
-            if not faces or not len(found):
+            if not faces or not len(boxes):
                 assert not faces
-                assert not len(found)
+                assert not len(boxes)
                 missed += 1
                 continue
             crop, ours = align(bgr, keypoints[0]), pack.align(image, faces[0])
@@ -77,7 +77,7 @@ def main() -> None:
             cosines["whole way"].append(float(right @ sample.embedding))
     print(f"insightface {package.__version__}, canvas {options.size}: {pictures} pictures,")
     print(f"no face in {missed} (by both); key points differ by at most {max(points):.2g} pixels,")
-    print(f"crops by {max(grey)} grey levels; cosine of the descriptors, least and median:")
+    print(f"crops by {max(grey)} grey levels; cosine of the embeddings, least and median:")
     for name, values in cosines.items():
         below = sum(value < 0.9999 for value in values)
         print(f"{name}: {min(values):.7f} {np.median(values):.7f}, below 0.9999: {below}")

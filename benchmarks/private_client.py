@@ -1,4 +1,4 @@
-"""FNMR and FMR of the real private client against a server without a pack, beside photos.
+"""FRR and FMR of the real private client against a server without a pack, beside photos.
 
 One contract, two services. The first has the model pack: photos 1-3 of every person are sent to it,
 then photos 4-5 against the person (genuine) and against other people (impostor), as in
@@ -30,7 +30,7 @@ import httpx
 from benchmarks.deployment import VEILFACE, database, service, veilface
 from benchmarks.end_to_end import (
     UNLIMITED,
-    Outcome,
+    AttemptCounts,
     Person,
     attempt_all,
     impostor_attempts,
@@ -44,12 +44,12 @@ T = TypeVar("T")
 
 def private_outcome(
     client: PrivateClient, people: Sequence[Person], *, level: str, impostors: int, at_once: int
-) -> tuple[Outcome, list[float]]:
+) -> tuple[AttemptCounts, list[float]]:
     """Enroll and verify everybody by lifted templates; also the seconds of every lift.
 
     The seconds of an enrollment include that of its one small request.
     """
-    outcome = Outcome()
+    counts = AttemptCounts()
     seconds: list[float] = []
 
     def timed(work: Callable[[], T]) -> T | str:
@@ -72,29 +72,29 @@ def private_outcome(
 
     def accepted(subject: str, probe: Probe | str) -> bool:
         if isinstance(probe, str):
-            outcome.other_answers[probe] += 1
+            counts.other_answers[probe] += 1
             return False
         try:
             return client.verify(subject, probe, level=level).accepted
         except ServiceError as error:
-            outcome.other_answers[f"{error.status} {error.code}"] += 1
+            counts.other_answers[f"{error.status} {error.code}"] += 1
             return False
 
     with ThreadPoolExecutor(at_once) as pool:
         for person, refused in zip(people, pool.map(enrolled, people), strict=True):
             if refused is not None:
-                outcome.refused_enrollments[person.name] = refused
+                counts.refused_enrollments[person.name] = refused
         photos = [photo for person in people for photo in person.probes]
         probes = dict(zip(photos, pool.map(lifted, photos), strict=True))
     for person in people:
         for photo in person.probes:
-            outcome.genuine += 1
-            outcome.genuine_rejected += not accepted(person.name, probes[photo])
-    there = [person for person in people if person.name not in outcome.refused_enrollments]
+            counts.genuine += 1
+            counts.genuine_rejected += not accepted(person.name, probes[photo])
+    there = [person for person in people if person.name not in counts.refused_enrollments]
     for person, photo in impostor_attempts(there, impostors):
-        outcome.impostor += 1
-        outcome.impostor_accepted += accepted(person.name, probes[photo])
-    return outcome, seconds
+        counts.impostor += 1
+        counts.impostor_accepted += accepted(person.name, probes[photo])
+    return counts, seconds
 
 
 def key_of(env: dict[str, str]) -> str:

@@ -120,7 +120,7 @@ def readme_table(results: Mapping[str, Any]) -> str:
     """Return the table: a line for each strategy and mode, a column for each m.
 
     Only LFW and the spherical distance, by which the product decides; ± is the standard deviation
-    over seeds. The caption states raw descriptors, pairs, runs and the model.
+    over seeds. The caption states raw embeddings, pairs, runs and the model.
 
     Raises
     ------
@@ -197,7 +197,7 @@ def _caption(results: Row, dataset: Row, raw: Row, rows: Sequence[Row]) -> str:
         f"Ten-fold accuracy in % on the {count(dataset.get('pairs'))} pairs of LFW "
         f"({count(rows[0].get('n_genuine'))} genuine and {count(rows[0].get('n_impostor'))} "
         f"impostor compared), {model.get('pack') or model.get('embeddings')}, spherical distance, "
-        f"{mean}. Raw descriptors: {reference}."
+        f"{mean}. Raw embeddings: {reference}."
     )
 
 

@@ -147,10 +147,10 @@ def steps_of(
         face = max(faces, key=lambda found: found.area)
         crop = clock.time("align", pack.align, image, face)
         embedding = clock.time("embed", pack.embed, crop[None])[0]
-        found = clock.time("fetch and decrypt", runtime.store.get, tenant, person.name)
-        if found is None:
+        stored = clock.time("fetch and decrypt", runtime.store.get, tenant, person.name)
+        if stored is None:
             raise SystemExit(f"{person.name} is not enrolled")
-        clock.time("compare and decide", verifier.decide_embedding, embedding, found.wire)
+        clock.time("compare and decide", verifier.decide_embedding, embedding, stored.wire)
     runtime.close()
     return clock.medians()
 

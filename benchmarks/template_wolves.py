@@ -52,7 +52,7 @@ HONEST = 600
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Faces:
-    """Descriptors (N, n), and how each one's similarities to the cohort lie, (N,)."""
+    """Embeddings (N, n), and how each one's similarities to the cohort lie, (N,)."""
 
     points: Floats
     means: Floats
@@ -117,8 +117,8 @@ def ascend(
         ).mean()
         loss, score = -torch.log(share + 1e-6), 0.0
         if limit is not None:
-            held = others @ p + radius * torch.linalg.norm(others @ span.T, dim=1)
-            tilted = TILT * (held - other_means) / other_spreads
+            similarities = others @ p + radius * torch.linalg.norm(others @ span.T, dim=1)
+            tilted = TILT * (similarities - other_means) / other_spreads
             reached = (torch.logsumexp(tilted, 0) - np.log(len(others))) / TILT
             loss, score = loss + 30 * torch.relu(reached - limit + 0.02), reached.item()
         if (
@@ -126,8 +126,10 @@ def ascend(
             and (limit is None or score <= limit)
             and share.item() > best[0] - 0.002
         ):
-            found = AffineSubspace(p.detach().numpy(), np.ascontiguousarray(span.detach().numpy()))
-            best = (share.item(), found)
+            subspace = AffineSubspace(
+                p.detach().numpy(), np.ascontiguousarray(span.detach().numpy())
+            )
+            best = (share.item(), subspace)
         optimiser.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         optimiser.step()
@@ -147,18 +149,20 @@ def unit(rows: NDArray[np.floating]) -> Floats:
 
 
 def crops(data: Path, cache: Path) -> tuple[Floats, NDArray[np.str_]]:
-    """Descriptors and names of LFW's aligned crops; ``cache`` saves a second extraction."""
+    """Embeddings and names of LFW's aligned crops; ``cache`` saves a second extraction."""
     if not cache.exists():
         pack = ModelPack.load(data / "packs" / "w600k_mbf")
         folder = labelled_folder(data / "lfw" / "aligned112")
-        found = Extractor(pack, cache=EmbeddingCache(), aligned=True).extract(folder.paths)
-        np.savez(cache, emb=found.descriptors, names=[path.parent.name for path in found.paths])
+        extraction = Extractor(pack, cache=EmbeddingCache(), aligned=True).extract(folder.paths)
+        np.savez(
+            cache, emb=extraction.descriptors, names=[path.parent.name for path in extraction.paths]
+        )
     stored = np.load(cache)
     return stored["emb"], stored["names"]
 
 
 def stored(data: Path, name: str) -> tuple[Floats, NDArray[np.str_]]:
-    """Descriptors and names of one file of embeddings."""
+    """Embeddings and names of one file of embeddings."""
     file = np.load(data / "embeddings" / f"{name}.npz")
     names = [str(path).split("/")[0] for path in file["paths"]]
     return unit(file["emb_mbf"].astype(np.float32)), np.array(names)
@@ -168,7 +172,7 @@ def main() -> None:
     """Print, as JSON lines, what each template accepts and whether the service takes it."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
-    parser.add_argument("--cache", type=Path, required=True, help="descriptors; made if absent")
+    parser.add_argument("--cache", type=Path, required=True, help="embeddings; made if absent")
     parser.add_argument("--decoys", choices=["lfw", "fairface"], default="lfw")
     parser.add_argument("--people", type=int, default=0, help="calibrate on so many; 0: half")
     parser.add_argument("--dim", type=int, default=64)

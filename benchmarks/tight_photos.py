@@ -3,7 +3,7 @@
 Every photo of a folder of people (`Name/Name_0001.jpg`) is cropped around its face, squeezed, put
 into a black border, and given a small second face in a corner, at its own size and enlarged. Two
 rules look at each picture in turn, in one process: one canvas of 640 with a look at 320 and into
-a border when nothing is found, and `models.detection.find_faces`. A descriptor is compared with
+a border when nothing is found, and `models.detection.find_faces`. An embedding is compared with
 that of the same pixels, cropped by the points that the whole photo gave at 320: it differs by the
 detection alone.
 
@@ -37,7 +37,7 @@ Picture = NDArray[np.uint8]
 Points = NDArray[np.float32]
 Rule = Callable[[Detector, Picture], list[Face]]
 
-WRONG = 0.5  # cosine to the right crop below which the descriptor is of something else
+WRONG = 0.5  # cosine to the right crop below which the embedding is of something else
 OFF = 0.95
 CROPS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.55)
 LARGE = 960
@@ -115,7 +115,7 @@ def main() -> None:
 def judge(
     pack: ModelPack, picture: Picture, points: Points, faces: list[Face], people: int, tally: Tally
 ) -> None:
-    """Book the descriptor's cosine to the right one, and what the gate refuses wrongly."""
+    """Book the embedding's cosine to the right one, and what the gate refuses wrongly."""
     right = align(picture, points, size=pack.crop_size)
     if not faces:
         tally.cosines.append(float("nan"))

@@ -88,12 +88,14 @@ def by_all_photos(
         )
         best, chosen = -2.0, None
         for other in np.argsort(-nearest)[:SHORTLIST].tolist():
-            for ours in combinations(rows.tolist(), own):
-                for theirs in combinations(known[other].tolist(), others):
-                    agreement = weakest_split(faces.descriptors[[*ours, *theirs]]).agreement
+            for own_photos in combinations(rows.tolist(), own):
+                for others_photos in combinations(known[other].tolist(), others):
+                    agreement = weakest_split(
+                        faces.descriptors[[*own_photos, *others_photos]]
+                    ).agreement
                     if agreement > best:
                         fresh = (int(people[place][-1]), int(people[other][-1]))
-                        best, chosen = agreement, Attempt((*ours, *theirs), fresh)
+                        best, chosen = agreement, Attempt((*own_photos, *others_photos), fresh)
         if chosen is not None:
             attempts.append(chosen)
     return attempts
@@ -102,7 +104,7 @@ def by_all_photos(
 def enrolled_means(
     faces: Faces, attempts: Sequence[Attempt], contract: Contract
 ) -> tuple[list[Attempt], NDArray[np.float32]]:
-    """Attempts that are not refused, and the descriptors that are enrolled for them."""
+    """Attempts that are not refused, and the embeddings that are enrolled for them."""
     passed, means = [], []
     for attempt in attempts:
         rows = faces.descriptors[list(attempt.enrolled)]
@@ -156,9 +158,9 @@ def embedded(pack: ModelPack, root: Path, *, aligned: bool) -> tuple[Faces, list
     """Embed a labelled folder."""
     folder = labelled_folder(root)
     name_of = dict(zip(folder.paths, folder.identities, strict=True))
-    found = Extractor(pack, aligned=aligned).extract(folder.paths)
-    names = np.array([name_of[path] for path in found.paths])
-    return Faces(found.descriptors, names), list(found.paths)
+    extraction = Extractor(pack, aligned=aligned).extract(folder.paths)
+    names = np.array([name_of[path] for path in extraction.paths])
+    return Faces(extraction.descriptors, names), list(extraction.paths)
 
 
 def blends(

@@ -1,6 +1,6 @@
 """From photos, or a client's template, to the one private template of a subject.
 
-Imports the floor below only: ``templates`` and ``models``.
+Imports the layer below only: ``templates`` and ``models``.
 """
 
 from enroll.enroller import Enroller, Enrollment, PhotoResult

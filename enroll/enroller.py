@@ -86,7 +86,7 @@ class Enroller:
         n = contract.binding.n
         if source.n != n or rotation.shape != (n, n):
             raise ContractMismatch(
-                f"the contract is for descriptors of {n} numbers; the decoy source gives "
+                f"the contract is for embeddings of {n} numbers; the decoy source gives "
                 f"{source.n}, the rotation turns {rotation.shape[0]}"
             )
         self._contract = contract
@@ -224,7 +224,7 @@ class Enroller:
         if not low <= subspace.foot_norm <= high:
             raise InvalidTemplate(
                 "the template's foot point is outside the range that the contract recorded: "
-                "lift a unit-norm descriptor with the contract's decoys"
+                "lift a unit-norm embedding with the contract's decoys"
             )
         return subspace
 

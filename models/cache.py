@@ -111,7 +111,7 @@ def _decode(content: bytes) -> dict[bytes, NDArray[np.float32]]:
         position += _HEADER.size
         size = _KEY_BYTES + 4 * n
         if magic != _MAGIC or count * size > len(content) - position:
-            raise CacheError("The file is no embedding cache of this version; delete it.")
+            raise CacheError("The file is not an embedding cache of this version; delete it.")
         for _ in range(count):
             key = content[position : position + _KEY_BYTES]
             values = np.frombuffer(content, dtype="<f4", count=n, offset=position + _KEY_BYTES)

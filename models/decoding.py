@@ -151,7 +151,7 @@ def decode_image(data: bytes, *, limits: ImageLimits = DEFAULT_LIMITS) -> NDArra
         the bytes.
     """
     if len(data) == 0:
-        raise ImageError("unsupported_image", "The picture is empty: it has no bytes.")
+        raise ImageError("unsupported_image", "The photo is empty.")
     if len(data) > limits.max_bytes:
         raise ImageError(
             "image_too_large",

@@ -1,4 +1,4 @@
-"""The demo model: a face descriptor without training, built here as an ONNX graph.
+"""The demo model: a face embedding without training, built here as an ONNX graph.
 
 It lets ``veilface demo`` and the tests run the whole service on a clone that has no weights. It
 looks at the direction of edges around each place of the picture (a histogram of oriented
@@ -126,8 +126,8 @@ def require_face(crop: NDArray[np.uint8]) -> None:
     )
     if both < _LEAST_ALIKE * np.sqrt(own * other) or own == 0:
         raise NoFace(
-            "no drawn face was found, and the demo model sees no other: send one, upright and "
-            "aligned, as the demo draws them"
+            "no cartoon face was found, and the demo model sees no others: send one that the demo "
+            "drew, upright and aligned"
         )
 
 

@@ -21,7 +21,7 @@ PREPROCESSING_VERSION = 2
 class Preprocessing:
     """What happens to a crop before the graph sees it: ``(x - mean) / scale`` per channel.
 
-    Part of the contract: descriptors of different preprocessing are not comparable.
+    Part of the contract: embeddings of different preprocessing are not comparable.
     """
 
     alignment: str

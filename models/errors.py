@@ -13,7 +13,7 @@
         ├── FaceTooSmall
         └── LowQuality(details)
 
-Messages name the cause and the remedy. They never hold a pixel or a number of a descriptor.
+Messages name the cause and the remedy. They never hold a pixel or a number of an embedding.
 """
 
 from collections.abc import Mapping
@@ -23,7 +23,7 @@ ImageCode = Literal["unsupported_image", "image_too_large"]
 
 
 class ModelError(Exception):
-    """Base of all errors that the models room raises on purpose."""
+    """Base of all errors that ``models`` raises on purpose."""
 
 
 class ImageError(ModelError):
@@ -85,7 +85,7 @@ class MultipleFaces(FaceError):
 
 
 class FaceTooSmall(FaceError):
-    """The face has too few pixels."""
+    """The face is too small in the photo."""
 
     code = "face_too_small"
 

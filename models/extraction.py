@@ -90,7 +90,7 @@ class Extraction:
     cached
         How many of ``paths`` came from the cache.
     mirrored
-        The descriptors with the mirror image added, where they were asked for.
+        The embeddings with the mirror image added, where they were asked for.
     """
 
     descriptors: NDArray[np.float32] = field(repr=False)
@@ -258,9 +258,9 @@ class Extractor:
                 content = hashlib.sha256(content + marks.tobytes()).digest()
             key = tuple(hashlib.sha256(kind + content).digest() for kind in self._kinds)
             known = () if self._cache is None else tuple(self._cache.get(each) for each in key)
-            found = tuple(each for each in known if each is not None)
-            if len(found) == len(key):
-                return _Prepared(key, embedding=found)
+            embeddings = tuple(each for each in known if each is not None)
+            if len(embeddings) == len(key):
+                return _Prepared(key, embedding=embeddings)
             if marks is not None:
                 image = decode_image(data, limits=self._limits)
                 crop = align(image, marks, size=self._pack.crop_size)

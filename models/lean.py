@@ -61,8 +61,8 @@ def jpeg_scans(data: bytes, *, most: int) -> int:
         One more than these is not looked for.
     """
     scans, at = 0, 2
-    while scans <= most and (found := _MARKER_AFTER_PIXELS.search(data, at)) is not None:
-        marker, at = found[1][0], found.end()
+    while scans <= most and (match := _MARKER_AFTER_PIXELS.search(data, at)) is not None:
+        marker, at = match[1][0], match.end()
         if marker == _END:
             break
         scans += marker == _SCAN

@@ -68,11 +68,11 @@ class PackInfo:
     name
         Of the folder, or of the file without its suffix.
     n
-        Descriptor dimension.
+        Embedding dimension.
     embedder_file, embedder_sha256
         Name and SHA-256 (hex) of the embedder's file.
     preprocessing
-        JSON-able; with the hash it decides whether descriptors are comparable.
+        JSON-able; with the hash it decides whether embeddings are comparable.
     detector
         ``None`` where the pack takes aligned crops only.
     """
@@ -117,9 +117,21 @@ class _Graph:
 
 
 class ModelPack:
-    """An embedder with its preprocessing and, mostly, a detector.
+    """An embedder with its preprocessing and, usually, a detector.
 
     Make one with `load`. All methods are safe from several threads at once.
+
+    Examples
+    --------
+    >>> from models.demo import build_demo_pack
+    >>> from models.synthetic import draw_face, encode_photo
+    >>> pack = ModelPack.load(build_demo_pack(tmp_path))
+    >>> one, same, other = (
+    ...     pack.embed_photo(encode_photo(draw_face(*seeds))).embedding
+    ...     for seeds in ((7, 0), (7, 1), (8, 0))
+    ... )
+    >>> bool(one @ same > one @ other)
+    True
     """
 
     def __init__(self, info: PackInfo, *, embedder: Embedder, detector: Detector | None) -> None:
@@ -389,7 +401,7 @@ def _locate(path: Path) -> tuple[_Location, PackFile]:
 def _read(path: Path, stated: PackFile) -> _Graph:
     try:
         if path.stat().st_size > _MAX_MODEL_BYTES:
-            raise PackError(f"{path} has more than {_MAX_MODEL_BYTES} bytes; it is no face model.")
+            raise PackError(f"{path} is larger than {_MAX_MODEL_BYTES} bytes: not a face model.")
         model = path.read_bytes()
     except OSError as error:
         raise PackError(f"{path} cannot be read: {error.strerror}.") from error
@@ -402,10 +414,10 @@ def _read(path: Path, stated: PackFile) -> _Graph:
 def _pick(graphs: Sequence[_Graph], folder: Path) -> tuple[_Graph, _Graph | None]:
     embedders = [graph for graph in graphs if graph.role is Role.EMBEDDER]
     detectors = [graph for graph in graphs if graph.role in DETECTORS]
-    for kind, found in (("embedders", embedders), ("detectors", detectors)):
-        if len(found) > 1:
-            names = " and ".join(graph.path.name for graph in found)
-            raise PackError(f"{folder} has {len(found)} {kind}: {names}; leave one of them there.")
+    for kind, graphs in (("embedders", embedders), ("detectors", detectors)):
+        if len(graphs) > 1:
+            names = " and ".join(graph.path.name for graph in graphs)
+            raise PackError(f"{folder} has {len(graphs)} {kind}: {names}; leave one of them there.")
     blind = [graph for graph in graphs if graph.role is Role.SCRFD_WITHOUT_KEYPOINTS]
     if blind and not detectors:
         raise PackError(

@@ -54,7 +54,7 @@ def read_pack_file(folder: Path) -> PackFile:
     if not path.is_file():
         return PackFile()
     if path.stat().st_size > _MAX_BYTES:
-        raise PackError(f"{path} has more than {_MAX_BYTES} bytes; it is no pack.toml.")
+        raise PackError(f"{path} is larger than {_MAX_BYTES} bytes: not a pack.toml.")
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

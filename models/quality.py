@@ -275,14 +275,14 @@ def select_face(faces: Sequence[Face], *, single: bool, limits: QualityLimits | 
         If ``single`` and a second face counts.
     """
     if not faces:
-        raise NoFace("No face was found; send an upright photo that shows one face.")
+        raise NoFace("No face was found; send an upright photo of one face.")
     # A speck in the middle outranks nobody who is large enough to be meant.
     large_enough = [face for face in faces if limits is None or _reaches(face, limits)]
     main = large_enough[0] if large_enough else faces[0]
     others = [face for face in large_enough[1:] if limits is None or _counts(face, main, limits)]
     if single and others:
         raise MultipleFaces(
-            f"The photo shows {1 + len(others)} faces; send one with a single face.",
+            f"The photo shows {1 + len(others)} faces; send one that shows a single face.",
             details={"faces": 1 + len(others)},
         )
     return main

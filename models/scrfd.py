@@ -71,12 +71,12 @@ class Scrfd:
                     f"{self._session.name}: the outputs at stride {stride} do not fit a"
                     f" {size[1]} x {size[0]} canvas."
                 )
-            found = np.flatnonzero(score >= self.score_threshold)
-            centres = cell_centres(rows, columns, stride=stride, per_cell=per_cell)[found]
-            reach = distance[found] * stride
+            cells = np.flatnonzero(score >= self.score_threshold)
+            centres = cell_centres(rows, columns, stride=stride, per_cell=per_cell)[cells]
+            reach = distance[cells] * stride
             boxes.append(np.concatenate([centres - reach[:, :2], centres + reach[:, 2:]], axis=1))
-            scores.append(score[found])
-            keypoints.append(centres[:, None, :] + point[found].reshape(-1, 5, 2) * stride)
+            scores.append(score[cells])
+            keypoints.append(centres[:, None, :] + point[cells].reshape(-1, 5, 2) * stride)
         return faces_from_candidates(boxes, scores, keypoints, overlap=OVERLAP, scale=scale)
 
 

@@ -6,7 +6,7 @@ face add (light, colour cast, small pose, expression, blur, noise, background), 
 depend on ``identity`` and ``photo``. The picture is aligned as a detector would align it: the
 eyes and the mouth stand where the 112 x 112 ArcFace template has them.
 
-These are cartoons. A descriptor that tells them apart says nothing about real faces.
+These are cartoons. An embedding that tells them apart says nothing about real faces.
 """
 
 import cv2

@@ -79,14 +79,14 @@ class YuNet:
                 )
             obj = named[f"obj_{stride}"].reshape(-1)
             score = np.sqrt(np.clip(cls, 0, 1) * np.clip(obj, 0, 1))
-            found = np.flatnonzero(score >= self.score_threshold)
-            corner = cell_centres(rows, columns, stride=stride, per_cell=1)[found]
-            box = named[f"bbox_{stride}"].reshape(-1, 4)[found]
+            cells = np.flatnonzero(score >= self.score_threshold)
+            corner = cell_centres(rows, columns, stride=stride, per_cell=1)[cells]
+            box = named[f"bbox_{stride}"].reshape(-1, 4)[cells]
             centre = corner + box[:, :2] * stride
             half = np.exp(np.minimum(box[:, 2:], _MAX_LOG_SIDE)) * (stride / 2)
             boxes.append(np.concatenate([centre - half, centre + half], axis=1))
-            scores.append(score[found])
-            points = named[f"kps_{stride}"].reshape(-1, 5, 2)[found]
+            scores.append(score[cells])
+            points = named[f"kps_{stride}"].reshape(-1, 5, 2)[cells]
             keypoints.append(corner[:, None, :] + points * stride)
         return faces_from_candidates(boxes, scores, keypoints, overlap=OVERLAP, scale=scale)
 

@@ -95,7 +95,7 @@ class StoreError(VeilfaceError):
 
 
 class StoreUnavailable(StoreError):
-    """The database does not answer."""
+    """The database does not respond."""
 
 
 class StoreBusy(StoreUnavailable):

@@ -1,4 +1,4 @@
-"""Fixtures shared by all rooms: the real models and faces, where they are present."""
+"""Fixtures shared by all packages: the real models and faces, where they are present."""
 
 import os
 from collections.abc import Iterator

@@ -37,14 +37,14 @@ def relation_files(
 ) -> dict[str, bytes]:
     """The files of all tables, indexes and TOAST tables, after everything was written to disk."""
     connection.execute("CHECKPOINT")
-    found = connection.execute(
+    tables = connection.execute(
         "SELECT c.relname, pg_relation_filepath(c.oid) FROM pg_class c WHERE c.oid IN ("
         " SELECT unnest(ARRAY[t.oid, t.reltoastrelid]) FROM pg_class t"
         " WHERE t.relnamespace = 'public'::regnamespace AND (%s::text IS NULL OR t.relname = %s))",
         (only, only),
     ).fetchall()
     content = {}
-    for name, path in found:
+    for name, path in tables:
         row = connection.execute(
             "SELECT pg_read_binary_file(%s, 0, %s, true)", (path, 256 * 1024 * 1024)
         ).fetchone()
@@ -115,13 +115,13 @@ def open_files(pid: int) -> dict[str, bytes]:
     while grown:
         more = {child for child, parent in parents.items() if parent in family}
         grown, family = not more <= family, family | more
-    found = {}
+    open_files = {}
     for member in family:
         for link in Path(f"/proc/{member}/fd").glob("*"):
             try:
                 about, target = link.stat(), str(link.readlink())
                 if stat.S_ISREG(about.st_mode) and about.st_size <= LARGEST_OPEN_FILE:
-                    found[target] = link.read_bytes()
+                    open_files[target] = link.read_bytes()
             except OSError:
                 continue
-    return found
+    return open_files

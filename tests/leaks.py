@@ -86,13 +86,13 @@ class LeakSearch:
         self._strings = _Table(self._chunks[:, :8].copy().view("<u8")[:, 0])
 
     def find(self, blob: bytes) -> list[Leak]:
-        """Everything found in a blob, the first of each thing and form."""
-        found: dict[tuple[str, str], Leak] = {}
+        """Everything leaks in a blob, the first of each thing and form."""
+        leaks: dict[tuple[str, str], Leak] = {}
         for form, content in [("", blob), *_decoded(blob)]:
             for leak in self._find_plain(content):
                 named = Leak(leak.what, f"{form}{leak.form}", leak.offset)
-                found.setdefault((named.what, named.form), named)
-        return list(found.values())
+                leaks.setdefault((named.what, named.form), named)
+        return list(leaks.values())
 
     def _find_plain(self, blob: bytes) -> Iterator[Leak]:
         raw = np.frombuffer(blob, dtype=np.uint8)
@@ -142,8 +142,8 @@ class LeakSearch:
             if len(numbers) < TEXT_RUN:
                 continue
             rows = np.lib.stride_tricks.sliding_window_view(np.array(numbers), TEXT_RUN)
-            found = self._text.query(rows, p=np.inf, distance_upper_bound=6e-4)
-            distances, nearest = np.asarray(found[0]), np.asarray(found[1])
+            matches = self._text.query(rows, p=np.inf, distance_upper_bound=6e-4)
+            distances, nearest = np.asarray(matches[0]), np.asarray(matches[1])
             for at in np.flatnonzero(np.isfinite(distances)):
                 yield Leak(self._names[self._text_owner[nearest[at]]], "decimals", offsets[at])
 

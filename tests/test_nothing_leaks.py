@@ -1,7 +1,7 @@
 """Every byte that a running deployment leaves behind, searched for what must never be there.
 
 A real service with two workers and a real pack, on SQLite and on PostgreSQL, enrolls and verifies
-real people over HTTP, answers bad requests, and erases one person. ``tests/leak_scene.py`` keeps
+real people over HTTP, answers bad requests, and erases one person. ``tests/leak_traces.py`` keeps
 all bytes at three moments: while it runs, after the erasure, after the stop. The positive controls
 plant each thing in each form in each kind of place first: the same search finds all of them.
 """
@@ -28,7 +28,7 @@ from tests.leak_places import (
     relation_files,
     written_log,
 )
-from tests.leak_scene import Scene, play
+from tests.leak_traces import ServiceTraces, exercise
 from tests.leaks import LeakSearch, as_bytes
 
 
@@ -47,14 +47,16 @@ def material(
 
 
 @pytest.fixture(scope="module", params=["sqlite", "postgres"])
-def scene(
+def traces(
     request: pytest.FixtureRequest,
     material: Material,
     tmp_path_factory: pytest.TempPathFactory,
-) -> Iterator[Scene]:
+) -> Iterator[ServiceTraces]:
     folder = tmp_path_factory.mktemp(request.param)
     if request.param == "sqlite":
-        yield play(material, folder, database_url=f"sqlite:///{folder / 'data' / 'veilface.db'}")
+        yield exercise(
+            material, folder, database_url=f"sqlite:///{folder / 'data' / 'veilface.db'}"
+        )
         return
     url = request.getfixturevalue("postgres_database")
     with psycopg.connect(postgres_server(), autocommit=True) as connection:
@@ -62,7 +64,7 @@ def scene(
         # plants would be found in it.
         connection.execute("SELECT pg_advisory_lock(hashtext('veilface leak tests'))")
         keep_log(connection)
-        yield play(material, folder, database_url=url)
+        yield exercise(material, folder, database_url=url)
         with psycopg.connect(url, autocommit=True) as emptied:
             # The controls leave dead rows. A vacuum would write their pages to the log again, after
             # the lock, when the next run searches it.
@@ -70,8 +72,8 @@ def scene(
 
 
 @pytest.fixture(scope="module")
-def search(scene: Scene) -> LeakSearch:
-    return LeakSearch(vectors=scene.vectors, strings=scene.strings)
+def search(traces: ServiceTraces) -> LeakSearch:
+    return LeakSearch(vectors=traces.vectors, strings=traces.strings)
 
 
 # The controls. What is planted is never a whole vector, but a run of it at an odd position.
@@ -123,9 +125,9 @@ def encodings(vector: np.ndarray) -> dict[str, bytes]:
 ENCODINGS = list(encodings(np.linspace(0.01, 0.2, 512)))
 
 
-def in_sqlite_row(scene: Scene, payload: bytes, folder: Path) -> bytes:
+def in_sqlite_row(traces: ServiceTraces, payload: bytes, folder: Path) -> bytes:
     copy = folder / "copy.db"
-    copy.write_bytes(scene.stopped["data/veilface.db"])
+    copy.write_bytes(traces.stopped["data/veilface.db"])
     with sqlite3.connect(copy) as connection:
         connection.execute("PRAGMA journal_mode = DELETE")
         connection.execute("UPDATE templates SET ciphertext = ?", (payload,))
@@ -133,9 +135,9 @@ def in_sqlite_row(scene: Scene, payload: bytes, folder: Path) -> bytes:
     return copy.read_bytes()
 
 
-def in_sqlite_log(scene: Scene, payload: bytes, folder: Path) -> bytes:
+def in_sqlite_log(traces: ServiceTraces, payload: bytes, folder: Path) -> bytes:
     copy = folder / "copy.db"
-    copy.write_bytes(scene.stopped["data/veilface.db"])
+    copy.write_bytes(traces.stopped["data/veilface.db"])
     connection = sqlite3.connect(copy)
     connection.execute("PRAGMA journal_mode = WAL")
     with connection:
@@ -145,27 +147,27 @@ def in_sqlite_log(scene: Scene, payload: bytes, folder: Path) -> bytes:
     return written
 
 
-def in_sqlite_file(scene: Scene, payload: bytes, folder: Path) -> bytes:
-    content = scene.stopped["data/veilface.db"]
+def in_sqlite_file(traces: ServiceTraces, payload: bytes, folder: Path) -> bytes:
+    content = traces.stopped["data/veilface.db"]
     at = len(content) // 2 + 1
     return content[:at] + payload + content[at + len(payload) :]
 
 
-def in_postgres_row(scene: Scene, payload: bytes, folder: Path) -> bytes:
-    with psycopg.connect(scene.database_url) as connection:
+def in_postgres_row(traces: ServiceTraces, payload: bytes, folder: Path) -> bytes:
+    with psycopg.connect(traces.database_url) as connection:
         connection.execute("UPDATE templates SET ciphertext = %s", (payload,))
         rows = b"".join(copied_tables(connection).values())
         connection.rollback()
     return rows
 
 
-def in_log(scene: Scene, payload: bytes, folder: Path) -> bytes:
-    log = scene.stopped["err"]
+def in_log(traces: ServiceTraces, payload: bytes, folder: Path) -> bytes:
+    log = traces.stopped["err"]
     at = log.index(b"\n") + 1
     return log[:at] + b'{"event": "' + payload + b'"}\n' + log[at:]
 
 
-def in_temporary_file(scene: Scene, payload: bytes, folder: Path) -> bytes:
+def in_temporary_file(traces: ServiceTraces, payload: bytes, folder: Path) -> bytes:
     (folder / "upload").write_bytes(NOISE + payload + NOISE)
     return files_of(folder)["upload"]
 
@@ -179,42 +181,44 @@ PLACES = {
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_a_planted_run_of_an_embedding_is_found_in_every_place(
-    scene: Scene, search: LeakSearch, encoding: str, tmp_path: Path
+    traces: ServiceTraces, search: LeakSearch, encoding: str, tmp_path: Path
 ) -> None:
-    payload = b"\x07" + encodings(scene.vectors[EMBEDDING])[encoding] + b"\x07"
-    if scene.kind == "sqlite" or encoding.startswith(("float", "json")):
-        for place in PLACES[scene.kind]:
+    payload = b"\x07" + encodings(traces.vectors[EMBEDDING])[encoding] + b"\x07"
+    if traces.kind == "sqlite" or encoding.startswith(("float", "json")):
+        for place in PLACES[traces.kind]:
             folder = tmp_path / place.__name__
             folder.mkdir()
-            planted = place(scene, payload, folder)
+            planted = place(traces, payload, folder)
             assert EMBEDDING in {leak.what for leak in search.find(planted)}, place.__name__
 
 
-def test_every_kind_of_thing_is_found_where_it_is_planted(scene: Scene, search: LeakSearch) -> None:
+def test_every_kind_of_thing_is_found_where_it_is_planted(
+    traces: ServiceTraces, search: LeakSearch
+) -> None:
     for sign, suffix in ((1, ""), (-1, ", negated")):
         planted = [NOISE]
-        for vector in scene.vectors.values():
+        for vector in traces.vectors.values():
             flat = sign * np.ravel(vector)
             middle = len(flat) // 2 + 1
             planted += [as_bytes(flat[middle : middle + 64], "float32", little=True), b"\x07"]
         found = {leak.what for leak in search.find(b"".join(planted))}
-        assert {f"{name}{suffix}" for name in scene.vectors} <= found
+        assert {f"{name}{suffix}" for name in traces.vectors} <= found
     planted = [NOISE]
-    for string in scene.strings.values():
+    for string in traces.strings.values():
         middle = len(string) // 2 - 1
         planted += [string[middle - 500 : middle + 700], b"\x07"]
-    assert set(scene.strings) <= {leak.what for leak in search.find(b"".join(planted))}
+    assert set(traces.strings) <= {leak.what for leak in search.find(b"".join(planted))}
 
 
 def test_a_plaintext_row_is_found_in_the_file_of_a_postgresql_table(
-    scene: Scene, search: LeakSearch
+    traces: ServiceTraces, search: LeakSearch
 ) -> None:
     """What the server writes to disk is what is searched, past all of its caches."""
-    if scene.kind != "postgres":
+    if traces.kind != "postgres":
         pytest.skip("SQLite's files are searched in the controls of every place")
-    require_files(scene)
-    forms = {k: v for k, v in encodings(scene.vectors[EMBEDDING]).items() if "-of-" not in k}
-    with psycopg.connect(scene.database_url, autocommit=True) as connection:
+    require_files(traces)
+    forms = {k: v for k, v in encodings(traces.vectors[EMBEDDING]).items() if "-of-" not in k}
+    with psycopg.connect(traces.database_url, autocommit=True) as connection:
         connection.execute("CREATE TABLE planted (value bytea)")
         # Compressible text would be hidden from any search of raw files: rows are searched too.
         connection.execute("ALTER TABLE planted ALTER COLUMN value SET STORAGE EXTERNAL")
@@ -230,15 +234,15 @@ def test_a_plaintext_row_is_found_in_the_file_of_a_postgresql_table(
 
 
 def test_what_is_planted_in_the_log_of_postgresql_is_found_in_its_range_only(
-    scene: Scene, search: LeakSearch
+    traces: ServiceTraces, search: LeakSearch
 ) -> None:
     """The log is one for all databases, and its files hold remains of earlier logs."""
-    if scene.kind != "postgres":
+    if traces.kind != "postgres":
         pytest.skip("SQLite's log is searched in the controls of every place")
-    require_files(scene)
-    forms = {k: v for k, v in encodings(scene.vectors[EMBEDDING]).items() if "-of-" not in k}
+    require_files(traces)
+    forms = {k: v for k, v in encodings(traces.vectors[EMBEDDING]).items() if "-of-" not in k}
     message = "SELECT pg_logical_emit_message(false, 'planted', %s::bytea)"
-    with psycopg.connect(scene.database_url, autocommit=True) as connection:
+    with psycopg.connect(traces.database_url, autocommit=True) as connection:
         for form, payload in forms.items():
             before = log_position(connection)
             connection.execute(message, (payload,))
@@ -248,11 +252,11 @@ def test_what_is_planted_in_the_log_of_postgresql_is_found_in_its_range_only(
             assert not search.find(written_log(connection, after)), form
 
 
-def test_the_log_of_postgresql_is_read_to_the_byte(scene: Scene) -> None:
-    if scene.kind != "postgres":
+def test_the_log_of_postgresql_is_read_to_the_byte(traces: ServiceTraces) -> None:
+    if traces.kind != "postgres":
         pytest.skip("SQLite's log is a file, read as it is")
-    require_files(scene)
-    with psycopg.connect(scene.database_url, autocommit=True) as connection:
+    require_files(traces)
+    with psycopg.connect(traces.database_url, autocommit=True) as connection:
         start = log_position(connection)
         for _ in range(2):  # the header of a page may cut one in two
             connection.execute("SELECT pg_logical_emit_message(false, 'first', 'here')")
@@ -265,78 +269,78 @@ def test_the_log_of_postgresql_is_read_to_the_byte(scene: Scene) -> None:
     assert len(written) <= end - start
 
 
-def require_files(scene: Scene) -> None:
-    if scene.files_hidden:
-        pytest.skip(f"the server does not hand out its files: {scene.files_hidden}")
+def require_files(traces: ServiceTraces) -> None:
+    if traces.files_hidden:
+        pytest.skip(f"the server does not hand out its files: {traces.files_hidden}")
 
 
 # What was left behind.
 
 
-def test_the_scene_took_place(scene: Scene) -> None:
+def test_the_scene_took_place(traces: ServiceTraces) -> None:
     """Nothing found means something only if there was something to find."""
     # At FMR 1e-2 and with fresh randomness a mistake or two may happen; it is no leak.
-    assert scene.decisions["genuine"].count("accept") >= len(scene.subjects) - 2
-    assert scene.decisions["impostor"].count("reject") >= len(scene.subjects) - 2
-    assert {"embedding", "lifted", "large upload"} <= set(scene.decisions)
-    assert list(enumerate(scene.refused)) == list(enumerate(scene.expected_refusals))
-    if scene.kind == "sqlite":
-        assert len(scene.running["data/veilface.db-wal"]) > 10_000
+    assert traces.decisions["genuine"].count("accept") >= len(traces.subjects) - 2
+    assert traces.decisions["impostor"].count("reject") >= len(traces.subjects) - 2
+    assert {"embedding", "lifted", "large upload"} <= set(traces.decisions)
+    assert list(enumerate(traces.refused)) == list(enumerate(traces.expected_refusals))
+    if traces.kind == "sqlite":
+        assert len(traces.running["data/veilface.db-wal"]) > 10_000
     else:
-        assert len(b"".join(scene.rows["running"].values())) > 30_000
-    assert {"data/contract.json", "data/decoys.veil", "data/cache.veil"} <= set(scene.running)
-    assert scene.running["err"].count(b'"event": "request"') > 20
+        assert len(b"".join(traces.rows["running"].values())) > 30_000
+    assert {"data/contract.json", "data/decoys.veil", "data/cache.veil"} <= set(traces.running)
+    assert traces.running["err"].count(b'"event": "request"') > 20
 
 
 @pytest.mark.parametrize("moment", ["running", "erased", "stopped"])
 def test_no_number_of_a_face_and_no_picture_is_left_anywhere(
-    scene: Scene, search: LeakSearch, moment: str
+    traces: ServiceTraces, search: LeakSearch, moment: str
 ) -> None:
     leaks = {
         place: found
-        for place, content in scene.unseen_at(moment).items()
+        for place, content in traces.unseen_at(moment).items()
         if (found := search.find(content))
     }
     assert not leaks
 
 
-def test_no_temporary_file_and_no_file_in_the_home_folder_is_made(scene: Scene) -> None:
+def test_no_temporary_file_and_no_file_in_the_home_folder_is_made(traces: ServiceTraces) -> None:
     """Not even an unlinked one: open files were listed in the middle of a large upload.
 
     The home folder is where onnxruntime keeps its telemetry, which is switched off.
     """
-    for moment in (scene.running, scene.erased, scene.stopped):
+    for moment in (traces.running, traces.erased, traces.stopped):
         made = [name for name in moment if name.startswith(("tmp/", "home/"))]
         # What the workers count, for /metrics; the other tests search these files too.
-        if moment is not scene.stopped:
+        if moment is not traces.stopped:
             made = [name for name in made if not name.startswith(COUNTERS)]
         assert not made
     if sys.platform == "linux":
-        assert scene.open_during_upload
+        assert traces.open_during_upload
     temporary = [
         name
-        for name in scene.open_during_upload
-        if scene.is_temporary(name) and f"/{COUNTERS}" not in name
+        for name in traces.open_during_upload
+        if traces.is_temporary(name) and f"/{COUNTERS}" not in name
     ]
     assert not temporary
 
 
-def test_the_token_is_shown_once_and_kept_nowhere(scene: Scene) -> None:
-    secret = scene.token.rsplit("_", 1)[1]
+def test_the_token_is_shown_once_and_kept_nowhere(traces: ServiceTraces) -> None:
+    secret = traces.token.rsplit("_", 1)[1]
     forms = [secret.encode(), secret.upper().encode(), bytes.fromhex(secret)]
-    assert scene.stopped["out"].count(forms[0]) == 1
-    for moment in (scene.running, scene.erased, scene.stopped):
+    assert traces.stopped["out"].count(forms[0]) == 1
+    for moment in (traces.running, traces.erased, traces.stopped):
         for place, content in moment.items():
             if place != "out":  # the bootstrap key is printed there, once, on purpose
                 assert not any(form in content for form in forms), place
 
 
-def test_no_subject_id_is_in_a_log_or_in_an_error(scene: Scene) -> None:
-    log = scene.stopped["err"] + scene.stopped["out"]
-    assert scene.stopped["err"].count(b'"subject": "') > len(scene.subjects)
-    for subject in scene.subjects:
+def test_no_subject_id_is_in_a_log_or_in_an_error(traces: ServiceTraces) -> None:
+    log = traces.stopped["err"] + traces.stopped["out"]
+    assert traces.stopped["err"].count(b'"subject": "') > len(traces.subjects)
+    for subject in traces.subjects:
         assert subject.encode() not in log
-    with_id = [r for r in scene.refused_bodies if any(s.encode() in r for s in scene.subjects)]
+    with_id = [r for r in traces.refused_bodies if any(s.encode() in r for s in traces.subjects)]
     assert not with_id
 
 
@@ -351,17 +355,17 @@ def nearest(rows: np.ndarray, points: np.ndarray) -> float:
     return float(np.sqrt(max(0.0, squared.min())))
 
 
-def test_no_row_of_a_decrypted_template_is_a_descriptor_or_a_decoy(scene: Scene) -> None:
+def test_no_row_of_a_decrypted_template_is_a_descriptor_or_a_decoy(traces: ServiceTraces) -> None:
     """The template's set contains the descriptor, by construction; no array of it is one."""
-    assert set(scene.templates) == set(scene.subjects)
-    for subject, template in scene.templates.items():
+    assert set(traces.templates) == set(traces.subjects)
+    for subject, template in traces.templates.items():
         rotated = template.rows
-        plain = rotated @ scene.rotation  # R⁻¹ = Rᵀ, and rows are vectors
-        points = np.concatenate([scene.descriptors_of(subject), scene.pool])
-        for rows, meant in ((rotated, points @ scene.rotation.T), (plain, points)):
+        plain = rotated @ traces.rotation  # R⁻¹ = Rᵀ, and rows are vectors
+        points = np.concatenate([traces.descriptors_of(subject), traces.pool])
+        for rows, meant in ((rotated, points @ traces.rotation.T), (plain, points)):
             assert nearest(rows, meant) > 1e-3
             assert nearest(rows, points) > 1e-3
-        mean = scene.descriptors_of(subject)[0]
+        mean = traces.descriptors_of(subject)[0]
         foot, basis = plain[0], plain[1:]
         off = mean - foot - (mean - foot) @ np.linalg.pinv(basis) @ basis
         assert np.linalg.norm(off) < 5e-3  # it is this person's template, to float16's rounding
@@ -372,10 +376,10 @@ def test_no_row_of_a_decrypted_template_is_a_descriptor_or_a_decoy(scene: Scene)
 # Erasure.
 
 
-def text_rows(scene: Scene, moment: str, *needles: str) -> dict[str, int]:
+def text_rows(traces: ServiceTraces, moment: str, *needles: str) -> dict[str, int]:
     """Rows, by table, that hold one of the texts in any column."""
     counts = {}
-    for table, rows in scene.values[moment].items():
+    for table, rows in traces.values[moment].items():
         hits = sum(
             any(needle.encode() in value for value in row for needle in needles) for row in rows
         )
@@ -384,16 +388,16 @@ def text_rows(scene: Scene, moment: str, *needles: str) -> dict[str, int]:
     return counts
 
 
-def test_before_the_erasure_the_person_was_there(scene: Scene) -> None:
-    victim = scene.victim
-    assert text_rows(scene, "running", victim.row_id, victim.subject_id, victim.pseudonym) == {
+def test_before_the_erasure_the_person_was_there(traces: ServiceTraces) -> None:
+    victim = traces.victim
+    assert text_rows(traces, "running", victim.row_id, victim.subject_id, victim.pseudonym) == {
         "subjects": 1,
         "templates": 1,
         "idempotency": 1,
         "failed_attempts": 1,
         "audit_log": 3,
     }
-    stored = scene.database_bytes("running")
+    stored = traces.database_bytes("running")
     assert victim.subject_id.encode() in stored
     assert all(piece in stored for piece in victim.key_pieces)
     assert np.mean([piece in stored for piece in victim.ciphertext_pieces]) > 0.9
@@ -401,20 +405,22 @@ def test_before_the_erasure_the_person_was_there(scene: Scene) -> None:
 
 @pytest.mark.parametrize("moment", ["erased", "stopped"])
 def test_after_the_erasure_only_receipt_and_audit_lines_name_the_person(
-    scene: Scene, moment: str
+    traces: ServiceTraces, moment: str
 ) -> None:
-    victim = scene.victim
+    victim = traces.victim
     about = (victim.subject_id, victim.row_id, victim.template_id, victim.pseudonym)
     # By the pseudonym: enrolled, accepted, rejected, erased.
-    assert text_rows(scene, moment, *about) == {"receipts": 1, "audit_log": 4}
-    assert text_rows(scene, moment, victim.subject_id, victim.row_id, victim.template_id) == {}
+    assert text_rows(traces, moment, *about) == {"receipts": 1, "audit_log": 4}
+    assert text_rows(traces, moment, victim.subject_id, victim.row_id, victim.template_id) == {}
 
 
 @pytest.mark.parametrize("moment", ["erased", "stopped"])
-def test_after_the_erasure_no_byte_of_template_and_key_is_left(scene: Scene, moment: str) -> None:
+def test_after_the_erasure_no_byte_of_template_and_key_is_left(
+    traces: ServiceTraces, moment: str
+) -> None:
     """On PostgreSQL in the rows; the next test is about its files."""
-    victim = scene.victim
-    stored = scene.database_bytes(moment)
+    victim = traces.victim
+    stored = traces.database_bytes(moment)
     wanted = [
         victim.subject_id.encode(),
         victim.template_id.encode(),
@@ -422,45 +428,49 @@ def test_after_the_erasure_no_byte_of_template_and_key_is_left(scene: Scene, mom
         *victim.ciphertext_pieces,
     ]
     assert not [piece for piece in wanted if piece in stored]
-    others = [subject for subject in scene.subjects if subject != victim.subject_id]
+    others = [subject for subject in traces.subjects if subject != victim.subject_id]
     assert all(other.encode() in stored for other in others)
 
 
-def test_compacting_takes_what_is_left_out_of_the_files_of_postgresql(scene: Scene) -> None:
+def test_compacting_takes_what_is_left_out_of_the_files_of_postgresql(
+    traces: ServiceTraces,
+) -> None:
     """PostgreSQL leaves a dead row in its page until a vacuum; ``VACUUM FULL`` writes new files.
 
     Its write-ahead log keeps the old row, as ciphertext and wrapped key, until it is recycled:
     docs/storage.md says so.
     """
-    if scene.kind != "postgres":
+    if traces.kind != "postgres":
         pytest.skip("SQLite overwrites deleted rows at once")
-    require_files(scene)
-    victim = scene.victim
-    before = b"\0".join(scene.relations["running"].values())
-    after = b"\0".join(scene.relations["compacted"].values())
+    require_files(traces)
+    victim = traces.victim
+    before = b"\0".join(traces.relations["running"].values())
+    after = b"\0".join(traces.relations["compacted"].values())
     wanted = [victim.subject_id.encode(), *victim.key_pieces, *victim.ciphertext_pieces]
     assert all(piece in before for piece in wanted[: 1 + len(victim.key_pieces)])
     assert not [piece for piece in wanted if piece in after]
-    other = next(subject for subject in scene.subjects if subject != victim.subject_id)
+    other = next(subject for subject in traces.subjects if subject != victim.subject_id)
     assert other.encode() in after
 
 
-def test_the_log_names_the_erased_person_by_the_pseudonym(scene: Scene) -> None:
-    lines = [json.loads(line) for line in scene.erased["err"].splitlines() if line[:1] == b"{"]
+def test_the_log_names_the_erased_person_by_the_pseudonym(traces: ServiceTraces) -> None:
+    lines = [json.loads(line) for line in traces.erased["err"].splitlines() if line[:1] == b"{"]
     erasures = [line for line in lines if line.get("method") == "DELETE"]
-    assert [line["subject"] for line in erasures] == [scene.victim.pseudonym[:16]]
-    assert scene.victim.subject_id.encode() not in scene.erased["err"]
+    assert [line["subject"] for line in erasures] == [traces.victim.pseudonym[:16]]
+    assert traces.victim.subject_id.encode() not in traces.erased["err"]
 
 
-def test_the_receipt_verifies_and_an_altered_one_does_not(scene: Scene, tmp_path: Path) -> None:
+def test_the_receipt_verifies_and_an_altered_one_does_not(
+    traces: ServiceTraces, tmp_path: Path
+) -> None:
     contract = tmp_path / "contract.json"
-    contract.write_text(json.dumps(scene.contract_answer))
+    contract.write_text(json.dumps(traces.contract_answer))
     receipt = tmp_path / "receipt.json"
-    receipt.write_text(json.dumps(scene.receipt_answer))
+    receipt.write_text(json.dumps(traces.receipt_answer))
     ran = run("keys", "verify-receipt", receipt, "--public-key", contract, "--json")
     assert ran.status == 0
     claims = ran.json["claims"]
-    assert claims["subject"] == scene.victim.pseudonym
+    assert claims["subject"] == traces.victim.pseudonym
     assert claims["held"] is True
     erased = {entry["item"]: entry["count"] for entry in claims["erased"]}
     assert (erased["template"], erased["data_key"], erased["idempotency_records"]) == (1, 1, 1)

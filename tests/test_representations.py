@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from templates.space.subspace import AffineSubspace, SubspaceBatch
 from verify.thresholds import Genuine
 
-ROOMS = ("templates", "enroll", "verify", "models")
+PACKAGES = ("templates", "enroll", "verify", "models")
 PRIVATE = (np.ndarray, np.generic, AffineSubspace, SubspaceBatch, bytes, bytearray, memoryview)
 
 
-def dataclasses_of(room: str) -> Iterator[type]:
-    package = importlib.import_module(room)
-    for entry in pkgutil.walk_packages(package.__path__, prefix=f"{room}."):
+def dataclasses_of(name: str) -> Iterator[type]:
+    package = importlib.import_module(name)
+    for entry in pkgutil.walk_packages(package.__path__, prefix=f"{name}."):
         if ".migrations." in entry.name:
             continue  # scripts that run inside alembic only
         module = importlib.import_module(entry.name)
@@ -48,10 +48,10 @@ def shown(kind: type) -> list[str]:
     return [f.name for f in fields if f.repr and holds_private(types[f.name])]
 
 
-@pytest.mark.parametrize("room", ROOMS)
-def test_no_dataclass_shows_private_numbers(room: str) -> None:
-    kinds = list(dataclasses_of(room))
-    assert kinds, f"the room {room} has no dataclass: is it still found?"
+@pytest.mark.parametrize("package", PACKAGES)
+def test_no_dataclass_shows_private_numbers(package: str) -> None:
+    kinds = list(dataclasses_of(package))
+    assert kinds, f"the package {package} has no dataclass: is it still found?"
     assert {kind.__qualname__: names for kind in kinds if (names := shown(kind))} == {}
 
 

@@ -1,6 +1,6 @@
 """Verification: a probe against a subject becomes a decision; metrics and calibration.
 
-Imports the floor below only: ``templates`` and ``models``.
+Imports the layer below only: ``templates`` and ``models``.
 """
 
 from verify.calibration import Calibrated, CalibrationReport, calibrate

@@ -140,7 +140,7 @@ def calibrate(
     unit = unit_descriptors(descriptors)
     if unit.shape != (len(identities), binding.n):
         raise ContractError(
-            f"{len(identities)} identities and a binding of n = {binding.n} need descriptors of "
+            f"{len(identities)} identities and a binding of n = {binding.n} need embeddings of "
             f"shape ({len(identities)}, {binding.n}), not {unit.shape}"
         )
     kept, names = chosen_photos(identities, exclude=exclude, aliases=aliases or {})

@@ -51,7 +51,7 @@ class Verifier:
         n = contract.binding.n
         if rotation.shape != (n, n):
             raise ContractMismatch(
-                f"the contract is for descriptors of {n} numbers, the rotation turns "
+                f"the contract is for embeddings of {n} numbers, the rotation turns "
                 f"{rotation.shape[0]}"
             )
         self._contract = contract
@@ -172,7 +172,7 @@ class Verifier:
         if not low <= subspace.foot_norm <= high:
             raise InvalidTemplate(
                 "the probe's foot point is outside the range that the calibration recorded: "
-                "lift a unit-norm descriptor with the contract's decoys"
+                "lift a unit-norm embedding with the contract's decoys"
             )
 
     def _template(self, stored: bytes | StandIn) -> SubspaceBatch:

@@ -75,7 +75,7 @@ app = typer.Typer(
     name="veilface",
     cls=Veilface,
     no_args_is_help=True,
-    help="Face authentication that stores no face descriptor.\n\n"
+    help="Face authentication that never stores a face embedding.\n\n"
     "Start with `veilface demo`: it needs nothing. With your own weights: `decoys build`, then "
     "`calibrate`, then `serve`. `docs/cli.md` shows every command with an example.",
     **_LOOKS,
@@ -98,7 +98,7 @@ def _root(
             "--version",
             callback=_show_version,
             is_eager=True,
-            help="Print name and version, and exit.",
+            help="Print the version and exit.",
         ),
     ] = False,
 ) -> None:

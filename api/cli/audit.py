@@ -9,7 +9,7 @@ app = typer.Typer(no_args_is_help=True)
 
 @app.callback()
 def audit() -> None:
-    """Attack private templates, and judge what an attacker achieves against your limits."""
+    """Attack private templates, and hold the results against your limits."""
 
 
 audit_fairface.register(app)

@@ -162,7 +162,7 @@ def fairface(
     Example: `veilface audit fairface fairface --pack buffalo_l --out audit`
     """
     require_extra("audit")
-    pack = bulk_pack(settings, flip=flip, why="an audit attacks descriptors of a model pack")
+    pack = bulk_pack(settings, flip=flip, why="an audit attacks embeddings of a model pack")
     wanted = listed(attributes, _attribute, "--attributes", expected=f"of {', '.join(CLASSES)}")
     strategies = listed(strategy, _strategy, "--strategy", expected=f"of {', '.join(STRATEGIES)}")
     if Strategy.HYBRID_PLUS in strategies and not {"gender", "race"} <= set(wanted):

@@ -25,7 +25,7 @@ app = typer.Typer(no_args_is_help=True)
 
 @app.callback()
 def audit_log() -> None:
-    """Verify and read the audit log, in which each line is chained to the one before."""
+    """Verify and read the audit log, a chain of lines."""
 
 
 @app.command()
@@ -43,11 +43,11 @@ def verify(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Check every line and the records that the log tells of; exit status 1 where one is wrong.
+    """Check the audit log and the records it covers; exit status 1 if anything is wrong.
 
-    A line that was altered, removed, added or moved is named; so are tenants, API keys and counts
-    of failed attempts that are not as the log tells, actors that were never created, and nonces
-    that served twice.
+    Reports lines that were altered, removed, added or moved; tenants, API keys and counts of failed
+    attempts that contradict the log; actors that were never created; and nonces that were used
+    twice.
 
     Needs: the database and its master key, under which chain and records are authenticated: whoever
     can write the database but has no master key can write neither. The service may run meanwhile.
@@ -79,7 +79,7 @@ def verify(
         )
     elif intact:
         checked = "" if kept is None else f", and holds the head of line {kept.sequence}"
-        say(f"The audit log is whole: {found.lines} lines{checked}.")
+        say(f"The audit log is intact: {found.lines} lines{checked}.")
         say("API keys, tenants and counts of failed attempts are as it tells.")
     if not intact:
         for each in found.problems[:PROBLEMS_SHOWN]:
@@ -100,10 +100,10 @@ def verify(
 @app.command()
 @takes_settings(*STORE)
 def head(*, settings: Settings, as_json: AsJson = False) -> None:
-    """Write the number and the hash of the last line, to be kept elsewhere.
+    """Print the number and hash of the last line, to be kept elsewhere.
 
-    Keep it where whoever administers the database cannot write: `verify --anchor` then finds a log
-    that was put back to a state before it.
+    Keep it where the database administrator cannot write: `verify --anchor` then detects a log that
+    was rolled back to an earlier state.
 
     Example: `veilface audit-log head > head.txt`
     """
@@ -130,7 +130,7 @@ def show(
     after: Annotated[int, typer.Option(min=0, help="Begin after this line.")] = 0,
     limit: Annotated[int | None, typer.Option(min=1, help="At most so many lines.")] = None,
 ) -> None:
-    """Write the lines as JSON, one a line, the oldest first. Nothing is verified.
+    """Print the lines as JSON, one a line, oldest first. Nothing is verified.
 
     Subjects appear as pseudonyms; name one with `--subject` to find its lines.
 

@@ -17,7 +17,7 @@ from templates.keys.private_file import make_folder, replace_public
 
 FAILED = 1
 Out = Annotated[Path, typer.Option(help="Folder of the report.")]
-Seed = Annotated[int, typer.Option(min=0, help="Seed of all that is random.")]
+Seed = Annotated[int, typer.Option(min=0, help="Seed for everything random.")]
 
 _DEFAULTS = {limit.name: limit.default for limit in LIMITS}
 

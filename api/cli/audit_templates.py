@@ -130,7 +130,7 @@ def templates(
         bool | None,
         typer.Option(
             "--learned/--no-learned",
-            help="Train an inverter from template to descriptor (needs the extra `torch`). Unset: "
+            help="Train an inverter from template to embedding (needs the extra `torch`). Unset: "
             "where torch is installed.",
             show_default=False,
         ),
@@ -142,7 +142,7 @@ def templates(
         bool,
         typer.Option(
             "--reconstruct",
-            help="Train a decoder from descriptor to face picture on the people who are not "
+            help="Train a decoder from embedding to face picture on the people who are not "
             "attacked, and try to reconstruct the victims' faces. No picture is written.",
         ),
     ] = False,
@@ -190,7 +190,7 @@ def templates(
     train = find_spec("torch") is not None if learned is None else learned
     if not train:
         message("note: no inverter is trained: torch is not installed, or --no-learned is set")
-    pack = bulk_pack(settings, flip=flip, why="an audit attacks descriptors of a model pack")
+    pack = bulk_pack(settings, flip=flip, why="an audit attacks embeddings of a model pack")
     sealer = file_sealer(open_keyring(settings))
     loaded = None if contract is None else Contract.load(contract, sealer)
     if contract is not None and (strategy is not None or dim is not None):

@@ -33,7 +33,7 @@ app = typer.Typer(no_args_is_help=True)
 
 @app.callback()
 def bench() -> None:
-    """Measure how fast this machine is, as ratios to what it cannot do without."""
+    """Time this machine, against the work that nothing can avoid."""
 
 
 @app.command()
@@ -42,7 +42,7 @@ def distances(
     count: Annotated[
         int, typer.Option(min=1, help="Probes, and templates: COUNT × COUNT distances.")
     ] = 1000,
-    n: Annotated[str, typer.Option("--n", help="Numbers of a descriptor.")] = "128,512",
+    n: Annotated[str, typer.Option("--n", help="Numbers in an embedding.")] = "128,512",
     dim: Annotated[str, typer.Option(help="Dimensions m of the subspaces.")] = "2,4,8,16",
     mode: Annotated[
         str, typer.Option(help="`p2s` compares points with templates, `s2s` lifted probes.")
@@ -70,16 +70,16 @@ def distances(
             show_default=False,
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the descriptors.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the embeddings.")] = 0,
     as_json: AsJson = False,
 ) -> None:
     """Time all distances between probes and templates, beside the bare matrix product.
 
-    Needs nothing: descriptors of nobody are drawn, spread like faces, and lifted among others of
-    them. Every time is shown as a multiple of the products that a distance starts from, made as
-    one matrix (`× product`), and of the point-to-point matrix of the descriptors (`× points`),
-    timed in turn in the same run. The default options take some minutes; the first run on a
-    machine compiles the kernels before, for half a minute.
+    Needs nothing: it draws embeddings of nobody, spread like faces, and lifts them. Every time is
+    shown as a multiple of the products that a distance starts from, made as one matrix
+    (`× product`), and of the point-to-point matrix of the embeddings (`× points`), timed in turn in
+    the same run. The default options take some minutes; the first run on a machine compiles the
+    kernels, which takes half a minute.
 
     Example: `veilface bench distances --n 512 --dim 16 --metric spherical`
     """
@@ -149,7 +149,7 @@ def _check(question: Question) -> None:
     if max(question.dims) >= min(question.dimensions):
         raise UsageError(
             f"--dim {max(question.dims)} does not fit --n {min(question.dimensions)}: a template "
-            "has fewer dimensions than its descriptors have numbers"
+            "has fewer dimensions than its embeddings have numbers"
         )
     if question.device is not None:
         if question.threads is not None:

@@ -103,7 +103,7 @@ def calibrate(
     exclude_people: Annotated[
         Path | None,
         typer.Option(
-            help="People to leave out, such as those of a test: a folder whose subfolders are "
+            help="People to leave out, such as those in a test: a folder whose subfolders are "
             "named like them, or a text file with a name on each line.",
             show_default=False,
         ),
@@ -111,7 +111,7 @@ def calibrate(
     aliases: Annotated[
         Path | None,
         typer.Option(
-            help="People who occur under two names: a text file, `second name,first name` on each "
+            help="People who appear under two names: a text file, `second name,first name` on each "
             "line.",
             show_default=False,
         ),
@@ -119,10 +119,10 @@ def calibrate(
     photos: Annotated[
         int, typer.Option(min=1, max=10, help="Most photos averaged into one template.")
     ] = 3,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the random choices.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed for the random choices.")] = 0,
     as_json: AsJson = False,
 ) -> None:
-    """Measure private templates of labelled people, and write the contract file.
+    """Calibrate on labelled people, and write the contract file.
 
     Needs: a model pack, a decoys file, and photos of people with two photos or more each. 80
     people resolve FMR 1e-2 and 1e-3; lower targets need more people, and those that the data
@@ -134,7 +134,7 @@ def calibrate(
     dims = default_probe_dims(dim) if probe_dims is None else parse_dims(probe_dims)
     pack = bulk_pack(settings, flip=flip, why="a contract is bound to a model pack")
     if dim >= pack.info.n:
-        raise UsageError(f"--dim must be below the {pack.info.n} numbers of a descriptor")
+        raise UsageError(f"--dim must be below the {pack.info.n} numbers of an embedding")
     labelled = labelled_folder(folder)
     name_of = dict(zip(labelled.paths, labelled.identities, strict=True))
     keyring = open_keyring(settings)
@@ -220,7 +220,7 @@ def likeness_note(found: Rate | None, strategy: Strategy, m: int) -> str | None:
         return None
     return (
         f"from {100 * found.value:.0f} % of the templates of these people ({found.errors} of "
-        f"{found.trials}, {strategy}, m = {m}), who has the decoy generator finds the descriptor: "
+        f"{found.trials}, {strategy}, m = {m}), who has the decoy generator finds the embedding: "
         "the decoys are spread unlike these people. Build the decoys from thousands of other "
         "people's photos of the same kind, then calibrate again: this line says what a change "
         "gains (docs/privacy.md)"

@@ -23,7 +23,7 @@ app = typer.Typer(no_args_is_help=True)
 
 @app.callback()
 def db() -> None:
-    """Bring the database's schema up to date, check it, clean up in it, and set up tenants."""
+    """Migrate, check and clean up the database; set up tenants."""
 
 
 @app.command()
@@ -31,7 +31,7 @@ def db() -> None:
 def upgrade(*, settings: Settings, as_json: AsJson = False) -> None:
     """Migrate the database to the schema of this version.
 
-    `serve` does this by itself at its start; run it before, where several machines start at once.
+    `serve` does this when it starts; run it first if several machines start at once.
     Safe to run again. Stop every process of an earlier version first, and make a backup.
 
     A database from before rows were authenticated is authenticated once, as it is: look through
@@ -62,13 +62,13 @@ def upgrade(*, settings: Settings, as_json: AsJson = False) -> None:
     if adoption.rows and not as_json:
         say(f"Authenticated the {adoption.rows} rows there were.")
     for prefix in adoption.refused:
-        message(f"key {prefix} is not as the audit log tells: it is good for nothing; replace it")
+        message(f"key {prefix} is not as the audit log tells: it no longer works; replace it")
 
 
 @app.command()
 @takes_settings(*STORE)
 def check(*, settings: Settings, as_json: AsJson = False) -> None:
-    """Check that schema and master key are the right ones; exit status 1 where they are not.
+    """Check that the schema and the master key match; exit status 1 if they do not.
 
     Example: `veilface db check --data-dir veilface-data`
     """
@@ -91,7 +91,7 @@ def check(*, settings: Settings, as_json: AsJson = False) -> None:
 @app.command()
 @takes_settings("data_dir", "database_url")
 def current(*, settings: Settings, as_json: AsJson = False) -> None:
-    """Say which schema the database has, and which one this version needs.
+    """Show which schema the database has and which one this version needs.
 
     Example: `veilface db current --json`
     """
@@ -106,7 +106,7 @@ def current(*, settings: Settings, as_json: AsJson = False) -> None:
 @app.command()
 @takes_settings(*STORE)
 def compact(*, settings: Settings, as_json: AsJson = False) -> None:
-    """Rewrite the database's files, so that no page keeps what was erased.
+    """Rewrite the database files, so that no page keeps erased data.
 
     On PostgreSQL this is `VACUUM (FULL)` of the tables that hold subject data: remains of erased
     rows go, and each table is locked meanwhile. SQLite overwrites what is erased at once; there
@@ -129,16 +129,16 @@ def compact(*, settings: Settings, as_json: AsJson = False) -> None:
 @app.command()
 @takes_settings(*STORE, "default_tenant")
 def unlock(
-    subject: Annotated[str, typer.Argument(help="Whose lockout is lifted.", show_default=False)],
+    subject: Annotated[str, typer.Argument(help="Subject to unlock.", show_default=False)],
     *,
     settings: Settings,
     tenant: Tenant = None,
     as_json: AsJson = False,
 ) -> None:
-    """Forget the failed attempts on a subject; exit status 1 where there were none.
+    """Clear the failed attempts of a subject; exit status 1 if there are none.
 
-    This is how a subject that was disabled after many failures is enabled again. Make sure first
-    that it was the subject who failed.
+    Use it to re-enable a subject that was disabled after many failures. Make sure first that it was
+    the subject who failed.
 
     Example: `veilface db unlock alice --tenant default`
     """
@@ -148,9 +148,9 @@ def unlock(
     if as_json:
         emit({"subject_id": subject, "tenant": name, "lifted": lifted})
     elif lifted:
-        say(f"The failed attempts on {subject} are forgotten.")
+        say(f"Cleared the failed attempts of {subject}.")
     if not lifted:
-        message("error: there were no failed attempts on this subject")
+        message("error: this subject has no failed attempts")
         raise typer.Exit(1)
 
 
@@ -160,13 +160,13 @@ def purge(
     *,
     settings: Settings,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Say how many subjects are due; erase none.")
+        bool, typer.Option("--dry-run", help="Report how many are due; erase none.")
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Erase the subjects whose time is over, and remove records that have expired.
+    """Erase subjects whose retention period has ended, and remove expired records.
 
-    The service does this by itself every `purge_interval_s` seconds. Each erased subject leaves a
+    The service does this every `purge_interval_s` seconds. Each erased subject leaves a
     receipt and a line in the audit log.
 
     Example: `veilface db purge --retention-days 730 --retention-disuse-days 365 --dry-run`
@@ -182,7 +182,7 @@ def purge(
     elif dry_run:
         say(f"{due} subjects are due to be erased.")
     else:
-        say(f"Erased {erased} subjects, and the records that had expired.")
+        say(f"Erased {erased} subjects and all expired records.")
 
 
 @app.command("template-enrollment")
@@ -199,14 +199,13 @@ def template_enrollment(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Allow a tenant's clients to enroll templates that they made themselves, or forbid it.
+    """Allow or forbid a tenant's clients to enroll templates that they made themselves.
 
     Forbidden unless you allow it. Nothing in a template tells whether it holds one person: whoever
     has a key with `enroll` and `embeddings` can lay one template through as many people as it has
-    dimensions, and the service accepts all of them as that subject. Allow it where you trust the
-    holders of such keys as you would trust them to say who somebody is. It counts at once, in all
-    workers; templates that are stored stay. Imports of exports need no such leave: the service
-    sealed them.
+    dimensions, and the service accepts all of them as that subject. Allow it only if you would
+    trust the holders of such keys to say who somebody is. It takes effect at once, in all workers;
+    stored templates stay. Importing an export needs no permission: the service sealed it.
 
     Example: `veilface db template-enrollment --tenant default --allow`
     """
@@ -234,7 +233,7 @@ def erase_tenant(
     confirm: Annotated[
         str,
         typer.Option(
-            help="The tenant's name once more. Nothing brings it back.", show_default=False
+            help="The name of the tenant again, since this cannot be undone.", show_default=False
         ),
     ],
     out: Annotated[
@@ -249,7 +248,7 @@ def erase_tenant(
     Example: `veilface db erase-tenant acme --confirm acme --out receipt.json`
     """
     if confirm != tenant:
-        raise UsageError("--confirm must be the tenant's name; nothing was erased")
+        raise UsageError("--confirm must repeat the name of the tenant; nothing was erased")
     with checked_store(settings) as store, progress("erasing", None) as advance:
         receipt = store.tenant_erasures.erase(tenant, by=operator(), progress=advance).receipt
     answer = receipt_json(receipt)

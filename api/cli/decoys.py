@@ -33,7 +33,7 @@ class Kind(StrEnum):
 
 @app.callback()
 def decoys() -> None:
-    """Make the decoys that hide a descriptor inside its private template."""
+    """Make the decoys that hide an embedding inside its private template."""
 
 
 @app.command()
@@ -55,7 +55,7 @@ def build(
         Kind,
         typer.Option(
             help="`generator`: decoys of nobody, drawn fresh for each template; clients may have "
-            "it. `pool`: the real descriptors, sealed; for hybrid+ and to reproduce the paper."
+            "it. `pool`: the real embeddings, sealed; for hybrid+ and to reproduce the paper."
         ),
     ] = Kind.GENERATOR,
     labels: Annotated[
@@ -85,14 +85,14 @@ def build(
 ) -> None:
     """Make the lifting database from a folder of face photos.
 
-    Needs: a model pack, and photos of at least 100 people (2,000 or more are better) who are not
-    to be enrolled. FairFace labels are read where they are present; only a pool keeps them.
+    Needs: a model pack, and photos of at least 100 people (better 2,000 or more) who will never be
+    enrolled. FairFace labels are read if present; only a pool keeps them.
 
     Example: `veilface decoys build fairface/train --pack buffalo_l --out decoys.veil`
     """
     if kind is Kind.GENERATOR:
         require_extra("decoys")
-    pack = bulk_pack(settings, flip=flip, why="decoys are descriptors of a model pack")
+    pack = bulk_pack(settings, flip=flip, why="decoys are made with a model pack")
     chosen = find_photos(photos)
     found = len(chosen)
     if exclude is not None:
@@ -113,9 +113,8 @@ def build(
     )
     if kind is Kind.GENERATOR and len(extraction.descriptors) < FACES_PER_DIMENSION * source.n:
         message(
-            f"note: {len(extraction.descriptors)} faces for {source.n} numbers each: from so few, "
-            "who was among them can be guessed from the generator; take "
-            f"{FACES_PER_DIMENSION * source.n} or more"
+            f"note: {len(extraction.descriptors)} faces are few for {source.n} numbers each: the "
+            f"generator gives away who they are; use {FACES_PER_DIMENSION * source.n} or more"
         )
     path = out or settings.resolved_decoys_file
     if isinstance(source, DecoyGenerator):
@@ -140,12 +139,12 @@ def build(
             }
         )
         return
-    made = f"{kind} from {len(extraction.descriptors)} descriptors"
+    made = f"{kind} from {len(extraction.descriptors)} embeddings"
     say(f"{path}: {made}{', labelled' if labelled else ''}, id {source.source_id[:16]}.")
-    say(f"Left out: {left_out}. {acquired(extraction)}.")
+    say(f"{acquired(extraction)}{f'; {left_out:,} left out by --exclude' if left_out else ''}.")
     if kind is Kind.POOL:
         message(
-            "note: who is in a pool is accepted by every template that uses them as a decoy; "
+            "note: people in a pool are accepted by every template that uses them as a decoy; "
             "never enroll them"
         )
 

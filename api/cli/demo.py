@@ -24,13 +24,13 @@ def register(app: typer.Typer) -> None:
 def demo(
     *,
     folder: Annotated[
-        Path, typer.Option(help="Where the data go; an earlier demo there is replaced.")
+        Path, typer.Option(help="Folder for the data; replaces an earlier demo there.")
     ] = Path("demo-data"),
     pack: Annotated[
         Path | None,
         typer.Option(
-            help="A real model pack, together with --faces. Unset: a model that is built here and "
-            "recognises drawn faces only.",
+            help="A real model pack, with --faces. Unset: a model that is built here and "
+            "recognises only cartoon faces.",
             show_default=False,
         ),
     ] = None,
@@ -120,22 +120,22 @@ def _print(outcome: Outcome) -> None:
     show(people, levels, stored)
     if outcome.locks_lifted:
         say(
-            f"Five rejections in a row locked a subject {outcome.locks_lifted} times; the demo "
-            "lifted the lock each time, as an operator may."
+            f"Five rejections in a row locked subjects {outcome.locks_lifted} times; each time the "
+            "demo lifted the lock, as an operator can."
         )
     for refusal in outcome.refused_photos:
         say(f"Not usable, counted as rejected: {refusal}")
     if outcome.receipt:
         say(
-            f"Erased {outcome.erased}: {outcome.rows_after_erasure} rows left, and a signed "
-            f"receipt that holds, naming pseudonym {outcome.receipt['subject'][:16]}…"
+            f"Erased {outcome.erased}: {outcome.rows_after_erasure} rows left, and a valid signed "
+            f"receipt for the pseudonym {outcome.receipt['subject'][:16]}…"
         )
     folder = outcome.folder
     say(
         f"\nDone in {outcome.seconds:.0f} s. Start the service on the same data:\n\n"
         f"  {_program()} serve --config {folder}/veilface.toml\n\n"
-        "and open its page, http://127.0.0.1:8421/, with the API key that is in a file which only "
-        f"you can read:\n\n  cat {folder}/api-key\n\n"
+        "and open http://127.0.0.1:8421/ with the API key, which is in a file that only you can "
+        f"read:\n\n  cat {folder}/api-key\n\n"
         "or ask it, in another terminal:\n\n"
         f'  curl -H "Authorization: Bearer $(cat {folder}/api-key)" '
         "http://127.0.0.1:8421/v1/subjects\n"

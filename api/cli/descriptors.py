@@ -1,4 +1,4 @@
-"""Descriptors of many photos, with a progress bar and an account of the failures."""
+"""Embeddings of many photos, with a progress bar and an account of the failures."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,7 +25,7 @@ Flip = Annotated[
     bool,
     typer.Option(
         "--flip",
-        help="Add the descriptor of the mirrored face. Decoys and contract must agree on it.",
+        help="Add the embedding of the mirrored face. Decoys and contract must agree on it.",
     ),
 ]
 Cache = Annotated[
@@ -66,7 +66,7 @@ def extract(
     Raises
     ------
     CommandError
-        No photo gave a descriptor.
+        No photo gave an embedding.
     """
     kept = None
     if cache is not None:
@@ -76,8 +76,8 @@ def extract(
         kept.flush()
     if not extraction.paths:
         raise CommandError(
-            f"no photo gave a descriptor: {acquired(extraction)}; are these photos of faces, and "
-            "does --aligned fit them?"
+            f"no photo gave an embedding ({acquired(extraction)}); are these photos of faces, and "
+            "is --aligned right for them?"
         )
     if extraction.failures:
         message(f"note: {acquired(extraction)}")

@@ -74,7 +74,7 @@ def evaluate(
     embeddings: Annotated[
         Path | None,
         typer.Option(
-            help="With `--pack none`: descriptors computed elsewhere, a `.npz` file with the "
+            help="With `--pack none`: embeddings computed elsewhere, a `.npz` file with the "
             "arrays `paths` and `descriptors`.",
             show_default=False,
         ),
@@ -259,7 +259,7 @@ def _wants_flip(asked: tuple[str, ...] | None, embeddings: Path | None, *, flip:
         return embeddings is None and not flip
     if RAW_FLIP in asked and (embeddings is not None or flip):
         raise UsageError(
-            f"{RAW_FLIP} is raw descriptors with the mirror image added, beside raw ones without: "
+            f"{RAW_FLIP} is raw embeddings with the mirror image added, beside raw ones without: "
             "it needs a pack, and no --flip"
         )
     return RAW_FLIP in asked

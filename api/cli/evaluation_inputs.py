@@ -124,7 +124,7 @@ def open_descriptors(
     """
     no_pack = settings.pack is None or str(settings.pack) == NO_PACK
     if embeddings is None:
-        why = "descriptors come from a model pack; without one, give --pack none --embeddings FILE"
+        why = "embeddings come from a model pack; without one, give --pack none --embeddings FILE"
         if no_pack:
             raise UsageError(why)
         pack = bulk_pack(settings, flip=flip, why=why)
@@ -132,7 +132,7 @@ def open_descriptors(
     if not no_pack:
         raise UsageError("give a pack, or --pack none and --embeddings, not both")
     if flip:
-        raise UsageError("--flip needs a pack: descriptors in a file are as they are")
+        raise UsageError("--flip needs a pack: embeddings in a file are as they are")
     return Descriptors(None, False, read_embeddings(embeddings), embeddings.name)
 
 
@@ -200,13 +200,13 @@ def acquire_faces(
         faces = Faces(pairs, acquired, crops, digest_of_pictures(contents))
     if not len(faces.acquired.descriptors):
         raise CommandError(
-            f"{pairs.name}: no photo gave a descriptor, the first because of "
+            f"{pairs.name}: no photo gave an embedding, the first because of "
             f"{faces.acquired.failures[0].code}; do --aligned and --embeddings fit?"
         )
     if faces.acquired.failures:
         message(
             f"note: {pairs.name}: {len(faces.acquired.failures)} of {len(pairs.pictures)} photos "
-            "failed to acquire; the results list them"
+            "skipped; the results list them"
         )
     return faces
 
@@ -237,7 +237,7 @@ def open_sources(
         )
         if source.n != descriptors.n:
             raise CommandError(
-                f"{file.name} has decoys of {source.n} numbers each, the descriptors have "
+                f"{file.name} has decoys of {source.n} numbers each, the embeddings have "
                 f"{descriptors.n}; build the decoys with this pack"
             )
         if descriptors.pack is not None:

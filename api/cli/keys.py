@@ -36,7 +36,7 @@ app = typer.Typer(no_args_is_help=True)
 
 @app.callback()
 def keys() -> None:
-    """Make, replace and revoke API keys, rotate keys and rotations, verify receipts of erasure."""
+    """Create, replace and revoke API keys; rotate keys; verify erasure receipts."""
 
 
 @app.command()
@@ -46,12 +46,12 @@ def create(
     settings: Settings,
     right: Annotated[
         list[Right],
-        typer.Option(help="A right of the key; repeat it for several.", show_default=False),
+        typer.Option(help="A right of the key; repeat for several.", show_default=False),
     ],
     tenant: Annotated[
         str | None,
         typer.Option(
-            help="Tenant; made where it is new. Unset: the setting `default_tenant`.",
+            help="Tenant, created if it is new. Unset: the setting `default_tenant`.",
             show_default=False,
         ),
     ] = None,
@@ -70,10 +70,10 @@ def create(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Make an API key and show it, once.
+    """Create an API key and show it once.
 
     Needs: the database and its master key; the service may run meanwhile. Give a key no more
-    rights than its user needs. `embeddings` and `scores` are rights that an attacker would like.
+    rights than its user needs. `embeddings` and `scores` are the ones an attacker would like.
 
     Example: `veilface keys create --right enroll --right verify --label web-shop`
     """
@@ -106,7 +106,7 @@ def list_keys(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """List API keys by their prefix; the keys themselves are not kept.
+    """List API keys by prefix; the keys themselves are not kept.
 
     Example: `veilface keys list --tenant default`
     """
@@ -135,13 +135,13 @@ def list_keys(
 def revoke(
     prefix: Annotated[
         str,
-        typer.Argument(help="The 12 digits after `vf_`, as `list` shows them.", show_default=False),
+        typer.Argument(help="The 12 digits after `vf_`, as in `list`.", show_default=False),
     ],
     *,
     settings: Settings,
     as_json: AsJson = False,
 ) -> None:
-    """Revoke an API key for good; exit status 1 where there was none to revoke.
+    """Revoke an API key for good; exit status 1 if there is none to revoke.
 
     Example: `veilface keys revoke 3f9a1c0b7d2e`
     """
@@ -167,15 +167,14 @@ def replace(
     settings: Settings,
     grace_hours: Annotated[
         float,
-        typer.Option(min=0, max=8760, help="Hours that the old key still works."),
+        typer.Option(min=0, max=8760, help="Hours for which the old key still works."),
     ] = 24.0,
     as_json: AsJson = False,
 ) -> None:
-    """Make a key with the rights of another one, which then expires; show the new one, once.
+    """Replace a key, which then expires, by a new one with the same rights; show it once.
 
-    Tenant, label and lowest level are those of the old key too.
-    Give the new key to whoever holds the old one before the hours are over. After a leak use
-    `--grace-hours 0`. Exit status 1 where there is no valid key of this prefix.
+    The new key keeps the tenant, label and lowest level. Hand it over before the grace period ends;
+    after a leak use `--grace-hours 0`. Exit status 1 if no valid key has this prefix.
 
     Example: `veilface keys replace 3f9a1c0b7d2e --grace-hours 48`
     """
@@ -212,14 +211,14 @@ def rotate_tenant(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Give a tenant a new secret rotation, and turn its stored templates into it.
+    """Give a tenant a new secret rotation, and move its stored templates to it.
 
-    Nobody has to be enrolled again, and the service may run meanwhile; the old rotation's key is
-    dropped at the end. That is enough where the rotation's key alone may be known. A template that
-    was stolen stays a credential whatever is done to ours: with `--stolen` only those who are
-    enrolled from now on get the new rotation, the others are listed and are verified as before
-    until they are enrolled again, with new photos. Run it with `--stolen --finish` to see who is
-    left, and once more when nobody is: `--finish` alone would turn the stolen templates too.
+    Nobody has to enroll again, and the service may run meanwhile; the key of the old rotation is
+    dropped at the end. That is enough if only that key may be known. A stolen template stays a
+    credential whatever happens to ours: with `--stolen`, only people enrolled from now on get the
+    new rotation; the others are listed, and verified as before until they enroll again with new
+    photos. Run it with `--stolen --finish` to see who is left, and again when nobody is: `--finish`
+    alone would move the stolen templates too.
 
     Example: `veilface keys rotate-tenant --tenant default`
     """
@@ -259,11 +258,10 @@ def rotate_tenant(
 @app.command()
 @takes_settings("data_dir", "master_key_file")
 def master(*, settings: Settings, as_json: AsJson = False) -> None:
-    """Make the master key file; one that is there is never touched.
+    """Create the master key file; an existing one is never touched.
 
-    `serve` and `calibrate` make it by themselves at their first run. Copy the file to a safe
-    place, apart from the backups of the database: without it nothing stored can be read, and with
-    it everything.
+    `serve` and `calibrate` create it on their first run. Keep a copy in a safe place, apart from
+    the database backups: without it nothing stored can be read, and with it everything.
 
     Example: `veilface keys master --master-key-file /etc/veilface/master.key`
     """
@@ -284,11 +282,11 @@ Retire = Annotated[
 @app.command()
 @takes_settings(*FILES)
 def rotate(*, settings: Settings, retire: Retire = False, as_json: AsJson = False) -> None:
-    """Put a new master key in force and wrap everything again under it.
+    """Put a new master key in force and rewrap everything under it.
 
     Needs: the database, the key file, and the contract and decoys files that it sealed. The
-    service may run meanwhile; it reads the key file again by itself. Templates are not touched,
-    only the keys that wrap them. Backups made before need the old keys: keep those with them.
+    service may run meanwhile; it rereads the key file. Templates are not touched, only the keys
+    that wrap them. Earlier backups need the old keys: keep those with them.
 
     Example: `veilface keys rotate --retire`
     """
@@ -302,7 +300,7 @@ def rotate(*, settings: Settings, retire: Retire = False, as_json: AsJson = Fals
 @app.command()
 @takes_settings(*FILES)
 def rewrap(*, settings: Settings, retire: Retire = False, as_json: AsJson = False) -> None:
-    """Finish a rotation: wrap again whatever an older master key still wraps.
+    """Finish a rotation: rewrap whatever an older master key still wraps.
 
     Safe to run again, and after an interrupted `rotate`.
 
@@ -330,7 +328,7 @@ def verify_receipt(
     ],
     as_json: AsJson = False,
 ) -> None:
-    """Verify the receipt of an erasure; exit status 1 where it does not hold.
+    """Verify an erasure receipt; exit status 1 if it is not valid.
 
     Needs no service and no other key: take the public key once from `receipt_key` in
     `GET /v1/contract`, and keep it with the receipts.

@@ -100,7 +100,7 @@ def lift(
     ] = FacePolicy.SINGLE,
     as_json: AsJson = False,
 ) -> None:
-    """Turn photos into a private template on this machine, without any secret of the service.
+    """Make a private template from photos on this machine, without any secret of the service.
 
     Needs: the service's model pack, `GET /v1/contract` and `GET /v1/contract/generator` saved to
     files. Send the result as `{"template": …}`; the key needs the right `embeddings`, and to enroll

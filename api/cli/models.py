@@ -11,12 +11,12 @@ from models.errors import ModelError
 from models.pack import ModelPack
 from models.pack import inspect as inspect_pack
 
-app = typer.Typer(no_args_is_help=True, help="Look into model packs (the weights you supply).")
+app = typer.Typer(no_args_is_help=True, help="Inspect model packs (the weights you supply).")
 
 
 @app.callback()
 def models() -> None:
-    """Look into model packs (the weights you supply)."""
+    """Inspect model packs (the weights you supply)."""
 
 
 @app.command()
@@ -28,7 +28,7 @@ def inspect(
     *,
     as_json: AsJson = False,
 ) -> None:
-    """Say what each graph of a pack is, and whether Veilface can use the pack.
+    """Show what each graph of a pack is, and whether Veilface can use the pack.
 
     Needs: a folder of `.onnx` files such as InsightFace's `buffalo_l`, or one `.onnx` embedder.
     Exit status 1 means that the pack cannot be used; the reason is shown.
@@ -81,7 +81,7 @@ def inspect(
                 if info.detector is None
                 else f"detector {info.detector.kind}"
             )
-            say(f"Usable: {info.n} numbers per descriptor, {detector}.")
+            say(f"Usable: {info.n} numbers per embedding, {detector}.")
     if info is None:
         raise typer.Exit(1)
     demo_notice(info.embedder_sha256, n=info.n)

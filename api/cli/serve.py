@@ -30,15 +30,15 @@ def serve(
     *,
     settings: Settings,
     check: Annotated[
-        bool, typer.Option("--check", help="Open everything, say whether it fits, and stop.")
+        bool, typer.Option("--check", help="Check that everything fits together, and stop.")
     ] = False,
 ) -> None:
     """Start the REST service.
 
-    Needs: a contract file (`veilface calibrate` writes it), and to accept photos also the model
-    pack and the decoys file of that contract. The database is created or migrated first. The very
-    first start prints an API key with all rights, once: keep it. Stop with Ctrl-C or SIGTERM;
-    requests in progress are finished.
+    Needs: a contract file (from `veilface calibrate`), and to accept photos also the model pack and
+    the decoys file of that contract. The database is created or migrated first. The very first
+    start prints an API key with all rights, once: keep it. Stop with Ctrl-C or SIGTERM; requests in
+    progress are finished.
 
     Example: `veilface serve --pack buffalo_l --data-dir veilface-data --workers 2`
     """
@@ -46,7 +46,7 @@ def serve(
     if demo and not settings.demo:
         settings = settings.model_copy(update={"demo": True})
     if check:
-        say("Everything fits: contract, decoys, pack, database and master key.")
+        say("Everything fits together: contract, decoys, pack, database and master key.")
         return
     if token is not None:
         say(f"API key with all rights of tenant {settings.default_tenant}, shown only now:")

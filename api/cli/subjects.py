@@ -21,11 +21,11 @@ from templates.decoys import Attributes
 from templates.store.audit_log import Entry
 from templates.store.subjects import Source
 
-Subject = Annotated[str, typer.Argument(help="Name of the person.", show_default=False)]
+Subject = Annotated[str, typer.Argument(help="Id of the person.", show_default=False)]
 Face = Annotated[
     FacePolicy,
     typer.Option(
-        help="What a photo with several faces means: an error, or the first by rank (large, and "
+        help="A photo with several faces: refuse it, or use the first by rank (large, and "
         "near the middle)."
     ),
 ]
@@ -58,10 +58,10 @@ def enroll(
     face: Face = FacePolicy.SINGLE,
     as_json: AsJson = False,
 ) -> None:
-    """Enroll a person from photos, or replace the enrollment.
+    """Enroll a person from photos, or replace their enrollment.
 
     Needs: what `serve` needs (contract, decoys, pack); the service may run meanwhile. All photos
-    must show one and the same person. Only the private template is stored.
+    must show the same person. Only the private template is stored.
 
     Example: `veilface enroll alice alice-1.jpg alice-2.jpg alice-3.jpg --pack buffalo_l`
     """
@@ -133,17 +133,16 @@ def verify(
     face: Face = FacePolicy.SINGLE,
     as_json: AsJson = False,
 ) -> None:
-    """Check whether a photo shows a person; exit status 0 accept, 1 reject.
+    """Check whether a photo shows a person; exit status 0 if accepted, 1 if rejected.
 
-    Status 2 is wrong usage, a photo that is not there included; 3 means that no decision could be
-    made, and why stands on stderr. Needs: what `serve` needs; the service may run meanwhile. The
-    decision stands in the audit log; it neither counts for the subject's lockout nor is stopped by
-    it.
+    Exit status 2 is wrong usage, such as a missing photo; 3 means that no decision was made, and
+    stderr says why. Needs: what `serve` needs; the service may run meanwhile. The decision goes
+    into the audit log; it neither counts towards the subject's lockout nor is stopped by it.
 
     Example: `veilface verify alice today.jpg --pack buffalo_l --level fmr-1e-4`
     """
     if not photo.exists():
-        raise UsageError(f"there is no photo {photo}")
+        raise UsageError(f"no such photo: {photo}")
     data = read_bounded(photo, settings.max_image_bytes)
     runtime = Runtime.open(settings)
     try:
@@ -151,7 +150,7 @@ def verify(
         name = _tenant(runtime, tenant)
         read = runtime.read(name, subject)
         if read is None:
-            raise CommandError(f"tenant {name} has no subject of that name; enroll it first")
+            raise CommandError(f"nobody is enrolled as {subject!r} in tenant {name}")
         found, room = read
         try:
             level = runtime.levels.in_force(level)

@@ -119,7 +119,7 @@ def run_demo(
     """
     started = time.monotonic()
     if (pack is None) != (faces is None):
-        raise StartError("a real run needs both a model pack and a folder of faces")
+        raise StartError("a real run needs both --pack and --faces")
     size = scale or Scale()
     _prepare_folder(folder)
     with tempfile.TemporaryDirectory(prefix="veilface-demo-") as scratch:
@@ -141,7 +141,7 @@ def _prepare_folder(folder: Path) -> None:
     if folder.exists() and any(folder.iterdir()):
         ours = settings.is_file() and settings.read_text(encoding="utf-8").startswith(MARKER)
         if not ours:
-            raise StartError(f"{folder} is not empty and no earlier demo; choose another folder")
+            raise StartError(f"{folder} is not empty and not a demo; choose another folder")
         shutil.rmtree(folder)
     folder.mkdir(parents=True, exist_ok=True)
     # Written first, so that a demo that is interrupted can be replaced.
@@ -184,7 +184,7 @@ def _calibrate(
 def _extract(pack: ModelPack, photos: Sequence[Path]) -> Extraction:
     extraction = Extractor(pack).extract(photos)
     if not len(extraction.descriptors):
-        raise StartError("no photo gave a descriptor; are these photos of faces?")
+        raise StartError("no photo gave an embedding; are these photos of faces?")
     return extraction
 
 

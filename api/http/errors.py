@@ -53,56 +53,60 @@ ERROR_CODES: dict[str, ErrorCode] = {
         ErrorCode(
             "malformed_request",
             400,
-            "The body is not what its content type says, or the request is not well-formed HTTP.",
+            "The body does not match its content type, or the request is not well-formed HTTP.",
         ),
-        ErrorCode("unsupported_image", 400, "The photo cannot be decoded, or not safely."),
-        ErrorCode("invalid_template", 400, "The template's bytes break the format or its limits."),
-        ErrorCode("invalid_embedding", 400, "The embedding is no finite unit vector of n numbers."),
+        ErrorCode("unsupported_image", 400, "The photo cannot be decoded safely."),
+        ErrorCode(
+            "invalid_template",
+            400,
+            "The template does not follow the format or exceeds its limits.",
+        ),
+        ErrorCode(
+            "invalid_embedding", 400, "The embedding is not a finite unit vector of n numbers."
+        ),
         ErrorCode(
             "unauthorized",
             401,
-            "No API key, one that is unknown or revoked, or a probe whose `hmac` is wrong.",
+            "The API key is missing, unknown or revoked, or the `hmac` of a probe is wrong.",
         ),
-        ErrorCode("replayed", 401, "The signed probe was seen before, or its time has passed."),
+        ErrorCode("replayed", 401, "The signed probe was used before, or has expired."),
         ErrorCode(
             "forbidden",
             403,
-            "The API key lacks the right, asks below the lowest level, or the tenant forbids it.",
+            "The API key lacks the right or asks for too low a level, or the tenant forbids it.",
         ),
-        ErrorCode("not_enrolled", 404, "The tenant has no such subject."),
-        ErrorCode("not_found", 404, "No such path, or nothing to return there."),
+        ErrorCode("not_enrolled", 404, "Nobody is enrolled under this id."),
+        ErrorCode("not_found", 404, "There is nothing at this path."),
         ErrorCode("method_not_allowed", 405, "The path exists, but not with this method."),
         ErrorCode("contract_mismatch", 409, "The template belongs to another contract."),
         ErrorCode(
             "idempotency_conflict",
             409,
-            "The Idempotency-Key was used for another request, or its first request still runs.",
+            "The Idempotency-Key was used for another request, or the first is still running.",
         ),
         ErrorCode(
             "export_superseded",
             409,
-            "The subject was erased, or enrolled again, after the export was made.",
+            "The subject was erased or enrolled again after the export was made.",
         ),
-        ErrorCode("image_too_large", 413, "The photo has too many bytes or pixels."),
-        ErrorCode("request_too_large", 413, "The request body has too many bytes."),
+        ErrorCode("image_too_large", 413, "The photo is too large, in bytes or pixels."),
+        ErrorCode("request_too_large", 413, "The request body is too large."),
         ErrorCode("too_many_images", 413, "The enrollment has too many photos."),
         ErrorCode("no_face", 422, "No face was found in the photo."),
-        ErrorCode("multiple_faces", 422, "The photo shows several faces."),
-        ErrorCode("face_too_small", 422, "The face has too few pixels."),
+        ErrorCode("multiple_faces", 422, "The photo shows more than one face."),
+        ErrorCode("face_too_small", 422, "The face is too small in the photo."),
         ErrorCode(
-            "low_quality", 422, "The photo is too blurred, too dark, or the pose too extreme."
+            "low_quality", 422, "The photo is too blurred or too dark, or the pose too extreme."
         ),
-        ErrorCode("inconsistent_images", 422, "The photos do not show one and the same person."),
+        ErrorCode("inconsistent_images", 422, "The photos do not all show the same person."),
         ErrorCode("uncalibrated", 422, "The contract has no calibration for what was asked."),
         ErrorCode("validation_failed", 422, "A field is missing, unknown, or has a wrong value."),
-        ErrorCode("locked_out", 423, "Too many failed attempts on this subject."),
-        ErrorCode(
-            "rate_limited", 429, "Too many requests with this API key, or from this address."
-        ),
-        ErrorCode("internal_error", 500, "A defect of the service: report the request id."),
+        ErrorCode("locked_out", 423, "Too many failed attempts for this subject."),
+        ErrorCode("rate_limited", 429, "Too many requests with this API key or from this address."),
+        ErrorCode("internal_error", 500, "A bug in the service: report the request id."),
         ErrorCode("model_unavailable", 503, "The service runs without a model pack."),
-        ErrorCode("store_unavailable", 503, "The database does not answer."),
-        ErrorCode("overloaded", 503, "Too many requests wait already, or the worker is stopping."),
+        ErrorCode("store_unavailable", 503, "The database does not respond."),
+        ErrorCode("overloaded", 503, "Too many requests are waiting, or the worker is stopping."),
     )
 }
 
@@ -133,11 +137,11 @@ DISABLED_RETRY_AFTER_S = 86_400
 
 
 def api_error(error: Exception) -> ApiError | None:
-    """Give an exception of the rooms below its code; None for one that is not expected.
+    """Give an exception of the packages below its code; None for one that is not expected.
 
-    The text of a client's mistake is passed on: the rooms below hold no number of a descriptor or
-    template and no key in their messages. The text of a failure of the service is not, because
-    it may name a file or a host.
+    The text of a client's mistake is passed on: the packages below put no number of an embedding
+    or template and no key into a message. The text of a failure of the service is not passed on,
+    because it may name a file or a host.
     """
     if isinstance(error, ApiError):
         return error
@@ -180,15 +184,15 @@ _TABLE: tuple[tuple[type[Exception], str, str | None], ...] = (
     (DecoyError, "validation_failed", None),
     (ContractMismatch, "contract_mismatch", None),
     (Uncalibrated, "uncalibrated", None),
-    (SealError, "store_unavailable", "what is stored cannot be opened with the master key"),
+    (SealError, "store_unavailable", "the stored data cannot be opened with the master key"),
     (InvalidIdentifier, "validation_failed", None),
     (IdempotencyConflict, "idempotency_conflict", None),
     (ExportSuperseded, "export_superseded", None),
     (Replayed, "replayed", None),
     (RetiredRotation, "store_unavailable", "the tenant's rotation is being renewed; send it again"),
     # The key was good a moment ago: its tenant was erased meanwhile.
-    (UnknownTenant, "unauthorized", "the tenant of this API key is no more"),
-    (StoreError, "store_unavailable", "the database does not answer"),
+    (UnknownTenant, "unauthorized", "the tenant of this API key no longer exists"),
+    (StoreError, "store_unavailable", "the database does not respond"),
 )
 
 

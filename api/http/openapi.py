@@ -15,7 +15,7 @@ from api.http.schemas import (
 )
 
 DESCRIPTION = """\
-Face authentication that never stores a face descriptor. Every error has one shape; the codes are
+Face authentication that never stores a face embedding. Every error has one shape; the codes are
 listed with every call. `X-Request-ID` is accepted, and returned in the header and in the body.
 """
 

@@ -114,7 +114,7 @@ class Protocol(H11Protocol):
         """Answer what is no request, if no answer has begun, and end the connection."""
         request_id = secrets.token_hex(16)
         refusal = self.conn.refusal or ApiError(
-            "malformed_request", "what came is not a well-formed request of HTTP/1.1"
+            "malformed_request", "this is not a well-formed HTTP/1.1 request"
         )
         if self.cycle is not None and not self.cycle.response_complete:
             # Nobody takes what the application may still answer.

@@ -37,5 +37,5 @@ def verify_answer(answer: Mapping[str, Any], public_key: bytes) -> dict[str, Any
     """
     receipt = answer.get("receipt", answer)
     if not isinstance(receipt, Mapping):
-        raise StoreError("this is no receipt: `receipt` is not an object")
+        raise StoreError("this is not a receipt: `receipt` is not an object")
     return verify_receipt(Receipt.from_json(dict(receipt)), public_key)

@@ -262,7 +262,7 @@ class StoredAnswer(_Answer):
     current: bool = Field(description="Of the contract in force; otherwise enroll again.")
     strategy: str | None = Field(description="How it was lifted; null: by another contract.")
     decoys: int | None = Field(description="Decoys among its m directions.")
-    n: int = Field(description="Numbers of a descriptor.")
+    n: int = Field(description="Numbers in an embedding.")
     m: int = Field(description="Dimension of the set that hides it.")
     dtype: str
     wire_bytes: int = Field(description="Bytes of the template before encryption.")
@@ -271,7 +271,7 @@ class StoredAnswer(_Answer):
         description="64 bytes at most from the middle of the ciphertext, hexadecimal."
     )
     foot_point_similarity: float = Field(
-        description="Length of the foot point: its cosine to the hidden descriptor, 3 digits."
+        description="Length of the foot point: its cosine to the hidden embedding, 3 digits."
     )
     enrolled_by: Literal["photos", "template"]
     photos: int = Field(description="Photos that were averaged; 0 for a template.")

@@ -129,7 +129,7 @@ def open_export(data: bytes, *, key: ExportKey, tenant: str, contract_id: str) -
     """
     start = len(MAGIC) + CONTRACT_ID_BYTES
     if len(data) < start or not data.startswith(MAGIC):
-        raise InvalidTemplate("this is no export of Veilface")
+        raise InvalidTemplate("this is not an export of Veilface")
     theirs = data[len(MAGIC) : start].hex()
     if theirs != contract_id:
         raise ContractMismatch(

@@ -1,4 +1,4 @@
-"""Fields of a request, checked and turned into the values of the rooms below."""
+"""Fields of a request, checked and turned into the values of the packages below."""
 
 from collections.abc import Mapping
 from datetime import UTC, datetime
@@ -65,7 +65,7 @@ def embedding_of(value: Any) -> NDArray[np.float64]:
     if not isinstance(value, list) or not 0 < len(value) <= MAX_EMBEDDING:
         raise InvalidEmbedding(f"an embedding is a list of 1 to {MAX_EMBEDDING} numbers")
     if not all(type(number) in (int, float) for number in value):
-        raise InvalidEmbedding("an embedding holds something that is no number")
+        raise InvalidEmbedding("an embedding holds something that is not a number")
     try:
         return np.array(value, dtype=np.float64)
     except OverflowError:

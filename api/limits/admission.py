@@ -224,7 +224,7 @@ def overloaded() -> ApiError:
     """Return the refusal of a request for which there is no room."""
     return ApiError(
         "overloaded",
-        "too many requests wait already; try again shortly",
+        "too many requests are waiting; try again shortly",
         {},
         {"Retry-After": str(RETRY_AFTER_S)},
     )

@@ -88,7 +88,7 @@ class Readiness:
         if self.stopping:
             raise ApiError(
                 "overloaded",
-                "this worker is stopping; ask again, and another one answers",
+                "this worker is stopping; try again, and another will answer",
                 {"stopping": True},
                 {"Retry-After": "5"},
             )

@@ -34,10 +34,12 @@ class PreparationError(VeilfaceError):
 
 
 def acquired(extraction: Extraction) -> str:
-    """Say how many photos gave no descriptor, and why (failure to acquire)."""
-    reasons = ", ".join(f"{n} {code}" for code, n in extraction.failure_counts().items())
-    counts = f"{len(extraction.failures)} of {extraction.attempts} photos failed to acquire"
-    return f"{counts} ({reasons})" if reasons else counts
+    """Say how many photos were skipped, and why (failures to acquire)."""
+    counts = [(code.replace("_", " "), n) for code, n in extraction.failure_counts().items()]
+    if not counts:
+        return f"All {extraction.attempts:,} photos used"
+    why = ", ".join(f"{name} ({n})" for name, n in counts) if len(counts) > 1 else counts[0][0]
+    return f"{len(extraction.failures):,} of {extraction.attempts:,} photos skipped: {why}"
 
 
 def acquired_json(extraction: Extraction) -> dict[str, Json]:
@@ -55,7 +57,7 @@ def default_probe_dims(m: int) -> tuple[int, ...]:
 
 
 def made_with(pack: ModelPack) -> str:
-    """Name the space of the pack's descriptors, as decoys made of them carry it."""
+    """Name the space of the pack's embeddings, as decoys made of them carry it."""
     return embedding_id(
         embedder_sha256=pack.info.embedder_sha256, preprocessing=pack.info.preprocessing
     )

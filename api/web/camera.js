@@ -22,7 +22,7 @@ export async function picture(source, width, height, { side, quality = QUALITY, 
     .drawImage(source, (width - w) / 2, (height - hgt) / 2, w, hgt, 0, 0, canvas.width, canvas.height);
   const blob = await new Promise((done) => canvas.toBlob(done, "image/jpeg", quality));
   // No blob: the picture is empty, or too large for the browser.
-  if (!blob) throw new Problem({ code: "page_error", message: "the browser could not make a photo" });
+  if (!blob) throw new Problem({ code: "page_error", message: "the browser could not take a photo" });
   return { blob, width: canvas.width, height: canvas.height };
 }
 
@@ -35,13 +35,13 @@ export const unasked = ({ status, code }) =>
 
 function whyNot(error) {
   if (!navigator.mediaDevices) {
-    return "The browser gives the camera to pages over HTTPS or on localhost only. Use files instead.";
+    return "Browsers allow the camera only over HTTPS or on localhost. Upload photos instead.";
   }
   if (error?.name === "NotAllowedError") {
-    return "The browser was not allowed to use the camera. Allow it in the address bar, or use files.";
+    return "Camera access was denied. Allow it in the address bar, or upload photos.";
   }
-  if (error?.name === "NotFoundError") return "No camera was found. Use files instead.";
-  return "The camera cannot be used; another program may hold it. Use files instead.";
+  if (error?.name === "NotFoundError") return "No camera found. Upload photos instead.";
+  return "The camera cannot be used: another program may have it. Upload photos instead.";
 }
 
 const release = (stream) => stream?.getTracks().forEach((each) => each.stop());
@@ -53,7 +53,7 @@ export function camera({ onphoto, face, capture = "Take photo" }) {
   video.muted = true;
   const frame = s("rect", { class: "found", rx: "6" });
   const overlay = s("svg", { class: "overlay", "aria-hidden": "true" }, frame);
-  const stage = h("div", { class: "stage", hidden: true }, video, overlay);
+  const viewfinder = h("div", { class: "viewfinder", hidden: true }, video, overlay);
   const said = h("p", { class: "guidance", role: "status", "data-state": "idle" }, OFF);
   const start = h("button", { type: "button", class: "secondary", onclick: begin }, "Start camera");
   const take = h("button", { type: "button", hidden: true, onclick: photo }, capture);
@@ -65,7 +65,7 @@ export function camera({ onphoto, face, capture = "Take photo" }) {
     // Only what changed is read out.
     if (said.textContent !== text) said.textContent = text;
     said.dataset.state = state;
-    stage.dataset.state = state;
+    viewfinder.dataset.state = state;
   }
 
   async function begin() {
@@ -96,7 +96,7 @@ export function camera({ onphoto, face, capture = "Take photo" }) {
     video.srcObject = stream;
     await video.play().catch(() => {});
     if (over(signal)) return release(opened);
-    stage.hidden = take.hidden = false;
+    viewfinder.hidden = take.hidden = false;
     start.hidden = true;
     take.focus();
     say("Looking for a face…", "idle");
@@ -128,8 +128,8 @@ export function camera({ onphoto, face, capture = "Take photo" }) {
           pause = 1000 * Math.max(2, (known && error.wait) || 0);
           say(
             error.code === "rate_limited"
-              ? "Guidance pauses: too many requests. You can still take a photo."
-              : "Guidance is not available now. You can still take a photo.",
+              ? "Guidance is paused: too many requests. You can still take a photo."
+              : "Guidance is unavailable right now. You can still take a photo.",
             "idle",
           );
         }
@@ -181,10 +181,10 @@ export function camera({ onphoto, face, capture = "Take photo" }) {
   function lost() {
     const focused = document.activeElement === take;
     stop();
-    stage.hidden = take.hidden = true;
+    viewfinder.hidden = take.hidden = true;
     start.hidden = start.disabled = false;
     if (focused) start.focus();
-    say("The camera has stopped. Start it again, or use files.", "bad");
+    say("The camera has stopped. Start it again, or upload photos.", "bad");
   }
 
   function stop() {
@@ -193,6 +193,6 @@ export function camera({ onphoto, face, capture = "Take photo" }) {
     video.srcObject = stream = null;
   }
 
-  const root = h("div", { class: "camera" }, stage, said, h("div", { class: "row" }, start, take), refused);
+  const root = h("div", { class: "camera" }, viewfinder, said, h("div", { class: "row" }, start, take), refused);
   return { root, stop };
 }

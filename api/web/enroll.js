@@ -21,7 +21,7 @@ export function subjectField(id = "") {
 export function whyOff(right) {
   if (!may(right)) return lacking(right);
   if (!session.contract.photos) {
-    return "This service runs without a model pack: it takes lifted templates only, and no photos.";
+    return "This service runs without a model pack: it accepts lifted templates but no photos.";
   }
   return null;
 }
@@ -88,8 +88,8 @@ export function enrollView(id) {
     h(
       "p",
       { class: "lead" },
-      "The photos become one private template, encrypted; the photos are not kept. ",
-      "A person who is enrolled already is replaced.",
+      "Your photos become one private template, which is encrypted; the photos are not kept. ",
+      "Enrolling a person again replaces their template.",
     ),
     offNote(why),
     h("form", { class: "card", onsubmit: submit }, fields),
@@ -102,7 +102,7 @@ function enrolled(id, answer) {
   return h(
     "div",
     { class: "verdict accept", role: "status", tabindex: "-1" },
-    h("p", { class: "verdict-word" }, answer.replaced ? "Enrolled anew" : "Enrolled"),
+    h("p", { class: "verdict-word" }, answer.replaced ? "Enrolled again" : "Enrolled"),
     facts([
       ["Person", id],
       ["Photos used", String(answer.images.length)],

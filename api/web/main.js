@@ -46,7 +46,7 @@ function route(focus = true) {
   try {
     subject = decodeURIComponent(id ?? "");
   } catch {
-    // A link that was cut: as if it named nobody.
+    // A truncated link names nobody.
   }
   show(view(subject), title, focus);
 }
@@ -95,7 +95,7 @@ function signInView(problem = null) {
     // A header carries visible ASCII only; anything else is no key.
     if (!/^[!-~]+$/.test(token)) {
       trouble.replaceChildren(
-        problemBox({ code: "unauthorized", message: "this is no API key: keys begin with vf_", details: {} }),
+        problemBox({ code: "unauthorized", message: "that is not an API key: keys begin with vf_", details: {} }),
       );
       return;
     }
@@ -122,7 +122,7 @@ function signInView(problem = null) {
     h(
       "p",
       { class: "lead" },
-      "Enroll and verify faces with this service, and see what it stores of them.",
+      "Enroll people, verify them, and see what the service stores about them.",
     ),
     h(
       "form",
@@ -135,12 +135,12 @@ function signInView(problem = null) {
         h(
           "p",
           { class: "hint", id: "key-hint" },
-          "The first start of the service prints one; ",
+          "The service prints one when it first starts; ",
           h("code", {}, "veilface keys create"),
-          " makes others.",
+          " creates more.",
         ),
       ),
-      h("p", { class: "check" }, keep, h("label", { for: "keep" }, "Keep it until this tab is closed")),
+      h("p", { class: "check" }, keep, h("label", { for: "keep" }, "Keep me signed in until I close this tab")),
       send,
     ),
     trouble,

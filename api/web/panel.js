@@ -4,17 +4,17 @@ import { problemBox } from "./words.js";
 
 const RIGHTS = {
   enroll: "enroll, list and describe people",
-  verify: "verify a photo",
-  erase: "erase a person",
-  export: "export and import",
+  verify: "verify people",
+  erase: "erase people",
+  export: "export and import templates",
   scores: "see distances",
-  embeddings: "send templates and embeddings",
+  embeddings: "send embeddings and templates",
   admin: "lift lockouts",
 };
 
 export function serviceView() {
   const { contract, own } = session;
-  const health = h("div", { role: "status" }, h("p", { class: "hint" }, "Asking…"));
+  const health = h("div", { role: "status" }, h("p", { class: "hint" }, "Checking…"));
   ask(health);
   const root = h(
     "section",
@@ -31,7 +31,7 @@ export function serviceView() {
         h(
           "p",
           {},
-          h("button", { type: "button", class: "secondary", onclick: () => ask(health) }, "Ask again"),
+          h("button", { type: "button", class: "secondary", onclick: () => ask(health) }, "Check again"),
         ),
       ),
       h(
@@ -41,7 +41,7 @@ export function serviceView() {
         facts([
           ["Key", h("code", {}, `vf_${own.prefix}_…`)],
           ["Tenant", own.tenant],
-          ["Ends", own.expires_at ? when(own.expires_at) : "never"],
+          ["Expires", own.expires_at ? when(own.expires_at) : "never"],
         ]),
         h(
           "ul",
@@ -63,15 +63,15 @@ export function serviceView() {
       "section",
       { class: "card" },
       h("h2", {}, "Contract"),
-      h("p", { class: "hint" }, "What templates and thresholds belong to."),
+      h("p", { class: "hint" }, "What every template and threshold belongs to."),
       facts([
         ["Contract", h("code", {}, contract.contract_id)],
         ["Model pack", String(contract.recorded.pack ?? "not recorded")],
-        ["Takes photos", contract.photos ? "yes" : "no: no model pack"],
+        ["Accepts photos", contract.photos ? "yes" : "no: there is no model pack"],
         ["Lifting", `${contract.binding.strategy}, m = ${contract.binding.m}, n = ${contract.binding.n}`],
         ["Decoys", h("code", {}, contract.binding.decoy_source_id)],
         ["Default level", contract.default_level],
-        ["Key of receipts", h("code", {}, contract.receipt_key.public_key)],
+        ["Receipt key", h("code", {}, contract.receipt_key.public_key)],
       ]),
       h(
         "p",
@@ -91,7 +91,7 @@ export function serviceView() {
           each.mode === "p2s"
             ? "Levels for photos"
             : `Levels for lifted probes, m = ${each.probe_m}`,
-          ["Level", "Target FMR", "FMR seen", "FNMR seen"],
+          ["Level", "Target FMR", "Measured FMR", "Measured FNMR"],
           each.levels.map((level) => [
             level.name,
             level.target_fmr ? `${percent(level.target_fmr)} (${oneIn(level.target_fmr)})` : "none",
@@ -119,9 +119,9 @@ async function ask(place) {
   ]) {
     try {
       await call("GET", path);
-      parts.push([what, h("span", { class: "ok" }, "✓ answers")]);
+      parts.push([what, h("span", { class: "ok" }, "✓ up")]);
     } catch (error) {
-      if (error.code === "not_found") parts.push([what, "asked on the operations port only"]);
+      if (error.code === "not_found") parts.push([what, "on the operations port only"]);
       else parts.push([what, problemBox(error)]);
     }
   }

@@ -37,7 +37,7 @@ export function peopleView() {
   function count() {
     const shown = list.childElementCount;
     said.textContent = shown
-      ? `${shown} ${shown === 1 ? "person" : "people"} shown${cursor ? ", and there are more" : ""}.`
+      ? `${shown} ${shown === 1 ? "person" : "people"} shown${cursor ? ", with more to come" : ""}.`
       : "Nobody is enrolled yet.";
   }
 
@@ -67,15 +67,15 @@ export function peopleView() {
       h(
         "p",
         { class: "hint" },
-        person.enrolled_by === "photos" ? `${person.photos} photos, ` : "lifted by the client, ",
+        person.enrolled_by === "photos" ? `${person.photos} photos, ` : "lifted by a client, ",
         "enrolled ",
         when(person.updated_at),
-        person.current ? "" : ". Of an earlier contract: enroll again",
+        person.current ? "" : ". Enrolled under an earlier contract: enroll again",
       ),
       h(
         "p",
         { class: "row" },
-        h("a", { href: `#/stored/${path}`, "aria-label": `What is stored of ${id}` }, "What is stored"),
+        h("a", { href: `#/stored/${path}`, "aria-label": `What is stored about ${id}` }, "What is stored"),
         h("a", { href: `#/verify/${path}`, "aria-label": `Verify ${id}` }, "Verify"),
         h("a", { href: `#/enroll/${path}`, "aria-label": `Enroll ${id} again` }, "Enroll again"),
         erase,
@@ -100,7 +100,7 @@ export function peopleView() {
     "section",
     {},
     title,
-    h("p", { class: "lead" }, "Everybody whom this key's tenant has enrolled, in the order of their ids."),
+    h("p", { class: "lead" }, "Everyone enrolled for this key's tenant, by id."),
     offNote(why),
     may("erase") ? null : offNote(lacking("erase")),
     receipts,
@@ -112,8 +112,8 @@ export function peopleView() {
   return { root, stop: () => dialog?.close() };
 }
 
-// The work is done while the dialog is open, so that a failure is told where it was asked for; a
-// browser may close it all the same, and then `failed` tells it.
+// The dialog stays open during the work, so that a failure shows where it was caused; if the
+// browser closes it all the same, `failed` shows it.
 function confirmErasure(id, work, failed) {
   const before = document.activeElement;
   const problem = h("div", {});
@@ -147,8 +147,8 @@ function confirmErasure(id, work, failed) {
     h(
       "p",
       { id: "erase-text" },
-      "The template, its key and all that is kept about this person are removed, and cannot be ",
-      "brought back. You get a signed receipt.",
+      "This removes the template, its key and everything else that is kept about this person. It cannot ",
+      "be undone. You get a signed receipt.",
     ),
     problem,
     h("p", { class: "row" }, keep, erase),
@@ -176,8 +176,8 @@ function receipt(id, answer) {
     facts([
       ["Erased at", when(claims.erased_at)],
       ["Removed", claims.erased.map((each) => `${each.count} ${each.item.replaceAll("_", " ")}`).join(", ")],
-      ["Receipt names the person", h("code", {}, `${claims.subject.slice(0, 16)}…`)],
-      ["Signed by key", h("code", {}, claims.signing_key)],
+      ["Pseudonym on the receipt", h("code", {}, `${claims.subject.slice(0, 16)}…`)],
+      ["Signing key", h("code", {}, claims.signing_key)],
     ]),
     h(
       "p",
@@ -197,7 +197,7 @@ function receipt(id, answer) {
       { class: "fine" },
       "Check it with ",
       h("code", {}, "veilface keys verify-receipt receipt.json --public-key contract.json"),
-      "; the view Service has the contract to download.",
+      "; download the contract under Service.",
     ),
   );
 }

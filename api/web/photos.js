@@ -1,4 +1,4 @@
-// Where photos come from: the camera, files, and in the demo drawn people; and a tray of those chosen.
+// Where photos come from (camera, files, in the demo cartoon people), and a tray of those chosen.
 
 import { camera, check, picture, unasked } from "./camera.js";
 import { h, newId } from "./dom.js";
@@ -10,7 +10,7 @@ import { guidance, problemBox, sentence } from "./words.js";
 const SIDE = 1600;
 const BYTES = 2 * 1024 * 1024;
 
-const SOURCES = { camera: "Camera", files: "Files", drawn: "Drawn people" };
+const SOURCES = { camera: "Camera", files: "Files", drawn: "Cartoon people" };
 
 // Runs one piece of work after the other.
 function inTurn() {
@@ -49,7 +49,7 @@ export function photoPicker({ most, capture, onchange }) {
   function add(blob, name, seen = null) {
     if (photos.length >= most) {
       if (most > 1) {
-        told.textContent = `${most} photos at most: remove one first.`;
+        told.textContent = `No more than ${most} photos: remove one first.`;
         return;
       }
       remove(photos[0]);
@@ -98,7 +98,7 @@ export function photoPicker({ most, capture, onchange }) {
   }
 
   function changed() {
-    // As the service's messages name them.
+    // The numbers that the service's messages use.
     photos.forEach((photo, index) => (photo.number.textContent = `Photo ${index + 1}`));
     told.textContent = most > 1 ? `${photos.length} of ${most} photos chosen.` : "";
     onchange(ready());
@@ -114,7 +114,7 @@ export function photoPicker({ most, capture, onchange }) {
       } catch (error) {
         if (error.name === "AbortError") return;
         if (!(error instanceof Problem)) throw error;
-        if (unasked(error)) mark(photo, "Not checked beforehand.", "idle");
+        if (unasked(error)) mark(photo, "Not checked yet.", "idle");
         else mark(photo, sentence(error.message), "bad");
       }
     });
@@ -144,7 +144,7 @@ export function photoPicker({ most, capture, onchange }) {
           input.value = "";
         },
       });
-      const many = most > 1 ? `Photos: JPEG, PNG or WebP, ${most} at most` : "Photo: JPEG, PNG or WebP";
+      const many = most > 1 ? `Photos: JPEG, PNG or WebP, up to ${most}` : "Photo: JPEG, PNG or WebP";
       return h("div", { class: "field" }, h("label", { for: input.id }, many), input);
     },
     drawn() {
@@ -183,7 +183,7 @@ export function photoPicker({ most, capture, onchange }) {
       return h(
         "div",
         {},
-        h("div", { class: "field" }, h("label", { for: who.id }, "Person who does not exist"), who),
+        h("div", { class: "field" }, h("label", { for: who.id }, "Cartoon person"), who),
         shots,
         place,
       );
@@ -202,7 +202,7 @@ export function photoPicker({ most, capture, onchange }) {
   const choice = h(
     "fieldset",
     { class: "choice" },
-    h("legend", {}, most > 1 ? `Photos, 1 to ${most}, of one person` : "Photo"),
+    h("legend", {}, most > 1 ? `1 to ${most} photos of one person` : "Photo"),
     sources.map((each) => {
       const radio = h("input", {
         type: "radio",
@@ -222,14 +222,14 @@ export function photoPicker({ most, capture, onchange }) {
     { class: "picker" },
     choice,
     demo
-      ? h("p", { class: "hint" }, "The demo model knows drawn faces only: a real face is not recognised.")
+      ? h("p", { class: "hint" }, "The demo model sees only cartoon faces, not real ones.")
       : null,
     panel,
     h(
       "p",
       { class: "check" },
       largest,
-      h("label", { for: largest.id }, "Others may be in the picture: take the large face near the middle"),
+      h("label", { for: largest.id }, "Others may be in the picture: use the large face near the middle"),
     ),
     tray,
     told,
@@ -247,7 +247,7 @@ export function photoPicker({ most, capture, onchange }) {
         mark(sent[image], sentence(problem.message.replace(/^photo \d+ of \d+: /, "")), "bad");
       }
       for (const index of unlike ?? []) {
-        if (sent[index]) mark(sent[index], "Does not look like the person on the other photos.", "bad");
+        if (sent[index]) mark(sent[index], "Does not look like the person in the other photos.", "bad");
       }
     },
     drop: (sent) => sent.filter((each) => photos.includes(each)).forEach(remove),

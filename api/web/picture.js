@@ -27,7 +27,7 @@ const label = (text, x, y, anchor = "start") => s("text", { x, y, "text-anchor":
 export function picture(stored) {
   const x = Math.min(1, stored.foot_point_similarity);
   const half = Math.sqrt(1 - x * x);
-  // One scale for both; the labels need some room on the right.
+  // One scale for both; the labels need space on the right.
   const width = Math.max(X + R + 70, X + R * x + 150);
   return h(
     "figure",
@@ -102,18 +102,18 @@ function legend(stored) {
   const seen =
     "Angle and lengths are to scale. In both views the set is shown in one or two of its " +
     `${stored.m} dimensions. `;
-  if (stored.decoys === null) return seen + "How it was lifted is not known: it is of another contract.";
+  if (stored.decoys === null) return seen + "How it was lifted is not known: it belongs to another contract.";
   if (stored.decoys === 0) {
-    return seen + "Its directions are random, without decoys: such a set conceals next to nothing.";
+    return seen + "Its directions are random, without decoys, so it conceals next to nothing.";
   }
-  const whose = session.contract.generator ? "faces of nobody" : "faces of other people";
+  const whose = session.contract.generator ? "faces that nobody has" : "faces of other people";
   return (
     seen +
-    `${stored.enrolled_by === "template" ? "By the contract the" : "The"} set was laid through ` +
+    `${stored.enrolled_by === "template" ? "By the contract, the" : "The"} set passes through ` +
     `${stored.decoys} decoys, ${whose}` +
-    `${stored.decoys > SHOWN ? ` (${SHOWN} are drawn)` : ""}: each lies on the rim, as far from the foot ` +
-    "point as the face, and only the drawing marks which is which. In which directions they lie is not " +
-    "stored, so those are an illustration; seen edge on, most would stand near the foot point. Equally a " +
-    "candidate: as far as the set alone tells. What an attacker gets who knows more is for an audit to say."
+    `${stored.decoys > SHOWN ? ` (${SHOWN} are drawn)` : ""}. Each lies on the rim, as far from the foot ` +
+    "point as the face; only the drawing marks which is which. Their directions are not stored, so those " +
+    "are an illustration; seen edge on, most would stand near the foot point. “Equally a candidate” holds " +
+    "for the set alone: what an attacker who knows more gets is for an audit to say."
   );
 }

@@ -57,7 +57,7 @@ export async function call(method, path, { body, headers, signal } = {}) {
     });
   } catch (error) {
     if (error.name === "AbortError") throw error;
-    throw new Problem({ code: "unreachable", message: "the service does not answer" });
+    throw new Problem({ code: "unreachable", message: "the service does not respond" });
   }
   if (answer.headers.get("X-Veilface-Notice")) document.documentElement.dataset.demo = "yes";
   const told = await answer.json().catch(() => null);
@@ -66,7 +66,7 @@ export async function call(method, path, { body, headers, signal } = {}) {
   const problem = new Problem({
     status: answer.status,
     code: told?.error?.code ?? "unreachable",
-    message: told?.error?.message ?? `an answer of status ${answer.status} that is not the service's`,
+    message: told?.error?.message ?? `status ${answer.status}, and not from this service`,
     details: told?.error?.details ?? {},
     requestId: told?.request_id ?? answer.headers.get("X-Request-ID"),
     wait: Number(answer.headers.get("Retry-After")) || null,

@@ -34,7 +34,7 @@ export function storedView(id) {
     "section",
     {},
     h("h1", { tabindex: "-1" }, "What is stored"),
-    h("p", { class: "lead" }, "No photo and no descriptor: one set of points that hides a face, encrypted."),
+    h("p", { class: "lead" }, "No photo and no embedding, only an encrypted set of points that hides the face."),
     offNote(why),
     h(
       "form",
@@ -54,7 +54,7 @@ export function storedView(id) {
 
 function truth(stored) {
   // What a client lifted itself may have been lifted otherwise.
-  const by = stored.enrolled_by === "template" ? ", by the contract; a client lifted it" : "";
+  const by = stored.enrolled_by === "template" ? ", by the contract; lifted by a client" : "";
   return h(
     "div",
     { class: "columns" },
@@ -62,38 +62,38 @@ function truth(stored) {
     h(
       "section",
       { class: "card" },
-      h("h2", {}, `Stored of ${stored.subject_id}`),
+      h("h2", {}, `Stored about ${stored.subject_id}`),
       facts([
         ["In the database", `${bytes(stored.sealed_bytes)}, encrypted (AES-256-GCM)`],
         ["Template inside", `${bytes(stored.wire_bytes)}, ${stored.dtype}`],
-        ["Similarity of foot point and face", stored.foot_point_similarity.toFixed(3)],
+        ["Similarity of foot point to face", stored.foot_point_similarity.toFixed(3)],
         ["Dimension", `${stored.m} of ${stored.n}`],
-        ["Lifting", stored.strategy ? stored.strategy + by : "of another contract"],
+        ["Lifting", stored.strategy ? stored.strategy + by : "under another contract"],
         ["Decoys", stored.decoys === null ? null : stored.decoys + by],
-        ["Made from", stored.photos ? `${stored.photos} photos, not kept` : "a template of the client's"],
+        ["Made from", stored.photos ? `${stored.photos} photos, not kept` : "a template sent by a client"],
         ["First enrolled", when(stored.created_at)],
         ["Enrolled", when(stored.updated_at)],
         ["Last accepted", when(stored.last_used_at)],
         ["Contract", h("code", {}, `${stored.contract_id.slice(0, 16)}…`)],
       ]),
-      h("h3", {}, "Some of its bytes, as they lie in the database"),
+      h("h3", {}, "Some of its bytes, as stored in the database"),
       h("code", { class: "hex" }, stored.sealed_excerpt.match(/.{1,8}/g).join(" ")),
-      h("p", { class: "fine" }, "Ciphertext: without the master key it is noise."),
+      h("p", { class: "fine" }, "Ciphertext: noise without the master key."),
     ),
   );
 }
 
 const ABOUT = {
   contract:
-    "Made for this contract: its model, lifting, dimension and decoys. Thresholds are no part of a " +
-    "contract's id: if it was calibrated again since, the shares that matched are of the earlier ones.",
+    "Made for this contract: its model, lifting, dimension and decoys. The id of a contract does not cover " +
+    "thresholds: if it was calibrated again since, the shares that matched are those of the earlier ones.",
   scheme:
-    "Made for the same model, lifting, dimension and kind of decoys, but not for this contract: other " +
-    "decoys, and thresholds of their own. How much a template gives away depends on both.",
+    "Made for the same model, lifting, dimension and kind of decoys, but not for this contract: its decoys " +
+    "and thresholds are others. How much a template gives away depends on both.",
 };
 
 function audited(told) {
-  const title = h("h2", {}, "What an attacker gets: the audit");
+  const title = h("h2", {}, "What an attacker gets, by audit");
   if (!told.audited || told.fits === "nothing") {
     return h(
       "section",
@@ -104,12 +104,12 @@ function audited(told) {
         {},
         h("strong", {}, "This deployment has not been audited. "),
         told.audited
-          ? "The report that the operator named is about another contract. "
-          : "How much a stolen and decrypted template gives away here is therefore not known. ",
-        "The operator can measure it:",
+          ? "The report that is configured is about another contract. "
+          : "So it is not known how much a stolen and decrypted template gives away here. ",
+        "An operator can measure it:",
       ),
       h("p", {}, h("code", {}, told.command)),
-      h("p", { class: "fine" }, "and name its report.json in the setting audit_report_file."),
+      h("p", { class: "fine" }, "and name the report.json in the setting audit_report_file."),
     );
   }
   const best = told.strongest;
@@ -136,7 +136,7 @@ function audited(told) {
       "p",
       {},
       "Verdict: ",
-      h("strong", {}, told.passed ? "passed, no limit is exceeded" : "failed, a limit is exceeded"),
+      h("strong", {}, told.passed ? "passed: no limit is exceeded" : "failed: a limit is exceeded"),
       ".",
     ),
     told.headlines.length ? h("ul", {}, told.headlines.map((each) => h("li", {}, each))) : null,
@@ -160,9 +160,9 @@ function audited(told) {
       ? h(
           "p",
           { class: "fine" },
-          "In brackets: 95 % intervals. Against the limit stands the result itself; for attributes ",
-          "(confidentiality) its distance from chance, and for D_sys (unlinkability), which is a number ",
-          "from 0 to 1 and no share, its excess over chance.",
+          "In brackets: 95 % intervals. What stands against the limit is the result itself; for attributes ",
+          "(confidentiality) its distance from chance, and for D_sys (unlinkability), a number from 0 to 1 ",
+          "and not a share, its excess over chance.",
         )
       : null,
   );

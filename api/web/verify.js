@@ -6,7 +6,7 @@ import { problemBox } from "./words.js";
 
 const REASONS = {
   match: "The photo matches the enrolled person.",
-  no_match: "The photo does not match: another person, a poor photo, or nobody of this id.",
+  no_match: "The photo does not match: a different person, a poor photo, or an id that nobody is enrolled under.",
 };
 
 export function verifyView(id) {
@@ -49,19 +49,19 @@ export function verifyView(id) {
     event.preventDefault();
     if (fields.disabled) return;
     clear();
-    const mine = asked;
+    const asking = asked;
     const name = subject.value;
     const body = form("image", picker.blobs(), { level: level.value, face: picker.face() });
     fields.disabled = true;
     send.textContent = "Comparing…";
     try {
       const answer = await call("POST", `${subjectPath(name)}/verify`, { body });
-      if (mine === asked) {
+      if (asking === asked) {
         result.replaceChildren(decision(name, answer));
         result.scrollIntoView({ block: "nearest" });
       }
     } catch (error) {
-      if (mine === asked) problem.replaceChildren(problemBox(error));
+      if (asking === asked) problem.replaceChildren(problemBox(error));
     }
     fields.disabled = false;
     send.textContent = "Verify";
@@ -77,8 +77,8 @@ export function verifyView(id) {
     field(
       "Level",
       level,
-      "How often a stranger is accepted: the level's target in calibration. A stricter level " +
-        "rejects the person more often.",
+      "How often a stranger is accepted, by calibration. Stricter levels reject the right person " +
+        "more often.",
     ),
     picker?.root ?? null,
     send,
@@ -88,7 +88,7 @@ export function verifyView(id) {
     "section",
     {},
     h("h1", { tabindex: "-1" }, "Verify"),
-    h("p", { class: "lead" }, "Is this the person who was enrolled under this id?"),
+    h("p", { class: "lead" }, "Check whether a photo shows the person enrolled under an id."),
     offNote(why),
     h("form", { class: "card", onsubmit: submit }, fields),
     problem,
@@ -114,7 +114,7 @@ function decision(id, answer) {
       ["Person", id],
       ["Reason", h("code", {}, answer.reason)],
       ["Level", answer.level],
-      ["False match rate of the level", `${percent(answer.fmr)} (${oneIn(answer.fmr)})`],
+      ["False match rate", `${percent(answer.fmr)} (${oneIn(answer.fmr)})`],
       ["Distance", answer.distance === undefined ? null : answer.distance.toFixed(4)],
       ["Request", h("code", {}, answer.request_id)],
     ]),

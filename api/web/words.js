@@ -5,46 +5,46 @@ import { h } from "./dom.js";
 const DEMO = document.documentElement.dataset.demo === "yes";
 
 const REMEDIES = {
-  unauthorized: "Check the API key: it may have been mistyped, revoked, or have expired.",
-  forbidden: "Ask the operator for a key with this right.",
-  not_enrolled: "Check the id, or enroll this person first.",
-  not_found: "The service has nothing there. Its version may differ from this page's: reload.",
-  contract_mismatch: "This person was enrolled under an earlier contract: enroll them again.",
+  unauthorized: "Check the API key: it may be mistyped, revoked or expired.",
+  forbidden: "Ask the operator for a key that has this right.",
+  not_enrolled: "Check the id, or enroll the person first.",
+  not_found: "The service has nothing at this address. It may have been updated: reload the page.",
+  contract_mismatch: "This person was enrolled under an earlier contract. Enroll them again.",
   unsupported_image: "Send a JPEG, PNG or WebP photo.",
   image_too_large: "Send a smaller photo.",
   request_too_large: "Send fewer or smaller photos.",
-  too_many_images: "Send ten photos at most.",
+  too_many_images: "Send no more than ten photos.",
   no_face: "Take a photo that shows the face upright and uncovered.",
-  multiple_faces: "Take a photo that shows one person, or allow other people in the photo.",
-  face_too_small: "Come closer, or send a larger photo.",
+  multiple_faces: "Take a photo of one person, or tick the box that allows others in the picture.",
+  face_too_small: "Move closer, or send a larger photo.",
   low_quality: "Take another photo.",
-  inconsistent_images: "Remove the photos that show another person, or look very unlike.",
+  inconsistent_images: "Remove the photos that show somebody else or look very different.",
   uncalibrated: "Choose another level.",
   validation_failed: "Correct the field and try again.",
-  locked_out: "Wait, or use another factor. An operator can lift the lock.",
+  locked_out: "Wait, or sign in another way. An operator can lift the lock.",
   rate_limited: "Wait, then try again.",
   overloaded: "Try again in a moment.",
-  store_unavailable: "Try again in a moment; tell the operator if it lasts.",
-  model_unavailable: "This service takes no photos. Ask its operator.",
+  store_unavailable: "Try again in a moment. If it keeps happening, tell the operator.",
+  model_unavailable: "This service cannot take photos. Ask the operator.",
   idempotency_conflict: "Wait a moment and try again.",
-  export_superseded: "Export the subject again where it is enrolled.",
-  internal_error: "Tell the operator the request id.",
-  unreachable: "Check the connection, and that the service runs; then try again.",
+  export_superseded: "Export the person again from where they are enrolled.",
+  internal_error: "Report the request id to the operator.",
+  unreachable: "Check your connection and that the service is running, then try again.",
 };
 
-// Where the service speaks to programs, the page speaks to people.
+// The service writes for programs, the page for people.
 const TITLES = {
   unauthorized: "The service does not accept this API key.",
   // The service says for how long; the page counts that down, and one clock is enough.
-  locked_out: "Too many failed attempts on this person.",
+  locked_out: "Too many failed attempts for this person.",
 };
 
 const QUALITY = {
-  score: "The face is hard to see: uncover it and look into the camera",
+  score: "The face is hard to see: uncover it and look at the camera",
   blur: "Blurred: hold still, and clean the lens",
-  darkness: "Too dark: put more light on the face",
-  brightness: "Too bright: put less light on the face",
-  pose: "Turned away: look straight into the camera",
+  darkness: "Too dark: find more light",
+  brightness: "Too bright: find softer light",
+  pose: "Turned away: look straight at the camera",
 };
 
 export const qualityWords = (details) =>
@@ -59,12 +59,12 @@ export function guidance(check) {
       // A pack without a detector takes crops of a face, and measures no box.
       return check.box ? "Good: one face, large and clear enough." : "Good: clear enough.";
     case "no_face":
-      if (DEMO) return "No drawn face found. The demo model sees no other: choose a drawn person.";
-      return "No face found. Look into the camera, upright.";
+      if (DEMO) return "No cartoon face found. The demo model sees no others: choose a cartoon person.";
+      return "No face found. Face the camera, with your head upright.";
     case "multiple_faces":
-      return `${check.details.faces ?? "Several"} faces found. Only one person may be in the picture.`;
+      return `${check.details.faces ?? "Several"} faces found. Only one person may be in view.`;
     case "face_too_small":
-      return "The face is too small. Come closer.";
+      return "The face is too small. Move closer.";
     default:
       return `${qualityWords(check.details).join(". ") || check.message}.`;
   }
@@ -111,7 +111,7 @@ export function problemBox(problem) {
           "p",
           {},
           disabled
-            ? "This person waits for an operator, who must lift the lock."
+            ? "This person is locked out until an operator lifts the lock."
             : (REMEDIES[code] ?? "Reload the page and try again."),
         ),
     problem.wait && !disabled ? waiting(problem.wait) : null,
@@ -127,5 +127,5 @@ export function problemBox(problem) {
 }
 
 export const lacking = (right) =>
-  `This key lacks the right “${right}”, so this is switched off. ` +
-  "The operator can make a key that has it: veilface keys create --right " + right;
+  `Switched off: this key does not have the right “${right}”. ` +
+  "An operator can create one that does: veilface keys create --right " + right;

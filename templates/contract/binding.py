@@ -74,7 +74,7 @@ class Binding:
         if not SHA256_HEX.fullmatch(self.decoy_source_id):
             raise ContractError("the decoy source's id must be 64 lower-case hexadecimal digits")
         if not 2 <= self.n <= MAX_N:
-            raise ContractError(f"the descriptor dimension must lie in 2 to {MAX_N}")
+            raise ContractError(f"the embedding dimension must lie in 2 to {MAX_N}")
         if not 1 <= self.m <= min(MAX_M, self.n - 1):
             raise ContractError(f"the subspace dimension must lie in 1 to min({MAX_M}, n - 1)")
         if not 1 <= len(self.rotation_version) <= 64:
@@ -117,7 +117,7 @@ class Binding:
         """
         if n != self.n:
             raise ContractMismatch(
-                f"the contract is for descriptors of {self.n} numbers, the pack gives {n}; "
+                f"the contract is for embeddings of {self.n} numbers, the pack gives {n}; "
                 "use the pack that the contract was calibrated with"
             )
         if embedder_sha256 != self.embedder_sha256:
@@ -157,7 +157,7 @@ class Binding:
         """
         if made_with is not None and made_with != self.embedding_id:
             raise ContractMismatch(
-                "the decoys are descriptors of another model or another preprocessing (made with "
+                "the decoys are embeddings of another model or another preprocessing (made with "
                 f"{made_with[:16]}…, the contract's is {self.embedding_id[:16]}…), and hide "
                 "nothing; build the decoys with this pack and the same --flip, and calibrate "
                 "with them"

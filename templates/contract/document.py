@@ -135,7 +135,7 @@ class Contract:
         if len(keys) != len(self.calibrations):
             raise ContractError("two calibrations share mode, metric and probe m")
         if any(entry.probe_m >= self.binding.n for entry in self.calibrations):
-            raise ContractError("a calibration's probe m is not below the descriptor dimension")
+            raise ContractError("a calibration's probe m is not below the embedding dimension")
         names = {level.name for entry in self.calibrations for level in entry.levels}
         if self.default_level not in names:
             raise ContractError("no calibration has the default level")

@@ -56,7 +56,7 @@ def fit_statistics(descriptors: NDArray[np.floating]) -> DescriptorStatistics:
     coordinates = cross_fitted(x, axes)
     deviations = np.sqrt(np.mean(coordinates**2, axis=0))
     if deviations[0] <= 1e-6:
-        raise DecoyError("the descriptors to fit hardly differ from each other")
+        raise DecoyError("the embeddings to fit hardly differ from each other")
     # An axis on which nothing varies stays an axis on which nothing varies.
     whitened = coordinates / np.maximum(deviations, 1e-12)
     weights, centres, covariances = _mixture(mixture_features(whitened))
@@ -73,13 +73,13 @@ def _checked(descriptors: NDArray[np.floating]) -> NDArray[np.float64]:
     x = np.asarray(descriptors)
     if x.ndim != 2 or not MIN_DESCRIPTORS <= x.shape[0] <= MAX_DESCRIPTORS or x.shape[1] < 2:
         raise DecoyError(
-            f"a decoy generator is fitted to {MIN_DESCRIPTORS} or more descriptors, shape (N, n); "
+            f"a decoy generator is fitted to {MIN_DESCRIPTORS} or more embeddings, shape (N, n); "
             f"seen {x.shape}"
         )
     x = x.astype(np.float64)
     # Written so that a NaN fails it too.
     if not np.all(np.abs(np.linalg.norm(x, axis=1) - 1.0) <= _UNIT_TOLERANCE):
-        raise DecoyError("the descriptors to fit are not all finite unit vectors")
+        raise DecoyError("the embeddings to fit are not all finite unit vectors")
     return x
 
 

@@ -63,21 +63,21 @@ class DecoyPool:
         array = np.array(descriptors, dtype="<f4", order="C", copy=True)
         if array.ndim != 2 or not 1 <= array.shape[0] <= MAX_ENTRIES:
             raise DecoyError(
-                f"a decoy pool needs descriptors of shape (N, n) with 1 ≤ N ≤ {MAX_ENTRIES}; "
+                f"a decoy pool needs embeddings of shape (N, n) with 1 ≤ N ≤ {MAX_ENTRIES}; "
                 f"seen {array.shape}"
             )
         if not 2 <= array.shape[1] <= MAX_DIMENSION:
-            raise DecoyError(f"descriptors must have 2 to {MAX_DIMENSION} numbers each")
+            raise DecoyError(f"embeddings must have 2 to {MAX_DIMENSION} numbers each")
         norms = np.sqrt(np.einsum("ij,ij->i", array, array, dtype=np.float64))
         wrong = int(np.count_nonzero(~(np.abs(norms - 1.0) <= UNIT_TOLERANCE)))
         if wrong:
-            raise DecoyError(f"{wrong} of {len(array)} descriptors are not finite unit vectors")
+            raise DecoyError(f"{wrong} of {len(array)} embeddings are not finite unit vectors")
         # Rows of unit length to float32 rounding stay bit for bit as they are: a second division
         # could change their last bit, and with it the id of a pool that is loaded again.
         off = np.abs(norms - 1.0) > _ROUNDING
         array[off] = array[off].astype(np.float64) / norms[off, None]
         if labels is not None and len(labels) != len(array):
-            raise DecoyError(f"{len(labels)} labels for {len(array)} descriptors")
+            raise DecoyError(f"{len(labels)} labels for {len(array)} embeddings")
         array.flags.writeable = False
         self._descriptors = array
         self._labels = None if labels is None else tuple(labels)

@@ -143,7 +143,7 @@ class DescriptorStatistics:
                 raise DecoyError("the decoy generator holds values that are not finite")
         largest = max(float(np.abs(a).max()) for a in (self.mean, self.axes))
         if largest > _LARGEST_SCALE or float(np.abs(self.axes).max()) < _SMALLEST_SCALE:
-            raise DecoyError("the decoy generator holds values far from those of unit descriptors")
+            raise DecoyError("the decoy generator holds values far from those of unit embeddings")
         if self.weights.min() <= 0 or abs(float(self.weights.sum(dtype=np.float64)) - 1) > 1e-4:
             raise DecoyError("the weights of the components must be positive and add up to 1")
         energies = slice(leading_axes(self.n), None)

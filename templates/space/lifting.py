@@ -65,16 +65,16 @@ def unit_descriptors(descriptors: ArrayLike) -> NDArray[np.float64]:
     rows = np.asarray(descriptors)
     if rows.ndim != 2 or rows.shape[1] < 2 or not np.issubdtype(rows.dtype, np.floating):
         raise InvalidEmbedding(
-            f"expected floating-point descriptors of shape (N, n), "
+            f"expected floating-point embeddings of shape (N, n), "
             f"seen {rows.dtype} of shape {rows.shape}"
         )
     rows = rows.astype(np.float64)
     if not np.isfinite(rows).all():
-        raise InvalidEmbedding("a descriptor holds a number that is not finite")
+        raise InvalidEmbedding("an embedding holds a number that is not finite")
     norms = np.linalg.norm(rows, axis=1, keepdims=True)
     if (np.abs(norms - 1) > UNIT_TOLERANCE).any():
         raise InvalidEmbedding(
-            f"a descriptor is not of unit length within {UNIT_TOLERANCE:g}: normalise it first"
+            f"an embedding is not of unit length within {UNIT_TOLERANCE:g}: normalise it first"
         )
     return np.asarray(rows / norms)
 
@@ -212,10 +212,10 @@ def _check(
         if source is None:
             raise LiftingError(f"{strategy} lifting needs a decoy source")
         if source.n != n:
-            raise LiftingError(f"decoys of {source.n} numbers do not fit descriptors of {n}")
+            raise LiftingError(f"decoys of {source.n} numbers do not fit embeddings of {n}")
     if strategy is Strategy.HYBRID_PLUS:
         if attributes is None or len(attributes) != count:
-            raise LiftingError("hybrid+ lifting needs the attributes of every descriptor")
+            raise LiftingError("hybrid+ lifting needs the attributes of every embedding")
     elif attributes is not None:
         raise LiftingError(f"{strategy} lifting does not use attributes: leave them out")
     return strategy

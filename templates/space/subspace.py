@@ -69,7 +69,7 @@ def span_basis(directions: NDArray[np.float64]) -> NDArray[np.float64]:
     """
     lengths = np.linalg.norm(directions, axis=2, keepdims=True)
     if not lengths.all():
-        raise LiftingError("a direction has length zero: the decoy equals the descriptor")
+        raise LiftingError("a direction has length zero: the decoy equals the embedding")
     rows = directions / lengths
     for _ in range(2):
         try:
@@ -351,7 +351,7 @@ class SubspaceBatch:
         """
         if rotation.shape != (self.n, self.n):
             raise InvalidTemplate(
-                f"a rotation of shape {rotation.shape} does not fit descriptors of {self.n} numbers"
+                f"a rotation of shape {rotation.shape} does not fit embeddings of {self.n} numbers"
             )
         feet = self.feet.astype(np.float64) @ rotation.T
         bases = np.empty_like(self.bases)

@@ -25,7 +25,7 @@ from templates.store.subjects import Guard, subject_lock
 
 
 class ExportSuperseded(StoreError):
-    """The subject was erased, or enrolled again, after the export was made."""
+    """The subject was erased or enrolled again after the export was made."""
 
     def __init__(self) -> None:
         super().__init__(

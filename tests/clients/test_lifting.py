@@ -568,15 +568,15 @@ def test_a_lift_that_nobody_waits_for_is_ended(tmp_path: Path) -> None:
 
 
 def test_a_lift_that_is_given_up_before_it_starts(tmp_path: Path) -> None:
-    leash = child_process.Leash()
-    leash.pull()
+    canceller = child_process.Canceller()
+    canceller.cancel()
     done = child_process.run(
         lambda names: ["sleep", "100000"],
         [],
         environment=os.environ,
         folder=str(tmp_path),
         limit_s=60,
-        leash=leash,
+        canceller=canceller,
     )
     assert done.status == -9
 

@@ -45,7 +45,7 @@ LOOK_AFTER_S = 0.0005
 """A case that took less cannot have touched enough memory to matter."""
 
 _ROOT = Path(__file__).resolve().parents[2]
-_OURS = tuple(str(_ROOT / room) for room in ("api", "models", "templates", "tests", "verify"))
+_OURS = tuple(str(_ROOT / name) for name in ("api", "models", "templates", "tests", "verify"))
 _VARYING = re.compile(r"[0-9a-f]{8,}|[0-9]+|'[^']*'|\"[^\"]*\"|b'.*'")
 
 
@@ -67,9 +67,9 @@ class _Watch:
 
 def resident(name: str) -> int:
     """A line of ``/proc/self/status``, such as ``VmHWM``, in bytes."""
-    found = re.search(rf"^{name}:\s+(\d+) kB", Path("/proc/self/status").read_text(), re.MULTILINE)
-    assert found is not None
-    return int(found[1]) * 1024
+    match = re.search(rf"^{name}:\s+(\d+) kB", Path("/proc/self/status").read_text(), re.MULTILINE)
+    assert match is not None
+    return int(match[1]) * 1024
 
 
 def caused_by_memory(error: BaseException | None) -> bool:
@@ -155,19 +155,19 @@ class Reader:
         return {"outcome": "accepted"}
 
 
-def case_of(target: Target, name: str, seed: int, number: int, *, found: bool) -> bytes:
+def case_of(target: Target, name: str, seed: int, number: int, *, regression: bool) -> bytes:
     """One case: generated, or of those that were once findings."""
-    if found:
-        return target.found[number]()
+    if regression:
+        return target.regressions[number]()
     return target.make(Random(f"{seed}/{name}/{number}"))
 
 
-def read_all(name: str, seed: int, numbers: range, folder: Path, *, found: bool) -> None:
+def read_all(name: str, seed: int, numbers: range, folder: Path, *, regression: bool) -> None:
     """Read the cases of some numbers under the limits of the target."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         target = target_of(name)(folder)
-        case_of(target, name, seed, 0, found=found)  # imports what is imported late
+        case_of(target, name, seed, 0, regression=regression)  # imports what is imported late
     # A reader that warns of hostile input floods a log, and the suite takes warnings as errors.
     warnings.simplefilter("error")
     faulthandler.enable()
@@ -175,7 +175,7 @@ def read_all(name: str, seed: int, numbers: range, folder: Path, *, found: bool)
     reader = Reader(target)
     with (folder / "state").open("r+b") as file, mmap(file.fileno(), STATE.size) as state:
         for number in numbers:
-            data = case_of(target, name, seed, number, found=found)
+            data = case_of(target, name, seed, number, regression=regression)
             STATE.pack_into(state, 0, number, time.monotonic())
             result = reader.outcome(data)
             STATE.pack_into(state, 0, -1, time.monotonic())
@@ -191,16 +191,16 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--count", type=int, default=1)
-    parser.add_argument("--found", action="store_true")
+    parser.add_argument("--regression", action="store_true")
     parser.add_argument("--write", type=Path)
     chosen = parser.parse_args()
     if chosen.write is None:
         numbers = range(chosen.first, chosen.first + chosen.count)
-        read_all(chosen.target, chosen.seed, numbers, chosen.folder, found=chosen.found)
+        read_all(chosen.target, chosen.seed, numbers, chosen.folder, regression=chosen.regression)
     else:
         target = target_of(chosen.target)(chosen.folder)
         chosen.write.write_bytes(
-            case_of(target, chosen.target, chosen.seed, chosen.first, found=chosen.found)
+            case_of(target, chosen.target, chosen.seed, chosen.first, regression=chosen.regression)
         )
 
 

@@ -63,7 +63,7 @@ class Raw(str):
 
 def places(value: Any) -> list[tuple[Any, Any]]:
     """Every (container, key) in a document."""
-    found: list[tuple[Any, Any]] = []
+    pairs: list[tuple[Any, Any]] = []
     waiting = [value]
     while waiting:
         one = waiting.pop()
@@ -71,9 +71,9 @@ def places(value: Any) -> list[tuple[Any, Any]]:
             list(one) if isinstance(one, dict) else range(len(one)) if isinstance(one, list) else ()
         )
         for key in keys:
-            found.append((one, key))
+            pairs.append((one, key))
             waiting.append(one[key])
-    return found
+    return pairs
 
 
 def twisted(rng: random.Random, document: Any) -> Any:
@@ -132,9 +132,9 @@ def written(rng: random.Random, document: Any) -> bytes:
     text = json.dumps(marked(document), separators=separators, ensure_ascii=rng.random() < 0.8)
     room = 2 * CAP
 
-    def as_it_is(found: re.Match[str]) -> str:
+    def as_it_is(match: re.Match[str]) -> str:
         nonlocal room
-        value = raw[int(found[1])]
+        value = raw[int(match[1])]
         room -= len(value)
         return value if room > 0 else "0"
 

@@ -84,10 +84,10 @@ def set_number(rng: random.Random, data: bytes, others: Sequence[bytes]) -> byte
 
 def set_decimal(rng: random.Random, data: bytes, others: Sequence[bytes]) -> bytes:
     """Another number, or something else, in the place of one that is written in digits."""
-    found = list(_DECIMAL.finditer(data[:CAP]))
-    if not found:
+    numbers = list(_DECIMAL.finditer(data[:CAP]))
+    if not numbers:
         return data
-    one = rng.choice(found)
+    one = rng.choice(numbers)
     value = rng.choice((rng.choice(LITERALS), str(rng.choice(NUMBERS)).encode()))
     return data[: one.start()] + value + data[one.end() :]
 

@@ -84,11 +84,11 @@ class Runner:
         first: int = 0,
         cases: int | None = None,
         seconds: float | None = None,
-        found: bool = False,
+        regression: bool = False,
     ) -> Tally:
         """Read ``cases`` cases from ``first`` on, or what ``seconds`` allow.
 
-        ``found`` takes the inputs of earlier findings instead of generated ones.
+        ``regression`` takes the inputs of earlier findings instead of generated ones.
         """
         began, cpu = time.monotonic(), _cpu_of_children()
         deadline = None if seconds is None else began + seconds
@@ -96,12 +96,12 @@ class Runner:
         number = first
         while (stop is None or number < stop) and (deadline is None or time.monotonic() < deadline):
             most = CASES_OF_A_CHILD if stop is None else min(CASES_OF_A_CHILD, stop - number)
-            number = self._child(number, most, deadline, found=found)
+            number = self._child(number, most, deadline, regression=regression)
         self.tally.seconds += time.monotonic() - began
         self.tally.cpu_seconds += _cpu_of_children() - cpu
         return self.tally
 
-    def _child(self, first: int, count: int, deadline: float | None, *, found: bool) -> int:
+    def _child(self, first: int, count: int, deadline: float | None, *, regression: bool) -> int:
         """Run one child; return the number of the case to go on with."""
         with tempfile.TemporaryDirectory(prefix="fuzz-") as name:
             folder = Path(name)
@@ -112,14 +112,14 @@ class Runner:
                 (folder / "state").open("r+b") as file,
                 mmap(file.fileno(), STATE.size) as state,
                 subprocess.Popen(
-                    self._command(folder, *numbers, found=found),
+                    self._command(folder, *numbers, regression=regression),
                     cwd=_ROOT,
                     env=_ENVIRONMENT,
                     stdout=subprocess.PIPE,
                     stderr=stderr,
                 ) as process,
             ):
-                done, hung = self._follow(process, state, first, deadline, found=found)
+                done, hung = self._follow(process, state, first, deadline, regression=regression)
                 number, _ = STATE.unpack(state)
                 if process.returncode == 0 or (
                     process.returncode == -signal.SIGKILL and not hung and done[1]
@@ -131,7 +131,8 @@ class Runner:
                 raise RuntimeError(f"the child of {self._target} failed between cases:\n{said}")
             what = f"hang: more than {SECONDS:g} s" if hung else _death(process.returncode)
             self._count(
-                {"case": number, "outcome": what, "finding": what, "trace": said}, found=found
+                {"case": number, "outcome": what, "finding": what, "trace": said},
+                regression=regression,
             )
             return int(number) + 1
 
@@ -142,7 +143,7 @@ class Runner:
         first: int,
         deadline: float | None,
         *,
-        found: bool,
+        regression: bool,
     ) -> tuple[tuple[int, bool], bool]:
         """Count until the child ends. Return (next case, whether time is up), whether it hung."""
         assert process.stdout is not None
@@ -158,7 +159,7 @@ class Runner:
                     *lines, rest = (rest + read).split(b"\n")
                     for line in lines:
                         result = json.loads(line)
-                        self._count(result, found=found)
+                        self._count(result, regression=regression)
                         following = result["case"] + 1
                 if not (over or hung):
                     hung = stopwatch.over(*STATE.unpack(state))
@@ -168,7 +169,7 @@ class Runner:
         process.wait()
         return (following, over), hung
 
-    def _count(self, result: dict[str, Any], *, found: bool) -> None:
+    def _count(self, result: dict[str, Any], *, regression: bool) -> None:
         tally = self.tally
         tally.outcomes[result["outcome"]] += 1
         tally.slowest_ms = max(tally.slowest_ms, result.get("ms", 0.0))
@@ -179,14 +180,17 @@ class Runner:
         if "finding" in result:
             tally.findings[result["finding"]] += 1
             if tally.findings[result["finding"]] <= SAVED_OF_A_KIND:
-                self._save(result, found=found)
+                self._save(result, regression=regression)
 
-    def _save(self, result: dict[str, Any], *, found: bool) -> None:
+    def _save(self, result: dict[str, Any], *, regression: bool) -> None:
         """Write the input, made again in a process of its own, and what was seen."""
         if self._out is None:
             return
         self._out.mkdir(parents=True, exist_ok=True)
-        stem = self._out / f"{self._target}-{'found' if found else self._seed}-{result['case']}"
+        stem = (
+            self._out
+            / f"{self._target}-{'regression' if regression else self._seed}-{result['case']}"
+        )
         stem.with_suffix(".json").write_text(json.dumps(result, indent=1), encoding="utf-8")
         with tempfile.TemporaryDirectory(prefix="fuzz-") as name:
             write = [
@@ -195,12 +199,18 @@ class Runner:
                 "--write",
                 str(stem.with_suffix(".bin").resolve()),
             ]
-            command = self._command(Path(name), *write, found=found)
+            command = self._command(Path(name), *write, regression=regression)
             subprocess.run(command, cwd=_ROOT, env=_ENVIRONMENT, check=True)
 
-    def _command(self, folder: Path, *options: str, found: bool) -> list[str]:
+    def _command(self, folder: Path, *options: str, regression: bool) -> list[str]:
         module = [sys.executable, "-m", "tests.fuzz.child", self._target, str(folder)]
-        return [*module, "--seed", str(self._seed), *options, *(["--found"] if found else [])]
+        return [
+            *module,
+            "--seed",
+            str(self._seed),
+            *options,
+            *(["--regression"] if regression else []),
+        ]
 
 
 class _Stopwatch:

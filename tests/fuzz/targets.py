@@ -32,7 +32,7 @@ class Target:
     memory_mib
         What reading one case may add to the memory of the process, MiB, beside
         :data:`COPIES` times its own size.
-    found
+    regressions
         Inputs that once were findings, each made when it is asked for.
     """
 
@@ -40,7 +40,7 @@ class Target:
     refusals: tuple[type[Exception], ...]
     make: Callable[[Random], bytes]
     memory_mib: int
-    found: Sequence[Callable[[], bytes]] = field(default=())
+    regressions: Sequence[Callable[[], bytes]] = field(default=())
 
     def memory_for(self, size: int) -> int:
         """Bytes that a case of ``size`` bytes may take."""
@@ -61,7 +61,7 @@ def image(folder: Path) -> Target:
     """``models.decoding``: any picture of a request."""
     from models.decoding import DEFAULT_LIMITS, MEMORY_AT_A_TIME, decode_image, image_size
     from models.errors import ImageError
-    from tests.fuzz import found
+    from tests.fuzz import regressions
     from tests.fuzz.pictures import Pictures
 
     def read(data: bytes) -> None:
@@ -76,14 +76,14 @@ def image(folder: Path) -> Target:
         demand(height * width <= DEFAULT_LIMITS.max_pixels, "no more pixels than the limit")
 
     most = MEMORY_AT_A_TIME // MIB + 1
-    return Target(read, (ImageError,), Pictures().make, most, found.pictures())
+    return Target(read, (ImageError,), Pictures().make, most, regressions.pictures())
 
 
 def template(folder: Path) -> Target:
     """``templates.contract.wire``: templates and lifted probes of clients, and the store's own."""
     from templates.contract import wire
     from templates.errors import InvalidTemplate
-    from tests.fuzz import found
+    from tests.fuzz import regressions
     from tests.fuzz.tensors import Templates
 
     def read(data: bytes) -> None:
@@ -95,7 +95,7 @@ def template(folder: Path) -> Target:
         wire.decode(again)
         demand(len(again) <= wire.size_limit(4096, 128), "no larger than the limit")
 
-    return Target(read, (InvalidTemplate,), Templates().make, 64, found.templates())
+    return Target(read, (InvalidTemplate,), Templates().make, 64, regressions.templates())
 
 
 def probe(folder: Path) -> Target:
@@ -142,7 +142,7 @@ def export(folder: Path) -> Target:
 
 def bin_file(folder: Path) -> Target:
     """``verify.evaluation.readers.insightface_bin``: pickles of strangers."""
-    from tests.fuzz import found
+    from tests.fuzz import regressions
     from tests.fuzz.pickles import Pickles
     from verify.datasets import DatasetError
     from verify.evaluation.readers.insightface_bin import read_bin
@@ -159,14 +159,14 @@ def bin_file(folder: Path) -> Target:
         for picture in benchmark.pictures[:3]:
             demand(isinstance(picture.read(), bytes), "photos as bytes")
 
-    return Target(read, (DatasetError,), Pickles().make, 256, found.pickles())
+    return Target(read, (DatasetError,), Pickles().make, 256, regressions.pickles())
 
 
 def contract(folder: Path) -> Target:
     """``templates.contract.document``: the contract file, its JSON and its sealed cohort."""
     from templates.contract.document import Binding, Contract
     from templates.errors import ContractError, SealError
-    from tests.fuzz import found
+    from tests.fuzz import regressions
     from tests.fuzz.contracts import Contracts
     from tests.fuzz.tensors import SEALER
 
@@ -182,7 +182,7 @@ def contract(folder: Path) -> Target:
         demand(bool(np.isfinite(score).all()), "a finite cohort")
 
     made = Contracts(folder)
-    return Target(read, (ContractError, SealError), made.make, 64, found.contracts(folder))
+    return Target(read, (ContractError, SealError), made.make, 64, regressions.contracts(folder))
 
 
 def decoys(folder: Path) -> Target:
@@ -210,7 +210,7 @@ def body(folder: Path) -> Target:
 
     from api.http.bodies import read_form, read_json
     from api.http.errors import ApiError
-    from tests.fuzz import found
+    from tests.fuzz import regressions
     from tests.fuzz.bodies import Bodies
 
     runner = asyncio.Runner()
@@ -241,7 +241,7 @@ def body(folder: Path) -> Target:
             form = run(read_form(request, max_bytes=64 * MIB, timeout_s=60, **limits))
             demand(len(form.files) <= 5 and len(form.fields) <= 16, "no more parts than the limit")
 
-    return Target(read, (ApiError,), Bodies().make, 64, found.bodies())
+    return Target(read, (ApiError,), Bodies().make, 64, regressions.bodies())
 
 
 TARGETS: dict[str, Callable[[Path], Target]] = {

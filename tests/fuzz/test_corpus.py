@@ -34,9 +34,9 @@ def test_readers_refuse_or_accept_within_their_limits(name: str, tmp_path: Path)
 
 @pytest.mark.parametrize("name", ["image", "template", "bin", "contract", "body"])
 def test_what_was_found_stays_mended(name: str, tmp_path: Path) -> None:
-    count = len(target_of(name)(tmp_path).found)
+    count = len(target_of(name)(tmp_path).regressions)
     assert count > 0
-    tally = Runner(name, out=tmp_path).run(cases=count, found=True)
+    tally = Runner(name, out=tmp_path).run(cases=count, regression=True)
     assert not tally.findings
     assert tally.cases == count
 
@@ -80,11 +80,11 @@ def test_time_is_kept() -> None:
 def test_equal_seeds_give_equal_cases(name: str, tmp_path: Path) -> None:
     one, same = target_of(name)(tmp_path), target_of(name)(tmp_path)
     first, again = (
-        [case_of(target, name, 5, number, found=False) for number in range(12)]
+        [case_of(target, name, 5, number, regression=False) for number in range(12)]
         for target in (one, same)
     )
     assert first == again
-    assert first != [case_of(one, name, 6, number, found=False) for number in range(12)]
+    assert first != [case_of(one, name, 6, number, regression=False) for number in range(12)]
 
 
 def test_a_run_prints_a_row_for_each_target_and_fails_on_a_finding(

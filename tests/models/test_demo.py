@@ -92,7 +92,7 @@ def test_drawn_faces_and_nothing_else_are_taken_for_faces():
     for face in draw_people(range(PEOPLE), range(2)):
         require_face(face)
     for picture in other_pictures():
-        with pytest.raises(NoFace, match="no drawn face was found"):
+        with pytest.raises(NoFace, match="no cartoon face was found"):
             require_face(picture)
 
 

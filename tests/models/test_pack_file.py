@@ -55,7 +55,7 @@ def test_all_keys(tmp_path):
         ("[embedder]\ninput_size = 112.0", "multiple of 16"),
         ("[detector]\ninput_size = 100", "multiple of 32"),
         ("[detector]\ninput_size = 65536", "to 2048"),
-        ("# " + "x" * 70_000, "no pack.toml"),
+        ("# " + "x" * 70_000, "not a pack.toml"),
     ],
 )
 def test_mistakes_are_named(tmp_path, text, said):

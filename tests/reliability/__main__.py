@@ -52,11 +52,11 @@ def _outage(arguments: argparse.Namespace, folder: Path) -> dict[str, Any]:
 
 
 def _full_disk(arguments: argparse.Namespace, folder: Path) -> dict[str, Any]:
-    found = {}
+    report = {}
     with ExitStack() as mounts:
         if may_mount():
             small = mounts.enter_context(small_file_system())
-            found["full file system"] = full_disk_run(
+            report["full file system"] = full_disk_run(
                 FullFileSystem(small),
                 small / "veilface.db",
                 folder / "full",
@@ -64,7 +64,7 @@ def _full_disk(arguments: argparse.Namespace, folder: Path) -> dict[str, Any]:
                 short_s=4.0,
                 seed=arguments.seed,
             ).as_dict()
-    found["limit of file sizes"] = full_disk_run(
+    report["limit of file sizes"] = full_disk_run(
         FileSizeLimit(),
         folder / "limit.db",
         folder / "limit",
@@ -72,7 +72,7 @@ def _full_disk(arguments: argparse.Namespace, folder: Path) -> dict[str, Any]:
         short_s=4.0,
         seed=arguments.seed,
     ).as_dict()
-    return found
+    return report
 
 
 ON_EITHER: dict[str, Callable[[argparse.Namespace, str | None, Path], dict[str, Any]]] = {
@@ -95,22 +95,22 @@ def main() -> int:
     parser.add_argument("--kills", type=int, help="default: one for ten operations")
     parser.add_argument("--seed", type=int, default=1)
     arguments = parser.parse_args()
-    with ExitStack() as held:
-        folder = Path(held.enter_context(tempfile.TemporaryDirectory(prefix="veilface-")))
+    with ExitStack() as resources:
+        folder = Path(resources.enter_context(tempfile.TemporaryDirectory(prefix="veilface-")))
         if arguments.scenario in ON_ONE:
-            found = ON_ONE[arguments.scenario](arguments, folder)
+            report = ON_ONE[arguments.scenario](arguments, folder)
         else:
             postgres = arguments.database == "postgres"
-            url = held.enter_context(Cluster()).url if postgres else None
-            found = ON_EITHER[arguments.scenario](arguments, url, folder)
-    print(json.dumps(found, indent=1))
-    return int(any(_violations(found)))
+            url = resources.enter_context(Cluster()).url if postgres else None
+            report = ON_EITHER[arguments.scenario](arguments, url, folder)
+    print(json.dumps(report, indent=1))
+    return int(any(_violations(report)))
 
 
-def _violations(found: dict[str, Any]) -> list[str]:
-    own = list(found.get("violations", []))
+def _violations(report: dict[str, Any]) -> list[str]:
+    own = list(report.get("violations", []))
     return own + [
-        each for value in found.values() if isinstance(value, dict) for each in _violations(value)
+        each for value in report.values() if isinstance(value, dict) for each in _violations(value)
     ]
 
 

@@ -21,9 +21,9 @@ class NoPostgres(Exception):
 
 
 def _programs() -> Path:
-    found = shutil.which("pg_config")
-    if found is not None:
-        folder = Path(subprocess.check_output([found, "--bindir"], text=True).strip())
+    pg_config = shutil.which("pg_config")
+    if pg_config is not None:
+        folder = Path(subprocess.check_output([pg_config, "--bindir"], text=True).strip())
         if (folder / "pg_ctl").exists():
             return folder
     for folder in sorted(Path("/usr/lib/postgresql").glob("*/bin"), reverse=True):

@@ -115,8 +115,8 @@ class _Examination:
         self.violations.append(what)
 
     def _chain(self) -> None:
-        found = self.store.audit_log.verify()
-        for problem in found.problems:
+        verification = self.store.audit_log.verify()
+        for problem in verification.problems:
             self._wrong(f"audit log: line {problem.sequence}: {problem.what}")
 
     def _answers_have_their_lines(self) -> None:
@@ -159,9 +159,9 @@ class _Examination:
             if self._scalar(query):
                 self._wrong(f"tables: a {what}")
         if self.store._database.is_sqlite:
-            found = self._scalar(sa.text("PRAGMA integrity_check"))
-            if found != "ok":
-                self._wrong(f"SQLite: integrity_check says {found}")
+            integrity = self._scalar(sa.text("PRAGMA integrity_check"))
+            if integrity != "ok":
+                self._wrong(f"SQLite: integrity_check says {integrity}")
 
     def _receipts(self) -> None:
         """Every acknowledged receipt is there, and each erasure of the audit log left one."""
@@ -213,25 +213,25 @@ class _Examination:
         last = writes[-1] if writes else None
         expected = last is not None and last.kind == "enroll"
         with self._noting(f"{subject}: its template cannot be opened"):
-            found = self.store.get(self.tenant, subject)
-            if (found is not None) != expected:
-                state = "enrolled" if found else "not enrolled"
+            stored = self.store.get(self.tenant, subject)
+            if (stored is not None) != expected:
+                state = "enrolled" if stored else "not enrolled"
                 self._wrong(f"{subject}: {state} after {last}")
-            elif found is not None and last is not None:
-                if last.answered_well and found.record.template_id != last.template_id:
+            elif stored is not None and last is not None:
+                if last.answered_well and stored.record.template_id != last.template_id:
                     self._wrong(f"{subject}: another template than that of {last}")
-                wire.decode(found.wire, max_n=N, max_m=M)
-        held, erased = False, False
+                wire.decode(stored.wire, max_n=N, max_m=M)
+        enrolled, erased = False, False
         for line in self._lines_of(subject):
             if line.action == "enroll":
-                if line.outcome != ENROLLED[held]:
+                if line.outcome != ENROLLED[enrolled]:
                     self._wrong(f"audit log: line {line.sequence} says {line.outcome}")
-                held = True
+                enrolled = True
             elif line.action == "erase":
                 repeated = "receipt_repeated" if erased else "nothing_held"
-                if line.outcome != ("erased" if held else repeated):
+                if line.outcome != ("erased" if enrolled else repeated):
                     self._wrong(f"audit log: line {line.sequence} says {line.outcome}")
-                held, erased = False, True
+                enrolled, erased = False, True
 
     def _counted(self, subject: str) -> None:
         """The failed attempts are those of the audit log."""
@@ -246,9 +246,9 @@ class _Examination:
                 case "verify", "accept":
                     counted = None if counted is None else (0, total)
         status = self.store.attempts.status(self.tenant, subject)
-        found = None if status is None else (status.consecutive, status.total)
-        if found != counted:
-            self._wrong(f"{subject}: failed attempts are {found}, by the audit log {counted}")
+        counts = None if status is None else (status.consecutive, status.total)
+        if counts != counted:
+            self._wrong(f"{subject}: failed attempts are {counts}, by the audit log {counted}")
 
     def _serial(self, subject: str) -> None:
         calls = []

@@ -153,9 +153,9 @@ def full_disk_run(
             report.violations.append("workers died: " + service.tail())
         look_at_all(clients, subjects)
         service.kill()
-        found = examine(clients, list(subjects))
-    report.violations += [*unexpected(clients.history, _is_unavailable), *found.violations]
-    report.audit_lines = found.lines
+        examined = examine(clients, list(subjects))
+    report.violations += [*unexpected(clients.history, _is_unavailable), *examined.violations]
+    report.audit_lines = examined.lines
     for each in clients.history:
         report.refused += each.outcome == 503
         report.acknowledged_writes += each.writes and each.answered_well

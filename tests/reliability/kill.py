@@ -146,10 +146,10 @@ def _may_end_so(each: Operation) -> bool:
 
 
 def _examine(clients: Clients, subjects: list[str], report: KillReport) -> None:
-    found = examine(clients, subjects)
+    examined = examine(clients, subjects)
     history = clients.history
-    report.violations = [*unexpected(history, _may_end_so), *found.violations]
-    report.of_these_effective, report.audit_lines = found.effective, found.lines
+    report.violations = [*unexpected(history, _may_end_so), *examined.violations]
+    report.of_these_effective, report.audit_lines = examined.effective, examined.lines
     for each in history:
         report.answers_503 += each.outcome == 503
         report.acknowledged_enrollments += each.kind == "enroll" and each.answered_well

@@ -105,17 +105,17 @@ class _Search(Generic[State]):
 
     def _ready(self, done: int) -> list[int]:
         """Calls that may come next: none that is still to come ended before they began."""
-        found: list[int] = []
+        candidates: list[int] = []
         earliest_end = math.inf
         i = (~done & (done + 1)).bit_length() - 1  # the first that is not done
         while i < len(self._calls) and self._calls[i].start <= earliest_end:
             call = self._calls[i]
             if not done >> i & 1:
-                found.append(i)
+                candidates.append(i)
                 if call.answered:
                     earliest_end = min(earliest_end, call.end)
             i += 1
-        return [i for i in found if self._calls[i].start <= earliest_end]
+        return [i for i in candidates if self._calls[i].start <= earliest_end]
 
     def _closed(self, done: int, now: float) -> int:
         """Give up the calls without an answer that ended before `now`."""
@@ -152,5 +152,5 @@ def serial_order(
         Where many calls overlap, and many of them had no answer.
     """
     ordered = sorted(calls, key=lambda call: (call.start, call.end))
-    found = _Search(ordered, step, initial).order()
-    return None if found is None else [ordered[i] for i in found]
+    order = _Search(ordered, step, initial).order()
+    return None if order is None else [ordered[i] for i in order]

@@ -92,8 +92,8 @@ class Operation:
     @property
     def receipt(self) -> dict[str, Any]:
         """Of an erasure: the signed receipt."""
-        found: dict[str, Any] = self.answer["receipt"]
-        return found
+        receipt: dict[str, Any] = self.answer["receipt"]
+        return receipt
 
     @property
     def receipt_id(self) -> str:

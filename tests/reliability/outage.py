@@ -107,13 +107,13 @@ def outage_run(
         clients.settle()
         look_at_all(clients, subjects)
         service.kill()
-        found = examine(clients, list(subjects))
+        examined = examine(clients, list(subjects))
     history = clients.history
     report.violations += [
         *unexpected(history, _is_unavailable),
-        *found.violations,
+        *examined.violations,
     ]
-    report.of_these_effective, report.audit_lines = found.effective, found.lines
+    report.of_these_effective, report.audit_lines = examined.effective, examined.lines
     for each in history:
         report.acknowledged_writes += each.writes and each.answered_well
         report.unacknowledged_writes += each.writes and each.may_have_happened

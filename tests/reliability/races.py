@@ -76,14 +76,14 @@ def race_run(
             _at_once(client, CLIENTS)
         look_at_all(clients, subjects)
         service.kill()
-        found = examine(clients, list(subjects))
-    report.violations += [*unexpected(clients.history, lambda _: False), *found.violations]
+        examined = examine(clients, list(subjects))
+    report.violations += [*unexpected(clients.history, lambda _: False), *examined.violations]
     report.operations = dict(Counter(each.kind for each in clients.history))
     report.most_at_once_on_one_subject = max(
         _most_at_once([each for each in clients.history if each.subject == subject])
         for subject in subjects
     )
-    report.audit_lines = found.lines
+    report.audit_lines = examined.lines
     return report
 
 

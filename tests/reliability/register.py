@@ -22,7 +22,7 @@ class Enrolled:
 
 
 @dataclass(frozen=True)
-class Held:
+class SubjectState:
     """State of one subject.
 
     Attributes
@@ -38,11 +38,13 @@ class Held:
     receipt: str | None = None
 
 
-def step_for(operations: Sequence[Operation]) -> Callable[[Held, Operation], Held | None]:
+def step_for(
+    operations: Sequence[Operation],
+) -> Callable[[SubjectState, Operation], SubjectState | None]:
     """Return the register's step, given all operations on the subject."""
     told = {each.template_id for each in operations if each.kind == "enroll" and each.answered_well}
 
-    def step(state: Held, each: Operation) -> Held | None:
+    def step(state: SubjectState, each: Operation) -> SubjectState | None:
         match each.kind:
             case "enroll":
                 return _enroll(state, each)
@@ -58,23 +60,23 @@ def step_for(operations: Sequence[Operation]) -> Callable[[Held, Operation], Hel
     return step
 
 
-def _enroll(state: Held, each: Operation) -> Held | None:
+def _enroll(state: SubjectState, each: Operation) -> SubjectState | None:
     if each.answered_well and each.replaced != (state.enrolled is not None):
         return None
     assert each.person is not None
     return replace(state, enrolled=Enrolled(each.person, each.template_id, each.request_id))
 
 
-def _erase(state: Held, each: Operation) -> Held | None:
+def _erase(state: SubjectState, each: Operation) -> SubjectState | None:
     repeats = state.enrolled is None and state.receipt is not None
     if not each.answered_well:
-        return state if repeats else Held(None, f"<{each.request_id}>")
+        return state if repeats else SubjectState(None, f"<{each.request_id}>")
     if repeats:
         known = state.receipt is not None and not state.receipt.startswith("<")
         return state if not known or state.receipt == each.receipt_id else None
     if each.receipt_id == state.receipt or each.held != (state.enrolled is not None):
         return None
-    return Held(None, each.receipt_id)
+    return SubjectState(None, each.receipt_id)
 
 
 def _describes(enrolled: Enrolled | None, seen: str | None, told: set[str | None]) -> bool:
@@ -104,5 +106,7 @@ def call_of(each: Operation, *, effective: bool | None = None) -> Call:
 
 def explain(calls: Sequence[Call]) -> list[Call] | None:
     """Find a serial order of the calls on one subject; None if there is none."""
-    step: Callable[[Held, Any], Held | None] = step_for([call.content for call in calls])
-    return serial_order(calls, step, Held())
+    step: Callable[[SubjectState, Any], SubjectState | None] = step_for(
+        [call.content for call in calls]
+    )
+    return serial_order(calls, step, SubjectState())

@@ -39,7 +39,7 @@ class InProcess(Clients):
 
 
 @dataclass
-class Scene:
+class StoppedDeployment:
     """A deployment that does not run, and what was asked of it."""
 
     service: Any
@@ -67,17 +67,17 @@ class Scene:
             store._database.write(work)
 
     def the(self, kind: str, *, last: bool = False) -> Operation:
-        found = [each for each in self.history if each.kind == kind]
-        return found[-1 if last else 0]
+        operations = [each for each in self.history if each.kind == kind]
+        return operations[-1 if last else 0]
 
     def violations(self) -> list[str]:
         return examine(self, list(SUBJECTS)).violations
 
 
 @pytest.fixture(scope="module")
-def lived(tmp_path_factory: pytest.TempPathFactory) -> InProcess:
+def exercised(tmp_path_factory: pytest.TempPathFactory) -> InProcess:
     """Two subjects: one erased and enrolled as somebody else in the end, one erased."""
-    deployment = deploy(tmp_path_factory.mktemp("lived"), **QUIET)
+    deployment = deploy(tmp_path_factory.mktemp("exercised"), **QUIET)
     people = People(deployment, people_of(SUBJECTS))
     with Client(create_app(deployment.settings)) as client:
         made = InProcess(client, deployment, people)
@@ -97,48 +97,50 @@ def lived(tmp_path_factory: pytest.TempPathFactory) -> InProcess:
 
 
 @pytest.fixture
-def scene(lived: InProcess, tmp_path: Path) -> Scene:
+def stopped(exercised: InProcess, tmp_path: Path) -> StoppedDeployment:
     """A copy of it, to be spoilt."""
-    deployment = lived.service.deployment
+    deployment = exercised.service.deployment
     shutil.copytree(deployment.settings.data_dir, tmp_path / "data")
     keys = deployment.settings.resolved_master_key_file
     settings = deployment.settings.model_copy(
         update={"data_dir": tmp_path / "data", "master_key_file": keys}
     )
     copied = dataclasses.replace(deployment, settings=settings)
-    history, replays = copy.deepcopy((lived.history, lived.replays))
-    return Scene(SimpleNamespace(deployment=copied), history, replays)
+    history, replays = copy.deepcopy((exercised.history, exercised.replays))
+    return StoppedDeployment(SimpleNamespace(deployment=copied), history, replays)
 
 
-def test_nothing_is_found_where_nothing_is_wrong(scene: Scene) -> None:
-    found = examine(scene, list(SUBJECTS))
-    assert found.violations == []
-    assert found.effective == 0
-    assert found.lines >= len(scene.history)
-    assert list(unexpected(scene.history, lambda _: False)) == []
+def test_nothing_is_found_where_nothing_is_wrong(stopped: StoppedDeployment) -> None:
+    examined = examine(stopped, list(SUBJECTS))
+    assert examined.violations == []
+    assert examined.effective == 0
+    assert examined.lines >= len(stopped.history)
+    assert list(unexpected(stopped.history, lambda _: False)) == []
 
 
-def test_a_write_that_nobody_was_told_of_may_have_happened_or_not(scene: Scene) -> None:
-    happened = scene.the("enroll")
+def test_a_write_that_nobody_was_told_of_may_have_happened_or_not(
+    stopped: StoppedDeployment,
+) -> None:
+    happened = stopped.the("enroll")
     happened.outcome, happened.answer = LOST, {}
     happened.over += 1
     never = Operation("enroll", "subject-1", 6, "000099-never", happened.started)
-    scene.history.append(never)
-    found = examine(scene, list(SUBJECTS))
-    assert found.violations == []
-    assert found.effective == 1
+    stopped.history.append(never)
+    examined = examine(stopped, list(SUBJECTS))
+    assert examined.violations == []
+    assert examined.effective == 1
 
 
-def loses_the_write(scene: Scene) -> None:
-    scene.execute("DELETE FROM templates", "DELETE FROM subjects")
+def loses_the_write(stopped: StoppedDeployment) -> None:
+    stopped.execute("DELETE FROM templates", "DELETE FROM subjects")
 
 
-def loses_half_of_it(scene: Scene) -> None:
-    scene.execute("DELETE FROM templates")
+def loses_half_of_it(stopped: StoppedDeployment) -> None:
+    stopped.execute("DELETE FROM templates")
 
 
-def keeps_what_was_erased(scene: Scene) -> None:
-    with scene.store() as store:
+def keeps_what_was_erased(stopped: StoppedDeployment) -> None:
+    with stopped.store() as store:
         other = store.get("default", "subject-0")
         assert other is not None
         columns = ("contract_id", "n", "m", "dtype", "source", "photos")
@@ -146,93 +148,93 @@ def keeps_what_was_erased(scene: Scene) -> None:
         store.put("default", "subject-1", other.wire, **known)
 
 
-def moves_a_template(scene: Scene) -> None:
-    scene.execute("UPDATE subjects SET subject_id = 'subject-1'")
+def moves_a_template(stopped: StoppedDeployment) -> None:
+    stopped.execute("UPDATE subjects SET subject_id = 'subject-1'")
 
 
-def spoils_the_template(scene: Scene) -> None:
-    scene.execute("UPDATE templates SET ciphertext = zeroblob(length(ciphertext))")
+def spoils_the_template(stopped: StoppedDeployment) -> None:
+    stopped.execute("UPDATE templates SET ciphertext = zeroblob(length(ciphertext))")
 
 
-def has_another_template(scene: Scene) -> None:
-    enrolled = [each for each in scene.history if each.kind == "enroll"][1]
+def has_another_template(stopped: StoppedDeployment) -> None:
+    enrolled = [each for each in stopped.history if each.kind == "enroll"][1]
     enrolled.answer = {**enrolled.answer, "template_id": "other"}
-    described = scene.the("describe")
+    described = stopped.the("describe")
     described.answer = {**described.answer, "template_id": "other"}
 
 
-def loses_the_receipts(scene: Scene) -> None:
-    scene.execute("DELETE FROM receipts")
+def loses_the_receipts(stopped: StoppedDeployment) -> None:
+    stopped.execute("DELETE FROM receipts")
 
 
-def forgets_a_nonce(scene: Scene) -> None:
-    scene.execute("DELETE FROM used_nonces WHERE nonce_hash IN "
+def forgets_a_nonce(stopped: StoppedDeployment) -> None:
+    stopped.execute("DELETE FROM used_nonces WHERE nonce_hash IN "
                     "(SELECT nonce_hash FROM used_nonces LIMIT 1)")  # fmt: skip
 
 
-def counts_wrongly(scene: Scene) -> None:
-    scene.execute("UPDATE failed_attempts SET consecutive = consecutive + 1")
+def counts_wrongly(stopped: StoppedDeployment) -> None:
+    stopped.execute("UPDATE failed_attempts SET consecutive = consecutive + 1")
 
 
-def alters_a_line(scene: Scene) -> None:
+def alters_a_line(stopped: StoppedDeployment) -> None:
     triggers = sa.text("SELECT name FROM sqlite_master WHERE type = 'trigger'")
-    with scene.store() as store:
+    with stopped.store() as store:
         named = store._database.read(lambda each: each.execute(triggers).scalars().all())
-    scene.execute(
+    stopped.execute(
         *(f"DROP TRIGGER {name}" for name in named),
         "UPDATE audit_log SET outcome = 'accept' WHERE outcome = 'reject'",
     )
 
 
-def answered_without_a_line(scene: Scene) -> None:
-    said = scene.the("enroll", last=True)
-    scene.history.append(dataclasses.replace(said, request_id="000099-unheard"))
+def answered_without_a_line(stopped: StoppedDeployment) -> None:
+    said = stopped.the("enroll", last=True)
+    stopped.history.append(dataclasses.replace(said, request_id="000099-unheard"))
 
 
-def wrote_what_was_refused(scene: Scene) -> None:
-    said = scene.the("enroll")
+def wrote_what_was_refused(stopped: StoppedDeployment) -> None:
+    said = stopped.the("enroll")
     said.outcome, said.code, said.answer = 429, "rate_limited", {}
 
 
-def wrote_what_was_not_sent(scene: Scene) -> None:
-    scene.the("erase").outcome = NOT_SENT
+def wrote_what_was_not_sent(stopped: StoppedDeployment) -> None:
+    stopped.the("erase").outcome = NOT_SENT
 
 
-def wrote_what_nobody_sent(scene: Scene) -> None:
-    scene.history.remove(scene.the("erase"))
+def wrote_what_nobody_sent(stopped: StoppedDeployment) -> None:
+    stopped.history.remove(stopped.the("erase"))
 
 
-def decided_otherwise(scene: Scene) -> None:
-    said = scene.the("verify")
+def decided_otherwise(stopped: StoppedDeployment) -> None:
+    said = stopped.the("verify")
     said.answer = {**said.answer, "decision": "reject"}
 
 
-def accepted_who_was_replaced(scene: Scene) -> None:
+def accepted_who_was_replaced(stopped: StoppedDeployment) -> None:
     """Answer, line and counts agree that person 1 is accepted again at the end."""
-    late = scene.the("verify", last=True)
+    late = stopped.the("verify", last=True)
     assert late.accepted
     late.person = 1
 
 
-def described_who_was_erased(scene: Scene) -> None:
-    gone = scene.the("describe", last=True)
-    gone.outcome, gone.answer = 200, {"template_id": scene.the("enroll").template_id}
+def described_who_was_erased(stopped: StoppedDeployment) -> None:
+    gone = stopped.the("describe", last=True)
+    gone.outcome, gone.answer = 200, {"template_id": stopped.the("enroll").template_id}
 
 
-def repeated_another_receipt(scene: Scene) -> None:
-    first, second, *_, other = [each for each in scene.history if each.kind == "erase"]
+def repeated_another_receipt(stopped: StoppedDeployment) -> None:
+    first, second, *_, other = [each for each in stopped.history if each.kind == "erase"]
     assert first.receipt_id == second.receipt_id
     second.answer = other.answer
 
 
-def wrote_before_it_was_asked(scene: Scene) -> None:
-    said = scene.the("enroll")
-    later = max(each.answered for each in scene.history)
+def wrote_before_it_was_asked(stopped: StoppedDeployment) -> None:
+    said = stopped.the("enroll")
+    later = max(each.answered for each in stopped.history)
     said.started, said.answered, said.over = later + 1, later + 2, later + 2
 
 
-def decided_twice(scene: Scene) -> None:
-    (_, again), *_ = scene.replays
+def decided_twice(stopped: StoppedDeployment) -> None:
+    (_, again), *_ = stopped.replays
     again.outcome, again.code = 200, None
 
 
@@ -261,13 +263,15 @@ def decided_twice(scene: Scene) -> None:
         (decided_twice, "replay: 200"),
     ],
 )
-def test_a_fault_is_found(scene: Scene, fault: Callable[[Scene], object], sentence: str) -> None:
-    fault(scene)
-    found = scene.violations()
-    assert any(sentence in each for each in found), found
+def test_a_fault_is_found(
+    stopped: StoppedDeployment, fault: Callable[[StoppedDeployment], object], sentence: str
+) -> None:
+    fault(stopped)
+    violations = stopped.violations()
+    assert any(sentence in each for each in violations), violations
 
 
-def test_an_answer_that_should_not_be_is_found(scene: Scene) -> None:
-    scene.the("verify").outcome = 500
-    (found,) = unexpected(scene.history, lambda each: each.outcome == 503)
-    assert "500" in found
+def test_an_answer_that_should_not_be_is_found(stopped: StoppedDeployment) -> None:
+    stopped.the("verify").outcome = 500
+    (violations,) = unexpected(stopped.history, lambda each: each.outcome == 503)
+    assert "500" in violations

@@ -21,7 +21,7 @@ def drawn(text: str) -> Iterator[tuple[str, str | None]]:
 
 
 def defined(kind: type[Exception]) -> Iterator[tuple[str, str | None]]:
-    """Every subclass that the rooms define, with its base."""
+    """Every subclass that the packages define, with its base."""
     for child in kind.__subclasses__():
         if child.__module__.split(".")[0] in ROOMS:
             yield child.__name__, kind.__name__

@@ -1,4 +1,4 @@
-"""One calibration of synthetic people, shared by the tests of this room."""
+"""One calibration of synthetic people, shared by the tests of this package."""
 
 import pytest
 

@@ -7,7 +7,7 @@ from typing import Any
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Page
 
-from tests.web.visit import Visit
+from tests.web.browser_tab import BrowserTab
 
 SHOTS = os.environ.get("VEILFACE_TEST_SCREENSHOTS")
 """A folder to keep pictures of the views in, for a person to look at."""
@@ -23,12 +23,12 @@ def serious(page: Page) -> list[tuple[str, str]]:
     ]
 
 
-def shot(tab: Visit, name: str) -> None:
+def shot(tab: BrowserTab, name: str) -> None:
     if SHOTS:
         tab.page.screenshot(path=Path(SHOTS) / f"{name}.png", full_page=True)
 
 
-def assert_accessible(tab: Visit, name: str) -> None:
+def assert_accessible(tab: BrowserTab, name: str) -> None:
     assert serious(tab.page) == [], name
     wide = tab.page.evaluate("document.documentElement.scrollWidth - innerWidth")
     assert wide <= 0, f"{name} scrolls sideways by {wide} px"

@@ -25,9 +25,9 @@ from templates.blas import single_threaded
 from templates.contract.document import Contract
 from templates.space.lifting import Strategy
 from tests.api.http.test_stored import report
+from tests.web.browser_tab import BrowserTab
 from tests.web.camera import FakeCamera
 from tests.web.served import Served, serving
-from tests.web.visit import Visit
 from verify import CalibrationOptions, LabelledFolder, labelled_folder
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
@@ -38,7 +38,7 @@ SMALL = Scale(
 )
 WHO, OTHER = "Ashanti", "Antonio_Palocci"
 
-OpenVisit = Callable[..., Visit]
+OpenTab = Callable[..., BrowserTab]
 
 
 @pytest.fixture(scope="session")
@@ -73,24 +73,24 @@ def browser(chromium: Path, camera: FakeCamera) -> Iterator[Browser]:
 
 
 @pytest.fixture
-def visit(browser: Browser) -> Iterator[OpenVisit]:
+def open_tab(browser: Browser) -> Iterator[OpenTab]:
     """Open a tab on a service; at its end, every one of them must have been clean."""
-    opened: list[tuple[Any, Visit]] = []
+    opened: list[tuple[Any, BrowserTab]] = []
 
-    def open_visit(served: Served, *, sign_in: str | None = "", **options: Any) -> Visit:
+    def open_one(served: Served, *, sign_in: str | None = "", **options: Any) -> BrowserTab:
         context = browser.new_context(
             viewport={"width": options.pop("width", 1280), "height": 800}, **options
         )
-        made = Visit.of(context, served.url + "/")
-        opened.append((context, made))
+        tab = BrowserTab.of(context, served.url + "/")
+        opened.append((context, tab))
         if sign_in is not None:
-            made.sign_in(sign_in or served.token)
-        return made
+            tab.sign_in(sign_in or served.token)
+        return tab
 
-    yield open_visit
+    yield open_one
     try:
-        for _, made in opened:
-            made.assert_clean()
+        for _, tab in opened:
+            tab.assert_clean()
     finally:
         for context, _ in opened:
             context.close()

@@ -8,10 +8,10 @@ import pytest
 from PIL import Image
 from playwright.sync_api import expect
 
+from tests.web.browser_tab import BrowserTab
 from tests.web.camera import FakeCamera
-from tests.web.conftest import OpenVisit
+from tests.web.conftest import OpenTab
 from tests.web.served import Served
-from tests.web.visit import Visit
 
 pytestmark = pytest.mark.long
 
@@ -57,19 +57,19 @@ async () => Promise.all(window.sent.map(async ([path, blob]) => {
 """
 
 
-def watched(visit: OpenVisit, served: Served) -> Visit:
-    tab = visit(served, sign_in=None)
+def watched(open_tab: OpenTab, served: Served) -> BrowserTab:
+    tab = open_tab(served, sign_in=None)
     tab.page.add_init_script(WATCH)
     tab.sign_in(served.token)
     return tab
 
 
-def start(tab: Visit) -> None:
+def start(tab: BrowserTab) -> None:
     tab.page.get_by_label("Camera", exact=True).check()
     tab.page.get_by_role("button", name="Start camera").click()
 
 
-def leave(tab: Visit, how: str, token: str) -> None:
+def leave(tab: BrowserTab, how: str, token: str) -> None:
     """Leave the view in one of three ways; the camera was this view's."""
     match how:
         case "view":
@@ -81,17 +81,17 @@ def leave(tab: Visit, how: str, token: str) -> None:
             expect(tab.page.get_by_role("heading", level=1, name="Sign in")).to_be_visible()
 
 
-def states(tab: Visit) -> list[str]:
+def states(tab: BrowserTab) -> list[str]:
     found: list[str] = tab.page.evaluate("window.tracks.map((each) => each.readyState)")
     return found
 
 
-def checks(tab: Visit) -> int:
+def checks(tab: BrowserTab) -> int:
     return sum(url.endswith("/v1/photos/check") for url in tab.requests)
 
 
-def test_nothing_is_sent_once_the_camera_was_left(visit: OpenVisit, demo: Served) -> None:
-    tab = watched(visit, demo)
+def test_nothing_is_sent_once_the_camera_was_left(open_tab: OpenTab, demo: Served) -> None:
+    tab = watched(open_tab, demo)
     page = tab.page
     for number, how in enumerate(("view", "source", "sign-out"), start=1):
         # Left while the video is about to play.
@@ -120,9 +120,9 @@ def test_nothing_is_sent_once_the_camera_was_left(visit: OpenVisit, demo: Served
 
 
 def test_a_camera_that_stops_is_said_and_can_be_started_again(
-    visit: OpenVisit, demo: Served
+    open_tab: OpenTab, demo: Served
 ) -> None:
-    tab = watched(visit, demo)
+    tab = watched(open_tab, demo)
     page = tab.page
     button = page.get_by_role("button", name="Start camera")
     for event in ("ended", "mute", "pagehide"):
@@ -143,10 +143,10 @@ def test_a_camera_that_stops_is_said_and_can_be_started_again(
 
 
 def test_the_photo_that_is_sent_was_itself_checked(
-    visit: OpenVisit, real: Served, camera: FakeCamera, people: dict[str, list[Path]]
+    open_tab: OpenTab, real: Served, camera: FakeCamera, people: dict[str, list[Path]]
 ) -> None:
     camera.shows(people["Ashanti"][0])
-    tab = watched(visit, real)
+    tab = watched(open_tab, real)
     page = tab.page
     page.get_by_label("Person's id").fill("nobody-there")
     tab.take_photo()
@@ -179,7 +179,7 @@ def test_the_photo_that_is_sent_was_itself_checked(
     page.get_by_role("button", name="Start camera").click()
     page.get_by_role("button", name="Take photo").click()
     expect(page.locator(".refused")).to_have_text(
-        "Not taken. No face found. Look into the camera, upright."
+        "Not taken. No face found. Face the camera, with your head upright."
     )
     expect(page.locator(".tray li")).to_have_count(0)
 
@@ -192,12 +192,12 @@ def assert_sent_as_checked(sent: list[dict[str, Any]], size: tuple[int, int]) ->
     assert sent[sending]["text"] in {each["text"] for each in checked}
 
 
-def test_photos_are_decoded_one_at_a_time(visit: OpenVisit, demo: Served) -> None:
+def test_photos_are_decoded_one_at_a_time(open_tab: OpenTab, demo: Served) -> None:
     out = io.BytesIO()
     Image.open(demo.settings.data_dir / "people" / "person-2" / "0.png").resize((1700, 1700)).save(
         out, "JPEG"
     )
-    tab = watched(visit, demo)
+    tab = watched(open_tab, demo)
     page = tab.page
     tab.open("Enroll")
     page.get_by_label("Files").check()
@@ -216,4 +216,4 @@ def test_photos_are_decoded_one_at_a_time(visit: OpenVisit, demo: Served) -> Non
     page.get_by_label("Camera", exact=True).check()
     page.get_by_role("button", name="Start camera").click()
     page.get_by_role("button", name="Take photo").click()
-    expect(page.locator(".refused")).to_have_text("Not taken. The browser could not make a photo.")
+    expect(page.locator(".refused")).to_have_text("Not taken. The browser could not take a photo.")

@@ -11,23 +11,23 @@ from playwright.sync_api import expect
 
 from models.demo import DEMO_NOTICE
 from tests.patience import PATIENCE_S
+from tests.web.browser_tab import BrowserTab
 from tests.web.camera import FakeCamera, browsers_test_picture
-from tests.web.conftest import OpenVisit
+from tests.web.conftest import OpenTab
 from tests.web.served import Served
-from tests.web.visit import Visit
 
 pytestmark = pytest.mark.long
 
 
-def choose(tab: Visit, person: str, shot: int) -> None:
+def choose(tab: BrowserTab, person: str, shot: int) -> None:
     """Take one photo of a drawn person."""
-    tab.page.get_by_label("Person who does not exist").select_option(person)
+    tab.page.get_by_label("Cartoon person").select_option(person)
     tab.page.get_by_role("button", name=f"Choose photo {shot} of {person}", exact=True).click()
     expect(tab.page.locator(".tray .seen[data-state=good]").last).to_be_visible()
 
 
-def test_a_visitor_enrolls_and_verifies_a_drawn_person(visit: OpenVisit, demo: Served) -> None:
-    tab = visit(demo)
+def test_a_visitor_enrolls_and_verifies_a_drawn_person(open_tab: OpenTab, demo: Served) -> None:
+    tab = open_tab(demo)
     page = tab.page
     tab.open("Enroll")
     page.get_by_label("Person's id").fill("visitor")
@@ -48,8 +48,8 @@ def test_a_visitor_enrolls_and_verifies_a_drawn_person(visit: OpenVisit, demo: S
         assert client.delete("/v1/subjects/visitor").is_success
 
 
-def test_every_screen_is_marked(visit: OpenVisit, demo: Served) -> None:
-    tab = visit(demo, sign_in=None)
+def test_every_screen_is_marked(open_tab: OpenTab, demo: Served) -> None:
+    tab = open_tab(demo, sign_in=None)
     tab.page.goto(tab.url)
     mark = tab.page.get_by_text(DEMO_NOTICE, exact=True)
     expect(mark).to_be_visible()
@@ -80,7 +80,7 @@ def test_drawn_photos_are_the_demos_only_and_always_the_same(demo: Served) -> No
         wire.close()
 
 
-def test_people_come_page_by_page(visit: OpenVisit, demo: Served) -> None:
+def test_people_come_page_by_page(open_tab: OpenTab, demo: Served) -> None:
     photo = (demo.settings.data_dir / "people" / "person-2" / "0.png").read_bytes()
     names = [f"many-{number:02}" for number in range(26)]
     with demo.client() as client:
@@ -89,11 +89,11 @@ def test_people_come_page_by_page(visit: OpenVisit, demo: Served) -> None:
                 f"/v1/subjects/{name}/enrollment", files={"images": ("0.png", photo)}
             )
             assert answer.status_code == 201, answer.text
-        tab = visit(demo)
+        tab = open_tab(demo)
         tab.open("People")
         cards = tab.page.locator("li.person")
         expect(cards).to_have_count(25)
-        expect(tab.page.get_by_role("status").first).to_contain_text("there are more")
+        expect(tab.page.get_by_role("status").first).to_contain_text("with more to come")
         tab.page.get_by_role("button", name="Show more").click()
         total = len(client.get("/v1/subjects").json()["subjects"])
         expect(cards).to_have_count(total)
@@ -103,7 +103,9 @@ def test_people_come_page_by_page(visit: OpenVisit, demo: Served) -> None:
             client.delete(f"/v1/subjects/{name}")
 
 
-def test_too_many_rejections_are_told_with_the_time_to_wait(visit: OpenVisit, demo: Served) -> None:
+def test_too_many_rejections_are_told_with_the_time_to_wait(
+    open_tab: OpenTab, demo: Served
+) -> None:
     stranger = (demo.settings.data_dir / "people" / "person-2" / "0.png").read_bytes()
     with demo.client() as client:
         enrolled = client.put(
@@ -113,7 +115,7 @@ def test_too_many_rejections_are_told_with_the_time_to_wait(visit: OpenVisit, de
         other = httpx.get(f"{demo.url}/demo/people/person-101/0.png", timeout=PATIENCE_S).content
         for _ in range(5):
             client.post("/v1/subjects/locked/verify", files={"image": ("0.png", other)})
-        tab = visit(demo)
+        tab = open_tab(demo)
         tab.page.get_by_label("Person's id").fill("locked")
         choose(tab, "person-2", 1)
         tab.page.get_by_role("button", name="Verify", exact=True).click()
@@ -126,16 +128,16 @@ def test_too_many_rejections_are_told_with_the_time_to_wait(visit: OpenVisit, de
 
 
 def test_the_test_picture_of_a_fake_camera_is_no_face(
-    visit: OpenVisit, demo: Served, camera: FakeCamera
+    open_tab: OpenTab, demo: Served, camera: FakeCamera
 ) -> None:
     camera.shows_the_browsers_test_picture()
-    tab = visit(demo)
+    tab = open_tab(demo)
     page = tab.page
     page.get_by_label("Camera", exact=True).check()
     page.get_by_role("button", name="Start camera").click()
-    tab.guided("No drawn face found")
+    tab.guided("No cartoon face found")
     page.get_by_role("button", name="Take photo").click()
-    expect(page.locator(".refused")).to_contain_text("Not taken. No drawn face found")
+    expect(page.locator(".refused")).to_contain_text("Not taken. No cartoon face found")
     expect(page.locator(".tray li")).to_have_count(0)
     drawn = demo.settings.data_dir / "people" / "person-2" / "0.png"
     page.get_by_label("Files", exact=True).check()
@@ -146,9 +148,9 @@ def test_the_test_picture_of_a_fake_camera_is_no_face(
 
 
 def test_photos_are_numbered_from_one_in_the_tray_and_in_messages(
-    visit: OpenVisit, demo: Served
+    open_tab: OpenTab, demo: Served
 ) -> None:
-    tab = visit(demo)
+    tab = open_tab(demo)
     page = tab.page
     tab.open("Enroll")
     page.get_by_label("Person's id").fill("mixed")
@@ -168,15 +170,15 @@ def test_photos_are_numbered_from_one_in_the_tray_and_in_messages(
     )
     page.get_by_role("button", name="Remove photo from person-1, photo 1").click()
     expect(numbers).to_have_text(["Photo 1", "Photo 2"])
-    expect(page.locator(".tray .seen").last).to_contain_text("No drawn face found")
+    expect(page.locator(".tray .seen").last).to_contain_text("No cartoon face found")
     page.get_by_role("button", name="Enroll", exact=True).click()
-    expect(alert).to_contain_text("Photo 2 of 2: no drawn face was found")
-    expect(page.locator(".tray .seen").last).to_contain_text("No drawn face was found")
+    expect(alert).to_contain_text("Photo 2 of 2: no cartoon face was found")
+    expect(page.locator(".tray .seen").last).to_contain_text("No cartoon face was found")
     expect(page.locator(".tray .seen").first).not_to_contain_text("was found")
 
 
-def test_the_mark_covers_nothing_that_has_the_focus(visit: OpenVisit, demo: Served) -> None:
-    tab = visit(demo)
+def test_the_mark_covers_nothing_that_has_the_focus(open_tab: OpenTab, demo: Served) -> None:
+    tab = open_tab(demo)
     page = tab.page
     tab.open("Service")
     tab.open("Enroll")

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Error, Page, Route, expect
 
-from tests.web.conftest import OpenVisit
+from tests.web.conftest import OpenTab
 from tests.web.served import Served
 from tests.web.test_demo import choose
 
@@ -23,8 +23,8 @@ Object.defineProperty(window, "sessionStorage", {
 """
 
 
-class Held:
-    """Requests of one pattern, answered when the test says so."""
+class PendingRequests:
+    """Requests that match a pattern, answered when the test says so."""
 
     def __init__(self, page: Page, pattern: str) -> None:
         self.page = page
@@ -47,17 +47,17 @@ def refusal(code: str, message: str, **details: Any) -> dict[str, Any]:
     }
 
 
-def test_a_late_decision_names_whom_it_is_about(visit: OpenVisit, demo: Served) -> None:
-    tab = visit(demo)
+def test_a_late_decision_names_whom_it_is_about(open_tab: OpenTab, demo: Served) -> None:
+    tab = open_tab(demo)
     page = tab.page
     subject = page.get_by_label("Person's id")
-    held = Held(page, "**/verify")
+    pending = PendingRequests(page, "**/verify")
     for heard in (False, True):
-        held.routes.clear()
+        pending.routes.clear()
         subject.fill("alice")
         choose(tab, "person-2", 1)
         page.get_by_role("button", name="Verify", exact=True).click()
-        waiting = held.wait()
+        waiting = pending.wait()
         expect(subject).to_be_disabled()
         expect(page.get_by_role("button", name="Remove photo")).to_be_disabled()
         subject.evaluate(
@@ -73,18 +73,21 @@ def test_a_late_decision_names_whom_it_is_about(visit: OpenVisit, demo: Served) 
         else:
             expect(page.locator(".verdict")).to_contain_text("Personalice")
             expect(page.locator(".verdict")).to_contain_text("0 % (none seen)")
-        assert len(held.routes) == 1
+        assert len(pending.routes) == 1
 
 
-def test_a_late_enrollment_is_of_the_photos_that_were_sent(visit: OpenVisit, demo: Served) -> None:
-    tab = visit(demo)
+def test_a_late_enrollment_is_of_the_photos_that_were_sent(open_tab: OpenTab, demo: Served) -> None:
+    tab = open_tab(demo)
     page = tab.page
     tab.open("Enroll")
     subject = page.get_by_label("Person's id")
     subject.fill("alice")
     for shot in (1, 2):
         choose(tab, "person-1", shot)
-    photo, enrollment = Held(page, "**/demo/people/person-1/2.png"), Held(page, "**/enrollment")
+    photo, enrollment = (
+        PendingRequests(page, "**/demo/people/person-1/2.png"),
+        PendingRequests(page, "**/enrollment"),
+    )
     page.get_by_role("button", name="Choose photo 3 of person-1").click()
     late = photo.wait()
     page.get_by_role("button", name="Enroll", exact=True).click()
@@ -122,12 +125,12 @@ def test_a_late_enrollment_is_of_the_photos_that_were_sent(visit: OpenVisit, dem
     expect(page.get_by_label("Remove photo from person-1, photo 3")).to_be_visible()
 
 
-def test_a_late_refusal_of_another_key_does_not_sign_out(visit: OpenVisit, demo: Served) -> None:
-    tab = visit(demo)
+def test_a_late_refusal_of_another_key_does_not_sign_out(open_tab: OpenTab, demo: Served) -> None:
+    tab = open_tab(demo)
     page = tab.page
-    held = Held(page, "**/v1/subjects?*")
+    pending = PendingRequests(page, "**/v1/subjects?*")
     page.get_by_role("link", name="People").click()
-    waiting = held.wait()
+    waiting = pending.wait()
     page.get_by_role("button", name="Sign out").click()
     page.get_by_label("API key").fill(demo.token)
     page.get_by_role("button", name="Sign in").click()
@@ -140,7 +143,7 @@ def test_a_late_refusal_of_another_key_does_not_sign_out(visit: OpenVisit, demo:
     tab.complaints[:] = [each for each in tab.complaints if "ERR_ABORTED" not in each]
 
 
-def people(page: Page, *names: str) -> Held:
+def people(page: Page, *names: str) -> PendingRequests:
     """Show these people, whose erasures wait for the test."""
     described = [
         {"subject_id": name, "template_id": "0" * 32, "contract_id": "0" * 64, "current": True,
@@ -154,7 +157,7 @@ def people(page: Page, *names: str) -> Held:
             json={"subjects": described, "next_cursor": None, "request_id": "0" * 32}
         ),
     )
-    return Held(page, "**/v1/subjects/*")
+    return PendingRequests(page, "**/v1/subjects/*")
 
 
 def erase(page: Page, name: str) -> None:
@@ -162,23 +165,23 @@ def erase(page: Page, name: str) -> None:
     page.get_by_role("dialog").get_by_role("button", name="Erase", exact=True).click()
 
 
-def test_every_receipt_stays_and_no_failure_is_lost(visit: OpenVisit, demo: Served) -> None:
-    tab = visit(demo)
+def test_every_receipt_stays_and_no_failure_is_lost(open_tab: OpenTab, demo: Served) -> None:
+    tab = open_tab(demo)
     page = tab.page
-    held = people(page, "ada", "bob", "cleo")
+    pending = people(page, "ada", "bob", "cleo")
     tab.open("People")
     for name in ("ada", "bob"):
-        held.routes.clear()
+        pending.routes.clear()
         erase(page, name)
         claims = {"erased_at": "2026-01-31T12:00:00Z", "erased": [], "subject": "0" * 64,
                   "signing_key": "0f3a", "receipt_id": name}  # fmt: skip
-        held.wait().fulfill(json={"receipt": {}, "claims": claims, "request_id": "0" * 32})
+        pending.wait().fulfill(json={"receipt": {}, "claims": claims, "request_id": "0" * 32})
         expect(page.locator(".verdict").first).to_contain_text(f"Erased {name}")
     expect(page.get_by_role("button", name="Download receipt")).to_have_count(2)
 
-    held.routes.clear()
+    pending.routes.clear()
     erase(page, "cleo")
-    waiting = held.wait()
+    waiting = pending.wait()
     # The browser itself closes a dialog that refuses twice: the failure is told all the same.
     page.keyboard.press("Escape")
     expect(page.get_by_role("dialog")).to_be_visible()
@@ -188,19 +191,21 @@ def test_every_receipt_stays_and_no_failure_is_lost(visit: OpenVisit, demo: Serv
     expect(page.get_by_role("alert")).to_be_visible()
 
 
-def test_a_key_that_ends_during_an_erasure_leaves_no_dialog(visit: OpenVisit, demo: Served) -> None:
-    tab = visit(demo)
-    held = people(tab.page, "ada")
+def test_a_key_that_ends_during_an_erasure_leaves_no_dialog(
+    open_tab: OpenTab, demo: Served
+) -> None:
+    tab = open_tab(demo)
+    pending = people(tab.page, "ada")
     tab.open("People")
     erase(tab.page, "ada")
-    held.wait().fulfill(status=401, json=refusal("unauthorized", "send a valid API key"))
+    pending.wait().fulfill(status=401, json=refusal("unauthorized", "send a valid API key"))
     expect(tab.page.get_by_role("heading", level=1, name="Sign in")).to_be_visible()
     expect(tab.page.locator("dialog")).to_have_count(0)
     tab.page.get_by_label("API key").click()
 
 
-def test_a_browser_without_storage_and_a_view_that_is_none(visit: OpenVisit, demo: Served) -> None:
-    tab = visit(demo, sign_in=None)
+def test_a_browser_without_storage_and_a_view_that_is_none(open_tab: OpenTab, demo: Served) -> None:
+    tab = open_tab(demo, sign_in=None)
     tab.page.add_init_script(BLOCKED)
     tab.sign_in(demo.token, keep=True)
     for name in ("constructor", "toString", "__proto__", ""):
@@ -211,11 +216,11 @@ def test_a_browser_without_storage_and_a_view_that_is_none(visit: OpenVisit, dem
 
 
 def test_what_a_client_lifted_is_told_as_the_contract_has_it(
-    visit: OpenVisit, demo: Served
+    open_tab: OpenTab, demo: Served
 ) -> None:
     with demo.client() as client:
         stored = client.get("/v1/subjects/person-2/stored").json()
-    tab = visit(demo)
+    tab = open_tab(demo)
     tab.page.route(
         "**/stored", lambda route: route.fulfill(json={**stored, "enrolled_by": "template"})
     )
@@ -223,5 +228,7 @@ def test_what_a_client_lifted_is_told_as_the_contract_has_it(
     tab.open("Stored")
     tab.page.get_by_label("Person's id").fill("person-2")
     tab.page.get_by_role("button", name="Show").click()
-    expect(tab.page.locator(".facts").first).to_contain_text("by the contract; a client lifted it")
-    expect(tab.page.locator("figcaption")).to_contain_text("By the contract the set was laid")
+    expect(tab.page.locator(".facts").first).to_contain_text("by the contract; lifted by a client")
+    expect(tab.page.locator("figcaption")).to_contain_text(
+        "By the contract, the set passes through"
+    )

@@ -9,31 +9,31 @@ from playwright.sync_api import expect
 from tests.api.cli.conftest import run
 from tests.web.access import assert_accessible
 from tests.web.camera import FakeCamera
-from tests.web.conftest import OTHER, WHO, OpenVisit
+from tests.web.conftest import OTHER, WHO, OpenTab
 from tests.web.served import Served
 
 pytestmark = pytest.mark.long
 
 
 def test_one_person_from_enrollment_to_erasure(
-    visit: OpenVisit,
+    open_tab: OpenTab,
     real: Served,
     camera: FakeCamera,
     people: dict[str, list[Path]],
     tmp_path: Path,
 ) -> None:
-    mine, theirs = people[WHO], people[OTHER]
-    tab = visit(real)
+    own, other = people[WHO], people[OTHER]
+    tab = open_tab(real)
     page = tab.page
 
     tab.open("Enroll")
     page.get_by_label("Person's id").fill("anna")
-    camera.shows(mine[0])
+    camera.shows(own[0])
     tab.take_photo()
     tab.guided("Good: one face")
     # Another photo from a file, as a visitor may mix them.
     page.get_by_label("Files").check()
-    page.get_by_label("Photos: JPEG").set_input_files(mine[1])
+    page.get_by_label("Photos: JPEG").set_input_files(own[1])
     expect(page.locator(".tray .seen[data-state=good]")).to_have_count(2)
     page.get_by_role("button", name="Enroll", exact=True).click()
     expect(page.locator(".verdict")).to_contain_text("Enrolled")
@@ -42,13 +42,13 @@ def test_one_person_from_enrollment_to_erasure(
 
     expect(page.get_by_label("Person's id")).to_have_value("anna")
     page.get_by_label("Level").select_option("fmr-1e-1")
-    camera.shows(mine[2])
+    camera.shows(own[2])
     tab.take_photo()
     page.get_by_role("button", name="Verify", exact=True).click()
     expect(page.locator(".verdict.accept")).to_contain_text("Accepted")
     expect(page.locator(".verdict")).to_contain_text("10 % (1 in 10)")
 
-    camera.shows(theirs[0])
+    camera.shows(other[0])
     tab.open("People")
     page.get_by_role("link", name="Verify anna").click()
     tab.take_photo()
@@ -93,7 +93,7 @@ def test_one_person_from_enrollment_to_erasure(
     ],
 )
 def test_guidance_says_what_the_camera_shows(
-    visit: OpenVisit,
+    open_tab: OpenTab,
     real: Served,
     camera: FakeCamera,
     people: dict[str, list[Path]],
@@ -110,7 +110,7 @@ def test_guidance_says_what_the_camera_shows(
             camera.shows(one, dark=0.14)
         case _:
             camera.shows(one)
-    tab = visit(real, width=360)
+    tab = open_tab(real, width=360)
     tab.page.get_by_role("button", name="Start camera").click()
     tab.guided(words)
     assert_accessible(tab, f"camera-{shown}")
@@ -120,9 +120,9 @@ def test_guidance_says_what_the_camera_shows(
 
 
 def test_photos_that_the_service_refuses_are_named(
-    visit: OpenVisit, real: Served, people: dict[str, list[Path]]
+    open_tab: OpenTab, real: Served, people: dict[str, list[Path]]
 ) -> None:
-    tab = visit(real)
+    tab = open_tab(real)
     page = tab.page
     tab.open("Enroll")
     page.get_by_label("Person's id").fill("two-people")
@@ -132,20 +132,20 @@ def test_photos_that_the_service_refuses_are_named(
     page.get_by_role("button", name="Enroll", exact=True).click()
     alert = page.get_by_role("alert")
     expect(alert).to_contain_text("inconsistent_images")
-    expect(alert).to_contain_text("Remove the photos that show another person")
+    expect(alert).to_contain_text("Remove the photos that show somebody else")
     expect(page.locator(".tray .seen[data-state=bad]")).to_have_count(2)
     with real.client() as client:
         assert client.get("/v1/subjects/two-people").status_code == 404
 
 
 def test_what_is_stored_is_shown_with_its_true_numbers(
-    visit: OpenVisit, real: Served, people: dict[str, list[Path]]
+    open_tab: OpenTab, real: Served, people: dict[str, list[Path]]
 ) -> None:
     with real.client() as client:
         files = [("images", (photo.name, photo.read_bytes())) for photo in people[OTHER][:2]]
         assert client.put("/v1/subjects/palocci/enrollment", files=files).is_success
         stored = client.get("/v1/subjects/palocci/stored").json()
-    tab = visit(real)
+    tab = open_tab(real)
     tab.open("Stored")
     tab.page.get_by_label("Person's id").fill("palocci")
     tab.page.get_by_role("button", name="Show").click()
@@ -194,7 +194,7 @@ def test_what_is_stored_is_shown_with_its_true_numbers(
     )
     audit = tab.page.locator("[data-audit=contract]")
     expect(audit).to_contain_text("20 % of stolen and decrypted templates gave a match")
-    expect(audit).to_contain_text("failed, a limit is exceeded")
+    expect(audit).to_contain_text("failed: a limit is exceeded")
     rows = audit.get_by_role("row")
     expect(rows).to_have_count(1 + 6)
     # What is compared stands beside the limit: not the value; and D_sys is no share.

@@ -1,16 +1,16 @@
-"""The key and what it may do; and that the record of a visit sees what it is there to see."""
+"""The key and what it may do; and that the record of a tab sees what it is there to see."""
 
 import pytest
 from playwright.sync_api import expect
 
-from tests.web.conftest import OpenVisit
+from tests.web.conftest import OpenTab
 from tests.web.served import Served
 
 pytestmark = pytest.mark.long
 
 
-def test_the_key_is_kept_only_where_it_is_asked_for(visit: OpenVisit, demo: Served) -> None:
-    tab = visit(demo)
+def test_the_key_is_kept_only_where_it_is_asked_for(open_tab: OpenTab, demo: Served) -> None:
+    tab = open_tab(demo)
     page = tab.page
     assert page.evaluate("sessionStorage.length + localStorage.length") == 0
     assert page.evaluate("document.cookie") == ""
@@ -28,31 +28,33 @@ def test_the_key_is_kept_only_where_it_is_asked_for(visit: OpenVisit, demo: Serv
 
 
 def test_what_a_key_may_not_do_is_switched_off_with_the_reason(
-    visit: OpenVisit, demo: Served
+    open_tab: OpenTab, demo: Served
 ) -> None:
-    tab = visit(demo, sign_in=demo.key("verify"))
+    tab = open_tab(demo, sign_in=demo.key("verify"))
     page = tab.page
     expect(page.get_by_label("Person's id")).to_be_enabled()
     for view in ("Enroll", "People", "Stored"):
         tab.open(view)
-        expect(page.get_by_role("note").filter(has_text="lacks the right “enroll”")).to_be_visible()
+        expect(
+            page.get_by_role("note").filter(has_text="does not have the right “enroll”")
+        ).to_be_visible()
     tab.open("Enroll")
     expect(page.get_by_label("Person's id")).to_be_disabled()
     expect(page.get_by_role("button", name="Enroll", exact=True)).to_be_disabled()
     tab.open("Service")
-    expect(page.get_by_role("list", name="Rights")).to_contain_text("verify: may verify a photo")
+    expect(page.get_by_role("list", name="Rights")).to_contain_text("verify: may verify people")
     expect(page.get_by_role("list", name="Rights")).to_contain_text("erase: may not erase")
 
 
-def test_who_may_not_erase_sees_why(visit: OpenVisit, demo: Served) -> None:
-    tab = visit(demo, sign_in=demo.key("enroll"))
+def test_who_may_not_erase_sees_why(open_tab: OpenTab, demo: Served) -> None:
+    tab = open_tab(demo, sign_in=demo.key("enroll"))
     tab.open("People")
     expect(tab.page.get_by_role("button", name="Erase person-2")).to_be_disabled()
     expect(tab.page.get_by_role("note").filter(has_text="“erase”")).to_be_visible()
 
 
-def test_a_key_that_is_revoked_meanwhile_signs_out(visit: OpenVisit, demo: Served) -> None:
-    tab = visit(demo)
+def test_a_key_that_is_revoked_meanwhile_signs_out(open_tab: OpenTab, demo: Served) -> None:
+    tab = open_tab(demo)
     tab.page.route(
         "**/v1/subjects?*",
         lambda route: route.fulfill(
@@ -68,19 +70,19 @@ def test_a_key_that_is_revoked_meanwhile_signs_out(visit: OpenVisit, demo: Serve
     expect(tab.page.get_by_role("alert")).to_contain_text("unauthorized")
 
 
-def test_a_service_that_is_away_is_said(visit: OpenVisit, demo: Served) -> None:
-    tab = visit(demo)
+def test_a_service_that_is_away_is_said(open_tab: OpenTab, demo: Served) -> None:
+    tab = open_tab(demo)
     tab.page.route("**/v1/subjects?*", lambda route: route.abort())
     tab.open("People")
     alert = tab.page.get_by_role("alert")
-    expect(alert).to_contain_text("The service does not answer.")
+    expect(alert).to_contain_text("The service does not respond.")
     expect(alert).to_contain_text("unreachable")
     assert tab.complaints == ["Failed to load resource: net::ERR_FAILED"]
     tab.complaints.clear()
 
 
-def test_guidance_waits_as_long_as_it_is_told(visit: OpenVisit, demo: Served) -> None:
-    tab = visit(demo)
+def test_guidance_waits_as_long_as_it_is_told(open_tab: OpenTab, demo: Served) -> None:
+    tab = open_tab(demo)
     asked: list[str] = []
 
     def too_many(route: object) -> None:
@@ -97,15 +99,15 @@ def test_guidance_waits_as_long_as_it_is_told(visit: OpenVisit, demo: Served) ->
     tab.page.route("**/v1/photos/check", too_many)
     tab.page.get_by_label("Camera", exact=True).check()
     tab.page.get_by_role("button", name="Start camera").click()
-    tab.guided("Guidance pauses: too many requests.")
+    tab.guided("Guidance is paused: too many requests.")
     tab.page.wait_for_timeout(2500)
     assert asked == ["check"]
     expect(tab.page.get_by_role("button", name="Take photo")).to_be_enabled()
 
 
-def test_a_request_elsewhere_would_be_seen(visit: OpenVisit, demo: Served) -> None:
+def test_a_request_elsewhere_would_be_seen(open_tab: OpenTab, demo: Served) -> None:
     """The control of what every other test relies on."""
-    tab = visit(demo)
+    tab = open_tab(demo)
     tab.page.evaluate("fetch('http://elsewhere.invalid/').catch(() => {})")
     tab.page.evaluate("document.body.append(Object.assign(document.createElement('style'), "
                       "{textContent: 'body {color: red}'}))")  # fmt: skip

@@ -125,6 +125,6 @@ def resembling_rows(
 def _require_dimension(descriptors: NDArray[np.float32], pool: DecoyPool) -> None:
     if descriptors.ndim != 2 or descriptors.shape[1] != pool.n:
         raise DecoyError(
-            f"the decoy pool has descriptors of {pool.n} numbers, and the set has the shape "
+            f"the decoy pool has embeddings of {pool.n} numbers, and the set has the shape "
             f"{descriptors.shape}; use decoys that were made with the same pack"
         )

@@ -84,9 +84,9 @@ def read_embeddings(file: Path) -> EmbeddingsFile:
     faults = [f"{name!a} occurs twice" for name in _repeated(names)]
     for place in np.flatnonzero(~(np.isfinite(lengths) & (lengths > 0))).tolist():
         state = "zero" if lengths[place] == 0 else "not finite"
-        faults.append(f"the descriptor of {names[place]!a} is {state}")
+        faults.append(f"the embedding of {names[place]!a} is {state}")
     if faults:
-        raise DatasetError(faults_in(file, "expected one descriptor per photo", faults))
+        raise DatasetError(faults_in(file, "expected one embedding per photo", faults))
     return EmbeddingsFile(tuple(names), unit, sha256)
 
 
@@ -130,7 +130,7 @@ def match(embeddings: EmbeddingsFile, benchmark: VerificationSet) -> NDArray[np.
             positions[place] = rows[0]
     if faults:
         raise DatasetError(
-            faults_in(Path(benchmark.name), "expected one descriptor for each photo", faults)
+            faults_in(Path(benchmark.name), "expected one embedding for each photo", faults)
         )
     return positions
 
@@ -241,7 +241,7 @@ def _require_shapes(file: Path, paths: tuple[int, ...], rows: tuple[int, ...]) -
         )
     if rows[0] > MAX_ROWS or rows[1] > MAX_DIMENSION:
         raise DatasetError(
-            f"{file} has {rows[0]} descriptors of {rows[1]} numbers each; at most {MAX_ROWS} of "
+            f"{file} has {rows[0]} embeddings of {rows[1]} numbers each; at most {MAX_ROWS} of "
             f"{MAX_DIMENSION} are read"
         )
 

@@ -96,7 +96,7 @@ def prepare(
     kept = np.flatnonzero((first >= 0) & (second >= 0))
     same = pairs.same[kept]
     require_both_classes(
-        f"{pairs.name}, without the {len(pairs) - len(kept)} pairs that lack a descriptor,",
+        f"{pairs.name}, without the {len(pairs) - len(kept)} pairs that lack an embedding,",
         same,
         pairs.folds[kept],
     )

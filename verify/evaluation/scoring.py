@@ -90,7 +90,7 @@ def score_unit(material: Material, unit: Unit) -> list[Scores]:
         case RawUnit():
             rows = material.flipped if unit.flip else material.descriptors
             if rows is None:
-                raise ValueError("descriptors with the mirror image were not acquired")
+                raise ValueError("embeddings with the mirror image were not acquired")
             columns = [_cosines(rows, material.first, material.second)]
         case HashUnit():
             columns = [

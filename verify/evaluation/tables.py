@@ -132,7 +132,7 @@ def _provenance(results: Row) -> str:
     kind = "Model pack" if model.get("pack") else "Embeddings"
     lines.append(f"{kind}: {plain(source)}, n = {plain(model.get('n'))}, SHA-256 {_short(sha256)}")
     if results.get("options", {}).get("flip"):
-        lines.append("Descriptors: of the photo and its mirror image, summed")
+        lines.append("Embeddings: of the photo and its mirror image, summed")
     for decoys in results.get("decoys") or ():
         facts = [plain(decoys.get("kind")), code(decoys.get("file"))]
         if decoys.get("entries") is not None:
@@ -220,7 +220,7 @@ def _kinds(rows: Sequence[Row]) -> list[tuple[str, list[Row], list[Column]]]:
     floor: Column = ("collision floor %", lambda row: percent(row.get("collision_floor")))
     seen: Column = ("collisions seen", _collisions)
     return [
-        ("Raw descriptors", [r for r in rows if r["strategy"] in RAW], [search]),
+        ("Raw embeddings", [r for r in rows if r["strategy"] in RAW], [search]),
         ("Point to subspace (p-to-s)", [r for r in rows if r["mode"] == "p2s"], [dimension]),
         (
             "Subspace to subspace (s-to-s)",

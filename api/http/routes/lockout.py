@@ -29,7 +29,7 @@ async def get_lockout(
     """
     found = await gate.query(lambda: runtime.store.attempts.status(caller.tenant, subject))
     if found is None or (found.consecutive == 0 and found.disabled_at is None):
-        raise ApiError("not_found", "there are no failed attempts on this subject")
+        raise ApiError("not_found", "this subject has no failed attempts")
     return answer(
         request,
         {

@@ -121,7 +121,7 @@ async def demo_photo(request: Request) -> Response:
     person = _PERSON.fullmatch(request.path_params["person"])
     shot = _SHOT.fullmatch(request.path_params["shot"])
     if person is None or shot is None or int(person[1]) not in _drawn() or int(shot[1]) >= SHOTS:
-        raise ApiError("not_found", "there is no such drawn person or photo")
+        raise ApiError("not_found", "there is no such cartoon person or photo")
     gate = request.app.state.gate
     address = address_of(request.client.host if request.client else "")
     body = await gate.compute(functools.partial(_draw, int(person[1]), int(shot[1])), key=address)

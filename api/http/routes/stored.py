@@ -58,7 +58,7 @@ async def get_stored(
     async with gate.admitted(caller.prefix):
         read = await gate.compute(work, key=caller.prefix)
     if read is None:
-        raise ApiError("not_enrolled", "the tenant has no such subject")
+        raise ApiError("not_enrolled", "nobody is enrolled under this id")
     found, norm = read
     record = found.template.record
     strategy = runtime.contract.binding.strategy

@@ -57,7 +57,7 @@ async def get_subject(
     """Right: `enroll`. Metadata only, never template bytes."""
     record = await gate.query(lambda: runtime.store.describe(caller.tenant, subject))
     if record is None:
-        raise ApiError("not_enrolled", "the tenant has no such subject")
+        raise ApiError("not_enrolled", "nobody is enrolled under this id")
     return answer(request, _described(record, runtime.contract.contract_id))
 
 
@@ -89,7 +89,7 @@ async def erase_subject(
             and store.describe(caller.tenant, subject) is None
             and store.receipt(caller.tenant, subject) is None
         ):
-            raise ApiError("not_enrolled", "the tenant never had such a subject")
+            raise ApiError("not_enrolled", "nobody was ever enrolled under this id")
         return receipt_json(store.erase(caller.tenant, subject, by=by(request)).receipt)
 
     # No stored answer: after another enrollment it would claim an erasure that did not happen.

@@ -47,7 +47,7 @@ async def export_subject(
         )
     if exported is None:
         if caller.sees_enrollment:
-            raise ApiError("not_enrolled", "the tenant has no such subject")
+            raise ApiError("not_enrolled", "nobody is enrolled under this id")
         raise ApiError("not_found", "there is nothing to export")
     return answer(
         request,

@@ -242,10 +242,10 @@ def _why_not(runtime: Runtime, tenant: str, subject: str) -> Exception:
     """Say why there is no template to decide by, to a key that may know who is enrolled."""
     record = runtime.store.describe(tenant, subject)
     if record is None:
-        return ApiError("not_enrolled", "the tenant has no such subject")
+        return ApiError("not_enrolled", "nobody is enrolled under this id")
     try:
         runtime.contract.binding.require_contract(record.contract_id, what="the stored template")
     except ContractMismatch as error:
         return error
     # It was enrolled between the two looks.
-    return ApiError("not_enrolled", "the tenant had no such subject a moment ago; send it again")
+    return ApiError("not_enrolled", "nobody was enrolled under this id a moment ago; send it again")

@@ -1,4 +1,4 @@
-"""Client of Veilface, a face-authentication service that never stores a face descriptor.
+"""Client of Veilface, a face-authentication service that never stores a face embedding.
 
 :class:`Client` sends photos; :class:`PrivateClient` embeds and lifts on this machine and sends
 private templates only. Both exist with ``Async`` before the name.

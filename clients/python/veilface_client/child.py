@@ -26,30 +26,30 @@ class Finished:
     errors: bytes
 
 
-class Leash:
+class Canceller:
     """Ends a command, with all that it started: from any thread, and also before it runs."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._pulled = False
+        self._cancelled = False
         self._process: subprocess.Popen[bytes] | None = None
 
-    def hold(self, process: "subprocess.Popen[bytes]") -> None:
-        """Take a command; it ends at once where the leash was pulled before."""
+    def attach(self, process: "subprocess.Popen[bytes]") -> None:
+        """Take a command; it ends at once if it was cancelled before."""
         with self._lock:
             self._process = process
-            pulled = self._pulled
-        if pulled:
-            self.pull()
+            cancelled = self._cancelled
+        if cancelled:
+            self.cancel()
 
-    def pull(self) -> None:
+    def cancel(self) -> None:
         """End the command, if one runs."""
         with self._lock:
-            self._pulled = True
+            self._cancelled = True
             if self._process is not None:
                 _kill(self._process)
 
-    def let_go(self) -> None:
+    def detach(self) -> None:
         """Its process id may soon be another's."""
         with self._lock:
             self._process = None
@@ -62,7 +62,7 @@ def run(
     environment: Mapping[str, str],
     folder: str,
     limit_s: float,
-    leash: Leash | None = None,
+    canceller: Canceller | None = None,
 ) -> Finished:
     """Run a command that reads ``blobs`` as files.
 
@@ -74,7 +74,7 @@ def run(
     limit_s
         The longest that the call may take. The command and all that it started in its session
         are ended then, and in any case before the call returns.
-    leash
+    canceller
         What another thread ends it with.
 
     Raises
@@ -112,7 +112,9 @@ def run(
         except OSError as error:
             raise LiftUnavailable(f"the command cannot be started: {error.strerror}") from None
         written.pop_all()
-    attended = _attend(process, [end for _, end in pipes], blobs, deadline, leash or Leash())
+    attended = _attend(
+        process, [end for _, end in pipes], blobs, deadline, canceller or Canceller()
+    )
     if attended is None:
         raise LiftTimeout(f"it took longer than {limit_s:g} s")
     return attended
@@ -123,7 +125,7 @@ def _attend(
     ends: Sequence[int],
     blobs: Sequence[bytes],
     deadline: float,
-    leash: Leash,
+    canceller: Canceller,
 ) -> Finished | None:
     """Feed a process, collect what it says, and end it; None: its time was over."""
     assert process.stdout is not None  # noqa: S101 - it was asked for
@@ -134,7 +136,7 @@ def _attend(
         with stream:
             said[name] = stream.read(MOST_OUTPUT)
             if stream.read(1):
-                leash.pull()
+                canceller.cancel()
 
     jobs = [
         partial(collect, "output", process.stdout),
@@ -148,7 +150,7 @@ def _attend(
     ]
     threads: list[threading.Thread] = []
     try:
-        leash.hold(process)
+        canceller.attach(process)
         for job in jobs:
             thread = threading.Thread(target=job, daemon=True)
             thread.start()
@@ -163,7 +165,7 @@ def _attend(
     finally:
         # Also after an end in order: what the command started may still run.
         _kill(process)
-        leash.let_go()
+        canceller.detach()
         process.wait()
         # A thread closes what it reads or writes; those that never started do not.
         for close in closes[len(threads) :]:

@@ -292,7 +292,7 @@ class PrivateClient(Session):
         """Lift photos here (or take a lift of :meth:`lift_enrollment`), and enroll by it alone.
 
         Rights: ``enroll``, ``embeddings``. Never enroll the same photos twice: two lifts of them
-        give the descriptor away. After an error repeat with its ``lift``.
+        give the embedding away. After an error repeat with its ``lift``.
         """
         return self._run(
             private_flows.enroll(subject, photos, self._lifter, self._retries, face=face)

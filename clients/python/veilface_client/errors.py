@@ -111,7 +111,7 @@ class NotFound(ServiceError):
 
 
 class NotEnrolled(NotFound):
-    """The tenant has no such subject."""
+    """Nobody is enrolled under this id."""
 
 
 class Conflict(ServiceError):
@@ -131,7 +131,7 @@ class LockedOut(ServiceError):
 
 
 class RateLimited(ServiceError):
-    """Too many requests with this API key, or from this address."""
+    """Too many requests with this API key or from this address."""
 
 
 class ServerFailed(ServiceError):

@@ -17,7 +17,7 @@ from typing import Any
 
 from veilface_client import child
 from veilface_client.calls import Face
-from veilface_client.child import Leash
+from veilface_client.child import Canceller
 from veilface_client.errors import LiftFailed, LiftUnavailable
 from veilface_client.results import Contract, Enrollable, Generator, Probe
 
@@ -26,7 +26,7 @@ _ERROR = re.compile(r"^error: (.*)$", flags=re.MULTILINE)
 
 
 @dataclass(frozen=True)
-class Kit:
+class LiftInputs:
     """The files that lifting under one contract needs."""
 
     contract_id: str
@@ -35,7 +35,7 @@ class Kit:
 
 
 class Lifter:
-    """Runs the command; keeps the kit in a folder of its own, readable by nobody else.
+    """Runs the command; keeps its inputs in a folder of its own, readable by nobody else.
 
     Parameters
     ----------
@@ -61,29 +61,29 @@ class Lifter:
         environment: Mapping[str, str] | None,
     ) -> None:
         self._pack = str(Path(pack).absolute())
-        found = shutil.which(command)
-        self._command = None if found is None else str(Path(found).absolute())
+        executable = shutil.which(command)
+        self._command = None if executable is None else str(Path(executable).absolute())
         self._sought = os.fspath(command)
         self._dim = dim
         self._limit_s = limit_s
         passed_on = {name: os.environ[name] for name in _PASSED_ON if name in os.environ}
         self._environment = {"PYTHONNOUSERSITE": "1", **passed_on, **(environment or {})}
         self._lock = threading.Lock()
-        self._kit: Kit | None = None
+        self._inputs: LiftInputs | None = None
         self._make_folder()
 
     @property
     def folder(self) -> Path:
-        """Where the kit is: contract and generator, never a photo or a template."""
+        """Where the inputs are: contract and generator, never a photo or a template."""
         return Path(self._folder)
 
     @property
-    def kit(self) -> Kit | None:
+    def inputs(self) -> LiftInputs | None:
         """What :meth:`keep` kept last; None where its files are gone, as cleaners of /tmp do."""
-        kit = self._kit
-        if kit is None or not self._folder_is_ours():
+        inputs = self._inputs
+        if inputs is None or not self._folder_is_ours():
             return None
-        return kit if kit.contract.is_file() and kit.generator.is_file() else None
+        return inputs if inputs.contract.is_file() and inputs.generator.is_file() else None
 
     def close(self) -> None:
         """Remove the folder."""
@@ -98,57 +98,68 @@ class Lifter:
     def _folder_is_ours(self) -> bool:
         """Whether it is there, and nobody else has made one of its name in the meantime."""
         try:
-            found = os.lstat(self._folder)
+            status = os.lstat(self._folder)
         except OSError:
             return False
-        return (found.st_uid, found.st_mode) == (self._made.st_uid, self._made.st_mode)
+        return (status.st_uid, status.st_mode) == (self._made.st_uid, self._made.st_mode)
 
-    def keep(self, contract: Contract, generator: Generator) -> Kit:
-        """Put a kit into the folder, in the place of an earlier one; make the folder if needed."""
+    def keep(self, contract: Contract, generator: Generator) -> LiftInputs:
+        """Put inputs into the folder, in place of earlier ones; make the folder if needed."""
         with self._lock:
             if not self._folder_is_ours():
                 # Its old name may be somebody else's by now.
                 self._remove_folder.detach()
                 self._make_folder()
             stem = self.folder / contract.contract_id
-        kit = Kit(contract.contract_id, stem.with_suffix(".json"), stem.with_suffix(".generator"))
-        for path, data in ((kit.contract, contract.raw), (kit.generator, generator.data)):
+        inputs = LiftInputs(
+            contract.contract_id, stem.with_suffix(".json"), stem.with_suffix(".generator")
+        )
+        for path, data in ((inputs.contract, contract.raw), (inputs.generator, generator.data)):
             # Whole or not at all: another thread may be lifting with this very file.
             part = path.with_name(f"{path.name}.{secrets.token_hex(4)}")
             part.write_bytes(data)
             part.replace(path)
-        self._kit = kit
-        return kit
+        self._inputs = inputs
+        return inputs
 
     def enrollment(
-        self, kit: Kit, photos: Sequence[bytes], *, face: Face | None, leash: Leash
+        self,
+        inputs: LiftInputs,
+        photos: Sequence[bytes],
+        *,
+        face: Face | None,
+        canceller: Canceller,
     ) -> Enrollable:
         """Return a template of these photos."""
-        return Enrollable.of(self._lift(kit, photos, face=face, leash=leash), kit.contract_id)
+        return Enrollable.of(
+            self._lift(inputs, photos, face=face, canceller=canceller), inputs.contract_id
+        )
 
-    def probe(self, kit: Kit, photo: bytes, *, face: Face | None, leash: Leash) -> Probe:
+    def probe(
+        self, inputs: LiftInputs, photo: bytes, *, face: Face | None, canceller: Canceller
+    ) -> Probe:
         """Return a probe of one photo."""
         dim = [] if self._dim is None else ["--dim", str(self._dim)]
         # A probe on stdout is always signed. It gets a key that is nobody's: the client's own
         # never leaves this process, and the client signs anew for each sending.
         nobodys = f"vf_{secrets.token_hex(6)}_{secrets.token_hex(32)}"
         template = self._lift(
-            kit,
+            inputs,
             [photo],
             "--probe", "--subject", "unsigned", *dim,
             face=face,
-            leash=leash,
+            canceller=canceller,
             environment={"VEILFACE_API_KEY": nobodys},
         )  # fmt: skip
-        return Probe.of(template, kit.contract_id)
+        return Probe.of(template, inputs.contract_id)
 
     def _lift(
         self,
-        kit: Kit,
+        inputs: LiftInputs,
         photos: Sequence[bytes],
         *options: str,
         face: Face | None,
-        leash: Leash,
+        canceller: Canceller,
         environment: Mapping[str, str] | None = None,
     ) -> bytes:
         if self._command is None:
@@ -163,7 +174,7 @@ class Lifter:
             # As one word each: a pack called --help is a pack.
             return [
                 command, "lift", *options, "--out=-", f"--pack={self._pack}",
-                f"--contract={kit.contract}", f"--generator={kit.generator}",
+                f"--contract={inputs.contract}", f"--generator={inputs.generator}",
                 *([] if face is None else [f"--face={face}"]), "--", *paths,
             ]  # fmt: skip
 
@@ -171,9 +182,9 @@ class Lifter:
             argv,
             photos,
             environment={**self._environment, **(environment or {})},
-            folder=str(kit.contract.parent),
+            folder=str(inputs.contract.parent),
             limit_s=self._limit_s,
-            leash=leash,
+            canceller=canceller,
         )
         if done.status != 0:
             raise LiftFailed(_sentence(done.errors, names), status=done.status)
@@ -194,11 +205,11 @@ def _template_of(output: bytes) -> bytes:
 
 
 def _sentence(errors: bytes, names: Sequence[str]) -> str:
-    """Return the sentence of the command, with positions in the place of descriptors' numbers."""
-    found = _ERROR.search(errors.decode(errors="replace"))
-    if found is None:
+    """Return the sentence of the command, with positions in place of file descriptors."""
+    match = _ERROR.search(errors.decode(errors="replace"))
+    if match is None:
         return "`veilface lift` failed, and did not say why"
-    text = found[1]
+    text = match[1]
     for number, name in enumerate(names, start=1):
         text = re.sub(rf"(?<![\w.]){re.escape(name)}(?=[:,;])", f"photo {number}", text)
     return text

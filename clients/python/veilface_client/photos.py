@@ -45,7 +45,7 @@ def read_photos(photos: Photo | Iterable[Photo]) -> list[bytes]:
         return [read_photo(photos)]
     if hasattr(photos, "read"):
         return [read_photo(cast("BinaryIO", photos))]
-    found = [read_photo(photo) for photo in photos]
-    if not found:
+    contents = [read_photo(photo) for photo in photos]
+    if not contents:
         raise ValueError("an enrollment takes at least one photo")
-    return found
+    return contents

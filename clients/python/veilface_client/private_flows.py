@@ -6,10 +6,10 @@ from typing import TypeVar
 
 from veilface_client import calls, results
 from veilface_client.calls import Call, Face
-from veilface_client.child import Leash
+from veilface_client.child import Canceller
 from veilface_client.errors import ContractMismatch, UnexpectedAnswer, VeilfaceError
 from veilface_client.flows import Flow, Work, send
-from veilface_client.lifting import Kit, Lifter
+from veilface_client.lifting import Lifter, LiftInputs
 from veilface_client.photos import Photo, read_photo, read_photos
 from veilface_client.results import Enrollable, Probe
 from veilface_client.retries import Retries
@@ -19,26 +19,26 @@ T = TypeVar("T")
 _LOOKS = 3
 
 
-def kit_of(lifter: Lifter, retries: Retries, *, fresh: bool = False) -> Flow[Kit]:
-    """Return the kit of the contract; fetch it where there is none, or a fresh one is wanted."""
-    kept = lifter.kit
-    if kept is not None and not fresh:
-        return kept
+def inputs_of(lifter: Lifter, retries: Retries, *, fresh: bool = False) -> Flow[LiftInputs]:
+    """Return the inputs of the contract; fetch it where there is none, or a fresh one is wanted."""
+    current = lifter.inputs
+    if current is not None and not fresh:
+        return current
     for _ in range(_LOOKS):
         contract = yield from send(calls.contract(), retries)
         generator = yield from send(calls.generator(), retries)
         # The contract may have changed between the two answers, or between two workers.
         if generator.source_id == contract.binding.get("decoy_source_id"):
-            kit: Kit = yield Work(partial(lifter.keep, contract, generator))
-            return kit
+            inputs: LiftInputs = yield Work(partial(lifter.keep, contract, generator))
+            return inputs
     raise UnexpectedAnswer("the generator of the service is not that of its contract")
 
 
 def lift_probe(photo: Photo, lifter: Lifter, retries: Retries, *, face: Face | None) -> Flow[Probe]:
     """Lift a probe; nothing is sent of it."""
     picture: bytes = yield Work(lambda: read_photo(photo))
-    kit = yield from kit_of(lifter, retries)
-    return (yield from _probe(picture, lifter, kit, face))
+    inputs = yield from inputs_of(lifter, retries)
+    return (yield from _probe(picture, lifter, inputs, face))
 
 
 def lift_enrollment(
@@ -46,8 +46,8 @@ def lift_enrollment(
 ) -> Flow[Enrollable]:
     """Lift a template that enrolls; nothing is sent of it."""
     pictures: list[bytes] = yield Work(lambda: read_photos(photos))
-    kit = yield from kit_of(lifter, retries)
-    return (yield from _enrollable(pictures, lifter, kit, face))
+    inputs = yield from inputs_of(lifter, retries)
+    return (yield from _enrollable(pictures, lifter, inputs, face))
 
 
 def enroll(
@@ -67,7 +67,7 @@ def enroll(
     try:
         return (yield from _enroll(subject, lift, retries))
     except ContractMismatch:
-        renewed = yield from kit_of(lifter, retries, fresh=True)
+        renewed = yield from inputs_of(lifter, retries, fresh=True)
         if renewed.contract_id == lift.contract_id:
             raise
     lift = yield from _enrollable(pictures, lifter, renewed, face)
@@ -93,7 +93,7 @@ def verify(
     try:
         return (yield from _verify(subject, probe, token, retries, level))
     except ContractMismatch:
-        renewed = yield from kit_of(lifter, retries, fresh=True)
+        renewed = yield from inputs_of(lifter, retries, fresh=True)
         if renewed.contract_id == probe.contract_id:
             # It is the subject's stored template that is of another contract.
             raise
@@ -101,19 +101,19 @@ def verify(
     return (yield from _verify(subject, probe, token, retries, level))
 
 
-def _probe(picture: bytes, lifter: Lifter, kit: Kit, face: Face | None) -> Flow[Probe]:
-    leash = Leash()
-    lift = partial(lifter.probe, kit, picture, face=face, leash=leash)
-    probe: Probe = yield Work(lift, leash.pull)
+def _probe(picture: bytes, lifter: Lifter, inputs: LiftInputs, face: Face | None) -> Flow[Probe]:
+    canceller = Canceller()
+    lift = partial(lifter.probe, inputs, picture, face=face, canceller=canceller)
+    probe: Probe = yield Work(lift, canceller.cancel)
     return probe
 
 
 def _enrollable(
-    pictures: list[bytes], lifter: Lifter, kit: Kit, face: Face | None
+    pictures: list[bytes], lifter: Lifter, inputs: LiftInputs, face: Face | None
 ) -> Flow[Enrollable]:
-    leash = Leash()
-    lift = partial(lifter.enrollment, kit, pictures, face=face, leash=leash)
-    enrollable: Enrollable = yield Work(lift, leash.pull)
+    canceller = Canceller()
+    lift = partial(lifter.enrollment, inputs, pictures, face=face, canceller=canceller)
+    enrollable: Enrollable = yield Work(lift, canceller.cancel)
     return enrollable
 
 
@@ -139,6 +139,6 @@ def _send(call: Call[T], lift: Enrollable | Probe, retries: Retries) -> Flow[T]:
         error.lift = lift
         error.add_note(
             "The service may have this lift: repeat the call with the error's `lift`, never with "
-            "the photo. Two lifts of one photo give the descriptor away."
+            "the photo. Two lifts of one photo give the embedding away."
         )
         raise

@@ -200,11 +200,11 @@ class _Lift(_Value):
 
 
 class Probe(_Lift):
-    """A lifted probe: no photo, and no descriptor. Use it once for each attempt it is meant for."""
+    """A lifted probe: no photo, and no embedding. Use it once for each attempt it is meant for."""
 
 
 class Enrollable(_Lift):
-    """A template that enrolls, lifted and not yet (or perhaps) sent: no photo, no descriptor.
+    """A template that enrolls, lifted and not yet (or perhaps) sent: no photo, no embedding.
 
     Attributes
     ----------
@@ -231,12 +231,12 @@ def parse(model: type[A], response: httpx.Response) -> A:
         It lacks a field, or has another type. The text names fields, and no value.
     """
     try:
-        found = model.model_validate_json(response.content)
+        value = model.model_validate_json(response.content)
     except ValidationError as error:
         fields = sorted({".".join(map(str, each["loc"])) or "body" for each in error.errors()})
         raise UnexpectedAnswer(
             f"the answer does not fit {model.__name__}: {', '.join(fields)}"
         ) from None
-    if isinstance(found, _Verbatim):
-        return found.model_copy(update={"raw": response.content})
-    return found
+    if isinstance(value, _Verbatim):
+        return value.model_copy(update={"raw": response.content})
+    return value

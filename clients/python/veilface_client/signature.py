@@ -23,10 +23,10 @@ def signed_probe(
     The key is HKDF-SHA256 (RFC 5869) of the secret part of the API key, without salt; one block of
     output is all 32 bytes of it.
     """
-    found = TOKEN.fullmatch(token)
-    if found is None:
+    match = TOKEN.fullmatch(token)
+    if match is None:
         raise ValueError("only an API key of the service signs probes")
-    extracted = hmac.digest(bytes(32), bytes.fromhex(found[1]), "sha256")
+    extracted = hmac.digest(bytes(32), bytes.fromhex(match[1]), "sha256")
     key = hmac.digest(extracted, _INFO + b"\x01", "sha256")
     nonce, timestamp = secrets.token_urlsafe(18), int(time.time())
     lines = (

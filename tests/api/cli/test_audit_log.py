@@ -50,7 +50,7 @@ def test_a_whole_log_is_verified_and_shown(log):
     ]
     assert all(line["actor"].startswith("operator:") for line in shown[-3:])
     assert "ann" not in json.dumps(shown)
-    assert "whole" in log("audit-log", "verify").stdout
+    assert "intact" in log("audit-log", "verify").stdout
 
 
 def test_lines_are_found_by_subject_and_number(log):

@@ -31,7 +31,7 @@ def test_too_few_faces_for_a_generator_are_noted(world, veilface, tmp_path, kind
         *("--out", tmp_path / "decoys.veil"),
     )
     assert ran.status == 0, ran.stderr
-    assert ("150 faces for 256 numbers each" in ran.stderr) is noted
+    assert ("150 faces are few for 256 numbers each" in ran.stderr) is noted
 
 
 @pytest.fixture
@@ -59,7 +59,7 @@ def test_a_pool_is_sealed_and_keeps_the_labels(world, veilface, data, labelled_s
     assert ran.json["labelled"]
     assert ran.json["descriptors"] == 11
     assert ran.json["failure_to_acquire"]["reasons"] == {"unsupported_image": 1}
-    assert "1 of 12 photos failed to acquire" in ran.stderr
+    assert "1 of 12 photos skipped: unsupported image" in ran.stderr
     assert DEMO_NOTICE in ran.stderr
     assert stat.S_IMODE(out.stat().st_mode) == 0o600
     sealer = file_sealer(MasterKeyring.load(key_file(data)))
@@ -100,14 +100,14 @@ def test_too_few_photos_for_a_generator_are_refused(world, veilface, labelled_so
         *("--out", tmp_path / "few.veil"),
     )
     assert ran.status == 1
-    assert "100 or more descriptors" in ran.stderr
+    assert "100 or more embeddings" in ran.stderr
 
 
 def test_no_usable_photo_is_refused(world, veilface, tmp_path):
     (tmp_path / "broken.jpg").write_bytes(b"\xff\xd8\xff")
     ran = veilface("decoys", "build", tmp_path, "--pack", world.pack)
     assert ran.status == 1
-    assert "no photo gave a descriptor: 1 of 1 photos" in ran.stderr
+    assert "no photo gave an embedding (1 of 1 photos" in ran.stderr
 
 
 def test_a_pack_must_be_named(world, tmp_path):

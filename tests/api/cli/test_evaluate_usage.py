@@ -44,7 +44,7 @@ FAILED: list[tuple[list[str], str]] = [
     (["--decoys", "POOL", "--flip"], "build the decoys with this pack and the same --flip"),
     (
         ["--pack", "none", "--embeddings", "EMBEDDINGS", "--decoys", "POOL"],
-        "decoys of 256 numbers each, the descriptors have 32; build the decoys with this pack",
+        "decoys of 256 numbers each, the embeddings have 32; build the decoys with this pack",
     ),
     (["--decoys", "ABSENT"], "absent: No such file or directory"),
     (["--labels", "ABSENT"], "the label file absent is not there"),

@@ -55,10 +55,10 @@ def test_a_verification_without_a_decision_is_no_rejection(world, veilface, tmp_
     pack = ("--pack", world.pack)
     absent = tmp_path / "absent"
     cases = [
-        (("verify", "ann", absent, *pack), 2, "there is no photo"),
+        (("verify", "ann", absent, *pack), 2, "no such photo"),
         (ann, 2, "--pack"),
         ((*ann, *pack, "--unknown-option"), 2, "No such option"),
-        (("verify", "nobody", *world.photos(1, range(1)), *pack), 3, "has no subject"),
+        (("verify", "nobody", *world.photos(1, range(1)), *pack), 3, "nobody is enrolled as"),
         (("verify", "ann", broken, *pack), 3, "broken.png"),
         (("verify", "ann", tmp_path, *pack), 3, "Is a directory"),
         ((*ann, "--pack", absent), 3, "does not exist"),

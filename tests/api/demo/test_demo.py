@@ -73,7 +73,7 @@ def test_the_folder_is_ready_for_serve(played):
 
 def test_it_replaces_its_own_folder_and_no_other(played, tmp_path):
     (tmp_path / "thesis.txt").write_text("precious")
-    with pytest.raises(StartError, match="not empty and no earlier demo"):
+    with pytest.raises(StartError, match="not empty and not a demo"):
         run_demo(tmp_path, scale=SMALL)
     assert (tmp_path / "thesis.txt").exists()
     ran = run("demo", "--folder", tmp_path)
@@ -84,7 +84,7 @@ def test_it_replaces_its_own_folder_and_no_other(played, tmp_path):
 def test_a_pack_without_faces_is_refused(tmp_path):
     ran = run("demo", "--folder", tmp_path / "new", "--pack", tmp_path)
     assert ran.status == 1
-    assert "both a model pack and a folder of faces" in ran.stderr
+    assert "both --pack and --faces" in ran.stderr
 
 
 def test_the_command_prints_tables_and_the_notice(played, monkeypatch):

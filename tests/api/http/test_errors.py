@@ -67,12 +67,12 @@ def test_exceptions_have_codes(error: Exception, code: str) -> None:
     assert known.code == code
 
 
-def test_every_exception_of_the_rooms_has_a_code() -> None:
+def test_every_exception_of_the_packages_has_a_code() -> None:
     def leaves(kind: type[Exception]) -> list[type[Exception]]:
         below = kind.__subclasses__()
         return [kind] if not below else [leaf for each in below for leaf in leaves(each)]
 
-    # Raised before there is a server, or by rooms that requests do not reach.
+    # Raised before there is a server, or by packages that requests do not reach.
     elsewhere = {
         *("DatabaseAway", "DatasetError", "CacheError", "AlignmentError", "PreparationError"),
         *("EvaluationError", "BackendError", "AuditError"),

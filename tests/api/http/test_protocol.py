@@ -117,15 +117,15 @@ SMUGGLED = b"GET /health/live HTTP/1.1\r\nHost: x\r\n\r\n"
         (
             b"POST /v1/contract HTTP/1.1\r\nHost: x\r\nContent-Length: 0\r\n"
             b"Content-Length: 40\r\n\r\n" + SMUGGLED,
-            "not a well-formed request",
+            "not a well-formed HTTP/1.1 request",
         ),
         (
             b"POST /v1/contract HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: gzip, chunked\r\n\r\n"
             + SMUGGLED,
-            "not a well-formed request",
+            "not a well-formed HTTP/1.1 request",
         ),
-        (b"GET / HTTP/1.1\r\n\r\n", "not a well-formed request"),  # no Host
-        (b"\x16\x03\x01\x02\x00\x01", "not a well-formed request"),  # TLS on a plain port
+        (b"GET / HTTP/1.1\r\n\r\n", "not a well-formed HTTP/1.1 request"),  # no Host
+        (b"\x16\x03\x01\x02\x00\x01", "not a well-formed HTTP/1.1 request"),  # TLS on a plain port
         (b"GET /v1/contract HTTP/1.1\r\nHost: x\r\nX-Long: " + b"a" * 70_000 + b"\r\n\r\n",
          f"more than {MAX_HEAD_BYTES} bytes"),
         (b"GET /v1/contract?" + b"a" * 70_000 + b" HTTP/1.1\r\nHost: x\r\n\r\n",
@@ -256,7 +256,7 @@ def test_a_body_that_breaks_off_ends_in_one_answer(server: Server, broken: bytes
             + b"4\r\n{   \r\n"
         )
         raw.sendall(broken)
-        assert "not a well-formed request" in error_of(until_closed(raw))
+        assert "not a well-formed HTTP/1.1 request" in error_of(until_closed(raw))
 
 
 def test_a_body_that_nobody_reads_ends_its_connection(server: Server) -> None:

@@ -80,7 +80,7 @@ def test_no_log_line_holds_anything_private(
         def explode(*args: object, **options: object) -> None:
             raise RuntimeError(f"{SUBJECT} {deployment.token} {probe}")
 
-        # A defect in any room, with the worst possible text.
+        # A defect in any package, with the worst possible text.
         for where, name in (
             (runtime.store, "get"),
             (runtime.store, "describe"),

@@ -213,7 +213,7 @@ def test_a_broken_container_does_not_chain_the_parsers_words() -> None:
 
 
 def test_labels_must_fit() -> None:
-    with pytest.raises(DecoyError, match="2 labels for 3 descriptors"):
+    with pytest.raises(DecoyError, match="2 labels for 3 embeddings"):
         DecoyPool(unit_rows(3, 4), labels=[Attributes()] * 2)
     with pytest.raises(DecoyError, match="labels must be"):
         DecoyPool(unit_rows(1, 4), labels=[Attributes("x" * 65, None)])

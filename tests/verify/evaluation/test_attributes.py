@@ -55,9 +55,9 @@ def test_a_pool_without_labels_or_of_another_dimension_is_refused() -> None:
     with pytest.raises(DecoyError, match="this one has no labels"):
         predict_attributes(unit_rows(2), DecoyPool(unit_rows(5)))
     labelled = DecoyPool(unit_rows(5), labels=[Attributes("Male", "White")] * 5)
-    with pytest.raises(DecoyError, match="descriptors of 16 numbers"):
+    with pytest.raises(DecoyError, match="embeddings of 16 numbers"):
         predict_attributes(unit_rows(2, n=8), labelled)
-    with pytest.raises(DecoyError, match="descriptors of 16 numbers"):
+    with pytest.raises(DecoyError, match="embeddings of 16 numbers"):
         resembling(labelled, unit_rows(2, n=8), cosine=0.5)
 
 

@@ -71,8 +71,8 @@ ZERO = ROWS * np.array([[1], [0], [1]])
         ({"paths": PATHS, "descriptors": ROWS.astype(complex)}, "descriptors is of type c16"),
         ({"paths": PATHS.astype("S"), "descriptors": ROWS}, "paths is of type S1"),
         ({"paths": PATHS.astype(object), "descriptors": ROWS}, "paths is of type O8"),
-        ({"paths": PATHS, "descriptors": NAN}, r"3 fault\(s\).*descriptor of 'a' is not finite"),
-        ({"paths": PATHS, "descriptors": ZERO}, "descriptor of 'b' is zero"),
+        ({"paths": PATHS, "descriptors": NAN}, r"3 fault\(s\).*embedding of 'a' is not finite"),
+        ({"paths": PATHS, "descriptors": ZERO}, "embedding of 'b' is zero"),
         ({"paths": np.array(["a", "b", "a"]), "descriptors": ROWS}, "'a' occurs twice"),
     ],
 )
@@ -148,7 +148,7 @@ def test_the_number_of_rows_is_compared_and_capped_before_anything_is_unpacked(
         read_embeddings(tmp_path / "e.npz")
     wide = np.zeros((1, 2**16 + 1), "f2")
     np.savez_compressed(tmp_path / "e.npz", paths=PATHS[:1], descriptors=wide)
-    with pytest.raises(DatasetError, match="1 descriptors of 65537 numbers"):
+    with pytest.raises(DatasetError, match="1 embeddings of 65537 numbers"):
         read_embeddings(tmp_path / "e.npz")
 
 

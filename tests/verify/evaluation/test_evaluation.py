@@ -181,7 +181,7 @@ def test_pairs_without_a_descriptor_are_counted(tmp_path: Path) -> None:
         known.people[0], [numbers[f"p{i // 2}"] for i in pairs.first[~touched]]
     )
     everything = Acquired(acquired.descriptors[:0], np.full(60, -1), acquired.failures)
-    with pytest.raises(DatasetError, match="without the 100 pairs that lack a descriptor"):
+    with pytest.raises(DatasetError, match="without the 100 pairs that lack an embedding"):
         prepare(pairs, everything, attributes=None, sources=())
 
 

@@ -38,7 +38,7 @@ def test_every_number_of_the_table_is_in_the_results() -> None:
             assert cell == f"{100 * row['accuracy_mean']:.2f} ± 0.04"
     raw = next(r for r in results["rows"] if r["strategy"] == "raw" and r["dim"] == 0)
     assert raw["threshold_search"] == "exact"
-    assert f"Raw descriptors: {100 * raw['accuracy_mean']:.2f} %" in block
+    assert f"Raw embeddings: {100 * raw['accuracy_mean']:.2f} %" in block
     assert "6,000 pairs of LFW (3,000 genuine and 3,000 impostor compared)" in block
     assert "mean of 3 seeds" in block
 
@@ -206,4 +206,4 @@ def test_a_single_seed_has_no_spread() -> None:
     results["runs"] = [run for run in results["runs"] if run["seed"] == 0]
     block = readme_table(results)
     assert "one seed" in block
-    assert "±" not in block.split("Raw descriptors")[1].split("\n", 1)[1]
+    assert "±" not in block.split("Raw embeddings")[1].split("\n", 1)[1]

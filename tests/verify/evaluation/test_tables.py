@@ -91,7 +91,7 @@ def test_the_report_has_a_table_for_each_kind_of_comparison() -> None:
     results = sample_results(dims=(2, 16))
     report = markdown(results)
     counts = {
-        "Raw descriptors": lambda r: r["strategy"].startswith("raw"),
+        "Raw embeddings": lambda r: r["strategy"].startswith("raw"),
         "Point to subspace (p-to-s)": lambda r: r["mode"] == "p2s",
         "Subspace to subspace (s-to-s)": lambda r: r["mode"] == "s2s",
         "Hashed templates": lambda r: r["mode"] == "hash",

@@ -74,7 +74,7 @@ def hash_similarities(
     """
     count, n = len(first), descriptors.shape[1]
     if not 1 <= bits <= n:
-        raise ValueError(f"a code of descriptors of {n} numbers has 1 to {n} bits, not {bits}")
+        raise ValueError(f"a code of embeddings of {n} numbers has 1 to {n} bits, not {bits}")
     if not first.shape == second.shape == same.shape == (count,):
         raise ValueError("hashing needs one first photo, second photo and truth for each pair")
     one_token = same | stolen

@@ -1,4 +1,4 @@
-"""The house: a room imports only from the floors below it (docs/architecture.md)."""
+"""A package imports only from the layers below its own (docs/architecture.md)."""
 
 import ast
 import re
@@ -8,17 +8,17 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-FLOORS = {"templates": 1, "models": 1, "enroll": 2, "verify": 2, "attacks": 3, "api": 4}
+LAYERS = {"templates": 1, "models": 1, "enroll": 2, "verify": 2, "attacks": 3, "api": 4}
 
 
-def imported_rooms(source: str) -> set[str]:
-    """Rooms that a file imports, wherever in the file the import stands."""
+def imported_packages(source: str) -> set[str]:
+    """Packages that a file imports, wherever in the file the import stands."""
     names: set[str] = set()
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
-            # A relative import stays inside its room: level 1 and more below a top-level package.
+            # A relative import stays inside its package: level 1 and more.
             names.add("" if node.level else node.module or "")
         elif (
             isinstance(node, ast.Call)
@@ -27,25 +27,25 @@ def imported_rooms(source: str) -> set[str]:
             and isinstance(node.args[0], ast.Constant)
         ):
             names.add(str(node.args[0].value))
-    return {name.split(".")[0] for name in names} & FLOORS.keys()
+    return {name.split(".")[0] for name in names} & LAYERS.keys()
 
 
 _DYNAMIC = {"import_module", "__import__"}
 
 
-def forbidden(room: str, imported: set[str]) -> set[str]:
-    """Arrows from a room that go up or sideways."""
-    return {other for other in imported - {room} if FLOORS[other] >= FLOORS[room]}
+def forbidden(package: str, imported: set[str]) -> set[str]:
+    """Imports of a package that point up or sideways."""
+    return {other for other in imported - {package} if LAYERS[other] >= LAYERS[package]}
 
 
-@pytest.mark.parametrize("room", FLOORS)
-def test_no_arrow_goes_up_or_sideways(room: str) -> None:
-    files = sorted((ROOT / room).rglob("*.py"))
-    assert files, f"the room {room} is gone"
+@pytest.mark.parametrize("package", LAYERS)
+def test_no_import_points_up_or_sideways(package: str) -> None:
+    files = sorted((ROOT / package).rglob("*.py"))
+    assert files, f"the package {package} is gone"
     wrong = {
-        str(path.relative_to(ROOT)): sorted(arrows)
+        str(path.relative_to(ROOT)): sorted(imports)
         for path in files
-        if (arrows := forbidden(room, imported_rooms(path.read_text(encoding="utf-8"))))
+        if (imports := forbidden(package, imported_packages(path.read_text(encoding="utf-8"))))
     }
     assert not wrong
 
@@ -70,9 +70,9 @@ def test_commands_write_no_file_where_a_link_of_somebody_else_leads() -> None:
     assert not wrong
 
 
-@pytest.mark.parametrize("room", FLOORS)
-def test_rooms_are_of_use_below_the_tests_only(room: str) -> None:
-    for path in (ROOT / room).rglob("*.py"):
+@pytest.mark.parametrize("package", LAYERS)
+def test_packages_import_neither_tests_nor_the_layer_of_http(package: str) -> None:
+    for path in (ROOT / package).rglob("*.py"):
         tree = ast.parse(path.read_text(encoding="utf-8"))
         modules = {
             alias.name.split(".")[0]
@@ -85,25 +85,25 @@ def test_rooms_are_of_use_below_the_tests_only(room: str) -> None:
             if isinstance(node, ast.ImportFrom) and not node.level
         }
         assert not modules & {"tests", "benchmarks", "pytest", "hypothesis"}, path
-        rest = modules - FLOORS.keys() - set(sys.stdlib_module_names) - {"", "__future__"}
-        if room != "api":
+        rest = modules - LAYERS.keys() - set(sys.stdlib_module_names) - {"", "__future__"}
+        if package != "api":
             assert not rest & {"fastapi", "starlette", "typer", "uvicorn"}, path
 
 
-def test_every_package_has_its_floor() -> None:
+def test_every_package_has_its_layer() -> None:
     packages = {path.parent.name for path in ROOT.glob("*/__init__.py")} - {"tests", "benchmarks"}
-    assert packages == set(FLOORS)
+    assert packages == set(LAYERS)
 
 
-def test_the_floors_are_those_of_the_architecture() -> None:
+def test_the_layers_are_those_of_the_page() -> None:
     text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| (\d) \| (.+?) \|", text, flags=re.MULTILINE)
-    stated = {room: int(floor) for floor, rooms in rows for room in re.findall(r"`(\w+)/`", rooms)}
-    assert stated == FLOORS
+    stated = {name: int(layer) for layer, names in rows for name in re.findall(r"`(\w+)/`", names)}
+    assert stated == LAYERS
 
 
 @pytest.mark.parametrize(
-    ("room", "line", "arrows"),
+    ("package", "line", "imports"),
     [
         ("templates", "import models", {"models"}),
         ("templates", "from models.pack import ModelPack", {"models"}),
@@ -117,5 +117,5 @@ def test_the_floors_are_those_of_the_architecture() -> None:
         ("models", "import numpy.api", set()),
     ],
 )
-def test_the_check_sees_an_arrow(room: str, line: str, arrows: set[str]) -> None:
-    assert forbidden(room, imported_rooms(line)) == arrows
+def test_the_check_sees_an_import(package: str, line: str, imports: set[str]) -> None:
+    assert forbidden(package, imported_packages(line)) == imports

@@ -1,6 +1,6 @@
-"""A deployment that lives through a day, and every byte that it leaves behind.
+"""A deployment in use, and every byte that it leaves behind.
 
-:func:`play` starts the real service on a database, sends it good and bad requests, erases one
+:func:`exercise` starts the real service on a database, sends it good and bad requests, erases one
 person, stops it, and keeps what was in every file, table and stream at each moment.
 """
 
@@ -84,7 +84,7 @@ class OpenedTemplate:
 
 
 @dataclass(repr=False)
-class Scene:
+class ServiceTraces:
     """What happened and what was left, by moment: running, erased, stopped, compacted."""
 
     kind: str
@@ -200,9 +200,9 @@ def _named(what: str, contents: dict[str, bytes]) -> dict[str, bytes]:
     return {f"{what} {name}": content for name, content in contents.items()}
 
 
-def play(material: Material, folder: Path, *, database_url: str) -> Scene:
+def exercise(material: Material, folder: Path, *, database_url: str) -> ServiceTraces:
     """Live through the day on one database."""
-    scene = Scene(
+    traces = ServiceTraces(
         kind="sqlite" if database_url.startswith("sqlite") else "postgres",
         material=material,
         database_url=database_url,
@@ -212,7 +212,7 @@ def play(material: Material, folder: Path, *, database_url: str) -> Scene:
     shutil.copytree(material.folder, folder / "data")
     (folder / "tmp").mkdir()
     (folder / "home").mkdir()
-    start = _log_position(scene)
+    start = _log_position(traces)
     ours = ("VEILFACE_", "XDG_", "ORT_")
     environment = {k: v for k, v in os.environ.items() if not k.startswith(ours)} | {
         "HOME": str(folder / "home"),
@@ -236,29 +236,29 @@ def play(material: Material, folder: Path, *, database_url: str) -> Scene:
             cwd=ROOT, env=environment, check=True, capture_output=True,
         )  # fmt: skip
         words = (folder / "out").read_text().split()
-        (scene.token,) = [word for word in words if word.startswith("vf_")]
-        headers = {"Authorization": f"Bearer {scene.token}"}
+        (traces.token,) = [word for word in words if word.startswith("vf_")]
+        headers = {"Authorization": f"Bearer {traces.token}"}
         with httpx.Client(base_url=url, headers=headers, timeout=PATIENCE_S) as client:
-            client.event_hooks["response"] = [lambda answer: _keep(scene, answer)]
-            _enroll_and_verify(scene, client, process.pid)
-            _send_bad_requests(scene, client)
-            _open_the_store(scene)
-            _look(scene, "running")
-            answer = client.delete(f"/v1/subjects/{scene.subjects[0]}")
+            client.event_hooks["response"] = [lambda answer: _keep(traces, answer)]
+            _enroll_and_verify(traces, client, process.pid)
+            _send_bad_requests(traces, client)
+            _open_the_store(traces)
+            _look(traces, "running")
+            answer = client.delete(f"/v1/subjects/{traces.subjects[0]}")
             assert answer.status_code == 200, answer.text
-            scene.receipt_answer = answer.json()
-            assert client.get(f"/v1/subjects/{scene.subjects[0]}").status_code == 404
-            scene.contract_answer = client.get("/v1/contract").json()
-            _look(scene, "erased")
+            traces.receipt_answer = answer.json()
+            assert client.get(f"/v1/subjects/{traces.subjects[0]}").status_code == 404
+            traces.contract_answer = client.get("/v1/contract").json()
+            _look(traces, "erased")
         process.send_signal(signal.SIGTERM)
         process.wait(timeout=PATIENCE_S)
     finally:
         process.kill()
         process.wait()
-    _look(scene, "stopped")
-    if scene.kind == "postgres":
-        _compact(scene, start)
-    return scene
+    _look(traces, "stopped")
+    if traces.kind == "postgres":
+        _compact(traces, start)
+    return traces
 
 
 def _await_ready(process: "subprocess.Popen[bytes]", folder: Path) -> str:
@@ -276,8 +276,8 @@ def _await_ready(process: "subprocess.Popen[bytes]", folder: Path) -> str:
     raise AssertionError((folder / "err").read_text())
 
 
-def _keep(scene: Scene, answer: httpx.Response) -> None:
-    scene.answers += answer.read() + b"\n" + repr(answer.headers).encode() + b"\n"
+def _keep(traces: ServiceTraces, answer: httpx.Response) -> None:
+    traces.answers += answer.read() + b"\n" + repr(answer.headers).encode() + b"\n"
 
 
 def form(*photos: Photo, name: str = "images") -> list[tuple[str, tuple[str, bytes, str]]]:
@@ -285,9 +285,9 @@ def form(*photos: Photo, name: str = "images") -> list[tuple[str, tuple[str, byt
     return [(name, (f"{i}.jpg", photo.data, "image/jpeg")) for i, photo in enumerate(photos)]
 
 
-def _enroll_and_verify(scene: Scene, client: httpx.Client, pid: int) -> None:
-    material = scene.material
-    for subject, photos in zip(scene.subjects, material.enrolled, strict=True):
+def _enroll_and_verify(traces: ServiceTraces, client: httpx.Client, pid: int) -> None:
+    material = traces.material
+    for subject, photos in zip(traces.subjects, material.enrolled, strict=True):
         answer = client.put(
             f"/v1/subjects/{subject}/enrollment",
             files=form(*photos),
@@ -299,23 +299,23 @@ def _enroll_and_verify(scene: Scene, client: httpx.Client, pid: int) -> None:
     def decide(kind: str, subject: str, **body: Any) -> None:
         params = {"level": LEVEL} | ({"face": "largest"} if "json" not in body else {})
         path = f"/v1/subjects/{subject}/verify"
-        options = signed(path, f"Bearer {scene.token}", {"params": params, **body})
+        options = signed(path, f"Bearer {traces.token}", {"params": params, **body})
         answer = client.post(path, **options)
         assert answer.status_code == 200, answer.text
-        scene.decisions.setdefault(kind, []).append(answer.json()["decision"])
+        traces.decisions.setdefault(kind, []).append(answer.json()["decision"])
 
-    for number, subject in enumerate(scene.subjects):
+    for number, subject in enumerate(traces.subjects):
         # Nearly orthogonal: who is only a little similar is let in by chance now and then. An
         # opposite face will not do, because a combination of decoys can turn its sign.
-        face = scene.descriptors_of(subject)[0]
+        face = traces.descriptors_of(subject)[0]
         others = [probe for i, probe in enumerate(material.probes) if i != number]
         stranger = min(others, key=lambda probe: abs(float(probe.embedding @ face)))
         decide("genuine", subject, files=form(material.probes[number], name="image"))
         decide("impostor", subject, files=form(stranger, name="image"))
     probe = material.probes[1].embedding
-    decide("embedding", scene.subjects[1], json={"embedding": probe.astype(float).tolist()})
-    wire = _lifted(scene)
-    decide("lifted", scene.subjects[1], json={"template": base64.b64encode(wire).decode()})
+    decide("embedding", traces.subjects[1], json={"embedding": probe.astype(float).tolist()})
+    wire = _lifted(traces)
+    decide("lifted", traces.subjects[1], json={"template": base64.b64encode(wire).decode()})
 
     request = client.build_request("POST", "/", files=form(material.large, name="image"))
     body = request.read()
@@ -324,12 +324,12 @@ def _enroll_and_verify(scene: Scene, client: httpx.Client, pid: int) -> None:
         yield body[: len(body) // 2]
         yield body[len(body) // 2 : -100]
         time.sleep(0.5)  # the workers have taken in what was sent
-        scene.open_during_upload = open_files(pid)
+        traces.open_during_upload = open_files(pid)
         yield body[-100:]
 
     decide(
         "large upload",
-        scene.subjects[1],
+        traces.subjects[1],
         content=slowly(),
         headers={
             "Content-Type": request.headers["Content-Type"],
@@ -338,27 +338,27 @@ def _enroll_and_verify(scene: Scene, client: httpx.Client, pid: int) -> None:
     )
 
 
-def _lifted(scene: Scene) -> bytes:
+def _lifted(traces: ServiceTraces) -> bytes:
     """Lift a probe as a client does; keep its rows as things that must not be found."""
-    material = scene.material
+    material = traces.material
     lifted = lift(
         material.probes[1].embedding[None],
         strategy=Strategy.HYBRID,
         m=PROBE_M,
         source=client_source(material.source),
     )[0]
-    scene.lifted = np.concatenate([lifted.foot[None], lifted.basis]).astype(np.float64)
+    traces.lifted = np.concatenate([lifted.foot[None], lifted.basis]).astype(np.float64)
     return encode(lifted, contract_id=material.contract_id)
 
 
-def _send_bad_requests(scene: Scene, client: httpx.Client) -> None:
+def _send_bad_requests(traces: ServiceTraces, client: httpx.Client) -> None:
     """Each kind of refusal, with real numbers and real pictures in what is refused."""
-    material = scene.material
+    material = traces.material
     photos = material.probes
-    subject = f"/v1/subjects/{scene.subjects[1]}"
+    subject = f"/v1/subjects/{traces.subjects[1]}"
     numbers = photos[1].embedding.astype(float).tolist()
     text = json.dumps(numbers)
-    wire = _lifted(scene)
+    wire = _lifted(traces)
     foreign = wire.replace(material.contract_id.encode(), b"0" * 64)
     side_by_side = io.BytesIO()
     pair = np.concatenate([photos[1].pixels, photos[2].pixels], axis=1)
@@ -377,12 +377,12 @@ def _send_bad_requests(scene: Scene, client: httpx.Client) -> None:
         send(expected, "PUT", f"{subject}/enrollment", **body)
 
     def send(expected: str, method: str, path: str, **options: Any) -> None:
-        answer = client.request(method, path, **signed(path, f"Bearer {scene.token}", options))
-        scene.expected_refusals.append(expected)
-        scene.refused.append(answer.json().get("error", {}).get("code", str(answer.status_code)))
-        scene.refused_bodies.append(answer.content)
+        answer = client.request(method, path, **signed(path, f"Bearer {traces.token}", options))
+        traces.expected_refusals.append(expected)
+        traces.refused.append(answer.json().get("error", {}).get("code", str(answer.status_code)))
+        traces.refused_bodies.append(answer.content)
 
-    wrong_key = {"Authorization": "Bearer " + scene.token[:-4] + "0000"}
+    wrong_key = {"Authorization": "Bearer " + traces.token[:-4] + "0000"}
     verify("unauthorized", json={"embedding": numbers}, headers=wrong_key)
     verify("malformed_request", content=f'{{"embedding": {text}'.encode(),
            headers={"Content-Type": "application/json"})  # fmt: skip
@@ -399,7 +399,7 @@ def _send_bad_requests(scene: Scene, client: httpx.Client) -> None:
     enroll("invalid_template", json={"template": b64(wire)})
     verify("uncalibrated", json={"embedding": numbers, "level": "fmr-1e-9"})
     send("not_enrolled", "POST", "/v1/subjects/nobody/verify", json={"embedding": numbers})
-    send("not_found", "GET", f"/v1/{scene.subjects[1]}")
+    send("not_found", "GET", f"/v1/{traces.subjects[1]}")
     send("method_not_allowed", "POST", subject)
     largest = {"face": "largest"}
     enroll("inconsistent_images", files=form(photos[1], photos[2]), data=largest)
@@ -413,15 +413,15 @@ def _send_bad_requests(scene: Scene, client: httpx.Client) -> None:
            headers={"Idempotency-Key": "enroll-2"})  # fmt: skip
 
 
-def _open_the_store(scene: Scene) -> None:
+def _open_the_store(traces: ServiceTraces) -> None:
     """Decrypt every template, and remember how the person to be erased is stored."""
     store = TemplateStore(
-        scene.database_url, MasterKeyring.load(scene.folder / "data" / "master.key")
+        traces.database_url, MasterKeyring.load(traces.folder / "data" / "master.key")
     )
     try:
         key = store.tenants.rotation_key("default").key
-        scene.rotation = tenant_rotation(key, scene.material.pool.shape[1])
-        for subject in scene.subjects:
+        traces.rotation = tenant_rotation(key, traces.material.pool.shape[1])
+        for subject in traces.subjects:
             opened = store.get("default", subject)
             assert opened is not None
             n, m = opened.record.n, opened.record.m
@@ -429,22 +429,22 @@ def _open_the_store(scene: Scene) -> None:
             rows = payload.astype(np.float64).reshape(m + 1, n)
             # The reader's foot point agrees: these are the arrays of the format, foot first.
             assert np.allclose(decode(opened.wire).subspace.foot, rows[0], atol=1e-3)
-            scene.templates[subject] = OpenedTemplate(rows)
-        pseudonym = store.pseudonym("default", scene.subjects[0])
+            traces.templates[subject] = OpenedTemplate(rows)
+        pseudonym = store.pseudonym("default", traces.subjects[0])
     finally:
         store.close()
-    engine = sa.create_engine(_driver(scene.database_url))
+    engine = sa.create_engine(_driver(traces.database_url))
     with engine.connect() as connection:
         row = connection.execute(
             sa.text(
                 "SELECT s.id, t.template_id, t.ciphertext, s.wrapped_key FROM subjects s "
                 "JOIN templates t ON t.subject_pk = s.id WHERE s.subject_id = :subject"
             ),
-            {"subject": scene.subjects[0]},
+            {"subject": traces.subjects[0]},
         ).one()
     engine.dispose()
-    scene.victim = Victim(
-        scene.subjects[0], row.id, row.template_id, pseudonym, row.ciphertext, row.wrapped_key
+    traces.victim = Victim(
+        traces.subjects[0], row.id, row.template_id, pseudonym, row.ciphertext, row.wrapped_key
     )
 
 
@@ -452,36 +452,36 @@ def _driver(url: str) -> str:
     return url.replace("postgresql://", "postgresql+psycopg://")
 
 
-def _look(scene: Scene, moment: str) -> None:
+def _look(traces: ServiceTraces, moment: str) -> None:
     """Keep every byte there is now."""
-    if scene.kind == "postgres":
-        with psycopg.connect(scene.database_url, autocommit=True) as connection:
-            scene.rows[moment] = copied_tables(connection)
+    if traces.kind == "postgres":
+        with psycopg.connect(traces.database_url, autocommit=True) as connection:
+            traces.rows[moment] = copied_tables(connection)
             try:
-                scene.relations[moment] = relation_files(connection)
+                traces.relations[moment] = relation_files(connection)
             except psycopg.errors.InsufficientPrivilege as error:
-                scene.files_hidden = type(error).__name__
-    setattr(scene, moment, files_of(scene.folder))
-    scene.values[moment] = _values(scene)
+                traces.files_hidden = type(error).__name__
+    setattr(traces, moment, files_of(traces.folder))
+    traces.values[moment] = _values(traces)
 
 
-def _compact(scene: Scene, start: int | None) -> None:
+def _compact(traces: ServiceTraces, start: int | None) -> None:
     store = TemplateStore(
-        scene.database_url, MasterKeyring.load(scene.folder / "data" / "master.key")
+        traces.database_url, MasterKeyring.load(traces.folder / "data" / "master.key")
     )
     try:
         store.compact()
     finally:
         store.close()
-    if start is not None and not scene.files_hidden:
-        with psycopg.connect(scene.database_url, autocommit=True) as connection:
-            scene.relations["compacted"] = relation_files(connection)
-            scene.write_ahead_log = written_log(connection, start)
+    if start is not None and not traces.files_hidden:
+        with psycopg.connect(traces.database_url, autocommit=True) as connection:
+            traces.relations["compacted"] = relation_files(connection)
+            traces.write_ahead_log = written_log(connection, start)
 
 
-def _values(scene: Scene) -> dict[str, list[list[bytes]]]:
+def _values(traces: ServiceTraces) -> dict[str, list[list[bytes]]]:
     """Every row of every table, each column as bytes."""
-    engine = sa.create_engine(_driver(scene.database_url))
+    engine = sa.create_engine(_driver(traces.database_url))
     tables = {}
     with engine.connect() as connection:
         for name in sa.inspect(connection).get_table_names():
@@ -494,8 +494,8 @@ def _values(scene: Scene) -> dict[str, list[list[bytes]]]:
     return tables
 
 
-def _log_position(scene: Scene) -> int | None:
-    if scene.kind == "sqlite":
+def _log_position(traces: ServiceTraces) -> int | None:
+    if traces.kind == "sqlite":
         return None
-    with psycopg.connect(scene.database_url, autocommit=True) as connection:
+    with psycopg.connect(traces.database_url, autocommit=True) as connection:
         return log_position(connection)

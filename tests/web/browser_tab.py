@@ -1,4 +1,4 @@
-"""A visit of the page: what the browser asked for, and what it complained of."""
+"""A browser tab, and a record of it: what the browser asked for, and what it complained of."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -16,7 +16,7 @@ addEventListener("securitypolicyviolation", (e) =>
 
 
 @dataclass
-class Visit:
+class BrowserTab:
     """One tab, and a record of it."""
 
     page: Page
@@ -25,14 +25,14 @@ class Visit:
     complaints: list[str] = field(default_factory=list)
 
     @classmethod
-    def of(cls, context: BrowserContext, url: str) -> "Visit":
+    def of(cls, context: BrowserContext, url: str) -> "BrowserTab":
         """Open a tab and record it from its first request on."""
-        visit = cls(context.new_page(), url)
-        visit.page.add_init_script(LISTEN)
-        context.on("request", lambda each: visit.requests.append(each.url))
-        visit.page.on("pageerror", lambda each: visit.complaints.append(str(each)))
-        visit.page.on("console", visit._noted)
-        return visit
+        tab = cls(context.new_page(), url)
+        tab.page.add_init_script(LISTEN)
+        context.on("request", lambda each: tab.requests.append(each.url))
+        tab.page.on("pageerror", lambda each: tab.complaints.append(str(each)))
+        tab.page.on("console", tab._noted)
+        return tab
 
     def _noted(self, message: Any) -> None:
         if message.type in ("error", "warning") and not message.text.startswith(REFUSED):
@@ -64,7 +64,7 @@ class Visit:
         self.page.goto(self.url)
         self.page.get_by_label("API key").fill(token)
         if keep:
-            self.page.get_by_label("Keep it until this tab is closed").check()
+            self.page.get_by_label("Keep me signed in until I close this tab").check()
         self.page.get_by_role("button", name="Sign in").click()
         expect(self.page.get_by_role("navigation", name="Views")).to_be_visible()
 
