@@ -17,7 +17,8 @@ from tests.api.deployment import photo
 from tests.clients.conftest import Running
 from tests.patience import PATIENCE_S
 from veilface_client import AsyncClient, Client, PrivateClient, VeilfaceError
-from veilface_client.results import Enrollable, Export, Generator, Probe
+from veilface_client.lifts import Enrollable, Probe
+from veilface_client.results import Export, Generator
 
 PACKAGE = Path(veilface_client.__file__).parent
 SECRET = "5e" * 32

@@ -28,18 +28,17 @@ from veilface_client.errors import (
     UnexpectedAnswer,
     VeilfaceError,
 )
+from veilface_client.lifts import Enrollable, Probe
 from veilface_client.photos import Photo
 from veilface_client.results import (
     Contract,
     Decision,
-    Enrollable,
     Enrollment,
     Export,
     Generator,
     Health,
     Imported,
     Lockout,
-    Probe,
     Receipt,
     Subject,
     SubjectPage,

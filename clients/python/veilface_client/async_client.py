@@ -16,8 +16,8 @@ from veilface_client.connection import DEFAULT_TIMEOUT, options, signing_token
 from veilface_client.errors import UnexpectedAnswer
 from veilface_client.flows import Flow, Send, Wait, Work
 from veilface_client.lifting import Lifter
+from veilface_client.lifts import Enrollable, Probe
 from veilface_client.photos import Photo
-from veilface_client.results import Enrollable, Probe
 from veilface_client.retries import DEFAULT_RETRIES, Retries
 
 T = TypeVar("T")

@@ -28,12 +28,11 @@ a photo, or a template.
 """
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import httpx
 
-if TYPE_CHECKING:
-    from veilface_client.results import Enrollable, Probe
+from veilface_client.lifts import Enrollable, Probe
 
 
 class VeilfaceError(Exception):
@@ -47,7 +46,7 @@ class VeilfaceError(Exception):
         not fit the service's contract.
     """
 
-    lift: "Enrollable | Probe | None" = None
+    lift: Enrollable | Probe | None = None
 
 
 class ServiceError(VeilfaceError):

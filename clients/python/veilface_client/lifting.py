@@ -19,7 +19,8 @@ from veilface_client import child
 from veilface_client.calls import Face
 from veilface_client.child import Canceller
 from veilface_client.errors import LiftFailed, LiftUnavailable
-from veilface_client.results import Contract, Enrollable, Generator, Probe
+from veilface_client.lifts import Enrollable, Probe
+from veilface_client.results import Contract, Generator
 
 _PASSED_ON = ("PATH", "HOME", "TMPDIR", "LANG", "LC_ALL", "NUMBA_CACHE_DIR", "OMP_NUM_THREADS")
 _ERROR = re.compile(r"^error: (.*)$", flags=re.MULTILINE)

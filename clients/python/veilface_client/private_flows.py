@@ -10,8 +10,8 @@ from veilface_client.child import Canceller
 from veilface_client.errors import ContractMismatch, UnexpectedAnswer, VeilfaceError
 from veilface_client.flows import Flow, Work, send
 from veilface_client.lifting import Lifter, LiftInputs
+from veilface_client.lifts import Enrollable, Probe
 from veilface_client.photos import Photo, read_photo, read_photos
-from veilface_client.results import Enrollable, Probe
 from veilface_client.retries import Retries
 
 T = TypeVar("T")

@@ -3,32 +3,27 @@
 Fields that this version does not know are ignored, so that it reads the answers of later ones.
 """
 
-import hashlib
 import os
-import secrets
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import httpx
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
+from pydantic import Field, StringConstraints, ValidationError
 
 from veilface_client.errors import UnexpectedAnswer
+from veilface_client.lifts import Value
 
 Hex = Annotated[str, StringConstraints(pattern=r"\A[0-9a-f]{64}\z")]
 
 
-class _Value(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="ignore")
-
-
-class Answer(_Value):
+class Answer(Value):
     """What every answer has."""
 
     request_id: str
     notice: str | None = None
 
 
-class PhotoUsed(_Value):
+class PhotoUsed(Value):
     """One photo of an enrollment: its position, and the measures of the quality gate."""
 
     index: int
@@ -66,7 +61,7 @@ class Decision(Answer):
         return self.accepted
 
 
-class Subject(_Value):
+class Subject(Value):
     """A subject, without its template."""
 
     subject_id: str
@@ -105,7 +100,7 @@ class Unlocked(Answer):
     lifted: bool
 
 
-class SignedText(_Value):
+class SignedText(Value):
     """The text of a receipt, and its Ed25519 signature in base64."""
 
     body: str
@@ -135,7 +130,7 @@ class Receipt(_Verbatim):
         return self.claims.get("held") is True
 
 
-class ReceiptKey(_Value):
+class ReceiptKey(Value):
     """The key that receipts are verified with; ``public_key`` is base64 of 32 bytes."""
 
     algorithm: str
@@ -156,7 +151,7 @@ class Contract(_Verbatim):
     receipt_key: ReceiptKey
 
 
-class Generator(_Value):
+class Generator(Value):
     """The decoy generator, for clients that lift."""
 
     data: bytes = Field(repr=False)
@@ -184,39 +179,6 @@ class Health(Answer):
     """The service can answer."""
 
     status: str
-
-
-class _Lift(_Value):
-    template: bytes = Field(repr=False)
-    contract_id: str
-
-    def __repr__(self) -> str:
-        return f"<{type(self).__name__} of {len(self.template)} bytes>"
-
-    @classmethod
-    def of(cls, template: bytes, contract_id: str) -> Self:
-        """Make a lift."""
-        return cls(template=template, contract_id=contract_id)
-
-
-class Probe(_Lift):
-    """A lifted probe: no photo, and no embedding. Use it once for each attempt it is meant for."""
-
-
-class Enrollable(_Lift):
-    """A template that enrolls, lifted and not yet (or perhaps) sent: no photo, no embedding.
-
-    Attributes
-    ----------
-    idempotency_key
-        Makes its enrollment one write, however often it is sent.
-    """
-
-    idempotency_key: str = Field(default_factory=lambda: secrets.token_urlsafe(24))
-
-    def key_for(self, subject: str) -> str:
-        """Return the ``Idempotency-Key`` of a subject: another subject is another write."""
-        return hashlib.sha256(f"{self.idempotency_key}/{subject}".encode()).hexdigest()
 
 
 A = TypeVar("A", bound=Answer)
