@@ -548,7 +548,7 @@ def test_a_file_of_more_values_than_any_contract_has_is_not_parsed(
     wide = tmp_path / "wide.json"
     wide.write_text(json.dumps(document | {"recorded": {"a": [[]] * MAX_PARTS}}))
     with monkeypatch.context() as patch:
-        patch.setattr("templates.canonical.json.loads", None)
+        patch.setattr("templates.contract.canonical.json.loads", None)
         with pytest.raises(ContractError, match="more than 100000 values"):
             Contract.load(wide, SEALER)
     assert Contract.load(path, SEALER).contract_id == document["contract_id"]
