@@ -17,21 +17,20 @@ from api.cli.errors import Commands
 COMMANDS = {
     "demo": "Enroll, verify and erase people through the real service, in under a minute.",
     "serve": "Start the REST service.",
-    "enroll": "Enroll a person from photos, or replace the enrollment.",
-    "verify": "Check whether a photo shows a person; exit status 0 accept, 1 reject.",
-    "lift": "Turn photos into a private template on this machine, without any secret of the "
+    "enroll": "Enroll a person from photos, or replace their enrollment.",
+    "verify": "Check whether a photo shows a person; exit status 0 if accepted, 1 if rejected.",
+    "lift": "Make a private template from photos on this machine, without any secret of the "
     "service.",
-    "calibrate": "Measure private templates of labelled people, and write the contract file.",
+    "calibrate": "Calibrate on labelled people, and write the contract file.",
     "evaluate": "Evaluate face verification with private templates: the LFW / CFP / AgeDB "
     "protocol.",
-    "audit": "Attack private templates, and judge what an attacker achieves against your limits.",
-    "decoys": "Make the decoys that hide a descriptor inside its private template.",
-    "keys": "Make, replace and revoke API keys, rotate keys and rotations, verify receipts of "
-    "erasure.",
-    "models": "Look into model packs (the weights you supply).",
-    "db": "Bring the database's schema up to date, check it, clean up in it, and set up tenants.",
-    "audit-log": "Verify and read the audit log, in which each line is chained to the one before.",
-    "bench": "Measure how fast this machine is, as ratios to what it cannot do without.",
+    "audit": "Attack private templates, and hold the results against your limits.",
+    "decoys": "Make the decoys that hide an embedding inside its private template.",
+    "keys": "Create, replace and revoke API keys; rotate keys; verify erasure receipts.",
+    "models": "Inspect model packs (the weights you supply).",
+    "db": "Migrate, check and clean up the database; set up tenants.",
+    "audit-log": "Verify and read the audit log, a chain of lines.",
+    "bench": "Time this machine, against the work that nothing can avoid.",
 }
 """The first paragraph of each command's help."""
 
