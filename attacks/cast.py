@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attacks.errors import AuditError
-from templates.space.lifting import unit_descriptors
+from templates.space.embedding import unit_descriptors
 
 ENROLLED_PHOTOS = 3
 """Most photos that are averaged into a victim's template."""

@@ -12,7 +12,7 @@ from templates.contract.nobody import Nobody
 from templates.decoys import Attributes, DecoySource
 from templates.errors import ContractError
 from templates.keys.randomness import Keystream
-from templates.space.lifting import unit_descriptors
+from templates.space.embedding import unit_descriptors
 from templates.space.subspace import SubspaceBatch
 from verify.calibration_mode import Bench, CalibrationOptions, calibrate_mode
 from verify.cohort import COHORT_SIZE, client_source, make_cohort, people_like, plain_strategy

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from attacks.errors import AuditError
 from templates.decoys.source import Attributes
-from templates.space.lifting import unit_descriptors
+from templates.space.embedding import unit_descriptors
 from verify.evaluation.attributes import resembling_rows
 
 Floats = NDArray[np.float32]

@@ -15,17 +15,15 @@ from templates.decoys.generator import DecoyGenerator
 from templates.distances import Metric, pairwise_distances, similarity
 from templates.errors import ContractError
 from templates.keys.randomness import Keystream
+from templates.space.embedding import UNIT_TOLERANCE
 from templates.space.lifting import Strategy, draw_directions
 from templates.space.subspace import AffineSubspace, SubspaceBatch, span_basis
 
 SIZES = (2, 65_536)
-UNIT_TOLERANCE = 1e-3
 TILT = 2.0
 """Weight of near strangers in :meth:`Nobody.score`: one 3 standard deviations above the cohort
 counts e⁶ = 403 times as much as one at its mean, and an honest template's score still rests on
 many of them."""
-
-Floats = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -42,9 +40,9 @@ class Nobody:
         Decoys of templates of nobody: those that lifting clients take.
     """
 
-    people: Floats
-    means: Floats
-    spreads: Floats
+    people: NDArray[np.float32]
+    means: NDArray[np.float32]
+    spreads: NDArray[np.float32]
     generator: DecoyGenerator
 
     def __getitem__(self, rows: slice) -> "Nobody":

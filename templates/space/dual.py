@@ -77,15 +77,15 @@ class DualSubspace:
                 f"the dual system is singular for dimensions {self.m} and {other.m} in R^{n}: "
                 "use the primal form"
             )
-        mine, theirs = self.normals, other.normals
+        own, others = self.normals, other.normals
         system = np.block(
             [
-                [mine, np.zeros((len(mine), len(mine))), np.zeros((len(mine), len(theirs)))],
-                [theirs, np.zeros((len(theirs), len(mine))), np.eye(len(theirs))],
-                [np.zeros((n, n)), mine.T, -theirs.T],
+                [own, np.zeros((len(own), len(own))), np.zeros((len(own), len(others)))],
+                [others, np.zeros((len(others), len(own))), np.eye(len(others))],
+                [np.zeros((n, n)), own.T, -others.T],
             ]
         )
-        known = np.concatenate([mine @ self.foot, theirs @ other.foot, np.zeros(n)])
-        solution = np.linalg.lstsq(system, known, rcond=None)[0]
-        multipliers = solution[n + len(mine) :]
-        return float(np.linalg.norm(multipliers @ theirs))  # y* − x* = Σ νⱼ eⱼ
+        right_side = np.concatenate([own @ self.foot, others @ other.foot, np.zeros(n)])
+        solution = np.linalg.lstsq(system, right_side, rcond=None)[0]
+        multipliers = solution[n + len(own) :]
+        return float(np.linalg.norm(multipliers @ others))  # y* − x* = Σ νⱼ eⱼ

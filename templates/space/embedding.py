@@ -1,18 +1,54 @@
 """The check that every raw embedding passes before anything is computed from it."""
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from templates.errors import InvalidEmbedding
 
-NORM_TOLERANCE = 1e-3
+UNIT_TOLERANCE = 1e-3
+
+
+def unit_descriptors(descriptors: ArrayLike) -> NDArray[np.float64]:
+    """Check embeddings and normalise them in float64.
+
+    One that is not a unit vector is refused, since distances assume the unit sphere: the zero
+    vector is at Euclidean distance ‖p‖ from every template (docs/method.md §4.7).
+
+    Parameters
+    ----------
+    descriptors : array_like of floats, shape (N, n)
+
+    Returns
+    -------
+    ndarray of float64, shape (N, n)
+        Unit rows.
+
+    Raises
+    ------
+    InvalidEmbedding
+        The shape is wrong, a number is not finite, or a norm differs from 1 by more than 1e-3.
+    """
+    rows = np.asarray(descriptors)
+    if rows.ndim != 2 or rows.shape[1] < 2 or not np.issubdtype(rows.dtype, np.floating):
+        raise InvalidEmbedding(
+            f"expected floating-point embeddings of shape (N, n), "
+            f"seen {rows.dtype} of shape {rows.shape}"
+        )
+    rows = rows.astype(np.float64)
+    if not np.isfinite(rows).all():
+        raise InvalidEmbedding("an embedding holds a number that is not finite")
+    # No entry of a unit vector exceeds 1; clipping keeps the squares of a larger one finite, and
+    # its norm is still 2 or more.
+    norms = np.linalg.norm(np.clip(rows, -2.0, 2.0), axis=1, keepdims=True)
+    if (np.abs(norms - 1.0) > UNIT_TOLERANCE).any():
+        raise InvalidEmbedding(
+            f"an embedding must have norm 1 within {UNIT_TOLERANCE:g}; L2-normalise it"
+        )
+    return np.asarray(rows / norms)
 
 
 def unit_rows(embeddings: NDArray[np.generic], *, n: int, most: int) -> NDArray[np.float32]:
-    """Validate raw embeddings and return them normalised exactly.
-
-    A probe that is not a unit vector is refused, since distances assume the unit sphere: the zero
-    vector is at Euclidean distance ‖p‖ from every template (docs/method.md §4.7).
+    """:func:`unit_descriptors` for what a client sends.
 
     Parameters
     ----------
@@ -29,7 +65,7 @@ def unit_rows(embeddings: NDArray[np.generic], *, n: int, most: int) -> NDArray[
     Raises
     ------
     InvalidEmbedding
-        Wrong shape, not finite, or a norm further than 1e-3 from 1.
+        As :func:`unit_descriptors`, or for another number of rows or columns.
     """
     array = np.asarray(embeddings)
     if array.dtype.kind not in "fiu":
@@ -39,13 +75,4 @@ def unit_rows(embeddings: NDArray[np.generic], *, n: int, most: int) -> NDArray[
         raise InvalidEmbedding(f"an embedding must have exactly {n} numbers")
     if not 1 <= rows.shape[0] <= most:
         raise InvalidEmbedding(f"1 to {most} embeddings are accepted, not {rows.shape[0]}")
-    rows = rows.astype(np.float64)
-    if not np.isfinite(rows).all():
-        raise InvalidEmbedding("an embedding holds a number that is not finite")
-    # The largest entry of a unit vector is below 1; testing it first keeps the squares finite.
-    norms = np.linalg.norm(np.clip(rows, -2.0, 2.0), axis=1, keepdims=True)
-    if np.abs(norms - 1.0).max() > NORM_TOLERANCE or np.abs(rows).max() > 2.0:
-        raise InvalidEmbedding(
-            f"an embedding must have norm 1 within {NORM_TOLERANCE:g}; L2-normalise it"
-        )
-    return np.ascontiguousarray(rows / norms, dtype=np.float32)
+    return np.ascontiguousarray(unit_descriptors(rows.astype(np.float64)), dtype=np.float32)

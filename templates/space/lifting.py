@@ -7,14 +7,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from templates.decoys.source import Attributes, DecoySource
-from templates.errors import InvalidEmbedding, LiftingError
+from templates.errors import LiftingError
 from templates.keys.randomness import Keystream
-from templates.space.subspace import SubspaceBatch, span_basis
+from templates.space.embedding import unit_descriptors
+from templates.space.subspace import SubspaceBatch
 
 SUB_DATABASES = 16
 """Parts that the sub-strategies split the database into (paper §4.2)."""
 
-UNIT_TOLERANCE = 1e-3
 # Two decoys, or a decoy and the descriptor, nearer than this are one photo twice: they would add
 # a direction of noise. Real descriptors of different photos are 0.1 apart or more.
 _SAME = 1e-3
@@ -43,40 +43,6 @@ class Strategy(StrEnum):
         """Number of sub-databases to draw from, or None for the whole database."""
         split = self in (Strategy.SUB_ADVERSARIAL, Strategy.SUB_HYBRID)
         return SUB_DATABASES if split else None
-
-
-def unit_descriptors(descriptors: ArrayLike) -> NDArray[np.float64]:
-    """Check descriptors and renormalise them in float64.
-
-    Parameters
-    ----------
-    descriptors : array_like, shape (N, n)
-
-    Returns
-    -------
-    ndarray of float64, shape (N, n)
-        Unit rows.
-
-    Raises
-    ------
-    InvalidEmbedding
-        The shape is wrong, a number is not finite, or a norm differs from 1 by more than 1e-3.
-    """
-    rows = np.asarray(descriptors)
-    if rows.ndim != 2 or rows.shape[1] < 2 or not np.issubdtype(rows.dtype, np.floating):
-        raise InvalidEmbedding(
-            f"expected floating-point embeddings of shape (N, n), "
-            f"seen {rows.dtype} of shape {rows.shape}"
-        )
-    rows = rows.astype(np.float64)
-    if not np.isfinite(rows).all():
-        raise InvalidEmbedding("an embedding holds a number that is not finite")
-    norms = np.linalg.norm(rows, axis=1, keepdims=True)
-    if (np.abs(norms - 1) > UNIT_TOLERANCE).any():
-        raise InvalidEmbedding(
-            f"an embedding is not of unit length within {UNIT_TOLERANCE:g}: normalise it first"
-        )
-    return np.asarray(rows / norms)
 
 
 def lift(
@@ -155,39 +121,6 @@ def draw_directions(
     points = unit_descriptors(descriptors)
     strategy = _check(points, strategy, m, source, attributes)
     return _directions(points, strategy, m, source, stream, attributes)
-
-
-def paper_basis(
-    points: ArrayLike, directions: ArrayLike, *, stream: Keystream
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Describe ``points[i] + span(directions[i])`` as in paper §3.2.
-
-    Parameters
-    ----------
-    points : array_like, shape (N, n)
-    directions : array_like, shape (N, m, n)
-    stream : Keystream
-
-    Returns
-    -------
-    origins : ndarray of float64, shape (N, n)
-        d₀, the projection of e ~ U([−1, 1])ⁿ on the set.
-    bases : ndarray of float64, shape (N, m, n)
-        The projections of eᵢ ~ U([−1, 1])ⁿ minus d₀, orthonormalised.
-
-    Raises
-    ------
-    LiftingError
-        The directions are linearly dependent.
-    """
-    span = span_basis(np.asarray(directions, dtype=np.float64))
-    start = np.asarray(points, dtype=np.float64)
-    count, m, n = span.shape
-    drawn = stream.uniform((count, m + 1, n), -1.0, 1.0)
-    inside = (drawn - start[:, None]) @ span.transpose(0, 2, 1) @ span
-    projections = start[:, None] + inside
-    origins = np.ascontiguousarray(projections[:, 0])
-    return origins, span_basis(projections[:, 1:] - origins[:, None])
 
 
 def _check(

@@ -24,8 +24,6 @@ FLOAT32_TOLERANCE = 1e-5
 _LEAST_PIVOT = 1e-5
 _TILE_BYTES = 16 << 20
 
-Floats = NDArray[np.float32] | NDArray[np.float64]
-
 
 def _stored(array: ArrayLike, ndim: int, name: str) -> NDArray[np.float32]:
     """Return a read-only, C-contiguous float32 view or copy."""
