@@ -125,12 +125,12 @@ class Binding:
                 f"the contract is bound to embedder {self.embedder_sha256[:16]}…, the pack's is "
                 f"{embedder_sha256[:16]}…; use the pack that the contract was calibrated with"
             )
-        theirs = free_object(preprocessing, what="the pack's preprocessing")
-        if theirs != self.preprocessing:
-            keys = sorted(theirs.keys() | self.preprocessing.keys())
-            differing = [key for key in keys if theirs.get(key) != self.preprocessing.get(key)]
+        of_pack = free_object(preprocessing, what="the pack's preprocessing")
+        if of_pack != self.preprocessing:
+            keys = sorted(of_pack.keys() | self.preprocessing.keys())
+            differing = [key for key in keys if of_pack.get(key) != self.preprocessing.get(key)]
             sides = "; ".join(
-                f"{key}: contract {self.preprocessing.get(key)}, pack {theirs.get(key)}"
+                f"{key}: contract {self.preprocessing.get(key)}, pack {of_pack.get(key)}"
                 for key in differing
             )
             raise ContractMismatch(

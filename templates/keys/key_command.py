@@ -13,8 +13,39 @@ from templates.errors import SealError
 from templates.keys.key_file import keys_in
 
 MAX_OUTPUT_BYTES = 64 * 1024
+ASK_AGAIN_S = 10.0
+"""Seconds between two runs of a key command that blobs under unknown keys ask for."""
 _CHUNK_BYTES = 4096
 _REMEDY = "run it by hand, as the user of the service, and mend it"
+
+
+class KeyCommand:
+    """A key command, when it was last run, and how that failed."""
+
+    def __init__(self, argv: Sequence[str], timeout_s: float) -> None:
+        self._argv = tuple(argv)
+        self._timeout_s = timeout_s
+        self._asked_at = 0.0
+        self.failure: SealError | None = None
+        self.source = f"the key command {self._argv[0] if self._argv else ''}"
+
+    def ask(self) -> list[bytes]:
+        """Run the command; :class:`SealError` where it fails."""
+        try:
+            return keys_of_command(self._argv, timeout_s=self._timeout_s)
+        finally:
+            self._asked_at = time.monotonic()
+
+    def ask_again(self) -> list[bytes]:
+        """Keys, or none where it was run just before, or failed: those in memory stay good."""
+        if time.monotonic() - self._asked_at < ASK_AGAIN_S:
+            return []
+        self.failure = None
+        try:
+            return self.ask()
+        except SealError as error:
+            self.failure = error
+            return []
 
 
 def keys_of_command(argv: Sequence[str], *, timeout_s: float) -> list[bytes]:

@@ -159,8 +159,8 @@ def locked(path: Path) -> Iterator[None]:
         target = _own_target(path, source=f"the key file {path}").resolve()
     except OSError as error:
         raise SealError(f"the key file {path} cannot be locked: {error.strerror}") from None
-    mine: set[Path] = _held.__dict__.setdefault("targets", set())
-    if target in mine:
+    locked_here: set[Path] = _held.__dict__.setdefault("targets", set())
+    if target in locked_here:
         yield
         return
     descriptor = _open_lock(path, target)
@@ -173,11 +173,11 @@ def locked(path: Path) -> Iterator[None]:
             ) from None
         except OSError as error:
             raise SealError(f"the key file {path} cannot be locked: {error.strerror}") from None
-        mine.add(target)
+        locked_here.add(target)
         try:
             yield
         finally:
-            mine.discard(target)
+            locked_here.discard(target)
     finally:
         os.close(descriptor)
 

@@ -13,7 +13,6 @@ blob to, each with its length in front, so that no two lists of parts have the s
 import hashlib
 import os
 import threading
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn, Protocol, Self
@@ -24,7 +23,7 @@ from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
 from templates.errors import SealError
-from templates.keys.key_command import keys_of_command
+from templates.keys.key_command import KeyCommand
 from templates.keys.key_file import (
     KEY_BYTES,
     Stamp,
@@ -41,9 +40,6 @@ KEY_ID_BYTES = 8
 NONCE_BYTES = 12
 TAG_BYTES = 16
 OVERHEAD_BYTES = 1 + KEY_ID_BYTES + NONCE_BYTES + TAG_BYTES
-
-ASK_AGAIN_S = 10.0
-"""Seconds between two runs of a key command that blobs under unknown keys ask for."""
 
 _VERSION = 1
 _MAX_PLAINTEXT_BYTES = 2**31 - 1 - OVERHEAD_BYTES  # the limit of one call of the AES-GCM library
@@ -114,7 +110,7 @@ class MasterKeyring:
         self._path: Path | None = None
         self._stamp: Stamp | None = None
         self._not_followed: str | None = None
-        self._command: _Command | None = None
+        self._command: KeyCommand | None = None
         self._lock = threading.Lock()
         self._keys = _Keys(keys, source=source)
 
@@ -174,7 +170,7 @@ class MasterKeyring:
         """Ask a command, such as the client of a KMS, for the keys.
 
         It writes one base64 key of 32 bytes on a line, the current one first. It is run now, and
-        again when a blob names a key that is not in memory, at most once in :data:`ASK_AGAIN_S`.
+        again when a blob names a key that is not in memory, at most once in ten seconds.
 
         Parameters
         ----------
@@ -188,7 +184,7 @@ class MasterKeyring:
         SealError
             If it fails, takes too long or writes anything but good keys.
         """
-        command = _Command(argv, timeout_s)
+        command = KeyCommand(argv, timeout_s)
         keyring = cls(command.ask(), source=command.source)
         keyring._command = command
         return keyring
@@ -216,7 +212,7 @@ class MasterKeyring:
         """Keep only the first key of a key file; returns how many were dropped.
 
         Whatever is still sealed under a dropped key is lost: ask
-        ``TemplateStore.wrapping_keys()`` first.
+        ``TemplateStore.wrapped_keys.count()`` first.
 
         Parameters
         ----------
@@ -322,7 +318,7 @@ class MasterKeyring:
                 self._follow_command(raw_id)
         keys = self._keys
         if raw_id not in keys.ids:
-            known = ", ".join(each.hex() for each in keys.ids)
+            known = ", ".join(own_id.hex() for own_id in keys.ids)
             raise SealError(
                 f"sealed under master key {key_id}, but {self._source} has only {known}: "
                 f"put the missing key back as a further line{self._last_failure()}"
@@ -377,7 +373,7 @@ class MasterKeyring:
         return "" if failure is None else f" (asked again, {failure})"
 
     def __repr__(self) -> str:
-        return f"MasterKeyring({', '.join(each.hex() for each in self._keys.ids)})"
+        return f"MasterKeyring({', '.join(key_id.hex() for key_id in self._keys.ids)})"
 
     def __reduce__(self) -> NoReturn:
         raise TypeError("a master keyring is not serialised: load it where it is needed")
@@ -419,34 +415,6 @@ def sealed_key_id(sealed: bytes) -> str:
     return sealed[1 : 1 + KEY_ID_BYTES].hex()
 
 
-class _Command:
-    """A key command, when it was last run, and how that failed."""
-
-    def __init__(self, argv: Sequence[str], timeout_s: float) -> None:
-        self._argv = tuple(argv)
-        self._timeout_s = timeout_s
-        self._asked_at = 0.0
-        self.failure: SealError | None = None
-        self.source = f"the key command {self._argv[0] if self._argv else ''}"
-
-    def ask(self) -> list[bytes]:
-        try:
-            return keys_of_command(self._argv, timeout_s=self._timeout_s)
-        finally:
-            self._asked_at = time.monotonic()
-
-    def ask_again(self) -> list[bytes]:
-        """Keys, or none where it was run just before, or failed: those in memory stay good."""
-        if time.monotonic() - self._asked_at < ASK_AGAIN_S:
-            return []
-        self.failure = None
-        try:
-            return self.ask()
-        except SealError as error:
-            self.failure = error
-            return []
-
-
 class _Keys:
     """An immutable set of checked keys, and the keys derived from them so far."""
 
@@ -457,11 +425,11 @@ class _Keys:
         self.ids = tuple(self._masters)
 
     def derived(self, key_id: bytes, purpose: str) -> bytes:
-        found = self._derived.get((key_id, purpose))
-        if found is None:
-            found = derive_key(self._masters[key_id], f"seal/{purpose}")
-            self._derived[key_id, purpose] = found
-        return found
+        key = self._derived.get((key_id, purpose))
+        if key is None:
+            key = derive_key(self._masters[key_id], f"seal/{purpose}")
+            self._derived[key_id, purpose] = key
+        return key
 
 
 def _bind(header: bytes, purpose: str, bound_to: Sequence[str | bytes | int]) -> bytes:

@@ -661,7 +661,7 @@ def test_a_command_is_asked_again_for_an_unknown_key_but_not_often(
     kms: Kms, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now = 1000.0
-    monkeypatch.setattr("templates.keys.sealing.time.monotonic", lambda: now)
+    monkeypatch.setattr("templates.keys.key_command.time.monotonic", lambda: now)
     kms.answer.write_text(lines_of(KEY))
     keyring = MasterKeyring.from_command(kms.argv)
     sealed = MasterKeyring([OTHER]).seal(b"text", purpose="p", bound_to=[])
@@ -688,7 +688,7 @@ def test_a_command_is_asked_again_for_an_unknown_key_but_not_often(
 def test_threads_that_meet_an_unknown_key_ask_once(
     kms: Kms, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("templates.keys.sealing.ASK_AGAIN_S", 0.0)
+    monkeypatch.setattr("templates.keys.key_command.ASK_AGAIN_S", 0.0)
     kms.answer.write_text(lines_of(KEY))
     keyring = MasterKeyring.from_command(kms.argv)
     kms.answer.write_text(lines_of(KEY, OTHER))
@@ -708,7 +708,7 @@ def test_threads_that_meet_an_unknown_key_ask_once(
 def test_a_service_keeps_its_keys_while_the_command_fails(
     kms: Kms, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("templates.keys.sealing.ASK_AGAIN_S", 0.0)
+    monkeypatch.setattr("templates.keys.key_command.ASK_AGAIN_S", 0.0)
     kms.answer.write_text(lines_of(KEY))
     keyring = MasterKeyring.from_command(kms.argv)
     mine = keyring.seal(b"text", purpose="p", bound_to=[])
@@ -724,7 +724,7 @@ def test_a_service_keeps_its_keys_while_the_command_fails(
 def test_a_blob_that_anybody_may_have_made_up_runs_no_command(
     kms: Kms, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("templates.keys.sealing.ASK_AGAIN_S", 0.0)
+    monkeypatch.setattr("templates.keys.key_command.ASK_AGAIN_S", 0.0)
     kms.answer.write_text(lines_of(KEY))
     keyring = MasterKeyring.from_command(kms.argv)
     theirs = MasterKeyring([OTHER]).seal(b"text", purpose="p", bound_to=[])
@@ -736,7 +736,7 @@ def test_a_blob_that_anybody_may_have_made_up_runs_no_command(
     store.upgrade()
     store.tenants.create("default")
     with pytest.raises(InvalidIdentifier, match="start again without one"):
-        store.list("default", cursor=base64.urlsafe_b64encode(theirs).decode())
+        store.subjects.list("default", cursor=base64.urlsafe_b64encode(theirs).decode())
     store.close()
     assert kms.count == 1
 
@@ -751,7 +751,7 @@ def test_a_key_file_is_followed_without_refreshing(tmp_path: Path) -> None:
 def test_a_command_that_failed_is_a_reason_to_look(
     kms: Kms, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("templates.keys.sealing.ASK_AGAIN_S", 0.0)
+    monkeypatch.setattr("templates.keys.key_command.ASK_AGAIN_S", 0.0)
     kms.answer.write_text(lines_of(KEY))
     keyring = MasterKeyring.from_command(kms.argv)
     theirs = MasterKeyring([OTHER]).seal(b"text", purpose="p", bound_to=[])
