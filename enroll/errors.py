@@ -18,14 +18,14 @@ class EnrollmentError(VeilfaceError):
 
 
 class PhotoRejected(EnrollmentError):
-    """One photo of a set was refused by the models room, and the set with it.
+    """One photo of a set was refused by ``models``, and the set with it.
 
     Parameters
     ----------
     index
         Position of the photo in the request, from 0. Words count from 1.
     cause
-        The error of the models room, which has its own code and message.
+        The error of ``models``, which has its own code and message.
     count
         Photos in the request.
     """

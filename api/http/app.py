@@ -115,22 +115,24 @@ def create_app(
         app.router.routes.extend(page_routes(demo=settings.demo))
     if settings.operations_port is None:
         app.include_router(health.router)
-        _dress(app, settings, operations_paths=OPERATIONS_PATHS)
+        _add_middleware(app, settings, operations_paths=OPERATIONS_PATHS)
     else:
-        _dress(app, settings, operations_paths=frozenset())
+        _add_middleware(app, settings, operations_paths=frozenset())
     return app
 
 
 def _operations_app(app: FastAPI) -> FastAPI:
     """Make the application of the operations port: the state of ``app``, and no other routes."""
-    beside = FastAPI(openapi_url=None, docs_url=None, redoc_url=None, redirect_slashes=False)
-    beside.state = app.state
-    beside.include_router(health.router)
-    _dress(beside, app.state.settings, operations_paths=OPERATIONS_PATHS)
-    return beside
+    operations_app = FastAPI(
+        openapi_url=None, docs_url=None, redoc_url=None, redirect_slashes=False
+    )
+    operations_app.state = app.state
+    operations_app.include_router(health.router)
+    _add_middleware(operations_app, app.state.settings, operations_paths=OPERATIONS_PATHS)
+    return operations_app
 
 
-def _dress(app: FastAPI, settings: Settings, *, operations_paths: frozenset[str]) -> None:
+def _add_middleware(app: FastAPI, settings: Settings, *, operations_paths: frozenset[str]) -> None:
     app.add_middleware(
         RequestContext,
         max_in_flight=settings.max_in_flight,
@@ -158,10 +160,10 @@ async def _open(
     app.state.audit_report = open_audit_report(settings)
     rate_limits = RateLimits.open(settings)
     running.push_async_callback(rate_limits.close)
-    told = threading.Event()
-    with told_to_stop(told.set):
+    stop_told = threading.Event()
+    with told_to_stop(stop_told.set):
         runtime = await anyio.to_thread.run_sync(
-            open_patiently, partial(open_runtime, settings), told
+            open_patiently, partial(open_runtime, settings), stop_told
         )
     running.push_async_callback(_close, runtime)
     gate = Gate(slots=settings.resolved_compute_slots, waiting=settings.queue_limit)

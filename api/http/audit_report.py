@@ -60,29 +60,32 @@ class AuditReport:
         ``nothing`` of it, and then no figure is told.
         """
         report, binding = self.document, contract.binding
-        ours = self._verdict(binding, decoys)
+        verdict = self._verdict(binding, decoys)
         fits = "nothing"
-        if ours is not None and report["settings"].get("contract_id") == contract.contract_id:
+        if verdict is not None and report["settings"].get("contract_id") == contract.contract_id:
             fits = "contract"
-        elif ours is not None and report["model"].get("embedder_sha256") == binding.embedder_sha256:
+        elif (
+            verdict is not None
+            and report["model"].get("embedder_sha256") == binding.embedder_sha256
+        ):
             fits = "scheme"
-        if ours is None or fits == "nothing":
+        if verdict is None or fits == "nothing":
             return {**NOT_AUDITED, "audited": True, "kind": report["kind"]}
-        cells = [{name: cell.get(name) for name in _CELL} for cell in ours["cells"]]
-        prefix = f"{Scheme.of(ours)}: "
+        cells = [{name: cell.get(name) for name in _CELL} for cell in verdict["cells"]]
+        prefix = f"{Scheme.of(verdict)}: "
         lines = [str(line) for line in report["headlines"]]
         return {
             "audited": True,
             "fits": fits,
             "kind": report["kind"],
-            "passed": ours["passed"],
+            "passed": verdict["passed"],
             "headlines": [line for line in lines if line.startswith(prefix)][:MAX_HEADLINES],
             "strongest": strongest(cells),
             "cells": cells,
             "limits": [
-                {"name": each.name, "most": report["limits"][each.name], "meaning": each.meaning}
-                for each in LIMITS
-                if each.name in report["limits"]
+                {"name": limit.name, "most": report["limits"][limit.name], "meaning": limit.meaning}
+                for limit in LIMITS
+                if limit.name in report["limits"]
             ],
             "command": COMMAND,
         }
@@ -165,7 +168,7 @@ def _is_report(document: Mapping[str, Any]) -> bool:
         return False
     if not all(isinstance(document.get(name), kind) for name, kind in _MEMBERS.items()):
         return False
-    return all(_is_verdict(each) for each in document["verdicts"]) and all(
+    return all(_is_verdict(verdict) for verdict in document["verdicts"]) and all(
         _is_number(value) for value in document["limits"].values()
     )
 

@@ -83,18 +83,18 @@ async def caller(
     # What is no token costs no query.
     if token is None or not is_token(token):
         raise refused
-    found = await gate.query(lambda: runtime.store.api_keys.verify(token))
-    if found is None:
+    api_key = await gate.query(lambda: runtime.store.api_keys.verify(token))
+    if api_key is None:
         raise refused
-    request.state.log.update(tenant=found.tenant, key_id=found.prefix)
+    request.state.log.update(tenant=api_key.tenant, key_id=api_key.prefix)
     rate_limits: RateLimits = request.app.state.rate_limits
-    await rate_limits.count_key(found.prefix)
+    await rate_limits.count_key(api_key.prefix)
     return Caller(
-        prefix=found.prefix,
-        tenant=found.tenant,
-        rights=frozenset(map(str, found.rights)),
+        prefix=api_key.prefix,
+        tenant=api_key.tenant,
+        rights=frozenset(map(str, api_key.rights)),
         token=token,
-        lowest_level=found.lowest_level,
+        lowest_level=api_key.lowest_level,
     )
 
 

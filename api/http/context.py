@@ -84,7 +84,7 @@ class _Body:
                 dropped += len(message.get("body", b""))
 
 
-class _Room:
+class _InFlightLimit:
     """A bound on requests that are answered at the same time, and their number as a metric."""
 
     def __init__(self, most: int, gauge: Gauge | None = None) -> None:
@@ -123,7 +123,7 @@ class RequestContext:
     max_in_flight
         Requests that are answered at the same time; the next one is refused unread.
     operations_paths
-        Paths that have room of their own, and no rate limit: an overload must be seen from them.
+        Paths that have a limit of their own, and no rate limit: an overload must be seen from them.
     demo, tls
         What the headers of every answer say.
     """
@@ -139,8 +139,8 @@ class RequestContext:
     ) -> None:
         self._app = app
         self._operations_paths = operations_paths
-        self._room = _Room(max_in_flight, IN_FLIGHT)
-        self._operations_room = _Room(OPERATIONS_IN_FLIGHT)
+        self._limit = _InFlightLimit(max_in_flight, IN_FLIGHT)
+        self._operations_limit = _InFlightLimit(OPERATIONS_IN_FLIGHT)
         self._headers = dict(SECURITY_HEADERS)
         if tls:
             self._headers["Strict-Transport-Security"] = HSTS
@@ -175,8 +175,8 @@ class RequestContext:
             if last and not (body.ended and len(message.get("body", b"")) <= SMALL_ANSWER):
                 # The end, sent by itself, waits until the client has taken most of the rest.
                 await deliver({**message, "more_body": True})
-                # Lingering is a courtesy: with it, nobody without a key shall fill the room.
-                if not self._room.crowded:
+                # Lingering is a courtesy: with it, nobody without a key shall use up the limit.
+                if not self._limit.crowded:
                     await body.linger()
                 message = {"type": "http.response.body", "body": b""}
             if message["type"] == "http.response.start":
@@ -224,11 +224,11 @@ class RequestContext:
     async def _admit(
         self, scope: Scope, body: _Body, send: Send, refuse: Callable[[ApiError], Awaitable[None]]
     ) -> None:
-        """Pass a request on if there is room for it and its client's address sends few enough."""
+        """Pass a request on if the limit allows it and its client's address sends few enough."""
         operations = scope["path"] in self._operations_paths
-        room = self._operations_room if operations else self._room
-        if not room.take():
-            # To read on would be to hold what there is no room for.
+        limit = self._operations_limit if operations else self._limit
+        if not limit.take():
+            # Reading on would hold what the limit is there to refuse.
             body.abandon()
             await refuse(overloaded())
             return
@@ -240,7 +240,7 @@ class RequestContext:
         except ApiError as refusal:
             await refuse(refusal)
         finally:
-            room.give_back()
+            limit.give_back()
 
     async def _start_and_stop(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass on the life of the worker, without the text of what ended it.

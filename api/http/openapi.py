@@ -169,7 +169,7 @@ def allowed_methods(document: Mapping[str, Any], path: str) -> list[str]:
         for template in document["paths"]
         if re.fullmatch(re.sub(r"\{[^}]*\}", "[^/]+", template), path)
     ]
-    for template in sorted(fitting, key=lambda each: each.count("{")):
+    for template in sorted(fitting, key=lambda template: template.count("{")):
         return sorted(method.upper() for method in document["paths"][template])
     return []
 

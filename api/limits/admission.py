@@ -147,7 +147,7 @@ class Gate:
         # Never short of threads: it has one for each slot.
         self._threads = anyio.CapacityLimiter(slots)
         self._queries = anyio.CapacityLimiter(max(4, 2 * slots))
-        self._room = slots + waiting
+        self._free_places = slots + waiting
         self._places: Counter[str] = Counter()
         self._asking = 0
 
@@ -179,15 +179,15 @@ class Gate:
         ApiError
             ``overloaded``, with ``Retry-After``.
         """
-        taken, left = self._places[key] + 1, self._room - 1
+        taken, left = self._places[key] + 1, self._free_places - 1
         if left < 0 or (taken > 1 and taken > SHARE * left):
             raise overloaded()
-        self._room = left
+        self._free_places = left
         self._places[key] = taken
         try:
             yield
         finally:
-            self._room += 1
+            self._free_places += 1
             self._places[key] -= 1
             if not self._places[key]:
                 del self._places[key]
@@ -221,7 +221,7 @@ class Gate:
 
 
 def overloaded() -> ApiError:
-    """Return the refusal of a request for which there is no room."""
+    """Return the refusal of a request for which there is no place."""
     return ApiError(
         "overloaded",
         "too many requests are waiting; try again shortly",

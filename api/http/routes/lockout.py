@@ -27,16 +27,16 @@ async def get_lockout(
 
     `not_found` where no verification failed since the last accept or reset.
     """
-    found = await gate.query(lambda: runtime.store.attempts.status(caller.tenant, subject))
-    if found is None or (found.consecutive == 0 and found.disabled_at is None):
+    status = await gate.query(lambda: runtime.store.attempts.status(caller.tenant, subject))
+    if status is None or (status.consecutive == 0 and status.disabled_at is None):
         raise ApiError("not_found", "this subject has no failed attempts")
     return answer(
         request,
         {
-            "consecutive_failures": found.consecutive,
-            "last_failed_at": iso_time(found.last_failed_at),
-            "locked_until": iso_time(found.locked_until),
-            "disabled_at": iso_time(found.disabled_at),
+            "consecutive_failures": status.consecutive,
+            "last_failed_at": iso_time(status.last_failed_at),
+            "locked_until": iso_time(status.locked_until),
+            "disabled_at": iso_time(status.disabled_at),
         },
     )
 

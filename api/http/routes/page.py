@@ -65,9 +65,9 @@ class Served:
     def answer(self, request: Request) -> Response:
         """Return the file, or that the browser's copy is still the same."""
         headers = {**HEADERS, "ETag": self.etag}
-        held = [each.strip().removeprefix("W/") for each in
-                request.headers.get("if-none-match", "").split(",")]  # fmt: skip
-        if self.etag in held or "*" in held:
+        tags = request.headers.get("if-none-match", "").split(",")
+        copies = {tag.strip().removeprefix("W/") for tag in tags}
+        if copies & {self.etag, "*"}:
             return Response(status_code=304, headers=headers)
         return Response(self.body, media_type=self.media_type, headers=headers)
 
@@ -86,10 +86,10 @@ def page_routes(*, demo: bool) -> list[BaseRoute]:
         return index.answer(request)
 
     async def asset(request: Request) -> Response:
-        found = assets.get(request.path_params["name"])
-        if found is None:
+        file = assets.get(request.path_params["name"])
+        if file is None:
             raise ApiError("not_found", "there is no such path")
-        return found.answer(request)
+        return file.answer(request)
 
     routes: list[BaseRoute] = [_route("/", page), _route("/assets/{name}", asset)]
     if demo:
