@@ -295,7 +295,7 @@ class Settings(BaseSettings):
     def _known_database(cls, value: str | None) -> str | None:
         # Imported here: most commands that read settings ask no database.
         from templates.errors import StoreError
-        from templates.store.database import checked_url
+        from templates.store.engine import checked_url
 
         if value:
             try:

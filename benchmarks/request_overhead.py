@@ -147,7 +147,7 @@ def steps_of(
         face = max(faces, key=lambda found: found.area)
         crop = clock.time("align", pack.align, image, face)
         embedding = clock.time("embed", pack.embed, crop[None])[0]
-        stored = clock.time("fetch and decrypt", runtime.store.get, tenant, person.name)
+        stored = clock.time("fetch and decrypt", runtime.store.subjects.get, tenant, person.name)
         if stored is None:
             raise SystemExit(f"{person.name} is not enrolled")
         clock.time("compare and decide", verifier.decide_embedding, embedding, stored.wire)

@@ -422,7 +422,7 @@ def _open_the_store(traces: ServiceTraces) -> None:
         key = store.tenants.rotation_key("default").key
         traces.rotation = tenant_rotation(key, traces.material.pool.shape[1])
         for subject in traces.subjects:
-            opened = store.get("default", subject)
+            opened = store.subjects.get("default", subject)
             assert opened is not None
             n, m = opened.record.n, opened.record.m
             payload = np.frombuffer(opened.wire[-2 * n * (m + 1) :], dtype="<f2")
@@ -430,7 +430,7 @@ def _open_the_store(traces: ServiceTraces) -> None:
             # The reader's foot point agrees: these are the arrays of the format, foot first.
             assert np.allclose(decode(opened.wire).subspace.foot, rows[0], atol=1e-3)
             traces.templates[subject] = OpenedTemplate(rows)
-        pseudonym = store.pseudonym("default", traces.subjects[0])
+        pseudonym = store.signer.pseudonym("default", traces.subjects[0])
     finally:
         store.close()
     engine = sa.create_engine(_driver(traces.database_url))

@@ -508,7 +508,7 @@ def test_the_architecture_names_what_exists() -> None:
 def fail_once(deployment: Deployment, subject: str) -> None:
     """A rejected verification, as over REST, where it counts on the subject."""
     store = open_store(deployment.settings, open_keyring(deployment.settings))
-    held = store.describe("default", subject)
+    held = store.subjects.describe("default", subject)
     assert held is not None
     store.attempts.conclude(
         "default",

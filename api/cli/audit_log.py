@@ -139,7 +139,7 @@ def show(
     written = 0
     with checked_store(settings) as store:
         name = tenant or (settings.default_tenant if subject is not None else None)
-        pseudonym = None if subject is None else store.pseudonym(str(name), subject)
+        pseudonym = None if subject is None else store.signer.pseudonym(str(name), subject)
         for line in store.audit_log.lines(after=after):
             if name is not None and line.tenant != name:
                 continue

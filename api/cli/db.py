@@ -117,9 +117,9 @@ def compact(*, settings: Settings, as_json: AsJson = False) -> None:
     Example: `veilface db compact --data-dir veilface-data`
     """
     with checked_store(settings) as store:
-        before = store.size()
+        before = store.database.size()
         store.compact()
-        after = store.size()
+        after = store.database.size()
     if as_json:
         emit({"bytes_before": before, "bytes_after": after})
     else:
@@ -173,9 +173,9 @@ def purge(
     """
     retention = retention_of(settings)
     with checked_store(settings) as store:
-        due, erased = store.due(retention), 0
+        due, erased = store.retention.due(retention), 0
         if not dry_run:
-            erased = store.erase_expired(retention)
+            erased = store.retention.erase_expired(retention)
             store.purge()
     if as_json:
         emit({"due": due, "erased": erased})

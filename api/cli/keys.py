@@ -384,11 +384,11 @@ def _rewrap(settings: Settings, *, retire: bool, as_json: bool) -> None:
     path = settings.resolved_master_key_file
     keyring = open_keyring(settings)
     with _store(settings, keyring) as store:
-        total = sum(n for key, n in store.wrapping_keys().items() if key != keyring.current)
+        total = sum(n for key, n in store.wrapped_keys.count().items() if key != keyring.current)
         with progress("wrapping keys again", total) as advance:
-            changed = store.rewrap(progress=advance)
+            changed = store.wrapped_keys.rewrap(progress=advance)
         current = keyring.current
-        left = set(store.wrapping_keys()) - {current}
+        left = set(store.wrapped_keys.count()) - {current}
     files = _seal_files_again(settings, keyring)
     dropped = 0
     if retire:

@@ -19,7 +19,7 @@ from models.errors import ModelError
 from models.pack import FacePolicy, ModelPack
 from templates.decoys import Attributes
 from templates.store.audit_log import Entry
-from templates.store.subjects import Source
+from templates.store.subject_rows import Source
 
 Subject = Annotated[str, typer.Argument(help="Id of the person.", show_default=False)]
 Face = Annotated[
@@ -164,7 +164,7 @@ def verify(
             raise CommandError(f"{photo.name}: {error}") from None
         outcome = "accept" if decision.accepted else "reject"
         # Another action than the service's: what an operator tries is not counted by the lockout.
-        pseudonym = runtime.store.pseudonym(name, subject)
+        pseudonym = runtime.store.signer.pseudonym(name, subject)
         runtime.store.audit_log.record(
             Entry("verify-locally", outcome, operator(), name, pseudonym)
         )

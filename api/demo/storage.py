@@ -34,7 +34,7 @@ def read_stored(folder: Path, names: Sequence[str]) -> tuple[Stored, ...]:
     found = []
     try:
         for name in names:
-            subject = store.get(TENANT, name)
+            subject = store.subjects.get(TENANT, name)
             if subject is None:
                 continue
             foot_norm = wire.decode(subject.wire).subspace.foot_norm

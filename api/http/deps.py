@@ -39,7 +39,9 @@ async def subject_of(
         If it breaks the rule.
     """
     runtime: Runtime = request.app.state.runtime
-    note_subject(request, runtime.store.pseudonym(caller.tenant, checked_subject_id(subject_id)))
+    note_subject(
+        request, runtime.store.signer.pseudonym(caller.tenant, checked_subject_id(subject_id))
+    )
     return subject_id
 
 

@@ -28,7 +28,7 @@ from templates.errors import ContractError, ContractMismatch, InvalidTemplate, S
 from templates.keys.sealing import MasterKeyring
 from templates.store.audit_chain import Anchor
 from templates.store.identifiers import InvalidIdentifier
-from templates.store.subjects import Source
+from templates.store.subject_rows import Source
 from templates.store.transfers import Stamp
 
 MAGIC = b"VEILEXP1"
@@ -130,11 +130,11 @@ def open_export(data: bytes, *, key: ExportKey, tenant: str, contract_id: str) -
     start = len(MAGIC) + CONTRACT_ID_BYTES
     if len(data) < start or not data.startswith(MAGIC):
         raise InvalidTemplate("this is not an export of Veilface")
-    theirs = data[len(MAGIC) : start].hex()
-    if theirs != contract_id:
+    export_contract_id = data[len(MAGIC) : start].hex()
+    if export_contract_id != contract_id:
         raise ContractMismatch(
-            f"the export belongs to contract {theirs[:16]}, the service to {contract_id[:16]}; "
-            "the subject must enroll again"
+            f"the export belongs to contract {export_contract_id[:16]}, the service to "
+            f"{contract_id[:16]}; the subject must enroll again"
         )
     try:
         plain = key.keyring.open(

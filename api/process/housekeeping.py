@@ -43,7 +43,7 @@ async def purge_regularly(
     def purge() -> None:
         if not keep.keeps_all:
             # Before the rest: it is emptied from the log of the same round.
-            store.erase_expired(keep)
+            store.retention.erase_expired(keep)
         store.purge(wait=PURGE_WAIT_S)
 
     # A thread of its own: requests in the default limiter do not delay it, nor it them.

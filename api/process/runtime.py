@@ -46,7 +46,8 @@ from templates.keys.sealing import MasterKeyring
 from templates.space.lifting import Strategy
 from templates.store import TemplateStore
 from templates.store.audit_log import By
-from templates.store.subjects import Guard, Source, StoredTemplate, SubjectTemplate
+from templates.store.subject_rows import Source, SubjectTemplate
+from templates.store.subjects import Guard, StoredTemplate
 from templates.store.tenants import RetiredRotation
 from verify import Verifier
 
@@ -154,8 +155,8 @@ class Runtime:
         store = open_store(settings, keyring)
         prepare_database(store)
         # Obtained now, so that no request waits for it, nor fails on it.
-        store.pseudonym(settings.default_tenant, "-")
-        store.receipt_public_key()
+        store.signer.pseudonym(settings.default_tenant, "-")
+        store.signer.public_key()
         if settings.export_key_file is not None:
             export_key = ExportKey.from_file(settings.export_key_file)
         else:
@@ -194,10 +195,10 @@ class Runtime:
     ) -> tuple[SubjectTemplate, InRotation] | None:
         """Return a subject's template and what works with its rotation; None if there is none.
 
-        ``contract_id`` as for ``TemplateStore.get``.
+        ``contract_id`` as for ``Subjects.get``.
         """
         for _ in range(READS):
-            found = self.store.get(tenant, subject, contract_id=contract_id)
+            found = self.store.subjects.get(tenant, subject, contract_id=contract_id)
             if found is None:
                 return None
             with contextlib.suppress(RetiredRotation):
@@ -288,9 +289,9 @@ class Runtime:
         by: By,
         guard: Guard | None = None,
     ) -> StoredTemplate:
-        """Store an enrollment in place of an earlier one; `guard` as for ``TemplateStore.put``."""
+        """Store an enrollment in place of an earlier one; `guard` as for ``Subjects.put``."""
         binding = self.contract.binding
-        return self.store.put(
+        return self.store.subjects.put(
             tenant,
             subject,
             enrollment.wire,

@@ -15,13 +15,8 @@ from templates.store.receipts import Receipt, verify_receipt
 from templates.store.repository import TemplateStore
 from templates.store.retention import Retention
 from templates.store.standing import AttemptsStatus
-from templates.store.subjects import (
-    Source,
-    StoredTemplate,
-    SubjectPage,
-    SubjectRecord,
-    SubjectTemplate,
-)
+from templates.store.subject_rows import Source, SubjectRecord, SubjectTemplate
+from templates.store.subjects import StoredTemplate, SubjectPage
 from templates.store.tenant_erasure import TenantErasure
 from templates.store.tenants import RetiredRotation, RotationKey, Tenant
 

@@ -24,7 +24,7 @@ from templates.store.authenticity import (
     row_mac,
     warn,
 )
-from templates.store.database import Database
+from templates.store.context import StoreContext
 from templates.store.schema import (
     ATTEMPT_LINES,
     KEY_LINES,
@@ -53,7 +53,7 @@ class Adoption:
     refused: tuple[str, ...] = ()
 
 
-def adopt(database: Database, audit_log: AuditLog) -> Adoption:
+def adopt(context: StoreContext) -> Adoption:
     """Authenticate the rows there are, if this database's never were.
 
     In one transaction, while no other write runs.
@@ -63,10 +63,10 @@ def adopt(database: Database, audit_log: AuditLog) -> Adoption:
     BrokenAuditLog
         If the key of the audit log is gone.
     """
-    audit_log.prepare()
-    if database.read(audit_log.authenticates_rows):
+    audit_log = context.audit_log
+    if context.read(audit_log.authenticates_rows):
         return Adoption()
-    return database.write_alone(lambda each: _adopt(each, audit_log))
+    return context.database.write_alone(lambda connection: _adopt(connection, audit_log))
 
 
 def _adopt(connection: Connection, audit_log: AuditLog) -> Adoption:
@@ -76,8 +76,8 @@ def _adopt(connection: Connection, audit_log: AuditLog) -> Adoption:
     for prefix in refused:
         warn("an API key that the audit log contradicts was not authenticated", key_id=prefix)
     rows = sum(
-        _authenticate(connection, audit_log.row_key(), table, line, ours)
-        for table, line, ours in (
+        _authenticate(connection, audit_log.row_key(), table, line, authentic)
+        for table, line, authentic in (
             (TenantRow, LAST_TENANT_LINE, sa.true()),
             (ApiKeyRow, LAST_KEY_LINE, ApiKeyRow.prefix.not_in(refused)),
             (FailedAttemptsRow, _LAST_ATTEMPT_LINE, sa.true()),
@@ -107,14 +107,14 @@ def _authenticate(
         *(column == sa.bindparam(f"of_{column.key}") for column in rows.primary_key)
     )
     # Read whole before it is written: a cursor over rows that change meanwhile is not defined.
-    found = [row._asdict() for row in connection.execute(query)]
-    for values in found:
+    before = [row._asdict() for row in connection.execute(query)]
+    for values in before:
         changed = {"mac": row_mac(key, table, values)}
         if last_line is not None:
             changed["line"] = values["line"]
         whose = {f"of_{column.key}": values[column.key] for column in rows.primary_key}
         connection.execute(statement, {**whose, **changed})
-    return len(found)
+    return len(before)
 
 
 def _contradicted(connection: Connection, line_key: bytes) -> Iterator[str]:
@@ -124,8 +124,8 @@ def _contradicted(connection: Connection, line_key: bytes) -> Iterator[str]:
     for key in connection.execute(query.order_by(ApiKeyRow.prefix)).all():
         lines = [
             line
-            for columns in connection.execute(_LINES_OF_KEY, {"prefix": key.prefix})
-            if is_true_line(line_key, line := Line(*columns))
+            for row in connection.execute(_LINES_OF_KEY, {"prefix": key.prefix})
+            if is_true_line(line_key, line := Line(**row._mapping))
         ]
         created = any((line.action, line.tenant) == ("key-create", key.tenant) for line in lines)
         revoked = any((line.action, line.outcome) == ("key-revoke", "revoked") for line in lines)

@@ -24,18 +24,12 @@ from sqlalchemy.engine import Connection
 from templates.contract.levels import LEVEL_NAME
 from templates.errors import StoreError, StoreUnavailable
 from templates.keys.api_token import TOKEN, probe_key
-from templates.keys.sealing import MasterKeyring, sealed_key_id
-from templates.store.audit_log import PROGRAM, TENANT_ERASE, AuditLog, By, Entry
-from templates.store.authenticity import (
-    LAST_KEY_LINE,
-    columns_of,
-    is_current,
-    row_mac,
-    warn,
-)
-from templates.store.database import Database
-from templates.store.identifiers import Clock, UnknownTenant
+from templates.keys.sealing import sealed_key_id
+from templates.store.audit_log import PROGRAM, TENANT_ERASE, By, Entry
+from templates.store.authenticity import LAST_KEY_LINE, columns_of, is_current, row_mac, warn
+from templates.store.context import StoreContext
 from templates.store.schema import ApiKeyRow, AuditRow, TenantRow
+from templates.store.subject_rows import tenant_id_of
 from templates.store.tenants import Tenants
 
 PROBE_KEY_PURPOSE = "api-key-probe-key"
@@ -75,9 +69,9 @@ class ApiKey:
     rights: frozenset[Right]
     label: str
     created_at: datetime
-    expires_at: datetime | None
-    revoked_at: datetime | None
-    last_used_at: datetime | None
+    expires_at: datetime | None = None
+    revoked_at: datetime | None = None
+    last_used_at: datetime | None = None
     lowest_level: str | None = None
     authentic: bool = True
 
@@ -95,22 +89,23 @@ class NewApiKey:
     token: str = field(repr=False)
 
 
+@dataclass(frozen=True)
+class _Grant:
+    """What a key that is made is good for."""
+
+    tenant: str
+    rights: frozenset[Right]
+    label: str
+    expires_at: datetime | None = None
+    lowest_level: str | None = None
+
+
 class ApiKeys:
     """Repository of API keys."""
 
-    def __init__(
-        self,
-        database: Database,
-        keyring: MasterKeyring,
-        tenants: Tenants,
-        audit_log: AuditLog,
-        clock: Clock,
-    ) -> None:
-        self._database = database
-        self._keyring = keyring
+    def __init__(self, context: StoreContext, tenants: Tenants) -> None:
+        self._context = context
         self._tenants = tenants
-        self._audit_log = audit_log
-        self._clock = clock
 
     def create(
         self,
@@ -136,18 +131,8 @@ class ApiKeys:
             raise StoreError(f"a label has at most {MAX_LABEL} printable characters")
         if lowest_level is not None and not LEVEL_NAME.fullmatch(lowest_level):
             raise StoreError("the lowest level of a key is the name of a level, such as fmr-1e-4")
-        self._audit_log.prepare()
-        return self._database.write(
-            lambda each: self._insert(
-                each,
-                tenant,
-                granted,
-                label=label,
-                expires_at=expires_at,
-                lowest_level=lowest_level,
-                by=by,
-            )
-        )
+        grant = _Grant(tenant, granted, label, expires_at, lowest_level)
+        return self._context.write(lambda connection: self._insert(connection, grant, by))
 
     def bootstrap(
         self,
@@ -161,23 +146,14 @@ class ApiKeys:
         Of any number of processes that call this at once, one gets the key and the others None.
         """
         granted = _rights(rights)
-        self._audit_log.prepare()
 
         def work(connection: Connection) -> NewApiKey | None:
             if _had_keys(connection):
                 return None
             self._tenants.ensure(connection, tenant)
-            return self._insert(
-                connection,
-                tenant,
-                granted,
-                label="bootstrap",
-                expires_at=None,
-                lowest_level=None,
-                by=by,
-            )
+            return self._insert(connection, _Grant(tenant, granted, "bootstrap"), by)
 
-        return self._database.write(work, lock="bootstrap")
+        return self._context.write(work, lock="bootstrap")
 
     def verify(self, token: str) -> ApiKey | None:
         """Return the key of a token, or None if it is unknown, wrong, expired or revoked.
@@ -187,11 +163,8 @@ class ApiKeys:
         """
         match = TOKEN.fullmatch(token)
         prefix = match[1] if match else ""
-        self._audit_log.prepare()
         try:
-            row = self._database.read(
-                lambda each: each.execute(_OF_PREFIX, {"prefix": prefix}).one_or_none()
-            )
+            row = self._row(prefix)
         except (ValueError, TypeError):
             # SQLite keeps any value in any column.
             warn("an API key's row is not authentic and was passed over", key_id=prefix)
@@ -200,7 +173,7 @@ class ApiKeys:
         same = hmac.compare_digest(_token_hash(token), expected)
         if row is None or not same:
             return None
-        key, now = self._read(row), self._clock()
+        key, now = self._read(row), self._context.clock()
         if not key.authentic:
             warn("an API key's row is not authentic and was passed over", key_id=prefix)
         if not key.is_valid_at(now):
@@ -210,10 +183,7 @@ class ApiKeys:
 
     def get(self, prefix: str) -> ApiKey | None:
         """Return a key by its prefix, or None."""
-        self._audit_log.prepare()
-        row = self._database.read(
-            lambda each: each.execute(_OF_PREFIX, {"prefix": prefix}).one_or_none()
-        )
+        row = self._row(prefix)
         return None if row is None else self._read(row)
 
     def all(self, *, tenant: str | None = None) -> tuple[ApiKey, ...]:
@@ -221,8 +191,7 @@ class ApiKeys:
         query = _KEYS.order_by(ApiKeyRow.created_at, ApiKeyRow.prefix)
         if tenant is not None:
             query = query.where(TenantRow.name == tenant)
-        self._audit_log.prepare()
-        rows = self._database.read(lambda each: each.execute(query).all())
+        rows = self._context.read(lambda connection: connection.execute(query).all())
         return tuple(self._read(row) for row in rows)
 
     def revoke(self, prefix: str, *, by: By = PROGRAM) -> bool:
@@ -230,12 +199,12 @@ class ApiKeys:
 
         An unknown prefix does not get into the audit log: it may be a token that was taken for one.
         """
-        self._audit_log.prepare()
 
         def work(connection: Connection) -> bool:
             row = connection.execute(_LOCKED, {"prefix": prefix}).one_or_none()
             if row is None:
-                self._audit_log.append(connection, Entry("key-revoke", "unknown_key", by))
+                entry = Entry("key-revoke", "unknown_key", by)
+                self._context.audit_log.append(connection, entry)
                 return False
             revoked = row.revoked_at is None
             outcome = "revoked" if revoked else "revoked_before"
@@ -243,17 +212,17 @@ class ApiKeys:
                 connection,
                 row,
                 Entry("key-revoke", outcome, by, row.tenant, detail=prefix),
-                revoked_at=self._clock() if revoked else row.revoked_at,
+                revoked_at=self._context.clock() if revoked else row.revoked_at,
             )
             return revoked
 
-        return self._database.write(work)
+        return self._context.write(work)
 
     def revoke_all(self, connection: Connection, tenant: str, *, by: By) -> None:
         """Revoke every key of a tenant inside a transaction that is open already."""
         query = _KEYS.where(TenantRow.name == tenant, ApiKeyRow.revoked_at.is_(None))
         rows = connection.execute(query.order_by(ApiKeyRow.id).with_for_update(of=ApiKeyRow)).all()
-        now = self._clock()
+        now = self._context.clock()
         for row in rows:
             entry = Entry("key-revoke", "revoked", by, tenant, detail=row.prefix)
             self._change(connection, row, entry, revoked_at=now)
@@ -280,23 +249,15 @@ class ApiKeys:
         """
         if grace < timedelta(0):
             raise StoreError("the time that an old key stays valid is nothing or more")
-        self._audit_log.prepare()
 
         def work(connection: Connection) -> NewApiKey | None:
-            now = self._clock()
+            now = self._context.clock()
             row = connection.execute(_LOCKED, {"prefix": prefix}).one_or_none()
             old = None if row is None else self._read(row)
             if old is None or not old.is_valid_at(now):
                 return None
-            new = self._insert(
-                connection,
-                old.tenant,
-                old.rights,
-                label=old.label,
-                expires_at=old.expires_at,
-                lowest_level=old.lowest_level,
-                by=by,
-            )
+            grant = _Grant(old.tenant, old.rights, old.label, old.expires_at, old.lowest_level)
+            new = self._insert(connection, grant, by)
             self._change(
                 connection,
                 row,
@@ -305,67 +266,52 @@ class ApiKeys:
             )
             return new
 
-        return self._database.write(work)
+        return self._context.write(work)
 
     def probe_key(self, prefix: str) -> bytes:
         """Open the key that probes of this API key are signed with; see :func:`probe_key`."""
-        row = self._database.read(
-            lambda each: each.execute(
-                sa.select(ApiKeyRow.id, ApiKeyRow.wrapped_probe_key).where(
-                    ApiKeyRow.prefix == prefix
-                )
-            ).one_or_none()
+        columns = ApiKeyRow.id, ApiKeyRow.wrapped_probe_key
+        query = sa.select(*columns).where(ApiKeyRow.prefix == prefix)
+        row = self._context.database.read(
+            lambda connection: connection.execute(query).one_or_none()
         )
         if row is None:
             raise StoreError("there is no API key of this prefix")
-        return self._keyring.open(
+        return self._context.keyring.open(
             row.wrapped_probe_key, purpose=PROBE_KEY_PURPOSE, bound_to=[row.id]
         )
 
-    def _insert(
-        self,
-        connection: Connection,
-        tenant: str,
-        rights: frozenset[Right],
-        *,
-        label: str,
-        expires_at: datetime | None,
-        lowest_level: str | None,
-        by: By,
-    ) -> NewApiKey:
-        tenant_id = connection.execute(
-            sa.select(TenantRow.id).where(TenantRow.name == tenant)
-        ).scalar_one_or_none()
-        if tenant_id is None:
-            raise UnknownTenant(f"there is no tenant {tenant!r}")
-        key_id, prefix, now = uuid.uuid4().hex, os.urandom(6).hex(), self._clock()
+    def _row(self, prefix: str) -> Any:
+        return self._context.read(
+            lambda connection: connection.execute(_OF_PREFIX, {"prefix": prefix}).one_or_none()
+        )
+
+    def _insert(self, connection: Connection, grant: "_Grant", by: By) -> NewApiKey:
+        tenant_id = tenant_id_of(connection, grant.tenant)
+        key_id, prefix = uuid.uuid4().hex, os.urandom(6).hex()
+        key = ApiKey(id=key_id, prefix=prefix, created_at=self._context.clock(), **vars(grant))
         token = f"vf_{prefix}_{os.urandom(32).hex()}"
-        wrapped = self._keyring.seal(probe_key(token), purpose=PROBE_KEY_PURPOSE, bound_to=[key_id])
-        entry = Entry("key-create", "created", by, tenant, detail=prefix)
+        wrapped = self._context.keyring.seal(
+            probe_key(token), purpose=PROBE_KEY_PURPOSE, bound_to=[key_id]
+        )
+        entry = Entry("key-create", "created", by, key.tenant, detail=prefix)
         row: dict[str, Any] = {
             "id": key_id,
             "tenant_id": tenant_id,
-            "tenant": tenant,
             "prefix": prefix,
             "token_hash": _token_hash(token),
-            "rights": ",".join(sorted(rights)),
-            "label": label,
-            "created_at": now,
-            "expires_at": expires_at,
+            "rights": ",".join(sorted(key.rights)),
+            "label": key.label,
+            "created_at": key.created_at,
+            "expires_at": key.expires_at,
             "revoked_at": None,
-            "lowest_level": lowest_level,
-            "line": self._audit_log.append(connection, entry),
+            "lowest_level": key.lowest_level,
+            "line": self._context.audit_log.append(connection, entry),
         }
-        mac = row_mac(self._audit_log.row_key(), ApiKeyRow, row)
-        del row["tenant"]
-        connection.execute(
-            sa.insert(ApiKeyRow).values(
-                **row, mac=mac, wrapped_probe_key=wrapped, wrapping_key=sealed_key_id(wrapped)
-            )
-        )
-        key = ApiKey(
-            key_id, prefix, tenant, rights, label, now, expires_at, None, None, lowest_level
-        )
+        row_key = self._context.audit_log.row_key()
+        row["mac"] = row_mac(row_key, ApiKeyRow, {**row, "tenant": key.tenant})
+        wrapping = {"wrapped_probe_key": wrapped, "wrapping_key": sealed_key_id(wrapped)}
+        connection.execute(sa.insert(ApiKeyRow).values(**row, **wrapping))
         return NewApiKey(key=key, token=token)
 
     def _change(self, connection: Connection, row: Any, entry: Entry, **columns: object) -> None:
@@ -374,36 +320,25 @@ class ApiKeys:
         A row that is not authentic stays so: whatever else it holds must not be vouched for.
         """
         authentic = self._is_authentic(row)
-        columns["line"] = self._audit_log.append(connection, entry)
+        columns["line"] = self._context.audit_log.append(connection, entry)
         if authentic:
-            key = self._audit_log.row_key()
-            columns["mac"] = row_mac(key, ApiKeyRow, {**row._mapping, **columns})
+            row_key = self._context.audit_log.row_key()
+            columns["mac"] = row_mac(row_key, ApiKeyRow, {**row._mapping, **columns})
         statement = sa.update(ApiKeyRow).where(ApiKeyRow.prefix == row.prefix)
         connection.execute(statement.values(columns))
 
     def _is_authentic(self, row: Any) -> bool:
-        return is_current(self._audit_log.row_key(), ApiKeyRow, row._mapping)
+        return is_current(self._context.audit_log.row_key(), ApiKeyRow, row._mapping)
 
     def _read(self, row: Any) -> ApiKey:
-        authentic = self._is_authentic(row)
-        return ApiKey(
-            id=row.id,
-            prefix=row.prefix,
-            tenant=row.tenant,
-            rights=_granted(row.rights),
-            label=row.label,
-            created_at=row.created_at,
-            expires_at=row.expires_at,
-            revoked_at=row.revoked_at,
-            last_used_at=row.last_used_at,
-            lowest_level=row.lowest_level,
-            authentic=authentic,
-        )
+        values = {name: row._mapping[name] for name in _KEY_COLUMNS}
+        values["rights"] = _granted(row.rights)
+        return ApiKey(**values, authentic=self._is_authentic(row))
 
     def _note_use(self, key: ApiKey, now: datetime) -> None:
         # To the minute, so that verifying does not turn every request into a write.
-        noted, due = key.last_used_at, now - _USE_IS_NOTED_EVERY
-        if noted is not None and noted > due:
+        due = now - _USE_IS_NOTED_EVERY
+        if key.last_used_at is not None and key.last_used_at > due:
             return
         statement = (
             sa.update(ApiKeyRow)
@@ -415,9 +350,10 @@ class ApiKeys:
         )
         # A full or busy disk must not refuse a good key.
         with contextlib.suppress(StoreUnavailable):
-            self._database.write(lambda each: each.execute(statement))
+            self._context.database.write(lambda connection: connection.execute(statement))
 
 
+_KEY_COLUMNS = set(ApiKey.__dataclass_fields__) - {"authentic"}
 _KEYS: Any = sa.select(
     *columns_of(ApiKeyRow),
     TenantRow.name.label("tenant"),
@@ -452,7 +388,7 @@ def _granted(rights: str) -> frozenset[Right]:
 
 def _rights(rights: Iterable[Right | str]) -> frozenset[Right]:
     try:
-        granted = frozenset(Right(each) for each in rights)
+        granted = frozenset(Right(right) for right in rights)
     except ValueError:
         raise StoreError(f"the rights of a key are among {', '.join(Right)}") from None
     if not granted:

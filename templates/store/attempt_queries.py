@@ -21,7 +21,7 @@ from templates.store.schema import (
     TenantRow,
     UsedNonceRow,
 )
-from templates.store.subjects import TEMPLATE_COLUMNS
+from templates.store.subject_rows import TEMPLATE_COLUMNS
 
 _TENANT = TenantRow.name == sa.bindparam("tenant")
 _FAILURES = sa.and_(
@@ -79,7 +79,6 @@ BEFORE: Any = (
         *TEMPLATE_COLUMNS,
         TenantRow.rotation_epoch.label("current_epoch"),
         sa.or_(sa.exists(_USED_NONCE), sa.exists(_LOGGED_NONCE)).label("used"),
-        SubjectRow.id.label("subject_pk"),
         *COUNTS,
         *LAST_LINE,
     )
@@ -96,8 +95,7 @@ BEFORE: Any = (
 """All that is looked at before a decision; one row where there is the tenant.
 
 Of `tenant`, `pseudonym`, `subject_id`, `contract_id`, `key_prefix`, `nonce_hash` and
-`nonce_digest`. The columns of the template are the first, and NULL where the subject has none of
-the contract.
+`nonce_digest`. The columns of the template are NULL where the subject has none of the contract.
 """
 
 STANDING: Any = (

@@ -11,7 +11,7 @@ import hashlib
 import hmac
 from collections.abc import Callable
 from dataclasses import dataclass
-from datetime import datetime, timedelta
+from datetime import timedelta
 from functools import partial
 from typing import Any, Protocol, TypeVar
 
@@ -19,28 +19,16 @@ import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
 from templates.errors import StoreError
-from templates.keys.sealing import MasterKeyring, encode_parts
-from templates.store.attempt_queries import BEFORE, FIRST_COUNTS, NEXT_COUNTS, NOTE_USE, STANDING
-from templates.store.audit_log import AuditLog, By, Entry
-from templates.store.database import Database
+from templates.keys.sealing import encode_parts
+from templates.store.attempt_queries import BEFORE, NOTE_USE, STANDING
+from templates.store.audit_log import By, Entry
+from templates.store.context import StoreContext
 from templates.store.deployment import insert_once
-from templates.store.identifiers import Clock, UnknownTenant, checked_subject_id
+from templates.store.identifiers import UnknownTenant, checked_subject_id
 from templates.store.lockout import LockedOut, LockoutPolicy, Nonce, Replayed, Superseded
-from templates.store.receipts import ReceiptSigner
 from templates.store.schema import FailedAttemptsRow, UsedNonceRow
-from templates.store.standing import (
-    UNKNOWN_RETENTION,
-    AttemptsStatus,
-    Subject,
-    counts_row,
-    standing,
-)
-from templates.store.subjects import (
-    TEMPLATE_COLUMNS,
-    SubjectTemplate,
-    opened_template,
-    subject_lock,
-)
+from templates.store.standing import UNKNOWN_RETENTION, AttemptsStatus, Standing
+from templates.store.subject_rows import SubjectTemplate, opened_template, subject_lock
 
 NONCE_GRACE = timedelta(minutes=5)
 BATCH = 500
@@ -87,21 +75,9 @@ D = TypeVar("D", bound=Decided)
 class Attempts:
     """Repository of failed attempts and used nonces."""
 
-    def __init__(
-        self,
-        database: Database,
-        keyring: MasterKeyring,
-        signer: ReceiptSigner,
-        audit_log: AuditLog,
-        clock: Clock,
-        policy: LockoutPolicy,
-    ) -> None:
-        self._database = database
-        self._keyring = keyring
-        self._signer = signer
-        self._audit_log = audit_log
-        self._clock = clock
-        self._policy = policy
+    def __init__(self, context: StoreContext, policy: LockoutPolicy) -> None:
+        self._context = context
+        self._standing = Standing(context.audit_log, context.clock, policy)
 
     def begin(
         self, tenant: str, subject_id: str, *, contract_id: str, nonce: Nonce | None = None
@@ -127,8 +103,8 @@ class Attempts:
         SealError
             If the row was altered or moved, or its master key is missing.
         """
-        about = self._about(tenant, subject_id, nonce, contract_id)
-        return self._opened(self._database.read(partial(self._before, about=about)))
+        asked = self._asked(tenant, subject_id, nonce, contract_id)
+        return self._opened(self._context.read(partial(self._before, asked=asked)))
 
     def conclude(
         self,
@@ -178,13 +154,12 @@ class Attempts:
             If the subject's template is another one now. Nothing is written.
         UnknownTenant, StoreError, StoreUnavailable
         """
-        about = self._about(tenant, subject_id, nonce, contract_id)
-        self._audit_log.prepare()
+        asked = self._asked(tenant, subject_id, nonce, contract_id)
 
         def work(connection: Connection) -> LockedOut | Replayed | None:
-            return self._record(connection, about, accepted, template_id, nonce, level, by)
+            return self._record(connection, asked, accepted, template_id, nonce, level, by)
 
-        refusal = self._database.write(work, lock=subject_lock(tenant, subject_id))
+        refusal = self._context.write(work, lock=subject_lock(tenant, subject_id))
         if refusal is not None:
             raise refusal
 
@@ -209,21 +184,20 @@ class Attempts:
         ------
         LockedOut, Replayed, UnknownTenant, SealError, StoreError, StoreUnavailable
         """
-        about = self._about(tenant, subject_id, nonce, contract_id)
-        self._audit_log.prepare()
+        asked = self._asked(tenant, subject_id, nonce, contract_id)
 
         def work(connection: Connection) -> D | LockedOut | Replayed:
-            attempt = self._opened(self._before(connection, about))
+            attempt = self._opened(self._before(connection, asked))
             decided = decide(attempt)
             refusal = self._record(
-                connection, about, decided.accepted, attempt.template_id, nonce, decided.level, by
+                connection, asked, decided.accepted, attempt.template_id, nonce, decided.level, by
             )
             return decided if refusal is None else refusal
 
-        found = self._database.write(work, lock=subject_lock(tenant, subject_id))
-        if isinstance(found, LockedOut | Replayed):
-            raise found
-        return found
+        outcome = self._context.write(work, lock=subject_lock(tenant, subject_id))
+        if isinstance(outcome, LockedOut | Replayed):
+            raise outcome
+        return outcome
 
     def reset(self, tenant: str, subject_id: str, *, by: By) -> bool:
         """Forget the consecutive failures on a subject, its lock and its being disabled.
@@ -233,30 +207,31 @@ class Attempts:
         bool
             False if there was none of these. The total stays.
         """
-        about = self._about(tenant, subject_id)
+        asked = self._asked(tenant, subject_id)
 
         def work(connection: Connection) -> bool:
-            row = _one(connection, query=STANDING, about=about)
-            status = self._standing(connection, row, about)
-            lifted = status is not None and status.holds_something
-            outcome = "reset" if lifted else "nothing_held"
-            entry = Entry("lockout-reset", outcome, by, tenant, about["pseudonym"])
-            line = self._audit_log.append(connection, entry)
-            if lifted and status is not None:
-                self._write_counts(connection, row, about, status.cleared(), line)
-            return lifted
+            row = _one(connection, STANDING, asked)
+            status = self._status(connection, row, asked)
+            held = status is not None and status.holds_something
+            outcome = "reset" if held else "nothing_held"
+            entry = Entry("lockout-reset", outcome, by, tenant, asked["pseudonym"])
+            line = self._context.audit_log.append(connection, entry)
+            if status is not None and held:
+                cleared = status.cleared()
+                self._standing.write(connection, row, asked["pseudonym"], cleared, line)
+            return held
 
-        return self._database.write(work, lock=subject_lock(tenant, subject_id))
+        return self._context.write(work, lock=subject_lock(tenant, subject_id))
 
     def status(self, tenant: str, subject_id: str) -> AttemptsStatus | None:
         """What is counted of a subject; None if no attempt on it ever failed."""
-        about = self._about(tenant, subject_id)
+        asked = self._asked(tenant, subject_id)
 
         def work(connection: Connection) -> AttemptsStatus | None:
-            row = connection.execute(STANDING, about).one_or_none()
-            return None if row is None else self._standing(connection, row, about)
+            row = connection.execute(STANDING, asked).one_or_none()
+            return None if row is None else self._status(connection, row, asked)
 
-        return self._database.read(work)
+        return self._context.read(work)
 
     def expire(self) -> int:
         """Remove nonces that are past their time, and old counts of who is not enrolled.
@@ -271,31 +246,28 @@ class Attempts:
         int
             How many were removed.
         """
-        now = self._clock()
-        return self._database.remove(
-            UsedNonceRow, UsedNonceRow.expires_at <= now - NONCE_GRACE, batch=BATCH
-        ) + self._database.remove(
-            FailedAttemptsRow,
-            sa.and_(
-                FailedAttemptsRow.known.is_(False),
-                FailedAttemptsRow.disabled_at.is_(None),
-                FailedAttemptsRow.last_failed_at <= now - UNKNOWN_RETENTION,
-            ),
-            batch=BATCH,
+        database, now = self._context.database, self._context.clock()
+        nonces = UsedNonceRow.expires_at <= now - NONCE_GRACE
+        counts = sa.and_(
+            FailedAttemptsRow.known.is_(False),
+            FailedAttemptsRow.disabled_at.is_(None),
+            FailedAttemptsRow.last_failed_at <= now - UNKNOWN_RETENTION,
         )
+        removed = database.remove(UsedNonceRow, nonces, batch=BATCH)
+        return removed + database.remove(FailedAttemptsRow, counts, batch=BATCH)
 
-    def _about(
+    def _asked(
         self,
         tenant: str,
         subject_id: str,
         nonce: Nonce | None = None,
         contract_id: str | None = None,
     ) -> dict[str, Any]:
-        self._audit_log.prepare()
+        """Parameters of :data:`BEFORE` and :data:`STANDING`."""
         return {
             "tenant": tenant,
             "subject_id": subject_id,
-            "pseudonym": self._signer.pseudonym(tenant, checked_subject_id(subject_id)),
+            "pseudonym": self._context.signer.pseudonym(tenant, checked_subject_id(subject_id)),
             "contract_id": contract_id,
             "key_prefix": None if nonce is None else nonce.key_prefix,
             "nonce_hash": None if nonce is None else nonce.hash,
@@ -305,65 +277,58 @@ class Attempts:
     def _digest(self, nonce: Nonce) -> str:
         """What the audit log keeps of a nonce."""
         message = encode_parts("nonce", nonce.key_prefix, nonce.hash)
-        return hmac.new(self._audit_log.row_key(), message, hashlib.sha256).hexdigest()
+        row_key = self._context.audit_log.row_key()
+        return hmac.new(row_key, message, hashlib.sha256).hexdigest()
 
-    def _before(self, connection: Connection, about: dict[str, Any]) -> Any:
+    def _before(self, connection: Connection, asked: dict[str, Any]) -> Any:
         """Row of :data:`BEFORE`, where nothing refuses the attempt."""
-        row = _one(connection, query=BEFORE, about=about)
+        row = _one(connection, BEFORE, asked)
         if row.used:
             raise Replayed
-        self._refuse_locked(self._standing(connection, row, about), self._clock())
+        self._standing.refuse_locked(self._status(connection, row, asked))
         return row
 
     def _opened(self, row: Any) -> Attempt:
-        template = row[: len(TEMPLATE_COLUMNS)]
-        found = None if row.template_id is None else opened_template(template, self._keyring)
-        return Attempt(rotation_epoch=row.current_epoch, template=found)
+        enrolled = row.template_id is not None
+        template = opened_template(row, self._context.keyring) if enrolled else None
+        return Attempt(rotation_epoch=row.current_epoch, template=template)
 
-    def _standing(
-        self, connection: Connection, row: Any, about: dict[str, Any]
+    def _status(
+        self, connection: Connection, row: Any, asked: dict[str, Any]
     ) -> AttemptsStatus | None:
-        return standing(
-            connection,
-            row,
-            Subject(about["tenant"], about["pseudonym"]),
-            line_key=self._audit_log.line_key(),
-            row_key=self._audit_log.row_key(),
-            policy=self._policy,
-            now=self._clock(),
-        )
+        tenant, pseudonym = asked["tenant"], asked["pseudonym"]
+        return self._standing.of(connection, row, tenant=tenant, pseudonym=pseudonym)
 
     def _record(
         self,
         connection: Connection,
-        about: dict[str, Any],
+        asked: dict[str, Any],
         accepted: bool,
         template_id: str | None,
         nonce: Nonce | None,
         level: str,
         by: By,
     ) -> LockedOut | Replayed | None:
-        row = _one(connection, query=STANDING, about=about)
-        status = self._standing(connection, row, about)
-        contract_id = about["contract_id"]
+        row = _one(connection, STANDING, asked)
+        status = self._status(connection, row, asked)
+        contract_id = asked["contract_id"]
         if accepted and template_id is None:
             raise ValueError("a subject that is not enrolled cannot be accepted")
         outcome = "accept" if accepted else "reject"
         refusal: LockedOut | Replayed | None = None
-        counted: AttemptsStatus | None = None
+        new_status: AttemptsStatus | None = None
         try:
             _use(connection, nonce, row)
-            now = self._clock()
-            self._refuse_locked(status, now)
+            self._standing.refuse_locked(status)
             of_contract = contract_id in (None, row.contract_id)
             if (row.template_id if of_contract else None) != template_id:
                 raise Superseded
             if accepted:
-                counted = status.cleared() if status and status.holds_something else None
-                note = {"of_subject": row.subject_pk, "last_used_at": now}
-                connection.execute(NOTE_USE, note)
+                new_status = status.cleared() if status and status.holds_something else None
+                use = {"of_subject": row.subject_pk, "last_used_at": self._context.clock()}
+                connection.execute(NOTE_USE, use)
             else:
-                counted = self._failed(status, now)
+                new_status = self._standing.after_failure(status)
         except LockedOut as error:
             outcome, refusal = "locked_out", LockedOut(error.retry_after_s, recorded=True)
         except Replayed:
@@ -372,67 +337,27 @@ class Attempts:
             "verify",
             outcome,
             by,
-            about["tenant"],
-            about["pseudonym"],
+            asked["tenant"],
+            asked["pseudonym"],
             detail=level,
-            nonce=None if outcome == "replayed" else about["nonce_digest"],
+            nonce=None if outcome == "replayed" else asked["nonce_digest"],
         )
-        line = self._audit_log.append(connection, entry)
-        if counted is not None:
-            self._write_counts(connection, row, about, counted, line)
+        line = self._context.audit_log.append(connection, entry)
+        if new_status is not None:
+            self._standing.write(connection, row, asked["pseudonym"], new_status, line)
         return refusal
 
-    def _refuse_locked(self, status: AttemptsStatus | None, now: datetime) -> None:
-        if not self._policy.after or status is None:
-            return
-        if status.disabled_at is not None:
-            raise LockedOut(None)
-        if status.locked_until is not None and now < status.locked_until:
-            raise LockedOut((status.locked_until - now).total_seconds())
 
-    def _failed(self, status: AttemptsStatus | None, now: datetime) -> AttemptsStatus:
-        consecutive = 1 if status is None else status.consecutive + 1
-        lock = self._policy.lock(consecutive)
-        return AttemptsStatus(
-            consecutive=consecutive,
-            total=1 if status is None else status.total + 1,
-            last_failed_at=now,
-            locked_until=None if lock is None else now + lock,
-            disabled_at=now if self._policy.disables(consecutive) else None,
-        )
-
-    def _write_counts(
-        self,
-        connection: Connection,
-        row: Any,
-        about: dict[str, Any],
-        status: AttemptsStatus,
-        line: int,
-    ) -> None:
-        """Write the row of the subject's failures; only its holder of the lock does."""
-        values = counts_row(
-            self._audit_log.row_key(), row.tenant_id, about["pseudonym"], status, line
-        )
-        # As the transaction finds it: an erasure since the decision must not leave a count that
-        # only another erasure would remove.
-        values["known"] = row.subject_pk is not None
-        if row.counted_pseudonym is None:
-            connection.execute(FIRST_COUNTS, values)
-            return
-        whose = {"of_tenant": values.pop("tenant_id"), "of_pseudonym": values.pop("pseudonym")}
-        connection.execute(NEXT_COUNTS, {**whose, **values})
-
-
-def _one(connection: Connection, *, query: Any, about: dict[str, Any]) -> Any:
+def _one(connection: Connection, query: Any, asked: dict[str, Any]) -> Any:
     try:
-        row = connection.execute(query, about).one_or_none()
+        row = connection.execute(query, asked).one_or_none()
     except (ValueError, TypeError):
         # SQLite keeps any value in any column.
         raise StoreError(
             "a row about this subject was altered: run `veilface audit-log verify`"
         ) from None
     if row is None:
-        raise UnknownTenant(f"there is no tenant {about['tenant']!r}")
+        raise UnknownTenant.named(asked["tenant"])
     return row
 
 

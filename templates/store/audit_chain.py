@@ -11,7 +11,7 @@ all removed, which the next upgrade of the schema takes for one that never began
 import hashlib
 import hmac
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any
@@ -86,7 +86,7 @@ class Line:
     hash: bytes = field(repr=False)
 
     @classmethod
-    def read(cls, columns: Sequence[Any]) -> "Line":
+    def read(cls, values: Mapping[str, Any]) -> "Line":
         """Make a line of its columns: `sequence` a number, the rest texts or their UTF-8 bytes.
 
         Raises
@@ -94,13 +94,14 @@ class Line:
         ValueError
             If a column holds what this program does not write.
         """
-        sequence, at, *texts, previous_hash, own_hash = columns
-        if not all(isinstance(each, bytes) for each in (previous_hash, own_hash)) or not (
-            len(previous_hash) == len(own_hash) == HASH_BYTES
-        ):
-            raise ValueError("a hash has 32 bytes")
-        values = (sequence, _time(_text(at)), *map(_text, texts), previous_hash, own_hash)
-        return cls(**dict(zip(cls.__dataclass_fields__, values, strict=True)))
+        columns: dict[str, Any] = {name: values[name] for name in cls.__dataclass_fields__}
+        for name in columns.keys() - {"sequence", "previous_hash", "hash"}:
+            columns[name] = _text(columns[name])
+        line = cls(**{**columns, "at": _time(columns["at"])})
+        for own_hash in (line.previous_hash, line.hash):
+            if not isinstance(own_hash, bytes) or len(own_hash) != HASH_BYTES:
+                raise ValueError("a hash has 32 bytes")
+        return line
 
 
 @dataclass(frozen=True)
@@ -150,20 +151,19 @@ class Verification:
         return not self.problems
 
 
-def line_hash(key: bytes, columns: Sequence[str | int | bytes | datetime | None]) -> bytes:
+def line_hash(key: bytes, values: Mapping[str, str | int | bytes | datetime | None]) -> bytes:
     """Hash of a line: of all its columns but the hash itself, in the order of :class:`Line`.
 
     A line without a nonce is hashed as it was before there were any: the number of parts tells.
     """
-    *before, nonce, previous_hash = columns
-    hashed = (*before, previous_hash) if nonce is None else columns
-    return hmac.digest(key, encode_parts("line", *map(_part, hashed)), hashlib.sha256)
+    unhashed = {"hash", "nonce"} if values["nonce"] is None else {"hash"}
+    parts = [_part(values[name]) for name in Line.__dataclass_fields__ if name not in unhashed]
+    return hmac.digest(key, encode_parts("line", *parts), hashlib.sha256)
 
 
 def is_true_line(key: bytes, line: Line) -> bool:
     """Whether a line is as it was written."""
-    *hashed, own_hash = (getattr(line, name) for name in Line.__dataclass_fields__)
-    return hmac.compare_digest(line_hash(key, hashed), own_hash)
+    return hmac.compare_digest(line_hash(key, vars(line)), line.hash)
 
 
 def head_mac(key: bytes, head: Anchor) -> bytes:
@@ -202,10 +202,10 @@ class Chain:
         self._problems: list[Problem] = []
         self._unlisted = 0
 
-    def step(self, columns: Sequence[Any]) -> None:
+    def step(self, values: Mapping[str, Any]) -> None:
         """Check the next line, given as :meth:`Line.read` takes it."""
-        sequence, expected = columns[0], self._last.sequence + 1
-        line = self._true_line(columns)
+        sequence, expected = values["sequence"], self._last.sequence + 1
+        line = self._true_line(values)
         self._lines += 1
         if sequence > expected:
             self._report(Problem(expected, MISSING, through=sequence - 1))
@@ -215,13 +215,13 @@ class Chain:
             self._report(Problem(sequence, OUT_OF_ORDER))
         if sequence < expected:
             return  # no link of the chain
-        self._last = Anchor(sequence, columns[-1] or b"")  # none where a column lost its NOT NULL
+        self._last = Anchor(sequence, values["hash"] or b"")  # where it lost its NOT NULL
         self._trusted = line is not None
         self._anchored |= self._last == self._anchor
 
-    def _true_line(self, columns: Sequence[Any]) -> Line | None:
+    def _true_line(self, values: Mapping[str, Any]) -> Line | None:
         try:
-            line = Line.read(columns)
+            line = Line.read(values)
         except ValueError:
             return None
         return line if is_true_line(self._key, line) else None
@@ -261,13 +261,13 @@ class Chain:
             self._unlisted += 1
 
 
-def read_line(columns: Sequence[Any]) -> Line:
+def read_line(values: Mapping[str, Any]) -> Line:
     """:meth:`Line.read` for a reader of the log, who is sent to the verification."""
     try:
-        return Line.read(columns)
+        return Line.read(values)
     except ValueError:
         raise StoreError(
-            f"line {columns[0]} of the audit log was altered and cannot be read: "
+            f"line {values['sequence']} of the audit log was altered and cannot be read: "
             "run `veilface audit-log verify`"
         ) from None
 

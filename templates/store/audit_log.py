@@ -6,12 +6,11 @@ The chain that shows whether a line was altered, removed or moved is in
 ``templates.store.audit_chain``; triggers of the database refuse to change or remove a line at all.
 """
 
-import functools
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from datetime import datetime
 from functools import partial
-from typing import Any, NamedTuple
 
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
@@ -30,6 +29,7 @@ from templates.store.audit_chain import (
     line_hash,
     read_line,
 )
+from templates.store.audit_rows import read_end, read_head, read_lines
 from templates.store.database import Database
 from templates.store.deployment import Secrets
 from templates.store.identifiers import (
@@ -103,7 +103,7 @@ class Entry:
     tenant
         Name of the tenant it was done in.
     pseudonym
-        Of the subject it was done to (:meth:`TemplateStore.pseudonym`). Never a subject id:
+        Of the subject it was done to (:meth:`ReceiptSigner.pseudonym`). Never a subject id:
         anything but 64 hexadecimal digits is refused.
     detail
         What else it was done with: the level of a verification, the prefix of a key.
@@ -166,10 +166,9 @@ class AuditLog:
         key = self._secrets.make(connection, CHAIN_SECRET)
         if key is None:
             return
-        columns = (AuditHeadRow.sequence, AuditHeadRow.hash, AuditHeadRow.mac)
-        heads = [tuple(row) for row in connection.execute(sa.select(*columns))]
+        head, mac = read_head(connection)
         written = connection.execute(sa.select(sa.exists(AuditRow.sequence))).scalar_one()
-        if written or heads != [(START.sequence, START.hash, b"")]:
+        if written or head != START or mac:
             raise _without_key()  # which takes back the key that was made
         connection.execute(sa.update(AuditHeadRow).values(mac=head_mac(key, START)))
 
@@ -178,12 +177,12 @@ class AuditLog:
 
         One that is missing or forged does too: who reads it is told, and no row is vouched for.
         """
-        head, mac = _only_head(_heads(connection))
+        head, mac = read_head(connection)
         return head is None or not is_head_before_authentication(self._opened_key(), head, mac)
 
     def begin_authentication(self, connection: Connection) -> bool:
         """Let the head say that rows are authenticated from now on; False if it said so before."""
-        head, mac = _only_head(_heads(connection, for_update=True))
+        head, mac = read_head(connection, for_update=True)
         key = self._opened_key()
         if head is None or not is_head_before_authentication(key, head, mac):
             return False
@@ -244,22 +243,21 @@ class AuditLog:
         if key is None:
             raise RuntimeError("call AuditLog.prepare before the transaction")
         last = self._head(connection, key, for_update=True)
-        columns = (
-            last.sequence + 1,
-            self._clock(),
-            entry.tenant,
-            entry.by.actor,
-            entry.action,
-            entry.pseudonym,
-            entry.outcome,
-            entry.by.request_id,
-            entry.detail,
-            entry.nonce,
-            last.hash,
-        )
-        new = Anchor(last.sequence + 1, line_hash(key, columns))
-        names = Line.__dataclass_fields__
-        connection.execute(_ADD_LINE, dict(zip(names, (*columns, new.hash), strict=True)))
+        values: dict[str, str | int | bytes | datetime | None] = {
+            "sequence": last.sequence + 1,
+            "at": self._clock(),
+            "tenant": entry.tenant,
+            "actor": entry.by.actor,
+            "action": entry.action,
+            "pseudonym": entry.pseudonym,
+            "outcome": entry.outcome,
+            "request_id": entry.by.request_id,
+            "detail": entry.detail,
+            "nonce": entry.nonce,
+            "previous_hash": last.hash,
+        }
+        new = Anchor(last.sequence + 1, line_hash(key, values))
+        connection.execute(_ADD_LINE, {**values, "hash": new.hash})
         moved = {"sequence": new.sequence, "hash": new.hash, "mac": head_mac(key, new)}
         connection.execute(_MOVE_HEAD, moved)
         return new.sequence
@@ -267,7 +265,7 @@ class AuditLog:
     def record(self, entry: Entry) -> None:
         """Add a line in a transaction of its own."""
         self.prepare()
-        self._database.write(lambda each: self.append(each, entry))
+        self._database.write(lambda connection: self.append(connection, entry))
 
     def head(self) -> Anchor:
         """Number and hash of the last line; keep them elsewhere, to verify the log against.
@@ -278,7 +276,7 @@ class AuditLog:
             If the head row is missing or forged.
         """
         key = self._opened_key()
-        return self._database.read(lambda each: self._head(each, key))
+        return self._database.read(lambda connection: self._head(connection, key))
 
     def lines(self, *, after: int = 0, batch: int = BATCH) -> Iterator[Line]:
         """Read the log from the line after `after` on, a batch in memory at a time.
@@ -288,9 +286,9 @@ class AuditLog:
         StoreError
             At a line that was altered so that it cannot be read.
         """
-        while rows := self._database.read(partial(_rows, after=after, batch=batch)):
-            yield from map(read_line, rows)
-            after = rows[-1][0]
+        while rows := self._database.read(partial(read_lines, after=after, batch=batch)):
+            yield from (read_line(row._mapping) for row in rows)
+            after = rows[-1].sequence
 
     def verify(
         self,
@@ -320,13 +318,13 @@ class AuditLog:
         chain = Chain(self._opened_key(), anchor=anchor)
         after: int | None = None
         while True:
-            while rows := self._database.read(partial(_rows, after=after, batch=batch)):
+            while rows := self._database.read(partial(read_lines, after=after, batch=batch)):
                 for row in rows:
-                    chain.step(row)
-                after = rows[-1][0]
+                    chain.step(row._mapping)
+                after = rows[-1].sequence
                 if progress is not None:
                     progress(len(rows))
-            end = self._database.read(partial(_end, after=after))
+            end = self._database.read(partial(read_end, after=after))
             if not end.more:
                 return chain.end(end.head, end.mac, held=end.held)
 
@@ -338,7 +336,7 @@ class AuditLog:
         return self._key
 
     def _head(self, connection: Connection, key: bytes, *, for_update: bool = False) -> Anchor:
-        head, mac = _only_head(_heads(connection, for_update=for_update))
+        head, mac = read_head(connection, for_update=for_update)
         if head is None or not is_head(key, head, mac):
             raise BrokenAuditLog(
                 "the head of the audit log is missing or was altered: "
@@ -350,87 +348,8 @@ class AuditLog:
         return "AuditLog()"
 
 
-class _End(NamedTuple):
-    """What the database holds in one moment, seen from the last line that was read."""
-
-    head: Anchor | None
-    mac: bytes
-    held: int  # lines up to that one
-    more: bool  # whether there are lines after it
-
-
-def _end(connection: Connection, *, after: int | None) -> _End:
-    before, later = _sides(after)
-    # With a limit: PostgreSQL refuses a subquery of two rows, and this must find them.
-    columns_of_head = _head_columns(connection.dialect.name)
-    head = [sa.select(each).limit(1).scalar_subquery() for each in columns_of_head]
-    heads = sa.select(sa.func.count()).select_from(AuditHeadRow).scalar_subquery()
-    held = sa.select(sa.func.count()).select_from(AuditRow).where(before).scalar_subquery()
-    columns: list[Any] = [heads, held, sa.exists().where(later), *head]
-    count, lines, more, *row = connection.execute(sa.select(*columns)).one()
-    return _End(*_only_head(row if count == 1 else (None, None, None)), lines, more)
-
-
-def _heads(connection: Connection, *, for_update: bool = False) -> Sequence[Any]:
-    """The head row as it is stored; no values where there is not one."""
-    rows = connection.execute(_head_query(connection.dialect.name, for_update)).all()
-    return rows[0] if len(rows) == 1 else (None, None, None)
-
-
-def _only_head(row: Sequence[Any]) -> tuple[Anchor | None, bytes]:
-    """Read the head row; None for it where a column has no value, as after a lost NOT NULL."""
-    sequence, own_hash, mac = row
-    if sequence is None or own_hash is None:
-        return None, b""
-    return Anchor(sequence, own_hash), mac or b""
-
-
 def _without_key() -> BrokenAuditLog:
     return BrokenAuditLog(
         "the key of the audit log is missing: run `veilface db upgrade` on a new database, and "
         "restore any other from a backup"
     )
-
-
-def _rows(connection: Connection, *, after: int | None, batch: int) -> Sequence[Any]:
-    _, later = _sides(after)
-    query = sa.select(*_line_columns(connection))
-    return connection.execute(query.where(later).order_by(AuditRow.sequence).limit(batch)).all()
-
-
-def _sides(after: int | None) -> tuple[sa.ColumnElement[bool], sa.ColumnElement[bool]]:
-    # Without a bound first: a line that was slipped in may have any number.
-    if after is None:
-        return sa.false(), AuditRow.sequence.is_not(None)
-    return AuditRow.sequence <= after, AuditRow.sequence > after
-
-
-def _line_columns(connection: Connection) -> list[Any]:
-    """The columns of :class:`Line`, in a form in which an altered one still arrives.
-
-    SQLite keeps any value in any column, and PostgreSQL knows times that Python does not. Read as
-    their types they would end the verification instead of failing it.
-    """
-    sequence, at, *rest = (getattr(AuditRow, name) for name in Line.__dataclass_fields__)
-    if connection.dialect.name == "sqlite":
-        return [sequence, *map(_raw, (at, *rest))]
-    utc = sa.func.to_char(sa.func.timezone("UTC", at), "YYYY-MM-DD HH24:MI:SS.US")
-    return [sequence, utc, *rest]
-
-
-@functools.cache
-def _head_query(dialect: str, for_update: bool) -> "sa.Select[*tuple[Any, ...]]":
-    query = sa.select(*_head_columns(dialect))
-    return query.with_for_update() if for_update else query
-
-
-def _head_columns(dialect: str) -> list[Any]:
-    columns: list[Any] = [AuditHeadRow.hash, AuditHeadRow.mac]
-    if dialect == "sqlite":
-        sequence = sa.cast(AuditHeadRow.sequence, sa.Integer).label("sequence")
-        return [sequence, *(_raw(each).label(each.key) for each in columns)]
-    return [AuditHeadRow.sequence, *columns]
-
-
-def _raw(column: Any) -> sa.ColumnElement[Any]:
-    return sa.type_coerce(sa.cast(column, sa.LargeBinary), sa.types.NullType())

@@ -14,17 +14,16 @@ import sqlite3
 import threading
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any, TypeVar
 
 import psycopg
 import sqlalchemy as sa
-from sqlalchemy import event
-from sqlalchemy.engine import URL, Connection, Engine, make_url
-from sqlalchemy.exc import ArgumentError, DBAPIError, SQLAlchemyError
+from sqlalchemy.engine import Connection, Engine
+from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 
 from templates.errors import StoreBusy, StoreError, StoreUnavailable
+from templates.store.engine import checked_url, make_engine
 
 T = TypeVar("T")
 
@@ -63,19 +62,18 @@ class Database:
         self._pool_size = pool_size
         self._max_overflow = max_overflow
         self._timeout = timeout
-        self._lock = threading.Lock()
-        self._process = _Process(self._make_engine())
+        self._own = _Process(self._make_engine())
 
     @property
     def engine(self) -> Engine:
         """The engine of this process."""
-        return self._here().engine
+        return self._process().engine
 
     def read(self, work: Callable[[Connection], T]) -> T:
         """Run `work` on a connection; what it sees is committed."""
-        here = self._here()
+        process = self._process()
         try:
-            with here.readers.connect() as connection:
+            with process.readers.connect() as connection:
                 return work(connection)
         except _DATABASE_ERRORS as error:
             raise _translated(error) from None
@@ -138,14 +136,14 @@ class Database:
     def _transaction(
         self, work: Callable[[Connection], T], locks: sa.Executable, names: dict[str, Any]
     ) -> T:
-        here = self._here()
+        process = self._process()
         for attempt in range(1, _ATTEMPTS + 1):
             try:
                 if self.is_sqlite:
                     # Threads queue here in turn; SQLite's own lock is polled and knows no order.
-                    with here.writing, here.writers.begin() as connection:
+                    with process.writing, process.writers.begin() as connection:
                         return work(connection)
-                with here.writers.begin() as connection:
+                with process.writers.begin() as connection:
                     connection.execute(locks, names)
                     return work(connection)
             except DBAPIError as error:
@@ -165,9 +163,9 @@ class Database:
         """
         if not self.is_sqlite:
             return True
-        here = self._here()
+        process = self._process()
         try:
-            with here.writing, here.engine.connect() as connection:
+            with process.writing, process.engine.connect() as connection:
                 # On the driver's connection: SQLAlchemy would begin a transaction around it.
                 driver = _driver(connection)
                 try:
@@ -201,16 +199,16 @@ class Database:
         statement = sa.delete(table).where(condition, sa.tuple_(*primary_key).in_(some))
         removed = 0
         # Read first: a round that finds nothing, and most do, takes no lock.
-        while self.read(lambda each: each.execute(some).first()) is not None:
-            removed += self.write(lambda each: each.execute(statement).rowcount)
+        while self.read(lambda connection: connection.execute(some).first()) is not None:
+            removed += self.write(lambda connection: connection.execute(statement).rowcount)
         return removed
 
     def compact(self, tables: Sequence[str]) -> None:
         """Rewrite tables (PostgreSQL) or the file (SQLite) without what was removed from them."""
-        here = self._here()
+        process = self._process()
         try:
-            autocommit = here.engine.execution_options(isolation_level="AUTOCOMMIT")
-            with here.writing, autocommit.connect() as connection:
+            autocommit = process.engine.execution_options(isolation_level="AUTOCOMMIT")
+            with process.writing, autocommit.connect() as connection:
                 if self.is_sqlite:
                     _driver(connection).execute("VACUUM")
                 for table in () if self.is_sqlite else tables:
@@ -227,11 +225,11 @@ class Database:
             if self.is_sqlite
             else "SELECT pg_database_size(current_database())"
         )
-        return int(self.read(lambda each: each.exec_driver_sql(query).scalar_one()))
+        return int(self.read(lambda connection: connection.exec_driver_sql(query).scalar_one()))
 
     def close(self) -> None:
         """Close the connections of this process that are idle."""
-        self._here().engine.dispose()
+        self._process().engine.dispose()
 
     def await_writers(self) -> None:
         """Return when every write that had begun before has ended.
@@ -248,45 +246,20 @@ class Database:
     def _lock_limit(self, wait: float | None) -> str:
         return str(round(1000 * (self._timeout if wait is None else wait)))
 
-    def _here(self) -> "_Process":
-        if self._process.pid != os.getpid():
+    def _process(self) -> "_Process":
+        if self._own.pid != os.getpid():
             # The sockets and file locks of the parent are not ours: forget them, unclosed.
-            self._lock = threading.Lock()
-            self._process.engine.dispose(close=False)
-            self._process = _Process(self._make_engine())
-        return self._process
+            self._own.engine.dispose(close=False)
+            self._own = _Process(self._make_engine())
+        return self._own
 
     def _make_engine(self) -> Engine:
-        common: dict[str, Any] = {
-            "pool_size": self._pool_size,
-            "max_overflow": self._max_overflow,
-            "pool_timeout": self._timeout,
-            "hide_parameters": True,  # an error text must never quote a row
-        }
-        if not self.is_sqlite:
-            return sa.create_engine(
-                self.url,
-                pool_pre_ping=True,
-                connect_args={
-                    "connect_timeout": max(2, round(self._timeout)),
-                    "application_name": "veilface",
-                    "keepalives_idle": 30,
-                    "keepalives_interval": 10,
-                    "keepalives_count": 3,
-                    "tcp_user_timeout": 30_000,
-                },
-                **common,
-            )
-        _create_private_file(Path(str(self.url.database)))
-        engine = sa.create_engine(
+        return make_engine(
             self.url,
-            poolclass=sa.pool.QueuePool,
-            connect_args={"timeout": self._timeout, "check_same_thread": False},
-            **common,
+            timeout=self._timeout,
+            pool_size=self._pool_size,
+            max_overflow=self._max_overflow,
         )
-        event.listen(engine, "connect", _prepare_sqlite)
-        event.listen(engine, "begin", _begin_sqlite)
-        return engine
 
     def __repr__(self) -> str:
         return f"Database({self.url.render_as_string(hide_password=True)!r})"
@@ -307,86 +280,12 @@ class _Process:
         )
 
 
-def checked_url(text: str) -> URL:
-    """Read a database URL, with the driver that is used; nothing is opened.
-
-    Raises
-    ------
-    StoreError
-        It cannot be read, or names no database that is supported. The text never quotes it: it
-        may hold a password.
-    """
-    try:
-        url = make_url(text)
-        if not 0 < (url.port or 1) < 2**16:
-            raise ValueError
-    except (ArgumentError, ValueError):  # the latter of a port that is no number
-        raise StoreError(
-            "the database URL cannot be read: write sqlite:///path or "
-            "postgresql://user@host:port/name, the port as a number up to 65535, and the "
-            "characters : / @ [ ] of a password as %3A %2F %40 %5B %5D"
-        ) from None
-    if url.drivername in ("postgresql", "postgres", "postgresql+psycopg"):
-        return url.set(drivername="postgresql+psycopg")
-    if url.drivername in ("sqlite", "sqlite+pysqlite"):
-        if not url.database or url.database == ":memory:" or url.database.startswith("file:"):
-            raise StoreError("SQLite needs a file: write sqlite:///path")
-        return url.set(drivername="sqlite+pysqlite")
-    raise StoreError(
-        f"a database of kind {url.drivername!r} is not supported: use sqlite:// or postgresql://"
-    )
-
-
-def _create_private_file(path: Path) -> None:
-    try:
-        os.close(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
-    except OSError as error:
-        raise StoreError(f"the database file {path} cannot be used: {error.strerror}") from None
-
-
-def _prepare_sqlite(connection: Any, _record: object) -> None:
-    connection.isolation_level = None  # transactions begin where _begin_sqlite says so
-    cursor = connection.cursor()
-    try:
-        # Waiting first: the switch to WAL below needs the file for itself for a moment.
-        _set_wal(cursor)
-        cursor.execute("PRAGMA synchronous = FULL")
-        cursor.execute("PRAGMA foreign_keys = ON")
-        cursor.execute("PRAGMA secure_delete = ON")
-        cursor.execute("PRAGMA temp_store = MEMORY")
-    finally:
-        cursor.close()
-
-
-def _set_wal(cursor: Any) -> None:
-    # SQLite answers "locked" at once here, without its busy handler, when two processes switch.
-    for pause in (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, None):
-        try:
-            (mode,) = cursor.execute("PRAGMA journal_mode = WAL").fetchone()
-        except Exception as error:
-            if pause is None or "locked" not in str(error):
-                raise
-            time.sleep(pause)
-            continue
-        if mode != "wal":
-            raise StoreError(
-                f"SQLite keeps its journal as {mode!r} here, not as a write-ahead log: "
-                "put the database file on a local disk"
-            )
-        return
-
-
 def _busy_timeout(seconds: float) -> str:
     return f"PRAGMA busy_timeout = {round(1000 * seconds)}"
 
 
 def _driver(connection: Connection) -> Any:
     return connection.connection.driver_connection
-
-
-def _begin_sqlite(connection: Connection) -> None:
-    writing = connection.get_execution_options().get("veilface_write", False)
-    connection.exec_driver_sql("BEGIN IMMEDIATE" if writing else "BEGIN")
 
 
 def _lock_number(name: str) -> int:

@@ -34,7 +34,7 @@ class Secrets:
         self._database = database
         self._keyring = keyring
         self._clock = clock
-        self._known: dict[str, bytes] = {}
+        self._opened: dict[str, bytes] = {}
         self._lock = threading.Lock()
 
     def get(self, name: str) -> bytes:
@@ -48,12 +48,14 @@ class Secrets:
         checked_opaque_id(name, what="secret's name")
         # Without the lock: a transaction that needs a known secret must not wait for a thread
         # that obtains another one, and so waits for that transaction.
-        if (known := self._known.get(name)) is not None:
-            return known
+        if (secret := self._opened.get(name)) is not None:
+            return secret
         with self._lock:
-            if name not in self._known:
-                self._known[name] = self._database.write(lambda each: self._obtain(each, name))
-            return self._known[name]
+            if name not in self._opened:
+                self._opened[name] = self._database.write(
+                    lambda connection: self._obtain(connection, name)
+                )
+            return self._opened[name]
 
     def existing(self, name: str) -> bytes | None:
         """Return what :meth:`get` returns where it was made before, and None where it was not.
@@ -63,13 +65,13 @@ class Secrets:
         SealError
             If the master key that wrapped it is missing.
         """
-        if (known := self._known.get(name)) is not None:
-            return known
-        found = self._database.read(lambda each: self._read(each, name))
-        if found is not None:
+        if (secret := self._opened.get(name)) is not None:
+            return secret
+        secret = self._database.read(lambda connection: self._read(connection, name))
+        if secret is not None:
             with self._lock:
-                self._known[name] = found
-        return found
+                self._opened[name] = secret
+        return secret
 
     def make(self, connection: Connection, name: str) -> bytes | None:
         """Make a secret inside a transaction that is open already; None if there is one."""
@@ -148,15 +150,12 @@ def check_master_key(database: Database, keyring: MasterKeyring) -> None:
     SealError
         If it was made with another master key.
     """
-    row = database.read(
-        lambda each: each.execute(
-            sa.select(MasterKeyCheckRow.wrapped_value, MasterKeyCheckRow.wrapping_key)
-        ).one_or_none()
-    )
-    if row is None:
+    query = sa.select(MasterKeyCheckRow.wrapped_value)
+    mark = database.read(lambda connection: connection.execute(query).scalar_one_or_none())
+    if mark is None:
         raise StoreError("the database has no master key yet: run `veilface db upgrade`")
     try:
-        opened = keyring.open(row.wrapped_value, purpose=CHECK_PURPOSE, bound_to=[])
+        opened = keyring.open(mark, purpose=CHECK_PURPOSE, bound_to=[])
     except SealError as error:
         raise SealError(f"this is not the master key of this database: {error}") from None
     if opened != _CHECK_TEXT:

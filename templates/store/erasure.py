@@ -6,19 +6,18 @@ from dataclasses import dataclass
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
-from templates.store.audit_log import PROGRAM, AuditLog, By, Entry
-from templates.store.database import Database
-from templates.store.identifiers import Clock, checked_subject_id
-from templates.store.receipts import Erased, Receipt, ReceiptSigner
+from templates.store.audit_log import PROGRAM, By, Entry
+from templates.store.context import StoreContext
+from templates.store.identifiers import checked_subject_id
+from templates.store.receipts import Erased, Receipt, keep_receipt, latest_receipt
 from templates.store.schema import (
     FailedAttemptsRow,
     IdempotencyRow,
-    ReceiptRow,
     SubjectRow,
     TemplateRow,
     TenantRow,
 )
-from templates.store.subjects import subject_lock, subject_row_id, tenant_row
+from templates.store.subject_rows import subject_lock, subject_pk_of, tenant_id_of
 
 
 @dataclass(frozen=True)
@@ -44,13 +43,8 @@ class Erasure:
 class Erasures:
     """Repository of erasure receipts, and the only way to get one."""
 
-    def __init__(
-        self, database: Database, signer: ReceiptSigner, audit_log: AuditLog, clock: Clock
-    ) -> None:
-        self._database = database
-        self._signer = signer
-        self._audit_log = audit_log
-        self._clock = clock
+    def __init__(self, context: StoreContext) -> None:
+        self._context = context
 
     def erase(self, tenant: str, subject_id: str, *, by: By = PROGRAM) -> Erasure:
         """Remove all that is held of a subject, its data key included; leave a signed receipt.
@@ -66,8 +60,9 @@ class Erasures:
         and enroll a subject may also start its count anew.
         """
         work = self._work(tenant, subject_id, by)
-        receipt, erased = self._database.write(work, lock=subject_lock(tenant, subject_id))
-        return Erasure(receipt=receipt, erased=erased, log_purged=self._database.try_purge_log())
+        receipt, erased = self._context.write(work, lock=subject_lock(tenant, subject_id))
+        log_purged = self._context.database.try_purge_log()
+        return Erasure(receipt=receipt, erased=erased, log_purged=log_purged)
 
     def erase_if(
         self, tenant: str, subject_id: str, condition: sa.ColumnElement[bool], *, by: By
@@ -93,43 +88,38 @@ class Erasures:
             receipt, _ = work(connection)
             return receipt
 
-        return self._database.write(work_if, lock=subject_lock(tenant, subject_id))
+        return self._context.write(work_if, lock=subject_lock(tenant, subject_id))
 
     def _work(
         self, tenant: str, subject_id: str, by: By
     ) -> Callable[[Connection], tuple[Receipt, bool]]:
         """The transaction of an erasure: what was signed, and whether there was a template."""
-        checked_subject_id(subject_id)
-        pseudonym = self._signer.pseudonym(tenant, subject_id)
-        self._signer.public_key()  # obtains the signing key before the transaction needs it
-        self._audit_log.prepare()
+        signer, audit_log = self._context.signer, self._context.audit_log
+        pseudonym = signer.pseudonym(tenant, checked_subject_id(subject_id))
+        signer.public_key()  # obtains the signing key before the transaction needs it
 
         def work(connection: Connection) -> tuple[Receipt, bool]:
             receipt, outcome = remove(connection)
-            self._audit_log.append(connection, Entry("erase", outcome, by, tenant, pseudonym))
+            audit_log.append(connection, Entry("erase", outcome, by, tenant, pseudonym))
             return receipt, outcome == "erased"
 
         def remove(connection: Connection) -> tuple[Receipt, str]:
-            tenant_id, _ = tenant_row(connection, tenant)
-            named_by_pseudonym = {
-                table: connection.execute(
-                    sa.delete(table).where(
-                        table.tenant_id == tenant_id, table.pseudonym == pseudonym
-                    )
-                ).rowcount
-                for table in (FailedAttemptsRow, IdempotencyRow)
-            }
+            tenant_id = tenant_id_of(connection, tenant)
+
+            def removed(table: type[FailedAttemptsRow | IdempotencyRow]) -> int:
+                whose = table.tenant_id == tenant_id, table.pseudonym == pseudonym
+                return connection.execute(sa.delete(table).where(*whose)).rowcount
+
+            failed_attempts, idempotency_records = (
+                removed(FailedAttemptsRow),
+                removed(IdempotencyRow),
+            )
             contract_id, templates, subjects = None, 0, 0
-            subject_pk = subject_row_id(connection, tenant_id, subject_id)
+            subject_pk = subject_pk_of(connection, tenant_id, subject_id)
             if subject_pk is None:
-                earlier = connection.execute(
-                    sa.select(ReceiptRow.body, ReceiptRow.signature)
-                    .where(ReceiptRow.pseudonym == pseudonym)
-                    .order_by(ReceiptRow.sequence.desc())
-                    .limit(1)
-                ).one_or_none()
+                earlier = latest_receipt(connection, pseudonym)
                 if earlier is not None:
-                    return Receipt(earlier.body, earlier.signature), "receipt_repeated"
+                    return earlier, "receipt_repeated"
             else:
                 contract_id = connection.execute(
                     sa.select(TemplateRow.contract_id).where(TemplateRow.subject_pk == subject_pk)
@@ -140,8 +130,8 @@ class Erasures:
                 subjects = connection.execute(
                     sa.delete(SubjectRow).where(SubjectRow.id == subject_pk)
                 ).rowcount
-            now = self._clock()
-            receipt = self._signer.sign(
+            now = self._context.clock()
+            receipt = signer.sign(
                 tenant=tenant,
                 pseudonym=pseudonym,
                 erased=Erased(
@@ -149,32 +139,17 @@ class Erasures:
                     template=templates,
                     data_key=subjects,  # a column of the subject's row, with the metadata
                     metadata=subjects,
-                    failed_attempts=named_by_pseudonym[FailedAttemptsRow],
-                    idempotency_records=named_by_pseudonym[IdempotencyRow],
+                    failed_attempts=failed_attempts,
+                    idempotency_records=idempotency_records,
                 ),
                 erased_at=now,
             )
-            connection.execute(
-                sa.insert(ReceiptRow).values(
-                    pseudonym=pseudonym,
-                    body=receipt.body,
-                    signature=receipt.signature,
-                    created_at=now,
-                )
-            )
+            keep_receipt(connection, pseudonym, receipt, now)
             return receipt, "nothing_held" if subject_pk is None else "erased"
 
         return work
 
     def receipt(self, tenant: str, subject_id: str) -> Receipt | None:
         """Return the latest erasure receipt of a subject, or None."""
-        pseudonym = self._signer.pseudonym(tenant, checked_subject_id(subject_id))
-        row = self._database.read(
-            lambda each: each.execute(
-                sa.select(ReceiptRow.body, ReceiptRow.signature)
-                .where(ReceiptRow.pseudonym == pseudonym)
-                .order_by(ReceiptRow.sequence.desc())
-                .limit(1)
-            ).one_or_none()
-        )
-        return None if row is None else Receipt(row.body, row.signature)
+        pseudonym = self._context.signer.pseudonym(tenant, checked_subject_id(subject_id))
+        return self._context.database.read(lambda connection: latest_receipt(connection, pseudonym))

@@ -19,13 +19,11 @@ from sqlalchemy.engine import Connection
 
 from templates.errors import StoreError
 from templates.keys.sealing import encode_parts
-from templates.store.audit_log import AuditLog
 from templates.store.authenticity import columns_of, is_authentic, row_mac, warn
-from templates.store.database import Database
-from templates.store.deployment import Secrets, insert_once
-from templates.store.identifiers import Clock, UnknownTenant
-from templates.store.receipts import ReceiptSigner
-from templates.store.schema import IdempotencyRow, TenantRow
+from templates.store.context import StoreContext
+from templates.store.deployment import insert_once
+from templates.store.schema import IdempotencyRow
+from templates.store.subject_rows import tenant_id_of
 
 RETENTION = timedelta(hours=24)
 CLAIM = timedelta(minutes=1)
@@ -63,19 +61,8 @@ class Answer:
 class Idempotency:
     """Repository of idempotency records."""
 
-    def __init__(
-        self,
-        database: Database,
-        secrets: Secrets,
-        signer: ReceiptSigner,
-        audit_log: AuditLog,
-        clock: Clock,
-    ) -> None:
-        self._database = database
-        self._audit_log = audit_log
-        self._secrets = secrets
-        self._signer = signer
-        self._clock = clock
+    def __init__(self, context: StoreContext) -> None:
+        self._context = context
 
     def claim(
         self, tenant: str, *, actor: str, key: str, request: bytes, subject_id: str | None = None
@@ -100,19 +87,15 @@ class Idempotency:
         """
         if not 1 <= len(key) <= MAX_KEY:
             raise StoreError(f"an idempotency key has 1 to {MAX_KEY} characters")
-        self._audit_log.prepare()
-        secret = self._secrets.get(_SECRET)
+        context = self._context
+        secret = context.secrets.get(_SECRET)
         key_hash = hmac.digest(secret, encode_parts("key", key), hashlib.sha256)
         request_hash = hmac.digest(secret, encode_parts("request", request), hashlib.sha256)
-        pseudonym = None if subject_id is None else self._signer.pseudonym(tenant, subject_id)
+        pseudonym = None if subject_id is None else context.signer.pseudonym(tenant, subject_id)
 
         def work(connection: Connection) -> Claim | Answer:
-            tenant_id = connection.execute(
-                sa.select(TenantRow.id).where(TenantRow.name == tenant)
-            ).scalar_one_or_none()
-            if tenant_id is None:
-                raise UnknownTenant(f"there is no tenant {tenant!r}")
-            now = self._clock()
+            tenant_id = tenant_id_of(connection, tenant)
+            now = context.clock()
             claim = Claim(
                 tenant_id, actor, key_hash, request_hash, uuid.uuid4().hex, now + RETENTION
             )
@@ -135,7 +118,7 @@ class Idempotency:
                 raise IdempotencyConflict("the first request with this key is still running")
             return Answer(row.status, row.body)
 
-        return self._database.write(work, lock=f"idempotency {tenant} {actor} {key_hash.hex()}")
+        return context.write(work, lock=f"idempotency {tenant} {actor} {key_hash.hex()}")
 
     def _insert(
         self, connection: Connection, claim: Claim, pseudonym: str | None, now: datetime
@@ -155,32 +138,34 @@ class Idempotency:
         )
 
     def _is_authentic(self, row: Any) -> bool:
-        return is_authentic(self._audit_log.row_key(), IdempotencyRow, row._mapping)
+        return is_authentic(self._context.audit_log.row_key(), IdempotencyRow, row._mapping)
 
     def finish(self, claim: Claim, *, status: int, body: bytes) -> bool:
         """Leave the answer; False if the claim is gone (lapsed, or the subject was erased)."""
         if len(body) > MAX_BODY_BYTES:
             raise StoreError(f"an answer of more than {MAX_BODY_BYTES} bytes is not kept")
         row = {**vars(claim), "claim": claim.token, "status": status, "body": body}
-        mac = row_mac(self._audit_log.row_key(), IdempotencyRow, row)
+        mac = row_mac(self._context.audit_log.row_key(), IdempotencyRow, row)
         statement = (
             sa.update(IdempotencyRow)
             .where(*_is(claim), IdempotencyRow.claim == claim.token)
             .values(status=status, body=body, mac=mac)
         )
-        return self._database.write(lambda each: each.execute(statement).rowcount == 1)
+        return self._context.database.write(
+            lambda connection: connection.execute(statement).rowcount == 1
+        )
 
     def release(self, claim: Claim) -> None:
         """Give the key back, because the write failed and may be tried again."""
         statement = sa.delete(IdempotencyRow).where(
             *_is(claim), IdempotencyRow.claim == claim.token, IdempotencyRow.status.is_(None)
         )
-        self._database.write(lambda each: each.execute(statement))
+        self._context.database.write(lambda connection: connection.execute(statement))
 
     def expire(self) -> int:
         """Remove records that are older than a day; returns how many."""
-        expired = IdempotencyRow.expires_at <= self._clock()
-        return self._database.remove(IdempotencyRow, expired, batch=BATCH)
+        expired = IdempotencyRow.expires_at <= self._context.clock()
+        return self._context.database.remove(IdempotencyRow, expired, batch=BATCH)
 
 
 _RECORD: Any = sa.select(*columns_of(IdempotencyRow))

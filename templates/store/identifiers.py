@@ -25,6 +25,11 @@ class InvalidIdentifier(StoreError):
 class UnknownTenant(StoreError):
     """No tenant of this name."""
 
+    @classmethod
+    def named(cls, name: str) -> "UnknownTenant":
+        """The error of a name that no tenant has."""
+        return cls(f"there is no tenant {name!r}")
+
 
 def utc_now() -> datetime:
     """Time of now, aware, in UTC."""

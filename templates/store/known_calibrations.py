@@ -10,50 +10,44 @@ from typing import Any
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
-from templates.store.audit_log import AuditLog
 from templates.store.authenticity import columns_of, is_authentic, row_mac
-from templates.store.database import Database
-from templates.store.identifiers import Clock
+from templates.store.context import StoreContext
 from templates.store.schema import KnownCalibrationsRow
 
 
 class KnownCalibrations:
     """Sets of calibrations of each contract, in the order in which they were first served."""
 
-    def __init__(self, database: Database, audit_log: AuditLog, clock: Clock) -> None:
-        self._database = database
-        self._audit_log = audit_log
-        self._clock = clock
+    def __init__(self, context: StoreContext) -> None:
+        self._context = context
 
     def are_superseded(self, contract_id: str, calibration_ids: Iterable[str]) -> bool:
         """Whether others of the contract were served first after these were; nothing is written."""
         ids = _joined(calibration_ids)
-        self._audit_log.prepare()
-        known = self._database.read(lambda each: self._known(each, contract_id))
-        return ids in known[:-1]
+        served = self._context.read(lambda connection: self._served(connection, contract_id))
+        return ids in served[:-1]
 
     def note(self, contract_id: str, calibration_ids: Iterable[str]) -> None:
         """Remember that these are served, where they are new."""
         ids = _joined(calibration_ids)
-        self._audit_log.prepare()
 
         def work(connection: Connection) -> None:
-            if ids in self._known(connection, contract_id):
+            if ids in self._served(connection, contract_id):
                 return
             position = connection.execute(_LAST_POSITION, {"contract_id": contract_id})
             row = {
                 "contract_id": contract_id,
                 "position": (position.scalar_one() or 0) + 1,
                 "calibration_ids": ids,
-                "created_at": self._clock(),
+                "created_at": self._context.clock(),
             }
-            mac = row_mac(self._audit_log.row_key(), KnownCalibrationsRow, row)
+            mac = row_mac(self._context.audit_log.row_key(), KnownCalibrationsRow, row)
             connection.execute(sa.insert(KnownCalibrationsRow).values(**row, mac=mac))
 
-        self._database.write(work, lock="known calibrations")
+        self._context.write(work, lock="known calibrations")
 
-    def _known(self, connection: Connection, contract_id: str) -> list[str]:
-        key = self._audit_log.row_key()
+    def _served(self, connection: Connection, contract_id: str) -> list[str]:
+        key = self._context.audit_log.row_key()
         rows: Any = connection.execute(_OF_CONTRACT, {"contract_id": contract_id})
         return [
             row.calibration_ids

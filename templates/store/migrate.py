@@ -33,7 +33,9 @@ def downgrade(database: Database, revision: str) -> None:
 
 def current_revision(database: Database) -> str | None:
     """Revision the database is at; None for an empty one."""
-    return database.read(lambda each: MigrationContext.configure(each).get_current_revision())
+    return database.read(
+        lambda connection: MigrationContext.configure(connection).get_current_revision()
+    )
 
 
 def head_revision() -> str:
@@ -45,19 +47,20 @@ def head_revision() -> str:
 
 def check(database: Database) -> None:
     """Raise :class:`StoreError`, naming the remedy, unless the schema is the one needed."""
-    found, needed = current_revision(database), head_revision()
-    if found == needed:
+    present, needed = current_revision(database), head_revision()
+    if present == needed:
         return
-    if found is None:
+    if present is None:
         raise StoreError("the database is empty: run `veilface db upgrade`")
-    known = {each.revision for each in ScriptDirectory.from_config(_config(None)).walk_revisions()}
-    if found not in known:
+    scripts = ScriptDirectory.from_config(_config(None)).walk_revisions()
+    if present not in {script.revision for script in scripts}:
         raise StoreError(
-            f"the database is at schema {found}, which this program does not know: "
+            f"the database is at schema {present}, which this program does not know: "
             "it was migrated by a newer version, install that one"
         )
     raise StoreError(
-        f"the database is at schema {found}, this program needs {needed}: run `veilface db upgrade`"
+        f"the database is at schema {present}, this program needs {needed}: "
+        "run `veilface db upgrade`"
     )
 
 

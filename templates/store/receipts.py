@@ -17,13 +17,16 @@ from dataclasses import dataclass, field, fields
 from datetime import datetime
 from typing import Any
 
+import sqlalchemy as sa
 from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
+from sqlalchemy.engine import Connection
 
 from templates.contract.canonical import canonical_json
 from templates.errors import StoreError
 from templates.keys.sealing import encode_parts
 from templates.store.deployment import Secrets
+from templates.store.schema import ReceiptRow
 
 PSEUDONYM_SECRET = "pseudonym"  # noqa: S105 - a name, not a secret
 RECEIPT_SECRET = "receipt-signing"  # noqa: S105
@@ -58,9 +61,9 @@ class Erased:
     def items(self) -> list[dict[str, Any]]:
         """Every kind of record with its count, in the order above."""
         return [
-            {"item": each.name, "count": getattr(self, each.name)}
-            for each in fields(self)
-            if each.name != "contract_id"
+            {"item": item.name, "count": getattr(self, item.name)}
+            for item in fields(self)
+            if item.name != "contract_id"
         ]
 
 
@@ -92,7 +95,7 @@ class ErasedTenant:
     @property
     def items(self) -> list[dict[str, Any]]:
         """Every kind of record with its count, in the order above."""
-        return [{"item": each.name, "count": getattr(self, each.name)} for each in fields(self)]
+        return [{"item": item.name, "count": getattr(self, item.name)} for item in fields(self)]
 
 
 @dataclass(frozen=True)
@@ -210,6 +213,26 @@ def tenant_receipt_name(tenant: str) -> str:
     Not secret: the receipt itself names the tenant.
     """
     return hashlib.sha256(encode_parts("tenant erasure", tenant)).hexdigest()
+
+
+def keep_receipt(connection: Connection, pseudonym: str, receipt: Receipt, now: datetime) -> None:
+    """Store a receipt under a subject's pseudonym, or a :func:`tenant_receipt_name`."""
+    connection.execute(
+        sa.insert(ReceiptRow).values(
+            pseudonym=pseudonym, body=receipt.body, signature=receipt.signature, created_at=now
+        )
+    )
+
+
+def latest_receipt(connection: Connection, pseudonym: str) -> Receipt | None:
+    """The last receipt that :func:`keep_receipt` stored under a name, or None."""
+    row = connection.execute(
+        sa.select(ReceiptRow.body, ReceiptRow.signature)
+        .where(ReceiptRow.pseudonym == pseudonym)
+        .order_by(ReceiptRow.sequence.desc())
+        .limit(1)
+    ).one_or_none()
+    return None if row is None else Receipt(row.body, row.signature)
 
 
 def verify_receipt(receipt: Receipt, public_key: bytes) -> dict[str, Any]:

@@ -5,6 +5,7 @@ by somebody who can write the database and has no key. The service passes over s
 names what it would not: that somebody tried.
 """
 
+import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
@@ -14,7 +15,6 @@ import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
 from templates.errors import StoreError
-from templates.store.audit_log import AuditLog
 from templates.store.authenticity import (
     LAST_KEY_LINE,
     LAST_TENANT_LINE,
@@ -23,7 +23,7 @@ from templates.store.authenticity import (
     is_authentic,
     is_current,
 )
-from templates.store.database import Database
+from templates.store.context import StoreContext
 from templates.store.schema import (
     ATTEMPT_LINES,
     KEY_LINES,
@@ -66,30 +66,23 @@ class RecordProblem:
     about: str
 
 
-def check_records(
-    database: Database, audit_log: AuditLog, now: datetime
-) -> tuple[RecordProblem, ...]:
+def check_records(context: StoreContext) -> tuple[RecordProblem, ...]:
     """Hold the rows that decide against the audit log, beside a service in use.
 
-    Parameters
-    ----------
-    database, audit_log
-        What is checked, and against what. Whether the log itself is whole is another question.
-    now
-        Time of now: counts of failures that had their time are removed rightly.
+    Whether the log itself is whole is another question. Counts of failures that had their time are
+    removed rightly.
 
     Returns
     -------
     tuple of RecordProblem
         The first thousand.
     """
-    key = audit_log.row_key()
+    key, now = context.audit_log.row_key(), context.clock()
 
     def work(connection: Connection) -> tuple[RecordProblem, ...]:
-        found = _problems(connection, key, now)
-        return tuple(problem for problem, _ in zip(found, range(MAX_PROBLEMS), strict=False))
+        return tuple(itertools.islice(_problems(connection, key, now), MAX_PROBLEMS))
 
-    return database.read(work)
+    return context.database.read(work)
 
 
 def _problems(connection: Connection, key: bytes, now: datetime) -> Iterator[RecordProblem]:

@@ -1,28 +1,26 @@
 """The store of a deployment, opened from a URL and a keyring."""
 
 import os
-from collections.abc import Callable
 
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
 from templates.keys.sealing import MasterKeyring
-from templates.store import deployment, migrate, retention, rewrap
+from templates.store import deployment, migrate
 from templates.store.adoption import Adoption, adopt
 from templates.store.api_keys import ApiKeys
 from templates.store.attempts import Attempts
-from templates.store.audit_log import PROGRAM, AuditLog, By
+from templates.store.context import StoreContext
 from templates.store.database import Database
-from templates.store.deployment import Secrets
-from templates.store.erasure import Erasure, Erasures
+from templates.store.erasure import Erasures
 from templates.store.idempotency import Idempotency
 from templates.store.identifiers import Clock, utc_now
 from templates.store.known_calibrations import KnownCalibrations
 from templates.store.lockout import LockoutPolicy
-from templates.store.receipts import Receipt, ReceiptSigner
 from templates.store.record_check import RecordProblem, check_records
 from templates.store.rerotation import Rerotation
-from templates.store.retention import RETENTION, Retention
+from templates.store.retention import RetentionJob
+from templates.store.rewrap import WrappedKeys
 from templates.store.schema import (
     ApiKeyRow,
     FailedAttemptsRow,
@@ -33,7 +31,6 @@ from templates.store.schema import (
     TemplateRow,
     UsedNonceRow,
 )
-from templates.store.stored_form import StoredForm, stored_form
 from templates.store.subjects import Subjects
 from templates.store.tenant_erasure import TenantErasures
 from templates.store.tenants import Tenants
@@ -44,12 +41,10 @@ _TRIAL_ROW = 0  # the table's one row has number 1
 _TRIAL_BYTES = 128 * 1024
 
 
-class TemplateStore(Subjects):
+class TemplateStore:
     """Everything that Veilface keeps, in SQLite or PostgreSQL.
 
-    Subjects are reached directly (:meth:`put`, :meth:`get`, :meth:`list`, :meth:`erase`), the rest
-    by its own part: `tenants`, `tenant_erasures`, `rerotation`, `api_keys`, `attempts`,
-    `idempotency`, `transfers`, `known_calibrations`, `audit_log`, `secrets`.
+    Each part has its own attribute; this class has only what concerns all of them.
     """
 
     def __init__(
@@ -64,20 +59,23 @@ class TemplateStore(Subjects):
         lockout: LockoutPolicy = _LOCKOUT,
     ) -> None:
         database = Database(url, pool_size=pool_size, max_overflow=max_overflow, timeout=timeout)
-        self.secrets = Secrets(database, keyring, clock)
-        signer, audit_log = ReceiptSigner(self.secrets), AuditLog(database, self.secrets, clock)
-        super().__init__(database, keyring, signer, audit_log, clock)
-        self.attempts = Attempts(database, keyring, signer, audit_log, clock, lockout)
-        self._erasures = Erasures(database, signer, audit_log, clock)
-        self.tenants = Tenants(database, keyring, audit_log, clock)
-        self.rerotation = Rerotation(database, keyring, self.tenants, audit_log)
-        self.api_keys = ApiKeys(database, keyring, self.tenants, audit_log, clock)
-        self.known_calibrations = KnownCalibrations(database, audit_log, clock)
-        self.transfers = Transfers(database, signer, audit_log, clock)
-        self.tenant_erasures = TenantErasures(
-            database, signer, audit_log, self.tenants, self.api_keys, clock
-        )
-        self.idempotency = Idempotency(database, self.secrets, signer, audit_log, clock)
+        self._context = context = StoreContext.of(database, keyring, clock)
+        self.database = database
+        self.secrets = context.secrets
+        self.signer = context.signer
+        self.audit_log = context.audit_log
+        self.tenants = Tenants(context)
+        self.api_keys = ApiKeys(context, self.tenants)
+        self.subjects = Subjects(context)
+        self.attempts = Attempts(context, lockout)
+        self.erasures = Erasures(context)
+        self.retention = RetentionJob(context, self.erasures)
+        self.transfers = Transfers(context)
+        self.idempotency = Idempotency(context)
+        self.known_calibrations = KnownCalibrations(context)
+        self.rerotation = Rerotation(context, self.tenants)
+        self.tenant_erasures = TenantErasures(context, self.tenants, self.api_keys)
+        self.wrapped_keys = WrappedKeys(context)
 
     def upgrade(self) -> Adoption:
         """Bring the schema to this program's version; safe when several workers start at once.
@@ -85,52 +83,29 @@ class TemplateStore(Subjects):
         Rows of a version that did not authenticate them are authenticated, once: see
         :func:`adoption.adopt`.
         """
-        migrate.upgrade(self._database)
-        deployment.mark_master_key(self._database, self._keyring, self._clock)
+        context = self._context
+        migrate.upgrade(self.database)
+        deployment.mark_master_key(self.database, context.keyring, context.clock)
         self.check()
         self.audit_log.begin()
-        return adopt(self._database, self.audit_log)
+        return adopt(context)
 
     def check(self) -> None:
         """Raise, naming the remedy, unless schema and master key are the right ones."""
-        migrate.check(self._database)
-        deployment.check_master_key(self._database, self._keyring)
+        migrate.check(self.database)
+        deployment.check_master_key(self.database, self._context.keyring)
 
     def check_records(self) -> tuple[RecordProblem, ...]:
         """Hold the rows that decide against the audit log; see :func:`check_records`."""
-        return check_records(self._database, self.audit_log, self._clock())
+        return check_records(self._context)
 
     def close(self) -> None:
         """Close the idle connections of this process."""
-        self._database.close()
-
-    def stored_form(self, tenant: str, subject_id: str) -> StoredForm | None:
-        """Return a subject's template as it is stored; see :func:`stored_form`."""
-        return stored_form(self._database, self._keyring, tenant, subject_id)
-
-    def erase(self, tenant: str, subject_id: str, *, by: By = PROGRAM) -> Erasure:
-        """Erase a subject and sign a receipt; see :meth:`Erasures.erase`."""
-        return self._erasures.erase(tenant, subject_id, by=by)
-
-    def receipt(self, tenant: str, subject_id: str) -> Receipt | None:
-        """Return the latest erasure receipt of a subject, or None."""
-        return self._erasures.receipt(tenant, subject_id)
-
-    def erase_expired(
-        self, keep: Retention, *, by: By = RETENTION, batch: int = retention.BATCH
-    ) -> int:
-        """Erase the subjects whose retention has ended; see :func:`retention.erase_expired`."""
-        return retention.erase_expired(
-            self._database, self._erasures, self._clock, keep, by=by, batch=batch
-        )
-
-    def due(self, keep: Retention) -> int:
-        """Count the subjects whose retention has ended."""
-        return retention.due(self._database, self._clock, keep)
+        self.database.close()
 
     def ping(self) -> None:
         """Raise :class:`StoreUnavailable` unless the database answers a query."""
-        self._database.read(lambda connection: connection.execute(sa.select(1)).one())
+        self.database.read(lambda connection: connection.execute(sa.select(1)).one())
 
     def ping_write(self) -> None:
         """Raise :class:`StoreError` unless the database takes a write; nothing changes by it.
@@ -142,7 +117,7 @@ class TemplateStore(Subjects):
             id=_TRIAL_ROW,
             wrapped_value=os.urandom(_TRIAL_BYTES),
             wrapping_key="",
-            created_at=self._clock(),
+            created_at=self._context.clock(),
         )
 
         def work(connection: Connection) -> None:
@@ -152,25 +127,7 @@ class TemplateStore(Subjects):
             )
 
         # One at a time: on PostgreSQL another worker's trial has the same row, not yet removed.
-        self._database.write(work, lock="trial write")
-
-    def pseudonym(self, tenant: str, subject_id: str) -> str:
-        """Name of a subject in receipts, logs and the audit log."""
-        return self._signer.pseudonym(tenant, subject_id)
-
-    def receipt_public_key(self) -> bytes:
-        """The 32 bytes that :func:`verify_receipt` checks this deployment's receipts with."""
-        return self._signer.public_key()
-
-    def rewrap(self, *, batch: int = 200, progress: Callable[[int], None] | None = None) -> int:
-        """Bring all wrapped keys and secrets under the current key; see ``rewrap.rewrap``."""
-        count = rewrap.rewrap(self._database, self._keyring, batch=batch, progress=progress)
-        self._database.try_purge_log()
-        return count
-
-    def wrapping_keys(self) -> dict[str, int]:
-        """Count what each master key still wraps; an absent key may be dropped from the file."""
-        return rewrap.wrapping_keys(self._database)
+        self.database.write(work, lock="trial write")
 
     def purge(self, *, wait: float | None = None) -> bool:
         """Remove expired records, and on SQLite empty the write-ahead log.
@@ -188,7 +145,7 @@ class TemplateStore(Subjects):
         """
         self.idempotency.expire()
         self.attempts.expire()
-        return self._database.purge_log(wait=wait)
+        return self.database.purge_log(wait=wait)
 
     def compact(self) -> None:
         """Rewrite the tables of subjects and of keys, so that no page keeps what was erased.
@@ -197,11 +154,7 @@ class TemplateStore(Subjects):
         files and locks each table meanwhile. SQLite overwrites as it deletes; there this gives
         the free pages back to the file system.
         """
-        self._database.compact([table.__tablename__ for table in _HOLD_SUBJECT_DATA])
-
-    def size(self) -> int:
-        """Bytes that the database takes on disk, without the write-ahead log."""
-        return self._database.size()
+        self.database.compact([table.__tablename__ for table in _HOLD_SUBJECT_DATA])
 
 
 _HOLD_SUBJECT_DATA = (

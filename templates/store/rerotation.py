@@ -19,7 +19,7 @@ moves the distance is 2.6·10⁻⁵ from that to the template before any roundin
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -31,11 +31,12 @@ from sqlalchemy.engine import Connection
 from templates.contract import wire
 from templates.errors import SealError, StoreError, TemplateError
 from templates.keys.rotation import tenant_rotation
-from templates.keys.sealing import MasterKeyring, sealed_key_id
-from templates.store.audit_log import PROGRAM, AuditLog, By, Entry
-from templates.store.database import Database
-from templates.store.envelope import Envelope, Owner, close_envelope, open_envelope
+from templates.keys.sealing import sealed_key_id
+from templates.store.audit_log import PROGRAM, By, Entry
+from templates.store.context import StoreContext
+from templates.store.envelope import close_envelope, open_envelope
 from templates.store.schema import RotationKeyRow, SubjectRow, TemplateRow, TenantRow
+from templates.store.subject_rows import TEMPLATE_COLUMNS, envelope_of, owner_of
 from templates.store.tenants import RetiredRotation, Tenants
 
 ACTION = "tenant-rotate"
@@ -47,18 +48,10 @@ Rotation = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class _Stored:
-    """A template as it was read."""
+class _Rotated:
+    """A template in the new epoch, and the row that it replaces, with ``TEMPLATE_COLUMNS``."""
 
-    owner: Owner
-    envelope: Envelope = field(repr=False)
-
-
-@dataclass(frozen=True)
-class _Turned:
-    """A template in the new epoch, and the row that it replaces."""
-
-    stored: _Stored
+    row: Any = field(repr=False)
     epoch: int
     wire: bytes = field(repr=False)
 
@@ -66,17 +59,9 @@ class _Turned:
 class Rerotation:
     """Renews the rotations of tenants."""
 
-    def __init__(
-        self,
-        database: Database,
-        keyring: MasterKeyring,
-        tenants: Tenants,
-        audit_log: AuditLog,
-    ) -> None:
-        self._database = database
-        self._keyring = keyring
+    def __init__(self, context: StoreContext, tenants: Tenants) -> None:
+        self._context = context
         self._tenants = tenants
-        self._audit_log = audit_log
 
     def begin(self, tenant: str, *, by: By = PROGRAM) -> int:
         """Make a new rotation, in which templates are enrolled from now on; returns its epoch.
@@ -87,7 +72,6 @@ class Rerotation:
         ------
         UnknownTenant
         """
-        self._audit_log.prepare()
 
         def work(connection: Connection) -> int:
             owner = self._tenants.locked(connection, tenant)
@@ -97,7 +81,7 @@ class Rerotation:
             self._tenants.change(connection, owner, entry, rotation_epoch=epoch)
             return epoch
 
-        return self._database.write(work)
+        return self._context.write(work)
 
     def move(
         self,
@@ -133,21 +117,19 @@ class Rerotation:
         StoreUnavailable
             If a write that was under way at the start does not end within the timeout.
         """
-        owner = self._tenants.get(tenant)
+        owner, database = self._tenants.get(tenant), self._context.database
         # An enrollment that read the epoch before the renewal may commit into the old one still.
-        self._database.await_writers()
-        turns = _Turns(self._tenants, tenant)
+        database.await_writers()
+        rotations = _Rotations(self._tenants, tenant)
         total, broken = 0, set[str]()
         while True:
             moved, left, after = 0, 0, ""
             broken_before, broken = broken, set()
-            while rows := self._database.read(
-                partial(_old_templates, tenant_id=owner.id, after=after, batch=batch)
-            ):
-                after = rows[-1].owner.subject_pk
-                turned = self._turn_all(turns, rows, broken)
-                changed = self._database.write(partial(self._replace_all, turned=turned))
-                moved, left = moved + changed, left + len(turned) - changed
+            while rows := database.read(partial(_old_templates, owner.id, after, batch)):
+                after = rows[-1].subject_pk
+                rotated = self._rotate_all(rotations, rows, broken)
+                changed = database.write(partial(self._replace_all, rotated=rotated))
+                moved, left = moved + changed, left + len(rotated) - changed
                 if progress is not None and changed:
                     progress(changed)
             total += moved
@@ -156,9 +138,10 @@ class Rerotation:
                 break
             if not moved:
                 time.sleep(_PAUSE_S)  # another write holds them
-        self._database.try_purge_log(wait=PURGE_WAIT_S)
+        database.try_purge_log(wait=PURGE_WAIT_S)
         if total:
-            self._audit_log.record(_entry("moved", tenant, turns.current_epoch(), by))
+            entry = _entry("moved", tenant, rotations.current_epoch(), by)
+            self._context.audit_log.record(entry)
         if broken:
             raise StoreError(
                 f"{len(broken)} templates of tenant {tenant!r} could not be moved to its new "
@@ -170,12 +153,13 @@ class Rerotation:
     def remaining(self, tenant: str) -> int:
         """Number of the tenant's templates that are not in its current rotation."""
         owner = self._tenants.get(tenant)
-        return self._database.read(lambda each: _count(each, _is_old(owner.id)))
+        return self._context.database.read(lambda connection: _count(connection, _is_old(owner.id)))
 
     def subjects_of_old_epochs(self, tenant: str, *, batch: int = 1000) -> Iterator[str]:
         """Ids, in order, of the subjects whose templates are not in the current rotation."""
         owner, after = self._tenants.get(tenant), ""
-        while names := self._database.read(partial(_old_subjects, owner.id, after, batch)):
+        database = self._context.database
+        while names := database.read(partial(_old_subjects, owner.id, after, batch)):
             yield from names
             after = names[-1]
 
@@ -192,9 +176,8 @@ class Rerotation:
         """
         # The epoch is read before the wait. Writes that begin later know it, or a newer one, and
         # store no template in an earlier one.
-        owner = self._tenants.get(tenant)
-        self._audit_log.prepare()
-        self._database.await_writers()
+        owner, database = self._tenants.get(tenant), self._context.database
+        database.await_writers()
 
         def work(connection: Connection) -> int:
             older = sa.and_(
@@ -212,103 +195,99 @@ class Rerotation:
                 )
             ).rowcount
             if dropped:
-                self._note(connection, "retired", tenant, owner.rotation_epoch, by)
+                entry = _entry("retired", tenant, owner.rotation_epoch, by)
+                self._context.audit_log.append(connection, entry)
             return dropped
 
-        dropped = self._database.write(work)
-        self._database.try_purge_log(wait=PURGE_WAIT_S)
+        dropped = self._context.write(work)
+        database.try_purge_log(wait=PURGE_WAIT_S)
         return dropped
 
-    def _turn_all(
-        self, turns: "_Turns", rows: Sequence[_Stored], broken: set[str]
-    ) -> list[_Turned]:
-        epoch, turned = turns.current_epoch(), []
-        for stored in rows:
+    def _rotate_all(
+        self, rotations: "_Rotations", rows: Sequence[Any], broken: set[str]
+    ) -> list[_Rotated]:
+        epoch, rotated = rotations.current_epoch(), []
+        for row in rows:
             try:
-                opened = open_envelope(stored.envelope, stored.owner, self._keyring)
-                turned.append(_Turned(stored, epoch, turns.turn(opened, stored.owner, epoch)))
+                stored = open_envelope(envelope_of(row), owner_of(row), self._context.keyring)
+                rotated.append(
+                    _Rotated(row, epoch, rotations.rotated(stored, row.rotation_epoch, epoch))
+                )
             except (SealError, TemplateError, RetiredRotation):
-                broken.add(stored.owner.subject_pk)
-        return turned
+                broken.add(row.subject_pk)
+        return rotated
 
-    def _replace_all(self, connection: Connection, *, turned: Sequence[_Turned]) -> int:
-        return sum(self._replace(connection, each) for each in turned)
+    def _replace_all(self, connection: Connection, *, rotated: Sequence[_Rotated]) -> int:
+        return sum(self._replace(connection, template) for template in rotated)
 
-    def _replace(self, connection: Connection, turned: _Turned) -> bool:
-        """Put the turned template in the place of the one that was read, if that is still there."""
-        old, envelope = turned.stored.owner, turned.stored.envelope
+    def _replace(self, connection: Connection, rotated: _Rotated) -> bool:
+        """Put the rotated template in the place of the one read, if that is still there."""
+        row = rotated.row
         # A row that another write holds is looked at again, rather than waited for: an erasure
         # takes the two rows in the other order.
         unchanged = connection.execute(
             sa.select(SubjectRow.id)
             .join(TemplateRow, TemplateRow.subject_pk == SubjectRow.id)
             .where(
-                SubjectRow.id == old.subject_pk,
-                SubjectRow.wrapped_key == envelope.wrapped_key,
-                TemplateRow.ciphertext == envelope.ciphertext,
+                SubjectRow.id == row.subject_pk,
+                SubjectRow.wrapped_key == row.wrapped_key,
+                TemplateRow.ciphertext == row.ciphertext,
             )
             .with_for_update(skip_locked=True)
         ).one_or_none()
         if unchanged is None:
             return False
-        owner = Owner(
-            old.tenant_id,
-            old.subject_pk,
-            old.subject_id,
-            old.contract_id,
-            old.template_id,
-            turned.epoch,
-        )
-        new = close_envelope(turned.wire, owner, self._keyring)
+        owner = replace(owner_of(row), rotation_epoch=rotated.epoch)
+        new = close_envelope(rotated.wire, owner, self._context.keyring)
         connection.execute(
             sa.update(SubjectRow)
-            .where(SubjectRow.id == old.subject_pk)
+            .where(SubjectRow.id == row.subject_pk)
             .values(wrapped_key=new.wrapped_key, wrapping_key=sealed_key_id(new.wrapped_key))
         )
         connection.execute(
             sa.update(TemplateRow)
-            .where(TemplateRow.subject_pk == old.subject_pk)
-            .values(rotation_epoch=turned.epoch, ciphertext=new.ciphertext)
+            .where(TemplateRow.subject_pk == row.subject_pk)
+            .values(rotation_epoch=rotated.epoch, ciphertext=new.ciphertext)
         )
         return True
-
-    def _note(self, connection: Connection, outcome: str, tenant: str, epoch: int, by: By) -> None:
-        self._audit_log.append(connection, _entry(outcome, tenant, epoch, by))
 
 
 def _entry(outcome: str, tenant: str, epoch: int, by: By) -> Entry:
     return Entry(ACTION, outcome, by, tenant=tenant, detail=f"epoch {epoch}")
 
 
-class _Turns:
-    """The matrices that turn templates of one tenant from an epoch into the current one."""
+class _Rotations:
+    """The rotations of one tenant, and the matrices that lead from one epoch to another."""
 
     def __init__(self, tenants: Tenants, tenant: str) -> None:
         self._tenants = tenants
         self._tenant = tenant
-        self._rotations: dict[tuple[int, int], Rotation] = {}
-        self._turns: dict[tuple[int, int, int], Rotation] = {}
+        self._of_epochs: dict[tuple[int, int], Rotation] = {}
+        self._between_epochs: dict[tuple[int, int, int], Rotation] = {}
 
     def current_epoch(self) -> int:
         return self._tenants.get(self._tenant).rotation_epoch
 
-    def turn(self, stored: bytes, owner: Owner, epoch: int) -> bytes:
+    def rotated(self, stored: bytes, old: int, new: int) -> bytes:
+        """Bring the wire bytes of a template from one epoch into another."""
         template = wire.decode(stored)
-        turn = self._between(owner.rotation_epoch, epoch, template.subspace.n)
+        rotation = self._between(old, new, template.subspace.n)
         return wire.encode(
-            template.subspace.rotated(turn), contract_id=template.contract_id, dtype=template.dtype
+            template.subspace.rotated(rotation),
+            contract_id=template.contract_id,
+            dtype=template.dtype,
         )
 
     def _between(self, old: int, new: int, n: int) -> Rotation:
-        if (old, new, n) not in self._turns:
-            self._turns[old, new, n] = self._rotation(new, n) @ self._rotation(old, n).T
-        return self._turns[old, new, n]
+        if (old, new, n) not in self._between_epochs:
+            self._between_epochs[old, new, n] = self._of(new, n) @ self._of(old, n).T
+        return self._between_epochs[old, new, n]
 
-    def _rotation(self, epoch: int, n: int) -> Rotation:
-        if (epoch, n) not in self._rotations:
+    def _of(self, epoch: int, n: int) -> Rotation:
+        if (epoch, n) not in self._of_epochs:
             key = self._tenants.rotation_key(self._tenant, epoch=epoch).key
-            self._rotations[epoch, n] = tenant_rotation(key, n)
-        return self._rotations[epoch, n]
+            self._of_epochs[epoch, n] = tenant_rotation(key, n)
+        return self._of_epochs[epoch, n]
 
 
 def _current_epoch(tenant_id: str) -> sa.ScalarSelect[int]:
@@ -342,28 +321,12 @@ def _old_subjects(tenant_id: str, after: str, batch: int, connection: Connection
     return connection.execute(query).scalars().all()
 
 
-def _old_templates(
-    connection: Connection, *, tenant_id: str, after: str, batch: int
-) -> list[_Stored]:
+def _old_templates(tenant_id: str, after: str, batch: int, connection: Connection) -> Sequence[Any]:
     query = (
-        sa.select(
-            SubjectRow.tenant_id,
-            SubjectRow.id,
-            SubjectRow.subject_id,
-            TemplateRow.contract_id,
-            TemplateRow.template_id,
-            TemplateRow.rotation_epoch,
-            SubjectRow.wrapped_key,
-            TemplateRow.ciphertext,
-        )
+        sa.select(*TEMPLATE_COLUMNS)
         .join(TemplateRow, TemplateRow.subject_pk == SubjectRow.id)
         .where(_is_old(tenant_id), SubjectRow.id > after)
         .order_by(SubjectRow.id)
         .limit(batch)
     )
-    return [_stored(row) for row in connection.execute(query)]
-
-
-def _stored(row: Any) -> _Stored:
-    *owner, wrapped_key, ciphertext = row
-    return _Stored(Owner(*owner), Envelope(wrapped_key, ciphertext))
+    return connection.execute(query).all()

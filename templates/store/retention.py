@@ -9,22 +9,24 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from functools import partial
-from typing import NamedTuple
+from typing import Any
 
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
 from templates.errors import StoreError
 from templates.store.audit_log import By
-from templates.store.database import Database
+from templates.store.context import StoreContext
 from templates.store.erasure import Erasures
-from templates.store.identifiers import Clock, UnknownTenant
+from templates.store.identifiers import UnknownTenant
 from templates.store.schema import SubjectRow, TenantRow, UtcDateTime
 
 BATCH = 100
 LONGEST = timedelta(days=36_500)
 PURGE_WAIT_S = 0.25
 RETENTION = By("retention")
+
+Place = tuple[datetime, str]  # in the list of who is due: `updated_at` and the row's id
 
 
 @dataclass(frozen=True)
@@ -73,83 +75,80 @@ class Retention:
 
     def _enrolled_before(self, now: datetime) -> datetime:
         # Follows from the reasons; said apart so that the index on the time is used.
-        limits = [each for each in (self.max_age, self.max_disuse) if each is not None]
+        limits = [limit for limit in (self.max_age, self.max_disuse) if limit is not None]
         return now - min(limits)
 
 
-class _Due(NamedTuple):
-    """A subject that was due when the list was read."""
+class RetentionJob:
+    """Erases the subjects whose retention has ended."""
 
-    updated_at: datetime
-    row_id: str
-    tenant: str
-    subject_id: str
+    def __init__(self, context: StoreContext, erasures: Erasures) -> None:
+        self._context = context
+        self._erasures = erasures
 
+    def erase_expired(self, retention: Retention, *, by: By = RETENTION, batch: int = BATCH) -> int:
+        """Erase every subject that is due, of all tenants; returns how many.
 
-def erase_expired(
-    database: Database,
-    erasures: Erasures,
-    clock: Clock,
-    retention: Retention,
-    *,
-    by: By = RETENTION,
-    batch: int = BATCH,
-) -> int:
-    """Erase every subject that is due, of all tenants; returns how many.
+        It may be interrupted, run again, and run by several workers at once.
 
-    It may be interrupted, run again, and run by several workers at once.
+        Parameters
+        ----------
+        retention
+            Who is due.
+        by
+            Actor of the audit lines.
+        batch
+            Subjects that are listed at once.
+        """
+        if retention.keeps_all:
+            return 0
+        database, erased = self._context.database, 0
+        expired = retention.expired(self._context.clock())
+        after: Place | None = None
+        while rows := database.read(partial(_due, expired=expired, after=after, batch=batch)):
+            for row in rows:
+                erased += self._erase(row, expired, by)
+            database.try_purge_log(wait=PURGE_WAIT_S)
+            after = rows[-1].updated_at, rows[-1].id
+        return erased
 
-    Parameters
-    ----------
-    database, erasures, clock
-        What to erase from, how, and what time it is.
-    retention
-        Who is due.
-    by
-        Actor of the audit lines.
-    batch
-        Subjects that are listed at once.
-    """
-    if retention.keeps_all:
-        return 0
-    expired, erased = retention.expired(clock()), 0
-    after: _Due | None = None
-    while rows := database.read(partial(_list, expired=expired, after=after, batch=batch)):
-        for due in rows:
-            erased += _erase(erasures, due, expired, by)
-        database.try_purge_log(wait=PURGE_WAIT_S)
-        after = rows[-1]
-    return erased
+    def due(self, retention: Retention) -> int:
+        """Count the subjects that :meth:`erase_expired` would erase now."""
+        if retention.keeps_all:
+            return 0
+        expired = retention.expired(self._context.clock())
+        query = sa.select(sa.func.count()).select_from(SubjectRow).where(expired)
+        return self._context.database.read(
+            lambda connection: connection.execute(query).scalar_one()
+        )
 
-
-def due(database: Database, clock: Clock, retention: Retention) -> int:
-    """Count the subjects that :func:`erase_expired` would erase now."""
-    if retention.keeps_all:
-        return 0
-    query = sa.select(sa.func.count()).select_from(SubjectRow).where(retention.expired(clock()))
-    return database.read(lambda each: int(each.execute(query).scalar_one()))
-
-
-def _erase(erasures: Erasures, due: _Due, expired: sa.ColumnElement[bool], by: By) -> bool:
-    # The row, too: a tenant or a subject of the same name may have been made anew.
-    still = sa.and_(SubjectRow.id == due.row_id, expired)
-    try:
-        return erasures.erase_if(due.tenant, due.subject_id, still, by=by) is not None
-    except UnknownTenant:
-        return False
+    def _erase(self, row: Any, expired: sa.ColumnElement[bool], by: By) -> bool:
+        # The row, too: a tenant or a subject of the same name may have been made anew.
+        still_due = sa.and_(SubjectRow.id == row.id, expired)
+        try:
+            receipt = self._erasures.erase_if(row.tenant, row.subject_id, still_due, by=by)
+        except UnknownTenant:
+            return False
+        return receipt is not None
 
 
-def _list(
-    connection: Connection, *, expired: sa.ColumnElement[bool], after: _Due | None, batch: int
-) -> Sequence[_Due]:
+def _due(
+    connection: Connection, *, expired: sa.ColumnElement[bool], after: Place | None, batch: int
+) -> Sequence[Any]:
     query = (
-        sa.select(SubjectRow.updated_at, SubjectRow.id, TenantRow.name, SubjectRow.subject_id)
+        sa.select(
+            SubjectRow.updated_at,
+            SubjectRow.id,
+            TenantRow.name.label("tenant"),
+            SubjectRow.subject_id,
+        )
         .join(TenantRow, TenantRow.id == SubjectRow.tenant_id)
         .where(expired)
         .order_by(SubjectRow.updated_at, SubjectRow.id)
         .limit(batch)
     )
     if after is not None:
-        place = sa.literal(after.updated_at, UtcDateTime()), sa.literal(after.row_id)
-        query = query.where(sa.tuple_(SubjectRow.updated_at, SubjectRow.id) > sa.tuple_(*place))
-    return [_Due(*row) for row in connection.execute(query)]
+        updated_at, row_id = after
+        place = sa.tuple_(sa.literal(updated_at, UtcDateTime()), sa.literal(row_id))
+        query = query.where(sa.tuple_(SubjectRow.updated_at, SubjectRow.id) > place)
+    return connection.execute(query).all()

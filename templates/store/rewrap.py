@@ -20,7 +20,7 @@ from sqlalchemy.orm import InstrumentedAttribute
 
 from templates.keys.sealing import MasterKeyring, sealed_key_id
 from templates.store.api_keys import PROBE_KEY_PURPOSE
-from templates.store.database import Database
+from templates.store.context import StoreContext
 from templates.store.deployment import CHECK_PURPOSE, SECRET_PURPOSE
 from templates.store.envelope import DATA_KEY_PURPOSE
 from templates.store.schema import (
@@ -93,62 +93,61 @@ WRAPPED_COLUMNS = (
 )
 
 
-def rewrap(
-    database: Database,
-    keyring: MasterKeyring,
-    *,
-    batch: int = 200,
-    progress: Callable[[int], None] | None = None,
-) -> int:
-    """Bring every wrapped blob under the keyring's current key; returns how many were not.
+class WrappedKeys:
+    """The blobs under master keys, all over the store."""
 
-    Parameters
-    ----------
-    database, keyring
-        What to re-wrap. The keyring holds the old keys too.
-    batch
-        Rows in one transaction.
-    progress
-        Called after each transaction with the number of rows it re-wrapped.
+    def __init__(self, context: StoreContext) -> None:
+        self._context = context
 
-    Raises
-    ------
-    SealError
-        If a blob is under a key that the keyring lacks. What was re-wrapped before it stays so,
-        and the next run goes on from there.
-    StoreUnavailable
-        If a write that was under way at the start does not end within the timeout.
-    """
-    total = 0
-    while True:
-        current = keyring.current
-        database.await_writers()
-        for column in WRAPPED_COLUMNS:
-            work = partial(_rewrap_batch, column=column, keyring=keyring, batch=batch)
-            while any(counts := database.write(work)):
-                total += counts.changed
-                if progress is not None:
-                    progress(counts.changed)
-        if keyring.current == current:  # else the key file changed once more: go round again
-            return total
+    def rewrap(self, *, batch: int = 200, progress: Callable[[int], None] | None = None) -> int:
+        """Bring every wrapped blob under the keyring's current key; returns how many were not.
 
+        Parameters
+        ----------
+        batch
+            Rows in one transaction.
+        progress
+            Called after each transaction with the number of rows it re-wrapped.
 
-def wrapping_keys(database: Database) -> dict[str, int]:
-    """Count the wrapped blobs under each master key id; one id alone means nothing is left."""
+        Raises
+        ------
+        SealError
+            If a blob is under a key that the keyring lacks. What was re-wrapped before it stays so,
+            and the next run goes on from there.
+        StoreUnavailable
+            If a write that was under way at the start does not end within the timeout.
+        """
+        database, keyring, total = self._context.database, self._context.keyring, 0
+        current = None
+        while keyring.current != current:  # again where the key file changed once more meanwhile
+            current = keyring.current
+            database.await_writers()
+            for column in WRAPPED_COLUMNS:
+                work = partial(_rewrap_batch, column=column, keyring=keyring, batch=batch)
+                while any(counts := database.write(work)):
+                    total += counts.changed
+                    if progress is not None:
+                        progress(counts.changed)
+        database.try_purge_log()
+        return total
 
-    def work(connection: Connection) -> dict[str, int]:
-        counts: dict[str, int] = {}
-        for column in WRAPPED_COLUMNS:
-            query = sa.select(column.wrapping_key, sa.func.count()).group_by(column.wrapping_key)
-            for key_id, count in connection.execute(query):
-                counts[key_id] = counts.get(key_id, 0) + count
-        return counts
+    def count(self) -> dict[str, int]:
+        """Count the blobs under each master key id; one that is absent wraps nothing any more."""
 
-    return database.read(work)
+        def work(connection: Connection) -> dict[str, int]:
+            counts: dict[str, int] = {}
+            for column in WRAPPED_COLUMNS:
+                wrapping_key = column.wrapping_key
+                query = sa.select(wrapping_key, sa.func.count()).group_by(wrapping_key)
+                for key_id, count in connection.execute(query):
+                    counts[key_id] = counts.get(key_id, 0) + count
+            return counts
+
+        return self._context.database.read(work)
 
 
 class _Counts(NamedTuple):
-    found: int  # rows under another key
+    selected: int  # rows under another key
     changed: int  # fewer, where somebody else wrote the row meanwhile
 
 
@@ -156,22 +155,20 @@ def _rewrap_batch(
     connection: Connection, *, column: WrappedColumn, keyring: MasterKeyring, batch: int
 ) -> _Counts:
     rows = connection.execute(
-        sa.select(column.blob, *column.key, *column.bound_to)
+        sa.select(column.blob.label("blob"), *dict.fromkeys((*column.key, *column.bound_to)))
         .where(column.wrapping_key != keyring.current)
         .order_by(*column.key)
         .limit(batch)
     ).all()
     changed = 0
-    for old, *rest in rows:
-        key, bound_to = rest[: len(column.key)], rest[len(column.key) :]
-        new = keyring.rewrap(old, purpose=column.purpose, bound_to=bound_to)
+    for row in rows:
+        bound_to = [row._mapping[part.key] for part in column.bound_to]
+        new = keyring.rewrap(row.blob, purpose=column.purpose, bound_to=bound_to)
+        unchanged = (part == row._mapping[part.key] for part in column.key)
         result = connection.execute(
             sa.update(column.table)
-            .where(
-                column.blob == old,
-                *(name == value for name, value in zip(column.key, key, strict=True)),
-            )
+            .where(column.blob == row.blob, *unchanged)
             .values({column.blob: new, column.wrapping_key: sealed_key_id(new)})
         )
         changed += result.rowcount
-    return _Counts(found=len(rows), changed=changed)
+    return _Counts(selected=len(rows), changed=changed)

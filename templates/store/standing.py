@@ -13,10 +13,17 @@ from typing import Any
 
 from sqlalchemy.engine import Connection
 
-from templates.store.attempt_queries import LINES_OF_ATTEMPTS, TENANT_ERASED
+from templates.store.attempt_queries import (
+    FIRST_COUNTS,
+    LINES_OF_ATTEMPTS,
+    NEXT_COUNTS,
+    TENANT_ERASED,
+)
 from templates.store.audit_chain import Line, is_true_line
+from templates.store.audit_log import AuditLog
 from templates.store.authenticity import AUTHENTICATED, is_authentic, row_mac, warn
-from templates.store.lockout import LockoutPolicy
+from templates.store.identifiers import Clock
+from templates.store.lockout import LockedOut, LockoutPolicy
 from templates.store.schema import FailedAttemptsRow
 
 UNKNOWN_RETENTION = timedelta(days=90)
@@ -44,116 +51,136 @@ class AttemptsStatus:
         return AttemptsStatus(0, self.total, self.last_failed_at, None, None)
 
 
-@dataclass(frozen=True)
-class Subject:
-    """Whose failures: the names that the rows and lines carry."""
-
-    tenant: str
-    pseudonym: str
-
-
-def standing(
-    connection: Connection,
-    row: Any,
-    subject: Subject,
-    *,
-    line_key: bytes,
-    row_key: bytes,
-    policy: LockoutPolicy,
-    now: datetime,
-) -> AttemptsStatus | None:
-    """Return what counts of a subject; None where nothing ever failed.
+class Standing:
+    """Tells how often verifying a subject failed, and writes its row.
 
     Parameters
     ----------
-    connection
-        Asked for further lines where the row is not good.
-    row
-        Of ``BEFORE`` or ``STANDING``: with ``COUNTS``, ``LAST_LINE`` and ``subject_pk``.
-    subject
-        Whose row it is.
-    line_key, row_key
-        Keys of the audit log's chain and of the MACs of rows.
+    audit_log, clock
+        What rows are held against, and what time it is.
     policy
-        By which a lock follows from lines.
-    now
-        Time of now.
+        By which a lock follows from failures.
     """
-    values = row._mapping
-    counted = _row_of(values)
-    row_is_true = counted is not None and is_authentic(row_key, FailedAttemptsRow, counted)
-    last = values["last_sequence"] or 0
-    if counted is not None and row_is_true and counted["line"] >= last:
-        return _status(counted)
-    total = counted["total"] if counted is not None and row_is_true else 0
-    if values["last_outcome"] != "reject":
-        return None if not total or counted is None else _status(counted).cleared()
-    found = _counted_in_log(connection, subject, line_key, policy)
-    if found is None or (
-        # An old count of somebody unknown was removed in its time: see Attempts.expire.
-        row.subject_pk is None
-        and found.disabled_at is None
-        and found.last_failed_at <= now - UNKNOWN_RETENTION
-    ):
-        return None
-    warn(
-        "the count of failed attempts on a subject was removed or altered in the database; "
-        "it was taken from the audit log",
-        tenant=subject.tenant,
-        subject=subject.pseudonym[:16],
-    )
-    return found
+
+    def __init__(self, audit_log: AuditLog, clock: Clock, policy: LockoutPolicy) -> None:
+        self._audit_log = audit_log
+        self._clock = clock
+        self._policy = policy
+
+    def of(
+        self, connection: Connection, row: Any, *, tenant: str, pseudonym: str
+    ) -> AttemptsStatus | None:
+        """Return what counts of a subject; None where nothing ever failed.
+
+        Parameters
+        ----------
+        connection
+            Asked for further lines where the row is not good.
+        row
+            Of ``BEFORE`` or ``STANDING``: with ``COUNTS``, ``LAST_LINE`` and ``subject_pk``.
+        tenant, pseudonym
+            Whose row it is.
+        """
+        row_key = self._audit_log.row_key()
+        counts = _counts_of(row)
+        if counts is not None and not is_authentic(row_key, FailedAttemptsRow, counts):
+            counts = None
+        if counts is not None and counts["line"] >= (row.last_sequence or 0):
+            return _status(counts)
+        if row.last_outcome != "reject":
+            return None if counts is None or not counts["total"] else _status(counts).cleared()
+        status = self._counted_in_log(connection, tenant, pseudonym)
+        if status is None or (
+            # An old count of somebody unknown was removed in its time: see Attempts.expire.
+            row.subject_pk is None
+            and status.disabled_at is None
+            and status.last_failed_at <= self._clock() - UNKNOWN_RETENTION
+        ):
+            return None
+        warn(
+            "the count of failed attempts on a subject was removed or altered in the database; "
+            "it was taken from the audit log",
+            tenant=tenant,
+            subject=pseudonym[:16],
+        )
+        return status
+
+    def after_failure(self, status: AttemptsStatus | None) -> AttemptsStatus:
+        """Status of a subject that has just failed once more."""
+        consecutive, total = (0, 0) if status is None else (status.consecutive, status.total)
+        return self._failed(consecutive + 1, total + 1, self._clock())
+
+    def _failed(self, consecutive: int, total: int, at: datetime) -> AttemptsStatus:
+        """Status of a subject with so many failures, the last one at a time."""
+        lock = self._policy.lock(consecutive)
+        return AttemptsStatus(
+            consecutive=consecutive,
+            total=total,
+            last_failed_at=at,
+            locked_until=None if lock is None else at + lock,
+            disabled_at=at if self._policy.disables(consecutive) else None,
+        )
+
+    def refuse_locked(self, status: AttemptsStatus | None) -> None:
+        """Raise :class:`LockedOut` where the subject is locked now."""
+        if not self._policy.after or status is None:
+            return
+        if status.disabled_at is not None:
+            raise LockedOut(None)
+        now = self._clock()
+        if status.locked_until is not None and now < status.locked_until:
+            raise LockedOut((status.locked_until - now).total_seconds())
+
+    def write(
+        self, connection: Connection, row: Any, pseudonym: str, status: AttemptsStatus, line: int
+    ) -> None:
+        """Write the row of a subject's failures; only the holder of the subject's lock does."""
+        identity = {"tenant_id": row.tenant_id, "pseudonym": pseudonym}
+        counts = {**vars(status), "line": line}
+        mac = row_mac(self._audit_log.row_key(), FailedAttemptsRow, {**identity, **counts})
+        # As the transaction finds it: an erasure since the decision must not leave a count that
+        # only another erasure would remove.
+        values = {**counts, "known": row.subject_pk is not None, "mac": mac}
+        if row.counted_pseudonym is None:
+            connection.execute(FIRST_COUNTS, {**identity, **values})
+        else:
+            of = {"of_tenant": row.tenant_id, "of_pseudonym": pseudonym}
+            connection.execute(NEXT_COUNTS, {**of, **values})
+
+    def _counted_in_log(
+        self, connection: Connection, tenant: str, pseudonym: str
+    ) -> AttemptsStatus | None:
+        policy = self._policy
+        most = max(policy.disable_at, 1) if policy.after else _MOST_COUNTED
+        rows = connection.execute(
+            LINES_OF_ATTEMPTS, {"pseudonym": pseudonym, "most": min(most, _MOST_COUNTED)}
+        )
+        # An erased tenant's subjects went without lines of their own.
+        erased = connection.execute(TENANT_ERASED, {"tenant": tenant}).scalar() or 0
+        line_key = self._audit_log.line_key()
+        failed_at: datetime | None = None
+        consecutive = 0
+        for row in rows:
+            line = Line(**row._mapping)
+            if line.sequence < erased:
+                break
+            if (line.actor or "").startswith("operator") and line.action == "verify":
+                continue  # an earlier version's name for what an operator tried: nothing counts it
+            # A line that is not true may have been any: it counts as a failure.
+            if is_true_line(line_key, line) and line.outcome != "reject":
+                break
+            failed_at = failed_at or line.at
+            consecutive += 1
+        return None if failed_at is None else self._failed(consecutive, consecutive, failed_at)
 
 
-def counts_row(
-    row_key: bytes, tenant_id: str, pseudonym: str, status: AttemptsStatus, line: int
-) -> dict[str, Any]:
-    """Columns of a row of ``failed_attempts``, its MAC among them."""
-    row = {"tenant_id": tenant_id, "pseudonym": pseudonym, **vars(status), "line": line}
-    return {**row, "mac": row_mac(row_key, FailedAttemptsRow, row)}
-
-
-def _counted_in_log(
-    connection: Connection, subject: Subject, line_key: bytes, policy: LockoutPolicy
-) -> AttemptsStatus | None:
-    most = max(policy.disable_at, 1) if policy.after else _MOST_COUNTED
-    lines = connection.execute(
-        LINES_OF_ATTEMPTS, {"pseudonym": subject.pseudonym, "most": min(most, _MOST_COUNTED)}
-    )
-    # An erased tenant's subjects went without lines of their own.
-    erased = connection.execute(TENANT_ERASED, {"tenant": subject.tenant}).scalar() or 0
-    failed_at: datetime | None = None
-    consecutive = 0
-    for columns in lines:
-        line = Line(*columns)
-        if line.sequence < erased:
-            break
-        if (line.actor or "").startswith("operator") and line.action == "verify":
-            continue  # an earlier version's name for what an operator tried, which nothing counts
-        # A line that is not true may have been any: it counts as a failure.
-        if is_true_line(line_key, line) and line.outcome != "reject":
-            break
-        failed_at = failed_at or line.at
-        consecutive += 1
-    if failed_at is None:
-        return None
-    lock = policy.lock(consecutive)
-    return AttemptsStatus(
-        consecutive=consecutive,
-        total=consecutive,
-        last_failed_at=failed_at,
-        locked_until=None if lock is None else failed_at + lock,
-        disabled_at=failed_at if policy.disables(consecutive) else None,
-    )
-
-
-def _row_of(values: Mapping[str, Any]) -> dict[str, Any] | None:
+def _counts_of(row: Any) -> dict[str, Any] | None:
     """Columns of the subject's row of ``failed_attempts``, or None where there is none."""
-    if values["counted_pseudonym"] is None:
+    if row.counted_pseudonym is None:
         return None
     names = (*AUTHENTICATED[FailedAttemptsRow], "mac")
-    return {name: values[f"counted_{name}"] for name in names}
+    return {name: row._mapping[f"counted_{name}"] for name in names}
 
 
-def _status(row: Mapping[str, Any]) -> AttemptsStatus:
-    return AttemptsStatus(**{name: row[name] for name in AttemptsStatus.__dataclass_fields__})
+def _status(counts: Mapping[str, Any]) -> AttemptsStatus:
+    return AttemptsStatus(**{name: counts[name] for name in AttemptsStatus.__dataclass_fields__})

@@ -6,26 +6,35 @@ import uuid
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import datetime
-from enum import StrEnum
 from typing import Any
 
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
 from templates.errors import SealError, StoreBusy, StoreError
-from templates.keys.sealing import MasterKeyring, sealed_key_id
-from templates.store.audit_log import PROGRAM, AuditLog, By, Entry
-from templates.store.database import Database
-from templates.store.envelope import Envelope, Owner, close_envelope, open_envelope
+from templates.keys.sealing import sealed_key_id
+from templates.store.audit_log import PROGRAM, By, Entry
+from templates.store.context import StoreContext
+from templates.store.envelope import Envelope, Owner, close_envelope
 from templates.store.identifiers import (
-    Clock,
     InvalidIdentifier,
     UnknownTenant,
     checked_opaque_id,
     checked_subject_id,
 )
-from templates.store.receipts import ReceiptSigner
 from templates.store.schema import FailedAttemptsRow, SubjectRow, TemplateRow, TenantRow
+from templates.store.subject_rows import (
+    RECORD_COLUMNS,
+    TEMPLATE_COLUMNS,
+    Source,
+    SubjectRecord,
+    SubjectTemplate,
+    of_tenant,
+    opened_template,
+    read_record,
+    subject_lock,
+    subject_pk_of,
+)
 
 MAX_WIRE_BYTES = 4 * 1024 * 1024  # a float32 template of n = 4096, m = 128 has 2.1 MB
 MAX_PAGE = 1000
@@ -33,13 +42,6 @@ MAX_PAGE = 1000
 _CURSOR_PURPOSE = "list-cursor"
 
 Guard = Callable[[Connection, str], Entry | None]
-
-
-class Source(StrEnum):
-    """What a template was made from."""
-
-    PHOTOS = "photos"
-    TEMPLATE = "template"
 
 
 @dataclass(frozen=True)
@@ -51,28 +53,22 @@ class StoredTemplate:
 
 
 @dataclass(frozen=True)
-class SubjectRecord:
-    """What is known of a subject without opening its template."""
+class StoredForm:
+    """A subject's template as it is stored.
 
-    subject_id: str
-    template_id: str
-    contract_id: str
-    rotation_epoch: int
-    n: int
-    m: int
-    dtype: str
-    source: Source
-    photos: int
-    created_at: datetime
-    updated_at: datetime
+    Attributes
+    ----------
+    template
+        What the ciphertext opens to, and its metadata.
+    sealed
+        The ciphertext, byte for byte: version, nonce, AES-256-GCM, tag.
+    last_used_at
+        Time of the last accepted verification.
+    """
 
-
-@dataclass(frozen=True)
-class SubjectTemplate:
-    """A subject with its decrypted template; the wire bytes stay out of its repr."""
-
-    record: SubjectRecord
-    wire: bytes = field(repr=False)
+    template: SubjectTemplate
+    sealed: bytes = field(repr=False)
+    last_used_at: datetime | None
 
 
 @dataclass(frozen=True)
@@ -86,19 +82,8 @@ class SubjectPage:
 class Subjects:
     """Repository of subjects."""
 
-    def __init__(
-        self,
-        database: Database,
-        keyring: MasterKeyring,
-        signer: ReceiptSigner,
-        audit_log: AuditLog,
-        clock: Clock,
-    ) -> None:
-        self._database = database
-        self._keyring = keyring
-        self._signer = signer
-        self.audit_log = audit_log
-        self._clock = clock
+    def __init__(self, context: StoreContext) -> None:
+        self._context = context
 
     def put(
         self,
@@ -155,35 +140,30 @@ class Subjects:
             raise StoreError(
                 f"a template has 1 to {MAX_WIRE_BYTES} wire bytes, this has {len(wire)}"
             )
-        pseudonym = self._signer.pseudonym(tenant, subject_id)
-        self.audit_log.prepare()
+        context, pseudonym = self._context, self._context.signer.pseudonym(tenant, subject_id)
 
         def work(connection: Connection) -> bool:
-            tenant_id, current_epoch = tenant_row(connection, tenant)
+            owner_row = connection.execute(_TENANT.where(TenantRow.name == tenant)).one_or_none()
+            if owner_row is None:
+                raise UnknownTenant.named(tenant)
+            tenant_id, current_epoch = owner_row.id, owner_row.rotation_epoch
             epoch = current_epoch if rotation_epoch is None else rotation_epoch
             if epoch != current_epoch:
                 raise StoreBusy("the tenant's rotation was renewed meanwhile; send it again")
-            noted = None if guard is None else guard(connection, pseudonym)
-            now = self._clock()
-            known = subject_row_id(connection, tenant_id, subject_id)
-            subject_pk = known or uuid.uuid4().hex
+            guard_entry = None if guard is None else guard(connection, pseudonym)
+            now = context.clock()
+            subject_pk = subject_pk_of(connection, tenant_id, subject_id)
+            is_new, subject_pk = subject_pk is None, subject_pk or uuid.uuid4().hex
             owner = Owner(tenant_id, subject_pk, subject_id, contract_id, template_id, epoch)
-            envelope = close_envelope(wire, owner, self._keyring)
-            key_columns = {
-                "wrapped_key": envelope.wrapped_key,
-                "wrapping_key": sealed_key_id(envelope.wrapped_key),
-                "updated_at": now,
-            }
-            if known is None:
-                connection.execute(
-                    sa.insert(SubjectRow).values(
-                        id=subject_pk,
-                        tenant_id=tenant_id,
-                        subject_id=subject_id,
-                        created_at=now,
-                        **key_columns,
-                    )
-                )
+            _write_rows(
+                connection,
+                owner,
+                close_envelope(wire, owner, context.keyring),
+                {"n": n, "m": m, "dtype": dtype, "source": Source(source).value, "photos": photos},
+                is_new=is_new,
+                now=now,
+            )
+            if is_new:
                 # A count of failures from before goes when the subject goes, and not earlier.
                 connection.execute(
                     sa.update(FailedAttemptsRow)
@@ -193,35 +173,15 @@ class Subjects:
                     )
                     .values(known=True)
                 )
-            else:
-                connection.execute(
-                    sa.update(SubjectRow).where(SubjectRow.id == known).values(**key_columns)
-                )
-                connection.execute(sa.delete(TemplateRow).where(TemplateRow.subject_pk == known))
-            connection.execute(
-                sa.insert(TemplateRow).values(
-                    subject_pk=subject_pk,
-                    template_id=template_id,
-                    contract_id=contract_id,
-                    rotation_epoch=epoch,
-                    ciphertext=envelope.ciphertext,
-                    n=n,
-                    m=m,
-                    dtype=dtype,
-                    source=Source(source).value,
-                    photos=photos,
-                    created_at=now,
-                )
-            )
-            if noted is not None:
-                self.audit_log.append(connection, noted)
-            outcome = "created" if known is None else "replaced"
-            self.audit_log.append(connection, Entry("enroll", outcome, by, tenant, pseudonym))
-            return known is None
+            if guard_entry is not None:
+                context.audit_log.append(connection, guard_entry)
+            outcome = "created" if is_new else "replaced"
+            context.audit_log.append(connection, Entry("enroll", outcome, by, tenant, pseudonym))
+            return is_new
 
-        created = self._database.write(work, lock=subject_lock(tenant, subject_id))
+        created = context.write(work, lock=subject_lock(tenant, subject_id))
         if not created:
-            self._database.try_purge_log()
+            context.database.try_purge_log()
         return StoredTemplate(template_id=template_id, created=created)
 
     def get(
@@ -242,18 +202,41 @@ class Subjects:
         SealError
             If the row was altered or moved, or its master key is missing.
         """
-        query = template_query(tenant, checked_subject_id(subject_id))
-        if contract_id is not None:
-            query = query.where(TemplateRow.contract_id == contract_id)
-        row = self._database.read(lambda each: each.execute(query).one_or_none())
-        return None if row is None else opened_template(row, self._keyring)
+        conditions = () if contract_id is None else (TemplateRow.contract_id == contract_id,)
+        row = self._row(TEMPLATE_COLUMNS, tenant, subject_id, *conditions)
+        return None if row is None else opened_template(row, self._context.keyring)
 
     def describe(self, tenant: str, subject_id: str) -> SubjectRecord | None:
         """Return a subject's metadata, or None; nothing is decrypted."""
-        checked_subject_id(subject_id)
-        query = _records(tenant).where(SubjectRow.subject_id == subject_id)
-        row = self._database.read(lambda each: each.execute(query).one_or_none())
-        return None if row is None else _record(row)
+        row = self._row(RECORD_COLUMNS, tenant, subject_id)
+        return None if row is None else read_record(row)
+
+    def stored_form(self, tenant: str, subject_id: str) -> StoredForm | None:
+        """Read a subject's template as it is stored, in one query; None if there is none.
+
+        Raises
+        ------
+        SealError
+            If the row was altered or moved, or its master key is missing.
+        """
+        row = self._row((*TEMPLATE_COLUMNS, SubjectRow.last_used_at), tenant, subject_id)
+        if row is None:
+            return None
+        template = opened_template(row, self._context.keyring)
+        return StoredForm(template, bytes(row.ciphertext), row.last_used_at)
+
+    def _row(
+        self,
+        columns: tuple[Any, ...],
+        tenant: str,
+        subject_id: str,
+        *conditions: sa.ColumnElement[bool],
+    ) -> Any:
+        subject = SubjectRow.subject_id == checked_subject_id(subject_id)
+        query = of_tenant(columns, tenant).where(subject, *conditions)
+        return self._context.database.read(
+            lambda connection: connection.execute(query).one_or_none()
+        )
 
     def list(self, tenant: str, *, limit: int = 100, cursor: str | None = None) -> SubjectPage:
         """Return a page of a tenant's subjects, in the order of their ids.
@@ -277,18 +260,18 @@ class Subjects:
         """
         if not 1 <= limit <= MAX_PAGE:
             raise InvalidIdentifier(f"the limit of a page is 1 to {MAX_PAGE}")
-        query = _records(tenant).order_by(SubjectRow.subject_id).limit(limit + 1)
+        query = of_tenant(RECORD_COLUMNS, tenant).order_by(SubjectRow.subject_id).limit(limit + 1)
         if cursor is not None:
             query = query.where(SubjectRow.subject_id > self._after(tenant, cursor))
-        rows = self._database.read(lambda each: each.execute(query).all())
-        records = tuple(_record(row) for row in rows[:limit])
+        rows = self._context.database.read(lambda connection: connection.execute(query).all())
+        records = tuple(read_record(row) for row in rows[:limit])
         return SubjectPage(
             records=records,
             next_cursor=self._cursor(tenant, records[-1]) if len(rows) > limit else None,
         )
 
     def _cursor(self, tenant: str, last: SubjectRecord) -> str:
-        sealed = self._keyring.seal(
+        sealed = self._context.keyring.seal(
             last.subject_id.encode(), purpose=_CURSOR_PURPOSE, bound_to=[tenant]
         )
         return base64.urlsafe_b64encode(sealed).decode().rstrip("=")
@@ -298,7 +281,7 @@ class Subjects:
             raise InvalidIdentifier("this cursor is too long to be one of ours")
         try:
             sealed = base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4))
-            opened = self._keyring.open(
+            opened = self._context.keyring.open(
                 sealed, purpose=_CURSOR_PURPOSE, bound_to=[tenant], refresh=False
             )
         except (SealError, binascii.Error, ValueError):
@@ -308,97 +291,44 @@ class Subjects:
         return opened.decode()
 
 
-_RECORD_COLUMNS = (
-    SubjectRow.subject_id,
-    TemplateRow.template_id,
-    TemplateRow.contract_id,
-    TemplateRow.rotation_epoch,
-    TemplateRow.n,
-    TemplateRow.m,
-    TemplateRow.dtype,
-    TemplateRow.source,
-    TemplateRow.photos,
-    SubjectRow.created_at,
-    SubjectRow.updated_at,
-)
-
-TEMPLATE_COLUMNS = (
-    *_RECORD_COLUMNS,
-    SubjectRow.id,
-    SubjectRow.tenant_id,
-    SubjectRow.wrapped_key,
-    TemplateRow.ciphertext,
-)
-"""What :func:`opened_template` needs."""
+_TENANT = sa.select(TenantRow.id, TenantRow.rotation_epoch)
 
 
-def _records(
-    tenant: str,
-) -> "sa.Select[*tuple[Any, ...]]":  # quoted: variadic from SQLAlchemy 2.1 on
-    return (
-        sa.select(*_RECORD_COLUMNS)
-        .join(TemplateRow, TemplateRow.subject_pk == SubjectRow.id)
-        .join(TenantRow, TenantRow.id == SubjectRow.tenant_id)
-        .where(TenantRow.name == tenant)
-    )
-
-
-def _record(columns: Any) -> SubjectRecord:
-    values = dict(zip(SubjectRecord.__dataclass_fields__, columns, strict=True))
-    return SubjectRecord(**{**values, "source": Source(values["source"])})
-
-
-def template_query(tenant: str, subject_id: str) -> Any:
-    """Select a subject's template, as :data:`TEMPLATE_COLUMNS`."""
-    return (
-        sa.select(*TEMPLATE_COLUMNS)
-        .join(TemplateRow, TemplateRow.subject_pk == SubjectRow.id)
-        .join(TenantRow, TenantRow.id == SubjectRow.tenant_id)
-        .where(TenantRow.name == tenant, SubjectRow.subject_id == subject_id)
-    )
-
-
-def opened_template(columns: Any, keyring: MasterKeyring) -> SubjectTemplate:
-    """Decrypt a template that was read as :data:`TEMPLATE_COLUMNS`.
-
-    Raises
-    ------
-    SealError
-        If the row was altered or moved, or its master key is missing.
-    """
-    *metadata, subject_pk, tenant_id, wrapped_key, ciphertext = columns
-    record = _record(metadata)
-    owner = Owner(
-        tenant_id,
-        subject_pk,
-        record.subject_id,
-        record.contract_id,
-        record.template_id,
-        record.rotation_epoch,
-    )
-    wire = open_envelope(Envelope(wrapped_key, ciphertext), owner, keyring)
-    return SubjectTemplate(record=record, wire=wire)
-
-
-def tenant_row(connection: Connection, name: str) -> tuple[str, int]:
-    """Row id and rotation epoch of a tenant, or :class:`UnknownTenant`."""
-    row = connection.execute(
-        sa.select(TenantRow.id, TenantRow.rotation_epoch).where(TenantRow.name == name)
-    ).one_or_none()
-    if row is None:
-        raise UnknownTenant(f"there is no tenant {name!r}")
-    return row.id, row.rotation_epoch
-
-
-def subject_row_id(connection: Connection, tenant_id: str, subject_id: str) -> str | None:
-    """Row id of a subject, or None."""
-    return connection.execute(
-        sa.select(SubjectRow.id).where(
-            SubjectRow.tenant_id == tenant_id, SubjectRow.subject_id == subject_id
+def _write_rows(
+    connection: Connection,
+    owner: Owner,
+    envelope: Envelope,
+    metadata: dict[str, Any],
+    *,
+    is_new: bool,
+    now: datetime,
+) -> None:
+    """Insert a subject and its template, or replace the template and the data key there are."""
+    key_columns = {
+        "wrapped_key": envelope.wrapped_key,
+        "wrapping_key": sealed_key_id(envelope.wrapped_key),
+        "updated_at": now,
+    }
+    if is_new:
+        identity = {
+            "id": owner.subject_pk,
+            "tenant_id": owner.tenant_id,
+            "subject_id": owner.subject_id,
+        }
+        connection.execute(sa.insert(SubjectRow).values(**identity, created_at=now, **key_columns))
+    else:
+        connection.execute(
+            sa.update(SubjectRow).where(SubjectRow.id == owner.subject_pk).values(**key_columns)
         )
-    ).scalar_one_or_none()
-
-
-def subject_lock(tenant: str, subject_id: str) -> str:
-    """Name of the lock under which a subject is written."""
-    return f"subject {tenant} {subject_id}"
+        connection.execute(sa.delete(TemplateRow).where(TemplateRow.subject_pk == owner.subject_pk))
+    connection.execute(
+        sa.insert(TemplateRow).values(
+            subject_pk=owner.subject_pk,
+            template_id=owner.template_id,
+            contract_id=owner.contract_id,
+            rotation_epoch=owner.rotation_epoch,
+            ciphertext=envelope.ciphertext,
+            created_at=now,
+            **metadata,
+        )
+    )

@@ -16,17 +16,22 @@ from sqlalchemy.engine import Connection
 from sqlalchemy.orm import InstrumentedAttribute
 
 from templates.store.api_keys import ApiKeys
-from templates.store.audit_log import PROGRAM, TENANT_ERASE, AuditLog, By, Entry
-from templates.store.database import Database
+from templates.store.audit_log import PROGRAM, TENANT_ERASE, By, Entry
+from templates.store.context import StoreContext
 from templates.store.deployment import insert_once
-from templates.store.identifiers import Clock, UnknownTenant, checked_tenant_name
-from templates.store.receipts import ErasedTenant, Receipt, ReceiptSigner, tenant_receipt_name
+from templates.store.identifiers import UnknownTenant, checked_tenant_name
+from templates.store.receipts import (
+    ErasedTenant,
+    Receipt,
+    keep_receipt,
+    latest_receipt,
+    tenant_receipt_name,
+)
 from templates.store.schema import (
     ApiKeyRow,
     Base,
     FailedAttemptsRow,
     IdempotencyRow,
-    ReceiptRow,
     RotationKeyRow,
     SubjectRow,
     TemplateRow,
@@ -34,13 +39,12 @@ from templates.store.schema import (
     TenantRow,
     UsedNonceRow,
 )
-from templates.store.subjects import subject_lock
+from templates.store.subject_rows import subject_lock, tenant_id_of
 from templates.store.tenants import AlteredTenant, Tenant, Tenants
 
 BATCH = 200
 
 Counts = dict[str, int]
-Key = tuple[Any, ...]
 
 
 @dataclass(frozen=True)
@@ -67,14 +71,14 @@ class TenantErasure:
 class _Records:
     """One kind of record of a tenant: its table and key, and which rows are the tenant's.
 
-    `lock` is the subject id where writes hold the lock of a subject rather than of the row.
+    `more` is what else is read of a row.
     """
 
     items: Sequence[str]
     table: type[Base]
     key: Sequence[InstrumentedAttribute[Any]]
     owned_by: Callable[[str], sa.ColumnElement[bool]]
-    lock: Sequence[InstrumentedAttribute[str]] = ()
+    more: Sequence[InstrumentedAttribute[str]] = ()
 
 
 # Before the row of the tenant, so that they can be counted; a subject's template goes with it.
@@ -112,21 +116,10 @@ _IN_BATCHES = (
 class TenantErasures:
     """The only way to erase a tenant."""
 
-    def __init__(
-        self,
-        database: Database,
-        signer: ReceiptSigner,
-        audit_log: AuditLog,
-        tenants: Tenants,
-        api_keys: ApiKeys,
-        clock: Clock,
-    ) -> None:
-        self._database = database
+    def __init__(self, context: StoreContext, tenants: Tenants, api_keys: ApiKeys) -> None:
+        self._context = context
         self._tenants = tenants
         self._api_keys = api_keys
-        self._signer = signer
-        self._audit_log = audit_log
-        self._clock = clock
 
     def erase(
         self,
@@ -158,32 +151,32 @@ class TenantErasures:
             If there never was a tenant of this name.
         """
         checked_tenant_name(tenant)
-        # Obtains the keys before the transactions need them.
-        self._signer.public_key()
-        self._audit_log.prepare()
-        begun = self._database.write(lambda each: self._begin(each, tenant, by))
+        context = self._context
+        context.signer.public_key()  # obtains the signing key before a transaction needs it
+        begun = context.write(lambda connection: self._begin(connection, tenant, by))
         if isinstance(begun, Receipt):
-            return TenantErasure(begun, erased=False, log_purged=self._database.try_purge_log())
-        for records in _IN_BATCHES:
-            while removed := self._remove_batch(begun, tenant, records, batch):
-                if progress is not None:
-                    progress(removed)
-        receipt, erased = self._database.write_alone(
-            lambda each: self._finish(each, begun, tenant, by)
-        )
-        return TenantErasure(receipt, erased, log_purged=self._database.try_purge_log())
+            receipt, erased = begun, False
+        else:
+            tenant_id = begun
+            for records in _IN_BATCHES:
+                while removed := self._remove_batch(tenant_id, tenant, records, batch):
+                    if progress is not None:
+                        progress(removed)
+            receipt, erased = context.database.write_alone(
+                lambda connection: self._finish(connection, tenant_id, tenant, by)
+            )
+        return TenantErasure(receipt, erased, log_purged=context.database.try_purge_log())
 
     def held(self, tenant: str) -> ErasedTenant:
         """Count what there is of a tenant now; :class:`UnknownTenant` where there is none."""
         checked_tenant_name(tenant)
 
         def work(connection: Connection) -> ErasedTenant:
-            tenant_id = _tenant_id(connection, tenant)
-            if tenant_id is None:
-                raise _unknown(tenant)
+            tenant_id = tenant_id_of(connection, tenant)
             counts = dict.fromkeys(_ITEMS, 0)
             owned: list[tuple[Sequence[str], type[Base], sa.ColumnElement[bool]]] = [
-                (each.items, each.table, each.owned_by(tenant_id)) for each in _IN_BATCHES
+                (records.items, records.table, records.owned_by(tenant_id))
+                for records in _IN_BATCHES
             ]
             owned += [
                 (["templates"], TemplateRow, _template_of(tenant_id)),
@@ -195,24 +188,31 @@ class TenantErasures:
                 counts |= dict.fromkeys(items, connection.execute(query).scalar_one())
             return ErasedTenant(**counts)
 
-        return self._database.read(work)
+        return self._context.database.read(work)
 
     def receipt(self, tenant: str) -> Receipt | None:
         """Return the latest receipt of the erasure of a tenant of this name, or None."""
         checked_tenant_name(tenant)
-        return self._database.read(lambda each: _latest_receipt(each, tenant))
+        return self._context.database.read(
+            lambda connection: latest_receipt(connection, tenant_receipt_name(tenant))
+        )
 
     def _begin(self, connection: Connection, tenant: str, by: By) -> str | Receipt:
         """Revoke the tenant's API keys; returns its row id, or the receipt where it is gone."""
-        tenant_id = _tenant_id(connection, tenant)
-        if tenant_id is None:
-            earlier = _latest_receipt(connection, tenant)
+        try:
+            tenant_id = tenant_id_of(connection, tenant)
+        except UnknownTenant:
+            earlier = latest_receipt(connection, tenant_receipt_name(tenant))
             if earlier is None:
-                raise _unknown(tenant)
+                raise
             self._note(connection, "receipt_repeated", tenant, by)
             return earlier
         first = insert_once(
-            connection, TenantErasureRow, tenant_id=tenant_id, begun_at=self._clock(), removed={}
+            connection,
+            TenantErasureRow,
+            tenant_id=tenant_id,
+            begun_at=self._context.clock(),
+            removed={},
         )
         # Before the first line: the head of the audit log is locked last.
         owner = self._locked(connection, tenant) if first else None
@@ -240,7 +240,7 @@ class TenantErasures:
             return sum(counts.values())
 
         # The lock is for the count, should the same tenant be erased twice at once.
-        return self._database.write(work, lock=f"tenant erasure {tenant_id}")
+        return self._context.write(work, lock=f"tenant erasure {tenant_id}")
 
     def _finish(
         self, connection: Connection, tenant_id: str, tenant: str, by: By
@@ -249,7 +249,7 @@ class TenantErasures:
             sa.select(TenantRow.rotation_epoch).where(TenantRow.id == tenant_id)
         ).scalar_one_or_none()
         if epoch is None:  # another call was faster
-            earlier = _latest_receipt(connection, tenant)
+            earlier = latest_receipt(connection, tenant_receipt_name(tenant))
             assert earlier is not None, "only the last transaction removes a tenant"  # noqa: S101
             return earlier, False
         for records in _IN_BATCHES:
@@ -265,21 +265,14 @@ class TenantErasures:
             sa.delete(TenantErasureRow).where(TenantErasureRow.tenant_id == tenant_id)
         )
         connection.execute(sa.delete(TenantRow).where(TenantRow.id == tenant_id))
-        now = self._clock()
-        receipt = self._signer.sign_tenant(
+        now = self._context.clock()
+        receipt = self._context.signer.sign_tenant(
             tenant=tenant,
             rotation_epoch=epoch,
             erased=ErasedTenant(**{**dict.fromkeys(_ITEMS, 0), **removed}),
             erased_at=now,
         )
-        connection.execute(
-            sa.insert(ReceiptRow).values(
-                pseudonym=tenant_receipt_name(tenant),
-                body=receipt.body,
-                signature=receipt.signature,
-                created_at=now,
-            )
-        )
+        keep_receipt(connection, tenant_receipt_name(tenant), receipt, now)
         self._note(connection, "erased", tenant, by)
         return receipt, True
 
@@ -290,61 +283,59 @@ class TenantErasures:
         tenant: str,
         records: _Records,
         batch: int | None,
-    ) -> Sequence[Key]:
-        """Keys of a batch of records that no other write is at; of all of them without a number.
+    ) -> Sequence[Any]:
+        """Rows of a batch of records that no other write is at; of all of them without a number.
 
         Those that are in use are left to a later batch, or to the last transaction: waiting for
         them, in whatever order they come, could make a deadlock.
         """
         query = (
-            sa.select(*records.key, *records.lock)
+            sa.select(*records.key, *records.more)
             .where(records.owned_by(tenant_id))
             .order_by(*records.key)
             .limit(batch)
             .with_for_update(skip_locked=True)
         )
-        rows = [tuple(row) for row in connection.execute(query)]
-        if not records.lock or batch is None:
-            return [row[: len(records.key)] for row in rows]
+        rows = connection.execute(query).all()
+        if records.table is not SubjectRow or batch is None:
+            return rows
+        locks = [subject_lock(tenant, row.subject_id) for row in rows]
         free: list[bool] = []
         for start in range(0, len(rows), BATCH):
-            names = [subject_lock(tenant, row[-1]) for row in rows[start : start + BATCH]]
-            free += self._database.try_locks(connection, names)
-        return [row[: len(records.key)] for row, ours in zip(rows, free, strict=True) if ours]
+            free += self._context.database.try_locks(connection, locks[start : start + BATCH])
+        return [row for row, is_free in zip(rows, free, strict=True) if is_free]
 
     def _note(self, connection: Connection, outcome: str, tenant: str, by: By) -> None:
-        self._audit_log.append(
-            connection, Entry(action=TENANT_ERASE, outcome=outcome, by=by, tenant=tenant)
-        )
+        entry = Entry(TENANT_ERASE, outcome, by, tenant)
+        self._context.audit_log.append(connection, entry)
 
 
-_ITEMS = tuple(each.name for each in fields(ErasedTenant))
+_ITEMS = tuple(item.name for item in fields(ErasedTenant))
 
 
-def _remove(connection: Connection, records: _Records, rows: Sequence[Key]) -> Counts:
+def _remove(connection: Connection, records: _Records, rows: Sequence[Any]) -> Counts:
     counts: Counts = {}
     for start in range(0, len(rows), BATCH):  # a statement has a bounded number of parameters
-        keys = rows[start : start + BATCH]
+        some = rows[start : start + BATCH]
         if records.table is SubjectRow:
             templates = sa.delete(TemplateRow).where(
-                TemplateRow.subject_pk.in_([subject_pk for (subject_pk,) in keys])
+                TemplateRow.subject_pk.in_([row.id for row in some])
             )
             _count(counts, ["templates"], connection.execute(templates).rowcount)
-        gone = sa.delete(records.table).where(sa.tuple_(*records.key).in_(keys))
-        _count(counts, records.items, connection.execute(gone).rowcount)
+        keys = [tuple(row._mapping[column.key] for column in records.key) for row in some]
+        statement = sa.delete(records.table).where(sa.tuple_(*records.key).in_(keys))
+        _count(counts, records.items, connection.execute(statement).rowcount)
     return counts
 
 
 def _add(connection: Connection, tenant_id: str, counts: Counts) -> None:
     """Add to what the erasure of the tenant has removed so far."""
-    mine = TenantErasureRow.tenant_id == tenant_id
-    removed: Counts = dict(
-        connection.execute(sa.select(TenantErasureRow.removed).where(mine)).scalar_one_or_none()
-        or {}
-    )
+    of_tenant = TenantErasureRow.tenant_id == tenant_id
+    query = sa.select(TenantErasureRow.removed).where(of_tenant)
+    removed: Counts = dict(connection.execute(query).scalar_one_or_none() or {})
     for item, count in counts.items():
         _count(removed, [item], count)
-    connection.execute(sa.update(TenantErasureRow).where(mine).values(removed=removed))
+    connection.execute(sa.update(TenantErasureRow).where(of_tenant).values(removed=removed))
 
 
 def _count(counts: Counts, items: Sequence[str], count: int) -> None:
@@ -356,23 +347,3 @@ def _template_of(tenant_id: str) -> sa.ColumnElement[bool]:
     return TemplateRow.subject_pk.in_(
         sa.select(SubjectRow.id).where(SubjectRow.tenant_id == tenant_id)
     )
-
-
-def _tenant_id(connection: Connection, tenant: str) -> str | None:
-    return connection.execute(
-        sa.select(TenantRow.id).where(TenantRow.name == tenant)
-    ).scalar_one_or_none()
-
-
-def _unknown(tenant: str) -> UnknownTenant:
-    return UnknownTenant(f"there is no tenant {tenant!r}")
-
-
-def _latest_receipt(connection: Connection, tenant: str) -> Receipt | None:
-    row = connection.execute(
-        sa.select(ReceiptRow.body, ReceiptRow.signature)
-        .where(ReceiptRow.pseudonym == tenant_receipt_name(tenant))
-        .order_by(ReceiptRow.sequence.desc())
-        .limit(1)
-    ).one_or_none()
-    return None if row is None else Receipt(row.body, row.signature)

@@ -5,7 +5,6 @@ after one of its name was erased, go on where those ended. So a process that kee
 memory, and an enrollment that was under way, cannot mistake one for the other.
 """
 
-import json
 import os
 import uuid
 from dataclasses import dataclass, field, replace
@@ -15,8 +14,8 @@ from typing import Any
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
-from templates.keys.sealing import MasterKeyring, sealed_key_id
-from templates.store.audit_log import PROGRAM, AuditLog, By, Entry
+from templates.keys.sealing import sealed_key_id
+from templates.store.audit_log import PROGRAM, By, Entry
 from templates.store.authenticity import (
     LAST_TENANT_LINE,
     columns_of,
@@ -25,17 +24,11 @@ from templates.store.authenticity import (
     row_mac,
     warn,
 )
-from templates.store.database import Database
+from templates.store.context import StoreContext
 from templates.store.deployment import insert_once
-from templates.store.identifiers import Clock, UnknownTenant, checked_tenant_name
-from templates.store.receipts import tenant_receipt_name
-from templates.store.schema import (
-    TENANT_LINES,
-    AuditRow,
-    ReceiptRow,
-    RotationKeyRow,
-    TenantRow,
-)
+from templates.store.identifiers import UnknownTenant, checked_tenant_name
+from templates.store.receipts import latest_receipt, tenant_receipt_name
+from templates.store.schema import TENANT_LINES, AuditRow, RotationKeyRow, TenantRow
 
 ROTATION_PURPOSE = "tenant-rotation-key"
 
@@ -84,19 +77,13 @@ class RetiredRotation(UnknownTenant):
 class Tenants:
     """Repository of tenants."""
 
-    def __init__(
-        self, database: Database, keyring: MasterKeyring, audit_log: AuditLog, clock: Clock
-    ) -> None:
-        self._database = database
-        self._keyring = keyring
-        self._audit_log = audit_log
-        self._clock = clock
+    def __init__(self, context: StoreContext) -> None:
+        self._context = context
 
     def create(self, name: str) -> Tenant:
         """Return the tenant of this name, which is made, with its rotation key, if it is new."""
         checked_tenant_name(name)
-        self._audit_log.prepare()
-        return self._database.write(lambda each: self.ensure(each, name))
+        return self._context.write(lambda connection: self.ensure(connection, name))
 
     def ensure(self, connection: Connection, name: str) -> Tenant:
         """:meth:`create` inside a transaction that is open already, its log prepared."""
@@ -104,13 +91,12 @@ class Tenants:
             id=uuid.uuid4().hex,
             name=name,
             rotation_epoch=1 + _last_epoch_of_erased(connection, name),
-            created_at=self._clock(),
+            created_at=self._context.clock(),
             template_enrollment=False,
         )
         # An erased tenant of this name has left lines, and a row from before them is none of ours.
         line = connection.execute(_LAST_LINE, {"name": name}).scalar() or 0
-        made = insert_once(connection, TenantRow, **self._row(tenant, line))
-        if made:
+        if insert_once(connection, TenantRow, **self._row(tenant, line)):
             self.add_rotation_key(connection, tenant.id, tenant.rotation_epoch)
         return self._one(connection, name)
 
@@ -122,13 +108,12 @@ class Tenants:
         UnknownTenant
             Where there is none; :class:`AlteredTenant` where its row is not authentic.
         """
-        self._audit_log.prepare()
-        return self._database.read(lambda each: self._one(each, name))
+        return self._context.read(lambda connection: self._one(connection, name))
 
     def all(self) -> tuple[Tenant, ...]:
         """Every tenant, by name; without those whose row is not authentic."""
-        self._audit_log.prepare()
-        rows = self._database.read(lambda each: each.execute(_ROWS.order_by(TenantRow.name)).all())
+        query = _ROWS.order_by(TenantRow.name)
+        rows = self._context.read(lambda connection: connection.execute(query).all())
         return tuple(_tenant(row) for row in rows if self._is_current(row))
 
     def set_template_enrollment(self, name: str, allowed: bool, *, by: By = PROGRAM) -> Tenant:
@@ -138,7 +123,6 @@ class Tenants:
         ------
         UnknownTenant
         """
-        self._audit_log.prepare()
         outcome = "template-enrollment-on" if allowed else "template-enrollment-off"
         entry = Entry("tenant-settings", outcome, by, checked_tenant_name(name))
 
@@ -146,7 +130,7 @@ class Tenants:
             tenant = self.locked(connection, name)
             return self.change(connection, tenant, entry, template_enrollment=allowed)
 
-        return self._database.write(work)
+        return self._context.write(work)
 
     def locked(self, connection: Connection, name: str) -> Tenant:
         """Return a tenant, whose row no other transaction changes until this one ends.
@@ -163,7 +147,7 @@ class Tenants:
     ) -> Tenant:
         """Change columns of a tenant that is :meth:`locked`, and add the line that tells of it."""
         changed = replace(tenant, **columns)
-        line = self._audit_log.append(connection, entry)
+        line = self._context.audit_log.append(connection, entry)
         connection.execute(
             sa.update(TenantRow).where(TenantRow.id == tenant.id).values(self._row(changed, line))
         )
@@ -175,38 +159,39 @@ class Tenants:
             query = query.with_for_update(of=TenantRow, key_share=True)
         row = connection.execute(query).one_or_none()
         if row is None:
-            raise UnknownTenant(f"there is no tenant {checked_tenant_name(name)!r}")
+            raise UnknownTenant.named(checked_tenant_name(name))
         if not self._is_current(row):
             warn("a tenant's row is not authentic and was passed over", tenant=name)
             raise AlteredTenant(name)
         return _tenant(row)
 
     def _is_current(self, row: Any) -> bool:
-        return is_current(self._audit_log.row_key(), TenantRow, row._mapping)
+        return is_current(self._context.audit_log.row_key(), TenantRow, row._mapping)
 
     def _row(self, tenant: Tenant, line: int) -> dict[str, Any]:
         row = {**vars(tenant), "line": line}
-        return {**row, "mac": row_mac(self._audit_log.row_key(), TenantRow, row)}
+        return {**row, "mac": row_mac(self._context.audit_log.row_key(), TenantRow, row)}
 
     def rotation_key(self, name: str, *, epoch: int | None = None) -> RotationKey:
         """Open the rotation key of a tenant, of the current epoch unless another is asked for."""
         tenant = self.get(name)
         epoch = tenant.rotation_epoch if epoch is None else epoch
-        wrapped = self._database.read(
-            lambda each: each.execute(
-                sa.select(RotationKeyRow.wrapped_key).where(
-                    RotationKeyRow.tenant_id == tenant.id, RotationKeyRow.epoch == epoch
-                )
-            ).scalar_one_or_none()
+        query = sa.select(RotationKeyRow.wrapped_key).where(
+            RotationKeyRow.tenant_id == tenant.id, RotationKeyRow.epoch == epoch
+        )
+        wrapped = self._context.database.read(
+            lambda connection: connection.execute(query).scalar_one_or_none()
         )
         if wrapped is None:
             raise RetiredRotation(f"tenant {name!r} has no rotation of epoch {epoch}")
-        key = self._keyring.open(wrapped, purpose=ROTATION_PURPOSE, bound_to=[tenant.id, epoch])
+        key = self._context.keyring.open(
+            wrapped, purpose=ROTATION_PURPOSE, bound_to=[tenant.id, epoch]
+        )
         return RotationKey(epoch=epoch, key=key)
 
     def add_rotation_key(self, connection: Connection, tenant_id: str, epoch: int) -> None:
         """Draw the key of a new epoch inside a transaction that is open already."""
-        wrapped = self._keyring.seal(
+        wrapped = self._context.keyring.seal(
             os.urandom(32), purpose=ROTATION_PURPOSE, bound_to=[tenant_id, epoch]
         )
         connection.execute(
@@ -215,7 +200,7 @@ class Tenants:
                 epoch=epoch,
                 wrapped_key=wrapped,
                 wrapping_key=sealed_key_id(wrapped),
-                created_at=self._clock(),
+                created_at=self._context.clock(),
             )
         )
 
@@ -226,13 +211,8 @@ _LAST_LINE = last_line(AuditRow.tenant == sa.bindparam("name"), TENANT_LINES)
 
 def _last_epoch_of_erased(connection: Connection, name: str) -> int:
     """Last epoch of the latest tenant of this name that was erased, by its receipt; else 0."""
-    body = connection.execute(
-        sa.select(ReceiptRow.body)
-        .where(ReceiptRow.pseudonym == tenant_receipt_name(name))
-        .order_by(ReceiptRow.sequence.desc())
-        .limit(1)
-    ).scalar_one_or_none()
-    return 0 if body is None else int(json.loads(body)["rotation_epoch"])
+    receipt = latest_receipt(connection, tenant_receipt_name(name))
+    return 0 if receipt is None else int(receipt.claims["rotation_epoch"])
 
 
 def _tenant(row: Any) -> Tenant:

@@ -15,13 +15,13 @@ from sqlalchemy.engine import Connection
 from templates.errors import StoreBusy, StoreError
 from templates.store.attempt_queries import TENANT_ERASED
 from templates.store.audit_chain import Anchor
-from templates.store.audit_log import AuditLog, By, Entry
+from templates.store.audit_log import By, Entry
 from templates.store.authenticity import last_line
-from templates.store.database import Database
-from templates.store.identifiers import Clock, checked_subject_id
-from templates.store.receipts import ReceiptSigner
+from templates.store.context import StoreContext
+from templates.store.identifiers import checked_subject_id
 from templates.store.schema import ENROLLMENT_LINES, AuditRow, SubjectRow, TemplateRow, TenantRow
-from templates.store.subjects import Guard, subject_lock
+from templates.store.subject_rows import subject_lock
+from templates.store.subjects import Guard
 
 
 class ExportSuperseded(StoreError):
@@ -54,13 +54,8 @@ class Stamp:
 class Transfers:
     """Stamps exports, and holds imports against what happened since."""
 
-    def __init__(
-        self, database: Database, signer: ReceiptSigner, audit_log: AuditLog, clock: Clock
-    ) -> None:
-        self._database = database
-        self._signer = signer
-        self._audit_log = audit_log
-        self._clock = clock
+    def __init__(self, context: StoreContext) -> None:
+        self._context = context
 
     def stamp(self, tenant: str, subject_id: str, *, template_id: str, by: By) -> Stamp:
         """Record that a template is exported, while it is still the subject's.
@@ -70,19 +65,19 @@ class Transfers:
         StoreBusy
             If the subject was enrolled again, or erased, since the template was read.
         """
-        pseudonym = self._signer.pseudonym(tenant, checked_subject_id(subject_id))
-        self._audit_log.prepare()
+        context = self._context
+        pseudonym = context.signer.pseudonym(tenant, checked_subject_id(subject_id))
 
         def work(connection: Connection) -> Stamp:
-            about = {"tenant": tenant, "subject_id": subject_id}
-            if connection.execute(_TEMPLATE_ID, about).scalar_one_or_none() != template_id:
+            subject = {"tenant": tenant, "subject_id": subject_id}
+            if connection.execute(_TEMPLATE_ID, subject).scalar_one_or_none() != template_id:
                 raise StoreBusy("the subject was enrolled again or erased meanwhile: send it again")
             entry = Entry("export", "exported", by, tenant, pseudonym)
-            line = self._audit_log.append(connection, entry)
+            line = context.audit_log.append(connection, entry)
             own_hash = connection.execute(_HASH, {"line": line}).scalar_one()
-            return Stamp(self._clock(), Anchor(line, own_hash))
+            return Stamp(context.clock(), Anchor(line, own_hash))
 
-        return self._database.write(work, lock=subject_lock(tenant, subject_id))
+        return context.write(work, lock=subject_lock(tenant, subject_id))
 
     def guard(self, tenant: str, stamp: Stamp | None, *, restore: bool, by: By) -> Guard:
         """What :meth:`Subjects.put` asks before it stores an import.
@@ -119,11 +114,10 @@ def is_superseded(connection: Connection, tenant: str, pseudonym: str, stamp: St
     stamp
         Of the export; None for one from before exports had any, which anything supersedes.
     """
-    numbers = (
+    last = max(
         connection.execute(_LAST_LINE, {"pseudonym": pseudonym}).scalar() or 0,
         connection.execute(TENANT_ERASED, {"tenant": tenant}).scalar() or 0,
     )
-    last = max(numbers)
     if not last or stamp is None:
         return bool(last)
     own_hash = connection.execute(_HASH, {"line": stamp.line.sequence}).scalar_one_or_none()

@@ -130,7 +130,7 @@ class _Examination:
             elif len(lines) > each.may_have_happened:
                 self._wrong(f"audit log: a line for {each}")
             for line in lines:
-                if line.pseudonym != self.store.pseudonym(self.tenant, each.subject):
+                if line.pseudonym != self.store.signer.pseudonym(self.tenant, each.subject):
                     self._wrong(f"audit log: another subject's line for {each}")
 
     def _lines_have_their_requests(self) -> None:
@@ -158,15 +158,15 @@ class _Examination:
         ):
             if self._scalar(query):
                 self._wrong(f"tables: a {what}")
-        if self.store._database.is_sqlite:
+        if self.store.database.is_sqlite:
             integrity = self._scalar(sa.text("PRAGMA integrity_check"))
             if integrity != "ok":
                 self._wrong(f"SQLite: integrity_check says {integrity}")
 
     def _receipts(self) -> None:
         """Every acknowledged receipt is there, and each erasure of the audit log left one."""
-        key = self.store.receipt_public_key()
-        rows = self.store._database.read(
+        key = self.store.signer.public_key()
+        rows = self.store.database.read(
             lambda each: each.execute(
                 sa.select(ReceiptRow.pseudonym, ReceiptRow.body, ReceiptRow.signature)
             ).all()
@@ -213,7 +213,7 @@ class _Examination:
         last = writes[-1] if writes else None
         expected = last is not None and last.kind == "enroll"
         with self._noting(f"{subject}: its template cannot be opened"):
-            stored = self.store.get(self.tenant, subject)
+            stored = self.store.subjects.get(self.tenant, subject)
             if (stored is not None) != expected:
                 state = "enrolled" if stored else "not enrolled"
                 self._wrong(f"{subject}: {state} after {last}")
@@ -266,7 +266,7 @@ class _Examination:
             self._wrong(f"{subject}: no serial order explains its {len(calls)} answers")
 
     def _lines_of(self, subject: str) -> list[Line]:
-        pseudonym = self.store.pseudonym(self.tenant, subject)
+        pseudonym = self.store.signer.pseudonym(self.tenant, subject)
         return [line for line in self.lines if line.pseudonym == pseudonym]
 
     def _writes_of(self, subject: str) -> list[Operation]:
@@ -278,7 +278,7 @@ class _Examination:
         ]
 
     def _scalar(self, query: Any) -> Any:
-        return self.store._database.read(lambda each: each.execute(query).scalar())
+        return self.store.database.read(lambda each: each.execute(query).scalar())
 
     def _noting(self, what: str) -> Any:
         return _Noting(self._wrong, what)

@@ -64,7 +64,7 @@ class StoppedDeployment:
                 connection.execute(sa.text(statement))
 
         with self.store() as store:
-            store._database.write(work)
+            store.database.write(work)
 
     def the(self, kind: str, *, last: bool = False) -> Operation:
         operations = [each for each in self.history if each.kind == kind]
@@ -141,11 +141,11 @@ def loses_half_of_it(stopped: StoppedDeployment) -> None:
 
 def keeps_what_was_erased(stopped: StoppedDeployment) -> None:
     with stopped.store() as store:
-        other = store.get("default", "subject-0")
+        other = store.subjects.get("default", "subject-0")
         assert other is not None
         columns = ("contract_id", "n", "m", "dtype", "source", "photos")
         known = {name: getattr(other.record, name) for name in columns}
-        store.put("default", "subject-1", other.wire, **known)
+        store.subjects.put("default", "subject-1", other.wire, **known)
 
 
 def moves_a_template(stopped: StoppedDeployment) -> None:
@@ -179,7 +179,7 @@ def counts_wrongly(stopped: StoppedDeployment) -> None:
 def alters_a_line(stopped: StoppedDeployment) -> None:
     triggers = sa.text("SELECT name FROM sqlite_master WHERE type = 'trigger'")
     with stopped.store() as store:
-        named = store._database.read(lambda each: each.execute(triggers).scalars().all())
+        named = store.database.read(lambda each: each.execute(triggers).scalars().all())
     stopped.execute(
         *(f"DROP TRIGGER {name}" for name in named),
         "UPDATE audit_log SET outcome = 'accept' WHERE outcome = 'reject'",

@@ -27,7 +27,7 @@ async def get_contract(
     request: Request, caller: CallerDep, runtime: RuntimeDep, gate: GateDep
 ) -> Response:
     """Any valid key may read it. The cohort is a secret and is not part of it."""
-    public_key = await gate.query(runtime.store.receipt_public_key)
+    public_key = await gate.query(runtime.store.signer.public_key)
     tenant = await gate.query(lambda: runtime.store.tenants.get(caller.tenant))
     return answer(
         request,

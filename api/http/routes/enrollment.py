@@ -35,7 +35,7 @@ from enroll import Enrollment
 from models.quality import Quality
 from templates.decoys import Attributes
 from templates.store.audit_log import By
-from templates.store.subjects import Source
+from templates.store.subject_rows import Source
 
 router = APIRouter(prefix="/v1/subjects", tags=["subjects"])
 

@@ -15,7 +15,7 @@ from api.http.values import iso_time
 from templates.contract import wire
 from templates.space.lifting import Strategy
 from templates.store.audit_log import Entry
-from templates.store.stored_form import StoredForm
+from templates.store.subjects import StoredForm
 
 router = APIRouter(prefix="/v1", tags=["stored"])
 
@@ -38,10 +38,10 @@ async def get_stored(
     """
 
     def work() -> tuple[StoredForm, float] | None:
-        found = runtime.store.stored_form(caller.tenant, subject)
-        if found is None:
+        form = runtime.store.subjects.stored_form(caller.tenant, subject)
+        if form is None:
             return None
-        norm = wire.decode(found.template.wire).subspace.foot_norm
+        norm = wire.decode(form.template.wire).subspace.foot_norm
         # It opens a template and tells when its person was last here: the line stands first.
         store = runtime.store
         line = Entry(
@@ -49,18 +49,18 @@ async def get_stored(
             "inspected",
             by(request),
             caller.tenant,
-            store.pseudonym(caller.tenant, subject),
+            store.signer.pseudonym(caller.tenant, subject),
         )
         store.audit_log.record(line)
-        return found, norm
+        return form, norm
 
     # Reading a template orthonormalises its basis: it takes a slot as a decision does.
     async with gate.admitted(caller.prefix):
         read = await gate.compute(work, key=caller.prefix)
     if read is None:
         raise ApiError("not_enrolled", "nobody is enrolled under this id")
-    found, norm = read
-    record = found.template.record
+    form, norm = read
+    record = form.template.record
     strategy = runtime.contract.binding.strategy
     current = record.contract_id == runtime.contract.contract_id
     return answer(
@@ -75,15 +75,15 @@ async def get_stored(
             "n": record.n,
             "m": record.m,
             "dtype": record.dtype,
-            "wire_bytes": len(found.template.wire),
-            "sealed_bytes": len(found.sealed),
-            "sealed_excerpt": _middle(found.sealed, EXCERPT_BYTES).hex(),
+            "wire_bytes": len(form.template.wire),
+            "sealed_bytes": len(form.sealed),
+            "sealed_excerpt": _middle(form.sealed, EXCERPT_BYTES).hex(),
             "foot_point_similarity": round(norm, 3),
             "enrolled_by": str(record.source),
             "photos": record.photos,
             "created_at": iso_time(record.created_at),
             "updated_at": iso_time(record.updated_at),
-            "last_used_at": iso_time(found.last_used_at),
+            "last_used_at": iso_time(form.last_used_at),
         },
     )
 

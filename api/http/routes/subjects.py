@@ -13,7 +13,7 @@ from api.http.openapi import EVERY_CALL, error_responses
 from api.http.receipts import receipt_json
 from api.http.schemas import ReceiptAnswer, SubjectAnswer, SubjectsAnswer
 from api.http.values import iso_time
-from templates.store.subjects import SubjectRecord
+from templates.store.subject_rows import SubjectRecord
 
 router = APIRouter(prefix="/v1/subjects", tags=["subjects"])
 
@@ -33,7 +33,9 @@ async def list_subjects(
     cursor: Annotated[str | None, Query(description="`next_cursor` of the page before.")] = None,
 ) -> Response:
     """Right: `enroll`. Metadata only, in the order of the subject ids."""
-    page = await gate.query(lambda: runtime.store.list(caller.tenant, limit=limit, cursor=cursor))
+    page = await gate.query(
+        lambda: runtime.store.subjects.list(caller.tenant, limit=limit, cursor=cursor)
+    )
     return answer(
         request,
         {
@@ -55,7 +57,7 @@ async def get_subject(
     request: Request, caller: Enrolls, subject: SubjectDep, runtime: RuntimeDep, gate: GateDep
 ) -> Response:
     """Right: `enroll`. Metadata only, never template bytes."""
-    record = await gate.query(lambda: runtime.store.describe(caller.tenant, subject))
+    record = await gate.query(lambda: runtime.store.subjects.describe(caller.tenant, subject))
     if record is None:
         raise ApiError("not_enrolled", "nobody is enrolled under this id")
     return answer(request, _described(record, runtime.contract.contract_id))
@@ -86,11 +88,11 @@ async def erase_subject(
         store = runtime.store
         if (
             caller.sees_enrollment
-            and store.describe(caller.tenant, subject) is None
-            and store.receipt(caller.tenant, subject) is None
+            and store.subjects.describe(caller.tenant, subject) is None
+            and store.erasures.receipt(caller.tenant, subject) is None
         ):
             raise ApiError("not_enrolled", "nobody was ever enrolled under this id")
-        return receipt_json(store.erase(caller.tenant, subject, by=by(request)).receipt)
+        return receipt_json(store.erasures.erase(caller.tenant, subject, by=by(request)).receipt)
 
     # No stored answer: after another enrollment it would claim an erasure that did not happen.
     return answer(request, await gate.query(work))

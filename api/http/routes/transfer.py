@@ -16,7 +16,7 @@ from api.http.openapi import BODY, EVERY_CALL, IDEMPOTENT, IMPORT_BODY, error_re
 from api.http.schemas import ExportAnswer, ImportAnswer
 from api.http.transfer import open_export
 from templates.store.identifiers import checked_subject_id
-from templates.store.subjects import Source
+from templates.store.subject_rows import Source
 
 router = APIRouter(prefix="/v1/subjects", tags=["transfer"])
 
@@ -111,7 +111,7 @@ async def import_subject(
             )
         )
         subject = checked_subject_id(exported.subject_id)
-        note_subject(request, runtime.store.pseudonym(caller.tenant, subject))
+        note_subject(request, runtime.store.signer.pseudonym(caller.tenant, subject))
 
         guard = runtime.store.transfers.guard(
             caller.tenant, exported.stamp, restore=restore, by=by(request)
@@ -121,8 +121,9 @@ async def import_subject(
             epoch = runtime.epoch(caller.tenant)
             enroller = runtime.enroller(caller.tenant, epoch)
             # A template that the service made of photos is no client's.
-            ours = exported.source == Source.PHOTOS
-            enrollment = (enroller.from_export if ours else enroller.from_template)(exported.wire)
+            from_photos = exported.source == Source.PHOTOS
+            make = enroller.from_export if from_photos else enroller.from_template
+            enrollment = make(exported.wire)
             stored = runtime.put(
                 caller.tenant,
                 exported.subject_id,

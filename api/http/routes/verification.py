@@ -240,7 +240,7 @@ def _compared(
 
 def _why_not(runtime: Runtime, tenant: str, subject: str) -> Exception:
     """Say why there is no template to decide by, to a key that may know who is enrolled."""
-    record = runtime.store.describe(tenant, subject)
+    record = runtime.store.subjects.describe(tenant, subject)
     if record is None:
         return ApiError("not_enrolled", "nobody is enrolled under this id")
     try:

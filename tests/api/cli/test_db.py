@@ -66,14 +66,14 @@ def test_compact_gives_the_space_of_erased_subjects_back(tmp_path):
     for number in range(20):
         put(store, f"s{number}", bytes(17_000))
     for number in range(19):
-        store.erase("default", f"s{number}")
+        store.erasures.erase("default", f"s{number}")
     before = (tmp_path / "veilface.db").stat().st_size
     ran = run("db", "compact", *where, "--json")
     assert ran.status == 0
     after = (tmp_path / "veilface.db").stat().st_size
     assert ran.json == {"bytes_before": before, "bytes_after": after}
     assert before - after > 18 * 17_000
-    kept = store.get("default", "s19")
+    kept = store.subjects.get("default", "s19")
     assert kept is not None
     assert kept.wire == bytes(17_000)
     store.close()
@@ -151,11 +151,11 @@ def test_purge_erases_who_is_due(opened):
     keep = ("--retention-days", "30", *where, "--json")
     assert run("db", "purge", *where, "--json").json == {"due": 0, "erased": 0}
     assert run("db", "purge", "--dry-run", *keep).json == {"due": 1, "erased": 0}
-    assert store.describe("default", "old") is not None
+    assert store.subjects.describe("default", "old") is not None
     assert run("db", "purge", *keep).json == {"due": 1, "erased": 1}
-    assert store.describe("default", "old") is None
-    assert store.describe("default", "new") is not None
-    assert store.receipt("default", "old") is not None
+    assert store.subjects.describe("default", "old") is None
+    assert store.subjects.describe("default", "new") is not None
+    assert store.erasures.receipt("default", "old") is not None
 
 
 def test_a_tenant_is_erased_with_a_receipt(opened, tmp_path):
@@ -166,15 +166,15 @@ def test_a_tenant_is_erased_with_a_receipt(opened, tmp_path):
     token = store.api_keys.create("acme", ["verify"]).token
     unsure = run("db", "erase-tenant", "acme", "--confirm", "acmf", *where)
     assert unsure.status == 2
-    assert store.describe("acme", "a") is not None
+    assert store.subjects.describe("acme", "a") is not None
     receipt = tmp_path / "receipt.json"
     ran = run("db", "erase-tenant", "acme", "--confirm", "acme", "--out", receipt, *where)
     assert ran.status == 0, ran.stderr
     assert "2 subjects" in ran.stdout
     assert store.api_keys.verify(token) is None
     assert "acme" not in [tenant.name for tenant in store.tenants.all()]
-    assert store.describe("default", "a") is not None
-    key = base64.b64encode(store.receipt_public_key()).decode()
+    assert store.subjects.describe("default", "a") is not None
+    key = base64.b64encode(store.signer.public_key()).decode()
     checked = run("keys", "verify-receipt", receipt, "--public-key", key)
     assert checked.status == 0, checked.stderr
     assert "acme was erased" in checked.stdout

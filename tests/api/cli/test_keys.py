@@ -198,16 +198,16 @@ def test_a_rotation_leaves_links_and_owners_as_they_are(veilface, data, tmp_path
 
 def test_a_receipt_is_verified_and_a_changed_one_is_not(store, tmp_path):
     store.tenants.create("default")
-    answer = receipt_json(store.erase("default", "ann").receipt)
+    answer = receipt_json(store.erasures.erase("default", "ann").receipt)
     receipt, contract = tmp_path / "receipt.json", tmp_path / "contract.json"
-    key = base64.b64encode(store.receipt_public_key()).decode()
+    key = base64.b64encode(store.signer.public_key()).decode()
     receipt.write_text(json.dumps({**answer, "request_id": "x"}))
     contract.write_text(json.dumps({"receipt_key": {"public_key": key}}))
     for public in (key, contract):
         ran = run("keys", "verify-receipt", receipt, "--public-key", public, "--json")
         assert ran.status == 0, ran.stderr
         assert ran.json["claims"]["held"] is False
-        assert ran.json["claims"]["subject"] == store.pseudonym("default", "ann")
+        assert ran.json["claims"]["subject"] == store.signer.pseudonym("default", "ann")
     assert "Valid" in run("keys", "verify-receipt", receipt, "--public-key", key).stdout
 
     changed = json.loads(receipt.read_text())
@@ -239,7 +239,7 @@ def test_a_key_is_replaced_with_time_to_change_over(veilface, store):
 def test_a_tenants_rotation_is_renewed_and_nobody_enrolls_again(world, veilface, store):
     pack = ("--pack", world.pack)
     assert veilface("enroll", "ann", *world.photos(1, range(3)), *pack).status == 0
-    before = store.get("default", "ann")
+    before = store.subjects.get("default", "ann")
     ran = veilface("keys", "rotate-tenant", "--json")
     assert ran.status == 0, ran.stderr
     assert ran.json == {
@@ -249,7 +249,7 @@ def test_a_tenants_rotation_is_renewed_and_nobody_enrolls_again(world, veilface,
         "enroll_again": [],
         "rotations_dropped": 1,
     }
-    after = store.get("default", "ann")
+    after = store.subjects.get("default", "ann")
     assert (before.record.rotation_epoch, after.record.rotation_epoch) == (1, 2)
     assert before.wire != after.wire
     assert veilface("verify", "ann", *world.photos(1, range(3, 4)), *pack).status == 0

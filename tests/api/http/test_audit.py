@@ -34,7 +34,7 @@ def test_what_is_done_is_written_with_who_did_it(service: tuple[Client, Deployme
     deployment.allow_templates()
     store = client.app.state.runtime.store
     path = "/v1/subjects/alice"
-    pseudonym = store.pseudonym("default", "alice")
+    pseudonym = store.signer.pseudonym("default", "alice")
     rejected = photo(2, 5)
     exported = client.get(f"{path}/export").json()["export"]
     calls: list[tuple[str, str, Any]] = [

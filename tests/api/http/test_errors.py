@@ -174,7 +174,7 @@ def test_a_defect_shows_nothing(
         raise RuntimeError("secret 0.123456")
 
     runtime = client.app.state.runtime
-    monkeypatch.setattr(runtime.store, "describe", explode)
+    monkeypatch.setattr(runtime.store.subjects, "describe", explode)
     answer = client.get("/v1/subjects/a")
     assert_error(answer, 500, "internal_error")
     assert "0.123456" not in answer.text

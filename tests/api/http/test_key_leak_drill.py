@@ -39,7 +39,7 @@ class Thief:
 
     def forged(self, subject: str) -> NDArray[np.float64]:
         """A unit vector of the stolen template, turned back: at distance 0 from it."""
-        found = self.store.get("default", subject)
+        found = self.store.subjects.get("default", subject)
         assert found is not None
         key = self.store.tenants.rotation_key("default", epoch=found.record.rotation_epoch).key
         stolen = wire.decode(found.wire).subspace.rotated(tenant_rotation(key, N).T)
@@ -114,7 +114,7 @@ def test_the_drill(tmp_path: Path) -> None:
         MasterKeyring.load(thief.folder / "master.key"),
     )
     with pytest.raises(SealError):
-        second.get("default", "alice")
+        second.subjects.get("default", "alice")
     with pytest.raises((SealError, StoreError)):
         second.tenants.rotation_key("default")
     second.close()
@@ -128,13 +128,15 @@ def test_a_rotation_that_leaked_alone_costs_nobody_an_enrollment(tmp_path: Path)
             assert enroll(client, subject, deployment.token, 0, 1) == 201
         store = client.app.state.runtime.store
         old = tenant_rotation(store.tenants.rotation_key("default").key, N)
-        before = {name: wire.decode(store.get("default", name).wire).subspace for name in PEOPLE}
+        before = {
+            name: wire.decode(store.subjects.get("default", name).wire).subspace for name in PEOPLE
+        }
         done = operator(deployment, "keys", "rotate-tenant")
         assert (done["moved"], done["enroll_again"], done["rotations_dropped"]) == (2, [], 1)
         new = tenant_rotation(store.tenants.rotation_key("default").key, N)
         assert np.abs(new - old).max() > 0.1
         for name, subspace in before.items():
-            after = wire.decode(store.get("default", name).wire).subspace
+            after = wire.decode(store.subjects.get("default", name).wire).subspace
             assert np.linalg.norm(after.foot - subspace.foot) > 0.1
             turned = subspace.rotated(new @ old.T)
             assert np.allclose(after.foot, turned.foot, atol=2e-3)

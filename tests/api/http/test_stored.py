@@ -28,7 +28,7 @@ def test_the_numbers_are_those_of_the_database(client: Client, deployment: Deplo
         (sealed,) = database.execute("SELECT ciphertext FROM templates").fetchone()
     store = open_store(deployment.settings, open_keyring(deployment.settings))
     try:
-        found = store.get("default", "a")
+        found = store.subjects.get("default", "a")
     finally:
         store.close()
     assert found is not None
@@ -68,7 +68,7 @@ def test_no_byte_of_the_template_is_told(client: Client, deployment: Deployment)
     assert client.put("/v1/subjects/secret/enrollment", files=images(photo(3))).is_success
     store = open_store(deployment.settings, open_keyring(deployment.settings))
     try:
-        found = store.get("default", "secret")
+        found = store.subjects.get("default", "secret")
     finally:
         store.close()
     assert found is not None
@@ -127,8 +127,10 @@ def test_whoever_looks_is_written_down(client: Client, deployment: Deployment) -
     assert lines[0].actor == f"key:{deployment.token[3:15]}"
     # A right that is missing is refused before the subject is looked at.
     assert [line.pseudonym for line in lines] == [
-        store.pseudonym("default", "seen"), None, store.pseudonym("default", "unseen"),
-    ]  # fmt: skip
+        store.signer.pseudonym("default", "seen"),
+        None,
+        store.signer.pseudonym("default", "unseen"),
+    ]
     assert [line.request_id for line in lines] == [
         answer.headers["x-request-id"] for answer in answers
     ]

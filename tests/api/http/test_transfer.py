@@ -104,7 +104,7 @@ def test_an_operator_restores_knowingly(both: tuple[Client, Deployment]) -> None
     assert send(client, data, restore=True).status_code == 201
     assert verdict(client, "anna", 1) == "accept"
     store = client.app.state.runtime.store
-    pseudonym = store.pseudonym("default", "anna")
+    pseudonym = store.signer.pseudonym("default", "anna")
     lines = [line for line in store.audit_log.lines() if line.pseudonym == pseudonym]
     about = [(line.action, line.outcome) for line in lines]
     assert about[-3:-1] == [("import", "restored"), ("enroll", "created")]
@@ -156,7 +156,7 @@ def test_what_travels_is_not_rotated_and_not_what_is_stored(
     assert pack is not None
     own = pack.embed_photo(photo(1)).embedding
     assert plain.contains(own[None], tol=0.02).all()
-    stored = runtime.store.get("default", "plain")
+    stored = runtime.store.subjects.get("default", "plain")
     assert stored is not None
     assert not wire.decode(stored.wire).subspace.contains(own[None], tol=0.02).any()
     assert inside.wire not in data

@@ -97,7 +97,7 @@ def test_who_is_not_enrolled_costs_the_same_steps(
 
     runtime = client.app.state.runtime
     seen: dict[str, list[str]] = {}
-    engine = runtime.store._database.engine
+    engine = runtime.store.database.engine
     for subject in ("alice", "nobody"):
         ask(client, token, subject, files=images(photo(2), name="image"))  # caches are warm
         steps: list[str] = []
@@ -314,7 +314,7 @@ def test_a_retired_master_key_does_not_tell_who_is_enrolled(
         runtime = client.app.state.runtime
         path = own.settings.resolved_master_key_file
         current = MasterKeyring.add_current(path)
-        runtime.store.rewrap()
+        runtime.store.wrapped_keys.rewrap()
         MasterKeyring.drop_retired(path, keep=current)
         for subject, decision in (("a", "accept"), ("nobody", "reject")):
             answer = client.post(

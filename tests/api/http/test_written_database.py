@@ -426,7 +426,7 @@ def test_the_locks_of_an_erased_subject_and_tenant_are_gone(
     enroll(client)
     token = deployment.key("verify")
     fail(client, token, AFTER)
-    store.erase("default", "alice")
+    store.erasures.erase("default", "alice")
     assert store.attempts.status("default", "alice") is None
     other = deployment.key("verify", tenant="other")
     fail(client, other, AFTER, "bob")
@@ -541,7 +541,7 @@ def test_all_still_works_after_the_master_key_is_rotated(
     fail(client, token, 2)
     path = deployment.settings.resolved_master_key_file
     MasterKeyring.add_current(path)
-    store.rewrap()
+    store.wrapped_keys.rewrap()
     MasterKeyring.drop_retired(path, keep=MasterKeyring.load(path).current)
     assert attempt(client, token, 1).json()["decision"] == "accept"
     fresh = open_store(deployment.settings, open_keyring(deployment.settings))

@@ -24,13 +24,13 @@ def own(tmp_path: Path) -> Deployment:
 
 def records(store: TemplateStore) -> int:
     count = sa.select(sa.func.count()).select_from(IdempotencyRow)
-    return store._database.read(lambda each: each.execute(count).scalar_one())
+    return store.database.read(lambda each: each.execute(count).scalar_one())
 
 
 def expire_all(store: TemplateStore) -> None:
     at = sa.func.datetime("now", "-1 day")
     changed = sa.update(IdempotencyRow).values(expires_at=at)
-    store._database.write(lambda each: each.execute(changed))
+    store.database.write(lambda each: each.execute(changed))
 
 
 def claim(store: TemplateStore, key: str) -> None:
@@ -93,7 +93,7 @@ def test_subjects_whose_time_is_over_go_by_themselves(
         store = client.app.state.runtime.store
         month_ago = datetime.now(UTC) - timedelta(days=31)
         old = sa.update(SubjectRow).values(updated_at=month_ago)
-        store._database.write(lambda each: each.execute(old.where(SubjectRow.subject_id == "old")))
+        store.database.write(lambda each: each.execute(old.where(SubjectRow.subject_id == "old")))
         wait_until(lambda: client.get("/v1/subjects/old").status_code == 404)
         assert client.get("/v1/subjects/young").status_code == 200
-        assert store.receipt("default", "old") is not None
+        assert store.erasures.receipt("default", "old") is not None

@@ -129,7 +129,7 @@ def test_every_line_is_json_of_declared_fields(
         assert set(line) <= LINE_FIELDS
     assert lines[0]["route"] == "/v1/subjects/{subject_id}"
     assert "route" not in lines[1]
-    pseudonym = client.app.state.runtime.store.pseudonym("default", "abc")
+    pseudonym = client.app.state.runtime.store.signer.pseudonym("default", "abc")
     assert lines[0]["subject"] == pseudonym[:16]
     assert lines[0]["code"] == "not_enrolled"
 

@@ -106,7 +106,7 @@ def test_no_metric_names_a_subject_a_tenant_or_a_key(
     client.post(f"{path}/verify", files=images(photo(1), name="image"), headers=headers)
     client.get(path, headers=headers)
     text = client.get("/metrics").text
-    pseudonym = client.app.state.runtime.store.pseudonym(tenant, subject)
+    pseudonym = client.app.state.runtime.store.signer.pseudonym(tenant, subject)
     secrets = (subject, tenant, token, token.split("_")[1], pseudonym[:16])
     assert [secret for secret in secrets if secret in text] == []
 
@@ -137,7 +137,7 @@ def test_a_refusal_of_a_locked_subject_is_counted(
         def locked(*_: Any, wait: float | None = wait, **__: Any) -> None:
             raise LockedOut(wait)
 
-        monkeypatch.setattr(client.app.state.runtime.store, "describe", locked)
+        monkeypatch.setattr(client.app.state.runtime.store.subjects, "describe", locked)
         assert client.get("/v1/subjects/a").status_code == 423
     assert rise("veilface_lockouts_total", kind="locked") == 2
     assert rise("veilface_lockouts_total", kind="disabled") == 1

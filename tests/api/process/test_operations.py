@@ -68,7 +68,7 @@ def refuse_writes(store: TemplateStore, *tables: str) -> None:
                     sa.text(f"CREATE TRIGGER {name} BEFORE {event} ON {table} {does}")
                 )
 
-    store._database.write(work)
+    store.database.write(work)
 
 
 def take_writes(store: TemplateStore, *tables: str) -> None:
@@ -78,7 +78,7 @@ def take_writes(store: TemplateStore, *tables: str) -> None:
                 on = "" if connection.dialect.name == "sqlite" else f" ON {table}"
                 connection.execute(sa.text(f"DROP TRIGGER full_{table}_{event}{on}"))
 
-    store._database.write(work)
+    store.database.write(work)
 
 
 def test_after_a_failed_write_a_write_must_succeed(both: tuple[Client, Deployment]) -> None:
@@ -108,7 +108,7 @@ def test_a_trial_write_changes_nothing(both: tuple[Client, Deployment]) -> None:
     row = sa.text("SELECT * FROM master_key_check")
 
     def rows() -> list[Any]:
-        return store._database.read(lambda each: [tuple(r) for r in each.execute(row)])
+        return store.database.read(lambda each: [tuple(r) for r in each.execute(row)])
 
     before = rows()
     store.ping_write()

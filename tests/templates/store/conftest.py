@@ -57,7 +57,7 @@ def store(database_url: str, keyring: MasterKeyring, clock: Clock) -> Iterator[T
 
 def template_id(store: TemplateStore, subject_id: str, tenant: str = "default") -> str | None:
     """Id of the template that a subject has now."""
-    record = store.describe(tenant, subject_id)
+    record = store.subjects.describe(tenant, subject_id)
     return None if record is None else record.template_id
 
 
@@ -85,7 +85,7 @@ def put(
     store: TemplateStore, subject_id: str, wire: bytes, *, tenant: str = "default", **changes: str
 ) -> StoredTemplate:
     """Store a template with ordinary metadata."""
-    return store.put(
+    return store.subjects.put(
         tenant,
         subject_id,
         wire,

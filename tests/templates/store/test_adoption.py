@@ -23,7 +23,7 @@ STRIPPED = (
 
 def run(store: TemplateStore, *statements: str, **values: object) -> None:
     for statement in statements:
-        store._database.write(lambda each, sql=statement: each.execute(sa.text(sql), values))
+        store.database.write(lambda each, sql=statement: each.execute(sa.text(sql), values))
 
 
 def as_an_earlier_version_left_it(store: TemplateStore) -> None:

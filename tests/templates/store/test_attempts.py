@@ -99,7 +99,7 @@ def status(store: TemplateStore, subject: str = "ada") -> AttemptsStatus:
 
 def count(store: TemplateStore, table: type) -> int:
     query = sa.select(sa.func.count()).select_from(table)
-    return store._database.read(lambda each: each.execute(query).scalar_one())
+    return store.database.read(lambda each: each.execute(query).scalar_one())
 
 
 @pytest.fixture
@@ -162,9 +162,9 @@ def test_an_accept_clears_the_count_and_notes_the_use(ada: TemplateStore, clock:
     used = sa.select(SubjectRow.last_used_at)
     for _ in range(4):
         assert attempt(ada) == "reject"
-    assert ada._database.read(lambda each: each.execute(used).scalar_one()) is None
+    assert ada.database.read(lambda each: each.execute(used).scalar_one()) is None
     assert attempt(ada, accepted=True) == "accept"
-    assert ada._database.read(lambda each: each.execute(used).scalar_one()) == clock.time
+    assert ada.database.read(lambda each: each.execute(used).scalar_one()) == clock.time
     assert (status(ada).consecutive, status(ada).total) == (0, 4)
     for _ in range(4):
         assert attempt(ada) == "reject"
@@ -219,7 +219,7 @@ def test_a_policy_of_ones_own(
     database_url: str, keyring: MasterKeyring, ada: TemplateStore
 ) -> None:
     policy = LockoutPolicy(after=1, first_s=2, longest_s=3, disable_at=2)
-    strict = TemplateStore(database_url, keyring, lockout=policy, clock=ada._clock)
+    strict = TemplateStore(database_url, keyring, lockout=policy, clock=ada._context.clock)
     assert attempt(strict) == "reject"
     assert attempt(strict) == "locked 2"
     strict.close()
@@ -269,7 +269,7 @@ def test_an_operator_resets(ada: TemplateStore, clock: Clock) -> None:
     resets = [each for each in ada.audit_log.lines() if each.action == "lockout-reset"]
     assert [each.outcome for each in resets] == ["nothing_held", "reset", "nothing_held"]
     assert {each.actor for each in resets} == {"operator:root"}
-    assert {each.pseudonym for each in resets} == {ada.pseudonym("default", "ada")}
+    assert {each.pseudonym for each in resets} == {ada.signer.pseudonym("default", "ada")}
 
 
 def test_an_erasure_takes_the_count_along_and_leaves_the_lines(ada: TemplateStore) -> None:
@@ -277,7 +277,8 @@ def test_an_erasure_takes_the_count_along_and_leaves_the_lines(ada: TemplateStor
         attempt(ada)
     lines = len(list(ada.audit_log.lines()))
     counts = {
-        each["item"]: each["count"] for each in ada.erase("default", "ada").receipt.claims["erased"]
+        each["item"]: each["count"]
+        for each in ada.erasures.erase("default", "ada").receipt.claims["erased"]
     }
     assert counts["failed_attempts"] == 1
     assert ada.attempts.status("default", "ada") is None
@@ -301,7 +302,7 @@ def test_counts_of_who_is_not_enrolled_expire(ada: TemplateStore, clock: Clock) 
         attempt(ada, "disabled", known=False)
         clock.pass_by(hours=1)
     put(ada, "later", b"wire")
-    ada.erase("default", "gone")
+    ada.erasures.erase("default", "gone")
     assert attempt(ada, "gone", known=False) == "reject"
     clock.pass_by(days=85)
     assert ada.attempts.expire() == 0
@@ -325,7 +326,7 @@ def written(store: TemplateStore) -> tuple[object, ...]:
         store.audit_log.head(),
         store.attempts.status("default", "ada"),
         count(store, UsedNonceRow),
-        store._database.read(lambda each: each.execute(sa.select(SubjectRow.last_used_at)).all()),
+        store.database.read(lambda each: each.execute(sa.select(SubjectRow.last_used_at)).all()),
     )
 
 
@@ -336,7 +337,7 @@ def test_a_decision_on_a_template_that_is_gone_is_taken_back(
 ) -> None:
     decided_on, nonce = template_id(ada, "ada"), nonce_of(prefix, clock)
     if change != "replaced":
-        ada.erase("default", "ada")
+        ada.erasures.erase("default", "ada")
     if change != "erased":
         put(ada, "ada", b"another")
         attempt(ada)
@@ -524,7 +525,7 @@ def test_the_value_of_a_nonce_is_not_kept(ada: TemplateStore, prefix: str, clock
     nonce = nonce_of(prefix, clock)
     assert nonce.value not in repr(nonce)
     attempt(ada, nonce=nonce)
-    rows = ada._database.read(lambda each: each.execute(sa.select(UsedNonceRow.__table__)).all())
+    rows = ada.database.read(lambda each: each.execute(sa.select(UsedNonceRow.__table__)).all())
     assert len(rows) == 1
     assert nonce.value not in repr(rows)
 
@@ -569,8 +570,8 @@ def test_every_conclusion_has_its_line(ada: TemplateStore, prefix: str, clock: C
     assert {(each.actor, each.request_id, each.detail) for each in lines} == {
         (BY.actor, BY.request_id, "high")
     }
-    assert lines[0].pseudonym == ada.pseudonym("default", "ada")
-    assert lines[-1].pseudonym == ada.pseudonym("default", "nobody")
+    assert lines[0].pseudonym == ada.signer.pseudonym("default", "ada")
+    assert lines[-1].pseudonym == ada.signer.pseudonym("default", "nobody")
     assert ada.audit_log.verify().intact
 
 
@@ -679,7 +680,7 @@ def test_concluding_beside_enrolling_and_erasing_never_deadlocks(ada: TemplateSt
                     case 0:
                         put(ada, name, b"wire")
                     case 1:
-                        ada.erase("default", name)
+                        ada.erasures.erase("default", name)
                     case _:
                         attempt(ada, name)
         except BaseException as error:
@@ -693,10 +694,14 @@ def test_concluding_beside_enrolling_and_erasing_never_deadlocks(ada: TemplateSt
     assert errors == []
     assert ada.audit_log.verify().intact
     for known, pseudonym in rows(ada):
-        enrolled = {ada.pseudonym("default", each) for each in names if ada.get("default", each)}
+        enrolled = {
+            ada.signer.pseudonym("default", each)
+            for each in names
+            if ada.subjects.get("default", each)
+        }
         assert known == (pseudonym in enrolled)
 
 
 def rows(store: TemplateStore) -> Iterator[tuple[bool, str]]:
     query = sa.select(FailedAttemptsRow.known, FailedAttemptsRow.pseudonym)
-    yield from store._database.read(lambda each: each.execute(query).all())
+    yield from store.database.read(lambda each: each.execute(query).all())

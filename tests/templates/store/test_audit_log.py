@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import astuple
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO
 
 import pytest
 import sqlalchemy as sa
@@ -175,7 +175,7 @@ def test_a_rolled_back_write_leaves_no_line(store: TemplateStore) -> None:
         raise RuntimeError
 
     with pytest.raises(RuntimeError):
-        store._database.write(work)
+        store.database.write(work)
     store.audit_log.record(entry(3))
     assert [line.request_id for line in store.audit_log.lines()] == [
         "request-00000001",
@@ -191,7 +191,7 @@ def test_two_lines_in_one_transaction(store: TemplateStore) -> None:
         store.audit_log.append(connection, entry(1))
         store.audit_log.append(connection, entry(2))
 
-    store._database.write(work)
+    store.database.write(work)
     assert store.audit_log.verify().lines == 2
     assert store.audit_log.verify().intact
 
@@ -202,7 +202,7 @@ def test_appending_unprepared_is_refused_and_does_not_hang(
     store.close()
     store = TemplateStore(database_url, keyring)
     with pytest.raises(RuntimeError, match="prepare"):
-        store._database.write(lambda each: store.audit_log.append(each, entry(1)))
+        store.database.write(lambda each: store.audit_log.append(each, entry(1)))
     store.close()
 
 
@@ -211,7 +211,7 @@ def test_the_chain_survives_a_rotation_of_the_master_key(
 ) -> None:
     head = filled.audit_log.head()
     current = MasterKeyring.add_current(key_file)
-    filled.rewrap()
+    filled.wrapped_keys.rewrap()
     MasterKeyring.drop_retired(key_file, keep=current)
     fresh = TemplateStore(database_url, MasterKeyring.load(key_file))
     fresh.audit_log.record(entry(9))
@@ -241,15 +241,15 @@ def test_every_write_has_its_line(store: TemplateStore) -> None:
     by = By("operator:root", "request-12345678")
     put(store, "ada", b"one", by=by)
     put(store, "ada", b"two", by=by)
-    store.erase("default", "ada", by=by)
-    store.erase("default", "ada", by=by)
-    store.erase("default", "eve", by=by)
+    store.erasures.erase("default", "ada", by=by)
+    store.erasures.erase("default", "ada", by=by)
+    store.erasures.erase("default", "eve", by=by)
     key = store.api_keys.create("other", ["verify"], by=by).key
     assert store.api_keys.revoke(key.prefix, by=by)
     assert not store.api_keys.revoke(key.prefix, by=by)
     assert not store.api_keys.revoke("vf_secret", by=by)
     assert store.api_keys.bootstrap(by=by) is None
-    ada, eve = (store.pseudonym("default", name) for name in ("ada", "eve"))
+    ada, eve = (store.signer.pseudonym("default", name) for name in ("ada", "eve"))
     assert [
         (line.action, line.outcome, line.tenant, line.pseudonym, line.detail)
         for line in store.audit_log.lines()
@@ -283,12 +283,12 @@ def test_no_line_holds_a_subject_id_a_token_or_a_template(
     put(store, "lovelace", b"template-bytes")
     token = store.api_keys.create("default", ["verify"]).token
     store.api_keys.revoke(token)
-    store.erase("default", "lovelace")
+    store.erasures.erase("default", "lovelace")
     database = Database(database_url)
     rows = database.read(lambda each: each.execute(sa.select(AuditRow.__table__)).all())
     assert len(rows) == 4
     text = repr(rows)
-    assert store.pseudonym("default", "lovelace") in text
+    assert store.signer.pseudonym("default", "lovelace") in text
     for secret in ("lovelace", "template-bytes", token, token.split("_")[2]):
         assert secret not in text
     database.close()
@@ -395,13 +395,11 @@ def assert_found_and_put_back(
     """Alter one column of one line, look whether exactly that is found, and mend it."""
     named = AuditRow.__table__.columns[column]
     where = AuditRow.sequence == sequence
-    old = store._database.read(
-        lambda each: each.execute(sa.select(named).where(where)).scalar_one()
-    )
+    old = store.database.read(lambda each: each.execute(sa.select(named).where(where)).scalar_one())
     attacker(f"UPDATE audit_log SET {column} = {value} WHERE sequence = {sequence}")
     assert problems(store) == [(sequence, "altered", None)], (column, value, sequence)
     mend = sa.update(AuditRow).where(where).values({named: old})
-    store._database.write(lambda each: each.execute(mend))
+    store.database.write(lambda each: each.execute(mend))
     assert problems(store) == [], (column, value, sequence)
 
 
@@ -433,7 +431,7 @@ def test_sqlite_values_of_no_type_of_ours_are_named_and_not_stumbled_over(
         store.audit_log.record(entry(number))
 
     def attacker(statement: str) -> None:
-        store._database.write(lambda each: each.execute(sa.text(statement)))
+        store.database.write(lambda each: each.execute(sa.text(statement)))
 
     attacker("DROP TRIGGER audit_log_no_update")
     for column in ALTERATIONS:
@@ -450,7 +448,7 @@ def test_postgresql_times_beyond_python_are_named_and_not_stumbled_over(
     store.audit_log.record(entry(1))
 
     def attacker(statement: str) -> None:
-        store._database.write(lambda each: each.execute(sa.text(statement)))
+        store.database.write(lambda each: each.execute(sa.text(statement)))
 
     attacker("ALTER TABLE audit_log DISABLE TRIGGER USER")
     for value in ("infinity", "-infinity", "0044-03-15 BC", "20000-01-01"):
@@ -538,7 +536,7 @@ def test_an_altered_head_row_is_found_and_not_built_upon(
     assert problems(filled) == [(LINES, "head does not match", None)]
     with pytest.raises(BrokenAuditLog):
         put(filled, "ada", b"wire")
-    assert filled.get("default", "ada") is None
+    assert filled.subjects.get("default", "ada") is None
     assert filled.audit_log.verify().lines == LINES
 
 
@@ -596,7 +594,7 @@ def test_a_line_that_is_there_twice_is_found(postgres_url: str, keyring: MasterK
         "ALTER TABLE audit_log DROP CONSTRAINT pk_audit_log",
         "INSERT INTO audit_log SELECT * FROM audit_log WHERE sequence = 2",
     ):
-        store._database.write(lambda each, sql=statement: each.execute(sa.text(sql)))
+        store.database.write(lambda each, sql=statement: each.execute(sa.text(sql)))
     assert store.audit_log.verify(batch=2).problems == (Problem(3, "lines that share a number"),)
     assert store.audit_log.verify(batch=9).problems == (Problem(2, "out of order"),)
     store.close()
@@ -607,7 +605,7 @@ def test_a_rolled_back_log_is_found_with_an_anchor_only(
 ) -> None:
     early = filled.audit_log.head()
     query = sa.select(AuditHeadRow.sequence, AuditHeadRow.hash, AuditHeadRow.mac)
-    old = filled._database.read(lambda each: each.execute(query).one())
+    old = filled.database.read(lambda each: each.execute(query).one())
     for number in range(9, 12):
         filled.audit_log.record(entry(number))
     late = filled.audit_log.head()
@@ -724,7 +722,7 @@ def test_a_column_without_a_value_is_named_and_not_stumbled_over(
     found: list[tuple[object, ...]],
 ) -> None:
     """As one leaves it who makes the column again without its NOT NULL."""
-    if filled._database.is_sqlite:
+    if filled.database.is_sqlite:
         made = "(sequence INTEGER PRIMARY KEY, at, tenant, actor, action, pseudonym, outcome, "
         made += "request_id, detail, nonce, previous_hash, hash)"
         if table == "audit_head":
@@ -753,8 +751,7 @@ def test_a_column_without_a_value_is_named_and_not_stumbled_over(
 
 def test_a_last_line_without_a_hash_can_be_told() -> None:
     chain = Chain(KEY)
-    *rest, _ = next(made_up_lines(1))
-    chain.step([*rest, None])
+    chain.step({**next(made_up_lines(1)), "hash": None})
     head = Anchor(1, bytes(32))
     found = chain.end(head, head_mac(KEY, head), held=1)
     assert found.problems == (Problem(1, "altered"),)
@@ -781,7 +778,7 @@ def test_lines_of_two_histories_do_not_mix(
 ) -> None:
     """Each line is a true one, written after the log was rolled back: only the links are wrong."""
     head = sa.select(AuditHeadRow.sequence, AuditHeadRow.hash, AuditHeadRow.mac)
-    old = filled._database.read(lambda each: each.execute(head).one())
+    old = filled.database.read(lambda each: each.execute(head).one())
     filled.audit_log.record(entry(9))
     filled.audit_log.record(entry(10))
     first_history = list(filled.audit_log.lines(after=8))
@@ -795,7 +792,7 @@ def test_lines_of_two_histories_do_not_mix(
     attacker("DELETE FROM audit_log WHERE sequence = 9")
     line = first_history[0]
     values = {name: getattr(line, name) for name in Line.__dataclass_fields__}
-    filled._database.write(lambda each: each.execute(sa.insert(AuditRow).values(**values)))
+    filled.database.write(lambda each: each.execute(sa.insert(AuditRow).values(**values)))
     assert problems(filled) == [(10, "out of order", None)]
 
 
@@ -856,15 +853,25 @@ def test_verifying_beside_writers_ends_and_is_clean(
 KEY = bytes(range(32))
 
 
-def made_up_lines(count: int) -> Iterator[tuple[object, ...]]:
+def made_up_lines(count: int) -> Iterator[dict[str, Any]]:
     """Columns of a true chain under `KEY`, as the database hands them out."""
     previous, at = bytes(32), datetime(2026, 3, 1, tzinfo=UTC)
     for sequence in range(1, count + 1):
-        columns = (sequence, at, "default", "key:x", "verify", f"{sequence:064x}", "reject")
-        columns_after = ("request-00000000", "high", None, previous)
-        own = line_hash(KEY, (*columns, *columns_after))
-        yield (sequence, "2026-03-01 00:00:00.000000", *columns[2:], *columns_after, own)
-        previous = own
+        columns = {
+            "sequence": sequence,
+            "at": at,
+            "tenant": "default",
+            "actor": "key:x",
+            "action": "verify",
+            "pseudonym": f"{sequence:064x}",
+            "outcome": "reject",
+            "request_id": "request-00000000",
+            "detail": "high",
+            "nonce": None,
+            "previous_hash": previous,
+        }
+        previous = line_hash(KEY, columns)
+        yield {**columns, "at": "2026-03-01 00:00:00.000000", "hash": previous}
 
 
 def test_the_walk_takes_the_same_memory_however_long_the_log() -> None:
@@ -922,12 +929,12 @@ def test_any_change_of_any_line_is_found(seed: int) -> None:
     """A flipped bit in any value of any line, in memory."""
     generator = random.Random(seed)
     lines = list(made_up_lines(12))
-    at, column = generator.randrange(12), generator.randrange(2, 11)
+    at = generator.randrange(12)
+    column = generator.choice([name for name in lines[at] if name not in ("sequence", "nonce")])
     value = lines[at][column]
-    raw = bytearray(value.encode() if isinstance(value, str) else value)  # type: ignore[call-overload]
+    raw = bytearray(value.encode() if isinstance(value, str) else value)
     raw[generator.randrange(len(raw))] ^= 1 << generator.randrange(7)
-    changed = raw.decode() if isinstance(value, str) else bytes(raw)
-    lines[at] = (*lines[at][:column], changed, *lines[at][column + 1 :])
+    lines[at][column] = raw.decode() if isinstance(value, str) else bytes(raw)
     chain = Chain(KEY)
     for columns in lines:
         chain.step(columns)
@@ -941,4 +948,4 @@ def test_an_enrollment_and_its_line_come_together_or_not_at_all(
     with pytest.raises(BrokenAuditLog):
         put(filled, "ada", b"wire")
     count = sa.select(sa.func.count()).select_from(SubjectRow)
-    assert filled._database.read(lambda each: each.execute(count).scalar_one()) == 0
+    assert filled.database.read(lambda each: each.execute(count).scalar_one()) == 0

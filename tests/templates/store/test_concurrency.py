@@ -50,11 +50,11 @@ def mix(store: TemplateStore, seed: int, steps: int) -> Counter[str]:
                 if put(store, subject, wire_of(seed * 10_000 + step)).created:
                     done[f"created {subject}"] += 1
             case 2:
-                if (found := store.get("default", subject)) is not None:
+                if (found := store.subjects.get("default", subject)) is not None:
                     number_of(found.wire)
                     done["read"] += 1
             case 3:
-                if store.erase("default", subject).erased:
+                if store.erasures.erase("default", subject).erased:
                     done[f"erased {subject}"] += 1
     return done
 
@@ -65,7 +65,7 @@ def write_for_ever(store: TemplateStore, subject: str, output: TextIO) -> None:
     while True:
         step += 1
         if step % ERASE_EVERY == 0:
-            store.erase("default", subject)
+            store.erasures.erase("default", subject)
         else:
             put(store, subject, wire_of(step))
         print(step, file=output, flush=True)
@@ -90,7 +90,7 @@ def fork(work: Callable[[TextIO], None]) -> tuple[int, TextIO]:
 def assert_equal_to_a_serial_order(store: TemplateStore, done: Counter[str]) -> None:
     """In any serial order, creations and erasures of a subject alternate."""
     for subject in SUBJECTS:
-        found = store.get("default", subject)
+        found = store.subjects.get("default", subject)
         alive = done[f"created {subject}"] - done[f"erased {subject}"]
         assert alive == (0 if found is None else 1), subject
         if found is not None:
@@ -104,9 +104,9 @@ def assert_equal_to_a_serial_order(store: TemplateStore, done: Counter[str]) -> 
         query = sa.select(sa.func.count()).select_from(joined).where(either)
         return connection.execute(query).scalar_one()
 
-    assert store._database.read(orphans) == 0
+    assert store.database.read(orphans) == 0
     held = sa.select(sa.func.count()).where(ReceiptRow.body.contains('"held":true'))
-    receipts = store._database.read(lambda each: each.execute(held).scalar_one())
+    receipts = store.database.read(lambda each: each.execute(held).scalar_one())
     assert receipts == sum(done[f"erased {subject}"] for subject in SUBJECTS)
 
 
@@ -163,9 +163,9 @@ def test_a_killed_writer_leaves_whole_subjects(store: TemplateStore) -> None:
         assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
 
         last = int(acknowledged[-1])
-        found = store.get("default", subject)
+        found = store.subjects.get("default", subject)
         state = 0 if found is None else number_of(found.wire)
         assert state in {0 if step % ERASE_EVERY == 0 else step for step in (last, last + 1)}
         # The locks of the dead are free.
-        store.erase("default", subject)
-        assert store.get("default", subject) is None
+        store.erasures.erase("default", subject)
+        assert store.subjects.get("default", subject) is None

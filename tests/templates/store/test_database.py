@@ -182,16 +182,16 @@ def test_a_full_disk_is_said_and_harms_nothing(tmp_path: Path, keyring: MasterKe
     store.upgrade()
     store.tenants.create("default")
     put(store, "first", b"1" * 5000)
-    pages = store._database.read(lambda each: each.exec_driver_sql("PRAGMA page_count").scalar())
+    pages = store.database.read(lambda each: each.exec_driver_sql("PRAGMA page_count").scalar())
 
     def limit(connection: sa.Connection) -> None:
         connection.exec_driver_sql(f"PRAGMA max_page_count = {pages}")
 
-    store._database.read(limit)
+    store.database.read(limit)
     with pytest.raises(StoreUnavailable, match="full"):
         put(store, "second", b"2" * 500_000)
-    assert store.get("default", "second") is None
-    first = store.get("default", "first")
+    assert store.subjects.get("default", "second") is None
+    first = store.subjects.get("default", "first")
     assert first is not None
     assert first.wire == b"1" * 5000
     store.close()
@@ -235,14 +235,14 @@ def test_a_forked_child_makes_its_own_connections(store: TemplateStore) -> None:
     child = os.fork()
     if child == 0:
         try:
-            found = store.get("default", "parent")
+            found = store.subjects.get("default", "parent")
             put(store, "child", b"c")
             os._exit(0 if found is not None and found.wire == b"p" else 1)
         except BaseException:
             os._exit(2)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
     for subject, wire in (("parent", b"p"), ("child", b"c")):
-        found = store.get("default", subject)
+        found = store.subjects.get("default", subject)
         assert found is not None
         assert found.wire == wire
 

@@ -43,24 +43,24 @@ def test_everything_about_the_subject_goes_at_once(
         store.idempotency.finish(claim, status=201, body=name.encode())
         failed = sa.insert(FailedAttemptsRow).values(
             tenant_id=store.tenants.get("default").id,
-            pseudonym=store.pseudonym("default", name),
+            pseudonym=store.signer.pseudonym("default", name),
             consecutive=1,
             total=2,
             last_failed_at=clock.time,
         )
         database.write(lambda each, failed=failed: each.execute(failed))
 
-    erasure = store.erase("default", "ada")
+    erasure = store.erasures.erase("default", "ada")
 
     assert erasure.erased
     assert erasure.log_purged
     assert erasure.receipt.held
-    assert store.get("default", "ada") is None
-    assert store.describe("default", "ada") is None
+    assert store.subjects.get("default", "ada") is None
+    assert store.subjects.describe("default", "ada") is None
     for table in (SubjectRow, TemplateRow, IdempotencyRow, FailedAttemptsRow):
         assert count(database, table) == 1, table  # eve's
-    assert store.get("default", "eve") is not None
-    claims = verify_receipt(erasure.receipt, store.receipt_public_key())
+    assert store.subjects.get("default", "eve") is not None
+    claims = verify_receipt(erasure.receipt, store.signer.public_key())
     assert claims["contract_id"] == CONTRACT
     assert claims["erased"] == [
         {"item": "template", "count": 1},
@@ -74,68 +74,68 @@ def test_everything_about_the_subject_goes_at_once(
 
 def test_erasing_again_gives_the_same_receipt(store: TemplateStore, clock: Clock) -> None:
     put(store, "ada", b"wire")
-    first = store.erase("default", "ada")
+    first = store.erasures.erase("default", "ada")
     clock.pass_by(days=1)
-    again = store.erase("default", "ada")
+    again = store.erasures.erase("default", "ada")
     assert not again.erased
-    assert again.receipt == first.receipt == store.receipt("default", "ada")
+    assert again.erasures.receipt == first.receipt == store.erasures.receipt("default", "ada")
 
 
 def test_erasing_after_a_second_enrollment_gives_a_second_receipt(
     store: TemplateStore, clock: Clock
 ) -> None:
     put(store, "ada", b"wire")
-    first = store.erase("default", "ada")
+    first = store.erasures.erase("default", "ada")
     clock.pass_by(days=1)
     put(store, "ada", b"wire")
-    second = store.erase("default", "ada")
+    second = store.erasures.erase("default", "ada")
     assert second.erased
     assert second.receipt != first.receipt
-    assert store.erase("default", "ada").receipt == second.receipt
+    assert store.erasures.erase("default", "ada").receipt == second.receipt
 
 
 def test_erasing_who_was_never_enrolled_says_so(store: TemplateStore) -> None:
-    erasure = store.erase("default", "nobody")
+    erasure = store.erasures.erase("default", "nobody")
     assert not erasure.erased
     assert not erasure.receipt.held
     assert erasure.receipt.claims["contract_id"] is None
     assert {entry["count"] for entry in erasure.receipt.claims["erased"]} == {0}
-    assert store.erase("default", "nobody").receipt == erasure.receipt
+    assert store.erasures.erase("default", "nobody").receipt == erasure.receipt
 
 
 def test_a_receipt_names_the_subject_by_its_pseudonym_only(
     store: TemplateStore, clock: Clock
 ) -> None:
     put(store, "lovelace", b"wire")
-    receipt = store.erase("default", "lovelace").receipt
+    receipt = store.erasures.erase("default", "lovelace").receipt
     assert "lovelace" not in json.dumps(receipt.to_json())
-    claims = verify_receipt(receipt, store.receipt_public_key())
-    assert claims["subject"] == store.pseudonym("default", "lovelace")
+    claims = verify_receipt(receipt, store.signer.public_key())
+    assert claims["subject"] == store.signer.pseudonym("default", "lovelace")
     assert claims["tenant"] == "default"
     assert claims["held"] is True
     assert datetime.fromisoformat(claims["erased_at"]) == clock.time
 
 
 def test_a_receipt_has_an_id_and_a_canonical_body(store: TemplateStore) -> None:
-    receipts = [store.erase("default", name).receipt for name in ("ada", "eve")]
+    receipts = [store.erasures.erase("default", name).receipt for name in ("ada", "eve")]
     ids = {receipt.claims["receipt_id"] for receipt in receipts}
     assert len(ids) == 2
     assert all(re.fullmatch("[0-9a-f]{32}", each) for each in ids)
     for receipt in receipts:
         written = json.dumps(json.loads(receipt.body), sort_keys=True, separators=(",", ":"))
         assert receipt.body == written
-        assert receipt.claims["signing_key"] == key_fingerprint(store.receipt_public_key())
+        assert receipt.claims["signing_key"] == key_fingerprint(store.signer.public_key())
 
 
 def test_a_receipt_is_plain_ed25519(store: TemplateStore) -> None:
-    receipt = store.erase("default", "ada").receipt
-    key = Ed25519PublicKey.from_public_bytes(store.receipt_public_key())
+    receipt = store.erasures.erase("default", "ada").receipt
+    key = Ed25519PublicKey.from_public_bytes(store.signer.public_key())
     key.verify(receipt.signature, receipt.body.encode())
 
 
 def test_an_altered_or_foreign_receipt_is_refused(store: TemplateStore, tmp_path: Path) -> None:
-    receipt = store.erase("default", "ada").receipt
-    key = store.receipt_public_key()
+    receipt = store.erasures.erase("default", "ada").receipt
+    key = store.signer.public_key()
     altered = Receipt(receipt.body.replace("false", "true"), receipt.signature)
     assert altered.body != receipt.body
     with pytest.raises(StoreError, match="signature"):
@@ -145,14 +145,14 @@ def test_an_altered_or_foreign_receipt_is_refused(store: TemplateStore, tmp_path
     )
     foreign.upgrade()
     with pytest.raises(StoreError, match="signature"):
-        verify_receipt(receipt, foreign.receipt_public_key())
+        verify_receipt(receipt, foreign.signer.public_key())
     with pytest.raises(StoreError, match="32 bytes"):
         verify_receipt(receipt, b"short")
     foreign.close()
 
 
 def test_a_receipt_survives_json(store: TemplateStore) -> None:
-    receipt = store.erase("default", "ada").receipt
+    receipt = store.erasures.erase("default", "ada").receipt
     assert Receipt.from_json(json.loads(json.dumps(receipt.to_json()))) == receipt
 
 
@@ -175,13 +175,13 @@ def test_what_is_no_receipt_is_refused(value: object) -> None:
 
 
 def test_pseudonyms_are_keyed_and_unambiguous(store: TemplateStore, tmp_path: Path) -> None:
-    assert store.pseudonym("a", "bc") != store.pseudonym("ab", "c")
-    assert store.pseudonym("default", "ada") == store.pseudonym("default", "ada")
+    assert store.signer.pseudonym("a", "bc") != store.signer.pseudonym("ab", "c")
+    assert store.signer.pseudonym("default", "ada") == store.signer.pseudonym("default", "ada")
     foreign = TemplateStore(
         f"sqlite:///{tmp_path / 'foreign.db'}", MasterKeyring.create(tmp_path / "foreign.key")
     )
     foreign.upgrade()
-    assert foreign.pseudonym("default", "ada") != store.pseudonym("default", "ada")
+    assert foreign.signer.pseudonym("default", "ada") != store.signer.pseudonym("default", "ada")
     foreign.close()
 
 
@@ -233,7 +233,7 @@ def test_sqlite_files_keep_nothing_of_what_was_removed(
     assert found(folder, name) != {}
 
     if action == "erase":
-        assert store.erase("default", "subject-0007").log_purged
+        assert store.erasures.erase("default", "subject-0007").log_purged
         assert found(folder, name) == {}
     else:
         put(store, "subject-0007", generator.randbytes(17_000))
@@ -241,7 +241,7 @@ def test_sqlite_files_keep_nothing_of_what_was_removed(
     assert found(folder, ciphertext) == {}
     assert found(folder, wrapped_key) == {}
     assert (folder / "veilface.db-wal").stat().st_size == 0
-    others = store.get("default", "subject-0008")
+    others = store.subjects.get("default", "subject-0008")
     assert others is not None
     database.close()
     store.close()
@@ -259,17 +259,17 @@ def test_a_long_reader_delays_the_purge_and_is_reported(
 
     def read_while_erasing(connection: sa.Connection) -> None:
         assert connection.execute(sa.select(SubjectRow.id)).all()
-        assert not store.erase("default", "ada").log_purged
+        assert not store.erasures.erase("default", "ada").log_purged
         assert not patient.purge(wait=0.05)  # gives up by its own limit, not by the store's
         timeout = sa.text("PRAGMA busy_timeout")
         assert (
-            patient._database.read(lambda each: each.execute(timeout).scalar_one())
+            patient.database.read(lambda each: each.execute(timeout).scalar_one())
             == 1_000 * PATIENCE_S
         )
 
     patient = TemplateStore(url, keyring, timeout=PATIENCE_S)
     database.read(read_while_erasing)
-    assert store.get("default", "ada") is None
+    assert store.subjects.get("default", "ada") is None
     assert store.purge()
     patient.close()
     assert (tmp_path / "veilface.db-wal").stat().st_size == 0
@@ -291,11 +291,11 @@ def test_postgresql_keeps_no_row_after_compacting(
     def relation_size() -> int:
         return database.read(lambda each: each.execute(size).scalar_one())
 
-    store.erase("default", "ada")
+    store.erasures.erase("default", "ada")
     assert relation_size() > 0
     store.compact()
     assert relation_size() == 0
-    assert store.receipt("default", "ada") is not None
+    assert store.erasures.receipt("default", "ada") is not None
     database.close()
     store.close()
 
@@ -303,11 +303,11 @@ def test_postgresql_keeps_no_row_after_compacting(
 def test_compacting_keeps_the_rest(store: TemplateStore) -> None:
     put(store, "ada", b"wire")
     put(store, "eve", b"wire")
-    store.erase("default", "eve")
+    store.erasures.erase("default", "eve")
     store.compact()
-    assert store.get("default", "ada") is not None
+    assert store.subjects.get("default", "ada") is not None
     assert count_receipts(store) == 1
 
 
 def count_receipts(store: TemplateStore) -> int:
-    return count(store._database, ReceiptRow)
+    return count(store.database, ReceiptRow)

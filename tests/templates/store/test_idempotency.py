@@ -85,7 +85,7 @@ def test_erasing_the_subject_takes_its_records_and_late_answers(store: TemplateS
     store.idempotency.finish(done, status=201, body=b"about ada")
     running = claim(store, key="running", subject_id="ada")
     store.idempotency.finish(claim(store, key="eve", subject_id="eve"), status=201, body=b"eve")
-    store.erase("default", "ada")
+    store.erasures.erase("default", "ada")
     assert not store.idempotency.finish(running, status=201, body=b"about ada")
     claim(store, key="done")
     assert answer(store, key="eve").body == b"eve"
@@ -101,7 +101,7 @@ def test_key_and_request_are_stored_as_keyed_hashes(
     stored = b"|".join(v if isinstance(v, bytes) else str(v).encode() for v in row)
     for plain in (b"enroll-zygmunt", b"digest of a photo", b"zygmunt"):
         assert plain not in stored
-    assert row.pseudonym == store.pseudonym("default", "zygmunt")
+    assert row.pseudonym == store.signer.pseudonym("default", "zygmunt")
     database.close()
 
 
@@ -144,13 +144,13 @@ def test_many_expired_records_go_in_small_transactions(
     clock.pass_by(hours=25)
     claim(store, key="young")
     sizes: list[int] = []
-    write = store._database.write
+    write = store.database.write
 
     def counted(work: Any, **named: Any) -> Any:
         sizes.append(write(work, **named))
         return sizes[-1]
 
-    monkeypatch.setattr(store._database, "write", counted)
+    monkeypatch.setattr(store.database, "write", counted)
     assert store.idempotency.expire() == 8
     assert sizes == [3, 3, 2]
     assert store.idempotency.expire() == 0

@@ -29,8 +29,10 @@ def test_only_what_was_followed_by_others_is_superseded(store: TemplateStore) ->
 def test_a_row_that_somebody_else_wrote_supersedes_nothing(store: TemplateStore) -> None:
     store.known_calibrations.note(CONTRACT, OLD)
     row = {"contract_id": CONTRACT, "position": 2, "calibration_ids": "f" * 64}
-    forged = sa.insert(KnownCalibrationsRow).values(**row, created_at=store._clock(), mac=bytes(32))
-    store._database.write(lambda each: each.execute(forged))
+    forged = sa.insert(KnownCalibrationsRow).values(
+        **row, created_at=store._context.clock(), mac=bytes(32)
+    )
+    store.database.write(lambda each: each.execute(forged))
     assert not store.known_calibrations.are_superseded(CONTRACT, OLD)
     store.known_calibrations.note(CONTRACT, NEW)
     assert store.known_calibrations.are_superseded(CONTRACT, OLD)

@@ -78,16 +78,16 @@ def test_who_is_enrolled_at_the_upgrade_is_not_taken_for_unused(
     store = TemplateStore(database_url, keyring)
     store.upgrade()
     disuse = Retention(max_disuse=timedelta(days=1))
-    assert store.due(disuse) == 0
-    assert store.erase_expired(disuse) == 0
-    assert store.due(Retention(max_age=timedelta(days=3649))) == 2
+    assert store.retention.due(disuse) == 0
+    assert store.retention.erase_expired(disuse) == 0
+    assert store.retention.due(Retention(max_age=timedelta(days=3649))) == 2
     used = database.read(lambda each: each.execute(sa.select(SubjectRow.last_used_at)).all())
     assert len(used) == 2
     assert all(now <= at <= datetime.now(UTC) for (at,) in used)
     # It counts from there on, in the format that the column has: two days later they are due.
     later = TemplateStore(database_url, keyring, clock=lambda: now + timedelta(days=2))
-    assert later.due(disuse) == 2
-    assert later.due(Retention(max_disuse=timedelta(days=3))) == 0
+    assert later.retention.due(disuse) == 2
+    assert later.retention.due(Retention(max_disuse=timedelta(days=3))) == 0
     for each in (later, store, database):
         each.close()
 
@@ -96,7 +96,7 @@ def test_a_schema_with_lines_in_the_audit_log_is_not_taken_back(store: TemplateS
     """Its head would begin again at 0, and the next line have the number of the first."""
     put(store, "ada", b"wire")
     with pytest.raises(StoreError, match="the audit log has lines"):
-        migrate.downgrade(store._database, "0001")
+        migrate.downgrade(store.database, "0001")
     store.check()
     put(store, "eve", b"wire")
     assert store.audit_log.verify().intact
@@ -109,14 +109,14 @@ def test_a_schema_that_was_taken_back_begins_the_audit_log_anew(
         store = TemplateStore(database_url, keyring)
         store.upgrade()
         assert store.audit_log.verify().intact
-        migrate.downgrade(store._database, "0001")
+        migrate.downgrade(store.database, "0001")
         store.close()
 
 
 def test_upgrading_twice_keeps_the_data(store: TemplateStore) -> None:
     put(store, "ada", b"wire")
     store.upgrade()
-    found = store.get("default", "ada")
+    found = store.subjects.get("default", "ada")
     assert found is not None
     assert found.wire == b"wire"
 
@@ -171,7 +171,7 @@ def test_a_query_before_the_upgrade_names_the_remedy(
 ) -> None:
     store = TemplateStore(database_url, keyring)
     with pytest.raises(StoreError, match="veilface db upgrade"):
-        store.get("default", "ada")
+        store.subjects.get("default", "ada")
     store.close()
 
 

@@ -23,7 +23,7 @@ from templates.space.subspace import AffineSubspace, SubspaceBatch
 from templates.store import Source, TemplateStore, UnknownTenant
 from templates.store.audit_log import By
 from templates.store.database import Database
-from templates.store.rerotation import _Turns
+from templates.store.rerotation import _Rotations
 from templates.store.schema import RotationKeyRow, SubjectRow, TemplateRow
 from templates.store.tenants import RetiredRotation
 from tests.patience import PATIENCE_S
@@ -68,7 +68,7 @@ class People:
     def put(
         self, name: str, encoded: bytes, epoch: int | None, tenant: str, dtype: str = "float16"
     ) -> None:
-        self._store.put(
+        self._store.subjects.put(
             tenant,
             name,
             encoded,
@@ -91,7 +91,7 @@ class People:
         self, probes: NDArray[np.float64], metric: Metric = Metric.EUCLIDEAN
     ) -> NDArray[np.float64]:
         """Distances of probes to all stored templates, each in its rotation, in float64."""
-        stored = [self._store.get("default", name) for name in self.names]
+        stored = [self._store.subjects.get("default", name) for name in self.names]
         held = [each for each in stored if each is not None]
         assert len(held) == len(stored)
         table = np.empty((len(probes), len(held)))
@@ -125,7 +125,7 @@ def rows(store: TemplateStore) -> dict[str, Any]:
         .join(TemplateRow, TemplateRow.subject_pk == SubjectRow.id)
         .where(SubjectRow.tenant_id == store.tenants.get("default").id)
     )
-    found = store._database.read(lambda each: each.execute(query).all())
+    found = store.database.read(lambda each: each.execute(query).all())
     by_name = [dict(zip(names, row, strict=True)) for row in found]
     return {row["subjects.subject_id"]: row for row in by_name}
 
@@ -134,7 +134,7 @@ def epochs(store: TemplateStore) -> list[int]:
     query = sa.select(RotationKeyRow.epoch).order_by(RotationKeyRow.epoch)
     owner = store.tenants.get("default").id
     return list(
-        store._database.read(
+        store.database.read(
             lambda each: each.execute(query.where(RotationKeyRow.tenant_id == owner)).scalars()
         )
     )
@@ -175,7 +175,7 @@ def test_moved_templates_are_the_same_sets_in_the_new_rotation(
     for name in people.names:
         people.enroll(name, dtype=dtype)
     people.enroll("s003", tenant="other")
-    theirs = store.get("other", "s003")
+    theirs = store.subjects.get("other", "s003")
     probes = units(Keystream.seeded("probes"), 20)
     before, distances_before = rows(store), people.distances(probes)
     clock.pass_by(days=1)
@@ -199,7 +199,7 @@ def test_moved_templates_are_the_same_sets_in_the_new_rotation(
     for name in people.names:
         different = {key for key in before[name] if before[name][key] != after[name][key]}
         assert different == changed, name
-        stored = store.get("default", name)
+        stored = store.subjects.get("default", name)
         assert stored is not None
         assert wire.decode(stored.wire).dtype == dtype
         # The new numbers are those of the new rotation only.
@@ -207,7 +207,7 @@ def test_moved_templates_are_the_same_sets_in_the_new_rotation(
         own = people.points[[people.names.index(name)]]
         old = pairwise_distances(rotate(own, people.rotation(1)), subspace, metric="euclidean")
         assert old.min() > 0.1
-    assert store.get("other", "s003") == theirs
+    assert store.subjects.get("other", "s003") == theirs
 
 
 @pytest.mark.parametrize("metric", list(Metric))
@@ -249,9 +249,9 @@ def test_an_enrollment_of_an_older_epoch_is_refused(store: TemplateStore) -> Non
     for epoch in (1, 3):
         with pytest.raises(StoreUnavailable, match="rotation was renewed meanwhile; send it again"):
             people.put("s000", late, epoch, "default")
-    assert store.describe("default", "s000") is None
+    assert store.subjects.describe("default", "s000") is None
     people.enroll("s000")
-    record = store.describe("default", "s000")
+    record = store.subjects.describe("default", "s000")
     assert record is not None
     assert record.rotation_epoch == 2
 
@@ -338,16 +338,16 @@ def test_an_interrupted_move_goes_on_where_it_stopped(store: TemplateStore) -> N
 
 def meanwhile(monkeypatch: pytest.MonkeyPatch, action: Callable[[], object]) -> None:
     """Do something once, after a template was read and before it is replaced."""
-    turn, done = _Turns.turn, threading.Event()
+    rotated, done = _Rotations.rotated, threading.Event()
 
-    def turn_later(*arguments: Any) -> bytes:
-        turned = turn(*arguments)
+    def rotated_late(*arguments: Any) -> bytes:
+        template = rotated(*arguments)
         if not done.is_set():
             done.set()
             action()
-        return turned
+        return template
 
-    monkeypatch.setattr(_Turns, "turn", turn_later)
+    monkeypatch.setattr(_Rotations, "rotated", rotated_late)
 
 
 def test_a_subject_that_is_enrolled_again_meanwhile_is_left_alone(
@@ -360,7 +360,7 @@ def test_a_subject_that_is_enrolled_again_meanwhile_is_left_alone(
     new = people.encoded(people.templates[1], "default", 2)
     meanwhile(monkeypatch, lambda: people.put("s000", new, 2, "default"))
     assert store.rerotation.move("default") == 1
-    stored = store.get("default", "s000")
+    stored = store.subjects.get("default", "s000")
     assert stored is not None
     assert stored.wire == new
     assert store.rerotation.remaining("default") == 0
@@ -373,7 +373,7 @@ def test_a_subject_that_is_erased_meanwhile_stays_erased(
     people.enroll("s000")
     people.enroll("s001")
     store.rerotation.begin("default")
-    meanwhile(monkeypatch, lambda: [store.erase("default", name) for name in people.names])
+    meanwhile(monkeypatch, lambda: [store.erasures.erase("default", name) for name in people.names])
     assert store.rerotation.move("default") == 0
     assert rows(store) == {}
 
@@ -386,9 +386,9 @@ def test_a_key_that_was_wrapped_again_meanwhile_is_not_put_back(
         people.enroll(name)
     store.rerotation.begin("default")
     MasterKeyring.add_current(key_file)
-    meanwhile(monkeypatch, store.rewrap)
+    meanwhile(monkeypatch, store.wrapped_keys.rewrap)
     assert store.rerotation.move("default") == 3  # looked at again
-    assert list(store.wrapping_keys()) == [MasterKeyring.load(key_file).current]
+    assert list(store.wrapped_keys.count()) == [MasterKeyring.load(key_file).current]
     assert people.own_distances().max() < 1e-3
 
 
@@ -399,7 +399,7 @@ def test_a_template_that_does_not_open_is_said_and_the_rest_is_moved(store: Temp
     people.put("s003", b"no template", 1, "default")
     pk = rows(store)["s001"]["subjects.id"]
     damage = sa.update(TemplateRow).where(TemplateRow.subject_pk == pk).values(template_id="x")
-    store._database.write(lambda each: each.execute(damage))
+    store.database.write(lambda each: each.execute(damage))
     store.rerotation.begin("default")
     with pytest.raises(StoreError, match=r"2 templates .* could not be moved") as caught:
         store.rerotation.move("default", batch=2)
@@ -407,7 +407,7 @@ def test_a_template_that_does_not_open_is_said_and_the_rest_is_moved(store: Temp
     assert list(store.rerotation.subjects_of_old_epochs("default")) == ["s001", "s003"]
     with pytest.raises(StoreError, match="move them first"):
         store.rerotation.retire("default")
-    store.erase("default", "s001")
+    store.erasures.erase("default", "s001")
     people.enroll("s003")
     assert store.rerotation.move("default") == 0
     assert store.rerotation.retire("default") == 1
@@ -421,7 +421,7 @@ def test_an_enrollment_under_way_is_waited_for_before_a_key_goes(
 ) -> None:
     """It read epoch 1 and has not committed: no query can see its template yet."""
     service = TemplateStore(database_url, MasterKeyring.load(key_file))
-    service.pseudonym("default", "-")
+    service.signer.pseudonym("default", "-")
     service.audit_log.prepare()
     people, slow_people = People(store, 1), People(service, 1)
     with ThreadPoolExecutor(2) as threads:
@@ -466,11 +466,11 @@ def test_a_service_in_use_loses_nothing(
                 name = generator.choice(users.names)
                 try:
                     if generator.random() < 0.2:
-                        service.erase("default", name)
+                        service.erasures.erase("default", name)
                     users.enroll(name)
                 except StoreUnavailable as error:
                     refused.append(str(error))
-                service.get("default", name)
+                service.subjects.get("default", name)
         except BaseException as error:
             errors.append(error)
 
@@ -478,7 +478,7 @@ def test_a_service_in_use_loses_nothing(
         try:
             while not stop.is_set():
                 for name, point in zip(users.names, users.points, strict=True):
-                    stored = service.get("default", name)
+                    stored = service.subjects.get("default", name)
                     if stored is None:
                         continue
                     try:
@@ -517,7 +517,7 @@ def test_a_service_in_use_loses_nothing(
     assert all("renewed meanwhile" in each for each in refused)
     assert all("move them first" in each for each in left)
     for name in people.names:
-        if store.describe("default", name) is None:
+        if store.subjects.describe("default", name) is None:
             people.enroll(name)
     assert people.own_distances().max() < 1e-2
     assert epochs(store) == [4]

@@ -41,7 +41,7 @@ def use(store: TemplateStore, subject_id: str, decided_on: str | None = None) ->
 
 
 def names(store: TemplateStore, tenant: str = "default") -> list[str]:
-    return [each.subject_id for each in store.list(tenant).records]
+    return [each.subject_id for each in store.subjects.list(tenant).records]
 
 
 @pytest.fixture
@@ -91,35 +91,43 @@ def test_who_is_due(
     keep = Retention(
         None if max_age is None else max_age * DAY, None if max_disuse is None else max_disuse * DAY
     )
-    assert five.due(keep) == 5 - len(kept)
-    assert five.erase_expired(keep, batch=2) == 5 - len(kept)
+    assert five.retention.due(keep) == 5 - len(kept)
+    assert five.retention.erase_expired(keep, batch=2) == 5 - len(kept)
     assert names(five) == kept
-    assert five.due(keep) == 0
-    assert five.erase_expired(keep) == 0
+    assert five.retention.due(keep) == 0
+    assert five.retention.erase_expired(keep) == 0
 
 
 def test_the_limit_itself_is_not_over_it(store: TemplateStore, clock: Clock) -> None:
     put(store, "ada", b"wire")
     clock.pass_by(days=10)
-    assert store.due(Retention(10 * DAY)) == store.due(Retention(None, 10 * DAY)) == 0
+    assert (
+        store.retention.due(Retention(10 * DAY))
+        == store.retention.due(Retention(None, 10 * DAY))
+        == 0
+    )
     clock.pass_by(microseconds=1)
-    assert store.due(Retention(10 * DAY)) == store.due(Retention(None, 10 * DAY)) == 1
+    assert (
+        store.retention.due(Retention(10 * DAY))
+        == store.retention.due(Retention(None, 10 * DAY))
+        == 1
+    )
 
 
 def test_it_is_the_ordinary_erasure(store: TemplateStore, clock: Clock) -> None:
     put(store, "ada", b"wire")
     put(store, "ada", b"wire", tenant="other")
     clock.pass_by(days=10)
-    assert store.erase_expired(Retention(5 * DAY)) == 2
+    assert store.retention.erase_expired(Retention(5 * DAY)) == 2
     for tenant in ("default", "other"):
-        receipt = store.receipt(tenant, "ada")
+        receipt = store.erasures.receipt(tenant, "ada")
         assert receipt is not None
-        claims = verify_receipt(receipt, store.receipt_public_key())
+        claims = verify_receipt(receipt, store.signer.public_key())
         assert (claims["tenant"], claims["held"], claims["contract_id"]) == (tenant, True, CONTRACT)
     lines = [line for line in store.audit_log.lines() if line.action == "erase"]
     assert [(line.actor, line.outcome) for line in lines] == [("retention", "erased")] * 2
     assert {line.pseudonym for line in lines} == {
-        store.pseudonym(tenant, "ada") for tenant in ("default", "other")
+        store.signer.pseudonym(tenant, "ada") for tenant in ("default", "other")
     }
     assert store.audit_log.verify().intact
 
@@ -127,7 +135,7 @@ def test_it_is_the_ordinary_erasure(store: TemplateStore, clock: Clock) -> None:
 def test_another_actor_may_ask_for_it(store: TemplateStore, clock: Clock) -> None:
     put(store, "ada", b"wire")
     clock.pass_by(days=10)
-    store.erase_expired(Retention(DAY), by=By("operator:kim"))
+    store.retention.erase_expired(Retention(DAY), by=By("operator:kim"))
     assert [line.actor for line in store.audit_log.lines()][-1] == "operator:kim"
 
 
@@ -143,13 +151,13 @@ def test_many_of_one_moment_are_listed_in_steps(store: TemplateStore, clock: Clo
         put(store, f"s{number}", b"wire")
     clock.pass_by(days=10)
     put(store, "young", b"wire")
-    assert store.erase_expired(Retention(5 * DAY), batch=3) == 11
+    assert store.retention.erase_expired(Retention(5 * DAY), batch=3) == 11
     assert names(store) == ["young"]
 
 
 def after_listing(monkeypatch: pytest.MonkeyPatch, action: Callable[[], object]) -> None:
     """Do something once, when the list of who is due was read and nobody is erased yet."""
-    erase, done = retention._erase, threading.Event()
+    erase, done = retention.RetentionJob._erase, threading.Event()
 
     def and_then(*arguments: Any) -> bool:
         if not done.is_set():
@@ -157,7 +165,7 @@ def after_listing(monkeypatch: pytest.MonkeyPatch, action: Callable[[], object])
             action()
         return erase(*arguments)
 
-    monkeypatch.setattr(retention, "_erase", and_then)
+    monkeypatch.setattr(retention.RetentionJob, "_erase", and_then)
 
 
 @pytest.mark.parametrize("change", ["enrolled again", "used", "erased", "made anew", "gone"])
@@ -177,19 +185,19 @@ def test_who_changed_since_the_list_was_read_is_asked_again(
             case "used":
                 use(store, "ada")
             case "erased":
-                store.erase("default", "ada")
+                store.erasures.erase("default", "ada")
             case "made anew":
-                store.erase("default", "ada")
+                store.erasures.erase("default", "ada")
                 put(store, "ada", b"wire")
             case "gone":
                 store.tenant_erasures.erase(tenant)
 
     after_listing(monkeypatch, act)
-    assert store.erase_expired(Retention(None, 5 * DAY)) == 1
+    assert store.retention.erase_expired(Retention(None, 5 * DAY)) == 1
     survives = change in ("enrolled again", "used", "made anew")
     assert names(store) == (["ada"] if survives else [])
     by_retention = [line for line in store.audit_log.lines() if line.actor == "retention"]
-    assert [line.pseudonym for line in by_retention] == [store.pseudonym("default", "eve")]
+    assert [line.pseudonym for line in by_retention] == [store.signer.pseudonym("default", "eve")]
 
 
 def test_of_a_use_and_an_erasure_at_once_one_comes_first(
@@ -207,7 +215,7 @@ def test_of_a_use_and_an_erasure_at_once_one_comes_first(
     def verify(mine: list[str]) -> None:
         start.wait()
         for name in mine:
-            found = service.get("default", name)
+            found = service.subjects.get("default", name)
             if found is None:
                 continue
             # What was found may be gone when it is noted: then nobody is told of an accept.
@@ -217,7 +225,7 @@ def test_of_a_use_and_an_erasure_at_once_one_comes_first(
 
     def erase() -> int:
         start.wait()
-        return store.erase_expired(Retention(None, 5 * DAY), batch=4)
+        return store.retention.erase_expired(Retention(None, 5 * DAY), batch=4)
 
     shuffled = random.Random(7).sample(people, len(people))
     with ThreadPoolExecutor(3) as threads:
@@ -239,12 +247,12 @@ def test_workers_that_erase_at_once_erase_each_subject_once(
     clock.pass_by(days=10)
     with ThreadPoolExecutor(4) as threads:
         runs = [
-            threads.submit(each.erase_expired, Retention(DAY), batch=4)
+            threads.submit(each.retention.erase_expired, Retention(DAY), batch=4)
             for each in (store, other, store, other)
         ]
         assert sum(run.result() for run in runs) == 25
-    assert count(store._database, ReceiptRow) == 25
-    assert count(store._database, TemplateRow) == 0
+    assert count(store.database, ReceiptRow) == 25
+    assert count(store.database, TemplateRow) == 0
     assert store.audit_log.verify().intact
     other.close()
 
@@ -262,12 +270,12 @@ def test_the_list_is_read_in_the_order_of_an_index(tmp_path: Path, keyring: Mast
             plans.append(" / ".join(row[-1] for row in explained.fetchall()))
 
         sa.event.listen(connection.engine, "before_cursor_execute", note)
-        place = retention._Due(store._clock(), "0" * 32, "default", "ada")
-        for after in (None, place):
-            retention._list(connection, expired=keep.expired(store._clock()), after=after, batch=3)
+        now = store._context.clock()
+        for after in (None, (now, "0" * 32)):
+            retention._due(connection, expired=keep.expired(now), after=after, batch=3)
         sa.event.remove(connection.engine, "before_cursor_execute", note)
 
-    store._database.read(explain)
+    store.database.read(explain)
     plans = [plan for plan in plans if plan]  # BEGIN has none
     assert len(plans) == 2
     for plan in plans:
@@ -303,9 +311,9 @@ def test_sqlite_files_keep_nothing_of_who_was_erased(
     wanted += [piece for row in gone for piece in pieces(row.wrapped_key[9:])]
     wanted += [row.subject_id.encode() for row in gone]
     assert max(found(folder, wanted).values()) >= 0.9 * len(wanted)
-    assert store.erase_expired(Retention(5 * DAY), batch=4) == 9
+    assert store.retention.erase_expired(Retention(5 * DAY), batch=4) == 9
     assert found(folder, wanted) == {}
     assert (folder / "veilface.db-wal").stat().st_size == 0
-    assert store.get("default", "subject-0003") is not None
+    assert store.subjects.get("default", "subject-0003") is not None
     database.close()
     store.close()

@@ -19,7 +19,7 @@ SUBJECTS = [f"s{number}" for number in range(12)]
 
 
 def wires(store: TemplateStore) -> dict[str, bytes]:
-    found = {name: store.get("default", name) for name in SUBJECTS}
+    found = {name: store.subjects.get("default", name) for name in SUBJECTS}
     return {name: each.wire for name, each in found.items() if each is not None}
 
 
@@ -29,27 +29,30 @@ def test_a_rotation_leaves_nothing_under_the_old_key(
     for name in SUBJECTS:
         put(store, name, name.encode())
     new = store.api_keys.create("default", ["verify"])
-    pseudonym, rotation = store.pseudonym("default", "s1"), store.tenants.rotation_key("default")
+    pseudonym, rotation = (
+        store.signer.pseudonym("default", "s1"),
+        store.tenants.rotation_key("default"),
+    )
     old = keyring.current
-    total = sum(store.wrapping_keys().values())
-    assert store.wrapping_keys() == {old: total}
+    total = sum(store.wrapped_keys.count().values())
+    assert store.wrapped_keys.count() == {old: total}
     before = ciphertexts(database_url)
 
     current = MasterKeyring.add_current(key_file)
-    assert store.wrapping_keys() == {old: total}
+    assert store.wrapped_keys.count() == {old: total}
     batches: list[int] = []
-    assert store.rewrap(batch=5, progress=batches.append) == total
+    assert store.wrapped_keys.rewrap(batch=5, progress=batches.append) == total
     assert sum(batches) == total
     assert max(batches) == 5
-    assert store.wrapping_keys() == {current: total}
-    assert store.rewrap() == 0
+    assert store.wrapped_keys.count() == {current: total}
+    assert store.wrapped_keys.rewrap() == 0
     assert ciphertexts(database_url) == before  # templates are not touched
 
     MasterKeyring.drop_retired(key_file, keep=current)
     fresh = TemplateStore(database_url, MasterKeyring.load(key_file))
     fresh.check()
     assert wires(fresh) == {name: name.encode() for name in SUBJECTS}
-    assert fresh.pseudonym("default", "s1") == pseudonym
+    assert fresh.signer.pseudonym("default", "s1") == pseudonym
     assert fresh.tenants.rotation_key("default") == rotation
     assert fresh.api_keys.probe_key(new.key.prefix) == probe_key(new.token)
     fresh.close()
@@ -75,10 +78,10 @@ def test_dropping_the_old_key_too_early_fails_at_the_start(
     with pytest.raises(SealError, match="not the master key"):
         early.check()
     with pytest.raises(SealError, match="put the missing key back"):
-        early.rewrap()
+        early.wrapped_keys.rewrap()
     key_file.write_bytes(backup)
     late = TemplateStore(database_url, MasterKeyring.load(key_file))
-    late.rewrap()
+    late.wrapped_keys.rewrap()
     late.check()
     early.close()
     late.close()
@@ -95,13 +98,13 @@ def test_an_interrupted_rotation_goes_on_where_it_stopped(
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        store.rewrap(batch=5, progress=stop)
-    counts = store.wrapping_keys()
+        store.wrapped_keys.rewrap(batch=5, progress=stop)
+    counts = store.wrapped_keys.count()
     assert sorted(counts.values())[0] == 5
     assert wires(store) == {name: name.encode() for name in SUBJECTS}  # both keys open meanwhile
     store.check()
-    store.rewrap()
-    assert len(store.wrapping_keys()) == 1
+    store.wrapped_keys.rewrap()
+    assert len(store.wrapped_keys.count()) == 1
     assert wires(store) == {name: name.encode() for name in SUBJECTS}
 
 
@@ -124,7 +127,7 @@ def test_a_service_in_use_loses_nothing(
                 wire = f"{name} {number}".encode()
                 put(service, name, wire)
                 latest[name] = wire
-                found = service.get("default", SUBJECTS[(7 * number) % len(SUBJECTS)])
+                found = service.subjects.get("default", SUBJECTS[(7 * number) % len(SUBJECTS)])
                 assert found is not None
                 number += 1
         except Exception as error:
@@ -134,11 +137,11 @@ def test_a_service_in_use_loses_nothing(
     thread.start()
     for _ in range(3):
         current = MasterKeyring.add_current(key_file)
-        store.rewrap(batch=3)
+        store.wrapped_keys.rewrap(batch=3)
     stop.set()
     thread.join()
     assert errors == []
-    store.rewrap()
+    store.wrapped_keys.rewrap()
     MasterKeyring.drop_retired(key_file, keep=current)
     fresh = TemplateStore(database_url, MasterKeyring.load(key_file))
     assert wires(fresh) == latest
@@ -154,21 +157,21 @@ def test_a_write_that_sealed_before_the_rotation_is_waited_for(
 ) -> None:
     """It sealed under the old key and has not committed: no query can see it yet."""
     service = TemplateStore(database_url, MasterKeyring.load(key_file))
-    service.pseudonym("default", "-")
+    service.signer.pseudonym("default", "-")
     with ThreadPoolExecutor(2) as threads:
         writing = threads.submit(put, service, "ada", b"wire")
         assert slow_sealing.sealed.wait(PATIENCE_S)
         current = MasterKeyring.add_current(key_file)
-        rotating = threads.submit(store.rewrap)
+        rotating = threads.submit(store.wrapped_keys.rewrap)
         early = wait([rotating], timeout=0.5).done
         slow_sealing.go_on.set()
         writing.result()
         rotating.result()
     assert not early
-    assert set(store.wrapping_keys()) == {current}
+    assert set(store.wrapped_keys.count()) == {current}
     MasterKeyring.drop_retired(key_file, keep=current)
     fresh = TemplateStore(database_url, MasterKeyring.load(key_file))
-    found = fresh.get("default", "ada")
+    found = fresh.subjects.get("default", "ada")
     assert found is not None
     assert found.wire == b"wire"
     service.close()

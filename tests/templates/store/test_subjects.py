@@ -15,12 +15,12 @@ from tests.templates.store.conftest import CONTRACT, Clock, put
 
 
 def wire_of(store: TemplateStore, subject_id: str, *, tenant: str = "default") -> bytes | None:
-    found = store.get(tenant, subject_id)
+    found = store.subjects.get(tenant, subject_id)
     return None if found is None else found.wire
 
 
 def test_put_then_get(store: TemplateStore, clock: Clock) -> None:
-    stored = store.put(
+    stored = store.subjects.put(
         "default",
         "ada@example.org",
         b"wire bytes",
@@ -33,11 +33,11 @@ def test_put_then_get(store: TemplateStore, clock: Clock) -> None:
         template_id="t-1",
     )
     assert (stored.template_id, stored.created) == ("t-1", True)
-    found = store.get("default", "ada@example.org")
+    found = store.subjects.get("default", "ada@example.org")
     assert found is not None
     assert found.wire == b"wire bytes"
     record = found.record
-    assert record == store.describe("default", "ada@example.org")
+    assert record == store.subjects.describe("default", "ada@example.org")
     assert (record.subject_id, record.template_id, record.contract_id) == (
         "ada@example.org",
         "t-1",
@@ -49,9 +49,9 @@ def test_put_then_get(store: TemplateStore, clock: Clock) -> None:
 
 
 def test_an_unknown_subject_is_none(store: TemplateStore) -> None:
-    assert store.get("default", "nobody") is None
-    assert store.describe("default", "nobody") is None
-    assert store.get("no-such-tenant", "nobody") is None
+    assert store.subjects.get("default", "nobody") is None
+    assert store.subjects.describe("default", "nobody") is None
+    assert store.subjects.get("no-such-tenant", "nobody") is None
 
 
 def test_replacing_keeps_the_first_date_and_forgets_the_rest(
@@ -65,7 +65,7 @@ def test_replacing_keeps_the_first_date_and_forgets_the_rest(
     assert not second.created
     assert first.template_id != second.template_id
     assert wire_of(store, "ada") == b"new"
-    record = store.describe("default", "ada")
+    record = store.subjects.describe("default", "ada")
     assert record is not None
     assert record.contract_id == CONTRACT
     assert (record.updated_at - record.created_at).days == 3
@@ -83,12 +83,12 @@ def test_what_is_committed_is_not_reported_as_failed(
     def fail(*, wait: float | None = None) -> bool:
         raise StoreUnavailable("all connections to the database are busy")
 
-    monkeypatch.setattr(store._database, "purge_log", fail)
+    monkeypatch.setattr(store.database, "purge_log", fail)
     assert not put(store, "ada", b"second").created
-    found = store.get("default", "ada")
+    found = store.subjects.get("default", "ada")
     assert found is not None
     assert found.wire == b"second"
-    erasure = store.erase("default", "ada")
+    erasure = store.erasures.erase("default", "ada")
     assert (erasure.erased, erasure.log_purged) == (True, False)
 
 
@@ -97,16 +97,16 @@ def test_tenants_do_not_see_each_other(store: TemplateStore) -> None:
     put(store, "ada", b"theirs", tenant="other")
     assert wire_of(store, "ada") == b"mine"
     assert wire_of(store, "ada", tenant="other") == b"theirs"
-    store.erase("other", "ada")
+    store.erasures.erase("other", "ada")
     assert wire_of(store, "ada") == b"mine"
-    assert [record.subject_id for record in store.list("other").records] == []
+    assert [record.subject_id for record in store.subjects.list("other").records] == []
 
 
 def test_an_unknown_tenant_is_refused(store: TemplateStore) -> None:
     with pytest.raises(UnknownTenant):
         put(store, "ada", b"wire", tenant="nobody")
     with pytest.raises(UnknownTenant):
-        store.erase("nobody", "ada")
+        store.erasures.erase("nobody", "ada")
 
 
 @given(st.text(max_size=6))
@@ -125,10 +125,10 @@ def test_subject_ids_keep_to_the_rule(text: str) -> None:
 def test_a_bad_subject_id_is_refused_everywhere(store: TemplateStore) -> None:
     calls = (
         lambda bad: put(store, bad, b"wire"),
-        lambda bad: store.get("default", bad),
-        lambda bad: store.describe("default", bad),
-        lambda bad: store.erase("default", bad),
-        lambda bad: store.receipt("default", bad),
+        lambda bad: store.subjects.get("default", bad),
+        lambda bad: store.subjects.describe("default", bad),
+        lambda bad: store.erasures.erase("default", bad),
+        lambda bad: store.erasures.receipt("default", bad),
     )
     for call in calls:
         for bad in ("", "x" * 129, "a b", "a/b", "ä", "a\n", "a\x00", "%", "..\\", ".", ".."):
@@ -145,7 +145,7 @@ def test_the_longest_subject_id_is_taken(store: TemplateStore) -> None:
 def test_a_template_of_an_absurd_size_is_refused(store: TemplateStore, size: int) -> None:
     with pytest.raises(StoreError, match="wire bytes"):
         put(store, "ada", bytes(size))
-    assert store.get("default", "ada") is None
+    assert store.subjects.get("default", "ada") is None
 
 
 def test_a_template_of_four_megabytes_is_kept(store: TemplateStore) -> None:
@@ -156,7 +156,7 @@ def test_a_template_of_four_megabytes_is_kept(store: TemplateStore) -> None:
 
 def test_the_wire_does_not_show(store: TemplateStore) -> None:
     put(store, "ada", b"wire bytes")
-    assert "wire bytes" not in repr(store.get("default", "ada"))
+    assert "wire bytes" not in repr(store.subjects.get("default", "ada"))
 
 
 def rows(database_url: str) -> list[sa.Row]:
@@ -210,7 +210,7 @@ def swap_and_read(
         **{column: getattr(source, column) for column in columns},
     )
     with pytest.raises(SealError, match="does not open"):
-        store.get("default", "ada")
+        store.subjects.get("default", "ada")
     # The control: nothing else was wrong.
     assert wire_of(store, subject, tenant=tenant) == b"another wire"
 
@@ -234,7 +234,7 @@ def test_a_row_relabelled_in_the_database_does_not_open(
         change(store, database_url, subject, **{column: value})
         tenant = "other" if column == "tenant_id" else "default"
         with pytest.raises(SealError):
-            store.get(tenant, "eve" if column == "subject_id" else subject)
+            store.subjects.get(tenant, "eve" if column == "subject_id" else subject)
 
 
 def test_a_subject_under_another_row_id_does_not_open(
@@ -243,11 +243,11 @@ def test_a_subject_under_another_row_id_does_not_open(
     """An old row put back after an erasure opens no more under the subject's new row."""
     put(store, "ada", b"first")
     (old,) = rows(database_url)
-    store.erase("default", "ada")
+    store.erasures.erase("default", "ada")
     put(store, "ada", b"second")
     change(store, database_url, "ada", wrapped_key=old.wrapped_key, ciphertext=old.ciphertext)
     with pytest.raises(SealError):
-        store.get("default", "ada")
+        store.subjects.get("default", "ada")
 
 
 def change(store: TemplateStore, database_url: str, who: str, **values: object) -> None:
@@ -275,7 +275,7 @@ def test_pages_hold_every_subject_once_in_order(store: TemplateStore) -> None:
         put(store, name, b"wire")
     seen, cursor, pages = [], None, 0
     while True:
-        page = store.list("default", limit=5, cursor=cursor)
+        page = store.subjects.list("default", limit=5, cursor=cursor)
         seen += [record.subject_id for record in page.records]
         pages += 1
         if (cursor := page.next_cursor) is None:
@@ -287,9 +287,9 @@ def test_pages_hold_every_subject_once_in_order(store: TemplateStore) -> None:
 def test_a_page_that_ends_with_the_last_subject_is_the_last(store: TemplateStore) -> None:
     for name in ("a", "b"):
         put(store, name, b"wire")
-    assert store.list("default", limit=2).next_cursor is None
-    assert store.list("default", limit=1).next_cursor is not None
-    assert store.list("other").records == ()
+    assert store.subjects.list("default", limit=2).next_cursor is None
+    assert store.subjects.list("default", limit=1).next_cursor is not None
+    assert store.subjects.list("other").records == ()
 
 
 def test_pages_are_stable_while_others_write(store: TemplateStore) -> None:
@@ -298,14 +298,14 @@ def test_pages_are_stable_while_others_write(store: TemplateStore) -> None:
         put(store, name, b"wire")
     generator, seen, cursor = random.Random(2), [], None
     while True:
-        page = store.list("default", limit=3, cursor=cursor)
+        page = store.subjects.list("default", limit=3, cursor=cursor)
         seen += [record.subject_id for record in page.records]
         for _ in range(3):
             name = f"s{generator.randrange(1, 40, 2):02d}"
             if generator.random() < 0.5:
                 put(store, name, b"wire")
             else:
-                store.erase("default", name)
+                store.erasures.erase("default", name)
         if page.next_cursor is None:
             break
         cursor = page.next_cursor
@@ -317,27 +317,27 @@ def test_a_cursor_shows_nothing_and_cannot_be_made(store: TemplateStore) -> None
     for name in ("ada", "eve"):
         put(store, name, b"wire")
         put(store, name, b"wire", tenant="other")
-    cursor = store.list("default", limit=1).next_cursor
+    cursor = store.subjects.list("default", limit=1).next_cursor
     assert cursor is not None
     raw = base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4))
     assert b"ada" not in raw
     altered = cursor[:-2] + ("AA" if cursor[-2:] != "AA" else "BB")
     for bad in (altered, cursor[:10], "", "ada", "ä", "x" * 1000):
         with pytest.raises(InvalidIdentifier, match="cursor"):
-            store.list("default", cursor=bad)
+            store.subjects.list("default", cursor=bad)
     with pytest.raises(InvalidIdentifier, match="cursor"):
-        store.list("other", cursor=cursor)
+        store.subjects.list("other", cursor=cursor)
     for limit in (0, -1, 1001):
         with pytest.raises(InvalidIdentifier, match="limit"):
-            store.list("default", limit=limit)
+            store.subjects.list("default", limit=limit)
 
 
 def test_a_template_of_another_contract_is_as_good_as_none(
     store: TemplateStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     put(store, "ada", b"wire")
-    found = store.get("default", "ada", contract_id=CONTRACT)
+    found = store.subjects.get("default", "ada", contract_id=CONTRACT)
     assert found is not None
     assert found.wire == b"wire"
-    monkeypatch.setattr(store._keyring, "open", None)  # nothing may be decrypted
-    assert store.get("default", "ada", contract_id="d" * 64) is None
+    monkeypatch.setattr(store._context.keyring, "open", None)  # nothing may be decrypted
+    assert store.subjects.get("default", "ada", contract_id="d" * 64) is None

@@ -67,7 +67,9 @@ def fill(store: TemplateStore, tenant: str, *, subjects: int = 5) -> dict[str, i
             accepted=False,
             template_id=template_id(store, f"s{number}", tenant),
             level="m",
-            nonce=Nonce(keys[0].prefix, f"nonce {number}", store._clock() + timedelta(hours=1)),
+            nonce=Nonce(
+                keys[0].prefix, f"nonce {number}", store._context.clock() + timedelta(hours=1)
+            ),
             by=By(),
         )
     for number in range(3):
@@ -96,7 +98,7 @@ def outcomes(store: TemplateStore) -> list[str]:
 
 def nothing_is_left(store: TemplateStore, *, tenants: int) -> bool:
     """Whether the tables hold what empty tenants hold: their row and a rotation key."""
-    held = {table: count(store._database, table) for table in OF_A_TENANT}
+    held = {table: count(store.database, table) for table in OF_A_TENANT}
     expected = dict.fromkeys(OF_A_TENANT, 0) | {TenantRow: tenants, RotationKeyRow: tenants}
     return held == expected
 
@@ -113,14 +115,14 @@ def test_everything_of_the_tenant_goes_and_nothing_of_another(
     assert erasure.erased
     assert erasure.log_purged
     assert counted(erasure.receipt) == mine
-    claims = verify_receipt(erasure.receipt, store.receipt_public_key())
+    claims = verify_receipt(erasure.receipt, store.signer.public_key())
     assert claims["kind"] == "veilface-tenant-erasure-receipt"
     assert (claims["tenant"], claims["held"], claims["version"]) == ("default", True, 1)
     assert claims["erased_at"] == clock.time.isoformat()
     assert "subject" not in claims
     assert erasure.receipt.held
     left = {
-        table: count(store._database, table) for table in OF_A_TENANT if table is not TemplateRow
+        table: count(store.database, table) for table in OF_A_TENANT if table is not TemplateRow
     }
     assert left == {
         SubjectRow: theirs["subjects"],
@@ -132,12 +134,12 @@ def test_everything_of_the_tenant_goes_and_nothing_of_another(
         TenantErasureRow: 0,
         TenantRow: 1,
     }
-    assert count(store._database, TemplateRow) == theirs["templates"]
+    assert count(store.database, TemplateRow) == theirs["templates"]
     for call in (store.tenants.get, store.tenant_erasures.held):
         with pytest.raises(UnknownTenant):
             call("default")
-    assert store.list("default").records == ()
-    found = store.get("other", "s0")
+    assert store.subjects.list("default").records == ()
+    found = store.subjects.get("other", "s0")
     assert found is not None
     assert outcomes(store) == ["begun", "erased"]
     line = list(store.audit_log.lines())[-1]
@@ -167,13 +169,13 @@ def test_erasing_again_gives_the_same_receipt(store: TemplateStore, clock: Clock
     clock.pass_by(days=1)
     again = store.tenant_erasures.erase("default")
     assert not again.erased
-    assert again.receipt == first.receipt == store.tenant_erasures.receipt("default")
+    assert again.erasures.receipt == first.receipt == store.tenant_erasures.receipt("default")
     assert outcomes(store) == ["begun", "erased", "receipt_repeated"]
 
 
 def test_a_tenant_that_never_was_is_unknown(store: TemplateStore) -> None:
     put(store, "ada", b"wire")
-    store.erase("default", "ada")
+    store.erasures.erase("default", "ada")
     with pytest.raises(UnknownTenant, match="'nobody'"):
         store.tenant_erasures.erase("nobody")
     with pytest.raises(InvalidIdentifier):
@@ -191,8 +193,8 @@ def test_an_interrupted_erasure_is_finished_and_counts_everything(store: Templat
     for _ in range(2):
         with pytest.raises(KeyboardInterrupt):
             store.tenant_erasures.erase("default", batch=2, progress=stop)
-    assert count(store._database, SubjectRow) == 1
-    assert count(store._database, TemplateRow) == 1
+    assert count(store.database, SubjectRow) == 1
+    assert count(store.database, TemplateRow) == 1
     erasure = store.tenant_erasures.erase("default", batch=2)
     assert counted(erasure.receipt) == everything
     assert outcomes(store) == ["begun", "resumed", "resumed", "erased"]
@@ -219,7 +221,7 @@ def test_a_tenant_made_anew_has_another_rotation_and_another_epoch(store: Templa
 
 def test_a_receipt_of_a_tenant_survives_json_and_shows_alteration(store: TemplateStore) -> None:
     receipt = store.tenant_erasures.erase("default").receipt
-    key = store.receipt_public_key()
+    key = store.signer.public_key()
     assert Receipt.from_json(json.loads(json.dumps(receipt.to_json()))) == receipt
     altered = Receipt(receipt.body.replace("default", "defaulT"), receipt.signature)
     with pytest.raises(StoreError, match="signature"):
@@ -229,7 +231,7 @@ def test_a_receipt_of_a_tenant_survives_json_and_shows_alteration(store: Templat
 def test_no_second_bootstrap_key_after_the_only_tenant_is_erased(store: TemplateStore) -> None:
     assert store.api_keys.bootstrap() is not None
     store.tenant_erasures.erase("default")
-    assert count(store._database, ApiKeyRow) == 0
+    assert count(store.database, ApiKeyRow) == 0
     assert store.api_keys.bootstrap() is None
 
 
@@ -253,7 +255,7 @@ def test_concurrent_enrollments_leave_nothing(
             try:
                 match generator.randrange(4):
                     case 0:
-                        service.erase("default", name)
+                        service.erasures.erase("default", name)
                     case 1:
                         service.attempts.conclude(
                             "default",
@@ -307,7 +309,7 @@ def test_an_enrollment_under_way_goes_with_the_tenant(
 ) -> None:
     """It found the tenant, and has not committed: no query can see it yet."""
     service = TemplateStore(database_url, MasterKeyring.load(key_file))
-    service.pseudonym("default", "-")
+    service.signer.pseudonym("default", "-")
     service.audit_log.prepare()
     with ThreadPoolExecutor(2) as threads:
         writing = threads.submit(put, service, "ada", b"wire")
@@ -405,7 +407,7 @@ def test_sqlite_files_keep_nothing_of_an_erased_tenant(
     assert store.tenant_erasures.erase("default", batch=5).log_purged
     assert found(folder, wanted) == {}
     assert (folder / "veilface.db-wal").stat().st_size == 0
-    assert store.get("other", "their-subject") is not None
+    assert store.subjects.get("other", "their-subject") is not None
     database.close()
     store.close()
 
@@ -426,11 +428,11 @@ def test_postgresql_keeps_no_row_after_compacting(
         return list(connection.execute(query).one())
 
     store.tenant_erasures.erase("default")
-    assert min(store._database.read(sizes)) > 0
+    assert min(store.database.read(sizes)) > 0
     # The server keeps dead rows that an older snapshot may see, of its own vacuum's for instance.
     for _ in range(20):
         store.compact()
-        left = set(store._database.read(sizes))
+        left = set(store.database.read(sizes))
         if left == {0}:
             break
         time.sleep(0.5)

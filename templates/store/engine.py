@@ -1,0 +1,131 @@
+"""What a connection to SQLite or PostgreSQL is made with: the URL, the pool, SQLite's settings."""
+
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import sqlalchemy as sa
+from sqlalchemy import event
+from sqlalchemy.engine import URL, Connection, Engine, make_url
+from sqlalchemy.exc import ArgumentError
+
+from templates.errors import StoreError
+
+
+def checked_url(text: str) -> URL:
+    """Read a database URL, with the driver that is used; nothing is opened.
+
+    Raises
+    ------
+    StoreError
+        It cannot be read, or names no database that is supported. The text never quotes it: it
+        may hold a password.
+    """
+    try:
+        url = make_url(text)
+        if not 0 < (url.port or 1) < 2**16:
+            raise ValueError
+    except (ArgumentError, ValueError):  # the latter of a port that is no number
+        raise StoreError(
+            "the database URL cannot be read: write sqlite:///path or "
+            "postgresql://user@host:port/name, the port as a number up to 65535, and the "
+            "characters : / @ [ ] of a password as %3A %2F %40 %5B %5D"
+        ) from None
+    if url.drivername in ("postgresql", "postgres", "postgresql+psycopg"):
+        return url.set(drivername="postgresql+psycopg")
+    if url.drivername in ("sqlite", "sqlite+pysqlite"):
+        if not url.database or url.database == ":memory:" or url.database.startswith("file:"):
+            raise StoreError("SQLite needs a file: write sqlite:///path")
+        return url.set(drivername="sqlite+pysqlite")
+    raise StoreError(
+        f"a database of kind {url.drivername!r} is not supported: use sqlite:// or postgresql://"
+    )
+
+
+def make_engine(url: URL, *, timeout: float, pool_size: int, max_overflow: int) -> Engine:
+    """Make an engine, whose SQLite transactions write where the option ``veilface_write`` is set.
+
+    Parameters
+    ----------
+    url
+        Of :func:`checked_url`.
+    timeout
+        Seconds to wait for a connection, or for another writer (SQLite).
+    pool_size, max_overflow
+        Connections kept, and further ones under load.
+    """
+    pool: dict[str, Any] = {
+        "pool_size": pool_size,
+        "max_overflow": max_overflow,
+        "pool_timeout": timeout,
+        "hide_parameters": True,  # an error text must never quote a row
+    }
+    if url.get_backend_name() != "sqlite":
+        return sa.create_engine(
+            url,
+            pool_pre_ping=True,
+            connect_args={
+                "connect_timeout": max(2, round(timeout)),
+                "application_name": "veilface",
+                "keepalives_idle": 30,
+                "keepalives_interval": 10,
+                "keepalives_count": 3,
+                "tcp_user_timeout": 30_000,
+            },
+            **pool,
+        )
+    _create_private_file(Path(str(url.database)))
+    engine = sa.create_engine(
+        url,
+        poolclass=sa.pool.QueuePool,
+        connect_args={"timeout": timeout, "check_same_thread": False},
+        **pool,
+    )
+    event.listen(engine, "connect", _prepare_sqlite)
+    event.listen(engine, "begin", _begin_sqlite)
+    return engine
+
+
+def _create_private_file(path: Path) -> None:
+    try:
+        os.close(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
+    except OSError as error:
+        raise StoreError(f"the database file {path} cannot be used: {error.strerror}") from None
+
+
+def _prepare_sqlite(connection: Any, _record: object) -> None:
+    connection.isolation_level = None  # transactions begin where _begin_sqlite says so
+    cursor = connection.cursor()
+    try:
+        # Waiting first: the switch to WAL below needs the file for itself for a moment.
+        _set_wal(cursor)
+        cursor.execute("PRAGMA synchronous = FULL")
+        cursor.execute("PRAGMA foreign_keys = ON")
+        cursor.execute("PRAGMA secure_delete = ON")
+        cursor.execute("PRAGMA temp_store = MEMORY")
+    finally:
+        cursor.close()
+
+
+def _set_wal(cursor: Any) -> None:
+    # SQLite answers "locked" at once here, without its busy handler, when two processes switch.
+    for pause in (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, None):
+        try:
+            (mode,) = cursor.execute("PRAGMA journal_mode = WAL").fetchone()
+        except Exception as error:
+            if pause is None or "locked" not in str(error):
+                raise
+            time.sleep(pause)
+            continue
+        if mode != "wal":
+            raise StoreError(
+                f"SQLite keeps its journal as {mode!r} here, not as a write-ahead log: "
+                "put the database file on a local disk"
+            )
+        return
+
+
+def _begin_sqlite(connection: Connection) -> None:
+    writing = connection.get_execution_options().get("veilface_write", False)
+    connection.exec_driver_sql("BEGIN IMMEDIATE" if writing else "BEGIN")

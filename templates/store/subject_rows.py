@@ -1,0 +1,131 @@
+"""Reading a subject's rows: its record, and its template opened."""
+
+from dataclasses import dataclass, field
+from datetime import datetime
+from enum import StrEnum
+from typing import Any
+
+import sqlalchemy as sa
+from sqlalchemy.engine import Connection
+
+from templates.keys.sealing import MasterKeyring
+from templates.store.envelope import Envelope, Owner, open_envelope
+from templates.store.identifiers import UnknownTenant
+from templates.store.schema import SubjectRow, TemplateRow, TenantRow
+
+
+class Source(StrEnum):
+    """What a template was made from."""
+
+    PHOTOS = "photos"
+    TEMPLATE = "template"
+
+
+@dataclass(frozen=True)
+class SubjectRecord:
+    """What is known of a subject without opening its template."""
+
+    subject_id: str
+    template_id: str
+    contract_id: str
+    rotation_epoch: int
+    n: int
+    m: int
+    dtype: str
+    source: Source
+    photos: int
+    created_at: datetime
+    updated_at: datetime
+
+
+@dataclass(frozen=True)
+class SubjectTemplate:
+    """A subject with its decrypted template; the wire bytes stay out of its repr."""
+
+    record: SubjectRecord
+    wire: bytes = field(repr=False)
+
+
+RECORD_COLUMNS = (
+    SubjectRow.subject_id,
+    TemplateRow.template_id,
+    TemplateRow.contract_id,
+    TemplateRow.rotation_epoch,
+    TemplateRow.n,
+    TemplateRow.m,
+    TemplateRow.dtype,
+    TemplateRow.source,
+    TemplateRow.photos,
+    SubjectRow.created_at,
+    SubjectRow.updated_at,
+)
+"""What :func:`read_record` needs."""
+TEMPLATE_COLUMNS = (
+    *RECORD_COLUMNS,
+    SubjectRow.id.label("subject_pk"),
+    SubjectRow.tenant_id,
+    SubjectRow.wrapped_key,
+    TemplateRow.ciphertext,
+)
+"""What the functions below need."""
+
+
+def of_tenant(columns: tuple[Any, ...], tenant: str) -> Any:
+    """Select columns of the subjects of a tenant, each with its template."""
+    return (
+        sa.select(*columns)
+        .join(TemplateRow, TemplateRow.subject_pk == SubjectRow.id)
+        .join(TenantRow, TenantRow.id == SubjectRow.tenant_id)
+        .where(TenantRow.name == tenant)
+    )
+
+
+def read_record(row: Any) -> SubjectRecord:
+    """Read a row that has :data:`RECORD_COLUMNS`."""
+    values = {name: row._mapping[name] for name in SubjectRecord.__dataclass_fields__}
+    return SubjectRecord(**{**values, "source": Source(row.source)})
+
+
+def owner_of(row: Any) -> Owner:
+    """What the template of a row belongs to."""
+    return Owner(**{name: row._mapping[name] for name in Owner.__dataclass_fields__})
+
+
+def envelope_of(row: Any) -> Envelope:
+    """The template of a row."""
+    return Envelope(row.wrapped_key, row.ciphertext)
+
+
+def opened_template(row: Any, keyring: MasterKeyring) -> SubjectTemplate:
+    """Decrypt the template of a row.
+
+    Raises
+    ------
+    SealError
+        If the row was altered or moved, or its master key is missing.
+    """
+    wire = open_envelope(envelope_of(row), owner_of(row), keyring)
+    return SubjectTemplate(record=read_record(row), wire=wire)
+
+
+def tenant_id_of(connection: Connection, name: str) -> str:
+    """Row id of a tenant, or :class:`UnknownTenant`."""
+    query = sa.select(TenantRow.id).where(TenantRow.name == name)
+    tenant_id = connection.execute(query).scalar_one_or_none()
+    if tenant_id is None:
+        raise UnknownTenant.named(name)
+    return tenant_id
+
+
+def subject_pk_of(connection: Connection, tenant_id: str, subject_id: str) -> str | None:
+    """Row id of a subject, or None."""
+    return connection.execute(
+        sa.select(SubjectRow.id).where(
+            SubjectRow.tenant_id == tenant_id, SubjectRow.subject_id == subject_id
+        )
+    ).scalar_one_or_none()
+
+
+def subject_lock(tenant: str, subject_id: str) -> str:
+    """Name of the lock under which a subject is written."""
+    return f"subject {tenant} {subject_id}"
