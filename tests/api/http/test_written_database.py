@@ -7,6 +7,7 @@ import hashlib
 import os
 import uuid
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
@@ -61,8 +62,12 @@ class Attacker:
     def rows(self, table: str, where: str = "1 = 1", **values: object) -> list[dict[str, Any]]:
         query = sa.text(f"SELECT * FROM {table} WHERE {where}")
         return self.database.read(
-            lambda each: [row._asdict() for row in each.execute(query, values)]
+            lambda connection: [row._asdict() for row in connection.execute(query, values)]
         )
+
+    def row(self, table: str, where: str, **values: object) -> dict[str, Any]:
+        (row,) = self.rows(table, where, **values)
+        return row
 
     def put_back(self, table: str, row: dict[str, Any], key: str) -> None:
         """Write a row as it was, whether it is still there or not."""
@@ -80,80 +85,98 @@ class Attacker:
             self.run("ALTER TABLE audit_log DISABLE TRIGGER USER")
 
 
-@pytest.fixture
-def attacker(both: tuple[Client, Deployment]) -> Iterator[Attacker]:
-    _, deployment = both
-    attacker = Attacker(deployment.settings.resolved_database_url)
-    yield attacker
-    attacker.database.close()
+@dataclass(frozen=True)
+class Attacked:
+    """The service, the store as its operator opens it, and the attacker."""
+
+    client: Client
+    deployment: Deployment
+    store: TemplateStore
+    attacker: Attacker
+
+    def accepts(self, token: str) -> bool:
+        """Whether the service knows a token; else it must say no more than that it does not."""
+        answer = self.client.get("/v1/contract", headers=bearer(token))
+        if answer.status_code != 200:
+            assert_error(answer, 401, "unauthorized")
+            unknown = self.client.get("/v1/contract", headers=bearer(new_token()))
+            assert answer.json()["error"] == unknown.json()["error"]
+        return bool(answer.status_code == 200)
+
+    def key_row(self, token: str) -> dict[str, Any]:
+        return self.attacker.row("api_keys", "prefix = :prefix", prefix=prefix_of(token))
+
+    def problems(self) -> set[tuple[str, str]]:
+        return {(problem.what, problem.about) for problem in self.store.check_records()}
+
+    def locked(self, failures: int = AFTER, subject: str = "alice") -> str:
+        """Enroll alice and fail on a subject; returns the token of the key that failed."""
+        enroll(self.client)
+        token = self.deployment.key("verify")
+        fail(self.client, token, failures, subject)
+        return token
+
+    def decides(self, token: str, subject: str = "alice") -> Any:
+        """Answer to alice's own face."""
+        return attempt(self.client, token, 1, subject)
+
+    def signed_probe(self, token: str) -> Callable[[], Any]:
+        """Sends alice's face, signed once, as often as it is called."""
+        face = self.client.app.state.runtime.pack.embed_photo(photo(1, 5)).embedding
+        body = signed_probe(token, "alice", face)
+        return lambda: self.client.post(
+            "/v1/subjects/alice/verify", json=body, headers=bearer(token), sign=False
+        )
 
 
 @pytest.fixture
-def store(both: tuple[Client, Deployment]) -> Iterator[TemplateStore]:
-    _, deployment = both
+def attacked(both: tuple[Client, Deployment]) -> Iterator[Attacked]:
+    client, deployment = both
     store = open_store(deployment.settings, open_keyring(deployment.settings))
-    yield store
+    attacker = Attacker(deployment.settings.resolved_database_url)
+    yield Attacked(client, deployment, store, attacker)
+    attacker.database.close()
     store.close()
-
-
-def contract(client: Client, token: str) -> Any:
-    """A call that any valid key may make."""
-    return client.get("/v1/contract", headers=bearer(token))
 
 
 def prefix_of(token: str) -> str:
     return token.split("_")[1]
 
 
-def problems(store: TemplateStore) -> set[tuple[str, str]]:
-    return {(problem.what, problem.about) for problem in store.check_records()}
+def new_token(prefix: str | None = None) -> str:
+    return f"vf_{prefix or os.urandom(6).hex()}_{os.urandom(32).hex()}"
 
 
 # --- API keys ------------------------------------------------------------------------------
 
 
-def test_a_made_up_key_is_none(
-    both: tuple[Client, Deployment], attacker: Attacker, store: TemplateStore
-) -> None:
-    client, _ = both
-    tenant = attacker.rows("tenants")[0]["id"]
-    token = f"vf_{os.urandom(6).hex()}_{os.urandom(32).hex()}"
-    for line, mac in ((0, None), (0, os.urandom(32)), (10**6, os.urandom(32))):
-        attacker.run(
-            "DELETE FROM api_keys WHERE prefix = :prefix",
-            "INSERT INTO api_keys (id, tenant_id, prefix, token_hash, rights, label, "
-            "wrapped_probe_key, wrapping_key, created_at, line, mac) VALUES (:id, :tenant, "
-            ":prefix, :token_hash, :rights, '', :zeros, '0123456789abcdef', :now, :line, :mac)",
-            id=uuid.uuid4().hex,
-            tenant=tenant,
-            prefix=prefix_of(token),
-            token_hash=hashlib.sha256(token.encode()).digest(),
-            rights=ALL_RIGHTS,
-            zeros=bytes(40),
-            now=datetime.now(UTC).replace(tzinfo=None),
-            line=line,
-            mac=mac,
-        )
-        refused = contract(client, token)
-        unknown = contract(client, f"vf_{os.urandom(6).hex()}_{os.urandom(32).hex()}")
-        assert_error(refused, 401, "unauthorized")
-        assert refused.json()["error"] == unknown.json()["error"]
-    assert problems(store) == {(KEY_NEVER_CREATED, f"key:{prefix_of(token)}")}
+@pytest.mark.parametrize("line", [0, 10**6])
+@pytest.mark.parametrize("mac", [None, bytes(range(32))])
+def test_a_made_up_key_is_none(attacked: Attacked, line: int, mac: bytes | None) -> None:
+    token = new_token()
+    own = attacked.key_row(attacked.deployment.token)
+    changed = {
+        "id": uuid.uuid4().hex,
+        "prefix": prefix_of(token),
+        "token_hash": hashlib.sha256(token.encode()).digest(),
+        "line": line,
+        "mac": mac,
+    }
+    attacked.attacker.insert("api_keys", {**own, **changed})
+    assert not attacked.accepts(token)
+    assert attacked.problems() == {(KEY_NEVER_CREATED, f"key:{prefix_of(token)}")}
 
 
-def test_a_key_whose_hash_was_put_in_place_of_anothers_is_none(
-    both: tuple[Client, Deployment], attacker: Attacker, store: TemplateStore
-) -> None:
-    client, deployment = both
-    prefix = prefix_of(deployment.token)
-    token = f"vf_{prefix}_{os.urandom(32).hex()}"
-    attacker.run(
+def test_a_key_whose_hash_was_put_in_place_of_anothers_is_none(attacked: Attacked) -> None:
+    prefix = prefix_of(attacked.deployment.token)
+    token = new_token(prefix)
+    attacked.attacker.run(
         "UPDATE api_keys SET token_hash = :token_hash WHERE prefix = :prefix",
         token_hash=hashlib.sha256(token.encode()).digest(),
         prefix=prefix,
     )
-    assert_error(contract(client, token), 401, "unauthorized")
-    assert problems(store) == {(KEY_ALTERED, f"key:{prefix}")}
+    assert not attacked.accepts(token)
+    assert attacked.problems() == {(KEY_ALTERED, f"key:{prefix}")}
 
 
 @pytest.mark.parametrize(
@@ -166,95 +189,77 @@ def test_a_key_whose_hash_was_put_in_place_of_anothers_is_none(
         "mac = NULL",
     ],
 )
-def test_a_key_with_a_changed_column_is_none(
-    both: tuple[Client, Deployment], attacker: Attacker, store: TemplateStore, change: str
-) -> None:
-    client, _ = both
-    store.tenants.create("other")
-    made = store.api_keys.create(
+def test_a_key_with_a_changed_column_is_none(attacked: Attacked, change: str) -> None:
+    attacked.store.tenants.create("other")
+    new = attacked.store.api_keys.create(
         "default",
         ["verify"],
         expires_at=datetime.now(UTC) + timedelta(hours=1),
         lowest_level="fmr-1e-3",
     )
-    assert contract(client, made.token).status_code == 200
-    attacker.run(f"UPDATE api_keys SET {change} WHERE prefix = '{made.key.prefix}'")
-    assert_error(contract(client, made.token), 401, "unauthorized")
-    assert problems(store) == {(KEY_ALTERED, f"key:{made.key.prefix}")}
+    assert attacked.accepts(new.token)
+    attacked.attacker.run(f"UPDATE api_keys SET {change} WHERE prefix = '{new.key.prefix}'")
+    assert not attacked.accepts(new.token)
+    assert attacked.problems() == {(KEY_ALTERED, f"key:{new.key.prefix}")}
 
 
-def test_a_revocation_is_not_undone(
-    both: tuple[Client, Deployment], attacker: Attacker, store: TemplateStore
-) -> None:
+def test_a_revocation_is_not_undone(attacked: Attacked) -> None:
     """Neither by emptying the column, nor by the row as it was, whose MAC is true."""
-    client, deployment = both
-    token = deployment.key("verify")
-    (before,) = attacker.rows("api_keys", "prefix = :prefix", prefix=prefix_of(token))
-    assert store.api_keys.revoke(prefix_of(token))
-    (after,) = attacker.rows("api_keys", "prefix = :prefix", prefix=prefix_of(token))
-    assert_error(contract(client, token), 401, "unauthorized")
+    token = attacked.deployment.key("verify")
+    before = attacked.key_row(token)
+    assert attacked.store.api_keys.revoke(prefix_of(token))
+    after = attacked.key_row(token)
+    assert not attacked.accepts(token)
     for row in ({**after, "revoked_at": None}, before, {**before, "line": after["line"]}):
-        attacker.put_back("api_keys", row, "prefix")
-        assert_error(contract(client, token), 401, "unauthorized")
-        assert problems(store) == {(KEY_ALTERED, f"key:{prefix_of(token)}")}
-    attacker.put_back("api_keys", after, "prefix")
-    assert problems(store) == set()
+        attacked.attacker.put_back("api_keys", row, "prefix")
+        assert not attacked.accepts(token)
+        assert attacked.problems() == {(KEY_ALTERED, f"key:{prefix_of(token)}")}
+    attacked.attacker.put_back("api_keys", after, "prefix")
+    assert attacked.problems() == set()
 
 
-def test_a_replaced_key_does_not_come_back(
-    both: tuple[Client, Deployment], attacker: Attacker, store: TemplateStore
-) -> None:
-    client, deployment = both
-    token = deployment.key("verify")
-    (before,) = attacker.rows("api_keys", "prefix = :prefix", prefix=prefix_of(token))
-    new = store.api_keys.replace(prefix_of(token), grace=timedelta(0))
+def test_a_replaced_key_does_not_come_back(attacked: Attacked) -> None:
+    token = attacked.deployment.key("verify")
+    before = attacked.key_row(token)
+    new = attacked.store.api_keys.replace(prefix_of(token), grace=timedelta(0))
     assert new is not None
-    attacker.put_back("api_keys", before, "prefix")
-    assert_error(contract(client, token), 401, "unauthorized")
-    assert contract(client, new.token).status_code == 200
+    attacked.attacker.put_back("api_keys", before, "prefix")
+    assert not attacked.accepts(token)
+    assert attacked.accepts(new.token)
 
 
-def test_a_key_that_the_operator_revokes_is_not_vouched_for(
-    both: tuple[Client, Deployment], attacker: Attacker, store: TemplateStore
-) -> None:
+def test_a_key_that_the_operator_revokes_is_not_vouched_for(attacked: Attacked) -> None:
     """Revoking, and erasing a revocation afterwards, must not make an altered row a good one."""
-    client, deployment = both
-    token = deployment.key("verify")
+    token = attacked.deployment.key("verify")
     prefix = prefix_of(token)
-    attacker.run(f"UPDATE api_keys SET rights = '{ALL_RIGHTS}' WHERE prefix = '{prefix}'")
-    assert store.api_keys.replace(prefix, grace=timedelta(0)) is None
-    assert store.api_keys.revoke(prefix)
-    attacker.run(f"UPDATE api_keys SET revoked_at = NULL WHERE prefix = '{prefix}'")
-    assert_error(contract(client, token), 401, "unauthorized")
+    attacked.attacker.run(f"UPDATE api_keys SET rights = '{ALL_RIGHTS}' WHERE prefix = '{prefix}'")
+    assert attacked.store.api_keys.replace(prefix, grace=timedelta(0)) is None
+    assert attacked.store.api_keys.revoke(prefix)
+    attacked.attacker.run(f"UPDATE api_keys SET revoked_at = NULL WHERE prefix = '{prefix}'")
+    assert not attacked.accepts(token)
 
 
-def test_a_line_that_was_slipped_in_does_not_revive_a_key(
-    both: tuple[Client, Deployment], attacker: Attacker, store: TemplateStore
-) -> None:
-    client, deployment = both
-    token = deployment.key("verify")
-    (before,) = attacker.rows("api_keys", "prefix = :prefix", prefix=prefix_of(token))
-    store.api_keys.revoke(prefix_of(token))
-    copy = attacker.rows("audit_log", "action = 'key-create'")[-1]
-    attacker.insert("audit_log", {**copy, "sequence": copy["sequence"] + 1000})
-    attacker.put_back("api_keys", before, "prefix")
-    assert_error(contract(client, token), 401, "unauthorized")
+def test_a_line_that_was_slipped_in_does_not_revive_a_key(attacked: Attacked) -> None:
+    token = attacked.deployment.key("verify")
+    before = attacked.key_row(token)
+    attacked.store.api_keys.revoke(prefix_of(token))
+    line = attacked.attacker.rows("audit_log", "action = 'key-create'")[-1]
+    attacked.attacker.insert("audit_log", {**line, "sequence": line["sequence"] + 1000})
+    attacked.attacker.put_back("api_keys", before, "prefix")
+    assert not attacked.accepts(token)
 
 
-def test_an_actor_without_a_key_is_found(
-    both: tuple[Client, Deployment], attacker: Attacker, store: TemplateStore
-) -> None:
-    attacker.drop_triggers()
-    client, deployment = both
-    enroll(client)
-    assert problems(store) == set()
-    prefix = prefix_of(deployment.token)
-    attacker.run(f"DELETE FROM audit_log WHERE detail = '{prefix}'")
-    assert problems(store) == {
+def test_an_actor_without_a_key_is_found(attacked: Attacked) -> None:
+    attacked.attacker.drop_triggers()
+    enroll(attacked.client)
+    assert attacked.problems() == set()
+    prefix = prefix_of(attacked.deployment.token)
+    attacked.attacker.run(f"DELETE FROM audit_log WHERE detail = '{prefix}'")
+    assert attacked.problems() == {
         (KEY_NEVER_CREATED, f"key:{prefix}"),
         (ACTOR_NEVER_CREATED, f"key:{prefix}"),
     }
-    assert not store.audit_log.verify().intact
+    assert not attacked.store.audit_log.verify().intact
 
 
 # --- tenants -------------------------------------------------------------------------------
@@ -263,48 +268,38 @@ def test_an_actor_without_a_key_is_found(
 @pytest.mark.parametrize(
     "change", ["template_enrollment = true", "rotation_epoch = rotation_epoch + 1", "mac = NULL"]
 )
-def test_a_changed_tenant_enrolls_nobody(
-    both: tuple[Client, Deployment], attacker: Attacker, store: TemplateStore, change: str
-) -> None:
-    client, _ = both
-    enroll(client)
-    attacker.run(f"UPDATE tenants SET {change} WHERE name = 'default'")
-    answer = client.put("/v1/subjects/bob/enrollment", files=images(photo(2), photo(2, 1)))
+def test_a_changed_tenant_enrolls_nobody(attacked: Attacked, change: str) -> None:
+    enroll(attacked.client)
+    attacked.attacker.run(f"UPDATE tenants SET {change} WHERE name = 'default'")
+    answer = attacked.client.put("/v1/subjects/bob/enrollment", files=images(photo(2), photo(2, 1)))
     assert_error(answer, 401, "unauthorized")
-    assert problems(store) == {(TENANT_ALTERED, "default")}
+    assert attacked.problems() == {(TENANT_ALTERED, "default")}
 
 
-def test_tenants_do_not_change_their_names(
-    both: tuple[Client, Deployment], attacker: Attacker
-) -> None:
-    client, deployment = both
-    token = deployment.key("verify", tenant="other")
-    attacker.run(
+def test_tenants_do_not_change_their_names(attacked: Attacked) -> None:
+    token = attacked.deployment.key("verify", tenant="other")
+    attacked.attacker.run(
         "UPDATE tenants SET name = 'x' WHERE name = 'default'",
         "UPDATE tenants SET name = 'default' WHERE name = 'other'",
         "UPDATE tenants SET name = 'other' WHERE name = 'x'",
     )
-    for each in (token, deployment.token):
-        assert_error(contract(client, each), 401, "unauthorized")
+    assert not attacked.accepts(token)
+    assert not attacked.accepts(attacked.deployment.token)
 
 
-def test_a_setting_of_a_tenant_is_not_put_back(
-    both: tuple[Client, Deployment], attacker: Attacker, store: TemplateStore
-) -> None:
-    client, _ = both
-    store.tenants.set_template_enrollment("default", True)
-    (before,) = attacker.rows("tenants", "name = 'default'")
-    store.tenants.set_template_enrollment("default", False)
-    enroll(client)
-    names = ("template_enrollment", "line", "mac")
-    changes = ", ".join(f"{name} = :{name}" for name in names)
-    attacker.run(
-        f"UPDATE tenants SET {changes} WHERE name = 'default'",
-        **{name: before[name] for name in names},
+def test_a_setting_of_a_tenant_is_not_put_back(attacked: Attacked) -> None:
+    attacked.store.tenants.set_template_enrollment("default", True)
+    before = attacked.attacker.row("tenants", "name = 'default'")
+    attacked.store.tenants.set_template_enrollment("default", False)
+    enroll(attacked.client)
+    attacked.attacker.run(
+        "UPDATE tenants SET template_enrollment = :template_enrollment, line = :line, mac = :mac "
+        "WHERE name = 'default'",
+        **before,
     )
     with pytest.raises(AlteredTenant):
-        store.tenants.get("default")
-    assert problems(store) == {(TENANT_ALTERED, "default")}
+        attacked.store.tenants.get("default")
+    assert attacked.problems() == {(TENANT_ALTERED, "default")}
 
 
 # --- locks ---------------------------------------------------------------------------------
@@ -320,120 +315,85 @@ LIFTS = {
 
 @pytest.mark.parametrize("subject", ["alice", "nobody"])
 @pytest.mark.parametrize("lift", LIFTS)
-def test_a_lock_is_not_lifted(
-    both: tuple[Client, Deployment],
-    attacker: Attacker,
-    store: TemplateStore,
-    lift: str,
-    subject: str,
-) -> None:
-    client, deployment = both
-    enroll(client)
-    token = deployment.key("verify")
-    fail(client, token, AFTER, subject)
-    assert problems(store) == set()
-    attacker.run(LIFTS[lift])
-    found = {what for what, _ in problems(store)}
-    assert found <= {COUNT_ALTERED, COUNT_VANISHED}
-    assert found
-    answer = attempt(client, token, 1, subject)
+def test_a_lock_is_not_lifted(attacked: Attacked, lift: str, subject: str) -> None:
+    token = attacked.locked(subject=subject)
+    assert attacked.problems() == set()
+    attacked.attacker.run(LIFTS[lift])
+    kinds = {what for what, _ in attacked.problems()}
+    assert kinds
+    assert kinds <= {COUNT_ALTERED, COUNT_VANISHED}
+    answer = attacked.decides(token, subject)
     assert assert_error(answer, 423, "locked_out") == {"disabled": False}
     assert 1 <= int(answer.headers["retry-after"]) <= 30
-    status = store.attempts.status("default", subject)
+    status = attacked.store.attempts.status("default", subject)
     assert status is not None
     assert status.consecutive == AFTER
 
 
-def test_a_count_is_not_put_back(
-    both: tuple[Client, Deployment], attacker: Attacker, store: TemplateStore
-) -> None:
+def test_a_count_is_not_put_back(attacked: Attacked) -> None:
     """Whoever writes the row of one failure back after each further one would guess for ever."""
-    client, deployment = both
-    enroll(client)
-    token = deployment.key("verify")
-    fail(client, token, 1)
-    (one,) = attacker.rows("failed_attempts")
+    token = attacked.locked(1)
+    (one,) = attacked.attacker.rows("failed_attempts")
     for _ in range(AFTER - 1):
-        fail(client, token, 1)
-        attacker.put_back("failed_attempts", one, "pseudonym")
-    assert (COUNT_VANISHED, one["pseudonym"]) in problems(store)
-    assert_error(attempt(client, token, 1), 423, "locked_out")
+        fail(attacked.client, token, 1)
+        attacked.attacker.put_back("failed_attempts", one, "pseudonym")
+    assert (COUNT_VANISHED, one["pseudonym"]) in attacked.problems()
+    assert_error(attacked.decides(token), 423, "locked_out")
 
 
-def test_lines_that_were_slipped_in_lift_no_lock(
-    both: tuple[Client, Deployment], attacker: Attacker
-) -> None:
+def test_lines_that_were_slipped_in_lift_no_lock(attacked: Attacked) -> None:
     """An accept of one's own, copied behind the head."""
-    client, deployment = both
-    enroll(client)
-    token = deployment.key("verify")
-    assert attempt(client, token, 1).json()["decision"] == "accept"
-    (accept,) = attacker.rows("audit_log", "outcome = 'accept'")
-    fail(client, token, AFTER)
-    attacker.run("DELETE FROM failed_attempts")
-    attacker.insert("audit_log", {**accept, "sequence": 10**6})
-    assert_error(attempt(client, token, 1), 423, "locked_out")
+    token = attacked.locked(0)
+    assert attacked.decides(token).json()["decision"] == "accept"
+    accept = attacked.attacker.row("audit_log", "outcome = 'accept'")
+    fail(attacked.client, token, AFTER)
+    attacked.attacker.run("DELETE FROM failed_attempts")
+    attacked.attacker.insert("audit_log", {**accept, "sequence": 10**6})
+    assert_error(attacked.decides(token), 423, "locked_out")
 
 
-def test_a_time_that_is_none_is_no_defect(both: tuple[Client, Deployment]) -> None:
+def test_a_time_that_is_none_is_no_defect(attacked: Attacked) -> None:
     """SQLite keeps any text where a time should be."""
-    client, deployment = both
-    attacker = Attacker(deployment.settings.resolved_database_url)
-    if not attacker.database.is_sqlite:
+    if not attacked.attacker.database.is_sqlite:
         pytest.skip("PostgreSQL keeps times only")
-    token = deployment.key("verify")
-    fail(client, token, 1)
-    attacker.run("UPDATE failed_attempts SET locked_until = 'never'")
-    assert_error(attempt(client, token, 1), 503, "store_unavailable")
+    token = attacked.locked(1)
+    attacked.attacker.run("UPDATE failed_attempts SET locked_until = 'never'")
+    assert_error(attacked.decides(token), 503, "store_unavailable")
     with pytest.raises(StoreError, match="failed_attempts"):
-        client.app.state.runtime.store.check_records()
-    attacker.run(f"UPDATE api_keys SET expires_at = 'never' WHERE prefix = '{prefix_of(token)}'")
-    assert_error(contract(client, token), 401, "unauthorized")
-    attacker.database.close()
+        attacked.problems()
+    attacked.attacker.run(
+        f"UPDATE api_keys SET expires_at = 'never' WHERE prefix = '{prefix_of(token)}'"
+    )
+    assert not attacked.accepts(token)
 
 
-def test_a_made_up_lock_locks_nobody_out(
-    both: tuple[Client, Deployment], attacker: Attacker
-) -> None:
-    client, deployment = both
-    enroll(client)
-    token = deployment.key("verify")
-    fail(client, token, AFTER - 1)
-    attacker.run("UPDATE failed_attempts SET consecutive = 50, disabled_at = last_failed_at")
-    assert attempt(client, token, 1).json()["decision"] == "accept"
-    attacker.run("UPDATE failed_attempts SET consecutive = 50, disabled_at = last_failed_at")
-    assert attempt(client, token, 1).json()["decision"] == "accept"
+def test_a_made_up_lock_locks_nobody_out(attacked: Attacked) -> None:
+    token = attacked.locked(AFTER - 1)
+    for _ in range(2):
+        attacked.attacker.run(
+            "UPDATE failed_attempts SET consecutive = 50, disabled_at = last_failed_at"
+        )
+        assert attacked.decides(token).json()["decision"] == "accept"
 
 
-def test_an_operator_lifts_a_lock_whose_row_is_gone(
-    both: tuple[Client, Deployment], attacker: Attacker, store: TemplateStore
-) -> None:
-    client, deployment = both
-    enroll(client)
-    token = deployment.key("verify")
-    fail(client, token, AFTER)
-    attacker.run("DELETE FROM failed_attempts")
-    assert store.attempts.reset("default", "alice", by=OPERATOR)
-    assert attempt(client, token, 1).json()["decision"] == "accept"
-    assert not store.attempts.reset("default", "alice", by=OPERATOR)
+def test_an_operator_lifts_a_lock_whose_row_is_gone(attacked: Attacked) -> None:
+    token = attacked.locked()
+    attacked.attacker.run("DELETE FROM failed_attempts")
+    assert attacked.store.attempts.reset("default", "alice", by=OPERATOR)
+    assert attacked.decides(token).json()["decision"] == "accept"
+    assert not attacked.store.attempts.reset("default", "alice", by=OPERATOR)
 
 
-def test_the_locks_of_an_erased_subject_and_tenant_are_gone(
-    both: tuple[Client, Deployment], store: TemplateStore
-) -> None:
+def test_the_locks_of_an_erased_subject_and_tenant_are_gone(attacked: Attacked) -> None:
     """What removes a count rightly does not leave one in the log."""
-    client, deployment = both
-    enroll(client)
-    token = deployment.key("verify")
-    fail(client, token, AFTER)
+    store, deployment = attacked.store, attacked.deployment
+    attacked.locked()
     store.erasures.erase("default", "alice")
     assert store.attempts.status("default", "alice") is None
-    other = deployment.key("verify", tenant="other")
-    fail(client, other, AFTER, "bob")
+    fail(attacked.client, deployment.key("verify", tenant="other"), AFTER, "bob")
     store.tenant_erasures.erase("other")
-    assert problems(store) == set()
-    again = deployment.key("verify", tenant="other")
-    fail(client, again, 1, "bob")
+    assert attacked.problems() == set()
+    fail(attacked.client, deployment.key("verify", tenant="other"), 1, "bob")
     status = store.attempts.status("other", "bob")
     assert status is not None
     assert (status.consecutive, status.total) == (1, 1)
@@ -446,105 +406,79 @@ def test_the_locks_of_an_erased_subject_and_tenant_are_gone(
     "forget",
     ["DELETE FROM used_nonces", "UPDATE used_nonces SET expires_at = '2020-01-01 00:00:00'"],
 )
-def test_a_signed_probe_does_not_pass_twice(
-    both: tuple[Client, Deployment], attacker: Attacker, store: TemplateStore, forget: str
-) -> None:
-    client, deployment = both
-    enroll(client)
-    token = deployment.key("verify", "embeddings")
-    face = client.app.state.runtime.pack.embed_photo(photo(1, 5)).embedding
-    body = signed_probe(token, "alice", face)
-
-    def send() -> Any:
-        return client.post(
-            "/v1/subjects/alice/verify", json=body, headers=bearer(token), sign=False
-        )
-
+def test_a_signed_probe_does_not_pass_twice(attacked: Attacked, forget: str) -> None:
+    enroll(attacked.client)
+    send = attacked.signed_probe(attacked.deployment.key("verify", "embeddings"))
     assert send().json()["decision"] == "accept"
-    attacker.run(forget)
-    store.purge()
+    attacked.attacker.run(forget)
+    attacked.store.purge()
     assert_error(send(), 401, "replayed")
-    assert problems(store) == set()
+    assert attacked.problems() == set()
 
 
-def test_a_nonce_that_served_twice_is_found(
-    both: tuple[Client, Deployment], attacker: Attacker, store: TemplateStore
-) -> None:
+def test_a_nonce_that_served_twice_is_found(attacked: Attacked) -> None:
     """With the lines of the first decision set aside, and put back afterwards."""
-    client, deployment = both
-    enroll(client)
-    token = deployment.key("verify", "embeddings")
-    face = client.app.state.runtime.pack.embed_photo(photo(1, 5)).embedding
-    body = signed_probe(token, "alice", face)
-    path = "/v1/subjects/alice/verify"
-    assert client.post(path, json=body, headers=bearer(token), sign=False).status_code == 200
-    attacker.drop_triggers()
-    line = attacker.rows("audit_log", "nonce IS NOT NULL")[0]
-    attacker.run(
+    enroll(attacked.client)
+    send = attacked.signed_probe(attacked.deployment.key("verify", "embeddings"))
+    assert send().status_code == 200
+    attacked.attacker.drop_triggers()
+    line = attacked.attacker.rows("audit_log", "nonce IS NOT NULL")[0]
+    attacked.attacker.run(
         "DELETE FROM used_nonces",
         "DELETE FROM audit_log WHERE sequence = :sequence",
         sequence=line["sequence"],
     )
-    assert client.post(path, json=body, headers=bearer(token), sign=False).status_code == 200
-    assert not store.audit_log.verify().intact
-    attacker.insert("audit_log", line)
-    assert store.audit_log.verify().intact
-    assert problems(store) == {(NONCE_TWICE, f"line {store.audit_log.head().sequence}")}
+    assert send().status_code == 200
+    audit_log = attacked.store.audit_log
+    assert not audit_log.verify().intact
+    attacked.attacker.insert("audit_log", line)
+    assert audit_log.verify().intact
+    assert attacked.problems() == {(NONCE_TWICE, f"line {audit_log.head().sequence}")}
 
 
 # --- answers -------------------------------------------------------------------------------
 
 
-def test_a_made_up_answer_is_not_given(both: tuple[Client, Deployment], attacker: Attacker) -> None:
-    client, _ = both
-    headers = {"Idempotency-Key": "once"}
-
+def test_a_made_up_answer_is_not_given(attacked: Attacked) -> None:
     def enroll_once() -> Any:
-        return client.put(
-            "/v1/subjects/alice/enrollment", files=images(photo(1), photo(1, 1)), headers=headers
+        return attacked.client.put(
+            "/v1/subjects/alice/enrollment",
+            files=images(photo(1), photo(1, 1)),
+            headers={"Idempotency-Key": "once"},
         )
 
-    first, again = enroll_once(), enroll_once()
-    assert again.json()["template_id"] == first.json()["template_id"]
-    attacker.run("UPDATE idempotency SET body = :body", body=b'{"template_id": "mine"}')
+    first = enroll_once().json()["template_id"]
+    assert enroll_once().json()["template_id"] == first
+    attacked.attacker.run("UPDATE idempotency SET body = :body", body=b'{"template_id": "mine"}')
     mended = enroll_once()
     assert mended.status_code == 200
-    assert mended.json()["template_id"] not in ("mine", first.json()["template_id"])
+    assert mended.json()["template_id"] not in ("mine", first)
     assert enroll_once().json()["template_id"] == mended.json()["template_id"]
 
 
 # --- the upgrade, and what must still work ---------------------------------------------------
 
 
-def test_stripping_macs_does_not_make_the_next_start_renew_them(
-    both: tuple[Client, Deployment], attacker: Attacker, store: TemplateStore
-) -> None:
-    client, deployment = both
-    token = deployment.key("verify")
-    prefix = prefix_of(token)
-    attacker.run(
-        f"UPDATE api_keys SET rights = '{ALL_RIGHTS}' WHERE prefix = '{prefix}'",
+def test_stripping_macs_does_not_make_the_next_start_renew_them(attacked: Attacked) -> None:
+    token = attacked.deployment.key("verify")
+    attacked.attacker.run(
+        f"UPDATE api_keys SET rights = '{ALL_RIGHTS}' WHERE prefix = '{prefix_of(token)}'",
         "UPDATE api_keys SET mac = NULL, line = 0",
         "UPDATE tenants SET mac = NULL, line = 0",
     )
-    assert store.upgrade().rows == 0
-    for each in (token, deployment.token):
-        assert_error(contract(client, each), 401, "unauthorized")
+    assert attacked.store.upgrade().rows == 0
+    assert not attacked.accepts(token)
+    assert not attacked.accepts(attacked.deployment.token)
 
 
-def test_all_still_works_after_the_master_key_is_rotated(
-    both: tuple[Client, Deployment], store: TemplateStore
-) -> None:
-    client, deployment = both
-    enroll(client)
-    token = deployment.key("verify")
-    fail(client, token, 2)
-    path = deployment.settings.resolved_master_key_file
+def test_all_still_works_after_the_master_key_is_rotated(attacked: Attacked) -> None:
+    token, settings = attacked.locked(2), attacked.deployment.settings
+    path = settings.resolved_master_key_file
     MasterKeyring.add_current(path)
-    store.wrapped_keys.rewrap()
+    attacked.store.wrapped_keys.rewrap()
     MasterKeyring.drop_retired(path, keep=MasterKeyring.load(path).current)
-    assert attempt(client, token, 1).json()["decision"] == "accept"
-    fresh = open_store(deployment.settings, open_keyring(deployment.settings))
+    assert attacked.decides(token).json()["decision"] == "accept"
+    fresh = open_store(settings, open_keyring(settings))
     try:
         fresh.upgrade()
         assert fresh.api_keys.verify(token) is not None
@@ -555,25 +489,19 @@ def test_all_still_works_after_the_master_key_is_rotated(
         assert fresh.check_records() == ()
     finally:
         fresh.close()
-    assert attempt(client, token, 1).json()["decision"] == "accept"
-
-
-@pytest.fixture
-def warned(caplog: pytest.LogCaptureFixture) -> Callable[[], list[Any]]:
-    return lambda: [record for record in caplog.records if record.name == "veilface.store"]
+    assert attacked.decides(token).json()["decision"] == "accept"
 
 
 def test_the_operator_is_warned_without_a_secret(
-    both: tuple[Client, Deployment], attacker: Attacker, warned: Callable[[], list[Any]]
+    attacked: Attacked, caplog: pytest.LogCaptureFixture
 ) -> None:
-    client, deployment = both
-    token = deployment.key("verify")
-    fail(client, token, 1, "alice")
-    attacker.run("DELETE FROM failed_attempts")
-    fail(client, token, 1, "alice")
-    attacker.run("UPDATE api_keys SET mac = NULL")
-    assert_error(contract(client, token), 401, "unauthorized")
-    texts = [f"{record.getMessage()} {record.fields}" for record in warned()]
+    token = attacked.locked(1)
+    attacked.attacker.run("DELETE FROM failed_attempts")
+    fail(attacked.client, token, 1)
+    attacked.attacker.run("UPDATE api_keys SET mac = NULL")
+    assert not attacked.accepts(token)
+    records: list[Any] = [record for record in caplog.records if record.name == "veilface.store"]
+    texts = [f"{record.getMessage()} {record.fields}" for record in records]
     assert any("failed attempts" in text for text in texts)
     assert any(prefix_of(token) in text for text in texts)
     assert not any("alice" in text or token in text for text in texts)

@@ -78,7 +78,7 @@ def test_erasing_again_gives_the_same_receipt(store: TemplateStore, clock: Clock
     clock.pass_by(days=1)
     again = store.erasures.erase("default", "ada")
     assert not again.erased
-    assert again.erasures.receipt == first.receipt == store.erasures.receipt("default", "ada")
+    assert again.receipt == first.receipt == store.erasures.receipt("default", "ada")
 
 
 def test_erasing_after_a_second_enrollment_gives_a_second_receipt(

@@ -169,7 +169,7 @@ def test_erasing_again_gives_the_same_receipt(store: TemplateStore, clock: Clock
     clock.pass_by(days=1)
     again = store.tenant_erasures.erase("default")
     assert not again.erased
-    assert again.erasures.receipt == first.receipt == store.tenant_erasures.receipt("default")
+    assert again.receipt == first.receipt == store.tenant_erasures.receipt("default")
     assert outcomes(store) == ["begun", "erased", "receipt_repeated"]
 
 
