@@ -77,7 +77,7 @@ class Attempts:
 
     def __init__(self, context: StoreContext, policy: LockoutPolicy) -> None:
         self._context = context
-        self._standing = Standing(context.audit_log, context.clock, policy)
+        self._standing = Standing(context, policy)
 
     def begin(
         self, tenant: str, subject_id: str, *, contract_id: str, nonce: Nonce | None = None

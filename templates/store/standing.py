@@ -20,9 +20,8 @@ from templates.store.attempt_queries import (
     TENANT_ERASED,
 )
 from templates.store.audit_chain import Line, is_true_line
-from templates.store.audit_log import AuditLog
 from templates.store.authenticity import AUTHENTICATED, is_authentic, row_mac, warn
-from templates.store.identifiers import Clock
+from templates.store.context import StoreContext
 from templates.store.lockout import LockedOut, LockoutPolicy
 from templates.store.schema import FailedAttemptsRow
 
@@ -54,17 +53,11 @@ class AttemptsStatus:
 class Standing:
     """Tells how often verifying a subject failed, and writes its row.
 
-    Parameters
-    ----------
-    audit_log, clock
-        What rows are held against, and what time it is.
-    policy
-        By which a lock follows from failures.
+    `policy` says when a lock follows from failures.
     """
 
-    def __init__(self, audit_log: AuditLog, clock: Clock, policy: LockoutPolicy) -> None:
-        self._audit_log = audit_log
-        self._clock = clock
+    def __init__(self, context: StoreContext, policy: LockoutPolicy) -> None:
+        self._context = context
         self._policy = policy
 
     def of(
@@ -81,7 +74,7 @@ class Standing:
         tenant, pseudonym
             Whose row it is.
         """
-        row_key = self._audit_log.row_key()
+        row_key = self._context.audit_log.row_key()
         counts = _counts_of(row)
         if counts is not None and not is_authentic(row_key, FailedAttemptsRow, counts):
             counts = None
@@ -94,7 +87,7 @@ class Standing:
             # An old count of somebody unknown was removed in its time: see Attempts.expire.
             row.subject_pk is None
             and status.disabled_at is None
-            and status.last_failed_at <= self._clock() - UNKNOWN_RETENTION
+            and status.last_failed_at <= self._context.clock() - UNKNOWN_RETENTION
         ):
             return None
         warn(
@@ -108,7 +101,7 @@ class Standing:
     def after_failure(self, status: AttemptsStatus | None) -> AttemptsStatus:
         """Status of a subject that has just failed once more."""
         consecutive, total = (0, 0) if status is None else (status.consecutive, status.total)
-        return self._failed(consecutive + 1, total + 1, self._clock())
+        return self._failed(consecutive + 1, total + 1, self._context.clock())
 
     def _failed(self, consecutive: int, total: int, at: datetime) -> AttemptsStatus:
         """Status of a subject with so many failures, the last one at a time."""
@@ -127,7 +120,7 @@ class Standing:
             return
         if status.disabled_at is not None:
             raise LockedOut(None)
-        now = self._clock()
+        now = self._context.clock()
         if status.locked_until is not None and now < status.locked_until:
             raise LockedOut((status.locked_until - now).total_seconds())
 
@@ -137,7 +130,7 @@ class Standing:
         """Write the row of a subject's failures; only the holder of the subject's lock does."""
         identity = {"tenant_id": row.tenant_id, "pseudonym": pseudonym}
         counts = {**vars(status), "line": line}
-        mac = row_mac(self._audit_log.row_key(), FailedAttemptsRow, {**identity, **counts})
+        mac = row_mac(self._context.audit_log.row_key(), FailedAttemptsRow, {**identity, **counts})
         # As the transaction finds it: an erasure since the decision must not leave a count that
         # only another erasure would remove.
         values = {**counts, "known": row.subject_pk is not None, "mac": mac}
@@ -157,7 +150,7 @@ class Standing:
         )
         # An erased tenant's subjects went without lines of their own.
         erased = connection.execute(TENANT_ERASED, {"tenant": tenant}).scalar() or 0
-        line_key = self._audit_log.line_key()
+        line_key = self._context.audit_log.line_key()
         failed_at: datetime | None = None
         consecutive = 0
         for row in rows:

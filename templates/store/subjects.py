@@ -152,8 +152,8 @@ class Subjects:
                 raise StoreBusy("the tenant's rotation was renewed meanwhile; send it again")
             guard_entry = None if guard is None else guard(connection, pseudonym)
             now = context.clock()
-            subject_pk = subject_pk_of(connection, tenant_id, subject_id)
-            is_new, subject_pk = subject_pk is None, subject_pk or uuid.uuid4().hex
+            enrolled_pk = subject_pk_of(connection, tenant_id, subject_id)
+            is_new, subject_pk = enrolled_pk is None, enrolled_pk or uuid.uuid4().hex
             owner = Owner(tenant_id, subject_pk, subject_id, contract_id, template_id, epoch)
             _write_rows(
                 connection,
