@@ -1,7 +1,7 @@
 """All distances of 1000 probes to 1000 templates, beside the products they start from and NumPy.
 
 The first figures are those of ``veilface bench distances``. The last divides the time for a pair
-of the plain NumPy reference in float32 (``templates.euclidean``, ``templates.spherical``), on 100
+of the plain NumPy reference in float32 (``templates.distances.euclidean``, ``templates.distances.spherical``), on 100
 probes and templates, by that of the kernels on all of them. Prints the table of
 docs/measurements.md, and the machine.
 
@@ -27,9 +27,8 @@ from api.cli.distance_bench import (
     machine,
     measure,
 )
-from templates import euclidean, spherical
-from templates.crossgram import Kind
-from templates.distances import DEFAULT_STEPS, Metric
+from templates.distances import DEFAULT_STEPS, Metric, euclidean, spherical
+from templates.distances.crossgram import Kind
 from templates.keys.randomness import Keystream
 from verify.evaluation.units import Mode
 

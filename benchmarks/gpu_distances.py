@@ -23,9 +23,9 @@ import torch
 from torch import Tensor
 
 from templates.distances import Metric, pairwise_distances, similarity
+from templates.distances.tensors import SubspaceTensors, nearest, pairwise
+from templates.distances.tensors.subspaces import fused, ieee_products, stacked, tile_bytes
 from templates.space.subspace import SubspaceBatch
-from templates.tensors import SubspaceTensors, nearest, pairwise
-from templates.tensors.subspaces import fused, ieee_products, stacked, tile_bytes
 
 _SIZE = 1000
 _MANY = 100_000

@@ -20,10 +20,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from templates import spherical
-from templates.crossgram import matched_tiles
 from templates.decoys import DecoyGenerator, DecoyPool, DecoySource
-from templates.distances import DEFAULT_STEPS, Metric, paired_distances, similarity
+from templates.distances import DEFAULT_STEPS, Metric, paired_distances, similarity, spherical
+from templates.distances.crossgram import matched_tiles
 from templates.keys.randomness import Keystream
 from templates.space.lifting import lift
 from templates.space.subspace import SubspaceBatch

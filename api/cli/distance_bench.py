@@ -316,8 +316,8 @@ def _on_device(
     """The same with tensors that are on the device before the time begins."""
     import torch
 
-    from templates.tensors import SubspaceTensors, pairwise
-    from templates.tensors.subspaces import ieee_products, stacked
+    from templates.distances.tensors import SubspaceTensors, pairwise
+    from templates.distances.tensors.subspaces import ieee_products, stacked
 
     device = torch.device(question.device or "cpu")
     synchronise: Task = torch.get_device_module(device).synchronize

@@ -5,7 +5,7 @@ import threading
 
 import pytest
 
-from templates.crew import Crew
+from templates.distances.crew import Crew
 from tests.patience import PATIENCE_S
 
 pytestmark = pytest.mark.skipif(
@@ -58,8 +58,8 @@ def test_the_library_of_compiled_code_is_held_to_one_thread_from_its_first_produ
     """In a process of its own, where nothing else has loaded it."""
     code = """
 from threadpoolctl import ThreadpoolController
-from templates import blas
-from templates.kernels import tiles
+from templates.distances import blas
+from templates.distances.kernels import tiles
 with blas.single_threaded():
     libraries = ThreadpoolController().select(user_api="blas").lib_controllers
     assert any("scipy" in each.filepath for each in libraries)

@@ -10,13 +10,14 @@ import scipy.optimize
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from templates import crossgram, tiles
 from templates.distances import (
     DEFAULT_STEPS,
     Metric,
+    crossgram,
     paired_distances,
     pairwise_distances,
     similarity,
+    tiles,
 )
 from templates.errors import InvalidEmbedding, InvalidTemplate, TemplateError
 from templates.keys.randomness import Keystream

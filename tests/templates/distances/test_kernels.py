@@ -13,8 +13,6 @@ import threadpoolctl
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from templates import spherical, tiles
-from templates.bulk import warm_up
 from templates.decoys import DecoyPool
 from templates.distances import (
     Metric,
@@ -23,7 +21,10 @@ from templates.distances import (
     paired_distances,
     pairwise_distances,
     similarity,
+    spherical,
+    tiles,
 )
+from templates.distances.bulk import warm_up
 from templates.errors import InvalidEmbedding, TemplateError
 from templates.keys.randomness import Keystream
 from templates.space.lifting import lift
@@ -462,7 +463,7 @@ import numpy as np
 from numba.core import event
 from templates.distances import nearest, paired_distances, pairwise_distances, count_within, warm_up
 from templates.space.lifting import lift
-from templates.rounded import RoundedSubspaces
+from templates.distances.rounded import RoundedSubspaces
 
 warm_up()
 compiled = []
@@ -515,7 +516,7 @@ def test_nothing_is_compiled_after_the_warm_up() -> None:
 
 def test_an_installation_that_cannot_be_written_to_compiles_anew(tmp_path: Path) -> None:
     script = """
-from templates.kernels import lanes
+from templates.distances.kernels import lanes
 import numba.core.caching as caching
 
 def nowhere(self, *_, **__):

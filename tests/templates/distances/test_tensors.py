@@ -21,7 +21,7 @@ torch = pytest.importorskip("torch", reason="torch is an optional extra")
 
 from torch.utils._python_dispatch import TorchDispatchMode  # noqa: E402
 
-from templates.tensors import (  # noqa: E402
+from templates.distances.tensors import (  # noqa: E402
     SubspaceTensors,
     counts_within,
     euclidean,
@@ -400,7 +400,7 @@ def test_triton_kernels_agree_in_the_interpreter(tmp_path: Path):
 def test_torch_alone_does_where_there_is_no_triton(monkeypatch: pytest.MonkeyPatch):
     a = faces(3, 2, seed=18)
     monkeypatch.setenv("TRITON_INTERPRET", "1")
-    monkeypatch.setitem(sys.modules, "templates.tensors.fused", None)
+    monkeypatch.setitem(sys.modules, "templates.distances.tensors.fused", None)
     assert subspaces.fused(torch.device("cpu"), 2) is None
     seen = distances(a, a, metric=Metric.EUCLIDEAN)
     np.testing.assert_allclose(seen, reference(a, a, metric="euclidean"), rtol=2e-6, atol=1e-6)
@@ -412,7 +412,7 @@ def test_triton_kernels_compile_for_a_gpu(tmp_path: Path, monkeypatch: pytest.Mo
     compiler = pytest.importorskip("triton.backends.compiler")
     monkeypatch.setenv("TRITON_CACHE_DIR", str(tmp_path))
     monkeypatch.delenv("TRITON_INTERPRET", raising=False)
-    from templates.tensors import fused
+    from templates.distances.tensors import fused
 
     pointers = {"proofs": "*i8", "pairs": "*i64"}
     constants = {"m": 3, "M": 4, "BLOCK": 32}

@@ -3,7 +3,7 @@
 Import it only where a device is asked for: torch is an optional extra of the project.
 """
 
-from templates.tensors.subspaces import SubspaceTensors
-from templates.tensors.tiles import counts_within, nearest, pairwise
+from templates.distances.tensors.subspaces import SubspaceTensors
+from templates.distances.tensors.tiles import counts_within, nearest, pairwise
 
 __all__ = ["SubspaceTensors", "counts_within", "nearest", "pairwise"]

@@ -10,7 +10,7 @@ computed again in float64 from explicit differences.
 import numpy as np
 from numpy.typing import NDArray
 
-from templates.crossgram import (
+from templates.distances.crossgram import (
     Floats,
     Indices,
     Kind,

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from templates.kernels.lanes import LANES, compiled, every, inlined, less, load
+from templates.distances.kernels.lanes import LANES, compiled, every, inlined, less, load
 
 Floats = NDArray[np.float32]
 Integers = NDArray[np.int64]

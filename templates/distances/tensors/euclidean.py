@@ -1,4 +1,4 @@
-"""Euclidean distances on tensors (paper eq. 1 to 9); ``templates.euclidean`` is the reference."""
+"""Euclidean distances on tensors (paper eq. 1 to 9); ``templates.distances.euclidean`` is the reference."""
 
 from collections.abc import Callable
 from typing import Any
@@ -6,8 +6,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from templates.euclidean import NEAR
-from templates.tensors.subspaces import (
+from templates.distances.euclidean import NEAR
+from templates.distances.tensors.subspaces import (
     SubspaceTensors,
     blocks,
     chunks,
@@ -71,7 +71,7 @@ def schur(block: Tensor, gaps: Tensor) -> Tensor:
 
     Notes
     -----
-    As ``templates.euclidean._schur``, with one elimination of [[I − MᵀM, w], [wᵀ, ·]] for all
+    As ``templates.distances.euclidean._schur``, with one elimination of [[I − MᵀM, w], [wᵀ, ·]] for all
     pairs at once and its test of exactness.
     """
     left, middle = block[:, 1:, 0], block[:, 1:, 1:]
@@ -103,7 +103,7 @@ def subspaces_exact(
 ) -> Tensor:
     """Distances of probes ``i`` to templates ``j`` from differences in float64, shape (K,).
 
-    The minimum-norm least squares of ``templates.euclidean.subspaces_exact``: 0 only if the
+    The minimum-norm least squares of ``templates.distances.euclidean.subspaces_exact``: 0 only if the
     residual is, and defined for parallel and for intersecting subspaces.
     """
     out = torch.empty(len(i), dtype=torch.float64, device=i.device)

@@ -11,11 +11,11 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from templates import spherical
-from templates.distances import Metric
+from templates.distances import spherical
+from templates.distances.kernels.lanes import LANES
+from templates.distances.kernels.rounded import squares_inside
+from templates.distances.metric import Metric
 from templates.errors import InvalidEmbedding
-from templates.kernels.lanes import LANES
-from templates.kernels.rounded import squares_inside
 from templates.space.subspace import SubspaceBatch, is_finite
 
 _LARGEST = 127

@@ -11,7 +11,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from templates.crossgram import (
+from templates.distances.crossgram import (
     Floats,
     Indices,
     Kind,

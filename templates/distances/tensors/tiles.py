@@ -12,10 +12,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from templates.distances import DEFAULT_STEPS, Metric
-from templates.tensors import euclidean, spherical
-from templates.tensors.edge import place
-from templates.tensors.subspaces import SubspaceTensors, ieee_products, tile_bytes
+from templates.distances.metric import DEFAULT_STEPS, Metric
+from templates.distances.tensors import euclidean, spherical
+from templates.distances.tensors.edge import place
+from templates.distances.tensors.subspaces import SubspaceTensors, ieee_products, tile_bytes
 
 Probes = Tensor | SubspaceTensors
 Labels = tuple[Tensor, Tensor]

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from templates.distances import DEFAULT_STEPS, Labels, Metric
-from templates.kernels.selection import count_within, keep_nearest
-from templates.rounded import RoundedSubspaces
+from templates.distances.kernels.selection import count_within, keep_nearest
+from templates.distances.metric import DEFAULT_STEPS, Labels, Metric
+from templates.distances.rounded import RoundedSubspaces
+from templates.distances.tiles import Floats, Probes, fill, paired_tile, traverse, whole
 from templates.space.subspace import SubspaceBatch
-from templates.tiles import Floats, Probes, fill, paired_tile, traverse, whole
 
 Integers = NDArray[np.int64]
 

@@ -4,7 +4,7 @@ A program reads the products of its pairs component by component, neighbouring p
 neighbouring addresses, and keeps everything else in registers. Matrices are (M, M, BLOCK) with M
 the next power of two: rows, columns, pairs.
 
-The functions return what their namesakes of ``templates.tensors.euclidean`` and ``.spherical`` do.
+The functions return what their namesakes of ``templates.distances.tensors.euclidean`` and ``.spherical`` do.
 They have run in Triton's interpreter and been compiled for Hopper; no GPU has run them yet.
 """
 
@@ -18,7 +18,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from templates.tensors import euclidean, spherical
+from templates.distances.tensors import euclidean, spherical
 
 LARGEST = 16
 """Systems with more unknowns do not fit in the registers."""
@@ -133,7 +133,7 @@ def _step(square, c, g2, h, v):
 
 @triton.jit
 def _ascended(square, c, g2, h, v, inside, steps):
-    """Value and v of the accelerated alternation, ``templates.spherical.maximise``."""
+    """Value and v of the accelerated alternation, ``templates.distances.spherical.maximise``."""
     value, stepped = _step(square, c, g2, h, v)
     moved = stepped - v
     trial = stepped
@@ -334,7 +334,7 @@ def schur(gram: Tensor, mine: Tensor, theirs: Tensor) -> Tensor:
 
 
 def prove(gram: Tensor, plain: int, turns: int) -> tuple[Tensor, Tensor, Tensor]:
-    """First stage of the spherical similarity, see ``templates.tensors.spherical.prove``.
+    """First stage of the spherical similarity, see ``templates.distances.tensors.spherical.prove``.
 
     Parameters
     ----------
@@ -358,7 +358,7 @@ def prove(gram: Tensor, plain: int, turns: int) -> tuple[Tensor, Tensor, Tensor]
 
 
 def maximise(gram: Tensor, pairs: Tensor, steps: int) -> tuple[Tensor, Tensor]:
-    """Second stage, for some pairs, see ``templates.tensors.spherical.maximise``.
+    """Second stage, for some pairs, see ``templates.distances.tensors.spherical.maximise``.
 
     ``gram`` as for `prove`.
     """

@@ -14,14 +14,14 @@ alternation, from the better sign of G's leading eigenvector, give λ and μ; Ne
 1/‖u‖ = 1/‖v‖ = 1 (Hebden 1973, Moré and Sorensen 1983, here in two variables) improves them; and a
 pair whose bound and value agree is finished, with proof. Where they do not, the bound is not
 attained or the system is nearly singular: those pairs, gathered into vectors of their own, take the
-accelerated alternation from both starts of the reference (``templates.spherical``). Where one of
+accelerated alternation from both starts of the reference (``templates.distances.spherical``). Where one of
 the subspaces is a line or a plane, v is a sign or an angle, and the angle is sampled.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
-from templates.kernels.lanes import (
+from templates.distances.kernels.lanes import (
     LANES,
     Lanes,
     blend,

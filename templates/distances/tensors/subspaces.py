@@ -120,7 +120,7 @@ def fused(device: torch.device, m: int) -> ModuleType | None:
     if device.type != "cuda" and os.environ.get("TRITON_INTERPRET") != "1":
         return None
     try:
-        module = importlib.import_module("templates.tensors.fused")
+        module = importlib.import_module("templates.distances.tensors.fused")
     except ImportError:  # torch has wheels without triton
         return None
     return module if m <= module.LARGEST else None

@@ -10,10 +10,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from templates.kernels.euclidean import euclidean_subspaces
-from templates.kernels.lanes import LANES, compiled, inlined, take
-from templates.kernels.points import euclidean_points, spherical_points
-from templates.kernels.spherical import spherical_subspaces
+from templates.distances.kernels.euclidean import euclidean_subspaces
+from templates.distances.kernels.lanes import LANES, compiled, inlined, take
+from templates.distances.kernels.points import euclidean_points, spherical_points
+from templates.distances.kernels.spherical import spherical_subspaces
 
 Floats = NDArray[np.float32]
 Integers = NDArray[np.int64]

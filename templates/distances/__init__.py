@@ -2,54 +2,44 @@
 
 A probe is a raw descriptor (point to subspace) or itself lifted (subspace to subspace). Probes
 and templates may have different subspace dimensions. Float32 runs on compiled kernels
-(``templates.tiles``) or, on a device, on torch (``templates.tensors``); float64 on the plain NumPy
-of ``templates.euclidean`` and ``templates.spherical``, which is their specification.
+(``templates.distances.tiles``) or, on a device, on torch (``templates.distances.tensors``); float64 on the plain NumPy
+of ``templates.distances.euclidean`` and ``templates.distances.spherical``, which is their specification.
 """
 
 from collections.abc import Callable
-from enum import StrEnum
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, NamedTuple, overload
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from templates import euclidean, spherical
-from templates.crossgram import Floats, Kind
+from templates.distances import euclidean, spherical
+from templates.distances.crossgram import Kind
+from templates.distances.metric import DEFAULT_STEPS, Floats, Labels, Metric, Neighbours
 from templates.errors import InvalidEmbedding, InvalidTemplate, TemplateError
 from templates.space.subspace import SubspaceBatch, is_finite
+
+__all__ = [
+    "DEFAULT_STEPS",
+    "Labels",
+    "Metric",
+    "Neighbours",
+    "count_within",
+    "nearest",
+    "paired_distances",
+    "pairwise_distances",
+    "similarity",
+    "warm_up",
+]
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from templates.tensors import SubspaceTensors
+    from templates.distances.tensors import SubspaceTensors
 
-DEFAULT_STEPS = 50
-"""Steps of the spherical subspace-to-subspace iteration; part of a calibration."""
-
-Labels = tuple[NDArray[np.int64], NDArray[np.int64]]
 Progress = Callable[[int], None]
 
 Probes = NDArray[np.float32] | NDArray[np.float64] | SubspaceBatch
-
-
-class Metric(StrEnum):
-    """Which closest points count."""
-
-    EUCLIDEAN = "euclidean"
-    """Any of the subspace: the paper's distances."""
-    SPHERICAL = "spherical"
-    """Those of unit length, as every descriptor is: what the product decides with."""
-
-
-class Neighbours(NamedTuple):
-    """The K nearest of each, nearest first; of equally near ones the lowest index first.
-
-    Where fewer than K could be found, index −1 at an infinite distance.
-    """
-
-    indices: NDArray[np.int64]
-    distances: NDArray[np.float32]
 
 
 @overload
@@ -359,14 +349,14 @@ def _check_finite(batch: SubspaceBatch) -> None:
 
 def _tiles() -> ModuleType:
     """The compiled kernels, imported when they are needed: the compiler takes a while to load."""
-    from templates import bulk
+    from templates.distances import bulk
 
     return bulk
 
 
 def _tensors() -> ModuleType:
     try:
-        from templates import tensors
+        from templates.distances import tensors
     except ImportError as error:
         raise TemplateError(
             f"a device needs the extra 'torch' of veilface ({error.name} is not installed)"

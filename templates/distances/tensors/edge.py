@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from templates.distances.tensors.subspaces import SubspaceTensors
 from templates.errors import InvalidEmbedding, InvalidTemplate, TemplateError
 from templates.space.subspace import SubspaceBatch
-from templates.tensors.subspaces import SubspaceTensors
 
 
 def place(

@@ -1,4 +1,4 @@
-"""Spherical distances on tensors (docs/method.md §3.5); ``templates.spherical`` is the reference.
+"""Spherical distances on tensors (docs/method.md §3.5); ``templates.distances.spherical`` is the reference.
 
 The similarity of two subspaces is p·q plus the maximum of g·u + h·v + uᵀBv over unit u and v. The
 best u of a v is known, so with G = BᵀB and c = Bᵀg the objective is F(v) = h·v + λ with
@@ -14,8 +14,8 @@ from typing import NamedTuple, Self
 import torch
 from torch import Tensor
 
-from templates.spherical import NEAR
-from templates.tensors.subspaces import (
+from templates.distances.spherical import NEAR
+from templates.distances.tensors.subspaces import (
     SubspaceTensors,
     blocks,
     chunks,
@@ -233,7 +233,7 @@ def _starts(problem: _Problem) -> Tensor:
 def _maximise(problem: _Problem, starts: Tensor, steps: int) -> tuple[Tensor, Tensor]:
     """Best value over all starts, shape (K,), and its v, shape (K, m_E).
 
-    ``templates.spherical._maximise``: extrapolated steps, a plain one where the value would fall.
+    ``templates.distances.spherical._maximise``: extrapolated steps, a plain one where the value would fall.
     """
     count, tiny = len(starts), torch.finfo(starts.dtype).tiny
     values, best = starts.new_zeros(starts.shape[:2]), starts.clone()

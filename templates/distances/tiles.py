@@ -14,17 +14,16 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from templates import euclidean, spherical
-from templates.blas import single_threaded
-from templates.crew import Crew
-from templates.crossgram import Indices
-from templates.distances import Metric
-from templates.kernels.euclidean import euclidean_subspaces
-from templates.kernels.euclidean import scratch_size as euclidean_scratch
-from templates.kernels.lanes import LANES
-from templates.kernels.spherical import scratch_size as spherical_scratch
-from templates.kernels.spherical import spherical_subspaces
-from templates.kernels.tiles import (
+from templates.distances import euclidean, spherical
+from templates.distances.blas import single_threaded
+from templates.distances.crew import Crew
+from templates.distances.crossgram import Indices
+from templates.distances.kernels.euclidean import euclidean_subspaces
+from templates.distances.kernels.euclidean import scratch_size as euclidean_scratch
+from templates.distances.kernels.lanes import LANES
+from templates.distances.kernels.spherical import scratch_size as spherical_scratch
+from templates.distances.kernels.spherical import spherical_subspaces
+from templates.distances.kernels.tiles import (
     Grid,
     euclidean_tiles,
     pack,
@@ -32,6 +31,7 @@ from templates.kernels.tiles import (
     spherical_tiles,
     square,
 )
+from templates.distances.metric import Metric
 from templates.space.subspace import SubspaceBatch
 
 Floats = NDArray[np.float32]
