@@ -1,21 +1,28 @@
 """Distances of probes to templates: the one entrance to both metrics and both modes.
 
 A probe is a raw descriptor (point to subspace) or itself lifted (subspace to subspace). Probes
-and templates may have different subspace dimensions. Float32 runs on compiled kernels
-(``templates.distances.tiles``) or, on a device, on torch (``templates.distances.tensors``); float64 on the plain NumPy
-of ``templates.distances.euclidean`` and ``templates.distances.spherical``, which is their specification.
+and templates may have different subspace dimensions. Float32 runs on compiled kernels (``tiles``)
+or, on a device, on ``torch``; float64 on the plain NumPy of ``exact``, which is their
+specification. The kernels' compiler and torch take long to load, so the two are imported where they
+are first used.
 """
 
-from collections.abc import Callable
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, overload
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from templates.distances import euclidean, spherical
-from templates.distances.crossgram import Kind
-from templates.distances.metric import DEFAULT_STEPS, Floats, Labels, Metric, Neighbours
+from templates.distances import exact
+from templates.distances.metric import (
+    DEFAULT_STEPS,
+    Floats,
+    Labels,
+    Metric,
+    Neighbours,
+    Progress,
+    similarity,
+)
 from templates.errors import InvalidEmbedding, InvalidTemplate, TemplateError
 from templates.space.subspace import SubspaceBatch, is_finite
 
@@ -32,49 +39,19 @@ __all__ = [
     "warm_up",
 ]
 
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from templates.distances.tensors import SubspaceTensors
-
-Progress = Callable[[int], None]
-
 Probes = NDArray[np.float32] | NDArray[np.float64] | SubspaceBatch
 
 
-@overload
 def pairwise_distances(
     probes: Probes,
     templates: SubspaceBatch,
-    *,
-    metric: Metric | str,
-    steps: int = ...,
-    dtype: DTypeLike = ...,
-    threads: int | None = ...,
-    device: str | None = ...,
-) -> Floats: ...
-
-
-@overload
-def pairwise_distances(
-    probes: "Tensor | SubspaceTensors",
-    templates: "SubspaceTensors",
-    *,
-    metric: Metric | str,
-    steps: int = ...,
-) -> "Tensor": ...
-
-
-def pairwise_distances(
-    probes: "Probes | Tensor | SubspaceTensors",
-    templates: "SubspaceBatch | SubspaceTensors",
     *,
     metric: Metric | str,
     steps: int = DEFAULT_STEPS,
     dtype: DTypeLike = np.float32,
     threads: int | None = None,
     device: str | None = None,
-) -> "Floats | Tensor":
+) -> Floats:
     """Distances of every probe to every template.
 
     Parameters
@@ -83,7 +60,6 @@ def pairwise_distances(
         Raw descriptors or lifted probes. The spherical metric sees only the direction of a raw
         descriptor; a zero vector has similarity 0.
     templates : SubspaceBatch of T
-        Or SubspaceTensors, with probes that are tensors: all stays on their device.
     metric : Metric
     steps : int
         Of the spherical subspace-to-subspace iteration; unused otherwise.
@@ -99,8 +75,7 @@ def pairwise_distances(
     Returns
     -------
     ndarray of ``dtype``, shape (P, T)
-        Never NaN and never negative. Memory beyond the result is bounded. A Tensor where
-        templates are tensors.
+        Never NaN and never negative. Memory beyond the result is bounded.
 
     Raises
     ------
@@ -113,26 +88,23 @@ def pairwise_distances(
     ----------
     Paper eq. 1 to 9; docs/method.md §3 and §5.
     """
-    metric = Metric(metric)
-    _check_options(steps, threads)
-    if device is not None or not isinstance(templates, SubspaceBatch):
+    options = _options(metric, steps, threads)
+    probes = _checked(probes, templates, dtype)
+    found: Floats
+    if device is not None:
         if np.dtype(dtype) != np.float32:
             raise TemplateError(f"a device computes in float32, not in {np.dtype(dtype)}")
-        found = _tensors().pairwise(probes, templates, metric=metric, steps=steps, device=device)
-        result: Floats = found.cpu().numpy() if isinstance(templates, SubspaceBatch) else found
-        return result
-    probes, kind = _checked(probes, templates, dtype)
-    out = np.empty((len(probes), len(templates)), dtype=kind)
-    if out.size and kind == np.float64:
-        return _reference(probes, templates, metric, steps)
-    if out.size:
-        _tiles().matrix(probes, templates, out, metric=metric, steps=steps, threads=threads)
-    return out
+        found = _torch().pairwise(probes, templates, device=device, **options).cpu().numpy()
+    elif np.dtype(dtype) == np.float64:
+        found = exact.pairwise(probes, templates, **options)
+    else:
+        found = _tiles().pairwise(probes, templates, threads=threads, **options)
+    return found
 
 
 def nearest(
-    probes: "Probes | Tensor | SubspaceTensors",
-    templates: "SubspaceBatch | SubspaceTensors",
+    probes: Probes,
+    templates: SubspaceBatch,
     *,
     k: int,
     metric: Metric | str,
@@ -162,45 +134,28 @@ def nearest(
     -------
     Neighbours
         Of shape (P, K), or (T, K) with ``of_templates``; the distances are those of
-        `pairwise_distances`. Tensors where templates are tensors.
+        `pairwise_distances`.
 
     Raises
     ------
     InvalidEmbedding, InvalidTemplate, TemplateError
         As of `pairwise_distances`.
     """
-    metric = Metric(metric)
+    options = _options(metric, steps, threads)
     if k < 1:
         raise TemplateError(f"{k} neighbours cannot be found; k is at least 1")
-    _check_options(steps, threads)
-    labels = _labels(labels, len(probes), len(templates))
-    if device is not None or not isinstance(templates, SubspaceBatch):
-        options: dict[str, Any] = {"k": k, "metric": metric, "steps": steps, "device": device}
-        found = _tensors().nearest(
-            probes, templates, of_templates=of_templates, labels=labels, **options
-        )
-        if isinstance(templates, SubspaceBatch):
-            return Neighbours(*(part.cpu().numpy() for part in found))
-        return Neighbours(*found)
-    probes, _ = _checked(probes, templates, np.float32)
-    return Neighbours(
-        *_tiles().nearest(
-            probes,
-            templates,
-            k,
-            of_templates=of_templates,
-            labels=labels,
-            metric=metric,
-            steps=steps,
-            threads=threads,
-            progress=progress,
-        )
-    )
+    options |= {"of_templates": of_templates, "labels": _labels(labels, probes, templates)}
+    probes = _checked(probes, templates, np.float32)
+    if device is not None:
+        found = _torch().nearest(probes, templates, k, device=device, **options)
+        return Neighbours(*(part.cpu().numpy() for part in found))
+    options |= {"threads": threads, "progress": progress}
+    return Neighbours(*_tiles().nearest(probes, templates, k, **options))
 
 
 def count_within(
-    probes: "Probes | Tensor | SubspaceTensors",
-    templates: "SubspaceBatch | SubspaceTensors",
+    probes: Probes,
+    templates: SubspaceBatch,
     thresholds: ArrayLike,
     *,
     metric: Metric | str,
@@ -232,30 +187,20 @@ def count_within(
     InvalidEmbedding, InvalidTemplate, TemplateError
         As of `pairwise_distances`; a threshold that is not a number.
     """
-    metric = Metric(metric)
+    options = _options(metric, steps, threads)
     limits = np.atleast_1d(np.asarray(thresholds, dtype=np.float64))
     if limits.ndim != 1 or not limits.size or np.isnan(limits).any():
         raise TemplateError("thresholds are a row of numbers")
-    _check_options(steps, threads)
-    labels = _labels(labels, len(probes), len(templates))
+    options["labels"] = _labels(labels, probes, templates)
     order = np.argsort(limits)
     counts = np.empty(len(limits), dtype=np.int64)
-    if device is not None or not isinstance(templates, SubspaceBatch):
-        options: dict[str, Any] = {"metric": metric, "steps": steps, "device": device}
-        found = _tensors().counts_within(probes, templates, limits[order], labels=labels, **options)
+    probes = _checked(probes, templates, np.float32)
+    if device is not None:
+        found = _torch().counts_within(probes, templates, limits[order], device=device, **options)
         counts[order] = found.cpu().numpy()
-        return counts
-    probes, _ = _checked(probes, templates, np.float32)
-    counts[order] = _tiles().counts(
-        probes,
-        templates,
-        limits[order],
-        labels=labels,
-        metric=metric,
-        steps=steps,
-        threads=threads,
-        progress=progress,
-    )
+    else:
+        options |= {"threads": threads, "progress": progress}
+        counts[order] = _tiles().counts_within(probes, templates, limits[order], **options)
     return counts
 
 
@@ -273,24 +218,15 @@ def paired_distances(
     -------
     ndarray of ``dtype``, shape (P,)
     """
-    metric = Metric(metric)
-    _check_options(steps, None)
-    probes, kind = _checked(probes, templates, dtype)
+    options = _options(metric, steps)
+    probes = _checked(probes, templates, dtype)
     if len(probes) != len(templates):
         raise TemplateError(f"{len(probes)} probes do not pair with {len(templates)} templates")
-    if not len(probes):
-        return np.empty(0, dtype=kind)
-    if isinstance(probes, SubspaceBatch):
-        if kind == np.float32:
-            found: Floats = _tiles().paired(probes, templates, metric=metric, steps=steps)
-            return found
-        if metric is Metric.EUCLIDEAN:
-            return euclidean.subspaces_paired(probes, templates, kind)
-        return spherical.subspaces_paired(probes, templates, steps, kind)
-    points = np.ascontiguousarray(probes, dtype=kind)
-    if metric is Metric.EUCLIDEAN:
-        return euclidean.points_paired(points, templates, kind)
-    return spherical.points_paired(points, templates, kind)
+    if isinstance(probes, SubspaceBatch) and np.dtype(dtype) == np.float32:
+        found: Floats = _tiles().paired(probes, templates, **options)
+        return found
+    every = np.arange(len(probes))
+    return exact.pairs(probes, templates, every, every, **options).astype(dtype)
 
 
 def warm_up() -> None:
@@ -298,30 +234,34 @@ def warm_up() -> None:
     _tiles().warm_up()
 
 
-@overload
-def similarity(distance: float) -> float: ...
+def _tiles() -> ModuleType:
+    from templates.distances import tiles
+
+    return tiles
 
 
-@overload
-def similarity(distance: NDArray[np.floating]) -> NDArray[np.floating]: ...
+def _torch() -> ModuleType:
+    try:
+        from templates.distances import torch
+    except ImportError as error:
+        raise TemplateError(
+            f"a device needs the extra 'torch' of veilface ({error.name} is not installed)"
+        ) from None
+    return torch
 
 
-def similarity(distance: float | NDArray[np.floating]) -> float | NDArray[np.floating]:
-    """Return 1 − distance²/2: the cosine on the unit sphere, and one scale for both metrics."""
-    return 1 - distance**2 / 2
-
-
-def _check_options(steps: int, threads: int | None) -> None:
+def _options(metric: Metric | str, steps: int, threads: int | None = None) -> dict[str, Any]:
     if threads is not None and threads < 1:
         raise TemplateError(f"there is no work for {threads} threads; at least 1 is needed")
     if steps < 1:
         raise TemplateError(f"the iteration needs at least one step, not {steps}")
+    return {"metric": Metric(metric), "steps": steps}
 
 
-def _checked(probes: Any, templates: SubspaceBatch, dtype: DTypeLike) -> tuple[Probes, Kind]:
-    kind: Kind = np.dtype(np.float64 if np.dtype(dtype) == np.float64 else np.float32)
-    if np.dtype(dtype) != kind:
-        raise TemplateError(f"distances are computed in float32 or float64, not {np.dtype(dtype)}")
+def _checked(probes: Any, templates: SubspaceBatch, dtype: DTypeLike) -> Probes:
+    kind = np.dtype(dtype)
+    if kind not in (np.float32, np.float64):
+        raise TemplateError(f"distances are computed in float32 or float64, not {kind}")
     _check_finite(templates)
     if isinstance(probes, SubspaceBatch):
         if probes.n != templates.n:
@@ -329,17 +269,17 @@ def _checked(probes: Any, templates: SubspaceBatch, dtype: DTypeLike) -> tuple[P
                 f"a probe in R^{probes.n} does not fit templates in R^{templates.n}"
             )
         _check_finite(probes)
-        return probes, kind
+        return probes
     if not isinstance(probes, np.ndarray):
-        raise TemplateError("probes are arrays or a batch where templates are a batch")
+        raise TemplateError("probes are an array or a batch")
     if probes.ndim != 2 or probes.shape[1] != templates.n:
         raise InvalidEmbedding(f"expected probes of shape (P, {templates.n}), seen {probes.shape}")
     # What is infinite in the precision of the work is refused.
     with np.errstate(over="ignore", invalid="ignore"):
-        probes = np.ascontiguousarray(probes, dtype=kind)
-    if not is_finite(probes):
+        points: NDArray[Any] = np.ascontiguousarray(probes, dtype=kind)
+    if not is_finite(points):
         raise InvalidEmbedding("a probe holds a number that is not finite")
-    return probes, kind
+    return points
 
 
 def _check_finite(batch: SubspaceBatch) -> None:
@@ -347,45 +287,16 @@ def _check_finite(batch: SubspaceBatch) -> None:
         raise InvalidTemplate("a template holds a number that is not finite")
 
 
-def _tiles() -> ModuleType:
-    """The compiled kernels, imported when they are needed: the compiler takes a while to load."""
-    from templates.distances import bulk
-
-    return bulk
-
-
-def _tensors() -> ModuleType:
-    try:
-        from templates.distances import tensors
-    except ImportError as error:
-        raise TemplateError(
-            f"a device needs the extra 'torch' of veilface ({error.name} is not installed)"
-        ) from None
-    return tensors
-
-
-def _reference(probes: Probes, templates: SubspaceBatch, metric: Metric, steps: int) -> Floats:
-    kind: Kind = np.dtype(np.float64)
-    if isinstance(probes, SubspaceBatch):
-        if metric is Metric.EUCLIDEAN:
-            return euclidean.subspaces_pairwise(probes, templates, kind)
-        return spherical.subspaces_pairwise(probes, templates, steps, kind)
-    points = np.ascontiguousarray(probes, dtype=kind)
-    if metric is Metric.EUCLIDEAN:
-        return euclidean.points_pairwise(points, templates, kind)
-    return spherical.points_pairwise(points, templates, kind)
-
-
-def _labels(labels: Labels | None, probes: int, templates: int) -> Labels | None:
+def _labels(labels: Labels | None, probes: Any, templates: Any) -> Labels | None:
     if labels is None:
         return None
     given = [np.asarray(side) for side in labels]
     if any(side.dtype.kind not in "iub" for side in given):
         raise TemplateError("labels are whole numbers; number the names, as np.unique does")
     mine, theirs = (np.array(side, dtype=np.int64) for side in given)
-    if mine.shape != (probes,) or theirs.shape != (templates,):
+    if mine.shape != (len(probes),) or theirs.shape != (len(templates),):
         raise TemplateError(
-            f"labels of shapes {mine.shape} and {theirs.shape} do not fit {probes} probes "
-            f"and {templates} templates"
+            f"labels of shapes {mine.shape} and {theirs.shape} do not fit {len(probes)} probes "
+            f"and {len(templates)} templates"
         )
     return mine, theirs

@@ -8,17 +8,16 @@ The product is the matrix library's of SciPy, as of all compiled code.
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from templates.distances.kernels.arguments import Floats, Integers, Options, Result, Tile
 from templates.distances.kernels.euclidean import euclidean_subspaces
 from templates.distances.kernels.lanes import LANES, compiled, inlined, take
-from templates.distances.kernels.points import euclidean_points, spherical_points
+from templates.distances.kernels.points import points
 from templates.distances.kernels.spherical import spherical_subspaces
 
-Floats = NDArray[np.float32]
-Integers = NDArray[np.int64]
-
 _MOST = np.float32(np.finfo(np.float32).max)
+# Tiles between two chances to stop.
+_AT_ONCE = 64
 
 
 class Grid(NamedTuple):
@@ -48,6 +47,29 @@ class Grid(NamedTuple):
         )
 
 
+class Sides(NamedTuple):
+    """Probes and templates of a problem."""
+
+    stacked: Floats
+    """Points (P, n), or the rows of lifted probes, probe after probe, (P · (m_d + 1), n)."""
+    mine: Floats
+    """(P,), as of a tile."""
+    m_d: int
+    feet: Floats
+    bases: Floats
+
+
+class Space(NamedTuple):
+    """Working space of a thread, for the largest tile."""
+
+    packed: Floats
+    squares: Floats
+    product: Floats
+    work: Floats
+    first: Integers
+    """(1,): the first of the templates that are packed, or −1."""
+
+
 @inlined
 def _square(row: Floats) -> float:
     """Squared length; several sums, because a processor adds several numbers at once."""
@@ -75,35 +97,20 @@ def square(rows: Floats, out: Floats) -> None:
 
 @compiled
 def pack(
-    feet: Floats,
-    bases: Floats,
-    first: int,
-    count: int,
-    spherical: bool,
-    stacked: Floats,
-    squares: Floats,
+    feet: Floats, bases: Floats, first: int, count: int, spherical: bool, space: Space, wide: int
 ) -> None:
-    """Stack the rows of some templates, all feet first.
+    """Stack the rows of some templates, all feet first, (m + 1, wide, n), with zeros behind them.
 
-    Parameters
-    ----------
-    feet, bases : (T, n) and (T, m, n)
-    first, count
-        The templates.
-    spherical
-        Scale the foot to the unit ball, and the rows by the radius of the sphere's section.
-    stacked : flat float32
-        (m + 1, C, n), C being the length of ``squares``; what is behind the templates is zeros.
-    squares : (C,)
-        Squared lengths of the feet.
+    The spherical metric scales the foot to the unit ball, and the rows by the radius of the
+    sphere's section. The squared lengths of the feet are written too.
     """
     m, n = bases.shape[1], bases.shape[2]
-    wide = len(squares)
+    packed, squares = space.packed, space.squares
     for c in range(wide):
         if c >= count:
             squares[c] = 0
             for k in range(m + 1):
-                stacked[(k * wide + c) * n : (k * wide + c + 1) * n] = 0
+                packed[(k * wide + c) * n : (k * wide + c + 1) * n] = 0
             continue
         foot = feet[first + c]
         square = _square(foot)
@@ -115,211 +122,73 @@ def pack(
             radius = np.float32(np.sqrt(max(1 - length * length, 0.0)))
         place = c * n
         for x in range(n):
-            stacked[place + x] = foot[x] * scale
+            packed[place + x] = foot[x] * scale
         for k in range(m):
             row = bases[first + c, k]
             place = ((k + 1) * wide + c) * n
             for x in range(n):
-                stacked[place + x] = row[x] * radius
-
-
-@inlined
-def _multiply(
-    left: Floats,
-    feet: Floats,
-    bases: Floats,
-    grid: Grid,
-    number: int,
-    held: Integers,
-    spherical: bool,
-    m_d: int,
-    stacked: Floats,
-    squares: Floats,
-    product: Floats,
-) -> tuple[int, int, int, int, int]:
-    """Make the products of a tile; return its first row and end, its first column, number, width.
-
-    ``held`` has the number of the first template that is packed, or −1.
-    """
-    n = feet.shape[1]
-    down = -(-grid.probes // grid.rows)
-    row = number % down * grid.rows
-    end = min(row + grid.rows, grid.probes)
-    first = number // down * grid.columns
-    count = min(grid.columns, grid.templates - first)
-    wide = count + -count % LANES
-    if held[0] != first:
-        pack(feet, bases, first, count, spherical, stacked, squares[:wide])
-        held[0] = first
-    rows, columns = (end - row) * (m_d + 1), wide * (bases.shape[1] + 1)
-    right = stacked[: columns * n].reshape(columns, n)
-    np.dot(
-        left[row * (m_d + 1) : end * (m_d + 1)],
-        right.T,
-        product[: rows * columns].reshape(rows, columns),
-    )
-    return row, end, first, count, wide
-
-
-@inlined
-def _place(
-    out: Floats, stride: int, row: int, first: int, count: int, wide: int
-) -> tuple[Floats, int, int]:
-    """Return where a tile's distances go, the length of a row there, and how many of it to write.
-
-    In the matrix of all distances, or, where ``stride`` is 0, in working space for this tile.
-    """
-    if stride:
-        return out[row * stride + first :], stride, count
-    return out, wide, wide
+                packed[place + x] = row[x] * radius
 
 
 @compiled
-def point_tiles(
-    left: Floats,
-    mine: Floats,
-    feet: Floats,
-    bases: Floats,
+def solve(tile: Tile, options: Options, work: Floats, out: Result) -> int:
+    """Write the distances of a tile; return the number of −1, or of groups with one."""
+    if tile.m_d == 0:
+        return points(tile, options, out)
+    if options.spherical:
+        return spherical_subspaces(tile, options, work, out)
+    return euclidean_subspaces(tile, options, work, out)
+
+
+@compiled
+def compute(
+    sides: Sides,
     grid: Grid,
+    options: Options,
+    space: Space,
     counter: Integers,
-    last: int,
-    most: int,
-    held: Integers,
-    spherical: bool,
-    least: np.float32,
-    stacked: Floats,
-    squares: Floats,
-    product: Floats,
     out: Floats,
     stride: int,
-    found: Integers,
-) -> None:
-    """Compute tiles of distances of points to templates.
+    inexact: Integers,
+) -> int:
+    """Compute the next tiles; return the number of the last of them, or −1 where none is left.
 
     Parameters
     ----------
-    left, mine : (P, n) and (P,)
-        Points, and what the kernel asks for.
-    feet, bases
-        Of all templates.
-    counter : (1,) int64
-        Number of the next tile; threads that share it share the tiles.
-    last, most
-        Return when the counter has reached the last, or after so many tiles.
-    held : (1,) int64
-        First of the templates that are packed in ``stacked``, or −1.
-    spherical, least
-        The metric; the smallest distance that is not −1 in ``out``.
-    stacked, squares, product
-        Working space, for the largest tile.
+    counter
+        (1,) int64, the number of the next tile; threads that share it share the tiles.
     out : flat float32
-        All distances, ``stride`` a row; or those of one tile where ``stride`` is 0.
-    found : int64
-        For each tile, what the kernel returns.
+        All distances, ``stride`` a row; or, where ``stride`` is 0, those of one tile.
+    inexact : int64
+        For each tile, what :func:`solve` returns.
     """
-    m = bases.shape[1]
-    for _ in range(most):
+    m_d, m_e, n = sides.m_d, sides.bases.shape[1], sides.feet.shape[1]
+    down = -(-grid.probes // grid.rows)
+    tiles = down * -(-grid.templates // grid.columns)
+    number = -1
+    for _ in range(_AT_ONCE if stride else 1):
         number = take(counter)
-        if number >= last:
-            return
-        row, end, first, count, wide = _multiply(
-            left, feet, bases, grid, number, held, spherical, 0, stacked, squares, product
+        if number >= tiles:
+            return -1
+        row = number % down * grid.rows
+        end = min(row + grid.rows, grid.probes)
+        first = number // down * grid.columns
+        count = min(grid.columns, grid.templates - first)
+        wide = count + -count % LANES
+        if space.first[0] != first:
+            pack(sides.feet, sides.bases, first, count, options.spherical, space, wide)
+            space.first[0] = first
+        rows, columns = (end - row) * (m_d + 1), wide * (m_e + 1)
+        product = space.product[: rows * columns]
+        np.dot(
+            sides.stacked[row * (m_d + 1) : end * (m_d + 1)],
+            space.packed[: columns * n].reshape(columns, n).T,
+            product.reshape(rows, columns),
         )
-        place, step, width = _place(out, stride, row, first, count, wide)
-        if spherical:
-            found[number] = spherical_points(
-                product, mine[row:end], wide, m, least, place, step, width
-            )
+        tile = Tile(product, sides.mine[row:end], space.squares[:wide], m_d, m_e)
+        if stride:
+            result = Result(out[row * stride + first :], stride, count)
         else:
-            found[number] = euclidean_points(
-                product, mine[row:end], squares[:wide], m, least, place, step, width
-            )
-
-
-@compiled
-def euclidean_tiles(
-    left: Floats,
-    mine: Floats,
-    feet: Floats,
-    bases: Floats,
-    grid: Grid,
-    counter: Integers,
-    last: int,
-    most: int,
-    held: Integers,
-    m_d: int,
-    least: np.float32,
-    accuracy: np.float32,
-    work: Floats,
-    stacked: Floats,
-    squares: Floats,
-    product: Floats,
-    out: Floats,
-    stride: int,
-    found: Integers,
-) -> None:
-    """Compute Euclidean distances of lifted probes, whose m_d + 1 rows follow each other.
-
-    Parameters are those of :func:`point_tiles` and of the kernel.
-    """
-    m = bases.shape[1]
-    for _ in range(most):
-        number = take(counter)
-        if number >= last:
-            return
-        row, end, first, count, wide = _multiply(
-            left, feet, bases, grid, number, held, False, m_d, stacked, squares, product
-        )
-        place, step, width = _place(out, stride, row, first, count, wide)
-        found[number] = euclidean_subspaces(
-            product,
-            mine[row:end],
-            squares[:wide],
-            m_d,
-            m,
-            least,
-            accuracy,
-            work,
-            place,
-            step,
-            width,
-        )
-
-
-@compiled
-def spherical_tiles(
-    left: Floats,
-    feet: Floats,
-    bases: Floats,
-    grid: Grid,
-    counter: Integers,
-    last: int,
-    most: int,
-    held: Integers,
-    m_d: int,
-    steps: int,
-    least: np.float32,
-    work: Floats,
-    stacked: Floats,
-    squares: Floats,
-    product: Floats,
-    out: Floats,
-    stride: int,
-    found: Integers,
-) -> None:
-    """Compute spherical distances of lifted probes, whose m_d + 1 rows follow each other.
-
-    Parameters are those of :func:`point_tiles` and of the kernel.
-    """
-    m = bases.shape[1]
-    for _ in range(most):
-        number = take(counter)
-        if number >= last:
-            return
-        row, end, first, count, wide = _multiply(
-            left, feet, bases, grid, number, held, True, m_d, stacked, squares, product
-        )
-        place, step, width = _place(out, stride, row, first, count, wide)
-        found[number] = spherical_subspaces(
-            product, end - row, wide, m_d, m, steps, least, work, place, step, width
-        )
+            result = Result(out, wide, wide)
+        inexact[number] = solve(tile, options, space.work, result)
+    return number

@@ -17,14 +17,14 @@ from templates.decoys import DecoyPool
 from templates.distances import (
     Metric,
     count_within,
+    exact,
     nearest,
     paired_distances,
     pairwise_distances,
     similarity,
-    spherical,
     tiles,
+    warm_up,
 )
-from templates.distances.bulk import warm_up
 from templates.errors import InvalidEmbedding, TemplateError
 from templates.keys.randomness import Keystream
 from templates.space.lifting import lift
@@ -148,9 +148,9 @@ def test_a_large_dimension() -> None:
 
 def restarted(a: SubspaceBatch, b: SubspaceBatch, restarts: int, steps: int) -> np.ndarray:
     """Best similarity of probe i and template i over random restarts of plain alternation."""
-    mine, theirs = spherical.spheres(a), spherical.spheres(b)
-    p, q = a.feet * mine.scales[:, None], b.feet * theirs.scales[:, None]
-    d, e = a.bases * mine.radii[:, None, None], b.bases * theirs.radii[:, None, None]
+    (scale, s), (other_scale, t) = exact.spheres(a.feet), exact.spheres(b.feet)
+    p, q = a.feet * scale[:, None], b.feet * other_scale[:, None]
+    d, e = a.bases * s[:, None, None], b.bases * t[:, None, None]
     g, h = (d @ q[:, :, None])[:, :, 0], (e @ p[:, :, None])[:, :, 0]
     middle = d @ e.transpose(0, 2, 1)
     v = Keystream.seeded("restarts").normal((len(a), restarts, b.m))
@@ -439,11 +439,11 @@ def test_several_threads_take_part(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_nothing_of_a_traversal_is_left_in_the_working_space() -> None:
     pairwise_distances(units(40, 64), lifted(faces(200, 64), 3, 1), metric="spherical")
-    assert tiles._spare._arrays
-    tiles._spare._arrays.clear()
+    assert tiles._ThreadSpace.spare
+    tiles._ThreadSpace.spare.clear()
     templates = lifted(faces(300, 64), 3, 1)
     pairwise_distances(templates, templates, metric="spherical")
-    (kept, *_) = tiles._spare._arrays
+    (kept, *_) = tiles._ThreadSpace.spare
     assert not kept.any()
 
 

@@ -1,3 +1,5 @@
+"""Threads of the distances, and of the matrix library beneath them."""
+
 import os
 import subprocess
 import sys
@@ -5,49 +7,56 @@ import threading
 
 import pytest
 
-from templates.distances.crew import Crew
+from templates.distances.tiles import share
 from tests.patience import PATIENCE_S
 
-pytestmark = pytest.mark.skipif(
-    not hasattr(os, "sched_getaffinity"), reason="the system places threads alone"
-)
 
+def meet(count: int) -> None:
+    """Let as many threads meet, each for one item."""
+    barrier = threading.Barrier(count, timeout=PATIENCE_S)
+    seen: list[int] = []
 
-def test_helpers_may_run_wherever_the_caller_may() -> None:
-    barrier = threading.Barrier(3, timeout=PATIENCE_S)
-
-    def work(_: int) -> set[int]:
+    def work(_: int) -> None:
         barrier.wait()
-        return os.sched_getaffinity(0)
+        seen.append(threading.get_ident())
 
-    for _ in range(2):
-        with Crew(3) as crew:
-            assert crew.map(work, range(3)) == [os.sched_getaffinity(0)] * 3
+    share(work, range(count), count)
+    assert len(set(seen)) == count
+    assert threading.get_ident() in seen
+
+
+def test_the_caller_and_its_helpers_share_the_items() -> None:
+    meet(3)
+    meet(3)
+
+
+def test_every_item_is_done_once_however_few_the_threads() -> None:
+    done: list[int] = []
+    share(done.append, range(100), 3)
+    share(done.append, range(100), 1)
+    assert sorted(done) == sorted([*range(100), *range(100)])
 
 
 def test_the_first_failure_is_raised_and_the_helpers_work_again() -> None:
+    calls: list[int] = []
+
     def fail(item: int) -> None:
+        calls.append(item)
         raise ValueError(str(item))
 
-    with Crew(2) as crew:
-        with pytest.raises(ValueError, match=r"[01]"):
-            crew.map(fail, range(8))
-        assert crew.map(str, range(8)) == list("01234567")
+    with pytest.raises(ValueError, match=r"[01]"):
+        share(fail, range(8), 2)
+    assert len(calls) <= 2
+    meet(2)
 
 
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="the system does not fork")
 def test_a_forked_child_has_helpers_of_its_own() -> None:
-    with Crew(2) as crew:
-        crew.map(str, range(8))
+    meet(2)
     child = os.fork()
     if not child:
-        barrier = threading.Barrier(2, timeout=PATIENCE_S)
-
-        def meet(_: int) -> None:
-            barrier.wait()
-
         try:
-            with Crew(2) as crew:
-                crew.map(meet, range(2))
+            meet(2)
             os._exit(0)
         except BaseException:
             os._exit(1)
