@@ -66,4 +66,4 @@ lock: | $(UV)
 	echo hatchling | $(UV) pip compile --quiet --upgrade - --universal --generate-hashes --python-version 3.11 -o deploy/build.lock
 
 clean:
-	rm -rf .venv .bootstrap dist .schemathesis templates/kernels/__pycache__ .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf .venv .bootstrap dist .schemathesis templates/distances/kernels/__pycache__ .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -1,9 +1,8 @@
 """All distances of 1000 probes to 1000 templates, beside the products they start from and NumPy.
 
 The first figures are those of ``veilface bench distances``. The last divides the time for a pair
-of the plain NumPy reference in float32 (``templates.euclidean``, ``templates.spherical``), on 100
-probes and templates, by that of the kernels on all of them. Prints the table of
-docs/measurements.md, and the machine.
+of the specification in float64 (``templates.distances.exact``), on 100 probes and templates, by
+that of the kernels on all of them. Prints the table of docs/measurements.md, and the machine.
 
 Example
 -------
@@ -18,6 +17,7 @@ import time
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from api.cli.distance_bench import (
     Question,
@@ -27,44 +27,28 @@ from api.cli.distance_bench import (
     machine,
     measure,
 )
-from templates import euclidean, spherical
-from templates.crossgram import Kind
-from templates.distances import DEFAULT_STEPS, Metric
+from templates.distances import Metric, pairwise_distances
 from templates.keys.randomness import Keystream
+from templates.space.subspace import SubspaceBatch
 from verify.evaluation.units import Mode
 
 _SLICE = 100
 _RUNS = 3
-_FLOAT32: Kind = np.dtype(np.float32)
 
 
 def reference_ns(n: int, m: int, mode: Mode, metric: Metric, *, size: int = _SLICE) -> float:
-    """Nanoseconds for a pair of the NumPy reference, its median of three runs."""
+    """Nanoseconds for a pair of the specification, its median of three runs."""
     stream = Keystream.seeded("distance reference", n, m)
     templates = face_like_templates(size, m, n, stream=stream)
-    task: Callable[[], object]
-    if mode is Mode.POINT:
-        points = face_like(size, n, stream=stream)
-        points_pairwise = (
-            euclidean.points_pairwise if metric is Metric.EUCLIDEAN else spherical.points_pairwise
-        )
-
-        def task() -> object:
-            return points_pairwise(points, templates, _FLOAT32)
-
-    else:
-        probes = face_like_templates(size, m, n, stream=stream)
-
-        def task() -> object:
-            if metric is Metric.EUCLIDEAN:
-                return euclidean.subspaces_pairwise(probes, templates, _FLOAT32)
-            return spherical.subspaces_pairwise(probes, templates, DEFAULT_STEPS, _FLOAT32)
-
-    task()
+    probes: NDArray[np.float32] | SubspaceBatch = (
+        face_like(size, n, stream=stream)
+        if mode is Mode.POINT
+        else face_like_templates(size, m, n, stream=stream)
+    )
     times = []
     for _ in range(_RUNS):
         start = time.perf_counter_ns()
-        task()
+        pairwise_distances(probes, templates, metric=metric, dtype=np.float64)
         times.append((time.perf_counter_ns() - start) / size**2)
     return statistics.median(times)
 
@@ -79,11 +63,11 @@ def table(rows: Sequence[Row], count: int, reference: Callable[[Row], float]) ->
     count
         Probes, and templates.
     reference
-        Nanoseconds for a pair of the NumPy reference.
+        Nanoseconds for a pair of the specification.
     """
     lines = [
         "| n | m | mode | metric | points, ms | product, ms | distances, ms | × product | × points "
-        "| ns a pair | NumPy |",
+        "| ns a pair | specification |",
         "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for row in rows:

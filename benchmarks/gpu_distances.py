@@ -22,10 +22,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from templates.distances import Metric, pairwise_distances, similarity
+from templates.distances import DEFAULT_STEPS, Metric, pairwise_distances, similarity
+from templates.distances.torch import (
+    TILE_BYTES,
+    SubspaceTensors,
+    ieee_products,
+    nearest,
+    pairwise,
+    stacked,
+)
 from templates.space.subspace import SubspaceBatch
-from templates.tensors import SubspaceTensors, nearest, pairwise
-from templates.tensors.subspaces import fused, ieee_products, stacked, tile_bytes
 
 _SIZE = 1000
 _MANY = 100_000
@@ -86,17 +92,12 @@ def largest_error(
     some, others = probes[:_CHECKED], templates[:_CHECKED]
     mine = some.cpu().numpy() if isinstance(some, Tensor) else _batch(some)
     expected = pairwise_distances(mine, _batch(others), metric=metric, dtype=np.float64)
-    seen = pairwise(some, others, metric=metric).double().cpu().numpy()
+    seen = pairwise(some, others, metric=metric, steps=DEFAULT_STEPS).double().cpu().numpy()
     return float(np.abs(similarity(seen) - similarity(expected)).max())
 
 
 def _batch(templates: SubspaceTensors) -> SubspaceBatch:
     return SubspaceBatch(templates.feet.cpu().numpy(), templates.bases.cpu().numpy())
-
-
-def rows_of(probes: Tensor | SubspaceTensors) -> Tensor:
-    """The rows whose products with the templates' are the Gram matrix."""
-    return probes if isinstance(probes, Tensor) else stacked(probes.feet, probes.bases)
 
 
 def matrix(m: int, n: int, device: torch.device) -> list[dict[str, Any]]:
@@ -108,7 +109,7 @@ def matrix(m: int, n: int, device: torch.device) -> list[dict[str, Any]]:
         ("point to subspace", descriptors(_SIZE, n, generator)),
         ("subspace to subspace", templates_of(_SIZE, m, n, generator)),
     ):
-        left, right = rows_of(probes), rows_of(templates).T.contiguous()
+        left, right = stacked(probes), stacked(templates).T.contiguous()
 
         def product(left: Tensor = left, right: Tensor = right) -> Tensor:
             with ieee_products(device):
@@ -117,7 +118,7 @@ def matrix(m: int, n: int, device: torch.device) -> list[dict[str, Any]]:
         for metric in Metric:
 
             def distances(probes: Any = probes, metric: Metric = metric) -> Tensor:
-                return pairwise(probes, templates, metric=metric)
+                return pairwise(probes, templates, metric=metric, steps=DEFAULT_STEPS)
 
             bare, whole = milliseconds([product, distances])
             found.append(
@@ -145,11 +146,12 @@ def search(device: torch.device, m: int = 8, n: int = 512) -> list[dict[str, Any
         ("subspace to subspace", templates_of(_MANY, m, n, generator)),
     ):
         for metric in Metric:
-            nearest(probes[:_SIZE], templates[:_SIZE], k=1, metric=metric)
+            search_one = functools.partial(nearest, k=1, metric=metric, steps=DEFAULT_STEPS)
+            search_one(probes[:_SIZE], templates[:_SIZE])
             torch.cuda.synchronize()
             torch.cuda.reset_peak_memory_stats()
             held = torch.cuda.memory_allocated()
-            seconds = once(functools.partial(nearest, probes, templates, k=1, metric=metric)) / 1000
+            seconds = once(functools.partial(search_one, probes, templates)) / 1000
             found.append(
                 {
                     "mode": mode,
@@ -185,8 +187,7 @@ def main() -> int:
     setting = {
         "device": torch.cuda.get_device_name(device),
         "torch": torch.__version__,
-        "fused": {m: fused(device, m) is not None for m in (2, 4, 8, 16)},
-        "tile_mib": tile_bytes(device) / 2**20,
+        "tile_mib": TILE_BYTES["cuda"] / 2**20,
     }
     print(", ".join(f"{key}: {value}" for key, value in setting.items()), "\n")
     pairs = [row for n in (128, 512) for m in (2, 4, 8, 16) for row in matrix(m, n, device)]

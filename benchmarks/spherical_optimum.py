@@ -20,10 +20,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from templates import spherical
-from templates.crossgram import matched_tiles
 from templates.decoys import DecoyGenerator, DecoyPool, DecoySource
-from templates.distances import DEFAULT_STEPS, Metric, paired_distances, similarity
+from templates.distances import DEFAULT_STEPS, Metric, exact, paired_distances, similarity
 from templates.keys.randomness import Keystream
 from templates.space.lifting import lift
 from templates.space.subspace import SubspaceBatch
@@ -102,17 +100,15 @@ def row(
 def best_of_restarts(a: SubspaceBatch, b: SubspaceBatch, seed: int) -> NDArray[np.float64]:
     """Best similarity of probe i and template i over random restarts, (P,)."""
     out = np.empty(len(a))
-    spheres = spherical.spheres(a), spherical.spheres(b)
     rng = np.random.default_rng(seed)
-    for tile in matched_tiles(a, b, np.dtype(np.float64)):
-        dots, problem = spherical.problem_of(tile, *spheres)
-        for start in range(0, len(dots), _CHUNK):
-            part = slice(start, start + _CHUNK)
-            some = problem.take(part)
-            starts = rng.normal(size=(len(some.g), _RESTARTS, b.m))
-            starts /= np.linalg.norm(starts, axis=2, keepdims=True)
-            gains, _ = spherical.maximise(some, starts, _STEPS)
-            out[tile.first[part]] = dots[part] + gains
+    left, right = exact.Rows.cleaned(a), exact.Rows.cleaned(b)
+    for start in range(0, len(a), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        dots, problem = exact.problem_of(exact.Rows.of(left, part), exact.Rows.of(right, part))
+        starts = rng.normal(size=(len(dots), _RESTARTS, b.m))
+        starts /= np.linalg.norm(starts, axis=2, keepdims=True)
+        gains, _ = exact.maximise(problem, starts, _STEPS)
+        out[part] = dots + gains
     return out
 
 

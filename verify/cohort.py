@@ -18,7 +18,7 @@ from templates.space.lifting import Strategy, lift
 from templates.space.subspace import SubspaceBatch
 
 if TYPE_CHECKING:
-    from templates.rounded import RoundedSubspaces
+    from templates.distances.rounded import RoundedSubspaces
 
 COHORT_SIZE = 400
 """Templates in a cohort. The score of a wolf rests on the cohort's mean and standard deviation as
@@ -109,7 +109,7 @@ _rounded: "WeakKeyDictionary[SubspaceBatch, RoundedSubspaces]" = WeakKeyDictiona
 def rounded_cohort(cohort: SubspaceBatch) -> "RoundedSubspaces":
     """Return the form of a cohort that points are compared with; made once, at the first call."""
     # Commands that decide nothing shall not wait for the compiler's import.
-    from templates.rounded import RoundedSubspaces
+    from templates.distances.rounded import RoundedSubspaces
 
     found = _rounded.get(cohort)
     if found is None:

@@ -23,7 +23,7 @@ from threadpoolctl import ThreadpoolController, threadpool_limits
 
 from api.settings import processors
 from templates.contract.canonical import Json
-from templates.distances import Metric, pairwise_distances, warm_up
+from templates.distances import DEFAULT_STEPS, Metric, pairwise_distances, warm_up
 from templates.errors import TemplateError
 from templates.keys.randomness import Keystream
 from templates.space.subspace import SubspaceBatch
@@ -202,15 +202,11 @@ def require_device(device: str) -> None:
         There is no torch, or no such device.
     """
     try:
-        import torch
+        from templates.distances.torch import usable
+
+        usable(device)
     except ImportError:
         raise TemplateError("a device needs the extra 'torch' of veilface") from None
-    try:
-        torch.zeros(1, device=device).cpu()
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
-        raise TemplateError(
-            f"torch cannot use the device {device}: {str(error).splitlines()[0]}"
-        ) from None
 
 
 def machine(question: Question) -> dict[str, Json]:
@@ -316,8 +312,7 @@ def _on_device(
     """The same with tensors that are on the device before the time begins."""
     import torch
 
-    from templates.tensors import SubspaceTensors, pairwise
-    from templates.tensors.subspaces import ieee_products, stacked
+    from templates.distances.torch import SubspaceTensors, ieee_products, pairwise, stacked
 
     device = torch.device(question.device or "cpu")
     synchronise: Task = torch.get_device_module(device).synchronize
@@ -339,10 +334,8 @@ def _on_device(
             if isinstance(probes, SubspaceBatch)
             else torch.tensor(probes, device=device)
         )
-        lifted = isinstance(mine, SubspaceTensors)
-        feet = mine.feet if lifted else mine
-        left = stacked(mine.feet, mine.bases) if lifted else mine
-        right = stacked(theirs.feet, theirs.bases)
+        feet = mine.feet if isinstance(mine, SubspaceTensors) else mine
+        left, right = stacked(mine), stacked(theirs)
         bands = list(_bands(len(left), len(right)))
         table = torch.empty(len(feet), len(theirs), device=device)
         out = torch.empty(len(left[bands[0]]), len(right), device=device)
@@ -358,7 +351,7 @@ def _on_device(
                     torch.matmul(part, right.T, out=out[: len(part)])
 
         distances = {
-            metric: finished(partial(pairwise, mine, theirs, metric=metric))
+            metric: finished(partial(pairwise, mine, theirs, metric=metric, steps=DEFAULT_STEPS))
             for metric in question.metrics
         }
         return _Tasks(finished(points), finished(whole), distances)

@@ -55,8 +55,8 @@ from api.process.runtime import Runtime
 from api.process.supervised import end_with_supervisor, is_supervised, open_patiently, told_to_stop
 from api.settings import ENV_PREFIX, NO_PROXIES, Settings, load_settings
 from models.errors import ModelError
-from templates.blas import single_threaded
 from templates.distances import warm_up
+from templates.distances.blas import single_threaded
 from templates.errors import VeilfaceError
 from verify.cohort import rounded_cohort
 

@@ -9,8 +9,8 @@ import numpy as np
 from attacks.attributes.neighbours import nearest_neighbours
 from attacks.attributes.plan import AttributePlan
 from attacks.errors import AuditError
-from templates.blas import single_threaded
 from templates.contract.canonical import Json
+from templates.distances.blas import single_threaded
 from templates.keys.randomness import Keystream
 from templates.space.lifting import Strategy, lift
 

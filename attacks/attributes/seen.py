@@ -21,8 +21,8 @@ from attacks.attributes.neighbours import METRICS, Attacked, merged, nearest_nei
 from attacks.attributes.plan import Bench, Side
 from attacks.errors import AuditError
 from attacks.outcomes import GENERATED, POOLED, RAW_SCHEME, Scheme
-from templates.blas import single_threaded
 from templates.distances import Metric
+from templates.distances.blas import single_threaded
 from templates.keys.randomness import Keystream
 from templates.space.lifting import Strategy, lift
 from templates.space.subspace import SubspaceBatch

@@ -21,8 +21,8 @@ from api.process.preparation import calibrate_folder, make_generator
 from api.settings import Settings
 from models.extraction import Extractor
 from models.pack import ModelPack
-from templates.blas import single_threaded
 from templates.contract.document import Contract
+from templates.distances.blas import single_threaded
 from templates.space.lifting import Strategy
 from tests.api.http.test_stored import report
 from tests.web.browser_tab import BrowserTab

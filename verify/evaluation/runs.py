@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from templates.blas import single_threaded
+from templates.distances.blas import single_threaded
 from verify.evaluation.material import Material
 from verify.evaluation.measures import Measures, measure
 from verify.evaluation.resampling import (

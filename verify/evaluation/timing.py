@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from templates.blas import single_threaded
 from templates.distances import pairwise_distances
+from templates.distances.blas import single_threaded
 from templates.keys.randomness import Keystream
 from templates.space.lifting import Strategy, lift
 from verify.evaluation.baselines import hash_comparison, packed_bytes

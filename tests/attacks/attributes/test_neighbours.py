@@ -13,9 +13,8 @@ from attacks.attributes.neighbours import (
     votes,
 )
 from attacks.errors import AuditError
-from templates import tiles
 from templates.decoys import DecoyPool
-from templates.distances import Metric, Neighbours, pairwise_distances
+from templates.distances import Metric, Neighbours, pairwise_distances, tiles
 from templates.keys.randomness import Keystream
 from templates.space.lifting import lift
 from tests.attacks.attributes.people import faces

@@ -7,7 +7,7 @@ SCRIPT = """
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from threadpoolctl import ThreadpoolController
-from templates.blas import single_threaded
+from templates.distances.blas import single_threaded
 
 with single_threaded():  # loads the libraries
     pass

@@ -10,13 +10,14 @@ import scipy.optimize
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from templates import crossgram, tiles
 from templates.distances import (
     DEFAULT_STEPS,
     Metric,
+    exact,
     paired_distances,
     pairwise_distances,
     similarity,
+    tiles,
 )
 from templates.errors import InvalidEmbedding, InvalidTemplate, TemplateError
 from templates.keys.randomness import Keystream
@@ -351,9 +352,7 @@ def test_tiles_bound_the_memory_and_do_not_show(
 
     whole = everything()
     for module, name, size in (
-        (crossgram, "_POINT_TILE_BYTES", 1 << 16),
-        (crossgram, "_PAIR_TILE_BYTES", 1 << 16),
-        (crossgram, "_GATHER_BYTES", 1 << 16),
+        (exact, "_CHUNK_BYTES", 1 << 16),
         (tiles, "_TILE_SIDE", 64),
         (tiles, "_BLOCK_BYTES", 1 << 16),
         (tiles, "_PAIRED_BYTES", 1 << 16),

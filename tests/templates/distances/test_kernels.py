@@ -13,16 +13,17 @@ import threadpoolctl
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from templates import spherical, tiles
-from templates.bulk import warm_up
 from templates.decoys import DecoyPool
 from templates.distances import (
     Metric,
     count_within,
+    exact,
     nearest,
     paired_distances,
     pairwise_distances,
     similarity,
+    tiles,
+    warm_up,
 )
 from templates.errors import InvalidEmbedding, TemplateError
 from templates.keys.randomness import Keystream
@@ -147,9 +148,9 @@ def test_a_large_dimension() -> None:
 
 def restarted(a: SubspaceBatch, b: SubspaceBatch, restarts: int, steps: int) -> np.ndarray:
     """Best similarity of probe i and template i over random restarts of plain alternation."""
-    mine, theirs = spherical.spheres(a), spherical.spheres(b)
-    p, q = a.feet * mine.scales[:, None], b.feet * theirs.scales[:, None]
-    d, e = a.bases * mine.radii[:, None, None], b.bases * theirs.radii[:, None, None]
+    (scale, s), (other_scale, t) = exact.spheres(a.feet), exact.spheres(b.feet)
+    p, q = a.feet * scale[:, None], b.feet * other_scale[:, None]
+    d, e = a.bases * s[:, None, None], b.bases * t[:, None, None]
     g, h = (d @ q[:, :, None])[:, :, 0], (e @ p[:, :, None])[:, :, 0]
     middle = d @ e.transpose(0, 2, 1)
     v = Keystream.seeded("restarts").normal((len(a), restarts, b.m))
@@ -438,11 +439,11 @@ def test_several_threads_take_part(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_nothing_of_a_traversal_is_left_in_the_working_space() -> None:
     pairwise_distances(units(40, 64), lifted(faces(200, 64), 3, 1), metric="spherical")
-    assert tiles._spare._arrays
-    tiles._spare._arrays.clear()
+    assert tiles._ThreadSpace.spare
+    tiles._ThreadSpace.spare.clear()
     templates = lifted(faces(300, 64), 3, 1)
     pairwise_distances(templates, templates, metric="spherical")
-    (kept, *_) = tiles._spare._arrays
+    (kept, *_) = tiles._ThreadSpace.spare
     assert not kept.any()
 
 
@@ -462,7 +463,7 @@ import numpy as np
 from numba.core import event
 from templates.distances import nearest, paired_distances, pairwise_distances, count_within, warm_up
 from templates.space.lifting import lift
-from templates.rounded import RoundedSubspaces
+from templates.distances.rounded import RoundedSubspaces
 
 warm_up()
 compiled = []
@@ -515,7 +516,7 @@ def test_nothing_is_compiled_after_the_warm_up() -> None:
 
 def test_an_installation_that_cannot_be_written_to_compiles_anew(tmp_path: Path) -> None:
     script = """
-from templates.kernels import lanes
+from templates.distances.kernels import lanes
 import numba.core.caching as caching
 
 def nowhere(self, *_, **__):

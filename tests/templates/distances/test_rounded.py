@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from templates.distances import Metric, pairwise_distances, similarity
+from templates.distances.kernels.lanes import LANES
+from templates.distances.rounded import RoundedSubspaces
 from templates.errors import InvalidEmbedding
-from templates.kernels.lanes import LANES
-from templates.rounded import RoundedSubspaces
 from templates.space.lifting import lift
 from templates.space.subspace import SubspaceBatch
 

@@ -14,20 +14,22 @@ alternation, from the better sign of G's leading eigenvector, give λ and μ; Ne
 1/‖u‖ = 1/‖v‖ = 1 (Hebden 1973, Moré and Sorensen 1983, here in two variables) improves them; and a
 pair whose bound and value agree is finished, with proof. Where they do not, the bound is not
 attained or the system is nearly singular: those pairs, gathered into vectors of their own, take the
-accelerated alternation from both starts of the reference (``templates.spherical``). Where one of
+accelerated alternation from both starts of the reference (``exact``). Where one of
 the subspaces is a line or a plane, v is a sign or an angle, and the angle is sampled.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-from templates.kernels.lanes import (
+from templates.distances.kernels.arguments import Floats, Integers, Options, Result, Tile
+from templates.distances.kernels.lanes import (
+    ALL,
     LANES,
     Lanes,
     blend,
     compiled,
     every,
     fma,
+    fma4,
     inlined,
     larger,
     less,
@@ -36,12 +38,10 @@ from templates.kernels.lanes import (
     root,
     smaller,
     store,
+    store4,
 )
+from templates.distances.metric import LONGEST, STILL
 
-Floats = NDArray[np.float32]
-Integers = NDArray[np.int64]
-
-_ALL = 0xFFFF
 _PAD = 4
 _TINY = np.float32(np.finfo(np.float32).tiny)
 _PLAIN = 8
@@ -49,9 +49,8 @@ _NEWTON = 4
 _GAP = np.float32(2e-6)
 _LEAST_PIVOT = np.float32(3e-6)
 _POWERS = 16
-# As in the reference: a pair rests when a step moves v by less, longer extrapolations are noise.
-_STILL2 = np.float32(9e-10)
-_LONGEST = np.float32(1e3)
+_STILL2 = np.float32(STILL**2)
+_LONGEST = np.float32(LONGEST)
 # Half a circle in eight parts.
 _COSINES = tuple(np.float32(np.cos(np.pi * k / 16)) for k in range(-7, 9))
 _SINES = tuple(np.float32(np.sin(np.pi * k / 16)) for k in range(-7, 9))
@@ -78,19 +77,12 @@ def _products(work: Floats, problem: int, v: int, w: int, m: int) -> tuple[Lanes
     of_c = problem + m * stride * LANES
     of_h = of_c + stride * LANES
     for r in range(0, m, _PAD):
-        s0, s1, s2, s3 = zero, zero, zero, zero
+        sums = zero, zero, zero, zero
         for k in range(m):
-            x = load(work, v + k * LANES)
             # G is symmetric, so the four rows lie side by side.
             place = problem + (k * stride + r) * LANES
-            s0 = fma(load(work, place), x, s0)
-            s1 = fma(load(work, place + LANES), x, s1)
-            s2 = fma(load(work, place + 2 * LANES), x, s2)
-            s3 = fma(load(work, place + 3 * LANES), x, s3)
-        store(work, w + r * LANES, s0)
-        store(work, w + (r + 1) * LANES, s1)
-        store(work, w + (r + 2) * LANES, s2)
-        store(work, w + (r + 3) * LANES, s3)
+            sums = fma4(work, place, LANES, load(work, v + k * LANES), sums)
+        store4(work, w + r * LANES, LANES, sums)
     hv, cv, vw = zero, zero, zero
     for k in range(m):
         x = load(work, v + k * LANES)
@@ -153,30 +145,17 @@ def _factorise(
 ) -> int:
     """Cholesky factor R of S = RᵀR; return the bits of the lanes where S is positive definite."""
     stride = m + _PAD
-    scale = every(np.float32(-1)) / lam
+    zero, scale = every(np.float32(0)), every(np.float32(-1)) / lam
     least = every(_LEAST_PIVOT) * mu
-    sound = _ALL
+    sound = ALL
     for k in range(m):
         for r in range(k, m, _PAD):
-            place = problem + (k * stride + r) * LANES
-            s0 = load(work, place) * scale
-            s1 = load(work, place + LANES) * scale
-            s2 = load(work, place + 2 * LANES) * scale
-            s3 = load(work, place + 3 * LANES) * scale
-            if r == k:
-                s0 = s0 + mu
+            sums = mu if r == k else zero, zero, zero, zero
+            sums = fma4(work, problem + (k * stride + r) * LANES, LANES, scale, sums)
             for t in range(k):
-                place = factor + (t * stride + r) * LANES
-                x = every(np.float32(0)) - load(work, factor + (t * stride + k) * LANES)
-                s0 = fma(load(work, place), x, s0)
-                s1 = fma(load(work, place + LANES), x, s1)
-                s2 = fma(load(work, place + 2 * LANES), x, s2)
-                s3 = fma(load(work, place + 3 * LANES), x, s3)
-            place = factor + (k * stride + r) * LANES
-            store(work, place, s0)
-            store(work, place + LANES, s1)
-            store(work, place + 2 * LANES, s2)
-            store(work, place + 3 * LANES, s3)
+                x = zero - load(work, factor + (t * stride + k) * LANES)
+                sums = fma4(work, factor + (t * stride + r) * LANES, LANES, x, sums)
+            store4(work, factor + (k * stride + r) * LANES, LANES, sums)
         pivot = load(work, factor + (k * stride + k) * LANES)
         sound &= less(least, pivot)
         inverse = every(np.float32(1)) / root(larger(pivot, least))
@@ -275,7 +254,7 @@ def _ascend(
         slope = smaller(larger(slope, every(-_LONGEST)), every(_LONGEST))
         value = blend(resting, value, next_value)
         resting |= less(distance, every(_STILL2))
-        if resting == _ALL:
+        if resting == ALL:
             break
         length = zero
         for k in range(m):
@@ -326,7 +305,7 @@ def _prove(work: Floats, problem: int, free: int, m: int, steps: int) -> tuple[L
         value = (hv + root(larger(g2 * v2 + (cv + cv) * v1 + vw, zero))) / v1
         best = blend(sound & less(best, value), value, best)
         proven |= sound & less(bound - best, every(_GAP))
-        if proven == _ALL or turn == _NEWTON - 1:
+        if proven == ALL or turn == _NEWTON - 1:
             break
         u2 = larger((g2 + cv + cv + vw) * inverse * inverse, tiny)
         u1 = root(u2)
@@ -436,8 +415,7 @@ def _finish(
     dots: int,
     free: int,
     m: int,
-    steps: int,
-    least: np.float32,
+    options: Options,
     places: Integers,
     count: int,
     out: Floats,
@@ -449,15 +427,15 @@ def _finish(
     for k in range(m):
         store(work, other + k * LANES, every(np.float32(0)) - load(work, start + k * LANES))
     gain = load(work, best)
-    value, _, _ = _ascend(work, waiting, other + size, start, m, steps, True)
+    value, _, _ = _ascend(work, waiting, other + size, start, m, options.steps, True)
     gain = larger(gain, value)
-    value, _, _ = _ascend(work, waiting, other + size, other, m, steps, True)
+    value, _, _ = _ascend(work, waiting, other + size, other, m, options.steps, True)
     gain = larger(gain, value)
     store(work, best, _distance(load(work, dots) + gain))
     found = 0
     for lane in range(count):
         distance = work[best + lane]
-        if not distance > least:
+        if not distance > options.least:
             distance = np.float32(-1)
             found += 1
         out[places[lane]] = distance
@@ -471,42 +449,22 @@ def _distance(similarity: Lanes) -> Lanes:
 
 
 @compiled
-def spherical_subspaces(
-    tile: Floats,
-    rows: int,
-    columns: int,
-    m_d: int,
-    m_e: int,
-    steps: int,
-    least: np.float32,
-    work: Floats,
-    out: Floats,
-    stride: int,
-    count: int,
-) -> int:
+def spherical_subspaces(tile: Tile, options: Options, work: Floats, out: Result) -> int:
     """Distances between the parts of two subspaces that lie on the unit sphere.
 
     Parameters
     ----------
-    tile : (R · (m_d + 1) · (m_e + 1) · C,) float32
-        Products of the rows p and s D of R probes with the rows q and t E of C templates, the
-        templates side by side. C is a multiple of 16.
-    steps
-        Of the alternation, at most.
-    least
-        A distance that is not above this is −1 in ``out``.
+    tile
+        Of the rows p and s D of the probes, q and t E of the templates.
     work : float32
         Of ``scratch_size(m_d, m_e)`` numbers, zeros.
-    out : flat float32
-        Row r of the distances is written from ``r · stride`` on.
-    count
-        Number of distances of a row that are written, at most C.
 
     Returns
     -------
     int
-        Number of −1, or of groups with one.
+        Number of −1, or of groups with one: distances that are not above the least.
     """
+    product, columns, m_d, m_e = tile.product, len(tile.theirs), tile.m_d, tile.m_e
     swapped = m_e > m_d
     high, low = (m_e, m_d) if swapped else (m_d, m_e)
     wide = low + _PAD
@@ -522,54 +480,46 @@ def spherical_subspaces(
     places = np.zeros(LANES, dtype=np.int64)
     held = found = 0
     zero = every(np.float32(0))
-    for i in range(rows):
+    for i in range(len(tile.mine)):
         for j in range(0, columns, LANES):
             origin = i * (m_d + 1) * (m_e + 1) * columns + j
             of_h = problem + (low + 1) * wide * LANES
             for e in range(low):
-                store(work, of_h + e * LANES, load(tile, origin + (e + 1) * across))
+                store(work, of_h + e * LANES, load(product, origin + (e + 1) * across))
             for a in range(high):
                 for e in range(low):
-                    x = load(tile, origin + (a + 1) * down + (e + 1) * across)
+                    x = load(product, origin + (a + 1) * down + (e + 1) * across)
                     store(work, (a * wide + e) * LANES, x)
-                store(work, (a * wide + low) * LANES, load(tile, origin + (a + 1) * down))
+                store(work, (a * wide + low) * LANES, load(product, origin + (a + 1) * down))
             for k in range(low + 1):
                 for r in range(k, low + 1, _PAD):
-                    s0, s1, s2, s3 = zero, zero, zero, zero
+                    sums = zero, zero, zero, zero
                     for a in range(high):
-                        place = (a * wide + r) * LANES
                         x = load(work, (a * wide + k) * LANES)
-                        s0 = fma(load(work, place), x, s0)
-                        s1 = fma(load(work, place + LANES), x, s1)
-                        s2 = fma(load(work, place + 2 * LANES), x, s2)
-                        s3 = fma(load(work, place + 3 * LANES), x, s3)
-                    place = problem + (k * wide + r) * LANES
-                    store(work, place, s0)
-                    store(work, place + LANES, s1)
-                    store(work, place + 2 * LANES, s2)
-                    store(work, place + 3 * LANES, s3)
+                        sums = fma4(work, (a * wide + r) * LANES, LANES, x, sums)
+                    store4(work, problem + (k * wide + r) * LANES, LANES, sums)
                 for r in range(k + 1, low + 1):
                     x = load(work, problem + (k * wide + r) * LANES)
                     store(work, problem + (r * wide + k) * LANES, x)
             if low == 1:
-                gain, proven = _of_one(work, problem), _ALL
+                gain, proven = _of_one(work, problem), ALL
             elif low == 2:
-                gain, proven = _of_two(work, problem), _ALL
+                gain, proven = _of_two(work, problem), ALL
             else:
-                gain, proven = _prove(work, problem, free, low, steps)
-            dot = load(tile, origin)
+                gain, proven = _prove(work, problem, free, low, options.steps)
+            dot = load(product, origin)
             distance = _distance(dot + gain)
-            known = less(every(least), distance)
-            place = i * stride + j
+            known = less(every(options.least), distance)
+            place = i * out.stride + j
             distance = blend(known, distance, every(np.float32(-1)))
-            put(out, place, count - j, distance)
-            found += known != _ALL
-            if proven == _ALL:
+            put(out.distances, place, out.width - j, distance)
+            found += known != ALL
+            if proven == ALL:
                 continue
             store(work, free, gain)
             store(work, free + LANES, dot)
             for lane in range(LANES):
-                if proven >> lane & 1 or j + lane >= count:
+                if proven >> lane & 1 or j + lane >= out.width:
                     continue
                 for k in range(0, size, LANES):
                     work[waiting + k + held] = work[problem + k + lane]
@@ -579,11 +529,11 @@ def spherical_subspaces(
                 held += 1
                 if held == LANES:
                     found += _finish(
-                        work, waiting, best, dots, free, low, steps, least, places, held, out
+                        work, waiting, best, dots, free, low, options, places, held, out.distances
                     )
                     held = 0
                     store(work, free, gain)
                     store(work, free + LANES, dot)
     if held:
-        found += _finish(work, waiting, best, dots, free, low, steps, least, places, held, out)
+        found += _finish(work, waiting, best, dots, free, low, options, places, held, out.distances)
     return found

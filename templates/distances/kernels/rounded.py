@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from templates.kernels.lanes import LANES, compiled, every, fma, load, load_bytes, store
+from templates.distances.kernels.lanes import LANES, compiled, every, fma, load, load_bytes, store
 
 
 @compiled

@@ -1,9 +1,6 @@
-import functools
-import os
-import subprocess
-import sys
+"""Distances on tensors: the specification's, whatever the tiles, and the same through a device."""
+
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,25 +11,20 @@ from templates.errors import InvalidEmbedding, InvalidTemplate, TemplateError
 from templates.keys.randomness import Keystream
 from templates.space.lifting import lift
 from templates.space.subspace import SubspaceBatch
-from tests.patience import PATIENCE_S
 from tests.templates.distances.test_distances import faces, pairs, randoms, units
 
 torch = pytest.importorskip("torch", reason="torch is an optional extra")
 
 from torch.utils._python_dispatch import TorchDispatchMode  # noqa: E402
 
-from templates.tensors import (  # noqa: E402
+from templates.distances import torch as on_device  # noqa: E402
+from templates.distances.torch import (  # noqa: E402
     SubspaceTensors,
     counts_within,
-    euclidean,
     nearest,
     pairwise,
-    spherical,
-    subspaces,
-    tiles,
 )
 
-ROOT = Path(__file__).parents[3]
 SHAPES = [(1, 1, 64), (3, 3, 128), (8, 5, 64), (5, 8, 512), (1, 6, 128), (16, 16, 128), (20, 3, 64)]
 
 
@@ -53,7 +45,7 @@ def distances(
 ) -> np.ndarray:
     lifted = isinstance(probes, SubspaceBatch)
     mine = tensors(probes) if lifted else torch.tensor(probes.astype(np.float32))
-    return pairwise(mine, tensors(templates), **options).numpy()
+    return pairwise(mine, tensors(templates), **{"steps": 50} | options).numpy()
 
 
 def reference(
@@ -76,7 +68,6 @@ def test_subspaces_and_points_agree_with_the_reference(shape: tuple[int, ...], m
     seen = distances(a, b, metric=metric)
     assert seen.dtype == np.float32
     missing = similarity(reference(a, b, metric=metric)) - similarity(seen.astype(np.float64))
-    # A proof leaves 2e-6 open; the rest is rounding.
     assert missing.max() < 3e-6
     assert missing.min() > -1e-6
     points = units(Keystream.seeded("tensors"), 20, n)
@@ -138,37 +129,6 @@ def test_sets_outside_the_sphere_and_squares_that_overflow(metric: Metric, scale
 # --- the spherical iteration -------------------------------------------------------------------
 
 
-@functools.cache
-def problems() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Random problems with several local maxima, and the best of many restarts in float64."""
-    stream = Keystream.seeded("problems")
-    count, m, k, restarts = 400, 4, 3, 48
-    g, h = 0.3 * stream.normal((count, m)), 0.3 * stream.normal((count, k))
-    b = 0.5 * stream.normal((count, m, k))
-    g, h, b = (part.astype(np.float32).astype(np.float64) for part in (g, h, b))
-    v = stream.normal((count, restarts, k))
-    for _ in range(400):
-        u = v @ b.transpose(0, 2, 1) + g[:, None]
-        value = np.linalg.norm(u, axis=2) + np.einsum("kri,ki->kr", v, h)
-        v = (u / np.linalg.norm(u, axis=2, keepdims=True)) @ b + h[:, None]
-        v /= np.linalg.norm(v, axis=2, keepdims=True)
-    return g, h, b, value.max(axis=1)
-
-
-def test_what_is_proven_is_the_global_maximum():
-    g, h, b, best = problems()
-    problem = spherical._Problem(*(torch.tensor(part, dtype=torch.float32) for part in (g, h, b)))
-    values, v, proven = (part.numpy() for part in spherical.prove(problem, 8, 8))
-    assert 0.5 < proven.mean() < 1
-    assert np.abs(best - values)[proven].max() < 4e-6
-    assert (values < best + 1e-6).all()
-    assert (best - values)[~proven].max() > 1e-3  # a local maximum, and no proof was made up
-    v = v.astype(np.float64)
-    np.testing.assert_allclose(np.linalg.norm(v, axis=1), 1, atol=1e-6)
-    u = np.linalg.norm(g + np.einsum("kij,kj->ki", b, v), axis=1)
-    np.testing.assert_allclose(values, u + np.einsum("ki,ki->k", h, v), atol=1e-6)
-
-
 def test_steps_raise_the_similarity_and_never_above_the_truth():
     a, b = faces(10, 16, seed=5), faces(11, 16, seed=6)
     truth = similarity(reference(a, b, metric="spherical"))
@@ -215,7 +175,7 @@ def test_tiles_bound_the_memory_and_do_not_show(
         with Largest() as unbounded:
             whole = pairwise(probes, templates, **options)
         with monkeypatch.context() as patch:
-            patch.setitem(subspaces.TILE_BYTES, "cpu", tile)
+            patch.setitem(on_device.TILE_BYTES, "cpu", tile)
             tiled = pairwise(probes, templates, **options)
             with Largest() as bounded:
                 nearest(probes, templates, k=3, **options)
@@ -243,7 +203,7 @@ def test_nearest_sorts_ties_by_index_and_leaves_labels_out(
     labels = np.arange(9) % 3, np.arange(23) % 4
     expected = np.round(reference(points, templates, metric=metric), 5)
     assert len(np.unique(expected[0])) < 8
-    monkeypatch.setitem(subspaces.TILE_BYTES, "cpu", 512)
+    monkeypatch.setitem(on_device.TILE_BYTES, "cpu", 512)
     for left_out in (None, labels):
         table = expected.copy()
         if left_out is not None:
@@ -256,7 +216,8 @@ def test_nearest_sorts_ties_by_index_and_leaves_labels_out(
             tensors(templates),
             k=k,
             metric=metric,
-            labels=left_out and tuple(torch.tensor(part) for part in left_out),
+            labels=left_out,
+            steps=50,
         )
         assert indices.dtype == torch.int64
         np.testing.assert_array_equal(indices, np.where(np.isinf(table), -1, order))
@@ -268,10 +229,11 @@ def test_nearest_and_counts_are_those_of_the_matrix(
     metric: Metric, monkeypatch: pytest.MonkeyPatch
 ):
     a, b = tensors(faces(40, 4, seed=9)), tensors(faces(37, 3, seed=10))
-    labels = torch.arange(40) % 7, torch.arange(37) % 5
-    monkeypatch.setitem(subspaces.TILE_BYTES, "cpu", 1 << 14)
-    matrix = pairwise(a, b, metric=metric).numpy()
-    indices, found = (part.numpy() for part in nearest(a, b, k=5, metric=metric))
+    labels = np.arange(40) % 7, np.arange(37) % 5
+    monkeypatch.setitem(on_device.TILE_BYTES, "cpu", 1 << 14)
+    matrix = pairwise(a, b, metric=metric, steps=50).numpy()
+    options = {"metric": metric, "steps": 50}
+    indices, found = (part.numpy() for part in nearest(a, b, k=5, **options))
     order = np.argsort(matrix, axis=1, kind="stable")[:, :5]
     np.testing.assert_array_equal(indices, order)
     np.testing.assert_array_equal(found, np.take_along_axis(matrix, order, axis=1))
@@ -280,9 +242,9 @@ def test_nearest_and_counts_are_those_of_the_matrix(
     for left_out in (None, labels):
         kept = matrix.ravel()
         if left_out is not None:
-            kept = matrix[(labels[0][:, None] != labels[1]).numpy()]
+            kept = matrix[labels[0][:, None] != labels[1]]
         expected = [(kept <= threshold).sum() for threshold in thresholds]
-        seen = counts_within(a, b, thresholds, metric=metric, labels=left_out)
+        seen = counts_within(a, b, thresholds, labels=left_out, **options)
         assert seen.dtype == torch.int64
         np.testing.assert_array_equal(seen, expected)
     assert seen[-1] < matrix.size
@@ -290,13 +252,13 @@ def test_nearest_and_counts_are_those_of_the_matrix(
 
 @pytest.mark.parametrize("metric", Metric)
 def test_empty_sides_give_empty_results(metric: Metric):
-    a = tensors(faces(3, 2, seed=11))
-    assert pairwise(a[:0], a, metric=metric).shape == (0, 3)
-    assert pairwise(a, a[:0], metric=metric).shape == (3, 0)
-    indices, found = nearest(a, a[:0], k=2, metric=metric)
+    a, options = tensors(faces(3, 2, seed=11)), {"metric": metric, "steps": 50}
+    assert pairwise(a[:0], a, **options).shape == (0, 3)
+    assert pairwise(a, a[:0], **options).shape == (3, 0)
+    indices, found = nearest(a, a[:0], k=2, **options)
     assert (indices == -1).all()
     assert torch.isinf(found).all()
-    assert counts_within(a, a[:0], np.array([9.0]), metric=metric).tolist() == [0]
+    assert counts_within(a, a[:0], np.array([9.0]), **options).tolist() == [0]
 
 
 # --- precision of the products -----------------------------------------------------------------
@@ -307,13 +269,13 @@ def test_products_are_float32_and_the_setting_is_restored(
     setting: str, monkeypatch: pytest.MonkeyPatch
 ):
     matmul, seen = torch.backends.cuda.matmul, []
-    make = tiles._distances
+    make = on_device._distances
 
     def spy(*arguments):
         seen.append((torch.get_float32_matmul_precision(), torch.is_autocast_enabled("cpu")))
         return make(*arguments)
 
-    monkeypatch.setattr(tiles, "_distances", spy)
+    monkeypatch.setattr(on_device, "_distances", spy)
     a = tensors(faces(3, 2, seed=12))
     if setting == "newer" and not hasattr(matmul, "fp32_precision"):
         pytest.skip("this torch has only the older setting")
@@ -323,7 +285,7 @@ def test_products_are_float32_and_the_setting_is_restored(
         else:
             matmul.fp32_precision = "tf32"
         with torch.autocast("cpu", dtype=torch.bfloat16):
-            pairwise(a, a, metric=Metric.EUCLIDEAN)
+            pairwise(a, a, metric=Metric.EUCLIDEAN, steps=1)
         assert seen == [("highest", False)]
         if setting == "older":
             assert torch.get_float32_matmul_precision() == "high"
@@ -340,93 +302,6 @@ def test_tensors_hold_what_the_batch_held():
     part = whole[1:3]
     np.testing.assert_array_equal(part.bases, batch.bases[1:3])
     np.testing.assert_array_equal(whole[torch.tensor([2, 0])].feet, batch.feet[[2, 0]])
-    with pytest.raises(InvalidTemplate, match="do not fit"):
-        SubspaceTensors(whole.feet[:2], whole.bases)
-    with pytest.raises(InvalidTemplate, match="float32"):
-        SubspaceTensors(whole.feet.double(), whole.bases.double())
-
-
-# --- Triton ------------------------------------------------------------------------------------
-
-
-def fused_cases() -> Iterator[tuple[str, SubspaceBatch, SubspaceBatch, Metric, int]]:
-    for m, k in ((1, 1), (3, 2), (2, 5), (12, 9)):
-        for metric in Metric:
-            yield f"{m} {k} {metric}", faces(5, m, 14, 64), faces(7, k, 15, 64), metric, 50
-    yield "few steps", faces(5, 8, 16, 64), faces(5, 8, 17, 64), Metric.SPHERICAL, 3
-    for name in ("two shared decoys", "parallel", "orthogonal", "crossing far away"):
-        a, b = (SubspaceBatch.of([subspace]) for subspace in pairs()[name])
-        for metric in Metric:
-            yield f"{name} {metric}", a, b, metric, 50
-
-
-def in_the_interpreter(out: str) -> None:
-    """Save the distances that the kernels find; without them there are none."""
-    torch.set_num_threads(1)
-    euclidean.schur = spherical.prove = spherical.maximise = None  # type: ignore[assignment]
-    assert subspaces.fused(torch.device("cpu"), 17) is None
-    with np.errstate(all="ignore"):  # lanes without a pair
-        found = {
-            name: distances(a, b, metric=metric, steps=steps)
-            for name, a, b, metric, steps in fused_cases()
-        }
-    np.savez(out, **found)
-
-
-def test_triton_kernels_agree_in_the_interpreter(tmp_path: Path):
-    pytest.importorskip("triton", reason="torch's wheels for Linux bring triton")
-    subprocess.run(
-        [
-            sys.executable,
-            "-c",
-            "import sys; from tests.templates.distances.test_tensors import in_the_interpreter; "
-            "in_the_interpreter(sys.argv[1])",
-            str(tmp_path / "found.npz"),
-        ],
-        env=os.environ | {"TRITON_INTERPRET": "1"},
-        cwd=ROOT,
-        check=True,
-        timeout=PATIENCE_S,
-    )
-    found = np.load(tmp_path / "found.npz")
-    for name, a, b, metric, steps in fused_cases():
-        unfused = distances(a, b, metric=metric, steps=steps)
-        np.testing.assert_allclose(found[name], unfused, rtol=3e-6, atol=1e-6, err_msg=name)
-        if steps == 50:
-            expected = reference(a, b, metric=metric)
-            np.testing.assert_allclose(found[name], expected, rtol=3e-6, atol=1e-6, err_msg=name)
-
-
-def test_torch_alone_does_where_there_is_no_triton(monkeypatch: pytest.MonkeyPatch):
-    a = faces(3, 2, seed=18)
-    monkeypatch.setenv("TRITON_INTERPRET", "1")
-    monkeypatch.setitem(sys.modules, "templates.tensors.fused", None)
-    assert subspaces.fused(torch.device("cpu"), 2) is None
-    seen = distances(a, a, metric=Metric.EUCLIDEAN)
-    np.testing.assert_allclose(seen, reference(a, a, metric="euclidean"), rtol=2e-6, atol=1e-6)
-
-
-def test_triton_kernels_compile_for_a_gpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """To machine code for Hopper, which needs no such GPU."""
-    triton = pytest.importorskip("triton", reason="torch's wheels for Linux bring triton")
-    compiler = pytest.importorskip("triton.backends.compiler")
-    monkeypatch.setenv("TRITON_CACHE_DIR", str(tmp_path))
-    monkeypatch.delenv("TRITON_INTERPRET", raising=False)
-    from templates.tensors import fused
-
-    pointers = {"proofs": "*i8", "pairs": "*i64"}
-    constants = {"m": 3, "M": 4, "BLOCK": 32}
-    for kernel in (fused._schur_kernel, fused._prove_kernel, fused._maximise_kernel):
-        kinds = dict.fromkeys(kernel.arg_names, "*fp32")
-        kinds |= {name: kind for name, kind in pointers.items() if name in kinds}
-        kinds |= {name: "i32" for name in fused._INTEGERS if name in kinds}
-        kinds |= dict.fromkeys(constants, "constexpr")
-        source = triton.compiler.ASTSource(fn=kernel, signature=kinds, constexprs=constants)
-        target = compiler.GPUTarget("cuda", 90, 32)
-        options = {"num_warps": 1, "enable_fp_fusion": True}
-        compiled = triton.compile(source, target=target, options=options)
-        assert f".entry {kernel.__name__}" in compiled.asm["ptx"]
-        assert compiled.asm["cubin"]
 
 
 # --- the one entrance --------------------------------------------------------------------------
@@ -457,12 +332,6 @@ def test_a_device_gives_what_the_processor_gives(metric: Metric) -> None:
             entrance.count_within(probes, b, limits, metric=metric, labels=labels, device="cpu"),
             entrance.count_within(probes, b, limits, metric=metric, labels=labels),
         )
-    held = SubspaceTensors.of(b, "cpu")
-    kept = entrance.pairwise_distances(torch.tensor(rows[:30]), held, metric=metric)
-    assert isinstance(kept, torch.Tensor)
-    np.testing.assert_allclose(
-        kept.numpy(), entrance.pairwise_distances(rows[:30], b, metric=metric), atol=2e-5
-    )
 
 
 def test_what_a_device_cannot_do_is_said() -> None:
@@ -470,7 +339,13 @@ def test_what_a_device_cannot_do_is_said() -> None:
     templates = lift(rows, strategy="random", m=2)
     with pytest.raises(TemplateError, match="cannot use the device nowhere"):
         entrance.pairwise_distances(rows, templates, metric="euclidean", device="nowhere")
-    with pytest.raises(TemplateError, match="arrays or a batch"):
+    if not torch.cuda.is_available():
+        with pytest.raises(TemplateError, match="cannot use the device cuda"):
+            entrance.nearest(rows, templates, k=1, metric="euclidean", device="cuda")
+    elsewhere = tensors(templates), torch.empty(4, 24, device="meta")
+    with pytest.raises(TemplateError, match="are on meta, the templates on cpu"):
+        pairwise(elsewhere[1], elsewhere[0], metric=Metric.EUCLIDEAN, steps=1)
+    with pytest.raises(TemplateError, match="an array or a batch"):
         entrance.pairwise_distances(torch.tensor(rows), templates, metric="euclidean")
     with pytest.raises(InvalidEmbedding, match="not finite"):
         entrance.pairwise_distances(

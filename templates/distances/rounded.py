@@ -11,11 +11,11 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from templates import spherical
-from templates.distances import Metric
+from templates.distances import exact
+from templates.distances.kernels.lanes import LANES
+from templates.distances.kernels.rounded import squares_inside
+from templates.distances.metric import Metric
 from templates.errors import InvalidEmbedding
-from templates.kernels.lanes import LANES
-from templates.kernels.rounded import squares_inside
 from templates.space.subspace import SubspaceBatch, is_finite
 
 _LARGEST = 127
@@ -23,23 +23,12 @@ _LARGEST = 127
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RoundedSubspaces:
-    """T subspaces of dimension m in R^n; made by :meth:`of`.
-
-    Attributes
-    ----------
-    rows : (G · m · n · 16,) int8
-        Rows of G groups of sixteen subspaces, the last ones zero; number by number, sixteen
-        subspaces side by side.
-    steps : (G · m · 16,) float32
-        What a row's numbers are multiples of.
-    feet : (T, n) float32
-    scales, radii : (T,) float32
-        Of the intersections with the unit sphere.
-    m : int
-    """
+    """T subspaces of dimension m in R^n, in groups of sixteen; made by :meth:`of`."""
 
     rows: NDArray[np.int8]
+    """(G · m · n · 16,): number by number, sixteen subspaces side by side, the last ones zero."""
     steps: NDArray[np.float32]
+    """(G · m · 16,): what a row's numbers are multiples of."""
     feet: NDArray[np.float32]
     scales: NDArray[np.float32]
     radii: NDArray[np.float32]
@@ -58,13 +47,13 @@ class RoundedSubspaces:
             group, count = first // LANES, len(bases)
             rows[group, :, :, :count] = np.rint(bases / step[:, :, None]).transpose(1, 2, 0)
             steps[group, :, :count] = step.T
-        balls = spherical.spheres(batch)
+        scales, radii = exact.spheres(batch.feet)
         return cls(
             rows=rows.reshape(-1),
             steps=steps.reshape(-1),
             feet=batch.feet,
-            scales=balls.scales.astype(np.float32),
-            radii=balls.radii.astype(np.float32),
+            scales=scales.astype(np.float32),
+            radii=radii.astype(np.float32),
             m=m,
         )
 
@@ -74,26 +63,15 @@ class RoundedSubspaces:
     def similarities(
         self, point: NDArray[np.float32], *, metric: Metric | str
     ) -> NDArray[np.float32]:
-        """Similarities of one point, 1 − distance²/2.
+        """Similarities of one point (n,), 1 − distance²/2, at most 1, shape (T,).
 
-        Parameters
-        ----------
-        point : (n,) float32
-            The spherical metric sees only its direction; a zero point has similarity 0.
-
-        Returns
-        -------
-        ndarray of float32, shape (T,)
-            At most 1.
+        The spherical metric sees only its direction; a zero point has similarity 0. See paper eq. 1
+        (Euclidean) and docs/method.md §3.4 (spherical).
 
         Raises
         ------
         InvalidEmbedding
             Where the point has another shape, or a number that is not finite.
-
-        References
-        ----------
-        Paper eq. 1 (Euclidean); docs/method.md §3.4 (spherical).
         """
         n = self.feet.shape[1]
         point = np.array(point, dtype=np.float32, order="C")
@@ -103,7 +81,7 @@ class RoundedSubspaces:
             raise InvalidEmbedding("a point holds a number that is not finite")
         metric = Metric(metric)
         if metric is Metric.SPHERICAL:
-            point = spherical.directions(point)
+            point = exact.normalised(point.astype(np.float64)).astype(np.float32)
         inside = np.empty(len(self) + -len(self) % LANES, dtype=np.float32)
         squares_inside(self.rows, self.steps, point, self.m, inside)
         inside = inside[: len(self)]

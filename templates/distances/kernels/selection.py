@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from templates.kernels.lanes import LANES, compiled, every, inlined, less, load
+from templates.distances.kernels.lanes import ALL, LANES, compiled, every, inlined, less, load
 
 Floats = NDArray[np.float32]
 Integers = NDArray[np.int64]
@@ -45,7 +45,7 @@ def keep_nearest(
     for i in range(len(best)):
         for j in range(0, columns, LANES):
             beyond = less(every(best[i, k - 1]), load(distances, i * stride + j))
-            if beyond == 0xFFFF:
+            if beyond == ALL:
                 continue
             for c in range(j, min(j + LANES, columns)):
                 if labelled and mine[i] == theirs[c]:
@@ -89,7 +89,7 @@ def count_within(
     for i in range(len(distances) // stride):
         for j in range(0, columns, LANES):
             beyond = less(limit, load(distances, i * stride + j))
-            if beyond == 0xFFFF:
+            if beyond == ALL:
                 continue
             for c in range(j, min(j + LANES, columns)):
                 distance = distances[i * stride + c]

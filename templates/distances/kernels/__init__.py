@@ -1,0 +1,1 @@
+"""Compiled kernels for tiles of the cross-Gram matrix; ``templates.distances.tiles`` feeds them."""
