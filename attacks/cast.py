@@ -17,6 +17,8 @@ from templates.space.embedding import unit_descriptors
 ENROLLED_PHOTOS = 3
 """Most photos that are averaged into a victim's template."""
 LEAST_ALBUM = 3
+LEAST_FITTED = 100
+"""Least that a decoy generator is fitted to."""
 LEAST_CALIBRATION = 200
 
 
@@ -118,8 +120,8 @@ def make_cast(
     if len(several) < victims + owners:
         raise AuditError(
             f"{victims} victims and {owners} decoy owners need {victims + owners} people with two "
-            f"photos or more, and {len(several)} are there: ask for fewer with --victims and "
-            "--owners, or give a larger folder"
+            f"photos or more, and {len(several)} are there: ask for fewer victims and decoy "
+            "owners, or give a larger folder"
         )
     attacked, owning = several[:victims], several[victims : victims + owners]
     others = rng.permutation(np.setdiff1d(np.arange(len(people)), several[: victims + owners]))

@@ -5,7 +5,7 @@ other template than the one that is asked about is used.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -16,7 +16,7 @@ from attacks.decisions import decide
 from attacks.errors import AuditError
 from attacks.outcomes import Knowledge, Outcome, Property, Scheme
 from attacks.recovery import fmr_of
-from attacks.rehearsal import Floats, Prior
+from attacks.rehearsal import Floats, Prior, rehearse_scene
 from attacks.scene import Scene
 from templates.contract.document import Level
 from templates.distances import pairwise_distances, similarity
@@ -279,6 +279,38 @@ def climbing_outcomes(
         )
         for limit in sorted({*(each for each in lockouts if each <= most_attempts), most_attempts})
     ]
+
+
+def climb_service(
+    scene: Scene,
+    scored: Sequence[Ask],
+    deciding: Sequence[Ask],
+    *,
+    most_attempts: int,
+    seed: int,
+) -> list[Outcome]:
+    """Climb towards the first victims, over the interface of a running service.
+
+    Parameters
+    ----------
+    scored, deciding
+        One a victim: what answers a probe with its score, and with the decision only.
+    most_attempts
+        Of a climber on one victim.
+    """
+    prior = rehearse_scene(scene)
+    outcomes: list[Outcome] = []
+    for climber in Climber:
+        decisions_only = climber is Climber.DICTIONARY
+        asks = deciding if decisions_only else scored
+        most = min(most_attempts, len(prior.faces)) if decisions_only else most_attempts
+        climbs = climb(dict(enumerate(asks)), prior, climber, most_attempts=most, seed=seed)
+        outcomes += [
+            # Decisions alone are judged on all victims, and not on these few.
+            replace(outcome, variant=f"{outcome.variant}, over REST", judged=not decisions_only)
+            for outcome in climbing_outcomes(climbs, scene.scheme, scene.level, most_attempts=most)
+        ]
+    return outcomes
 
 
 def in_process(scene: Scene, victims: Sequence[int], *, scores: bool) -> dict[int, Ask]:

@@ -10,6 +10,7 @@ from api.cli.console import demo_notice, emit, message, say, share_done, show, t
 from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, extract
 from api.cli.errors import CommandError, UsageError
 from api.cli.files import read_bounded, read_names
+from api.cli.inputs import load_decoys
 from api.cli.options import AsJson, takes_settings
 from api.process.opening import file_sealer, open_keyring
 from api.process.preparation import (
@@ -19,12 +20,10 @@ from api.process.preparation import (
     acquired_json,
     calibrate_folder,
     default_probe_dims,
-    require_made_with,
 )
 from api.settings import Settings
 from attacks.likelihood import share_found
 from templates.contract.document import Calibration, Contract, Rate
-from templates.decoys import load_source
 from templates.distances import Metric
 from templates.space.lifting import Strategy
 from verify import CalibrationOptions, CalibrationReport, labelled_folder
@@ -139,13 +138,7 @@ def calibrate(
     name_of = dict(zip(labelled.paths, labelled.identities, strict=True))
     keyring = open_keyring(settings)
     sealer = file_sealer(keyring)
-    source = load_source(decoys or settings.resolved_decoys_file, sealer)
-    if source.n != pack.info.n:
-        raise CommandError(
-            f"the decoys have {source.n} numbers each, the pack gives {pack.info.n}; build the "
-            "decoys with this pack"
-        )
-    require_made_with(source, pack)
+    source = load_decoys(decoys or settings.resolved_decoys_file, sealer, pack)
     exclude = frozenset() if exclude_people is None else read_names(exclude_people)
     extraction = extract(pack, labelled.paths, aligned=aligned, settings=settings, cache=cache)
     with share_done("calibrating") as report:

@@ -15,8 +15,6 @@ from api.cli.evaluation_inputs import (
     acquire_faces,
     attributes_of,
     default_jobs,
-    listed,
-    named_file,
     open_cache,
     open_descriptors,
     open_sources,
@@ -24,6 +22,7 @@ from api.cli.evaluation_inputs import (
     without_test_people,
 )
 from api.cli.evaluation_report import read_audit, summary, write_results
+from api.cli.inputs import listed, named_file
 from api.cli.options import AsJson, takes_settings
 from api.settings import Settings
 from templates.decoys import DecoyPool

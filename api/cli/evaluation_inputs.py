@@ -1,10 +1,9 @@
 """What ``veilface evaluate`` works on: descriptors of the sets, decoys, and attributes."""
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 
@@ -38,34 +37,10 @@ from verify.evaluation.results import Model, SourceFacts
 from verify.evaluation.rows import Json
 from verify.evaluation.verification_set import VerificationSet
 
-T = TypeVar("T")
 NO_PACK = "none"
 SAME_PERSON = 0.4
 """Cosine from which a decoy counts as a person of the test set. Of 29.6 million pairs of photos of
 two people of LFW 54 reach it, and some of those are one person under two names."""
-
-
-def listed(text: str, kind: Callable[[str], T], option: str, *, expected: str) -> tuple[T, ...]:
-    """Read a list with commas.
-
-    Parameters
-    ----------
-    expected
-        Said where something is not of the kind.
-
-    Raises
-    ------
-    UsageError
-        Something in it is not of the kind, or it is empty.
-    """
-    parts = [part.strip() for part in text.split(",") if part.strip()]
-    try:
-        values = tuple(kind(part) for part in parts)
-    except ValueError:
-        raise UsageError(f"{option} takes {expected}, not {text!r}") from None
-    if not values:
-        raise UsageError(f"{option} takes {expected}, and is empty")
-    return values
 
 
 @dataclass(frozen=True, eq=False)
@@ -288,14 +263,6 @@ def resemblance(material: Material) -> Json:
     first, second = rows[material.first[material.same]], rows[material.second[material.same]]
     cosines = np.einsum("ij,ij->i", first, second, dtype=np.float64)
     return {"cosine": SAME_PERSON, "genuine_below": float(np.mean(cosines < SAME_PERSON))}
-
-
-def named_file(file: Path | None) -> Json | None:
-    """Name and SHA-256 of a file that figures depend on."""
-    if file is None:
-        return None
-    with file.open("rb") as stream:
-        return {"file": file.name, "sha256": hashlib.file_digest(stream, "sha256").hexdigest()}
 
 
 def attributes_of(

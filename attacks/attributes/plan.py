@@ -11,6 +11,7 @@ from attacks.attributes.attackers import TRAINED
 from attacks.attributes.faces import LabelledFaces, Split
 from attacks.attributes.features import Axes
 from attacks.attributes.likely_points import Form, contrast, decoy_precision
+from attacks.cast import LEAST_FITTED
 from attacks.errors import AuditError
 from attacks.outcomes import GENERATED, POOLED, RAW_SCHEME, Scheme
 from templates.decoys import DecoyGenerator, DecoyPool
@@ -228,7 +229,7 @@ def prepare(
     AuditError
         The attacker has too few faces for the plan.
     """
-    if generator is None and len(parts.lifting) >= 100:
+    if generator is None and len(parts.lifting) >= LEAST_FITTED:
         generator = DecoyGenerator.fit(parts.lifting.descriptors)
     against = None if generator is None else decoy_precision(generator, seed=seed)
     side_of = partial(Side.of, nearby=plan.gallery_most, against=against)

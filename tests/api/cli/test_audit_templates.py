@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+import attacks.audit
 import attacks.cast
 import attacks.scene
-from api.cli import audit_attacks, audit_templates
 from attacks.cast import Cast
 from attacks.databases import link_databases
 from attacks.outcomes import Knowledge, Property
@@ -55,7 +55,7 @@ def on_small_material(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(presentation, "TARGETS", 40)
     patch.setattr(presentation, "STARTS", 2)
     patch.setattr(
-        audit_attacks,
+        attacks.audit,
         "link_databases",
         partial(link_databases, accounts=(30,), strangers=150, permutations=200),
     )
@@ -87,8 +87,8 @@ def people(world: World, tmp_path_factory: pytest.TempPathFactory) -> Iterator[T
             scenes.append(stage(*given, **named))
             return scenes[-1]
 
-        patch.setattr(audit_templates, "make_cast", recorded_cast)
-        patch.setattr(audit_templates, "stage", recorded_stage)
+        patch.setattr(attacks.audit, "make_cast", recorded_cast)
+        patch.setattr(attacks.audit, "stage", recorded_stage)
         first = run(
             *asked, "--no-comparison", "--climbed", "1", "--attempts", "50",
             "--max-success-with-key", "0", "--out", root / "out", "--json",
