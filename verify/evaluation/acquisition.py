@@ -77,6 +77,24 @@ class Acquired:
     mirrored: NDArray[np.float32] | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class EmbeddedSet:
+    """A set with its embeddings.
+
+    Parameters
+    ----------
+    aligned
+        Whether its photos were taken for aligned crops; None where they were not embedded here.
+    pictures_sha256
+        Of all pictures; empty where they were not read.
+    """
+
+    pairs: VerificationSet
+    acquired: Acquired
+    aligned: bool | None
+    pictures_sha256: str
+
+
 def digests(pairs: VerificationSet) -> list[str]:
     """SHA-256 of every picture, in the order of the set; a picture that cannot be read has none.
 

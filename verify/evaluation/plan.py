@@ -81,6 +81,22 @@ class Plan:
             raise EvaluationError("at least one repeat is needed")
 
 
+def default_strategies(sources: Sequence[Source], *, raw_flip: bool) -> tuple[str, ...]:
+    """All strategies that the decoys allow but the sub- ones.
+
+    Parameters
+    ----------
+    raw_flip
+        Whether embeddings with the mirror image are there beside those without.
+    """
+    able = set(WITHOUT_DECOYS) - (set() if raw_flip else {RAW_FLIP})
+    if sources:
+        able |= {Strategy.ADVERSARIAL, Strategy.HYBRID}
+    if any(isinstance(source, DecoyPool) and source.labelled for source in sources):
+        able |= {Strategy.HYBRID_PLUS}
+    return tuple(name for name in STRATEGIES if name in able)
+
+
 def units_of(plan: Plan, sources: Sequence[Source], *, n: int) -> list[Unit]:
     """List the units of work, long ones first.
 

@@ -12,7 +12,7 @@ from templates.distances import Metric
 from tests.verify.evaluation.materials import N, material, pool
 from verify.datasets import DatasetError
 from verify.evaluation import evaluation
-from verify.evaluation.acquisition import Acquired
+from verify.evaluation.acquisition import Acquired, EmbeddedSet
 from verify.evaluation.backends import Backend
 from verify.evaluation.evaluation import Evaluated, evaluate_set, prepare
 from verify.evaluation.measures import measure
@@ -59,7 +59,8 @@ def run(
 
 def document_of(evaluated: Evaluated, plan: Plan = PLAN) -> dict[str, Any]:
     pairs = verification_set()
-    whole = SetResult(pairs, evaluated, (), (), True, "0" * 64, ())
+    acquired = Acquired(np.empty((0, N), np.float32), np.empty(0, np.int64), ())
+    whole = SetResult(EmbeddedSet(pairs, acquired, True, "0" * 64), evaluated, ())
     return document(
         plan, Model(N, {}), [], [whole], options={}, timings=[], groups=[], group_summaries=[]
     )
