@@ -9,20 +9,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from attacks.cast import LEAST_FITTED, Cast, make_cast, without_decoy_people
 from attacks.chosen_enrollment import chosen_enrollment
 from attacks.databases import link_databases
-from attacks.dictionary import dictionary_outcomes
 from attacks.errors import AuditError
-from attacks.hill_climbing import Ask, climb_service
+from attacks.hill_climbing import Ask, climb_service, dictionary_outcomes
 from attacks.learned import FaceCrops, invert, reconstruct
 from attacks.learned.inverter import SECONDS, Inverter
 from attacks.likelihood import find_least_decoy_like, likeliest_guesses
 from attacks.linkage import link
-from attacks.outcomes import GENERATED, POOLED, Outcome, Scheme
+from attacks.outcomes import GENERATED, POOLED, AttackOutcome, Scheme
+from attacks.population import LEAST_FITTED, Population, draw_population, without_decoy_people
 from attacks.renewability import renew
-from attacks.scene import Scene, owners_pool, stage
 from attacks.stored import template_attacks
+from attacks.system import System, enroll_victims, owners_pool
 from models.extraction import Extraction
 from models.pack import ModelPack
 from templates.contract import wire
@@ -49,24 +48,9 @@ a ``probe → answer`` callable with scores, and one with decisions only."""
 class AuditPlan:
     """What is attacked, and how hard.
 
-    Parameters
-    ----------
-    strategy, dims
-        The schemes that are audited, where no contract says them.
-    contract
-        Of the service that is audited; None to calibrate on people who are not attacked.
-    victims, owners
-        How many people are attacked, and make up the pool of real decoys that is compared with.
-    comparison
-        Whether templates with decoys of real people are attacked too.
-    climbed, attempts
-        Victims that are climbed towards over the service, and most attempts on each.
-    training_seconds
-        For each network; None to train no inverter.
-    reconstruction
-        Whether faces are drawn from templates.
-    seed
-        Of all that is random.
+    The contract of a service says its own scheme; without one, each of ``strategy`` and ``dims`` is
+    calibrated on people who are not attacked. ``comparison`` adds templates with decoys of the
+    ``owners``. ``training_seconds`` is for each network; None trains no inverter.
     """
 
     strategy: Strategy = Strategy.ADVERSARIAL
@@ -84,21 +68,9 @@ class AuditPlan:
 
 @dataclass(frozen=True)
 class AuditResult:
-    """What an audit found.
+    """What an audit found: ``comparisons`` names the schemes that are there to compare with."""
 
-    Parameters
-    ----------
-    outcomes
-        Of all attacks on all schemes.
-    schemes
-        What each scheme costs: error rates of its calibration, and the size of a template.
-    comparisons
-        Names of the schemes that are there to compare with.
-    settings
-        What was audited, for the report.
-    """
-
-    outcomes: list[Outcome]
+    outcomes: list[AttackOutcome]
     schemes: list[dict[str, Any]]
     comparisons: list[str]
     settings: dict[str, Any]
@@ -122,7 +94,7 @@ def run_audit(
     faces, identities
         Embedded photos, and the name of the person on each.
     decoys
-        What the service lifts with; None to fit a generator to people who play no other part.
+        What the service lifts with; None to fit a generator to people of no other group.
     aligned
         Whether the photos are aligned crops.
     start_service
@@ -135,49 +107,49 @@ def run_audit(
     AuditError
         There are too few people, or they are in the decoy pool.
     """
-    cast = make_cast(
+    population = draw_population(
         faces.descriptors, identities, victims=plan.victims, owners=plan.owners, seed=plan.seed
     )
-    if len(cast.attacker) < 2 * LEAST_FITTED:
+    if len(population.attacker) < 2 * LEAST_FITTED:
         raise AuditError(
-            f"the attacker has {len(cast.attacker)} faces, a third of the people who are neither "
-            f"victims nor decoy owners, and needs {2 * LEAST_FITTED}: ask for fewer victims and "
-            "decoy owners, or give a larger folder"
+            f"the attacker has {len(population.attacker)} faces, a third of the people who are "
+            f"neither victims nor decoy owners, and needs {2 * LEAST_FITTED}: ask for fewer "
+            "victims and decoy owners, or give a larger folder"
         )
     # Faces that the attacker has beside their own third: one of each person of no other part.
-    known = cast.attacker[:0]
+    known = population.attacker[:0]
     if decoys is None:
-        fitted, cast = without_decoy_people(cast, seed=plan.seed)
+        fitted, population = without_decoy_people(population, seed=plan.seed)
         info = pack.info
         space = embedding_id(embedder_sha256=info.embedder_sha256, preprocessing=info.preprocessing)
         decoys = DecoyGenerator.fit(fitted, made_with=space)
     else:
-        known = cast.owners.enrolled
+        known = population.owners.enrolled
         if isinstance(decoys, DecoyPool):
-            _require_strangers(decoys, cast)
-    schemes = _schemes(plan, decoys, cast)
+            _require_strangers(decoys, population)
+    schemes = _schemes(plan, decoys, population)
     crops = FaceCrops(pack, faces, aligned=aligned) if plan.reconstruction else None
     result = AuditResult(
         [],
         [],
-        [str(each.scheme) for each in schemes if each.pool_of_owners],
-        _settings(plan, cast, decoys, service=start_service is not None),
+        [str(audited.scheme) for audited in schemes if audited.pool_of_owners],
+        _settings(plan, population, decoys, service=start_service is not None),
     )
     progress(0.0)
-    for number, each in enumerate(schemes):
-        scene = stage(
-            cast,
-            each.scheme,
-            each.source,
+    for number, audited in enumerate(schemes):
+        system = enroll_victims(
+            population,
+            audited.scheme,
+            audited.source,
             embedder_sha256=pack.info.embedder_sha256,
             preprocessing=pack.info.preprocessing,
-            pool_of_owners=each.pool_of_owners,
-            contract=each.contract,
+            pool_of_owners=audited.pool_of_owners,
+            contract=audited.contract,
             seed=plan.seed,
         )
-        result.schemes.append({**each.scheme.to_json(), **_operating_point(scene)})
-        own = known[:0] if each.pool_of_owners else known
-        attacks = _attacks(plan, scene, cast, faces, own, crops, start_service)
+        result.schemes.append({**audited.scheme.to_json(), **_operating_point(system)})
+        attacker_faces = known[:0] if audited.pool_of_owners else known
+        attacks = _attacks(plan, system, population, faces, attacker_faces, crops, start_service)
         for done, attack in enumerate(attacks, start=1):
             result.outcomes.extend(attack())
             progress((number + done / len(attacks)) / len(schemes))
@@ -194,7 +166,7 @@ class _AuditedScheme:
     contract: Contract | None
 
 
-def _schemes(plan: AuditPlan, source: DecoySource, cast: Cast) -> list[_AuditedScheme]:
+def _schemes(plan: AuditPlan, source: DecoySource, population: Population) -> list[_AuditedScheme]:
     """The schemes to audit, and those to compare them with."""
     strategy, dims = plan.strategy, plan.dims
     if plan.contract is not None:
@@ -205,14 +177,14 @@ def _schemes(plan: AuditPlan, source: DecoySource, cast: Cast) -> list[_AuditedS
         _AuditedScheme(Scheme(strategy, decoys, m), source, False, plan.contract) for m in dims
     ]
     if plan.comparison and decoys == GENERATED:
-        pool = owners_pool(cast, source.made_with)
+        pool = owners_pool(population, source.made_with)
         schemes += [_AuditedScheme(Scheme(strategy, POOLED, m), pool, True, None) for m in dims]
     return schemes
 
 
-def _require_strangers(pool: DecoyPool, cast: Cast) -> None:
+def _require_strangers(pool: DecoyPool, population: Population) -> None:
     """Refuse a pool that holds photos of the victims: every attack would find them in it."""
-    shown = np.concatenate([cast.victims.enrolled, cast.victims.fresh])
+    shown = np.concatenate([population.victims.enrolled, population.victims.fresh])
     if len(resembling(pool, shown, cosine=SAME_PHOTO)):
         raise AuditError(
             "the decoy pool holds photos of PEOPLE, and an attack would find the victims in it: "
@@ -220,21 +192,23 @@ def _require_strangers(pool: DecoyPool, cast: Cast) -> None:
         )
 
 
-def _operating_point(scene: Scene) -> dict[str, Any]:
+def _operating_point(system: System) -> dict[str, Any]:
     return {
-        "default_level": scene.level.name,
-        "levels": [level.to_json() for level in scene.points.levels],
-        "raw_thresholds": dict(scene.raw_thresholds),
-        "template_bytes": wire.encoded_size(scene.templates.n, scene.templates.m),
+        "default_level": system.level.name,
+        "levels": [level.to_json() for level in system.points.levels],
+        "raw_thresholds": dict(system.raw_thresholds),
+        "template_bytes": wire.encoded_size(system.templates.n, system.templates.m),
     }
 
 
-def _settings(plan: AuditPlan, cast: Cast, decoys: DecoySource, *, service: bool) -> dict[str, Any]:
+def _settings(
+    plan: AuditPlan, population: Population, decoys: DecoySource, *, service: bool
+) -> dict[str, Any]:
     return {
         "victims": plan.victims,
         "decoy_owners": plan.owners,
-        "attacker_faces": len(cast.attacker),
-        "calibration_people": len(set(cast.names)),
+        "attacker_faces": len(population.attacker),
+        "calibration_people": len(set(population.names)),
         "calibration": "of the people" if plan.contract is None else "of the contract",
         "contract_id": None if plan.contract is None else plan.contract.contract_id,
         "decoy_source_id": decoys.source_id,
@@ -248,63 +222,63 @@ def _settings(plan: AuditPlan, cast: Cast, decoys: DecoySource, *, service: bool
 
 def _attacks(
     plan: AuditPlan,
-    scene: Scene,
-    cast: Cast,
+    system: System,
+    population: Population,
     faces: Extraction,
     known: NDArray[np.float32],
     crops: FaceCrops | None,
     start_service: StartService | None,
-) -> list[Callable[[], list[Outcome]]]:
+) -> list[Callable[[], list[AttackOutcome]]]:
     """All attacks on a scheme, in the order of the report."""
     inverters: list[Inverter] = []
-    likeliest = cache(lambda: likeliest_guesses(scene, known))
+    likeliest = cache(lambda: likeliest_guesses(system, known))
     seconds = plan.training_seconds
 
-    def learned() -> list[Outcome]:
+    def learned() -> list[AttackOutcome]:
         if seconds is None:
             return []
-        inverter, outcomes = invert(scene, known, seconds=seconds, seed=plan.seed)
+        inverter, outcomes = invert(system, known, seconds=seconds, seed=plan.seed)
         inverters.append(inverter)
         return outcomes
 
-    def drawn() -> list[Outcome]:
+    def drawn() -> list[AttackOutcome]:
         if crops is None:
             return []
         guesses = dict(likeliest())
         for inverter in inverters:
-            guesses["inverter"] = inverter(scene.templates)
+            guesses["inverter"] = inverter(system.templates)
         return reconstruct(
-            scene,
-            crops.of(cast.rows),
-            faces.descriptors[cast.rows],
-            crops.of(scene.victims.shown),
+            system,
+            crops.of(population.rows),
+            faces.descriptors[population.rows],
+            crops.of(system.victims.shown),
             embed=crops.embed,
             guesses=guesses,
             seconds=SECONDS if seconds is None else seconds,
             seed=plan.seed,
         )
 
-    def climbs() -> list[Outcome]:
+    def climbs() -> list[AttackOutcome]:
         if start_service is None:
             return []
         templates = [
-            wire.encode(template, contract_id=scene.contract.contract_id)
-            for template in scene.templates[: plan.climbed]
+            wire.encode(template, contract_id=system.contract.contract_id)
+            for template in system.templates[: plan.climbed]
         ]
-        with start_service(scene.contract, scene.source, templates) as (scored, deciding):
+        with start_service(system.contract, system.source, templates) as (scored, deciding):
             return climb_service(
-                scene, scored, deciding, most_attempts=plan.attempts, seed=plan.seed
+                system, scored, deciding, most_attempts=plan.attempts, seed=plan.seed
             )
 
     return [
-        lambda: find_least_decoy_like(scene, known, guesses=likeliest()),
-        lambda: template_attacks(scene, photos=cast.albums),
+        lambda: find_least_decoy_like(system, known, guesses=likeliest()),
+        lambda: template_attacks(system, photos=population.albums),
         learned,
         drawn,
-        lambda: link(scene, liftings=3, most_people=LINKED),
-        lambda: link_databases(scene, most_people=LINKED),
-        lambda: renew(scene, photos=cast.albums, guesses=likeliest()),
-        lambda: chosen_enrollment(scene),
-        lambda: dictionary_outcomes(scene),
+        lambda: link(system, liftings=3, most_people=LINKED),
+        lambda: link_databases(system, most_people=LINKED),
+        lambda: renew(system, photos=population.albums, guesses=likeliest()),
+        lambda: chosen_enrollment(system),
+        lambda: dictionary_outcomes(system),
         climbs,
     ]

@@ -1,6 +1,5 @@
 """``veilface audit fairface``: what templates tell about gender, race and age."""
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,23 +10,22 @@ from api.cli.audit_report import Out, Seed, conclude, model_json, share_once_beg
 from api.cli.console import message
 from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, extract
 from api.cli.errors import CommandError, UsageError, require_extra
-from api.cli.files import read_bounded
-from api.cli.inputs import listed_dims, listed_names, named_file
+from api.cli.inputs import listed_dims, listed_names, named_file, read_json
 from api.cli.options import AsJson, takes_settings
 from api.process.preparation import DEFAULT_DIM, acquired_json
 from api.settings import Settings
-from attacks.attribute_outcomes import attribute_outcomes
 from attacks.attributes.attackers import TRAINED
 from attacks.attributes.audit import (
     AttributeAuditPlan,
+    attribute_outcomes,
     default_lifting,
     labelled_faces,
     run_attribute_audit,
 )
 from attacks.attributes.plan import OUR_DIMS, PAPER_DIMS, AttributePlan, schemes_of
-from attacks.cast import LEAST_FITTED
 from attacks.frontier import frontier, verification_accuracy
 from attacks.outcomes import GENERATED, Scheme
+from attacks.population import LEAST_FITTED
 from attacks.report import document
 from templates.space.lifting import Strategy
 from verify.fairface_labels import CLASSES, Label, read_labels
@@ -41,7 +39,6 @@ STRATEGIES = (
 )
 KNN = "knn"
 ATTACKERS = (KNN, *TRAINED)
-_MAX_RESULTS_BYTES = 64 * 2**20
 
 
 def register(app: typer.Typer) -> None:
@@ -234,10 +231,7 @@ def _labels(root: Path, part: str) -> dict[Path, Label]:
 
 
 def _read_results(file: Path) -> Any:
-    try:
-        results = json.loads(read_bounded(file, _MAX_RESULTS_BYTES))
-    except (ValueError, RecursionError):
-        raise CommandError(f"{file.name} is no JSON file") from None
+    results = read_json(file)
     if not isinstance(results, dict) or results.get("format") != "veilface evaluation":
         raise CommandError(f"{file.name} is no results.json of `veilface evaluate`")
     return results

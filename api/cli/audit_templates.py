@@ -18,8 +18,8 @@ from api.process.opening import file_sealer, open_keyring
 from api.process.preparation import DEFAULT_DIM, acquired_json
 from api.settings import Settings
 from attacks.audit import AuditPlan, run_audit
-from attacks.cast import LEAST_FITTED
 from attacks.learned.extra import need
+from attacks.population import LEAST_FITTED
 from attacks.report import document
 from templates.contract.document import Contract
 from templates.space.lifting import Strategy

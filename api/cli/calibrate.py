@@ -162,9 +162,9 @@ def calibrate(
         )
     path = out or settings.resolved_contract_file
     done.contract.save(path, sealer)
-    found = None
+    share_rate = None
     if strategy is not Strategy.RANDOM:
-        found = share_found(
+        share_rate = share_found(
             extraction.descriptors,
             [name_of[path] for path in extraction.paths],
             source,
@@ -173,7 +173,7 @@ def calibrate(
             cosine=done.report.consistency.match_cosine,
             seed=seed,
         )
-    for note in (concealment_note(strategy, dim), likeness_note(found, strategy, dim)):
+    for note in (concealment_note(strategy, dim), likeness_note(share_rate, strategy, dim)):
         if note:
             message(f"note: {note}")
     notice = demo_notice(pack.info.embedder_sha256, n=pack.info.n)
@@ -184,7 +184,7 @@ def calibrate(
                 **notice,
                 "contract": done.contract.public(),
                 "failure_to_acquire": acquired_json(extraction),
-                "found_by_decoy_likelihood": None if found is None else found.to_json(),
+                "found_by_decoy_likelihood": None if share_rate is None else share_rate.to_json(),
                 **_report_json(done.report),
             }
         )
@@ -207,13 +207,13 @@ def concealment_note(strategy: Strategy, m: int) -> str | None:
     )
 
 
-def likeness_note(found: Rate | None, strategy: Strategy, m: int) -> str | None:
+def likeness_note(rate: Rate | None, strategy: Strategy, m: int) -> str | None:
     """Say that the decoys are spread unlike the people, where their statistics give faces away."""
-    if found is None or found.value <= MOST_FOUND:
+    if rate is None or rate.value <= MOST_FOUND:
         return None
     return (
-        f"from {100 * found.value:.0f} % of the templates of these people ({found.errors} of "
-        f"{found.trials}, {strategy}, m = {m}), who has the decoy generator finds the embedding: "
+        f"from {100 * rate.value:.0f} % of the templates of these people ({rate.errors} of "
+        f"{rate.trials}, {strategy}, m = {m}), who has the decoy generator finds the embedding: "
         "the decoys are spread unlike these people. Build the decoys from thousands of other "
         "people's photos of the same kind, then calibrate again: this line says what a change "
         "gains (docs/privacy.md)"

@@ -31,7 +31,7 @@ from verify.evaluation.plan import (
     STRATEGIES,
     TARGETS,
     EvaluationError,
-    Plan,
+    EvaluationPlan,
     default_strategies,
     units_of,
 )
@@ -165,7 +165,7 @@ def evaluate(
     decoy_sources = [facts.source for facts in sources]
     try:
         where = Backend.parse(backend, jobs=jobs or default_jobs())
-        plan = Plan(
+        plan = EvaluationPlan(
             strategies=names or default_strategies(decoy_sources, raw_flip=raw_flip),
             dims=listed(dim, int, "--dim", expected="whole numbers such as 2,4"),
             modes=listed(mode, _mode, "--mode", expected=f"a list of {', '.join(LIFTED_MODES)}"),

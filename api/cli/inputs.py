@@ -1,11 +1,13 @@
 """Lists, files and decoys that bulk commands are given."""
 
 import hashlib
+import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from api.cli.errors import CommandError, UsageError
+from api.cli.files import read_bounded
 from api.process.preparation import require_made_with
 from models.pack import ModelPack
 from templates.contract.canonical import Json
@@ -13,6 +15,7 @@ from templates.decoys import DecoySource, load_source
 from templates.keys.sealing import Sealer
 
 T = TypeVar("T")
+_MAX_JSON_BYTES = 64 * 2**20
 
 
 def listed(text: str, kind: Callable[[str], T], option: str, *, expected: str) -> tuple[T, ...]:
@@ -58,6 +61,14 @@ def listed_dims(text: str, option: str, *, n: int, example: str) -> tuple[int, .
     if wrong:
         raise UsageError(f"{option} takes dimensions from 1 to {n - 1}, not {wrong[0]}")
     return dims
+
+
+def read_json(file: Path) -> Any:
+    """Read a JSON file, such as a report that another command wrote."""
+    try:
+        return json.loads(read_bounded(file, _MAX_JSON_BYTES))
+    except (ValueError, RecursionError):
+        raise CommandError(f"{file.name} is no JSON file") from None
 
 
 def named_file(file: Path | None) -> dict[str, Json] | None:

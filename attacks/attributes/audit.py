@@ -11,15 +11,22 @@ from attacks.attributes.cost import measure_cost
 from attacks.attributes.experiment import run_scheme, work_of
 from attacks.attributes.faces import LabelledFaces, Split, near_duplicates, split
 from attacks.attributes.plan import AttributePlan, prepare
-from attacks.attributes.rows import AttributeRow
-from attacks.cast import LEAST_FITTED
-from attacks.outcomes import Scheme
+from attacks.attributes.rows import AttributeRow, strongest
+from attacks.outcomes import AttackOutcome, Knowledge, Property, Scheme
+from attacks.population import LEAST_FITTED
 from models.extraction import Extraction
 from verify.fairface_labels import CLASSES, Label
 
 PAPER_LIFTING = 10_000
 LIFTING_SHARE = 0.3
 """Of the training faces, where they are too few for the paper's 10,000."""
+
+ATTACK = "attribute-inference"
+_HAS = {
+    Knowledge.ALGORITHM: "One template, how templates are lifted, and labelled faces of other "
+    "people, which it lifts itself to learn from",
+    Knowledge.DECOYS: "The same, and the pool that the decoys were drawn from",
+}
 
 
 def default_lifting(training: int) -> int:
@@ -90,19 +97,7 @@ class AttributeAuditPlan:
 
 @dataclass(frozen=True, eq=False)
 class AttributeAudit:
-    """What an audit found.
-
-    Parameters
-    ----------
-    rows
-        One for each scheme, attribute and attacker.
-    cost
-        Time of the neighbour search, one entry for each dimension.
-    split
-        The faces of each part.
-    duplicates
-        Faces that were not attacked because they resemble a training face.
-    """
+    """What an audit found; ``cost`` has the time of the neighbour search for each dimension."""
 
     rows: list[AttributeRow]
     cost: list[dict[str, Any]]
@@ -158,8 +153,8 @@ def run_attribute_audit(
         attacked_most=plan.attacked,
         seed=plan.seed,
     )
-    bench = prepare(parts, plan=plan.attackers, seed=plan.seed)
-    total = sum(work_of(bench, scheme) for scheme in plan.schemes)
+    setup = prepare(parts, plan=plan.attackers, seed=plan.seed)
+    total = sum(work_of(setup, scheme) for scheme in plan.schemes)
     done = 0
     progress(0.0)
 
@@ -170,10 +165,46 @@ def run_attribute_audit(
 
     rows: list[AttributeRow] = []
     for scheme in plan.schemes:
-        rows += run_scheme(bench, scheme, progress=advance)
+        rows += run_scheme(setup, scheme, progress=advance)
     # One scheme of each dimension: the search takes the same time whatever the decoys.
     timed = {scheme.dim: scheme for scheme in plan.schemes if scheme.dim}.values()
     cost = [
         {**scheme.to_json(), **measure_cost(n=train.n, m=scheme.dim).to_json()} for scheme in timed
     ]
     return AttributeAudit(rows, cost, parts, duplicates)
+
+
+def attribute_outcomes(rows: Sequence[AttributeRow], *, audited: Scheme) -> list[AttackOutcome]:
+    """Report the strongest attacker on each scheme and attribute, by what it knows.
+
+    The strongest is chosen on faces of the attacker's own (see ``attributes.rows.strongest``).
+    Chance is what its very predictions would score dealt out at random: an attacker who knows
+    nothing stays below the majority's share, and would seem to know something.
+
+    Parameters
+    ----------
+    rows
+        Of all schemes.
+    audited
+        The scheme that is judged; the others are reported to compare with.
+    """
+    return [
+        AttackOutcome(
+            attack=ATTACK,
+            variant=f"{attribute} by {row.attacker}",
+            breaks=Property.CONFIDENTIALITY,
+            knowledge=knowledge,
+            assumption=f"{_HAS[knowledge]}; success is the right {attribute}.",
+            scheme=scheme,
+            measured=row.measures.accuracy,
+            chance=row.chance_of_predictions,
+            judged=scheme == audited,
+            details={
+                "majority": row.chance,
+                "balanced_accuracy": row.measures.balanced_accuracy,
+                "leakage": str(row.measures.leakage),
+                "chosen_among": "the attacker's own held-out faces",
+            },
+        )
+        for (scheme, attribute, knowledge), row in strongest(rows).items()
+    ]

@@ -157,13 +157,13 @@ def resembling_rows(
     int64
         Their numbers, ascending.
     """
-    found = np.zeros(len(rows), dtype=np.bool_)
+    resembles = np.zeros(len(rows), dtype=np.bool_)
     for start in range(0, len(rows), _ROWS):
         tile = rows[start : start + _ROWS]
         for other in range(0, len(others), _ROWS):
             cosines = tile @ others[other : other + _ROWS].T
-            found[start : start + _ROWS] |= (cosines >= np.float64(cosine)).any(axis=1)
-    return np.flatnonzero(found).astype(np.int64)
+            resembles[start : start + _ROWS] |= (cosines >= np.float64(cosine)).any(axis=1)
+    return np.flatnonzero(resembles).astype(np.int64)
 
 
 def _require_dimension(descriptors: NDArray[np.float32], pool: DecoyPool) -> None:

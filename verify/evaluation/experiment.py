@@ -13,13 +13,13 @@ from verify.evaluation.acquisition import EmbeddedSet
 from verify.evaluation.attributes import known_attributes, resembling
 from verify.evaluation.backends import Backend
 from verify.evaluation.embedder import Embedder, Progress
-from verify.evaluation.evaluation import evaluate_set, prepare
-from verify.evaluation.group_rows import group_rows
+from verify.evaluation.evaluation import Evaluated, evaluate_set, prepare
+from verify.evaluation.groups import by_group
 from verify.evaluation.labels_file import Labels
 from verify.evaluation.material import Material
-from verify.evaluation.plan import EvaluationError, Plan, units_of
+from verify.evaluation.plan import EvaluationError, EvaluationPlan, units_of
 from verify.evaluation.results import SetResult, SourceFacts, document
-from verify.evaluation.rows import Json
+from verify.evaluation.rows import Json, cell_json, grouped
 from verify.evaluation.timing import timings
 from verify.evaluation.verification_set import VerificationSet
 
@@ -30,7 +30,7 @@ two people of LFW 54 reach it, and some of those are one person under two names.
 
 
 def run_evaluation(
-    plan: Plan,
+    plan: EvaluationPlan,
     embedder: Embedder,
     sets: Sequence[VerificationSet],
     sources: Sequence[SourceFacts],
@@ -175,3 +175,39 @@ def resemblance(material: Material) -> Json:
     first, second = rows[material.first[material.same]], rows[material.second[material.same]]
     cosines = np.einsum("ij,ij->i", first, second, dtype=np.float64)
     return {"cosine": SAME_PERSON, "genuine_below": float(np.mean(cosines < SAME_PERSON))}
+
+
+def group_rows(
+    pairs: VerificationSet, evaluated: Evaluated, labels: Labels, *, seed: int
+) -> tuple[list[Json], list[Json]]:
+    """Count errors by group at the threshold that holds for all, in every row and target.
+
+    Returns
+    -------
+    groups, summaries
+        Entries for each group, and one for all groups of an attribute together.
+    """
+    names = [picture.name for picture in pairs.pictures]
+    groups: list[Json] = []
+    summaries: list[Json] = []
+    for attribute in labels.attributes:
+        column = labels.column(attribute, names)
+        first = [column[place] for place in pairs.first[evaluated.kept].tolist()]
+        second = [column[place] for place in pairs.second[evaluated.kept].tolist()]
+        for (cell, search), runs in grouped(evaluated.runs).items():
+            if search != "exact":
+                continue
+            head = {"dataset": pairs.name, **cell_json(cell), "seed": seed}
+            for place, errors in enumerate(runs[0].measures.at):
+                report = by_group(
+                    [run.similarities for run in runs],
+                    evaluated.material.same,
+                    first,
+                    second,
+                    attribute=attribute,
+                    thresholds=[run.measures.at[place].threshold for run in runs],
+                    target_fmr=errors.target,
+                )
+                groups += [{**head, **entry} for entry in report.json()]
+                summaries.append({**head, **report.summary()})
+    return groups, summaries

@@ -17,7 +17,7 @@ from verify.evaluation.acquisition import EmbeddedSet
 from verify.evaluation.backends import SOFTWARE
 from verify.evaluation.evaluation import Evaluated, Work
 from verify.evaluation.material import Source
-from verify.evaluation.plan import Plan
+from verify.evaluation.plan import EvaluationPlan
 from verify.evaluation.readers import notes
 from verify.evaluation.rows import (
     Json,
@@ -138,7 +138,7 @@ def software() -> Json:
 
 
 def document(
-    plan: Plan,
+    plan: EvaluationPlan,
     model: Model,
     sources: Sequence[SourceFacts],
     sets: Sequence[SetResult],
@@ -155,9 +155,9 @@ def document(
     rows: list[Json] = []
     runs: list[Json] = []
     curves: list[Json] = []
-    for each in sets:
-        evaluated = each.evaluated
-        for (cell, search), found in sorted(
+    for result in sets:
+        evaluated = result.evaluated
+        for (cell, search), cell_runs in sorted(
             grouped(evaluated.runs).items(), key=lambda entry: _order(plan, *entry[0])
         ):
             place = evaluated.source_of[cell]
@@ -166,7 +166,7 @@ def document(
                 row_json(
                     cell,
                     search,
-                    found,
+                    cell_runs,
                     evaluated.facts,
                     seed=plan.seed,
                     n=model.n,
@@ -174,9 +174,9 @@ def document(
                     contract_id=contract_id(model, cell, source),
                 )
             )
-            runs += [run_json(run, each.faces.pairs.name) for run in found]
+            runs += [run_json(run, result.faces.pairs.name) for run in cell_runs]
             if search == "exact":
-                curves.append(curve_json(cell, found, evaluated.facts))
+                curves.append(curve_json(cell, cell_runs, evaluated.facts))
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -188,18 +188,19 @@ def document(
         "decoys": [
             {**source.json(), "file": source.file, "sha256": source.sha256} for source in sources
         ],
-        "datasets": [each.json() for each in sets],
+        "datasets": [result.json() for result in sets],
         "rows": rows,
         "groups": list(groups),
         "group_summaries": list(group_summaries),
         "timings": list(timings),
         "work": [
-            {"dataset": each.faces.pairs.name, **entry}
-            for each in sets
-            for entry in _work(each.evaluated)
+            {"dataset": result.faces.pairs.name, **entry}
+            for result in sets
+            for entry in _work(result.evaluated)
         ],
         "refused": refused_targets(
-            plan.targets, {each.faces.pairs.name: each.evaluated.facts.impostor for each in sets}
+            plan.targets,
+            {result.faces.pairs.name: result.evaluated.facts.impostor for result in sets},
         ),
         "runs": runs,
         "curves": curves,
@@ -245,7 +246,7 @@ def contract_id(model: Model, cell: Cell, source: Source | None) -> str | None:
     ).contract_id
 
 
-def _order(plan: Plan, cell: Cell, search: str) -> tuple[Any, ...]:
+def _order(plan: EvaluationPlan, cell: Cell, search: str) -> tuple[Any, ...]:
     """Rows as the plan names them; raw first, stolen tokens after the others."""
     modes = list(Mode)
     plain = cell.strategy.removesuffix("-stolen")

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from api.cli import audit_templates
-from attacks.cast import LEAST_FITTED
 from attacks.learned import extra
+from attacks.population import LEAST_FITTED
 from models.pack import ModelPack
 from templates.decoys import DecoyGenerator
 from templates.decoys.fitting import MIN_DESCRIPTORS
