@@ -17,11 +17,11 @@ from scipy.linalg import svd
 from attacks.decisions import decide
 from attacks.errors import AuditError
 from attacks.linkage import secret_rotation
-from attacks.outcomes import Knowledge, Outcome, Property
+from attacks.outcomes import AttackOutcome, Knowledge, Property
 from attacks.recovery import fmr_of
-from attacks.scene import Scene
+from attacks.stored.honest_probes import honest_embedding, points_inside
 from attacks.stored.nearest_neighbour import nearest_points
-from attacks.stored.presentation import honest_embedding, points_inside
+from attacks.system import System
 from templates.keys.randomness import Keystream
 from templates.space.subspace import SubspaceBatch
 from verify.comparisons import through_wire
@@ -39,7 +39,7 @@ _SPANNED = 0.02
 """Singular values below this share of the largest are the rounding of float16, or as unsure."""
 _CLIMB = 30
 
-Floats = NDArray[np.float64]
+Array64 = NDArray[np.float64]
 
 
 class Sides(NamedTuple):
@@ -49,7 +49,7 @@ class Sides(NamedTuple):
     stolen: SubspaceBatch
 
 
-def estimate_from_sets(sides: Sides, *, steps: int = ALIGNMENTS) -> Floats:
+def estimate_from_sets(sides: Sides, *, steps: int = ALIGNMENTS) -> Array64:
     """Estimate R from S sets and their images under R.
 
     Parameters
@@ -91,21 +91,21 @@ def estimate_from_sets(sides: Sides, *, steps: int = ALIGNMENTS) -> Floats:
 class _Stacked(NamedTuple):
     """Templates in float64, their foot points scaled to length 1."""
 
-    feet: Floats
-    bases: Floats
+    feet: Array64
+    bases: Array64
 
     @classmethod
     def of(cls, batch: SubspaceBatch) -> "_Stacked":
         feet = batch.feet.astype(np.float64)
         return cls(_unit(feet), batch.bases.astype(np.float64))
 
-    def project(self, number: int, points: Floats) -> Floats:
+    def project(self, number: int, points: Array64) -> Array64:
         """Orthogonal projection of (K, n) points on the directions of one template."""
         basis = self.bases[number]
         return np.asarray((points @ basis.T) @ basis)
 
 
-def _product_pairs(sent: _Stacked, stolen: _Stacked) -> Floats:
+def _product_pairs(sent: _Stacked, stolen: _Stacked) -> Array64:
     """Σ y xᵀ over pairs y = R x of products of projections of foot points, (n, n).
 
     Products of two projections are taken only where those of one are too few: they are shorter,
@@ -118,21 +118,21 @@ def _product_pairs(sent: _Stacked, stolen: _Stacked) -> Floats:
     for _ in range(2):
         if count < 2 or pairs >= _ENOUGH_PAIRS * n:
             break
-        found: tuple[list[Floats], list[Floats]] = [], []
+        products: tuple[list[Array64], list[Array64]] = [], []
         for number in range(count):
             here, there = sent.project(number, points), stolen.project(number, images)
             # A foot point is orthogonal to its own directions, and P P = P: both give no new pair.
             lengths = np.linalg.norm(here, axis=1)
             new = (lengths > _LEAST) & (lengths < 1 - _LEAST)
-            found[0].append(_unit(here[new]))
-            found[1].append(there[new] / lengths[new, None])
-        points, images = np.concatenate(found[0]), np.concatenate(found[1])
+            products[0].append(_unit(here[new]))
+            products[1].append(there[new] / lengths[new, None])
+        points, images = np.concatenate(products[0]), np.concatenate(products[1])
         moment += images.T @ points
         pairs += len(points)
     return np.asarray(moment)
 
 
-def polar_factor(moment: Floats) -> Floats:
+def polar_factor(moment: Array64) -> Array64:
     """Return the orthogonal matrix that is nearest to a square one; of several, any."""
     try:
         left, _values, right = np.linalg.svd(moment)
@@ -143,11 +143,11 @@ def polar_factor(moment: Floats) -> Floats:
     return np.asarray(left @ right)
 
 
-def _unit(rows: Floats) -> Floats:
+def _unit(rows: Array64) -> Array64:
     return np.asarray(rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-300))
 
 
-def best_known_points(stolen: SubspaceBatch, accounts: SubspaceBatch, *, seed: int) -> Floats:
+def best_known_points(stolen: SubspaceBatch, accounts: SubspaceBatch, *, seed: int) -> Array64:
     """Unit point of each stolen template that lies most in the span of the accounts' sets, (V, n).
 
     Where the accounts do not span everything, R is known on their span only. ‖P x‖² is convex, so
@@ -163,7 +163,9 @@ def best_known_points(stolen: SubspaceBatch, accounts: SubspaceBatch, *, seed: i
     return points
 
 
-def chosen_enrollment(scene: Scene, *, accounts: tuple[int, ...] = ACCOUNTS) -> list[Outcome]:
+def chosen_enrollment(
+    system: System, *, accounts: tuple[int, ...] = ACCOUNTS
+) -> list[AttackOutcome]:
     """Steal a tenant's database in which the attacker has accounts that it sent as templates.
 
     Parameters
@@ -173,7 +175,7 @@ def chosen_enrollment(scene: Scene, *, accounts: tuple[int, ...] = ACCOUNTS) -> 
 
     Returns
     -------
-    list of Outcome
+    list of AttackOutcome
         Named ``chosen-enrollment``, one for each number of accounts; ``alignment`` in ``details``
         is tr(R̂ᵀR) / n, 1 where the rotation is known.
 
@@ -182,27 +184,27 @@ def chosen_enrollment(scene: Scene, *, accounts: tuple[int, ...] = ACCOUNTS) -> 
     AuditError
         The attacker has fewer faces than the least number of accounts.
     """
-    kept = [number for number in sorted(set(accounts)) if 1 <= number <= len(scene.attacker)]
-    if not kept:
+    numbers = [number for number in sorted(set(accounts)) if 1 <= number <= len(system.attacker)]
+    if not numbers:
         raise AuditError("an attacker that enrolls templates of its own needs faces to lift")
-    rotation = secret_rotation(scene, "chosen enrollment")
-    sent = scene.lift(scene.attacker[: max(kept)], "templates that the attacker enrolls")
-    held = _as_stored(scene, sent, rotation)
+    rotation = secret_rotation(system, "chosen enrollment")
+    sent = system.lift(system.attacker[: max(numbers)], "templates that the attacker enrolls")
+    enrolled = _as_stored(system, sent, rotation)
     victims = through_wire(
-        scene.templates.rotated(rotation), contract_id=scene.contract.contract_id
+        system.templates.rotated(rotation), contract_id=system.contract.contract_id
     )
     outcomes = []
-    for number in kept:
-        mine = Sides(sent[:number], held[:number])
-        estimate = estimate_from_sets(mine)
-        points = best_known_points(victims, mine.stolen, seed=scene.seed) @ estimate
+    for number in numbers:
+        sides = Sides(sent[:number], enrolled[:number])
+        estimate = estimate_from_sets(sides)
+        points = best_known_points(victims, sides.stolen, seed=system.seed) @ estimate
         probes = np.ascontiguousarray(points, dtype=np.float32)
         decided = decide(
-            probes, scene.templates, scene.contract, scene.points, scene.level, paired=True
+            probes, system.templates, system.contract, system.points, system.level, paired=True
         )
         accepted = decided.accepted & honest_embedding(probes)
         outcomes.append(
-            Outcome(
+            AttackOutcome(
                 attack="chosen-enrollment",
                 variant=f"{number} accounts",
                 breaks=Property.IMPERSONATION,
@@ -213,10 +215,10 @@ def chosen_enrollment(scene: Scene, *, accounts: tuple[int, ...] = ACCOUNTS) -> 
                 "templates that it sent and what became of them, and sends a unit point of every "
                 "victim's template, turned back, as an embedding; success is acceptance by "
                 "threshold and cohort test",
-                scheme=scene.scheme,
-                level=scene.level.name,
+                scheme=system.scheme,
+                level=system.level.name,
                 measured=rate(int(np.count_nonzero(accepted)), len(accepted)),
-                chance=fmr_of(scene.level),
+                chance=fmr_of(system.level),
                 details={
                     "accounts": number,
                     "alignment": float(np.einsum("ij,ij->", estimate, rotation) / sent.n),
@@ -227,8 +229,8 @@ def chosen_enrollment(scene: Scene, *, accounts: tuple[int, ...] = ACCOUNTS) -> 
     return outcomes
 
 
-def _as_stored(scene: Scene, sent: SubspaceBatch, rotation: Floats) -> SubspaceBatch:
+def _as_stored(system: System, sent: SubspaceBatch, rotation: Array64) -> SubspaceBatch:
     """Rotate and store templates as the service does: in a fresh basis, and in float16."""
-    with Keystream.seeded("audit", scene.seed, "bases of the service") as stream:
+    with Keystream.seeded("audit", system.seed, "bases of the service") as stream:
         spanned = SubspaceBatch.through(sent.feet, sent.bases, stream=stream)
-    return through_wire(spanned.rotated(rotation), contract_id=scene.contract.contract_id)
+    return through_wire(spanned.rotated(rotation), contract_id=system.contract.contract_id)

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from attacks.errors import AuditError
 from attacks.linkage import linkage_outcome, nearest_similarities, secret_rotation
-from attacks.outcomes import Knowledge, Outcome
-from attacks.scene import Scene
+from attacks.outcomes import AttackOutcome, Knowledge
+from attacks.system import System
 from attacks.unlinkability import unlinkability
 from templates.keys.randomness import Keystream
 from templates.space.subspace import SubspaceBatch
@@ -28,7 +28,7 @@ ALIGNMENTS = 6
 """Steps of the estimate of a rotation; it is settled after some three."""
 _TILE = 64
 
-Floats = NDArray[np.float64]
+Array64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -49,9 +49,9 @@ class Moments:
         How many templates, of which dimension.
     """
 
-    mean: Floats
-    variances: Floats
-    axes: Floats
+    mean: Array64
+    variances: Array64
+    axes: Array64
     power: float
     templates: int
     m: int
@@ -81,7 +81,7 @@ def estimate_rotation(
     descriptors: NDArray[np.floating],
     *,
     steps: int = ALIGNMENTS,
-) -> Floats:
+) -> Array64:
     """Estimate the rotation of a tenant from its database.
 
     Parameters
@@ -124,7 +124,7 @@ def estimate_rotation(
     return np.asarray(stolen.axes @ turn @ lifted.axes.T)
 
 
-def whitened_cosines(left: SubspaceBatch, right: SubspaceBatch, spread: Moments) -> Floats:
+def whitened_cosines(left: SubspaceBatch, right: SubspaceBatch, spread: Moments) -> Array64:
     """Cosines of foot points, less their mean, in units of what decoys vary along each axis."""
     scale = np.sqrt(spread.variances)
     sides = []
@@ -140,7 +140,7 @@ def signature_cosines(
     right: SubspaceBatch,
     left_accounts: SubspaceBatch,
     right_accounts: SubspaceBatch,
-) -> Floats:
+) -> Array64:
     """Cosines of signatures: similarities to the accounts inside each tenant, (T, U).
 
     A signature holds inner products of foot points and spherical similarities, which no rotation
@@ -168,17 +168,17 @@ class _Database:
 
 
 def _steal(
-    scene: Scene,
+    system: System,
     tenant: str,
     people: NDArray[np.float32],
     own: NDArray[np.float32],
     strangers: int,
 ) -> _Database:
-    with Keystream.seeded("audit", scene.seed, "strangers", tenant) as stream:
-        others = client_source(scene.lifter.source).draw(strangers, 1, stream=stream)[:, 0, :]
+    with Keystream.seeded("audit", system.seed, "strangers", tenant) as stream:
+        others = client_source(system.lifter.source).draw(strangers, 1, stream=stream)[:, 0, :]
     members = np.ascontiguousarray(np.concatenate([people, own, others]), dtype=np.float32)
-    lifted = scene.lift(members, f"database of the {tenant} tenant")
-    stolen = lifted.rotated(secret_rotation(scene, tenant, "database"))
+    lifted = system.lift(members, f"database of the {tenant} tenant")
+    stolen = lifted.rotated(secret_rotation(system, tenant, "database"))
     return _Database(
         victims=stolen[: len(people)],
         accounts=stolen[len(people) : len(people) + len(own)],
@@ -187,13 +187,13 @@ def _steal(
 
 
 def link_databases(
-    scene: Scene,
+    system: System,
     *,
     accounts: tuple[int, ...] = ACCOUNTS,
     strangers: int = STRANGERS,
     permutations: int = 500,
     most_people: int = 400,
-) -> list[Outcome]:
+) -> list[AttackOutcome]:
     """Link the victims between two stolen databases, keys unknown.
 
     Parameters
@@ -206,7 +206,7 @@ def link_databases(
 
     Returns
     -------
-    list of Outcome
+    list of AttackOutcome
         Named ``database-linkage``: for each number of accounts, by the estimated rotation
         (whitened foot points, and nearest points) and, where there are accounts, by signatures.
 
@@ -217,15 +217,15 @@ def link_databases(
     """
     if strangers < 1:
         raise AuditError("the moments of a database need strangers: ask for one or more")
-    kept = [number for number in sorted(set(accounts)) if number <= len(scene.attacker)]
-    own = scene.attacker[: max(kept, default=0)]
-    first = _steal(scene, "first", scene.victims.enrolled[:most_people], own, strangers)
-    second = _steal(scene, "second", scene.victims.fresh[:most_people], own, strangers)
-    with Keystream.seeded("audit", scene.seed, "strangers", "attacker") as stream:
-        drawn = client_source(scene.lifter.source).draw(strangers, 1, stream=stream)[:, 0, :]
-    lifted = Moments.of(scene.lift(drawn, "database lifted by the attacker"))
+    numbers = [number for number in sorted(set(accounts)) if number <= len(system.attacker)]
+    own = system.attacker[: max(numbers, default=0)]
+    first = _steal(system, "first", system.victims.enrolled[:most_people], own, strangers)
+    second = _steal(system, "second", system.victims.fresh[:most_people], own, strangers)
+    with Keystream.seeded("audit", system.seed, "strangers", "attacker") as stream:
+        drawn = client_source(system.lifter.source).draw(strangers, 1, stream=stream)[:, 0, :]
+    lifted = Moments.of(system.lift(drawn, "database lifted by the attacker"))
     outcomes = []
-    for number in kept:
+    for number in numbers:
         left, right = (
             side.victims.rotated(
                 estimate_rotation(side.moments, lifted, side.accounts.feet[:number], own[:number]).T
@@ -242,8 +242,8 @@ def link_databases(
             )
         outcomes += [
             linkage_outcome(
-                scene,
-                unlinkability(score[None], permutations=permutations, seed=scene.seed),
+                system,
+                unlinkability(score[None], permutations=permutations, seed=system.seed),
                 attack="database-linkage",
                 variant=f"{number} accounts, {name}",
                 knowledge=Knowledge.TEMPLATES,

@@ -69,16 +69,16 @@ def verification_accuracy(results: Row, schemes: Iterable[Scheme]) -> Accuracies
     try:
         name = datasets_of(results)[0]
         raw = raw_row(results["rows"], name)
-        mine = [
+        rows = [
             row
             for row in results["rows"]
             if row["dataset"] == name
             and row["mode"] == MODE
             and row.get("accuracy_mean") is not None
         ]
-        metric = preferred_metric(mine)
-        found = {
-            Scheme.of(row): float(row["accuracy_mean"]) for row in mine if row["metric"] == metric
+        metric = preferred_metric(rows)
+        accuracies = {
+            Scheme.of(row): float(row["accuracy_mean"]) for row in rows if row["metric"] == metric
         }
         raw_accuracy = None if raw is None else float(raw["accuracy_mean"])
     except (KeyError, TypeError, ValueError, IndexError) as error:
@@ -86,7 +86,7 @@ def verification_accuracy(results: Row, schemes: Iterable[Scheme]) -> Accuracies
             f"the results of the evaluation lack what is needed ({type(error).__name__}): give the "
             "results.json of `veilface evaluate`"
         ) from None
-    common = {scheme: found[scheme] for scheme in schemes if scheme in found}
+    common = {scheme: accuracies[scheme] for scheme in schemes if scheme in accuracies}
     if not common or raw_accuracy is None:
         raise AuditError(
             "the evaluation and the audit have no scheme in common, or the evaluation has no raw "
@@ -120,14 +120,14 @@ def frontier(results: Row, rows: Sequence[Row], *, most_lost: float) -> dict[str
         No scheme is in both.
     """
     leaks = _strongest(rows)
-    found = verification_accuracy(results, leaks)
-    points = [Point(scheme, value, leaks[scheme]) for scheme, value in found.of.items()]
-    least = found.raw - most_lost
+    accuracies = verification_accuracy(results, leaks)
+    points = [Point(scheme, value, leaks[scheme]) for scheme, value in accuracies.of.items()]
+    least = accuracies.raw - most_lost
     able = [
         point for point in points if point.accuracy >= least and point.scheme.decoys == GENERATED
     ]
     chosen = _recommended(able)
-    said = f"{found.dataset}: raw descriptors reach {100 * found.raw:.2f} %. " + (
+    said = f"{accuracies.dataset}: raw descriptors reach {100 * accuracies.raw:.2f} %. " + (
         f"Recommended: {chosen.scheme}, the least leakage among those that lose at most "
         f"{100 * most_lost:g} points, or as little within its interval and more accurate."
         if chosen
@@ -138,10 +138,10 @@ def frontier(results: Row, rows: Sequence[Row], *, most_lost: float) -> dict[str
         "learnt from a template."
     )
     return {
-        "dataset": found.dataset,
+        "dataset": accuracies.dataset,
         "mode": MODE,
-        "metric": found.metric,
-        "raw_accuracy": found.raw,
+        "metric": accuracies.metric,
+        "raw_accuracy": accuracies.raw,
         "most_lost": most_lost,
         "statement": said,
         "points": [
@@ -165,16 +165,16 @@ def frontier(results: Row, rows: Sequence[Row], *, most_lost: float) -> dict[str
 
 
 def _strongest(rows: Sequence[Row]) -> dict[Scheme, dict[str, Row]]:
-    found: dict[Scheme, dict[str, Row]] = {}
+    strongest: dict[Scheme, dict[str, Row]] = {}
     for row in rows:
         if row["knowledge"] not in (Knowledge.TEMPLATE, Knowledge.ALGORITHM):
             continue
         scheme = Scheme.of(row)
-        best = found.setdefault(scheme, {})
+        best = strongest.setdefault(scheme, {})
         now = best.get(row["attribute"])
         if now is None or row["held_out_strength"] > now["held_out_strength"]:
             best[row["attribute"]] = row
-    return found
+    return strongest
 
 
 def _far(row: Row) -> float:

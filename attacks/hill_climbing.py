@@ -1,11 +1,11 @@
 """Getting accepted by asking the service again and again, with its scores or its decisions only.
 
-Every climber starts from a rehearsal (``attacks.rehearsal``), so that every answer counts. No
+Every climber starts from a prior (``attacks.prior``), so that every answer counts. No
 other template than the one that is asked about is used.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from attacks.decisions import decide
 from attacks.errors import AuditError
-from attacks.outcomes import Knowledge, Outcome, Property, Scheme
+from attacks.outcomes import AttackOutcome, Knowledge, Property, Scheme
+from attacks.prior import Array64, Prior, attacker_prior
 from attacks.recovery import fmr_of
-from attacks.rehearsal import Floats, Prior
-from attacks.scene import Scene
+from attacks.system import System
 from templates.contract.document import Level
 from templates.distances import pairwise_distances, similarity
 from templates.space.subspace import SubspaceBatch
@@ -43,7 +43,7 @@ class Climber(StrEnum):
     """How the next probe is chosen."""
 
     DICTIONARY = "dictionary"
-    """Decisions only: faces, in the order in which they open the most rehearsed templates that
+    """Decisions only: faces, in the order in which they open the most own templates that
     none before them opened."""
     GRADIENT = "gradient"
     """Scores: estimates the gradient from random steps along the principal axes of faces."""
@@ -83,7 +83,7 @@ class _Asked:
     def over(self) -> bool:
         return self.accepted_at is not None or self.attempts >= self._most
 
-    def __call__(self, probe: Floats) -> float:
+    def __call__(self, probe: Array64) -> float:
         """Score of the direction of a probe."""
         unit = probe / np.linalg.norm(probe)
         answer = self._ask(np.ascontiguousarray(unit, dtype=np.float32))
@@ -107,7 +107,7 @@ def _gradient(prior: Prior, asked: _Asked, rng: np.random.Generator) -> None:
     best = asked(place)
     reach = 0.6
     while not asked.over():
-        steps: list[Floats] = []
+        steps: list[Array64] = []
         gains: list[float] = []
         for _ in range(4):
             step = prior.axes @ rng.normal(size=len(place))
@@ -135,7 +135,7 @@ def _gradient(prior: Prior, asked: _Asked, rng: np.random.Generator) -> None:
 
 
 def _regression(prior: Prior, asked: _Asked, rng: np.random.Generator) -> None:
-    """Gaussian-process regression with the rehearsed kernel, asked where it is highest.
+    """Gaussian-process regression with the prior's kernel, asked where it is highest.
 
     It climbs what the scores add to the mean over all templates, and not the sum: what every
     template is near to is a wolf, which the cohort test rejects.
@@ -190,7 +190,7 @@ def climb(
     victims
         By number of the victim, what answers a unit probe, (n,) float32.
     prior
-        Of ``attacks.rehearsal.rehearse``.
+        Of ``attacks.prior.learn_prior``.
     most_attempts
         Where to give up.
 
@@ -224,7 +224,7 @@ def climbing_outcomes(
     *,
     most_attempts: int,
     lockouts: Sequence[int] = LOCKOUTS,
-) -> list[Outcome]:
+) -> list[AttackOutcome]:
     """Report climbs of one kind, against lockouts that are simulated here.
 
     Parameters
@@ -244,17 +244,17 @@ def climbing_outcomes(
     AuditError
         No climbs, or of two climbers.
     """
-    if len({each.climber for each in climbs}) != 1:
+    if len({attack.climber for attack in climbs}) != 1:
         raise AuditError("an outcome is of the climbs of one climber")
     climber = climbs[0].climber
     scored = climber is not Climber.DICTIONARY
     reached = np.array(
-        [np.inf if each.accepted_at is None else each.accepted_at for each in climbs]
+        [np.inf if attack.accepted_at is None else attack.accepted_at for attack in climbs]
     )
     median = float(np.median(reached))
     fmr = fmr_of(level)
     return [
-        Outcome(
+        AttackOutcome(
             attack="hill-climbing",
             variant=f"{climber}, {'scores' if scored else 'decisions only'}, {limit} attempts",
             breaks=Property.IMPERSONATION,
@@ -274,27 +274,97 @@ def climbing_outcomes(
             details={
                 "limit": limit,
                 "median_attempts": median if np.isfinite(median) else None,
-                "attempts": sum(each.attempts for each in climbs),
+                "attempts": sum(attack.attempts for attack in climbs),
             },
         )
-        for limit in sorted({*(each for each in lockouts if each <= most_attempts), most_attempts})
+        for limit in sorted(
+            {*(attack for attack in lockouts if attack <= most_attempts), most_attempts}
+        )
     ]
 
 
-def in_process(scene: Scene, victims: Sequence[int], *, scores: bool) -> dict[int, Ask]:
-    """Return the scene's own decisions on some victims, as a service would answer."""
+def dictionary_outcomes(
+    system: System, *, most_attempts: int = LOCKOUTS[-1]
+) -> list[AttackOutcome]:
+    """Try the attacker's best faces on every victim's template, seeing decisions only.
+
+    Every service that decides at an FMR is open to this, protected or not; only a lockout bounds
+    it. The order of the faces is the prior's, so it does not depend on the answers, and all victims
+    can be tried at once.
+
+    Parameters
+    ----------
+    most_attempts
+        Faces that are tried on each.
+
+    Returns
+    -------
+    list of AttackOutcome
+        As of :func:`climbing_outcomes`.
+    """
+    faces = attacker_prior(system).faces[:most_attempts].astype(np.float32)
+    accepted = decide(
+        faces, system.templates, system.contract, system.points, system.level
+    ).accepted
+    climbs = [
+        Climb(
+            Climber.DICTIONARY,
+            attempts=int(np.argmax(column)) + 1 if column.any() else len(faces),
+            accepted_at=int(np.argmax(column)) + 1 if column.any() else None,
+        )
+        for column in accepted.T
+    ]
+    return climbing_outcomes(climbs, system.scheme, system.level, most_attempts=len(faces))
+
+
+def climb_service(
+    system: System,
+    scored: Sequence[Ask],
+    deciding: Sequence[Ask],
+    *,
+    most_attempts: int,
+    seed: int,
+) -> list[AttackOutcome]:
+    """Climb towards the first victims, over the interface of a running service.
+
+    Parameters
+    ----------
+    scored, deciding
+        One a victim: what answers a probe with its score, and with the decision only.
+    most_attempts
+        Of a climber on one victim.
+    """
+    prior = attacker_prior(system)
+    outcomes: list[AttackOutcome] = []
+    for climber in Climber:
+        decisions_only = climber is Climber.DICTIONARY
+        asks = deciding if decisions_only else scored
+        most = min(most_attempts, len(prior.faces)) if decisions_only else most_attempts
+        climbs = climb(dict(enumerate(asks)), prior, climber, most_attempts=most, seed=seed)
+        outcomes += [
+            # Decisions alone are judged on all victims, and not on these few.
+            replace(outcome, variant=f"{outcome.variant}, over REST", judged=not decisions_only)
+            for outcome in climbing_outcomes(
+                climbs, system.scheme, system.level, most_attempts=most
+            )
+        ]
+    return outcomes
+
+
+def in_process(system: System, victims: Sequence[int], *, scores: bool) -> dict[int, Ask]:
+    """Return the system's own decisions on some victims, as a service would answer."""
 
     def answers(template: SubspaceBatch) -> Ask:
         def ask(probe: NDArray[np.float32]) -> Answer:
-            points = scene.points
-            yes = decide(probe[None], template, scene.contract, points, scene.level).accepted
+            points = system.points
+            accepted = decide(probe[None], template, system.contract, points, system.level).accepted
             if not scores:
-                return Answer(bool(yes[0, 0]))
+                return Answer(bool(accepted[0, 0]))
             distance = pairwise_distances(
                 probe[None], template, metric=points.metric, steps=points.steps
             )
-            return Answer(bool(yes[0, 0]), float(similarity(distance)[0, 0]))
+            return Answer(bool(accepted[0, 0]), float(similarity(distance)[0, 0]))
 
         return ask
 
-    return {number: answers(scene.templates[number : number + 1]) for number in victims}
+    return {number: answers(system.templates[number : number + 1]) for number in victims}

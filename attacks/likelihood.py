@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attacks.errors import AuditError
-from attacks.outcomes import Knowledge, Outcome
+from attacks.outcomes import AttackOutcome, Knowledge
 from attacks.recovery import recovery_outcome
-from attacks.scene import Scene
 from attacks.stored.face_statistics import FaceStatistics
+from attacks.system import System
 from templates.contract.document import Rate
 from templates.decoys import DecoySource
 from templates.keys.randomness import Keystream
@@ -32,16 +32,16 @@ SHRINKAGE = 1e-3
 MOST_LIFTED = 300
 _TILE = 64
 
-Floats = NDArray[np.float64]
+Array64 = NDArray[np.float64]
 
 
-def precision(rows: NDArray[np.floating], *, shrinkage: float = SHRINKAGE) -> Floats:
+def precision(rows: NDArray[np.floating], *, shrinkage: float = SHRINKAGE) -> Array64:
     """Inverse of the covariance of (K, n) rows, with a share of its largest variance added."""
     variances, axes = np.linalg.eigh(np.cov(np.asarray(rows, dtype=np.float64).T))
     return np.asarray((axes / (variances + shrinkage * variances[-1])) @ axes.T)
 
 
-def face_precision(faces: NDArray[np.floating]) -> Floats:
+def face_precision(faces: NDArray[np.floating]) -> Array64:
     """Inverse of the covariance of an attacker's faces, (A, n).
 
     With as many faces as dimensions, :func:`precision`, as for decoys: what the two are compared
@@ -56,7 +56,7 @@ def face_precision(faces: NDArray[np.floating]) -> Floats:
     return np.asarray(whitening @ whitening)
 
 
-def likeliest_points(templates: SubspaceBatch, form: Floats) -> Floats:
+def likeliest_points(templates: SubspaceBatch, form: Array64) -> Array64:
     """Unit vector x of each template's linear span that maximises xᵀ form x; (T, n) float64.
 
     Of the two signs the one that lies on the side of the foot point.
@@ -122,26 +122,26 @@ def share_found(
         lifted = lift(means, strategy=plain_strategy(strategy), m=m, source=source, stream=stream)
         decoys = nobody.draw(draws, 1, stream=stream)[:, 0, :]
     against = precision(decoys)
-    found = 0
+    most_found = 0
     for form in (against, against - face_precision(faces)):
         guesses = likeliest_points(lifted, form)
         hits = np.einsum("ij,ij->i", guesses, means) >= cosine
-        found = max(found, int(np.count_nonzero(hits)))
-    return rate(found, len(means))
+        most_found = max(most_found, int(np.count_nonzero(hits)))
+    return rate(most_found, len(means))
 
 
 GENERATOR, GENERATOR_AND_FACES = "generator", "generator and faces"
 
 
 def likeliest_guesses(
-    scene: Scene, faces: NDArray[np.float32] | None = None, *, draws: int = DRAWS
-) -> dict[str, Floats]:
+    system: System, faces: NDArray[np.float32] | None = None, *, draws: int = DRAWS
+) -> dict[str, Array64]:
     """Guess the victims' descriptors from the decoys' statistics, and from faces too.
 
     Parameters
     ----------
     faces : (A, n) float32
-        Faces that the attacker has beside the scene's.
+        Faces that the attacker has beside the system's.
     draws
         Decoys that the attacker draws. For a pool, of the generator that is fitted to it and given
         to clients.
@@ -157,31 +157,31 @@ def likeliest_guesses(
     AuditError
         There are no more draws than dimensions.
     """
-    if scene.source is None:
+    if system.source is None:
         return {}
-    if draws <= scene.templates.n:
+    if draws <= system.templates.n:
         raise AuditError("a covariance needs more draws than the descriptor has dimensions")
-    with Keystream.seeded("audit", scene.seed, "decoys that the attacker draws") as stream:
-        decoys = client_source(scene.source).draw(draws, 1, stream=stream)[:, 0, :]
+    with Keystream.seeded("audit", system.seed, "decoys that the attacker draws") as stream:
+        decoys = client_source(system.source).draw(draws, 1, stream=stream)[:, 0, :]
     against = precision(decoys)
     forms = {
         GENERATOR: against,
-        GENERATOR_AND_FACES: against - face_precision(_known(scene, faces)),
+        GENERATOR_AND_FACES: against - face_precision(_known(system, faces)),
     }
-    return {name: likeliest_points(scene.templates, form) for name, form in forms.items()}
+    return {name: likeliest_points(system.templates, form) for name, form in forms.items()}
 
 
-def _known(scene: Scene, faces: NDArray[np.float32] | None) -> NDArray[np.float32]:
-    return scene.attacker if faces is None else np.concatenate([scene.attacker, faces])
+def _known(system: System, faces: NDArray[np.float32] | None) -> NDArray[np.float32]:
+    return system.attacker if faces is None else np.concatenate([system.attacker, faces])
 
 
 def find_least_decoy_like(
-    scene: Scene,
+    system: System,
     faces: NDArray[np.float32] | None = None,
     *,
     draws: int = DRAWS,
-    guesses: Mapping[str, Floats] | None = None,
-) -> list[Outcome]:
+    guesses: Mapping[str, Array64] | None = None,
+) -> list[AttackOutcome]:
     """Report the guesses of :func:`likeliest_guesses`, which takes the same parameters.
 
     Parameters
@@ -191,15 +191,15 @@ def find_least_decoy_like(
 
     Returns
     -------
-    list of Outcome
+    list of AttackOutcome
         Named ``decoy-likelihood``, one for each guess.
     """
     if guesses is None:
-        guesses = likeliest_guesses(scene, faces, draws=draws)
-    counts = {GENERATOR: 0, GENERATOR_AND_FACES: len(_known(scene, faces))}
+        guesses = likeliest_guesses(system, faces, draws=draws)
+    counts = {GENERATOR: 0, GENERATOR_AND_FACES: len(_known(system, faces))}
     return [
         recovery_outcome(
-            scene,
+            system,
             guess,
             attack="decoy-likelihood",
             variant=name,

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from attacks.outcomes import Knowledge, Outcome, Property
-from attacks.scene import Scene
+from attacks.outcomes import AttackOutcome, Knowledge, Property
+from attacks.system import System
 from attacks.unlinkability import Unlinkability, unlinkability
 from templates.contract.canonical import Json
 from templates.distances import Metric, pairwise_distances, similarity
@@ -25,17 +25,17 @@ from templates.space.subspace import SubspaceBatch
 LIFTINGS = 4
 """Times that every victim is lifted for both tenants, with other decoys and other keys."""
 
-Floats = NDArray[np.float64]
-Score = Callable[[SubspaceBatch, SubspaceBatch], Floats]
+Array64 = NDArray[np.float64]
+Score = Callable[[SubspaceBatch, SubspaceBatch], Array64]
 
 
-def nearest_similarities(left: SubspaceBatch, right: SubspaceBatch) -> Floats:
+def nearest_similarities(left: SubspaceBatch, right: SubspaceBatch) -> Array64:
     """Spherical subspace-to-subspace similarities, (T, U): what a service would match with."""
     distances = pairwise_distances(left, right, metric=Metric.SPHERICAL)
     return np.asarray(similarity(distances), dtype=np.float64)
 
 
-def foot_cosines(left: SubspaceBatch, right: SubspaceBatch) -> Floats:
+def foot_cosines(left: SubspaceBatch, right: SubspaceBatch) -> Array64:
     """Cosines of the foot points, (T, U)."""
     first, second = (
         batch.feet.astype(np.float64) / np.maximum(batch.foot_norms, 1e-300)[:, None]
@@ -44,7 +44,7 @@ def foot_cosines(left: SubspaceBatch, right: SubspaceBatch) -> Floats:
     return np.asarray(first @ second.T)
 
 
-def foot_lengths(left: SubspaceBatch, right: SubspaceBatch) -> Floats:
+def foot_lengths(left: SubspaceBatch, right: SubspaceBatch) -> Array64:
     """−|‖p‖ − ‖q‖|, (T, U): the only score of two templates that no rotation changes."""
     return -np.abs(left.foot_norms[:, None] - right.foot_norms)
 
@@ -98,14 +98,14 @@ _SETTINGS = (
 )
 
 
-def secret_rotation(scene: Scene, *tenant: str | int) -> Floats:
+def secret_rotation(system: System, *tenant: str | int) -> Array64:
     """Return the rotation of a tenant of the experiment."""
-    with Keystream.seeded("audit", scene.seed, "tenant key", *tenant) as stream:
-        return tenant_rotation(stream.token(KEY_BYTES), scene.templates.n)
+    with Keystream.seeded("audit", system.seed, "tenant key", *tenant) as stream:
+        return tenant_rotation(stream.token(KEY_BYTES), system.templates.n)
 
 
 def linkage_outcome(
-    scene: Scene,
+    system: System,
     measured: Unlinkability,
     *,
     attack: str,
@@ -114,15 +114,15 @@ def linkage_outcome(
     assumption: str,
     judged: bool,
     details: Mapping[str, Json] | None = None,
-) -> Outcome:
+) -> AttackOutcome:
     """Report D_sys, with the mean of its null as chance."""
-    return Outcome(
+    return AttackOutcome(
         attack=attack,
         variant=variant,
         breaks=Property.UNLINKABILITY,
         knowledge=knowledge,
         assumption=assumption,
-        scheme=scene.scheme,
+        scheme=system.scheme,
         measured=measured.d_sys,
         chance=measured.null_mean,
         judged=judged,
@@ -131,16 +131,16 @@ def linkage_outcome(
 
 
 def link(
-    scene: Scene,
+    system: System,
     *,
     liftings: int = LIFTINGS,
     permutations: int = 500,
     most_people: int = 400,
-) -> list[Outcome]:
+) -> list[AttackOutcome]:
     """Link two tenants' templates of the victims, one by one.
 
-    One tenant has enrolled each victim from ``scene.victims.enrolled``, the other from the fresh
-    photo. All pairs of two victims are non-mated.
+    One tenant has enrolled each victim from ``system.victims.enrolled``, the other from the fresh
+    photo. All pairs of two victims are impostor pairs.
 
     Parameters
     ----------
@@ -153,16 +153,16 @@ def link(
 
     Returns
     -------
-    list of Outcome
+    list of AttackOutcome
         A row for each setting and score, named ``linkage``.
     """
-    enrolled = scene.victims.enrolled[:most_people]
-    fresh = scene.victims.fresh[:most_people]
-    scores: dict[tuple[str, str], list[Floats]] = {}
+    enrolled = system.victims.enrolled[:most_people]
+    fresh = system.victims.fresh[:most_people]
+    scores: dict[tuple[str, str], list[Array64]] = {}
     for number in range(liftings):
-        first = scene.lift(enrolled, f"linkage, first tenant {number}")
-        second = scene.lift(fresh, f"linkage, second tenant {number}")
-        keys = secret_rotation(scene, "first", number), secret_rotation(scene, "second", number)
+        first = system.lift(enrolled, f"linkage, first tenant {number}")
+        second = system.lift(fresh, f"linkage, second tenant {number}")
+        keys = secret_rotation(system, "first", number), secret_rotation(system, "second", number)
         hidden = first.rotated(keys[0]), second.rotated(keys[1])
         opened = hidden[0].rotated(keys[0].T), hidden[1].rotated(keys[1].T)
         for setting in _SETTINGS:
@@ -173,9 +173,9 @@ def link(
                 scores.setdefault((setting.name, name), []).append(score(*sides))
     return [
         linkage_outcome(
-            scene,
+            system,
             unlinkability(
-                np.stack(scores[setting.name, name]), permutations=permutations, seed=scene.seed
+                np.stack(scores[setting.name, name]), permutations=permutations, seed=system.seed
             ),
             attack="linkage",
             variant=f"{setting.name}, {name}",

@@ -125,7 +125,7 @@ Measured: TypeAlias = Rate | Estimate
 
 
 @dataclass(frozen=True, kw_only=True)
-class Outcome:
+class AttackOutcome:
     """One attack on one scheme.
 
     Parameters

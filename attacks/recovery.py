@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from attacks.cast import Person
 from attacks.decisions import score
-from attacks.outcomes import Knowledge, Outcome, Property
-from attacks.scene import Scene
+from attacks.outcomes import AttackOutcome, Knowledge, Property
+from attacks.population import Subjects
+from attacks.system import System
 from templates.contract.canonical import Json
 from templates.contract.document import Level, Rate
 from verify.metrics import rate
@@ -43,39 +43,41 @@ class Recovery:
             "cosine_to_truth_5_percent": float(np.quantile(self.to_truth, 0.05)),
             "cosine_to_truth_95_percent": float(np.quantile(self.to_truth, 0.95)),
             "cosine_to_fresh_mean": float(self.to_fresh.mean()),
-            "matched_by_level": {name: each.to_json() for name, each in self.matched.items()},
-            "accepted_when_renewed": {name: each.to_json() for name, each in self.accepted.items()},
+            "matched_by_level": {name: share.to_json() for name, share in self.matched.items()},
+            "accepted_when_renewed": {
+                name: share.to_json() for name, share in self.accepted.items()
+            },
         }
 
 
 def score_guesses(
-    scene: Scene, guesses: NDArray[np.floating], *, people: Person | None = None
+    system: System, guesses: NDArray[np.floating], *, people: Subjects | None = None
 ) -> Recovery:
     """Score one guess a victim.
 
     Parameters
     ----------
     guesses : (V, n) floating
-        In the order of ``scene.victims``; their length does not matter. A zero row is a failure.
+        In the order of ``system.victims``; their length does not matter. A zero row is a failure.
     people
-        Who was attacked instead of ``scene.victims``.
+        Who was attacked instead of ``system.victims``.
     """
-    attacked = people or scene.victims
+    attacked = people or system.victims
     lengths = np.linalg.norm(guesses.astype(np.float64), axis=1, keepdims=True)
     unit = guesses / np.maximum(lengths, np.finfo(np.float64).tiny)
     truth = attacked.enrolled.astype(np.float64)
     fresh = attacked.fresh.astype(np.float64)
     to_fresh = np.einsum("ij,ij->i", unit, fresh)
-    renewed = scene.lift(attacked.fresh, "renewed from the fresh photo")
+    renewed = system.lift(attacked.fresh, "renewed from the fresh photo")
     probes = np.ascontiguousarray(unit, dtype=np.float32)
     matched: dict[str, Rate] = {}
     accepted: dict[str, Rate] = {}
-    scores = score(probes, renewed, scene.contract, scene.points, paired=True)
-    for level in scene.levels:
-        hits = to_fresh >= scene.raw_thresholds[level.name]
+    scores = score(probes, renewed, system.contract, system.points, paired=True)
+    for level in system.levels:
+        hits = to_fresh >= system.raw_thresholds[level.name]
         matched[level.name] = rate(int(np.count_nonzero(hits)), len(hits))
-        yes = scores.at(level).accepted & (lengths[:, 0] > 0)
-        accepted[level.name] = rate(int(np.count_nonzero(yes)), len(yes))
+        opened = scores.at(level).accepted & (lengths[:, 0] > 0)
+        accepted[level.name] = rate(int(np.count_nonzero(opened)), len(opened))
     return Recovery(
         to_truth=np.einsum("ij,ij->i", unit, truth),
         to_fresh=to_fresh,
@@ -90,7 +92,7 @@ def fmr_of(level: Level) -> float:
 
 
 def recovery_outcome(
-    scene: Scene,
+    system: System,
     guesses: NDArray[np.floating],
     *,
     attack: str,
@@ -99,21 +101,21 @@ def recovery_outcome(
     variant: str = "",
     breaks: Property = Property.IRREVERSIBILITY,
     judged: bool = True,
-    people: Person | None = None,
+    people: Subjects | None = None,
     details: Mapping[str, Json] | None = None,
-) -> Outcome:
+) -> AttackOutcome:
     """Report guesses: success is a match with the fresh photo at the default level, raw."""
-    recovery = score_guesses(scene, guesses, people=people)
-    return Outcome(
+    recovery = score_guesses(system, guesses, people=people)
+    return AttackOutcome(
         attack=attack,
         variant=variant,
         breaks=breaks,
         knowledge=knowledge,
         assumption=assumption,
-        scheme=scene.scheme,
-        level=scene.level.name,
-        measured=recovery.matched[scene.level.name],
-        chance=fmr_of(scene.level),
+        scheme=system.scheme,
+        level=system.level.name,
+        measured=recovery.matched[system.level.name],
+        chance=fmr_of(system.level),
         judged=judged,
         details={**recovery.details(), **(details or {})},
     )

@@ -12,21 +12,21 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from attacks.cast import LEAST_ALBUM, Person
 from attacks.decisions import decide
 from attacks.likelihood import likeliest_guesses
 from attacks.linkage import secret_rotation
-from attacks.outcomes import Knowledge, Outcome, Property
+from attacks.outcomes import AttackOutcome, Knowledge, Property
+from attacks.population import LEAST_ALBUM, Subjects
 from attacks.recovery import fmr_of, recovery_outcome
-from attacks.scene import Scene
 from attacks.stored.foot_point import foot_points
-from attacks.stored.intersection import JUDGED_PEOPLE, nearest_common_points
-from attacks.stored.presentation import (
+from attacks.stored.honest_probes import (
     honest_embedding,
     honest_flats,
     honest_lift,
     points_inside,
 )
+from attacks.stored.intersection import JUDGED_PEOPLE, nearest_common_points
+from attacks.system import System
 from templates.contract.document import Calibration
 from templates.keys.rotation import rotate
 from templates.space.subspace import SubspaceBatch
@@ -37,11 +37,11 @@ SAME, NEW = "same photos", "new photos"
 
 
 def renew(
-    scene: Scene,
+    system: System,
     photos: Sequence[NDArray[np.float32]] = (),
     *,
     guesses: Mapping[str, NDArray[np.floating]] | None = None,
-) -> list[Outcome]:
+) -> list[AttackOutcome]:
     """Attack the victims' renewed templates with the old ones.
 
     Parameters
@@ -57,44 +57,48 @@ def renew(
 
     Returns
     -------
-    list of Outcome
+    list of AttackOutcome
         Named ``renewal-replay`` (acceptance of the old foot point, a point of the old template,
         the guesses, and the old template as a lifted probe) and ``renewal-intersection``
         (recovery from the old and the new template, both opened).
     """
-    known = likeliest_guesses(scene) if guesses is None else guesses
-    again = {
-        name: scene.lift(people, f"renewal, {name}")
-        for name, people in ((SAME, scene.victims.enrolled), (NEW, scene.victims.fresh))
+    known = likeliest_guesses(system) if guesses is None else guesses
+    renewed = {
+        name: system.lift(people, f"renewal, {name}")
+        for name, people in ((SAME, system.victims.enrolled), (NEW, system.victims.fresh))
     }
-    outcomes = [each for name, new in again.items() for each in _replays(scene, new, known, name)]
-    outcomes.append(_intersection(scene, scene.templates, again[SAME], SAME))
-    albums = [mine for mine in photos if len(mine) >= LEAST_ALBUM]
+    outcomes = [
+        outcome for name, new in renewed.items() for outcome in _replays(system, new, known, name)
+    ]
+    outcomes.append(_intersection(system, system.templates, renewed[SAME], SAME))
+    albums = [album for album in photos if len(album) >= LEAST_ALBUM]
     if albums:
-        first, second, third = (np.stack([mine[number] for mine in albums]) for number in range(3))
+        first, second, third = (
+            np.stack([album[number] for album in albums]) for number in range(3)
+        )
         mean = first.astype(np.float64) + second
-        people = Person(
+        people = Subjects(
             enrolled=(mean / np.linalg.norm(mean, axis=1, keepdims=True)).astype(np.float32),
             fresh=third,
             photos=np.full(len(albums), 2),
             shown=np.full(len(albums), -1),  # of no folder
         )
-        old, new = scene.lift(first, "before a renewal"), scene.lift(second, "after a renewal")
-        outcomes.append(_intersection(scene, old, new, NEW, people=people))
+        old, new = system.lift(first, "before a renewal"), system.lift(second, "after a renewal")
+        outcomes.append(_intersection(system, old, new, NEW, people=people))
     return outcomes
 
 
 def _intersection(
-    scene: Scene,
+    system: System,
     old: SubspaceBatch,
     new: SubspaceBatch,
     photos: str,
     *,
-    people: Person | None = None,
-) -> Outcome:
+    people: Subjects | None = None,
+) -> AttackOutcome:
     judged = len(old) >= JUDGED_PEOPLE
     return recovery_outcome(
-        scene,
+        system,
         nearest_common_points([old, new]),
         attack="renewal-intersection",
         variant=f"{photos}, same rotation",
@@ -112,22 +116,22 @@ def _intersection(
 
 
 def _replays(
-    scene: Scene, new: SubspaceBatch, guesses: Mapping[str, NDArray[np.floating]], photos: str
-) -> list[Outcome]:
+    system: System, new: SubspaceBatch, guesses: Mapping[str, NDArray[np.floating]], photos: str
+) -> list[AttackOutcome]:
     """Present what the old templates give to the service that holds the new ones.
 
     The service rotates what it is sent, by the old key or by a new one: so a new rotation guards
     nothing where the old one leaked and the attacker can open the old template, and where it did
     not leak, either turns the stored form away from what it was. Guesses need the template opened.
     """
-    old = scene.templates
+    old = system.templates
     points: dict[str, NDArray[np.floating]] = {
         "old foot point": foot_points(old),
-        "a point of the old template": points_inside(old, seed=scene.seed),
+        "a point of the old template": points_inside(old, seed=system.seed),
     }
     likely = {f"likeliest guess, {name}": rows for name, rows in guesses.items()}
-    turn = secret_rotation(scene, "breached")
-    found: list[Outcome] = []
+    turn = secret_rotation(system, "breached")
+    outcomes: list[AttackOutcome] = []
     for leaked in (True, False):
         setting = f"{photos}, old rotation {'leaked' if leaked else 'secret'}"
         for name, rows in (points | likely if leaked else points).items():
@@ -135,18 +139,18 @@ def _replays(
             probes = np.ascontiguousarray(shown, dtype=np.float32)
             passed = honest_embedding(probes)
             variant = f"{setting}, {name}"
-            found += _replay(scene, probes, passed, new, scene.points, variant, leaked=leaked)
-        if scene.lifted is not None and scene.lifted.probe_m <= old.m:
-            flats = honest_flats(old, scene.lifted)
+            outcomes += _replay(system, probes, passed, new, system.points, variant, leaked=leaked)
+        if system.lifted is not None and system.lifted.probe_m <= old.m:
+            flats = honest_flats(old, system.lifted)
             lifts = flats if leaked else flats.rotated(turn)
-            passed = honest_lift(lifts, scene.lifted)
+            passed = honest_lift(lifts, system.lifted)
             variant = f"{setting}, old template as a lifted probe"
-            found += _replay(scene, lifts, passed, new, scene.lifted, variant, leaked=leaked)
-    return found
+            outcomes += _replay(system, lifts, passed, new, system.lifted, variant, leaked=leaked)
+    return outcomes
 
 
 def _replay(
-    scene: Scene,
+    system: System,
     probes: Probes,
     passed: NDArray[np.bool_],
     new: SubspaceBatch,
@@ -154,15 +158,17 @@ def _replay(
     variant: str,
     *,
     leaked: bool,
-) -> list[Outcome]:
+) -> list[AttackOutcome]:
     """Report acceptance; empty where the calibration lacks the service's default level."""
-    level = next((each for each in calibration.levels if each.name == scene.level.name), None)
+    level = next(
+        (candidate for candidate in calibration.levels if candidate.name == system.level.name), None
+    )
     if level is None:
         return []
-    decided = decide(probes, new, scene.contract, calibration, level, paired=True)
+    decided = decide(probes, new, system.contract, calibration, level, paired=True)
     accepted = decided.accepted & passed
     return [
-        Outcome(
+        AttackOutcome(
             attack="renewal-replay",
             variant=variant,
             breaks=Property.RENEWABILITY,
@@ -171,7 +177,7 @@ def _replay(
             f"{'leaked' if leaked else 'secret'}, and the right to send embeddings or templates; "
             "success is acceptance against the renewed template, after the input checks, which a "
             "new rotation does not change",
-            scheme=scene.scheme,
+            scheme=system.scheme,
             level=level.name,
             measured=rate(int(np.count_nonzero(accepted)), len(new)),
             chance=fmr_of(level),

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from attacks.outcomes import Outcome
+from attacks.outcomes import AttackOutcome
 from attacks.verdict import LIMITS, headlines, judge
 
 FORMAT = "veilface audit"
@@ -14,7 +14,7 @@ Document = dict[str, Any]
 def document(
     kind: str,
     *,
-    outcomes: Sequence[Outcome],
+    outcomes: Sequence[AttackOutcome],
     rows: Sequence[Mapping[str, Any]] = (),
     limits: Mapping[str, float],
     comparisons: Sequence[str] = (),
@@ -45,18 +45,19 @@ def document(
         Further parts.
     """
     verdicts = judge(outcomes, limits=limits)
-    audited = [each for each in verdicts if str(each.scheme) not in comparisons]
-    compared = [each for each in verdicts if str(each.scheme) in comparisons]
+    audited = [verdict for verdict in verdicts if str(verdict.scheme) not in comparisons]
+    compared = [verdict for verdict in verdicts if str(verdict.scheme) in comparisons]
     return {
         "format": FORMAT,
         "version": VERSION,
         "kind": kind,
-        "passed": bool(audited) and all(each.passed for each in audited),
+        "passed": bool(audited) and all(verdict.passed for verdict in audited),
         "headlines": headlines(audited),
         "comparison_headlines": headlines(compared),
         "limits": {limit.name: limits.get(limit.name, limit.default) for limit in LIMITS},
         "verdicts": [
-            {**each.to_json(), "comparison": str(each.scheme) in comparisons} for each in verdicts
+            {**verdict.to_json(), "comparison": str(verdict.scheme) in comparisons}
+            for verdict in verdicts
         ],
         "model": dict(model),
         "settings": dict(settings),

@@ -63,8 +63,8 @@ def _verdicts(report: Row) -> Iterable[str]:
         for cell in verdict["cells"]:
             cells.setdefault((cell["property"], cell["knowledge"]), []).append(_verdict_cell(cell))
         lines = [
-            [str(each), *("<br>".join(cells.get((each, known), [MISSING])) for known in Knowledge)]
-            for each in Property
+            [str(prop), *("<br>".join(cells.get((prop, known), [MISSING])) for known in Knowledge)]
+            for prop in Property
         ]
         title = f"### {plain(str(Scheme.of(verdict)))}"
         if verdict["comparison"]:
@@ -106,9 +106,9 @@ def _attributes(rows: Sequence[Row]) -> Iterable[str]:
         "or down, from what the same predictions would score if they were dealt out at random."
     )
     for attribute in dict.fromkeys(str(row["attribute"]) for row in rows):
-        mine = [row for row in rows if row["attribute"] == attribute]
+        of_attribute = [row for row in rows if row["attribute"] == attribute]
         yield f"### {plain(attribute)}"
-        first = mine[0]
+        first = of_attribute[0]
         stated = ", ".join(
             f"{plain(name)} {percent(value)}"
             for name, value in first["baselines"].items()
@@ -138,7 +138,7 @@ def _attributes(rows: Sequence[Row]) -> Iterable[str]:
                     f"({fixed(_null(row['mutual_information_null']), 3)})",
                     plain(row["leakage"]),
                 ]
-                for row in mine
+                for row in of_attribute
             ],
             [True, True, True, False, False, False, False, True],
         )
@@ -198,15 +198,15 @@ def _operating(report: Row) -> Iterable[str]:
         ["scheme", "level", "FMR %", "FNMR %", "template, bytes"],
         [
             [
-                plain(str(Scheme.of(each))),
+                plain(str(Scheme.of(scheme))),
                 plain(level["name"])
-                + (" (default)" if level["name"] == each["default_level"] else ""),
+                + (" (default)" if level["name"] == scheme["default_level"] else ""),
                 interval_cell({**level["fmr"], "value": _share(level["fmr"])}),
                 interval_cell({**level["fnmr"], "value": _share(level["fnmr"])}),
-                count(each["template_bytes"]),
+                count(scheme["template_bytes"]),
             ]
-            for each in schemes
-            for level in each["levels"]
+            for scheme in schemes
+            for level in scheme["levels"]
         ],
         [True, True, False, False, False],
     )
@@ -278,12 +278,12 @@ def _cost(report: Row) -> Iterable[str]:
         ["scheme", "pairs searched", "seconds", "paper's size, minutes"],
         [
             [
-                plain(str(Scheme.of(each))),
-                count(each["pairs"]),
-                fixed(each["seconds"], 2),
-                fixed(each["full_size_seconds"] / 60, 1),
+                plain(str(Scheme.of(cost))),
+                count(cost["pairs"]),
+                fixed(cost["seconds"], 2),
+                fixed(cost["full_size_seconds"] / 60, 1),
             ]
-            for each in costs
+            for cost in costs
         ],
         [True, False, False, False],
     )

@@ -19,7 +19,7 @@ SCORES_PER_BIN = 10
 LEAST_PERMUTATIONS = 200
 _INTERVAL = "bootstrap by person, centred"
 
-Floats = NDArray[np.float64]
+Array64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -29,14 +29,14 @@ class Unlinkability:
     Parameters
     ----------
     d_sys
-        0: mated and non-mated scores are alike; 1: they never meet. The interval resamples people.
+        0: genuine and impostor scores are alike; 1: they never meet. The interval resamples people.
     null_mean, null_95
-        Mean and 95th percentile of D_sys over permutations of who is mated with whom.
+        Mean and 95th percentile of D_sys over permutations of who is paired with whom.
     edges : (bins + 1,) float64
         Bins of equal width over all scores.
     local : (bins,) float64
         D(s): how much a score in the bin speaks for one person rather than two.
-    mated, non_mated
+    genuine, impostor
         Numbers of scores.
     permutations
         Number of them.
@@ -47,10 +47,10 @@ class Unlinkability:
     d_sys: Estimate
     null_mean: float
     null_95: float
-    edges: Floats
-    local: Floats
-    mated: int
-    non_mated: int
+    edges: Array64
+    local: Array64
+    genuine: int
+    impostor: int
     permutations: int
     first_rank: float
 
@@ -65,46 +65,48 @@ class Unlinkability:
             "null_95_percent": self.null_95,
             "permutations": self.permutations,
             "bins": len(self.local),
-            "mated_scores": self.mated,
-            "non_mated_scores": self.non_mated,
+            "mated_scores": self.genuine,
+            "non_mated_scores": self.impostor,
             "identified_at_rank_1": self.first_rank,
             "score_edges": [float(edge) for edge in self.edges],
             "local_d": [float(value) for value in self.local],
         }
 
 
-def local_d(mated: Floats, non_mated: Floats, *, omega: float = 1.0) -> Floats:
-    """D(s) from histograms of mated and non-mated scores on the same bins.
+def local_d(genuine: Array64, impostor: Array64, *, omega: float = 1.0) -> Array64:
+    """D(s) from histograms of genuine and impostor scores on the same bins.
 
     Parameters
     ----------
-    mated, non_mated : (..., B) float64
+    genuine, impostor : (..., B) float64
         Counts or weights; each normalised here.
     omega
-        Prior odds of mated against non-mated.
+        Prior odds of genuine against impostor.
 
     Returns
     -------
     ndarray of float64, shape (..., B)
-        2 ωLR / (1 + ωLR) − 1 where ωLR > 1 and 0 elsewhere; 1 where only mated scores fall.
+        2 ωLR / (1 + ωLR) − 1 where ωLR > 1 and 0 elsewhere; 1 where only genuine scores fall.
 
     References
     ----------
     Gomez-Barrero, Galbally, Rathgeb, Busch, "General framework to evaluate unlinkability in
     biometric template protection systems", IEEE TIFS 2018, eq. 6 and 7.
     """
-    ours = omega * mated / np.maximum(mated.sum(axis=-1, keepdims=True), 1e-300)
-    theirs = non_mated / np.maximum(non_mated.sum(axis=-1, keepdims=True), 1e-300)
+    genuine_share = omega * genuine / np.maximum(genuine.sum(axis=-1, keepdims=True), 1e-300)
+    impostor_share = impostor / np.maximum(impostor.sum(axis=-1, keepdims=True), 1e-300)
     # 2 LR / (1 + LR) − 1 = (a − b) / (a + b) for LR = a / b, which needs no division by b = 0.
-    total = ours + theirs
-    share = np.divide(ours - theirs, total, out=np.zeros_like(total), where=total > 0)
-    return np.asarray(np.maximum(share, 0.0))
+    total = genuine_share + impostor_share
+    difference = np.divide(
+        genuine_share - impostor_share, total, out=np.zeros_like(total), where=total > 0
+    )
+    return np.asarray(np.maximum(difference, 0.0))
 
 
-def global_d(mated: Floats, non_mated: Floats, *, omega: float = 1.0) -> Floats:
-    """D_sys = Σ p(s | mated) D(s) Δs from histograms (..., B); shape (...)."""
-    shares = mated / np.maximum(mated.sum(axis=-1, keepdims=True), 1e-300)
-    return np.asarray((shares * local_d(mated, non_mated, omega=omega)).sum(axis=-1))
+def global_d(genuine: Array64, impostor: Array64, *, omega: float = 1.0) -> Array64:
+    """D_sys = Σ p(s | genuine) D(s) Δs from histograms (..., B); shape (...)."""
+    shares = genuine / np.maximum(genuine.sum(axis=-1, keepdims=True), 1e-300)
+    return np.asarray((shares * local_d(genuine, impostor, omega=omega)).sum(axis=-1))
 
 
 def unlinkability(
@@ -121,9 +123,9 @@ def unlinkability(
     ----------
     scores : (L, V, V) floating
         Of template i in one database with template j in another, in each of L independent
-        liftings of the same V people; i = j is mated.
+        liftings of the same V people; i = j is genuine.
     bins
-        Number of bins; by default one for ten mated scores, 100 at most.
+        Number of bins; by default one for ten genuine scores, 100 at most.
     permutations
         Random assignments of mates, the same in all liftings: rows and columns keep what they
         have in common, which a shuffle of single scores would destroy.
@@ -145,15 +147,15 @@ def unlinkability(
     bin_of = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, count - 1)
     every = np.bincount(bin_of.ravel(), minlength=count).astype(np.float64)
 
-    def histograms(mates: NDArray[np.int64]) -> tuple[Floats, Floats]:
-        mated = np.bincount(bin_of[:, np.arange(people), mates].ravel(), minlength=count)
-        return mated.astype(np.float64), every - mated
+    def histograms(mates: NDArray[np.int64]) -> tuple[Array64, Array64]:
+        genuine = np.bincount(bin_of[:, np.arange(people), mates].ravel(), minlength=count)
+        return genuine.astype(np.float64), every - genuine
 
     own = np.arange(people)
-    mated, non_mated = histograms(own)
+    genuine, impostor = histograms(own)
     shuffles = [histograms(rng.permutation(people)) for _ in range(permutations)]
     null = global_d(np.stack([m for m, _ in shuffles]), np.stack([n for _, n in shuffles]))
-    value = float(global_d(mated, non_mated))
+    value = float(global_d(genuine, impostor))
     spread = _bootstrap(bin_of, count, replicates, rng)
     low, high = np.quantile(spread - spread.mean(), (0.025, 0.975))
     best = values.argmax(axis=2)
@@ -168,9 +170,9 @@ def unlinkability(
         null_mean=float(null.mean()),
         null_95=float(np.quantile(null, 0.95)),
         edges=edges,
-        local=local_d(mated, non_mated),
-        mated=liftings * people,
-        non_mated=liftings * people * (people - 1),
+        local=local_d(genuine, impostor),
+        genuine=liftings * people,
+        impostor=liftings * people * (people - 1),
         permutations=permutations,
         first_rank=float((best == own).mean()),
     )
@@ -178,7 +180,7 @@ def unlinkability(
 
 def _bootstrap(
     bin_of: NDArray[np.int64], count: int, replicates: int, rng: np.random.Generator
-) -> Floats:
+) -> Array64:
     """D_sys of resampled people, (replicates,).
 
     Few scores raise D_sys, and a resample holds fewer different ones, so the replicates lie above
@@ -196,8 +198,8 @@ def _bootstrap(
         weights = np.bincount(drawn, minlength=people).astype(np.float64)
         pairs = weights[:, None] * weights
         pairs[own, own] = 0.0
-        non_mated = sum(
+        impostor = sum(
             np.bincount(each.ravel(), weights=pairs.ravel(), minlength=count) for each in bin_of
         )
-        out[index] = global_d(weights @ mates, np.asarray(non_mated))
+        out[index] = global_d(weights @ mates, np.asarray(impostor))
     return out

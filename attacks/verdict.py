@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
-from attacks.outcomes import Knowledge, Outcome, Property, Scheme
+from attacks.outcomes import AttackOutcome, Knowledge, Property, Scheme
 from templates.contract.canonical import Json
 
 
@@ -122,7 +122,7 @@ class Cell:
         What is compared with the limit, and its interval.
     """
 
-    outcome: Outcome
+    outcome: AttackOutcome
     limit: str
     most: float
     excess: float
@@ -190,7 +190,7 @@ class Verdict:
 
 
 def judge(
-    outcomes: Iterable[Outcome], *, limits: Mapping[str, float] | None = None
+    outcomes: Iterable[AttackOutcome], *, limits: Mapping[str, float] | None = None
 ) -> list[Verdict]:
     """Judge every scheme by the strongest attack on each property with each knowledge.
 
@@ -207,12 +207,12 @@ def judge(
         One a scheme, in the order of their first outcome.
     """
     most = {limit.name: limit.default for limit in LIMITS} | dict(limits or {})
-    found: dict[Scheme, dict[tuple[Property, Knowledge, str], Cell]] = {}
+    by_scheme: dict[Scheme, dict[tuple[Property, Knowledge, str], Cell]] = {}
     for outcome in outcomes:
         if not outcome.judged:
             continue
         cell = cell_of(outcome, most)
-        cells = found.setdefault(outcome.scheme, {})
+        cells = by_scheme.setdefault(outcome.scheme, {})
         key = (outcome.breaks, outcome.knowledge, cell.limit)
         if key not in cells or cell.rank > cells[key].rank:
             cells[key] = cell
@@ -228,11 +228,11 @@ def judge(
                 )
             ),
         )
-        for scheme, cells in found.items()
+        for scheme, cells in by_scheme.items()
     ]
 
 
-def cell_of(outcome: Outcome, most: Mapping[str, float]) -> Cell:
+def cell_of(outcome: AttackOutcome, most: Mapping[str, float]) -> Cell:
     """Compare one outcome with its limit."""
     name = _BY_ATTACK.get(outcome.attack, _BY_PROPERTY[outcome.breaks])
     if outcome.knowledge is Knowledge.KEY:
@@ -245,7 +245,7 @@ def cell_of(outcome: Outcome, most: Mapping[str, float]) -> Cell:
         value, low, high = _distance(outcome.chance, value, low, high)
     elif outcome.breaks is Property.UNLINKABILITY:
         # D_sys below its null is chance, and tells nothing.
-        value, low, high = (max(0.0, each - outcome.chance) for each in (value, low, high))
+        value, low, high = (max(0.0, bound - outcome.chance) for bound in (value, low, high))
     return Cell(outcome, name, most[name], value, low, high)
 
 

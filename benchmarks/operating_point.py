@@ -14,11 +14,11 @@ Example
 import argparse
 from pathlib import Path
 
-from attacks.cast import Cast, make_cast, without_decoy_people
 from attacks.likelihood import find_least_decoy_like
-from attacks.outcomes import GENERATED, POOLED, Outcome, Scheme
-from attacks.scene import owners_pool, stage
+from attacks.outcomes import GENERATED, POOLED, AttackOutcome, Scheme
+from attacks.population import Population, draw_population, without_decoy_people
 from attacks.stored import foot_point_attack, nearest_neighbour_attack
+from attacks.system import enroll_victims, owners_pool
 from models.cache import EmbeddingCache
 from models.extraction import Extractor
 from models.pack import ModelPack
@@ -35,7 +35,9 @@ GRID = (
 )
 
 
-def rows_of(cast: Cast, kind: str, source: DecoySource, pack: ModelPack, seed: int) -> list[str]:
+def rows_of(
+    population: Population, kind: str, source: DecoySource, pack: ModelPack, seed: int
+) -> list[str]:
     """Lines of the table for one source of decoys."""
     lines = []
     pooled = kind.startswith("pool")
@@ -43,8 +45,8 @@ def rows_of(cast: Cast, kind: str, source: DecoySource, pack: ModelPack, seed: i
         if (decoys == POOLED) != pooled or (decoys is None and kind != "FairFace"):
             continue
         for m in dims:
-            scene = stage(
-                cast,
+            system = enroll_victims(
+                population,
                 Scheme(strategy, decoys, m),
                 None if decoys is None else source,
                 embedder_sha256=pack.info.embedder_sha256,
@@ -53,9 +55,9 @@ def rows_of(cast: Cast, kind: str, source: DecoySource, pack: ModelPack, seed: i
                 lifted_probes=False,
                 seed=seed,
             )
-            level = scene.level
-            outcomes = [*foot_point_attack(scene), *nearest_neighbour_attack(scene)]
-            outcomes += find_least_decoy_like(scene)
+            level = system.level
+            outcomes = [*foot_point_attack(system), *nearest_neighbour_attack(system)]
+            outcomes += find_least_decoy_like(system)
             judged = [each for each in outcomes if each.judged]
             best = max(judged, key=lambda each: each.measured.value)
             foot = next(each for each in judged if each.attack == "foot-point")
@@ -69,7 +71,7 @@ def rows_of(cast: Cast, kind: str, source: DecoySource, pack: ModelPack, seed: i
     return lines
 
 
-def shown(outcome: Outcome) -> str:
+def shown(outcome: AttackOutcome) -> str:
     """Success in per cent with its interval."""
     measured = outcome.measured
     return f"{100 * measured.value:.1f} ({100 * measured.ci_low:.1f}-{100 * measured.ci_high:.1f})"
@@ -95,14 +97,16 @@ def main() -> None:
     lfw = Extractor(pack, aligned=True, cache=caches["lfw"]).extract(crops.paths).descriptors
     photos = sorted((args.data / "fairface").glob("*/*.jpg"))
     fairface = Extractor(pack, cache=caches["fair"]).extract(photos).descriptors
-    cast = make_cast(lfw, crops.identities, victims=VICTIMS, owners=OWNERS, seed=args.seed)
-    own, calibrating = without_decoy_people(cast, seed=args.seed)
+    population = draw_population(
+        lfw, crops.identities, victims=VICTIMS, owners=OWNERS, seed=args.seed
+    )
+    own, calibrating = without_decoy_people(population, seed=args.seed)
     print("| strategy | decoys | m | FNMR % at FMR 1e-3 | foot point % | strongest theft % |")
     print("|---|---|---|---|---|---|")
     for kind, source in (
         ("FairFace", DecoyGenerator.fit(fairface)),
         (f"{len(own):,} photos of LFW", DecoyGenerator.fit(own)),
-        (f"pool of {OWNERS} of LFW", owners_pool(cast, None)),
+        (f"pool of {OWNERS} of LFW", owners_pool(population, None)),
     ):
         rows_of(calibrating, kind, source, pack, args.seed)
 

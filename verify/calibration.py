@@ -14,14 +14,14 @@ from templates.errors import ContractError
 from templates.keys.randomness import Keystream
 from templates.space.embedding import unit_descriptors
 from templates.space.subspace import SubspaceBatch
-from verify.calibration_mode import Bench, CalibrationOptions, calibrate_mode
+from verify.calibration_mode import CalibrationOptions, CalibrationRun, calibrate_mode
 from verify.cohort import COHORT_SIZE, client_source, make_cohort, people_like, plain_strategy
 from verify.comparisons import Lifter, Progress, honest_norms
 from verify.consistency import Consistency, photo_consistency
 from verify.raw_pairs import SuspiciousPair, suspicious_pairs
 from verify.strangers import honest_score, make_nobody, strangers_like
 from verify.tenfold import Pair, TenFold, pair_arrays, random_pairs, require_folds
-from verify.trials import Plan, chosen_photos, enrolled_means, plan_trials
+from verify.trials import TrialPlan, chosen_photos, enrolled_means, plan_trials
 
 DEFAULT_LEVEL = "fmr-1e-3"
 
@@ -135,7 +135,7 @@ def calibrate(
     ContractMismatch
         Where ``source`` is not the binding's.
     """
-    chosen_options = options or CalibrationOptions()
+    options = options or CalibrationOptions()
     binding.require_source(source_id=source.source_id)
     unit = unit_descriptors(descriptors)
     if unit.shape != (len(identities), binding.n):
@@ -149,81 +149,89 @@ def calibrate(
             "a calibration needs at least two people, and one with at least two photos"
         )
     data = np.ascontiguousarray(unit[kept], dtype=np.float32)
-    rng = np.random.default_rng(chosen_options.seed)
-    plan = plan_trials(names, photos_per_enrollment=chosen_options.photos_per_enrollment, rng=rng)
-    bench = _lay_out(
+    rng = np.random.default_rng(options.seed)
+    plan = plan_trials(names, photos_per_enrollment=options.photos_per_enrollment, rng=rng)
+    run = _lay_out(
         data,
         plan,
         binding=binding,
         source=source,
-        options=chosen_options,
+        options=options,
         cohort=cohort,
         nobody=nobody,
         attributes=None if attributes is None else [attributes[index] for index in kept],
-        pairs=_protocol_pairs(chosen_options, pairs, kept, plan, rng),
+        pairs=_protocol_pairs(options, pairs, kept, plan, rng),
         facts={
             "dataset": dataset,
             "photos": len(data),
             "people": len(plan.people),
             "excluded_photos": len(identities) - len(data),
-            "photos_per_enrollment": chosen_options.photos_per_enrollment,
-            "protocol": chosen_options.protocol,
-            "seed": chosen_options.seed,
+            "photos_per_enrollment": options.photos_per_enrollment,
+            "protocol": options.protocol,
+            "seed": options.seed,
         },
         progress=progress,
     )
     consistency = photo_consistency(
-        data, plan.person_of, photos=chosen_options.photos_per_enrollment, rng=rng
+        data, plan.person_of, photos=options.photos_per_enrollment, rng=rng
     )
     calibrations: list[Calibration] = []
     unresolved: list[str] = []
     ten_folds: list[TenFold] = []
-    for number, probe_m in enumerate(chosen_options.probe_dims):
-        part = replace(bench, progress=_part_of(progress, number, len(chosen_options.probe_dims)))
+    for number, probe_m in enumerate(options.probe_dims):
+        part = replace(run, progress=_part_of(progress, number, len(options.probe_dims)))
         entry, missing, folds = calibrate_mode(part, probe_m, rng)
         calibrations.append(entry)
         unresolved += missing
         ten_folds += [folds] if folds else []
-    contract = Contract(
-        binding=binding,
-        recorded={
-            **(recorded or {}),
-            "photo_consistency_fmr": consistency.fmr.value,
-            "photo_consistency_refused": consistency.refused.value,
-        },
-        calibrations=tuple(calibrations),
-        default_level=_default_level(calibrations),
-        photo_consistency=consistency.threshold,
-        template_foot_point_norm=honest_norms(bench.templates.foot_norms),
-        template_stranger_score=honest_score(
-            bench.nobody,
-            bench.templates,
-            halves=bench.halves,
-            metric=chosen_options.metric,
-            steps=chosen_options.steps,
-        ),
-        cohort=bench.cohort,
-        nobody=bench.nobody,
-    )
+    contract = _contract(run, binding, calibrations, consistency, recorded or {})
     return Calibrated(
         contract,
         CalibrationReport(
             consistency=consistency,
             unresolved=tuple(unresolved),
             suspicious=tuple(
-                suspicious_pairs(
-                    data, plan.person_of, plan.people, above=chosen_options.suspicious_above
-                )
+                suspicious_pairs(data, plan.person_of, plan.people, above=options.suspicious_above)
             ),
-            suspicious_above=chosen_options.suspicious_above,
+            suspicious_above=options.suspicious_above,
             ten_folds=tuple(ten_folds),
         ),
     )
 
 
+def _contract(
+    run: CalibrationRun,
+    binding: Binding,
+    calibrations: Sequence[Calibration],
+    consistency: Consistency,
+    recorded: Mapping[str, Json],
+) -> Contract:
+    return Contract(
+        binding=binding,
+        recorded={
+            **recorded,
+            "photo_consistency_fmr": consistency.fmr.value,
+            "photo_consistency_refused": consistency.refused.value,
+        },
+        calibrations=tuple(calibrations),
+        default_level=_default_level(calibrations),
+        photo_consistency=consistency.threshold,
+        template_foot_point_norm=honest_norms(run.templates.foot_norms),
+        template_stranger_score=honest_score(
+            run.nobody,
+            run.templates,
+            halves=run.halves,
+            metric=run.options.metric,
+            steps=run.options.steps,
+        ),
+        cohort=run.cohort,
+        nobody=run.nobody,
+    )
+
+
 def _lay_out(
     data: NDArray[np.float32],
-    plan: Plan,
+    plan: TrialPlan,
     *,
     binding: Binding,
     source: DecoySource,
@@ -234,7 +242,7 @@ def _lay_out(
     pairs: tuple[Pair, ...],
     facts: Mapping[str, Json],
     progress: Progress,
-) -> Bench:
+) -> CalibrationRun:
     """Enroll everybody, and draw the cohort and the strangers where none are given."""
     service = Lifter(binding.strategy, source, binding.contract_id)
     generator = client_source(source)
@@ -274,7 +282,7 @@ def _lay_out(
                 steps=options.steps,
                 stream=stream,
             )
-    return Bench(
+    return CalibrationRun(
         descriptors=data,
         plan=plan,
         templates=templates,
@@ -294,7 +302,7 @@ def _protocol_pairs(
     options: CalibrationOptions,
     pairs: Sequence[Pair] | None,
     kept: NDArray[np.int64],
-    plan: Plan,
+    plan: TrialPlan,
     rng: np.random.Generator,
 ) -> tuple[Pair, ...]:
     if options.protocol == "fmr":

@@ -32,7 +32,7 @@ from verify.thresholds import (
     make_level,
     resolved_targets,
 )
-from verify.trials import Plan
+from verify.trials import TrialPlan
 
 Protocol: TypeAlias = Literal["fmr", "ten-fold"]
 
@@ -85,14 +85,14 @@ class CalibrationOptions:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Bench:
+class CalibrationRun:
     """Everything that the calibrations of one run share.
 
     ``halves``: the strangers are of two sources (:func:`verify.strangers.strangers_like`).
     """
 
     descriptors: NDArray[np.float32]
-    plan: Plan
+    plan: TrialPlan
     templates: SubspaceBatch
     cohort: SubspaceBatch
     nobody: Nobody
@@ -106,32 +106,31 @@ class Bench:
 
 
 def calibrate_mode(
-    bench: Bench, probe_m: int, rng: np.random.Generator
+    run: CalibrationRun, probe_m: int, rng: np.random.Generator
 ) -> tuple[Calibration, list[str], TenFold | None]:
     """Calibrate one probe dimension: 0 is p-to-s."""
-    options = bench.options
+    options = run.options
     norms: tuple[float, float] | None = None
     if probe_m == 0:
         impostors, genuine = point_trials(
-            bench.descriptors,
-            bench.plan,
-            bench.templates,
-            bench.cohort,
+            run.descriptors,
+            run.plan,
+            run.templates,
+            run.cohort,
             metric=options.metric,
             steps=options.steps,
             most_cells=options.most_cells,
             rng=rng,
-            progress=bench.progress,
+            progress=run.progress,
         )
-        everything = len(bench.plan.person_of) * (len(bench.plan.people) - 1)
     else:
         with Keystream.seeded("calibration probes", options.seed, probe_m) as stream:
             trials = lifted_trials(
-                bench.descriptors,
-                bench.plan,
-                bench.templates,
-                bench.cohort,
-                bench.client,
+                run.descriptors,
+                run.plan,
+                run.templates,
+                run.cohort,
+                run.client,
                 probe_m=probe_m,
                 metric=options.metric,
                 steps=options.steps,
@@ -139,11 +138,11 @@ def calibrate_mode(
                 impostor_pairs=options.lifted_impostor_pairs,
                 rng=rng,
                 stream=stream,
-                progress=bench.progress,
+                progress=run.progress,
             )
         impostors, genuine = trials.impostors, trials.genuine
         norms = honest_norms(trials.foot_norms)
-        everything = len(bench.plan.person_of) * (len(bench.plan.people) - 1)
+    everything = len(run.plan.person_of) * (len(run.plan.people) - 1)
     tails = JointTails(impostors)
     kept, unresolved = resolved_targets(impostors, options.targets)
     levels = [
@@ -159,12 +158,12 @@ def calibrate_mode(
     ]
     folds = None
     if options.protocol == "ten-fold":
-        folds = _ten_fold(bench, probe_m)
+        folds = _ten_fold(run, probe_m)
         levels.append(_accuracy_level(folds, tails, impostors, genuine, seed=options.seed))
     if not levels:
         raise ContractError("the data resolve no level: " + "; ".join(unresolved))
     facts: dict[str, Json] = {
-        **bench.facts,
+        **run.facts,
         "genuine_trials": len(genuine.people),
         "impostor_trials": impostors.trials,
         "impostor_people_pairs": impostors.person_pairs,
@@ -188,19 +187,17 @@ def calibrate_mode(
     return calibration, [where + sentence for sentence in unresolved], folds
 
 
-def _ten_fold(bench: Bench, probe_m: int) -> TenFold:
+def _ten_fold(run: CalibrationRun, probe_m: int) -> TenFold:
     """Paper's protocol: one photo enrolled, one photo as the probe, raw or lifted."""
-    firsts = np.array([pair.first for pair in bench.pairs], dtype=np.int64)
-    seconds = np.array([pair.second for pair in bench.pairs], dtype=np.int64)
+    firsts = np.array([pair.first for pair in run.pairs], dtype=np.int64)
+    seconds = np.array([pair.second for pair in run.pairs], dtype=np.int64)
     enrolled, numbers = np.unique(firsts, return_inverse=True)
     probing, positions = np.unique(seconds, return_inverse=True)
-    options = bench.options
+    options = run.options
     with Keystream.seeded("ten folds", options.seed, probe_m) as stream:
-        templates = bench.service.lift(
-            bench.descriptors[enrolled], m=bench.templates.m, stream=stream
-        )
-        raw = bench.descriptors[probing]
-        probes = bench.client.lift(raw, m=probe_m, stream=stream) if probe_m else raw
+        templates = run.service.lift(run.descriptors[enrolled], m=run.templates.m, stream=stream)
+        raw = run.descriptors[probing]
+        probes = run.client.lift(raw, m=probe_m, stream=stream) if probe_m else raw
     scores = pair_similarities(
         probes,
         templates,
@@ -209,7 +206,7 @@ def _ten_fold(bench: Bench, probe_m: int) -> TenFold:
         metric=options.metric,
         steps=options.steps,
     )
-    return ten_fold(scores, *pair_arrays(bench.pairs))
+    return ten_fold(scores, *pair_arrays(run.pairs))
 
 
 def _accuracy_level(

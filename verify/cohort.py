@@ -111,10 +111,10 @@ def rounded_cohort(cohort: SubspaceBatch) -> "RoundedSubspaces":
     # Commands that decide nothing shall not wait for the compiler's import.
     from templates.distances.rounded import RoundedSubspaces
 
-    found = _rounded.get(cohort)
-    if found is None:
-        found = _rounded[cohort] = RoundedSubspaces.of(cohort)
-    return found
+    kept = _rounded.get(cohort)
+    if kept is None:
+        kept = _rounded[cohort] = RoundedSubspaces.of(cohort)
+    return kept
 
 
 def cohort_statistics(

@@ -18,7 +18,7 @@ from templates.space.lifting import Strategy, lift
 from templates.space.subspace import SubspaceBatch
 from verify.cohort import Probes, cohort_statistics
 from verify.thresholds import Genuine, Impostors
-from verify.trials import Indices, Plan, impostor_groups
+from verify.trials import Indices, TrialPlan, impostor_groups
 
 WIRE_DTYPE: wire.WireDtype = "float16"
 PROBE_TILE = 256
@@ -78,7 +78,7 @@ def through_wire(batch: SubspaceBatch, *, contract_id: str) -> SubspaceBatch:
 
 def point_trials(
     descriptors: NDArray[np.float32],
-    plan: Plan,
+    plan: TrialPlan,
     templates: SubspaceBatch,
     cohort: SubspaceBatch,
     *,
@@ -126,8 +126,8 @@ def point_trials(
         return np.stack([owners[flat // people], flat % people], axis=1)
 
     def weighted_trials(weights: NDArray[np.float64]) -> float:
-        mine = probes_of * weights
-        return float(mine.sum() * weights.sum() - mine @ weights)
+        probe_weights = probes_of * weights
+        return float(probe_weights.sum() * weights.sum() - probe_weights @ weights)
 
     probing = int(np.count_nonzero(probes_of))
     return Impostors(
@@ -152,7 +152,7 @@ class LiftedTrials:
 
 def lifted_trials(
     descriptors: NDArray[np.float32],
-    plan: Plan,
+    plan: TrialPlan,
     templates: SubspaceBatch,
     cohort: SubspaceBatch,
     lifter: Lifter,
@@ -199,7 +199,9 @@ def lifted_trials(
     pair_people = np.concatenate(met)
     own = owners[: len(genuine_photos)]
     first = np.arange(len(own), dtype=np.int64)
-    mated = pair_similarities(probes, templates, first, own, metric=metric, steps=steps)
+    genuine_similarities = pair_similarities(
+        probes, templates, first, own, metric=metric, steps=steps
+    )
     keys, repeats = np.unique(pair_people, axis=0, return_counts=True)
     unordered = np.unique(np.sort(keys, axis=1), axis=0)
 
@@ -215,8 +217,12 @@ def lifted_trials(
         people_of=lambda flat: pair_people[flat],
         weighted_trials=weighted_trials,
     )
-    mated_z = ((mated - means[: len(own)]) / spreads[: len(own)]).astype(np.float32)
-    return LiftedTrials(impostors, Genuine(mated, mated_z, own), probes.foot_norms)
+    genuine_scores = ((genuine_similarities - means[: len(own)]) / spreads[: len(own)]).astype(
+        np.float32
+    )
+    return LiftedTrials(
+        impostors, Genuine(genuine_similarities, genuine_scores, own), probes.foot_norms
+    )
 
 
 def pair_similarities(

@@ -1,4 +1,15 @@
-"""The labels that FairFace knows, and its ages as spreadsheets have left them."""
+"""FairFace's label files, also as spreadsheets have left them.
+
+Columns are ``file,age,gender,race,service_test``; ``file`` is a path relative to the folder of the
+label file. Spreadsheets turn the ages 3-9 and 10-19 into dates; those are repaired here.
+"""
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+from templates.decoys import Attributes
+from verify.datasets import DatasetError
 
 AGES = (
     "0-2",
@@ -21,6 +32,9 @@ RACES = (
     "White",
     "Indian",
 )
+CLASSES = {"gender": GENDERS, "race": RACES, "age": AGES}
+_NEEDED = ("file", "age", "gender", "race")
+_MAX_BYTES = 64 * 2**20
 # 3-9 read as a date is 3 September or 9 March; 10-19 is 19 October or October (20)19.
 _DATES = {
     "03-sep": "3-9",
@@ -46,3 +60,68 @@ def repaired_age(text: str) -> str | None:
     """
     plain = text.strip()
     return plain if plain in AGES else _DATES.get(plain.lower())
+
+
+@dataclass(frozen=True)
+class Label:
+    """The labels of one photo; ``age`` is one of ``AGES``."""
+
+    age: str
+    gender: str
+    race: str
+
+    @property
+    def attributes(self) -> Attributes:
+        """What lifting may ask for."""
+        return Attributes(gender=self.gender, race=self.race)
+
+
+def label_files(source: Path) -> list[Path]:
+    """Label files of a photo folder: inside it, or beside it."""
+    return [
+        *sorted(source.glob("fairface_label_*.csv")),
+        *sorted(source.resolve().parent.glob("fairface_label_*.csv")),
+    ]
+
+
+def read_labels(file: Path) -> dict[Path, Label]:
+    """Read a label file: labels by the resolved path of the photo.
+
+    Raises
+    ------
+    DatasetError
+        Naming the file, the line, and what was expected.
+    """
+    labels: dict[Path, Label] = {}
+    folder = file.resolve().parent
+    if file.stat().st_size > _MAX_BYTES:
+        raise DatasetError(f"{file.name} has more than {_MAX_BYTES} bytes; is it a label file?")
+    try:
+        with file.open(encoding="utf-8-sig", newline="") as stream:
+            reader = csv.DictReader(stream)
+            missing = [name for name in _NEEDED if name not in (reader.fieldnames or [])]
+            if missing:
+                raise DatasetError(f"{file.name} lacks the columns {', '.join(missing)}")
+            for row in reader:
+                label = _label(row, where=f"{file.name}, line {reader.line_num}")
+                labels[(folder / row["file"].strip()).resolve()] = label
+    except (UnicodeDecodeError, csv.Error):
+        raise DatasetError(f"{file.name} is not a CSV file in UTF-8") from None
+    return labels
+
+
+def _label(row: dict[str, str], *, where: str) -> Label:
+    if any(not row.get(name) for name in _NEEDED):
+        raise DatasetError(f"{where}: a cell is empty")
+    if not row["file"].isprintable():
+        raise DatasetError(f"{where}: the file has a name with characters that are not printable")
+    age = repaired_age(row["age"])
+    if age is None:
+        raise DatasetError(
+            f"{where}: the age is none of {', '.join(AGES)}, and no date that a spreadsheet makes "
+            "of one"
+        )
+    for name, known in (("gender", GENDERS), ("race", RACES)):
+        if row[name] not in known:
+            raise DatasetError(f"{where}: the {name} is none of {', '.join(known)}")
+    return Label(age=age, gender=row["gender"], race=row["race"])

@@ -15,7 +15,7 @@ from scipy.special import ndtri
 
 from templates.contract.document import Rate
 
-FloatArray = NDArray[np.float64]
+Array64 = NDArray[np.float64]
 
 RULE_OF_THREE = 3.0
 """With no error in N independent trials, the 95 % upper bound of the rate is 3 / N."""
@@ -165,21 +165,21 @@ class ErrorCurve:
         Float64 arrays of equal length; thresholds ascend, FMR falls, FNMR rises.
     """
 
-    thresholds: FloatArray
-    fmr: FloatArray
-    fnmr: FloatArray
+    thresholds: Array64
+    fmr: Array64
+    fnmr: Array64
 
 
 def error_curve(genuine: ArrayLike, impostor: ArrayLike) -> ErrorCurve:
     """Count both errors at every observed similarity and above the largest."""
-    mated = np.sort(np.asarray(genuine, dtype=np.float64).ravel())
-    non_mated = np.sort(np.asarray(impostor, dtype=np.float64).ravel())
-    if mated.size == 0 or non_mated.size == 0:
+    genuine_sorted = np.sort(np.asarray(genuine, dtype=np.float64).ravel())
+    impostor_sorted = np.sort(np.asarray(impostor, dtype=np.float64).ravel())
+    if genuine_sorted.size == 0 or impostor_sorted.size == 0:
         raise ValueError("an error curve needs genuine and impostor trials")
-    observed = np.unique(np.concatenate([mated, non_mated]))
+    observed = np.unique(np.concatenate([genuine_sorted, impostor_sorted]))
     thresholds = np.append(observed, np.nextafter(observed[-1], np.inf))
-    fmr = 1.0 - np.searchsorted(non_mated, thresholds, side="left") / non_mated.size
-    fnmr = np.searchsorted(mated, thresholds, side="left") / mated.size
+    fmr = 1.0 - np.searchsorted(impostor_sorted, thresholds, side="left") / impostor_sorted.size
+    fnmr = np.searchsorted(genuine_sorted, thresholds, side="left") / genuine_sorted.size
     return ErrorCurve(thresholds=thresholds, fmr=fmr, fnmr=fnmr)
 
 
@@ -195,7 +195,7 @@ def subject_bootstrap(
     *,
     people: int,
     trials: int,
-    weighted_trials: Callable[[FloatArray], float],
+    weighted_trials: Callable[[Array64], float],
     replicates: int = 1000,
     seed: int = 0,
 ) -> Rate:

@@ -104,7 +104,7 @@ def require_others(
     firsts = np.unique(person, return_index=True)[1]
     if isinstance(source, DecoyGenerator):
         seen = [memory(source.statistics, rows) for rows in (descriptors, descriptors[firsts])]
-        unmixed = any(each.correlation < each.least for each in seen)
+        unmixed = any(trace.correlation < trace.least for trace in seen)
         if unmixed or seen[0].energy < LEAST_ENERGY:
             raise ContractError(
                 "the decoys were made of the photos of these people, or of most of them: " + _REMEDY

@@ -89,7 +89,7 @@ def make_nobody(
     if not isinstance(generator, DecoyGenerator):
         raise ContractError("strangers are lifted with a decoy generator")
     share = size // len(strangers)
-    people = np.concatenate([each.draw(share, 1, stream=stream)[:, 0] for each in strangers])
+    people = np.concatenate([crowd.draw(share, 1, stream=stream)[:, 0] for crowd in strangers])
     means, spreads = cohort_statistics(people, cohort, metric=metric, steps=steps)
     return Nobody(people, means.astype(np.float32), spreads.astype(np.float32), generator)
 

@@ -61,9 +61,9 @@ def best_threshold(similarities: ArrayLike, same: ArrayLike) -> float:
     if scores.size == 0:
         raise ValueError("a threshold needs at least one pair")
     order = np.argsort(-scores, kind="stable")
-    ranked, mated = scores[order], truth[order]
+    ranked, genuine = scores[order], truth[order]
     # right[k]: correct decisions when the k highest are accepted.
-    right = np.concatenate([[0], np.cumsum(np.where(mated, 1, -1))]) + np.count_nonzero(~truth)
+    right = np.concatenate([[0], np.cumsum(np.where(genuine, 1, -1))]) + np.count_nonzero(~truth)
     # A cut inside a run of equal similarities cannot be made by a threshold.
     possible = np.concatenate([[True], ranked[1:] < ranked[:-1], [True]])
     cut = int(np.argmax(np.where(possible, right, -1)))
@@ -86,8 +86,8 @@ def best_grid_threshold(similarities: ArrayLike, same: ArrayLike) -> float:
     if scores.size == 0:
         raise ValueError("a threshold needs at least one pair")
     distances = 2 - 2 * scores
-    mated, non_mated = np.sort(distances[truth]), np.sort(distances[~truth])
-    right = np.searchsorted(mated, GRID) + non_mated.size - np.searchsorted(non_mated, GRID)
+    genuine, impostor = np.sort(distances[truth]), np.sort(distances[~truth])
+    right = np.searchsorted(genuine, GRID) + impostor.size - np.searchsorted(impostor, GRID)
     return float(np.nextafter(1 - GRID[np.argmax(right)] / 2, np.inf))
 
 
@@ -132,9 +132,9 @@ def ten_fold(
         raise ValueError("the protocol needs one similarity, one truth and one fold for each pair")
     accuracies, thresholds = [], []
     for fold in range(FOLDS):
-        held = numbers == fold
-        threshold = search(scores[~held], truth[~held])
-        accuracies.append(float(np.mean((scores[held] >= threshold) == truth[held])))
+        held_out = numbers == fold
+        threshold = search(scores[~held_out], truth[~held_out])
+        accuracies.append(float(np.mean((scores[held_out] >= threshold) == truth[held_out])))
         thresholds.append(threshold)
     return TenFold(accuracies=tuple(accuracies), thresholds=tuple(thresholds))
 

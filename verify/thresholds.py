@@ -24,7 +24,7 @@ EXPECTED_ERRORS = 10.0
 them beyond it the relative standard error of the true rate is about 1/√k, a third for 10."""
 
 Scores = NDArray[np.float32]
-Floats = NDArray[np.float64]
+Array64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -53,7 +53,7 @@ class Impostors:
     people: int
     person_pairs: int
     people_of: Callable[[NDArray[np.int64]], NDArray[np.int64]]
-    weighted_trials: Callable[[Floats], float]
+    weighted_trials: Callable[[Array64], float]
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -12,7 +12,7 @@ GROUP = 50
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Plan:
+class TrialPlan:
     """One enrollment per person, and which photos probe it.
 
     Parameters
@@ -36,7 +36,7 @@ class Plan:
 
 def plan_trials(
     identities: Sequence[str], *, photos_per_enrollment: int, rng: np.random.Generator
-) -> Plan:
+) -> TrialPlan:
     """Split every person's photos into enrollment and probes.
 
     A person with k ≥ 2 photos is enrolled on ``min(photos_per_enrollment, k - 1)`` of them,
@@ -55,7 +55,7 @@ def plan_trials(
         take = min(photos_per_enrollment, max(1, len(photos) - 1))
         enrolled.append(np.sort(shuffled[:take]))
         genuine.append(np.sort(shuffled[take:]))
-    return Plan(
+    return TrialPlan(
         people=tuple(map(str, people)),
         person_of=person_of.astype(np.int64).reshape(-1),
         enrolled=tuple(enrolled),
@@ -63,7 +63,7 @@ def plan_trials(
     )
 
 
-def enrolled_means(descriptors: NDArray[np.float32], plan: Plan) -> NDArray[np.float32]:
+def enrolled_means(descriptors: NDArray[np.float32], plan: TrialPlan) -> NDArray[np.float32]:
     """Average and normalise every person's enrolled photos, (people, n)."""
     means = np.stack(
         [descriptors[photos].mean(axis=0, dtype=np.float64) for photos in plan.enrolled]
@@ -97,7 +97,7 @@ def chosen_photos(
 
 
 def impostor_groups(
-    plan: Plan, probes: int, *, pairs: int, rng: np.random.Generator, size: int = GROUP
+    plan: TrialPlan, probes: int, *, pairs: int, rng: np.random.Generator, size: int = GROUP
 ) -> Iterator[tuple[slice, Indices]]:
     """Split ``probes`` into groups, and draw for each the people it is compared with.
 
@@ -105,7 +105,7 @@ def impostor_groups(
     matrix product; the next group meets others. Together about ``pairs`` comparisons. Those of a
     probe with its own person are among them, and are no impostor trials.
     """
-    each = min(len(plan.people), -(-pairs // probes))
+    people_each = min(len(plan.people), -(-pairs // probes))
     for start in range(0, probes, size):
-        people = np.sort(rng.choice(len(plan.people), size=each, replace=False))
+        people = np.sort(rng.choice(len(plan.people), size=people_each, replace=False))
         yield slice(start, min(start + size, probes)), people.astype(np.int64)

@@ -23,6 +23,7 @@ from attacks.hill_climbing import Answer
 from templates.contract.document import Contract
 from templates.decoys import DecoyGenerator, DecoyPool, DecoySource
 from templates.distances import similarity
+from templates.keys.private_file import replace_public
 from templates.keys.probe_signature import signed_probe
 from templates.keys.sealing import MasterKeyring
 from templates.store import Right, TemplateStore
@@ -73,10 +74,10 @@ def attacked_service(
         elif isinstance(source, DecoyPool):
             source.save(folder / "decoys.veil", file_sealer(keyring))
         quoted = str(folder).replace("\\", "\\\\").replace('"', '\\"')
-        (folder / "veilface.toml").write_text(
-            f'data_dir = "{quoted}"\nmaster_key_file = "{quoted}/master.key"\n{UNLIMITED}',
-            encoding="utf-8",
+        configuration = (
+            f'data_dir = "{quoted}"\nmaster_key_file = "{quoted}/master.key"\n{UNLIMITED}'
         )
+        replace_public(folder / "veilface.toml", configuration.encode())
         with running_service(folder) as client:
             store = TemplateStore(f"sqlite:///{folder / 'veilface.db'}", keyring)
             try:

@@ -1,39 +1,86 @@
 """What ``veilface audit`` writes and shows, and the limits that it takes."""
 
+import functools
+import inspect
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import typer
 from rich.table import Table
 
-from api.cli.console import emit, say, show, table
+from api.cli.console import demo_notice, emit, say, share_done, show, table
+from api.process.preparation import recorded_of
 from attacks.outcomes import Scheme
 from attacks.report import Document
 from attacks.report_tables import markdown
 from attacks.verdict import LIMITS
+from models.pack import ModelPack
 from templates.keys.private_file import make_folder, replace_public
 
 FAILED = 1
 Out = Annotated[Path, typer.Option(help="Folder of the report.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed for everything random.")]
 
-_DEFAULTS = {limit.name: limit.default for limit in LIMITS}
+R = TypeVar("R")
 
 
-def limit_option(name: str) -> Any:
-    """Return the option that sets a limit."""
-    meaning = next(limit.meaning for limit in LIMITS if limit.name == name)
-    return typer.Option(
-        f"--max-{name}", min=0.0, max=1.0, help=f"Most that passes: {meaning}.",
-        rich_help_panel="Limits",
-    )  # fmt: skip
+def takes_limits(*names: str) -> Callable[[Callable[..., R]], Callable[..., R]]:
+    """Give a command a flag ``--max-NAME`` for each named limit.
+
+    The command's parameter ``limits`` receives their values by name.
+    """
+    chosen = {
+        f"max_{limit.name.replace('-', '_')}": limit for limit in LIMITS if limit.name in names
+    }
+
+    def decorate(command: Callable[..., R]) -> Callable[..., R]:
+        @functools.wraps(command)
+        def run(**given: Any) -> R:
+            limits = {limit.name: given.pop(flag) for flag, limit in chosen.items()}
+            return command(limits=limits, **given)
+
+        flags = [
+            inspect.Parameter(
+                flag,
+                inspect.Parameter.KEYWORD_ONLY,
+                default=limit.default,
+                annotation=Annotated[
+                    float,
+                    typer.Option(
+                        min=0.0,
+                        max=1.0,
+                        help=f"Most that passes: {limit.meaning}.",
+                        rich_help_panel="Limits",
+                    ),
+                ],
+            )
+            for flag, limit in chosen.items()
+        ]
+        own = [p for p in inspect.signature(command).parameters.values() if p.name != "limits"]
+        run.__signature__ = inspect.Signature([*own, *flags])  # type: ignore[attr-defined]
+        return run
+
+    return decorate
 
 
-def default_of(name: str) -> float:
-    """Return the default of a limit."""
-    return _DEFAULTS[name]
+@contextmanager
+def share_once_begun(description: str) -> Iterator[Callable[[float], None]]:
+    """Show per cent as :func:`share_done` does, from the first share that is reported.
+
+    An audit may refuse what it was given before it begins: no bar stands above that sentence.
+    """
+    with ExitStack() as stack:
+        shown: list[Callable[[float], None]] = []
+
+        def report(share: float) -> None:
+            if not shown:
+                shown.append(stack.enter_context(share_done(description)))
+            shown[0](share)
+
+        yield report
 
 
 def write_report(
@@ -57,15 +104,21 @@ def write_report(
     return [*files, *write_figures(report, out, evaluation=evaluation)]
 
 
+def model_json(pack: ModelPack) -> dict[str, Any]:
+    """State which model gave the embeddings."""
+    return {**recorded_of(pack), "embedder_sha256": pack.info.embedder_sha256}
+
+
 def conclude(
     report: Document,
     out: Path,
+    pack: ModelPack,
     *,
     as_json: bool,
-    notice: Mapping[str, str],
     evaluation: Mapping[str, Any] | None = None,
 ) -> None:
     """Write the report, say how it ended, and leave with status 1 where a limit is exceeded."""
+    notice = demo_notice(pack.info.embedder_sha256, n=pack.info.n)
     files = write_report(report, out, evaluation=evaluation)
     if as_json:
         emit({**notice, "out": str(out), "files": [path.name for path in files], **report})

@@ -1,47 +1,29 @@
 """``veilface audit templates``: every attack on a template that we know, on people with photos."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-import numpy as np
 import typer
 
-from api.cli.audit_attacks import PARTS, Drawings, attacks_on, operating
-from api.cli.audit_report import Out, Seed, conclude, default_of, limit_option
-from api.cli.console import demo_notice, message, progress
+from api.cli.attacked_service import attacked_service
+from api.cli.audit_report import Out, Seed, conclude, model_json, share_once_begun, takes_limits
+from api.cli.console import message
 from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, extract
-from api.cli.errors import CommandError, UsageError, require_extra
-from api.cli.evaluation_inputs import listed
+from api.cli.errors import UsageError, require_extra
+from api.cli.inputs import listed_dims, load_decoys
 from api.cli.options import AsJson, takes_settings
 from api.process.opening import file_sealer, open_keyring
-from api.process.preparation import (
-    DEFAULT_DIM,
-    acquired_json,
-    made_with,
-    recorded_of,
-    require_made_with,
-)
+from api.process.preparation import DEFAULT_DIM, acquired_json
 from api.settings import Settings
-from attacks.cast import Cast, make_cast, without_decoy_people
+from attacks.audit import AuditPlan, run_audit
 from attacks.learned.extra import need
-from attacks.outcomes import GENERATED, POOLED, Outcome, Scheme
+from attacks.population import LEAST_FITTED
 from attacks.report import document
-from attacks.scene import owners_pool, stage
-from models.pack import ModelPack
 from templates.contract.document import Contract
-from templates.decoys import DecoyGenerator, DecoyPool, DecoySource, load_source
-from templates.keys.sealing import Sealer
 from templates.space.lifting import Strategy
 from verify import labelled_folder
-from verify.evaluation.attributes import resembling
-
-FITTED_FACES = 100
-"""Least that a decoy generator is fitted to: the decoy owners, and half of the attacker's faces."""
-SAME_PHOTO = 0.999
-"""Cosine from which two descriptors are of one photo."""
 
 
 def register(app: typer.Typer) -> None:
@@ -50,6 +32,16 @@ def register(app: typer.Typer) -> None:
 
 
 @takes_settings(*BULK)
+@takes_limits(
+    "foot-point-success",
+    "recovery-success",
+    "linkability",
+    "renewed-success",
+    "false-acceptance",
+    "climbing-success",
+    "success-with-templates",
+    "success-with-key",
+)
 def templates(
     people: Annotated[
         Path,
@@ -62,6 +54,7 @@ def templates(
     ],
     *,
     settings: Settings,
+    limits: Mapping[str, float],
     decoys: Annotated[
         Path | None,
         typer.Option(
@@ -105,7 +98,7 @@ def templates(
     owners: Annotated[
         int,
         typer.Option(
-            min=FITTED_FACES,
+            min=LEAST_FITTED,
             help="People who make up the pool of real decoys that is compared with.",
         ),
     ] = 600,
@@ -146,28 +139,6 @@ def templates(
             "attacked, and try to reconstruct the victims' faces. No picture is written.",
         ),
     ] = False,
-    max_foot_point_success: Annotated[float, limit_option("foot-point-success")] = default_of(
-        "foot-point-success"
-    ),
-    max_recovery_success: Annotated[float, limit_option("recovery-success")] = default_of(
-        "recovery-success"
-    ),
-    max_linkability: Annotated[float, limit_option("linkability")] = default_of("linkability"),
-    max_renewed_success: Annotated[float, limit_option("renewed-success")] = default_of(
-        "renewed-success"
-    ),
-    max_false_acceptance: Annotated[float, limit_option("false-acceptance")] = default_of(
-        "false-acceptance"
-    ),
-    max_climbing_success: Annotated[float, limit_option("climbing-success")] = default_of(
-        "climbing-success"
-    ),
-    max_success_with_templates: Annotated[
-        float, limit_option("success-with-templates")
-    ] = default_of("success-with-templates"),
-    max_success_with_key: Annotated[float, limit_option("success-with-key")] = default_of(
-        "success-with-key"
-    ),
     seed: Seed = 0,
     aligned: Aligned = False,
     flip: Flip = False,
@@ -193,168 +164,57 @@ def templates(
     pack = bulk_pack(settings, flip=flip, why="an audit attacks embeddings of a model pack")
     sealer = file_sealer(open_keyring(settings))
     loaded = None if contract is None else Contract.load(contract, sealer)
-    if contract is not None and (strategy is not None or dim is not None):
+    if loaded is not None and (strategy is not None or dim is not None):
         raise UsageError(
             "a contract says its strategy and dimension: leave out --strategy and --dim"
         )
-    chosen = Strategy.ADVERSARIAL if strategy is None else strategy
-    asked = str(DEFAULT_DIM) if dim is None else dim
-    dims = tuple(dict.fromkeys(listed(asked, int, "--dim", expected="whole numbers such as 16,32")))
-    _require_dims(dims, pack)
-    given = None if fit_decoys else _decoys(decoys or settings.resolved_decoys_file, sealer, pack)
-    if loaded is not None and given is not None:
-        loaded.binding.require_source(source_id=given.source_id, made_with=given.made_with)
-    labelled = labelled_folder(people)
-    name_of = dict(zip(labelled.paths, labelled.identities, strict=True))
-    faces = extract(pack, labelled.paths, aligned=aligned, settings=settings, cache=cache)
-    cast = make_cast(
-        faces.descriptors,
-        [name_of[path] for path in faces.paths],
+    plan = AuditPlan(
+        strategy=strategy or Strategy.ADVERSARIAL,
+        dims=listed_dims(
+            str(DEFAULT_DIM) if dim is None else dim, "--dim", n=pack.info.n, example="16,32"
+        ),
+        contract=loaded,
         victims=victims,
         owners=owners,
+        comparison=comparison,
+        climbed=climbed,
+        attempts=attempts,
+        training_seconds=training_seconds if train else None,
+        reconstruction=reconstruction,
         seed=seed,
     )
-    if len(cast.attacker) < 2 * FITTED_FACES:
-        raise CommandError(
-            f"the attacker has {len(cast.attacker)} faces, a third of the people who are neither "
-            f"victims nor decoy owners, and needs {2 * FITTED_FACES}: ask for fewer with "
-            "--victims and --owners, or give a larger folder"
+    source = None
+    if not fit_decoys:
+        source = load_decoys(decoys or settings.resolved_decoys_file, sealer, pack)
+        if loaded is not None:
+            loaded.binding.require_source(source_id=source.source_id, made_with=source.made_with)
+    labelled = labelled_folder(people)
+    faces = extract(pack, labelled.paths, aligned=aligned, settings=settings, cache=cache)
+    name_of = dict(zip(labelled.paths, labelled.identities, strict=True))
+    with share_once_begun("auditing") as report_share:
+        result = run_audit(
+            plan,
+            faces,
+            [name_of[path] for path in faces.paths],
+            pack=pack,
+            decoys=source,
+            aligned=aligned,
+            start_service=attacked_service if service else None,
+            progress=report_share,
         )
-    if isinstance(given, DecoyPool):
-        _require_strangers(given, cast)
-    # Faces that the attacker has beside their own third: one of each person of no other part.
-    known = cast.attacker[:0]
-    if given is None:
-        fitted, cast = without_decoy_people(cast, seed=seed)
-        source: DecoySource = DecoyGenerator.fit(fitted, made_with=made_with(pack))
-    else:
-        source = given
-        known = cast.owners.enrolled
-    targets = _targets(
-        source, cast, strategy=chosen, dims=dims, contract=loaded, comparison=comparison
-    )
-    drawings = Drawings(pack, faces, aligned=aligned) if reconstruction else None
-    outcomes: list[Outcome] = []
-    schemes: list[dict[str, Any]] = []
-    with progress("auditing", PARTS * len(targets)) as advance:
-        for target in targets:
-            scene = stage(
-                cast,
-                target.scheme,
-                target.source,
-                embedder_sha256=pack.info.embedder_sha256,
-                preprocessing=pack.info.preprocessing,
-                pool_of_owners=target.pool_of_owners,
-                contract=target.contract,
-                seed=seed,
-            )
-            schemes.append({**target.scheme.to_json(), **operating(scene)})
-            for attack in attacks_on(
-                scene,
-                cast,
-                known[:0] if target.pool_of_owners else known,
-                seconds=training_seconds if train else None,
-                attempts=attempts if service else None,
-                climbed=climbed,
-                drawings=drawings,
-                seed=seed,
-            ):
-                outcomes += attack()
-                advance(1)
     report = document(
         "templates",
-        outcomes=outcomes,
-        limits={
-            "foot-point-success": max_foot_point_success,
-            "recovery-success": max_recovery_success,
-            "linkability": max_linkability,
-            "renewed-success": max_renewed_success,
-            "false-acceptance": max_false_acceptance,
-            "climbing-success": max_climbing_success,
-            "success-with-templates": max_success_with_templates,
-            "success-with-key": max_success_with_key,
-        },
-        comparisons=[str(each.scheme) for each in targets if each.pool_of_owners],
-        model={**recorded_of(pack), "embedder_sha256": pack.info.embedder_sha256},
+        outcomes=result.outcomes,
+        limits=limits,
+        comparisons=result.comparisons,
+        model=model_json(pack),
         settings={
             "people": labelled.root.resolve().name,
-            "victims": victims,
-            "decoy_owners": owners,
-            "attacker_faces": len(cast.attacker),
-            "calibration_people": len(set(cast.names)),
-            "calibration": "of the people" if loaded is None else "of the contract",
-            "contract_id": None if loaded is None else loaded.contract_id,
-            "decoy_source_id": source.source_id,
-            "service": service,
-            "attempts": attempts if service else None,
-            "training_seconds": training_seconds if train else None,
-            "reconstruction": reconstruction,
+            **result.settings,
             "fit_decoys": fit_decoys,
             "flip": flip,
-            "seed": seed,
         },
-        schemes=schemes,
+        schemes=result.schemes,
         failure_to_acquire=acquired_json(faces),
     )
-    conclude(
-        report, out, as_json=as_json,
-        notice=demo_notice(pack.info.embedder_sha256, n=pack.info.n),
-    )  # fmt: skip
-
-
-@dataclass(frozen=True, eq=False)
-class _Target:
-    """A scheme with its decoys."""
-
-    scheme: Scheme
-    source: DecoySource
-    pool_of_owners: bool
-    contract: Contract | None
-
-
-def _targets(
-    source: DecoySource,
-    cast: Cast,
-    *,
-    strategy: Strategy,
-    dims: Sequence[int],
-    contract: Contract | None,
-    comparison: bool,
-) -> list[_Target]:
-    """The schemes to audit, and those to compare them with."""
-    if contract is not None:
-        strategy, dims = contract.binding.strategy, (contract.binding.m,)
-    kind = POOLED if isinstance(source, DecoyPool) else GENERATED
-    chosen = kind if strategy is not Strategy.RANDOM else None
-    targets = [_Target(Scheme(strategy, chosen, m), source, False, contract) for m in dims]
-    if comparison and kind == GENERATED and strategy is not Strategy.RANDOM:
-        pool = owners_pool(cast, source.made_with)
-        targets += [_Target(Scheme(strategy, POOLED, m), pool, True, None) for m in dims]
-    return targets
-
-
-def _decoys(file: Path, sealer: Sealer, pack: ModelPack) -> DecoySource:
-    source = load_source(file, sealer)
-    if source.n != pack.info.n:
-        raise CommandError(
-            f"the decoys have {source.n} numbers each, the pack gives {pack.info.n}; build the "
-            "decoys with this pack"
-        )
-    require_made_with(source, pack)
-    return source
-
-
-def _require_strangers(pool: DecoyPool, cast: Cast) -> None:
-    """Refuse a pool that holds photos of the victims: every attack would find them in it."""
-    shown = np.concatenate([cast.victims.enrolled, cast.victims.fresh])
-    if len(resembling(pool, shown, cosine=SAME_PHOTO)):
-        raise CommandError(
-            "the decoy pool holds photos of PEOPLE, and an attack would find the victims in it: "
-            "give people who are not in the pool"
-        )
-
-
-def _require_dims(dims: Sequence[int], pack: ModelPack) -> None:
-    wrong = [m for m in dims if not 1 <= m < pack.info.n]
-    if wrong:
-        raise UsageError(f"--dim takes dimensions from 1 to {pack.info.n - 1}, not {wrong[0]}")
+    conclude(report, out, pack, as_json=as_json)

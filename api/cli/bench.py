@@ -19,7 +19,7 @@ from api.cli.distance_bench import (
     require_device,
 )
 from api.cli.errors import CommandError, UsageError
-from api.cli.evaluation_inputs import listed
+from api.cli.inputs import listed
 from api.cli.options import AsJson
 from templates.distances import DEFAULT_STEPS, Metric
 from templates.errors import TemplateError

@@ -10,6 +10,7 @@ from api.cli.console import demo_notice, emit, message, say, share_done, show, t
 from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, extract
 from api.cli.errors import CommandError, UsageError
 from api.cli.files import read_bounded, read_names
+from api.cli.inputs import load_decoys
 from api.cli.options import AsJson, takes_settings
 from api.process.opening import file_sealer, open_keyring
 from api.process.preparation import (
@@ -19,12 +20,10 @@ from api.process.preparation import (
     acquired_json,
     calibrate_folder,
     default_probe_dims,
-    require_made_with,
 )
 from api.settings import Settings
 from attacks.likelihood import share_found
 from templates.contract.document import Calibration, Contract, Rate
-from templates.decoys import load_source
 from templates.distances import Metric
 from templates.space.lifting import Strategy
 from verify import CalibrationOptions, CalibrationReport, labelled_folder
@@ -139,13 +138,7 @@ def calibrate(
     name_of = dict(zip(labelled.paths, labelled.identities, strict=True))
     keyring = open_keyring(settings)
     sealer = file_sealer(keyring)
-    source = load_source(decoys or settings.resolved_decoys_file, sealer)
-    if source.n != pack.info.n:
-        raise CommandError(
-            f"the decoys have {source.n} numbers each, the pack gives {pack.info.n}; build the "
-            "decoys with this pack"
-        )
-    require_made_with(source, pack)
+    source = load_decoys(decoys or settings.resolved_decoys_file, sealer, pack)
     exclude = frozenset() if exclude_people is None else read_names(exclude_people)
     extraction = extract(pack, labelled.paths, aligned=aligned, settings=settings, cache=cache)
     with share_done("calibrating") as report:
@@ -169,9 +162,9 @@ def calibrate(
         )
     path = out or settings.resolved_contract_file
     done.contract.save(path, sealer)
-    found = None
+    share_rate = None
     if strategy is not Strategy.RANDOM:
-        found = share_found(
+        share_rate = share_found(
             extraction.descriptors,
             [name_of[path] for path in extraction.paths],
             source,
@@ -180,7 +173,7 @@ def calibrate(
             cosine=done.report.consistency.match_cosine,
             seed=seed,
         )
-    for note in (concealment_note(strategy, dim), likeness_note(found, strategy, dim)):
+    for note in (concealment_note(strategy, dim), likeness_note(share_rate, strategy, dim)):
         if note:
             message(f"note: {note}")
     notice = demo_notice(pack.info.embedder_sha256, n=pack.info.n)
@@ -191,7 +184,7 @@ def calibrate(
                 **notice,
                 "contract": done.contract.public(),
                 "failure_to_acquire": acquired_json(extraction),
-                "found_by_decoy_likelihood": None if found is None else found.to_json(),
+                "found_by_decoy_likelihood": None if share_rate is None else share_rate.to_json(),
                 **_report_json(done.report),
             }
         )
@@ -214,13 +207,13 @@ def concealment_note(strategy: Strategy, m: int) -> str | None:
     )
 
 
-def likeness_note(found: Rate | None, strategy: Strategy, m: int) -> str | None:
+def likeness_note(rate: Rate | None, strategy: Strategy, m: int) -> str | None:
     """Say that the decoys are spread unlike the people, where their statistics give faces away."""
-    if found is None or found.value <= MOST_FOUND:
+    if rate is None or rate.value <= MOST_FOUND:
         return None
     return (
-        f"from {100 * found.value:.0f} % of the templates of these people ({found.errors} of "
-        f"{found.trials}, {strategy}, m = {m}), who has the decoy generator finds the embedding: "
+        f"from {100 * rate.value:.0f} % of the templates of these people ({rate.errors} of "
+        f"{rate.trials}, {strategy}, m = {m}), who has the decoy generator finds the embedding: "
         "the decoys are spread unlike these people. Build the decoys from thousands of other "
         "people's photos of the same kind, then calibrate again: this line says what a change "
         "gains (docs/privacy.md)"

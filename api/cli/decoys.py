@@ -10,13 +10,13 @@ import typer
 from api.cli.console import demo_notice, emit, message, say
 from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, extract
 from api.cli.errors import CommandError, require_extra
-from api.cli.fairface import label_files, read_labels
 from api.cli.files import find_photos, is_left_out, read_names
 from api.cli.options import AsJson, takes_settings
 from api.process.opening import file_sealer, open_keyring
 from api.process.preparation import acquired, acquired_json, make_generator, make_pool
 from api.settings import Settings
 from templates.decoys import Attributes, DecoyGenerator
+from verify.fairface_labels import label_files, read_labels
 
 FACES_PER_DIMENSION = 4
 """Below that many fitted faces, membership of the fit shows in the statistics (docs/decoys.md)."""

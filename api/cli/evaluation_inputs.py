@@ -1,121 +1,86 @@
-"""What ``veilface evaluate`` works on: descriptors of the sets, decoys, and attributes."""
+"""What ``veilface evaluate`` works on: sets, the embedder, decoys, and the cache."""
 
 import hashlib
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TypeVar
 
-import numpy as np
-
-from api.cli.console import message, progress
+from api.cli.console import message
 from api.cli.descriptors import bulk_pack
 from api.cli.errors import CommandError, UsageError
 from api.process.opening import file_sealer, open_keyring
 from api.process.preparation import recorded_of, require_made_with
 from api.settings import Settings
 from models.cache import EmbeddingCache
-from models.pack import ModelPack
 from models.sessions import default_workers
-from templates.decoys import Attributes, DecoyGenerator, DecoyPool, load_source
+from templates.decoys import DecoyGenerator, DecoyPool, load_source
 from templates.decoys.pool import POOL_MAGIC
-from templates.keys.sealing import Sealer
-from verify.evaluation.acquisition import (
-    Acquired,
-    PackSource,
-    acquire,
-    are_aligned,
-    digest_of_pictures,
-    digests,
-    from_file,
-)
-from verify.evaluation.attributes import predict_attributes, resembling
-from verify.evaluation.backends import Backend
-from verify.evaluation.embeddings_file import EmbeddingsFile, read_embeddings
-from verify.evaluation.labels_file import Labels
-from verify.evaluation.material import Material
-from verify.evaluation.results import Model, SourceFacts
-from verify.evaluation.rows import Json
+from verify.evaluation.embedder import Embedder, FileEmbedder, PackEmbedder
+from verify.evaluation.embeddings_file import read_embeddings
+from verify.evaluation.readers import notes, open_sets
+from verify.evaluation.results import SourceFacts
+from verify.evaluation.units import RAW_FLIP
 from verify.evaluation.verification_set import VerificationSet
 
-T = TypeVar("T")
 NO_PACK = "none"
-SAME_PERSON = 0.4
-"""Cosine from which a decoy counts as a person of the test set. Of 29.6 million pairs of photos of
-two people of LFW 54 reach it, and some of those are one person under two names."""
 
 
-def listed(text: str, kind: Callable[[str], T], option: str, *, expected: str) -> tuple[T, ...]:
-    """Read a list with commas.
-
-    Parameters
-    ----------
-    expected
-        Said where something is not of the kind.
+def open_all(datasets: Sequence[Path], *, pictures: bool) -> list[VerificationSet]:
+    """Open the sets, and say what is unusual in them.
 
     Raises
     ------
     UsageError
-        Something in it is not of the kind, or it is empty.
+        Two have one name.
     """
-    parts = [part.strip() for part in text.split(",") if part.strip()]
-    try:
-        values = tuple(kind(part) for part in parts)
-    except ValueError:
-        raise UsageError(f"{option} takes {expected}, not {text!r}") from None
-    if not values:
-        raise UsageError(f"{option} takes {expected}, and is empty")
-    return values
+    sets = [pairs for path in datasets for pairs in open_sets(path, pictures=pictures)]
+    names = [pairs.name for pairs in sets]
+    if len(set(names)) < len(names):
+        raise UsageError(
+            f"two sets have one name ({', '.join(sorted(names))}), and rows are told apart by it: "
+            "evaluate them one at a time, or rename a file"
+        )
+    for pairs in sets:
+        for note in notes(pairs):
+            message(f"note: {note}")
+    return sets
 
 
-@dataclass(frozen=True, eq=False)
-class Descriptors:
-    """Where descriptors come from: a pack that computes them, or a file that has them.
+def wants_raw_flip(asked: tuple[str, ...] | None, embeddings: Path | None, *, flip: bool) -> bool:
+    """Whether raw embeddings with the mirror image are compared beside the others.
 
-    Parameters
-    ----------
-    pack
-        The pack as it is named.
-    mirrored
-        Whether descriptors with the mirror image are wanted beside those without.
-    file
-        Descriptors that were computed elsewhere.
+    Raises
+    ------
+    UsageError
+        They are asked for, and there is nothing to compute them with or to compare them with.
     """
-
-    pack: ModelPack | None
-    mirrored: bool
-    file: EmbeddingsFile | None
-    file_name: str = ""
-
-    @property
-    def n(self) -> int:
-        """Their dimension."""
-        if self.pack is not None:
-            return self.pack.info.n
-        assert self.file is not None  # noqa: S101 - one of both is there
-        return int(self.file.descriptors.shape[1])
-
-    @property
-    def model(self) -> Model:
-        """What the results say about them."""
-        if self.pack is None:
-            assert self.file is not None  # noqa: S101 - one of both is there
-            return Model(self.n, {"embeddings": self.file_name, "sha256": self.file.sha256})
-        info = self.pack.info
-        return Model(self.n, recorded_of(self.pack), info.embedder_sha256, info.preprocessing)
+    if asked is None:
+        return embeddings is None and not flip
+    if RAW_FLIP in asked and (embeddings is not None or flip):
+        raise UsageError(
+            f"{RAW_FLIP} is raw embeddings with the mirror image added, beside raw ones without: "
+            "it needs a pack, and no --flip"
+        )
+    return RAW_FLIP in asked
 
 
-def open_descriptors(
-    settings: Settings, embeddings: Path | None, *, flip: bool, both: bool
-) -> Descriptors:
+def open_embedder(
+    settings: Settings,
+    embeddings: Path | None,
+    *,
+    flip: bool,
+    raw_flip: bool,
+    aligned: bool | None,
+) -> Embedder:
     """Open the pack or the file of embeddings.
 
     Parameters
     ----------
     flip
         Add the mirror image everywhere.
-    both
-        Compare raw descriptors with the mirror image too.
+    raw_flip
+        Compare raw embeddings with the mirror image too.
+    aligned
+        Whether the photos are aligned crops; None to see.
 
     Raises
     ------
@@ -128,91 +93,23 @@ def open_descriptors(
         if no_pack:
             raise UsageError(why)
         pack = bulk_pack(settings, flip=flip, why=why)
-        return Descriptors(pack, both, None)
+        return PackEmbedder(
+            pack,
+            Path(str(settings.pack)).expanduser().resolve(),
+            settings.providers,
+            recorded_of(pack),
+            mirrored=raw_flip,
+            aligned=aligned,
+        )
     if not no_pack:
         raise UsageError("give a pack, or --pack none and --embeddings, not both")
     if flip:
         raise UsageError("--flip needs a pack: embeddings in a file are as they are")
-    return Descriptors(None, False, read_embeddings(embeddings), embeddings.name)
-
-
-@dataclass(frozen=True, eq=False)
-class Faces:
-    """A set with its descriptors."""
-
-    pairs: VerificationSet
-    acquired: Acquired
-    aligned: bool | None
-    pictures_sha256: str
-
-
-def acquire_faces(
-    pairs: VerificationSet,
-    descriptors: Descriptors,
-    settings: Settings,
-    *,
-    aligned: bool | None,
-    cache: EmbeddingCache | None,
-    backend: Backend,
-) -> Faces:
-    """Get the descriptors of a set.
-
-    Raises
-    ------
-    CommandError
-        No photo gave one, or nothing can align the photos.
-    """
-    if descriptors.file is not None:
-        faces = Faces(pairs, from_file(pairs, descriptors.file), None, "")
-    else:
-        assert descriptors.pack is not None  # noqa: S101 - one of both is there
-        contents = digests(pairs)
-        size = int(descriptors.pack.info.preprocessing["size"])
-        crops = pairs.aligned if aligned is None else aligned
-        if crops is None:
-            crops = are_aligned(pairs, size)
-        marked = all(picture.keypoints is not None for picture in pairs.pictures)
-        if not crops and not marked and descriptors.pack.info.detector is None:
-            raise CommandError(
-                f"the pack has no detector, and the photos of {pairs.name} are not all crops of "
-                f"{size} x {size}: use a pack with a detector, or say --aligned if they are "
-                "aligned crops of another size"
-            )
-        source = PackSource(
-            folder=Path(str(settings.pack)).expanduser().resolve(),
-            embedder_sha256=descriptors.pack.info.embedder_sha256,
-            providers=settings.providers,
-            threads=None if backend.scheduler is None else 1,
-            flip=bool(descriptors.pack.info.preprocessing["flip"]),
-            aligned=crops,
-            mirrored=descriptors.mirrored,
-        )
-        with progress(f"embedding {pairs.name}", len(pairs.pictures)) as advance:
-            acquired = acquire(
-                pairs,
-                contents,
-                descriptors.pack,
-                source,
-                cache=cache,
-                backend=backend,
-                progress=advance,
-            )
-        faces = Faces(pairs, acquired, crops, digest_of_pictures(contents))
-    if not len(faces.acquired.descriptors):
-        raise CommandError(
-            f"{pairs.name}: no photo gave an embedding, the first because of "
-            f"{faces.acquired.failures[0].code}; do --aligned and --embeddings fit?"
-        )
-    if faces.acquired.failures:
-        message(
-            f"note: {pairs.name}: {len(faces.acquired.failures)} of {len(pairs.pictures)} photos "
-            "skipped; the results list them"
-        )
-    return faces
+    return FileEmbedder(read_embeddings(embeddings), embeddings.name)
 
 
 def open_sources(
-    files: Sequence[Path], settings: Settings, descriptors: Descriptors
+    files: Sequence[Path], settings: Settings, embedder: Embedder
 ) -> list[SourceFacts]:
     """Load decoy files, and check that they fit.
 
@@ -235,118 +132,25 @@ def open_sources(
             if is_pool
             else DecoyGenerator.load(file)
         )
-        if source.n != descriptors.n:
+        if source.n != embedder.model.n:
             raise CommandError(
                 f"{file.name} has decoys of {source.n} numbers each, the embeddings have "
-                f"{descriptors.n}; build the decoys with this pack"
+                f"{embedder.model.n}; build the decoys with this pack"
             )
-        if descriptors.pack is not None:
-            require_made_with(source, descriptors.pack)
+        if isinstance(embedder, PackEmbedder):
+            require_made_with(source, embedder.pack)
         sources.append(SourceFacts(source, file.name, digest))
-    kinds = [isinstance(each.source, DecoyPool) for each in sources]
+    kinds = [isinstance(facts.source, DecoyPool) for facts in sources]
     if len(set(kinds)) != len(kinds):
         raise UsageError("give one pool and one generator at most: rows name the kind only")
     return sources
-
-
-def without_test_people(sources: Sequence[SourceFacts], faces: Faces) -> list[SourceFacts]:
-    """Leave pool entries out that resemble a person of the set.
-
-    Whoever was not acquired, or resembles their own photos less than ``SAME_PERSON``, stays in;
-    ``resemblance`` says how many genuine pairs that concerns.
-
-    Raises
-    ------
-    CommandError
-        None is left.
-    """
-    kept = []
-    for each in sources:
-        if not isinstance(each.source, DecoyPool):
-            kept.append(each)
-            continue
-        pool = each.source
-        gone = resembling(pool, faces.acquired.descriptors, cosine=SAME_PERSON)
-        if len(gone) == len(pool):
-            raise CommandError(
-                f"every face of {each.file} resembles one of {faces.pairs.name}; build it from "
-                "other people"
-            )
-        if len(gone):
-            message(
-                f"note: {faces.pairs.name}: {len(gone)} of {len(pool)} decoys resemble its people "
-                f"(cosine {SAME_PERSON:g} or more) and are left out"
-            )
-            pool = pool.subset(np.setdiff1d(np.arange(len(pool)), gone))
-        kept.append(replace(each, source=pool, left_out=len(gone)))
-    return kept
-
-
-def resemblance(material: Material) -> Json:
-    """State from which cosine decoys were left out, and which share of genuine pairs is below."""
-    rows = material.descriptors
-    first, second = rows[material.first[material.same]], rows[material.second[material.same]]
-    cosines = np.einsum("ij,ij->i", first, second, dtype=np.float64)
-    return {"cosine": SAME_PERSON, "genuine_below": float(np.mean(cosines < SAME_PERSON))}
-
-
-def named_file(file: Path | None) -> Json | None:
-    """Name and SHA-256 of a file that figures depend on."""
-    if file is None:
-        return None
-    with file.open("rb") as stream:
-        return {"file": file.name, "sha256": hashlib.file_digest(stream, "sha256").hexdigest()}
-
-
-def attributes_of(
-    faces: Faces, labels: Labels | None, sources: Sequence[SourceFacts]
-) -> tuple[list[Attributes], int]:
-    """Gender and race of every acquired row: as labelled, else predicted from the pool.
-
-    Returns
-    -------
-    attributes
-        One for each row.
-    predicted
-        How many were predicted.
-    """
-    pool = next(
-        each.source
-        for each in sources
-        if isinstance(each.source, DecoyPool) and each.source.labelled
-    )
-    vocabulary = _vocabulary(pool)
-    found = predict_attributes(faces.acquired.descriptors, pool)
-    predicted = len(found)
-    for picture, row in zip(faces.pairs.pictures, faces.acquired.rows.tolist(), strict=True):
-        own = {} if labels is None or row < 0 else labels.find(picture.name)
-        if {"gender", "race"} <= own.keys():
-            for attribute in ("gender", "race"):
-                if own[attribute] not in vocabulary[attribute]:
-                    known = ", ".join(sorted(vocabulary[attribute]))
-                    raise CommandError(
-                        f"the label file says {attribute} {own[attribute]!r} of {picture.name}; "
-                        f"the decoy pool knows {known}: hybrid+ needs one vocabulary for both"
-                    )
-            found[row] = Attributes(gender=own["gender"], race=own["race"])
-            predicted -= 1
-    return found, predicted
-
-
-def _vocabulary(pool: DecoyPool) -> dict[str, set[str]]:
-    labels = pool.entries[1] or ()
-    return {
-        "gender": {label.gender for label in labels if label.gender is not None},
-        "race": {label.race for label in labels if label.race is not None},
-    }
 
 
 def open_cache(cache: Path | None, settings: Settings) -> EmbeddingCache | None:
     """Open the sealed cache of embeddings, where one is named."""
     if cache is None:
         return None
-    sealer: Sealer = file_sealer(open_keyring(settings))
-    return EmbeddingCache.open_file(cache, sealer)
+    return EmbeddingCache.open_file(cache, file_sealer(open_keyring(settings)))
 
 
 def default_jobs() -> int:

@@ -7,13 +7,10 @@ from typing import Any
 from rich.table import Table
 
 from api.cli.console import table
-from api.cli.errors import CommandError
-from api.cli.files import read_bounded
+from api.cli.inputs import read_json
 from templates.keys.private_file import replace_public
 from verify.evaluation.rows import Json
 from verify.evaluation.tables import markdown, write_csv
-
-_MAX_AUDIT_BYTES = 64 * 2**20
 
 
 def read_audit(file: Path) -> Json:
@@ -26,10 +23,7 @@ def read_audit(file: Path) -> Json:
     """
     from verify.evaluation.figures.frontier import strongest_attackers
 
-    try:
-        report = json.loads(read_bounded(file, _MAX_AUDIT_BYTES))
-    except (ValueError, RecursionError):
-        raise CommandError(f"{file.name} is no JSON file") from None
+    report = read_json(file)
     strongest_attackers(report)
     return dict(report)
 

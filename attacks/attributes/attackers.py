@@ -6,7 +6,7 @@ every class of a template that it has not seen.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,14 +26,14 @@ _KERNEL_ROWS = 2048
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Lesson:
+class TrainingSet:
     """What an attacker learns from, and what it chooses by.
 
     Parameters
     ----------
     features, labels
         Of templates that the attacker lifted itself; labels (P,) int64 by attribute.
-    held_features, held_labels
+    held_out_features, held_out_labels
         Of others that it lifted, and did not learn from: what it chooses its settings by.
     classes
         Number of classes of every attribute.
@@ -43,18 +43,10 @@ class Lesson:
 
     features: Features
     labels: Mapping[str, Codes]
-    held_features: Features
-    held_labels: Mapping[str, Codes]
+    held_out_features: Features
+    held_out_labels: Mapping[str, Codes]
     classes: Mapping[str, int]
     seed: int
-
-
-class Attacker(Protocol):
-    """A trained attacker."""
-
-    def scores(self, features: Features) -> dict[str, Scores]:
-        """Score every class, by attribute (P, classes); the highest is the prediction."""
-        ...
 
 
 class Logistic:
@@ -63,36 +55,36 @@ class Logistic:
     Its regularisation is chosen for each attribute by the held-out templates.
     """
 
-    def __init__(self, lesson: Lesson) -> None:
+    def __init__(self, training: TrainingSet) -> None:
         from sklearn.linear_model import LogisticRegression
 
-        self._scale = _Scale(lesson.features.derived)
-        rows = self._scale(lesson.features.derived)
-        held = self._scale(lesson.held_features.derived)
-        self._classes = lesson.classes
+        self._scale = _Scale(training.features.derived)
+        rows = self._scale(training.features.derived)
+        held_out = self._scale(training.held_out_features.derived)
+        self._classes = training.classes
         self._models: dict[str, Any] = {}
-        for name, codes in lesson.labels.items():
+        for name, codes in training.labels.items():
             if len(np.unique(codes)) < 2:
                 continue
             best = -1.0
             for c in _LOGISTIC_CS:
                 model = LogisticRegression(C=c, max_iter=1000).fit(rows, codes)
-                score = float(model.score(held, lesson.held_labels[name]))
+                score = float(model.score(held_out, training.held_out_labels[name]))
                 if score > best:  # of equals the more regularised
                     best, self._models[name] = score, model
 
     def scores(self, features: Features) -> dict[str, Scores]:
-        """See `Attacker.scores`."""
+        """Score every class, by attribute (P, classes); the highest is the prediction."""
         return _probabilities(self._models, self._scale(features.derived), self._classes)
 
 
 class Boosting:
     """Gradient-boosted trees on the derived features."""
 
-    def __init__(self, lesson: Lesson) -> None:
+    def __init__(self, training: TrainingSet) -> None:
         from sklearn.ensemble import HistGradientBoostingClassifier
 
-        self._classes = lesson.classes
+        self._classes = training.classes
         self._models = {
             name: HistGradientBoostingClassifier(
                 max_iter=_BOOSTING_ROUNDS,
@@ -100,14 +92,14 @@ class Boosting:
                 max_leaf_nodes=8,
                 max_bins=63,
                 early_stopping=False,
-                random_state=lesson.seed,
-            ).fit(lesson.features.derived, codes)
-            for name, codes in lesson.labels.items()
+                random_state=training.seed,
+            ).fit(training.features.derived, codes)
+            for name, codes in training.labels.items()
             if len(np.unique(codes)) > 1
         }
 
     def scores(self, features: Features) -> dict[str, Scores]:
-        """See `Attacker.scores`."""
+        """Score every class, by attribute (P, classes); the highest is the prediction."""
         return _probabilities(self._models, features.derived, self._classes)
 
 
@@ -126,22 +118,22 @@ class KernelMachine:
     Processing Letters 9 (1999).
     """
 
-    def __init__(self, lesson: Lesson) -> None:
+    def __init__(self, training: TrainingSet) -> None:
         from scipy.linalg import cho_factor, cho_solve
 
-        self._scale = _Scale(lesson.features.derived)
-        self._length = float(np.sqrt(np.mean(np.sum(lesson.features.foot**2, axis=1)))) or 1.0
-        self._rows = self._joined(lesson.features)
+        self._scale = _Scale(training.features.derived)
+        self._length = float(np.sqrt(np.mean(np.sum(training.features.foot**2, axis=1)))) or 1.0
+        self._rows = self._joined(training.features)
         self._targets = np.hstack(
-            [np.eye(count)[lesson.labels[name]] for name, count in lesson.classes.items()]
+            [np.eye(count)[training.labels[name]] for name, count in training.classes.items()]
         )
         self._mean = self._targets.mean(axis=0)
         self._columns: dict[str, slice] = {}
-        for name, count in lesson.classes.items():
+        for name, count in training.classes.items():
             start = sum(part.stop - part.start for part in self._columns.values())
             self._columns[name] = slice(start, start + count)
         squares = _squared_distances(self._rows, self._rows)
-        held = _squared_distances(self._joined(lesson.held_features), self._rows)
+        held_out = _squared_distances(self._joined(training.held_out_features), self._rows)
         best: dict[str, tuple[float, float]] = {}
         weights: dict[float, NDArray[np.float32]] = {}
         for width in _KERNEL_WIDTHS:
@@ -151,17 +143,17 @@ class KernelMachine:
             factor = cho_factor(kernel, overwrite_a=True, check_finite=False)
             centred = (self._targets - self._mean).astype(np.float32)
             weights[width] = cho_solve(factor, centred, check_finite=False)
-            scores = np.exp(np.float32(-width) * held) @ weights[width] + self._mean
+            scores = np.exp(np.float32(-width) * held_out) @ weights[width] + self._mean
             for name, columns in self._columns.items():
                 predicted = np.argmax(scores[:, columns], axis=1)
-                found = float(np.mean(predicted == lesson.held_labels[name]))
-                if name not in best or found > best[name][0]:
-                    best[name] = (found, width)
+                score = float(np.mean(predicted == training.held_out_labels[name]))
+                if name not in best or score > best[name][0]:
+                    best[name] = (score, width)
         self._widths = {name: width for name, (_, width) in best.items()}
         self._weights = {width: weights[width] for width in set(self._widths.values())}
 
     def scores(self, features: Features) -> dict[str, Scores]:
-        """See `Attacker.scores`."""
+        """Score every class, by attribute (P, classes); the highest is the prediction."""
         rows = self._joined(features)
         out = {
             name: np.empty((len(rows), part.stop - part.start))

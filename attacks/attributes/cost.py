@@ -121,8 +121,8 @@ def measure_cost(
     k, threads = plan.neighbours, plan.threads
     if min(templates, repeats) < 1 or faces < k:
         raise AuditError(f"the search is timed on {k} or more faces, one template, one repeat")
-    chance = np.random.default_rng(seed)
-    rows = chance.standard_normal((faces + templates, n)).astype(np.float32)
+    rng = np.random.default_rng(seed)
+    rows = rng.standard_normal((faces + templates, n)).astype(np.float32)
     rows /= np.linalg.norm(rows, axis=1, keepdims=True)
     batch = lift(
         rows[:templates], strategy=Strategy.RANDOM, m=m, stream=Keystream.seeded("cost", seed)

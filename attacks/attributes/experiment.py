@@ -8,24 +8,25 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from attacks.attributes.attackers import TRAINED, KernelMachine, Lesson
+from attacks.attributes.attackers import TRAINED, TrainingSet
 from attacks.attributes.features import Features
 from attacks.attributes.known_decoys import Flags
-from attacks.attributes.measures import Measures, measure
-from attacks.attributes.plan import Bench
-from attacks.attributes.rows import AttributeRow
-from attacks.attributes.seen import (
+from attacks.attributes.measures import InferenceMeasures, measure
+from attacks.attributes.observations import (
     ByAttribute,
     Codes,
     Progress,
-    Seen,
+    observe_attacked,
+    observe_own,
     own_templates,
     search_work,
-    see_own,
-    see_victims,
 )
+from attacks.attributes.plan import Setup
+from attacks.attributes.rows import AttributeRow
 from attacks.outcomes import POOLED, Knowledge, Scheme
 from templates.distances import Metric
+
+ByClass = Mapping[str, NDArray[np.float64]]
 
 _KNN, _LIKELIHOOD, _STRIP, _RULE = "knn", "likelihood", "strip", "rule"
 # Products of two descriptors that take as long as one attacker's training on one template: of the
@@ -34,13 +35,13 @@ _TRAINING_WORK = 30_000
 
 
 def run_scheme(
-    bench: Bench, scheme: Scheme, *, progress: Progress | None = None
+    setup: Setup, scheme: Scheme, *, progress: Progress | None = None
 ) -> list[AttributeRow]:
     """Attack one scheme with every attacker of the plan, for every attribute.
 
     Parameters
     ----------
-    bench
+    setup
         From `prepare`.
     scheme
         Raw descriptors, or a strategy with the pool of the lifting faces or the generator. hybrid+
@@ -70,50 +71,50 @@ def run_scheme(
     Memory holds the templates of one tile at a time.
     """
     advance = None if progress is None else _one_at_a_time(progress)
-    training = _TRAINING_WORK * own_templates(bench, scheme)
-    own, held = see_own(bench, scheme, advance)
-    victims = see_victims(bench, scheme, advance)
-    taught, kept = own.take(np.flatnonzero(~held)), own.take(np.flatnonzero(held))
+    training_work = _TRAINING_WORK * own_templates(setup, scheme)
+    own, is_held_out = observe_own(setup, scheme, advance)
+    victims = observe_attacked(setup, scheme, advance)
+    training, validation = (
+        own.take(np.flatnonzero(~is_held_out)),
+        own.take(np.flatnonzero(is_held_out)),
+    )
     predictions: list[_Predictions] = [
         # The vote learns from no template, so that all of the attacker's own try it.
         _Predictions(_KNN, metric, Knowledge.ALGORITHM, victims.votes[metric], own.votes[metric])
         for metric in victims.votes
     ]
-    for name in bench.plan.attackers:
-        begun = time.perf_counter()
-        model = TRAINED[name](_lesson(bench, name, taught.features, kept.features, taught, kept))
-        found, tried = _chosen(model.scores(victims.features)), _chosen(model.scores(kept.features))
-        spent = time.perf_counter() - begun
-        predictions.append(_Predictions(name, None, Knowledge.ALGORITHM, found, tried, spent))
+    truths = training.truth, validation.truth
+    features = training.features, validation.features, victims.features
+    for name in setup.plan.attackers:
+        attacked, held_out, seconds = _trained(setup, name, features, truths)
+        choices = _chosen(attacked), _chosen(held_out)
+        predictions.append(_Predictions(name, None, Knowledge.ALGORITHM, *choices, seconds))
         if advance is not None:
-            advance(training)
-    if not (victims.guessed is None or taught.guessed is None or kept.guessed is None):
-        begun = time.perf_counter()
-        pooled = scheme.decoys == POOLED
-        knowledge = Knowledge.DECOYS if pooled else Knowledge.ALGORITHM
-        machine = KernelMachine(_lesson(bench, "svm", taught.guessed, kept.guessed, taught, kept))
-        scores, own_scores = machine.scores(victims.guessed), machine.scores(kept.guessed)
-        spent = time.perf_counter() - begun
-        found, tried = _chosen(scores), _chosen(own_scores)
-        name = _STRIP if pooled else _LIKELIHOOD
-        predictions.append(_Predictions(name, None, knowledge, found, tried, spent))
+            advance(training_work)
+    if not (victims.guessed is None or training.guessed is None or validation.guessed is None):
+        name, knowledge = _LIKELIHOOD, Knowledge.ALGORITHM
+        if scheme.decoys == POOLED:
+            name, knowledge = _STRIP, Knowledge.DECOYS
+        features = training.guessed, validation.guessed, victims.guessed
+        attacked, held_out, seconds = _trained(setup, "svm", features, truths)
+        choices = _chosen(attacked), _chosen(held_out)
+        predictions.append(_Predictions(name, None, knowledge, *choices, seconds))
         if victims.absent:
-            found = _chosen({a: _among(scores[a], flags) for a, flags in victims.absent.items()})
-            tried = _chosen({a: _among(own_scores[a], flags) for a, flags in kept.absent.items()})
-            predictions.append(_Predictions(_RULE, None, knowledge, found, tried, spent))
+            choices = _among(attacked, victims.absent), _among(held_out, validation.absent)
+            predictions.append(_Predictions(_RULE, None, knowledge, *choices, seconds))
         if advance is not None:
-            advance(training)
+            advance(training_work)
     rows: list[AttributeRow] = []
-    for each in predictions:
-        tried_on = own.truth if each.attacker == _KNN else kept.truth
-        rows += _rows(bench, scheme, each, victims.truth, tried_on)
+    for prediction in predictions:
+        held_out_truth = own.truth if prediction.attacker == _KNN else validation.truth
+        rows += _rows(setup, scheme, prediction, victims.truth, held_out_truth)
     return rows
 
 
-def work_of(bench: Bench, scheme: Scheme) -> int:
+def work_of(setup: Setup, scheme: Scheme) -> int:
     """Work that `run_scheme` reports as progress, in products of two descriptors."""
-    trained = len(bench.plan.attackers) + (scheme.decoys is not None)
-    return search_work(bench, scheme) + trained * _TRAINING_WORK * own_templates(bench, scheme)
+    trained = len(setup.plan.attackers) + (scheme.decoys is not None)
+    return search_work(setup, scheme) + trained * _TRAINING_WORK * own_templates(setup, scheme)
 
 
 def _one_at_a_time(progress: Progress) -> Progress:
@@ -138,56 +139,76 @@ class _Predictions:
     seconds: float = 0.0
 
 
-def _lesson(
-    bench: Bench, attacker: str, features: Features, held: Features, taught: Seen, kept: Seen
-) -> Lesson:
-    rows = np.arange(len(features))
-    if attacker == "svm" and len(rows) > bench.plan.kernel_most:
-        chance = np.random.default_rng([bench.seed, 2])
-        rows = np.sort(chance.permutation(len(rows))[: bench.plan.kernel_most])
-    return Lesson(
-        features.take(rows),
-        {name: codes[rows] for name, codes in taught.truth.items()},
-        held,
-        kept.truth,
-        {name: len(classes) for name, classes in bench.split.attack.classes.items()},
-        bench.seed,
+def _trained(
+    setup: Setup,
+    attacker: str,
+    features: tuple[Features, Features, Features],
+    truths: tuple[ByAttribute, ByAttribute],
+) -> tuple[ByClass, ByClass, float]:
+    """Train an attacker; its scores of the attacked and of the held-out faces, and its seconds.
+
+    ``features`` are of the training, the held-out and the attacked faces, ``truths`` of the first
+    two.
+    """
+    start = time.perf_counter()
+    training, held_out, attacked = features
+    rows = np.arange(len(training))
+    if attacker == "svm" and len(rows) > setup.plan.kernel_most:
+        rng = np.random.default_rng([setup.seed, 2])
+        rows = np.sort(rng.permutation(len(rows))[: setup.plan.kernel_most])
+    model = TRAINED[attacker](
+        TrainingSet(
+            training.take(rows),
+            {name: codes[rows] for name, codes in truths[0].items()},
+            held_out,
+            truths[1],
+            {name: len(classes) for name, classes in setup.split.attack.classes.items()},
+            setup.seed,
+        )
     )
+    return model.scores(attacked), model.scores(held_out), time.perf_counter() - start
 
 
 def _rows(
-    bench: Bench, scheme: Scheme, found: _Predictions, truth: ByAttribute, held: ByAttribute
+    setup: Setup,
+    scheme: Scheme,
+    predictions: _Predictions,
+    truth: ByAttribute,
+    held_out_truth: ByAttribute,
 ) -> Iterator[AttributeRow]:
-    attack = bench.split.attack
-    for name, predicted in found.attacked.items():
+    attack = setup.split.attack
+    for name, predicted in predictions.attacked.items():
         classes = attack.classes[name]
 
-        def against(predicted: Codes, truth: Codes, name: str = name) -> Measures:
+        def against(predicted: Codes, truth: Codes, name: str = name) -> InferenceMeasures:
             return measure(
                 predicted,
                 truth,
                 training=attack.labels[name],
                 classes=len(attack.classes[name]),
-                seed=bench.seed,
+                seed=setup.seed,
             )
 
         yield AttributeRow(
             scheme=scheme,
             attribute=name,
-            attacker=found.attacker,
-            metric=found.metric,
-            knowledge=found.knowledge,
+            attacker=predictions.attacker,
+            metric=predictions.metric,
+            knowledge=predictions.knowledge,
             classes=classes,
             measures=against(predicted, truth[name]),
-            held_out=against(found.held[name], held[name]).strength,
-            seed=bench.seed,
-            seconds=found.seconds,
+            held_out=against(predictions.held[name], held_out_truth[name]).strength,
+            seed=setup.seed,
+            seconds=predictions.seconds,
         )
 
 
-def _chosen(scores: Mapping[str, NDArray[np.float64]]) -> ByAttribute:
-    return {name: np.argmax(each, axis=1).astype(np.int64) for name, each in scores.items()}
+def _chosen(scores: ByClass) -> ByAttribute:
+    return {name: np.argmax(values, axis=1).astype(np.int64) for name, values in scores.items()}
 
 
-def _among(scores: NDArray[np.float64], allowed: Flags) -> NDArray[np.float64]:
-    return np.where(allowed, scores, -np.inf)
+def _among(scores: ByClass, allowed: Mapping[str, Flags]) -> ByAttribute:
+    """Choose among some classes of each face only, of the attributes that have such."""
+    return _chosen(
+        {name: np.where(flags, scores[name], -np.inf) for name, flags in allowed.items()}
+    )

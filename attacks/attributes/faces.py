@@ -1,4 +1,4 @@
-"""Faces with labels, and who of them plays which part in the paper's privacy experiment."""
+"""Faces with labels, and how the paper's privacy experiment divides them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from templates.decoys.source import Attributes
 from templates.space.embedding import unit_descriptors
 from verify.evaluation.attributes import resembling_rows
 
-Floats = NDArray[np.float32]
+Array32 = NDArray[np.float32]
 Codes = NDArray[np.int64]
 
 
@@ -36,7 +36,7 @@ class LabelledFaces:
         A descriptor is not a finite unit vector.
     """
 
-    descriptors: Floats
+    descriptors: Array32
     labels: Mapping[str, Codes]
     classes: Mapping[str, tuple[str, ...]]
 
@@ -79,7 +79,7 @@ class LabelledFaces:
     @classmethod
     def of_names(
         cls,
-        descriptors: Floats,
+        descriptors: Array32,
         labels: Mapping[str, Sequence[str]],
         classes: Mapping[str, Sequence[str]],
     ) -> "LabelledFaces":
@@ -122,7 +122,7 @@ class LabelledFaces:
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """Who plays which part; the three have no face in common.
+    """The faces of each part; the three have no face in common.
 
     Parameters
     ----------
@@ -194,7 +194,7 @@ def split(
     )
 
 
-def near_duplicates(attacked: Floats, training: Floats, *, cosine: float) -> NDArray[np.int64]:
+def near_duplicates(attacked: Array32, training: Array32, *, cosine: float) -> NDArray[np.int64]:
     """Find attacked faces of which the training faces show nearly the same photo.
 
     FairFace's two parts share such photos. An attacker who has the victim's own labelled face

@@ -17,7 +17,7 @@ from attacks.attributes.neighbours import Attacked, votes
 from templates.distances import Metric, Neighbours
 from templates.space.subspace import SubspaceBatch
 
-Floats = NDArray[np.float32]
+Array32 = NDArray[np.float32]
 Codes = NDArray[np.int64]
 
 # Shrinkage of the within-class covariance towards a multiple of the identity: measured on FairFace,
@@ -38,8 +38,8 @@ class Axes:
         Unit rows: the mean face of every class of every attribute.
     """
 
-    discriminants: Floats
-    prototypes: Floats
+    discriminants: Array32
+    prototypes: Array32
 
     @classmethod
     def fit(cls, faces: LabelledFaces) -> "Axes":
@@ -65,8 +65,8 @@ class Axes:
             covariance = within.T @ within / len(x)
             level = np.trace(covariance) / faces.n
             covariance[np.diag_indices(faces.n)] += _SHRINKAGE * level + 1e-12
-            found = np.linalg.solve(covariance, (means - mean).T).T
-            discriminants.append(found[1:] if len(names) == 2 else found)
+            directions = np.linalg.solve(covariance, (means - mean).T).T
+            discriminants.append(directions[1:] if len(names) == 2 else directions)
             prototypes.append(means)
         return cls(_unit(np.vstack(discriminants)), _unit(np.vstack(prototypes)))
 
@@ -83,8 +83,8 @@ class Features:
         Everything else.
     """
 
-    foot: Floats
-    derived: Floats
+    foot: Array32
+    derived: Array32
 
     def __len__(self) -> int:
         return len(self.foot)
@@ -133,8 +133,8 @@ def features_of(
         D, those that are left.
     """
     shares = [
-        votes(found, gallery.labels[attribute], len(names), k=k)
-        for found in neighbours.values()
+        votes(neighbours_found, gallery.labels[attribute], len(names), k=k)
+        for neighbours_found in neighbours.values()
         for attribute, names in gallery.classes.items()
         for k in ks
     ]
@@ -156,11 +156,11 @@ def features_of(
     return Features(feet, np.hstack([*parts, *shares]).astype(np.float32))
 
 
-def _inside(templates: SubspaceBatch, rows: Floats) -> Floats:
+def _inside(templates: SubspaceBatch, rows: Array32) -> Array32:
     """D x for all rows x, shape (P, m, rows)."""
     return np.asarray(templates.bases @ rows.T)
 
 
-def _unit(rows: NDArray[np.float64]) -> Floats:
+def _unit(rows: NDArray[np.float64]) -> Array32:
     norms = np.linalg.norm(rows, axis=1, keepdims=True)
     return np.asarray(rows / np.maximum(norms, 1e-12), dtype=np.float32)

@@ -73,11 +73,11 @@ def attribute_figure(rows: Sequence[Row]) -> Figure | None:
             header=HEADER_INCHES,
         )
         for axes, attribute in zip((line[0] for line in grid), attributes, strict=True):
-            mine = [row for (name, _), row in bars.items() if name == attribute]
-            _draw_bars(axes, mine, places, list(centres))
+            attribute_bars = [row for (name, _), row in bars.items() if name == attribute]
+            _draw_bars(axes, attribute_bars, places, list(centres))
             for knowledge, (marker, _) in _MARKS.items():
                 _draw_marks(axes, attribute, knowledge, marker, marks, places)
-            _draw_chance(axes, mine[0])
+            _draw_chance(axes, attribute_bars[0])
             _dress(axes, attribute, places, centres, width)
         _legend(figure, {knowledge for _, _, knowledge in marks})
     return figure
@@ -94,21 +94,21 @@ def _order(row: Row) -> tuple[Any, ...]:
 
 def _bars_of(rows: Sequence[Row]) -> dict[tuple[str, Cell], Row]:
     """The paper's attacker by attribute and scheme, Euclidean rather than spherical."""
-    found: dict[tuple[str, Cell], Row] = {}
+    bars: dict[tuple[str, Cell], Row] = {}
     for row in rows:
         key = (str(row["attribute"]), _cell(row))
-        if row["attacker"] == "knn" and (key not in found or row["metric"] == Metric.EUCLIDEAN):
-            found[key] = row
-    return found
+        if row["attacker"] == "knn" and (key not in bars or row["metric"] == Metric.EUCLIDEAN):
+            bars[key] = row
+    return bars
 
 
 def _strongest(rows: Sequence[Row]) -> dict[tuple[str, Cell, str], Row]:
-    found: dict[tuple[str, Cell, str], Row] = {}
+    strongest: dict[tuple[str, Cell, str], Row] = {}
     for row in rows:
         key = (str(row["attribute"]), _cell(row), str(row["knowledge"]))
-        if key not in found or row["held_out_strength"] > found[key]["held_out_strength"]:
-            found[key] = row
-    return found
+        if key not in strongest or row["held_out_strength"] > strongest[key]["held_out_strength"]:
+            strongest[key] = row
+    return strongest
 
 
 def _layout(rows: Sequence[Row]) -> tuple[dict[Cell, float], dict[Group, float], float]:
@@ -131,7 +131,7 @@ def _layout(rows: Sequence[Row]) -> tuple[dict[Cell, float], dict[Group, float],
 
 def _look(group: Group, groups: Sequence[Group]) -> dict[str, Any]:
     """White for raw; else a hue and a hatch of the group's own."""
-    lifted = [each for each in groups if each[0] != RAW]
+    lifted = [other for other in groups if other[0] != RAW]
     if group not in lifted:
         return {"facecolor": GROUND, "edgecolor": INK}
     number = lifted.index(group)

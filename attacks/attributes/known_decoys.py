@@ -9,7 +9,7 @@ from attacks.attributes.neighbours import Advance, nearest_neighbours
 from templates.distances import Metric
 from templates.space.subspace import SubspaceBatch
 
-Floats = NDArray[np.float32]
+Array32 = NDArray[np.float32]
 Codes = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
@@ -36,7 +36,7 @@ class Decoys:
 
 def find_decoys(
     templates: SubspaceBatch,
-    pool: Floats,
+    pool: Array32,
     *,
     most: int,
     skip: Codes | None = None,
@@ -65,7 +65,7 @@ def find_decoys(
     return Decoys(nearest.indices, nearest.distances < TOUCH)
 
 
-def strip(templates: SubspaceBatch, pool: Floats, decoys: Decoys) -> Floats:
+def strip(templates: SubspaceBatch, pool: Array32, decoys: Decoys) -> Array32:
     """Remove the known decoys from the templates' foot points.
 
     The foot point is an affine combination of the descriptor, the decoys and random directions;
@@ -100,7 +100,7 @@ def never_seen(decoys: Decoys, labels: Codes, classes: int) -> Flags:
     bool, shape (P, classes)
         All true where the decoys have all classes, and the rule says nothing.
     """
-    of = np.where(decoys.found, labels[decoys.entries], -1)
-    absent = np.stack([(of != code).all(axis=1) for code in range(classes)], axis=1)
+    decoy_labels = np.where(decoys.found, labels[decoys.entries], -1)
+    absent = np.stack([(decoy_labels != code).all(axis=1) for code in range(classes)], axis=1)
     absent[~absent.any(axis=1)] = True
     return np.asarray(absent)

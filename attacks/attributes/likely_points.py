@@ -14,7 +14,7 @@ from templates.decoys.source import DecoySource
 from templates.keys.randomness import Keystream
 from templates.space.subspace import SubspaceBatch
 
-Floats = NDArray[np.float32]
+Array32 = NDArray[np.float32]
 Form = NDArray[np.float64]
 
 DRAWS = 4000
@@ -28,7 +28,7 @@ def decoy_precision(source: DecoySource, *, seed: int, draws: int = DRAWS) -> Fo
     return precision(drawn)
 
 
-def contrast(against: Form, faces: Floats) -> Form:
+def contrast(against: Form, faces: Array32) -> Form:
     """Form (n, n) that is large at a face and small at a decoy.
 
     Parameters
@@ -44,6 +44,6 @@ def contrast(against: Form, faces: Floats) -> Form:
     return np.asarray(against - precision(faces))
 
 
-def guesses(templates: SubspaceBatch, form: Form) -> Floats:
+def guesses(templates: SubspaceBatch, form: Form) -> Array32:
     """Guess each template's descriptor; unit rows, (P, n) float32."""
     return np.ascontiguousarray(likeliest_points(templates, form), dtype=np.float32)

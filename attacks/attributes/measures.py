@@ -28,7 +28,7 @@ PERMUTATIONS = 200
 
 
 class Leakage(StrEnum):
-    """Outcome of the two-sided test."""
+    """AttackOutcome of the two-sided test."""
 
     ABOVE = "leaks above"
     """Right more often than the same predictions dealt out at random."""
@@ -91,7 +91,7 @@ class MutualInformation:
 
 
 @dataclass(frozen=True)
-class Measures:
+class InferenceMeasures:
     """Predictions against the truth.
 
     Parameters
@@ -140,7 +140,7 @@ def measure(
     classes: int,
     seed: int,
     permutations: int = PERMUTATIONS,
-) -> Measures:
+) -> InferenceMeasures:
     """Compare predictions with the truth.
 
     Parameters
@@ -186,7 +186,7 @@ def measure(
         above = hits / count > baselines.same_predictions
         leakage = Leakage.ABOVE if above else Leakage.BELOW
     occurring = of_truth > 0
-    return Measures(
+    return InferenceMeasures(
         accuracy=rate(hits, count),
         balanced_accuracy=float(np.mean(np.diag(table)[occurring] / of_truth[occurring])),
         confusion=tuple(tuple(map(int, row)) for row in table),

@@ -13,9 +13,9 @@ from attacks.errors import AuditError
 from templates.distances import Metric, Neighbours, nearest
 from templates.space.subspace import SubspaceBatch
 
-Floats = NDArray[np.float32]
+Array32 = NDArray[np.float32]
 Codes = NDArray[np.int64]
-Attacked = Floats | SubspaceBatch
+Attacked = Array32 | SubspaceBatch
 """Raw descriptors (P, n), or templates of P faces."""
 Advance = Callable[[int], None]
 """Called with a number of (template, face) pairs that are done."""
@@ -29,7 +29,7 @@ _TIE = 1e-4
 
 def nearest_neighbours(
     attacked: Attacked,
-    gallery: Floats,
+    gallery: Array32,
     *,
     k: int,
     metrics: Sequence[Metric] = METRICS,
@@ -76,8 +76,8 @@ def nearest_neighbours(
             f"faces of {gallery.shape[1]} numbers; K must be 1 to {_MOST}"
         )
     if not isinstance(attacked, SubspaceBatch):
-        found = _nearest_points(attacked, gallery, k, skip, progress)
-        return dict.fromkeys(metrics, found)
+        nearest_points = _nearest_points(attacked, gallery, k, skip, progress)
+        return dict.fromkeys(metrics, nearest_points)
     labels = None if skip is None else (np.arange(len(gallery), dtype=np.int64), skip)
     advance = None if progress is None else _in_parts(progress, len(metrics))
     return {
@@ -108,7 +108,7 @@ def _in_parts(progress: Advance, parts: int) -> Advance:
 
 
 def _nearest_points(
-    attacked: Floats, gallery: Floats, k: int, skip: Codes | None, progress: Advance | None
+    attacked: Array32, gallery: Array32, k: int, skip: Codes | None, progress: Advance | None
 ) -> Neighbours:
     indices = np.empty((len(attacked), k), dtype=np.int64)
     distances = np.empty((len(attacked), k), dtype=np.float32)
@@ -117,13 +117,13 @@ def _nearest_points(
         rows = slice(start, min(start + step, len(attacked)))
         far = 1 - attacked[rows] @ gallery.T
         if skip is not None:
-            own = np.flatnonzero(skip[rows] >= 0)
-            far[own, skip[rows][own]] = np.inf
-        some = np.argsort(far, axis=1, kind="stable")[:, :k]
-        gaps = attacked[rows, None].astype(np.float64) - gallery[some]
+            in_gallery = np.flatnonzero(skip[rows] >= 0)
+            far[in_gallery, skip[rows][in_gallery]] = np.inf
+        candidates = np.argsort(far, axis=1, kind="stable")[:, :k]
+        gaps = attacked[rows, None].astype(np.float64) - gallery[candidates]
         near = np.sqrt(np.einsum("pki,pki->pk", gaps, gaps))
-        order = np.lexsort((some, near), axis=1)
-        indices[rows] = np.take_along_axis(some, order, 1)
+        order = np.lexsort((candidates, near), axis=1)
+        indices[rows] = np.take_along_axis(candidates, order, 1)
         distances[rows] = np.take_along_axis(near, order, 1)
         if progress is not None:
             progress(far.size)
@@ -140,7 +140,7 @@ def merged(first: Neighbours, second: Neighbours, *, after: int, k: int) -> Neig
     )
 
 
-def votes(neighbours: Neighbours, labels: Codes, classes: int, *, k: int) -> Floats:
+def votes(neighbours: Neighbours, labels: Codes, classes: int, *, k: int) -> Array32:
     """Share of the k nearest neighbours in each class.
 
     Parameters

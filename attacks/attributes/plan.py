@@ -13,6 +13,7 @@ from attacks.attributes.features import Axes
 from attacks.attributes.likely_points import Form, contrast, decoy_precision
 from attacks.errors import AuditError
 from attacks.outcomes import GENERATED, POOLED, RAW_SCHEME, Scheme
+from attacks.population import LEAST_FITTED
 from templates.decoys import DecoyGenerator, DecoyPool
 from templates.decoys.source import DecoySource
 from templates.space.lifting import Strategy
@@ -174,7 +175,7 @@ class Fold:
 
 
 @dataclass(frozen=True, eq=False)
-class Bench:
+class Setup:
     """What all schemes share; made once by :func:`prepare`.
 
     Parameters
@@ -213,7 +214,7 @@ def prepare(
     plan: AttributePlan,
     seed: int,
     generator: DecoyGenerator | None = None,
-) -> Bench:
+) -> Setup:
     """Find what all schemes share.
 
     Parameters
@@ -228,12 +229,12 @@ def prepare(
     AuditError
         The attacker has too few faces for the plan.
     """
-    if generator is None and len(parts.lifting) >= 100:
+    if generator is None and len(parts.lifting) >= LEAST_FITTED:
         generator = DecoyGenerator.fit(parts.lifting.descriptors)
     against = None if generator is None else decoy_precision(generator, seed=seed)
     side_of = partial(Side.of, nearby=plan.gallery_most, against=against)
-    chance = np.random.default_rng([seed, 1])
-    order = chance.permutation(len(parts.attack))
+    rng = np.random.default_rng([seed, 1])
+    order = rng.permutation(len(parts.attack))
     number = np.empty(len(order), dtype=np.int64)
     number[order] = np.arange(len(order)) % plan.folds
     chosen = np.zeros(len(order), dtype=np.bool_)
@@ -251,16 +252,16 @@ def prepare(
         gallery = parts.attack.take(order[number[order] != fold])
         entries = np.flatnonzero(chosen[number == fold])
         own = part.take(entries)
-        held = np.zeros(len(own), dtype=np.bool_)
-        held[chance.permutation(len(own))[: round(plan.held_out * len(own))]] = True
-        if not held.any() or held.all():
+        held_out = np.zeros(len(own), dtype=np.bool_)
+        held_out[rng.permutation(len(own))[: round(plan.held_out * len(own))]] = True
+        if not held_out.any() or held_out.all():
             raise AuditError(
                 f"a fold of {len(own)} faces is too small to hold some of them out: give the "
                 "attacker more faces"
             )
-        folds.append(Fold(own, entries, held, side_of(part, gallery)))
+        folds.append(Fold(own, entries, held_out, side_of(part, gallery)))
     side = side_of(parts.lifting, parts.attack.take(order))
-    return Bench(parts, plan, seed, side, generator, tuple(folds))
+    return Setup(parts, plan, seed, side, generator, tuple(folds))
 
 
 def schemes_of(

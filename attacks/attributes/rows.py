@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from attacks.attributes.measures import Measures
+from attacks.attributes.measures import InferenceMeasures
 from attacks.outcomes import Knowledge, Scheme
 from templates.contract.canonical import Json
 from templates.distances import Metric
@@ -33,9 +33,9 @@ class AttributeRow:
     measures
         On the attacked faces.
     held_out
-        The attacker's strength (`Measures.strength`) on faces that it lifted itself and did not
-        learn from, of ``knn`` on all that it lifted: what it chooses the best attacker by, before
-        it sees a victim.
+        The attacker's strength (`InferenceMeasures.strength`) on faces that it lifted itself and
+        did not learn from, of ``knn`` on all that it lifted: what it chooses the best attacker by,
+        before it sees a victim.
     seed
         Of lifting, training and permutations.
     seconds
@@ -49,7 +49,7 @@ class AttributeRow:
     metric: Metric | None
     knowledge: Knowledge
     classes: tuple[str, ...]
-    measures: Measures
+    measures: InferenceMeasures
     held_out: float
     seed: int
     seconds: float

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from attacks.errors import AuditError
 from attacks.learned.extra import need
-from attacks.outcomes import Knowledge, Outcome
+from attacks.outcomes import AttackOutcome, Knowledge
 from attacks.recovery import recovery_outcome
-from attacks.scene import Scene
+from attacks.system import System
 from templates.space.subspace import SubspaceBatch
 
 if TYPE_CHECKING:
@@ -144,22 +144,22 @@ def train(
     rng = np.random.default_rng(seed)
     order = rng.permutation(len(faces))
     count = max(1, int(_HELD_OUT * len(faces)))
-    held, mine = faces[order[:count]], faces[order[count:]]
+    held_out, training = faces[order[:count]], faces[order[count:]]
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         rounds = _networks(faces.shape[1])
     optimiser = torch.optim.AdamW(rounds.parameters(), lr=_RATE, weight_decay=1e-2)
-    test = lift(held, 0)
-    foot = float(_cosines(test.feet, held).mean())
+    test = lift(held_out, 0)
+    foot = float(_cosines(test.feet, held_out).mean())
     best, since, epoch = foot, 0, 0
     kept = {name: value.clone() for name, value in rounds.state_dict().items()}
     while epoch < epochs and since < PATIENCE and monotonic() - started < seconds:
         epoch += 1
-        batch = lift(mine, epoch)
-        shuffled = rng.permutation(len(mine))
-        for rows in _slices(len(mine)):
+        batch = lift(training, epoch)
+        shuffled = rng.permutation(len(training))
+        for rows in _slices(len(training)):
             chosen = shuffled[rows]
-            truth = torch.tensor(mine[chosen])
+            truth = torch.tensor(training[chosen])
             guess = _guess(
                 rounds, torch.tensor(batch.feet[chosen]), torch.tensor(batch.bases[chosen])
             )
@@ -167,7 +167,7 @@ def train(
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()
-        now = float(_cosines(Inverter(rounds, epoch, 0, 0)(test), held).mean())
+        now = float(_cosines(Inverter(rounds, epoch, 0, 0)(test), held_out).mean())
         since += 1
         if now > best:
             best, since = now, 0
@@ -182,19 +182,19 @@ def _cosines(rows: NDArray[np.floating], truth: NDArray[np.floating]) -> NDArray
 
 
 def invert(
-    scene: Scene,
+    system: System,
     faces: NDArray[np.float32] | None = None,
     *,
     seconds: float = SECONDS,
     epochs: int = MOST_EPOCHS,
     seed: int,
-) -> tuple[Inverter, list[Outcome]]:
-    """Train an inverter for the scene's scheme, and let it guess the victims' descriptors.
+) -> tuple[Inverter, list[AttackOutcome]]:
+    """Train an inverter for the system's scheme, and let it guess the victims' descriptors.
 
     Parameters
     ----------
     faces : (A, n) float32
-        Faces that the attacker has beside the scene's.
+        Faces that the attacker has beside the system's.
 
     Returns
     -------
@@ -204,20 +204,20 @@ def invert(
         One, named ``inverter``. Its details hold the cosine of the foot point beside the guess's:
         the better of the two is what an attacker uses.
     """
-    known = scene.attacker if faces is None else np.concatenate([scene.attacker, faces])
+    known = system.attacker if faces is None else np.concatenate([system.attacker, faces])
     known = np.ascontiguousarray(known, dtype=np.float32)
     inverter = train(
         known,
-        lambda rows, epoch: scene.lift(rows, f"inverter, epoch {epoch}"),
+        lambda rows, epoch: system.lift(rows, f"inverter, epoch {epoch}"),
         seconds=seconds,
         epochs=epochs,
         seed=seed,
     )
-    foot = _cosines(scene.templates.feet, scene.victims.enrolled)
+    foot = _cosines(system.templates.feet, system.victims.enrolled)
     return inverter, [
         recovery_outcome(
-            scene,
-            inverter(scene.templates),
+            system,
+            inverter(system.templates),
             attack="inverter",
             knowledge=Knowledge.ALGORITHM,
             assumption="One template, how templates are lifted, and faces of other people, lifted "

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from attacks.errors import AuditError
 from attacks.learned.decoder import SECONDS, SIZE, Images, resized, train_decoder
 from attacks.learned.extra import need
-from attacks.outcomes import RAW_SCHEME, Knowledge, Outcome, Property
+from attacks.outcomes import RAW_SCHEME, AttackOutcome, Knowledge, Property
 from attacks.recovery import fmr_of
-from attacks.scene import Scene
+from attacks.system import System
 from templates.contract.canonical import Json
 from verify.metrics import rate
 
@@ -67,8 +67,8 @@ def score_images(
     return Reconstruction(
         ssim=np.array(
             [
-                similarity(mine, theirs, channel_axis=2, data_range=255)
-                for mine, theirs in zip(drawn, small, strict=True)
+                similarity(one_drawn, one_photo, channel_axis=2, data_range=255)
+                for one_drawn, one_photo in zip(drawn, small, strict=True)
             ]
         ),
         psnr=10 * np.log10(255.0**2 / np.maximum(errors, 1e-9)),
@@ -77,7 +77,7 @@ def score_images(
 
 
 def reconstruct(
-    scene: Scene,
+    system: System,
     images: Images,
     descriptors: NDArray[np.floating],
     photos: Images,
@@ -87,7 +87,7 @@ def reconstruct(
     seconds: float = SECONDS,
     epochs: int | None = None,
     seed: int,
-) -> list[Outcome]:
+) -> list[AttackOutcome]:
     """Train a decoder on the auditor's images, and draw the victims from their templates.
 
     Parameters
@@ -104,7 +104,7 @@ def reconstruct(
 
     Returns
     -------
-    list of Outcome
+    list of AttackOutcome
         Named ``reconstruction``: from the raw descriptor (a control, which must succeed), the
         foot point, every further guess, and noise (a control, which must not). No image is kept.
 
@@ -113,26 +113,26 @@ def reconstruct(
     AuditError
         Arrays that do not fit, or the ``torch`` extra is not installed.
     """
-    count = len(scene.victims)
+    count = len(system.victims)
     if len(photos) != count or any(len(rows) != count for rows in (guesses or {}).values()):
         raise AuditError(f"{count} victims need a photo and a guess each")
     need("skimage.metrics")  # before the training rather than after it
     options = {} if epochs is None else {"epochs": epochs}
     decoder = train_decoder(images, descriptors, seconds=seconds, seed=seed, **options)
-    noise = np.random.default_rng(seed).normal(size=scene.victims.enrolled.shape)
+    noise = np.random.default_rng(seed).normal(size=system.victims.enrolled.shape)
     inputs: dict[str, NDArray[np.floating]] = {
-        RAW: scene.victims.enrolled,
-        FOOT: scene.templates.feet,
+        RAW: system.victims.enrolled,
+        FOOT: system.templates.feet,
         **(guesses or {}),
         NOISE: noise,
     }
     outcomes = []
     for name, rows in inputs.items():
-        scored = score_images(decoder(rows), photos, scene.victims.fresh, embed=embed)
-        hits = scored.cosines >= scene.raw_thresholds[scene.level.name]
+        scored = score_images(decoder(rows), photos, system.victims.fresh, embed=embed)
+        hits = scored.cosines >= system.raw_thresholds[system.level.name]
         control = name in (RAW, NOISE)
         outcomes.append(
-            Outcome(
+            AttackOutcome(
                 attack="reconstruction",
                 variant=name,
                 breaks=Property.IRREVERSIBILITY,
@@ -140,10 +140,10 @@ def reconstruct(
                 assumption=f"A decoder trained on {len(images)} faces of other people draws the "
                 f"face from the {name}; success is a raw match of the drawn face with a fresh "
                 "photo" + (" (a control)" if control else ""),
-                scheme=RAW_SCHEME if name == RAW else scene.scheme,
-                level=scene.level.name,
+                scheme=RAW_SCHEME if name == RAW else system.scheme,
+                level=system.level.name,
                 measured=rate(int(np.count_nonzero(hits)), count),
-                chance=fmr_of(scene.level),
+                chance=fmr_of(system.level),
                 judged=not control,
                 details={
                     **scored.details(),

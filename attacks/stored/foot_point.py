@@ -3,9 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from attacks.outcomes import Knowledge, Outcome
+from attacks.outcomes import AttackOutcome, Knowledge
 from attacks.recovery import recovery_outcome
-from attacks.scene import Scene
+from attacks.system import System
 from templates.space.subspace import SubspaceBatch
 
 
@@ -15,14 +15,14 @@ def foot_points(templates: SubspaceBatch) -> NDArray[np.float64]:
     return np.asarray(feet / np.linalg.norm(feet, axis=1, keepdims=True))
 
 
-def foot_point_attack(scene: Scene) -> list[Outcome]:
+def foot_point_attack(system: System) -> list[AttackOutcome]:
     """Guess p / ‖p‖, from one template and nothing else."""
-    guesses = foot_points(scene.templates)
-    cosines = np.einsum("ij,ij->i", guesses, scene.victims.enrolled.astype(np.float64))
-    norms = scene.templates.foot_norms
+    guesses = foot_points(system.templates)
+    cosines = np.einsum("ij,ij->i", guesses, system.victims.enrolled.astype(np.float64))
+    norms = system.templates.foot_norms
     return [
         recovery_outcome(
-            scene,
+            system,
             guesses,
             attack="foot-point",
             knowledge=Knowledge.TEMPLATE,

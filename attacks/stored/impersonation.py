@@ -4,10 +4,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attacks.decisions import Scores, score
-from attacks.outcomes import POOLED, Knowledge, Outcome, Property
+from attacks.outcomes import POOLED, AttackOutcome, Knowledge, Property
 from attacks.recovery import fmr_of
-from attacks.scene import Scene
 from attacks.stored.recording import decoy_count, recorded_lift
+from attacks.system import System
 from templates.contract.canonical import Json
 from templates.contract.document import Rate
 from templates.decoys import DecoyGenerator, DecoyPool
@@ -19,8 +19,8 @@ Pairs = NDArray[np.int64]
 
 
 def impersonation_attack(
-    scene: Scene, *, faces: NDArray[np.float32] | None = None
-) -> list[Outcome]:
+    system: System, *, faces: NDArray[np.float32] | None = None
+) -> list[AttackOutcome]:
     """Owners of decoys against the templates that hold them.
 
     With a pool they come with another photo of themselves, where there is one, else with the photo
@@ -34,49 +34,49 @@ def impersonation_attack(
         others are strangers to it. The attacker's where None. A generator that is fitted to few
         people lets them in more often; a service's is fitted to thousands.
     """
-    if not decoy_count(scene.scheme) or scene.source is None:
+    if not decoy_count(system.scheme) or system.source is None:
         return []
-    if scene.scheme.decoys == POOLED and isinstance(scene.source, DecoyPool):
-        return [_pooled(scene, scene.source)]
-    return [_generated(scene, scene.attacker if faces is None else faces)]
+    if system.scheme.decoys == POOLED and isinstance(system.source, DecoyPool):
+        return [_pooled(system, system.source)]
+    return [_generated(system, system.attacker if faces is None else faces)]
 
 
-def _pooled(scene: Scene, pool: DecoyPool) -> Outcome:
+def _pooled(system: System, pool: DecoyPool) -> AttackOutcome:
     entries = pool.entries[0]
-    lift = recorded_lift(scene, scene.victims.enrolled, "templates that hold owners")
+    lift = recorded_lift(system, system.victims.enrolled, "templates that hold owners")
     drawn = lift.decoys.reshape(-1, pool.n)
     owners = np.argmax(drawn @ entries.T, axis=1)
     pairs = np.stack([owners, np.arange(len(drawn)) // lift.decoys.shape[1]], axis=1)
-    photo = entries if scene.owners is None else scene.owners.fresh
-    same = "the photo of the pool" if scene.owners is None else "another photo of themselves"
+    photo = entries if system.owners is None else system.owners.fresh
+    same = "the photo of the pool" if system.owners is None else "another photo of themselves"
     return _outcome(
-        scene,
+        system,
         photo,
         lift.templates,
         pairs,
         variant="",
-        chance=fmr_of(scene.level),
+        chance=fmr_of(system.level),
         assumption=(
             f"The owner of a decoy comes with {same} to a template that holds their decoy; "
             "success is acceptance by threshold and cohort test."
         ),
-        details={"with_the_photo_of_the_pool": _rate(scene, entries, lift.templates, pairs)},
+        details={"with_the_photo_of_the_pool": _rate(system, entries, lift.templates, pairs)},
     )
 
 
-def _generated(scene: Scene, faces: NDArray[np.float32]) -> Outcome:
+def _generated(system: System, faces: NDArray[np.float32]) -> AttackOutcome:
     half = len(faces) // 2
     fitted, strangers = faces[:half], faces[half:]
     generator = DecoyGenerator.fit(fitted)
     lift = recorded_lift(
-        scene, scene.victims.enrolled, "decoys of a fitted generator", source=generator
+        system, system.victims.enrolled, "decoys of a fitted generator", source=generator
     )
-    scores = score(strangers, lift.templates, scene.contract, scene.points)
-    accepted = scores.at(scene.level).accepted
+    scores = score(strangers, lift.templates, system.contract, system.points)
+    accepted = scores.at(system.level).accepted
     control = rate(int(np.count_nonzero(accepted)), accepted.size)
     pairs = np.argwhere(np.ones((len(fitted), len(lift.templates)), dtype=np.bool_))
     return _outcome(
-        scene,
+        system,
         fitted,
         lift.templates,
         pairs,
@@ -93,7 +93,7 @@ def _generated(scene: Scene, faces: NDArray[np.float32]) -> Outcome:
 
 
 def _outcome(
-    scene: Scene,
+    system: System,
     photos: NDArray[np.float32],
     templates: SubspaceBatch,
     pairs: Pairs,
@@ -102,24 +102,24 @@ def _outcome(
     chance: float,
     assumption: str,
     details: dict[str, Json],
-) -> Outcome:
+) -> AttackOutcome:
     by_level: dict[str, Json] = {}
-    scores = _scored(scene, photos, templates, pairs)
-    for level in scene.levels:
+    scores = _scored(system, photos, templates, pairs)
+    for level in system.levels:
         near, accepted = scores.at(level)
         by_level[level.name] = {
             "threshold_alone": _counted(near, pairs, len(photos), len(templates)).to_json(),
             "with_cohort_test": _counted(accepted, pairs, len(photos), len(templates)).to_json(),
         }
-    accepted = scores.at(scene.level).accepted
-    return Outcome(
+    accepted = scores.at(system.level).accepted
+    return AttackOutcome(
         attack="impersonation",
         variant=variant,
         breaks=Property.IMPERSONATION,
         knowledge=Knowledge.ALGORITHM,
         assumption=assumption,
-        scheme=scene.scheme,
-        level=scene.level.name,
+        scheme=system.scheme,
+        level=system.level.name,
         measured=_counted(accepted, pairs, len(photos), len(templates)),
         chance=chance,
         details={"people": len(np.unique(pairs[:, 0])), "by_level": by_level, **details},
@@ -127,17 +127,17 @@ def _outcome(
 
 
 def _rate(
-    scene: Scene, photos: NDArray[np.float32], templates: SubspaceBatch, pairs: Pairs
+    system: System, photos: NDArray[np.float32], templates: SubspaceBatch, pairs: Pairs
 ) -> dict[str, Json]:
-    accepted = _scored(scene, photos, templates, pairs).at(scene.level).accepted
+    accepted = _scored(system, photos, templates, pairs).at(system.level).accepted
     return rate(int(np.count_nonzero(accepted)), len(accepted)).to_json()
 
 
 def _scored(
-    scene: Scene, photos: NDArray[np.float32], templates: SubspaceBatch, pairs: Pairs
+    system: System, photos: NDArray[np.float32], templates: SubspaceBatch, pairs: Pairs
 ) -> Scores:
     """Scores of the pairs, (P,)."""
-    every = score(photos, templates, scene.contract, scene.points)
+    every = score(photos, templates, system.contract, system.points)
     row, column = pairs.T
     return Scores(every.similarities[row, column], every.cohort_scores[row, column])
 

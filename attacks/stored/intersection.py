@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from attacks.cast import Person
-from attacks.outcomes import Knowledge, Outcome
+from attacks.outcomes import AttackOutcome, Knowledge
+from attacks.population import Subjects
 from attacks.recovery import recovery_outcome
-from attacks.scene import Scene
+from attacks.system import System
 from templates.decoys import Attributes
 from templates.keys.randomness import Keystream
 from templates.space.lifting import Strategy, lift
@@ -111,25 +111,25 @@ def _normalised(rows: Array) -> Array:
     return np.asarray(rows / np.maximum(np.linalg.norm(rows, axis=-1, keepdims=True), 1e-12))
 
 
-def same_descriptor(scene: Scene, *, lifts: Sequence[int] = LIFTS) -> list[Outcome]:
+def same_descriptor(system: System, *, lifts: Sequence[int] = LIFTS) -> list[AttackOutcome]:
     """Intersect T templates of one descriptor: as they are lifted, and through the wire format."""
     outcomes = []
     for stored in (True, False):
         batches = [
-            scene.lift(scene.victims.enrolled, f"lift {number} of one descriptor")
+            system.lift(system.victims.enrolled, f"lift {number} of one descriptor")
             if stored
-            else _in_memory(scene, f"lift {number} of one descriptor")
+            else _in_memory(system, f"lift {number} of one descriptor")
             for number in range(max(lifts))
         ]
         for count in lifts:
             meetings = _meetings(batches[:count])
             unique = np.array([meeting.shared == 0 for meeting in meetings])
             guesses = np.stack([meeting.point for meeting in meetings])
-            gaps = np.linalg.norm(guesses - scene.victims.enrolled, axis=1)[unique]
+            gaps = np.linalg.norm(guesses - system.victims.enrolled, axis=1)[unique]
             form = "float16 of the wire format" if stored else "float32"
             outcomes.append(
                 recovery_outcome(
-                    scene,
+                    system,
                     guesses,
                     attack="intersection",
                     variant=f"{count} lifts of one descriptor, {form}",
@@ -151,8 +151,8 @@ def same_descriptor(scene: Scene, *, lifts: Sequence[int] = LIFTS) -> list[Outco
 
 
 def different_photos(
-    scene: Scene, photos: Sequence[NDArray[np.float32]], *, lifts: Sequence[int] = LIFTS
-) -> list[Outcome]:
+    system: System, photos: Sequence[NDArray[np.float32]], *, lifts: Sequence[int] = LIFTS
+) -> list[AttackOutcome]:
     """Intersect templates of different photos of one person.
 
     Parameters
@@ -164,17 +164,17 @@ def different_photos(
     """
     outcomes = []
     for count in lifts:
-        enough = [mine for mine in photos if len(mine) > count]
+        enough = [album for album in photos if len(album) > count]
         if not enough:
             continue
         batches = [
-            scene.lift(np.stack([mine[number] for mine in enough]), f"photo {number} of {count}")
+            system.lift(np.stack([album[number] for album in enough]), f"photo {number} of {count}")
             for number in range(count)
         ]
-        means = np.stack([mine[:count].mean(axis=0, dtype=np.float64) for mine in enough])
-        people = Person(
+        means = np.stack([album[:count].mean(axis=0, dtype=np.float64) for album in enough])
+        people = Subjects(
             enrolled=_normalised(means).astype(np.float32),
-            fresh=np.stack([mine[-1] for mine in enough]),
+            fresh=np.stack([album[-1] for album in enough]),
             photos=np.full(len(enough), count),
             shown=np.full(len(enough), -1),  # of no folder
         )
@@ -182,7 +182,7 @@ def different_photos(
         guesses = nearest_common_points(batches)
         outcomes.append(
             recovery_outcome(
-                scene,
+                system,
                 guesses,
                 attack="intersection",
                 variant=f"{count} photos of one person",
@@ -211,16 +211,16 @@ def different_photos(
     return outcomes
 
 
-def _in_memory(scene: Scene, purpose: str) -> SubspaceBatch:
+def _in_memory(system: System, purpose: str) -> SubspaceBatch:
     """Lift the victims without the rounding of the wire format."""
-    strategy = scene.lifter.strategy
-    named = [Attributes()] * len(scene.victims) if strategy is Strategy.HYBRID_PLUS else None
-    with Keystream.seeded("audit", scene.seed, str(scene.scheme), purpose) as stream:
+    strategy = system.lifter.strategy
+    named = [Attributes()] * len(system.victims) if strategy is Strategy.HYBRID_PLUS else None
+    with Keystream.seeded("audit", system.seed, str(system.scheme), purpose) as stream:
         return lift(
-            scene.victims.enrolled,
+            system.victims.enrolled,
             strategy=strategy,
-            m=scene.scheme.dim,
-            source=scene.lifter.source,
+            m=system.scheme.dim,
+            source=system.lifter.source,
             stream=stream,
             attributes=named,
         )

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from attacks.outcomes import POOLED, Knowledge, Outcome
+from attacks.outcomes import POOLED, AttackOutcome, Knowledge
 from attacks.recovery import recovery_outcome
-from attacks.scene import Scene
 from attacks.stored.face_statistics import FaceStatistics
 from attacks.stored.recording import RecordedLift, decoy_count, recorded_lift
+from attacks.system import System
 from templates.contract.canonical import Json
 from templates.decoys import DecoyPool
 from templates.distances import Metric, pairwise_distances
@@ -31,7 +31,7 @@ DRAWN = 10_000
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Found:
+class DecoyMatches:
     """Entries of W that are taken for decoys.
 
     Parameters
@@ -48,7 +48,7 @@ class Found:
 
 def find_decoys(
     database: NDArray[np.float32], templates: SubspaceBatch, *, most: int, exact: bool = True
-) -> Found:
+) -> DecoyMatches:
     """Tell the decoys of templates among the entries of a database, (|W|, n).
 
     Parameters
@@ -69,7 +69,7 @@ def find_decoys(
         gaps = np.diff(ordered, axis=1, prepend=0.0)
         cuts = np.argmax(gaps, axis=1)
     entries = [row[:cut] for row, cut in zip(nearest, cuts, strict=True)]
-    return Found(entries, np.asarray(distances, dtype=np.float64))
+    return DecoyMatches(entries, np.asarray(distances, dtype=np.float64))
 
 
 def remainder(
@@ -148,30 +148,32 @@ def strip_decoys(
     return guesses
 
 
-def known_database_attack(scene: Scene) -> list[Outcome]:
+def known_database_attack(system: System) -> list[AttackOutcome]:
     """Attack with the pool, exactly known and perturbed.
 
     With a generator: with draws of it, which everybody can make, and with the templates' own
     decoys, which nobody has. Neither is judged. Empty for a scheme without decoys.
     """
-    most = decoy_count(scene.scheme)
-    if not most or scene.source is None:
+    most = decoy_count(system.scheme)
+    if not most or system.source is None:
         return []
-    if scene.scheme.decoys != POOLED or not isinstance(scene.source, DecoyPool):
-        with Keystream.seeded("audit", scene.seed, "decoys that the attacker draws") as stream:
-            drawn = scene.lifter.source.draw(1, DRAWN, stream=stream)[0]
-        lift = recorded_lift(scene, scene.victims.enrolled, "decoys of a generator")
-        return [attack_with_draws(scene, lift, drawn), _told(scene, lift)]
-    database = scene.source.entries[0]
-    faces = FaceStatistics.of(np.concatenate([scene.attacker, database]))
+    if system.scheme.decoys != POOLED or not isinstance(system.source, DecoyPool):
+        with Keystream.seeded("audit", system.seed, "decoys that the attacker draws") as stream:
+            drawn = system.lifter.source.draw(1, DRAWN, stream=stream)[0]
+        lift = recorded_lift(system, system.victims.enrolled, "decoys of a generator")
+        return [attack_with_draws(system, lift, drawn), _told(system, lift)]
+    database = system.source.entries[0]
+    faces = FaceStatistics.of(np.concatenate([system.attacker, database]))
     outcomes = []
     for noise in (0.0, *NOISES):
-        lift = recorded_lift(scene, scene.victims.enrolled, f"decoys moved by {noise}", noise=noise)
-        found = find_decoys(database, lift.templates, most=most, exact=not noise)
-        guesses = strip_decoys(lift.templates, database, found.entries, faces)
+        lift = recorded_lift(
+            system, system.victims.enrolled, f"decoys moved by {noise}", noise=noise
+        )
+        matches = find_decoys(database, lift.templates, most=most, exact=not noise)
+        guesses = strip_decoys(lift.templates, database, matches.entries, faces)
         outcomes.append(
             recovery_outcome(
-                scene,
+                system,
                 guesses,
                 attack="known-database",
                 variant=f"decoys perturbed by {noise:g}" if noise else "",
@@ -187,15 +189,17 @@ def known_database_attack(scene: Scene) -> list[Outcome]:
                 ),
                 judged=not noise,
                 details={
-                    **_search_details(found, lift, database),
-                    **_remainder_details(scene, lift, database, found),
+                    **_search_details(matches, lift, database),
+                    **_remainder_details(system, lift, database, matches),
                 },
             )
         )
     return outcomes
 
 
-def attack_with_draws(scene: Scene, lift: RecordedLift, drawn: NDArray[np.float32]) -> Outcome:
+def attack_with_draws(
+    system: System, lift: RecordedLift, drawn: NDArray[np.float32]
+) -> AttackOutcome:
     """Look for the decoys of the victims' templates among draws of their generator.
 
     Parameters
@@ -205,11 +209,11 @@ def attack_with_draws(scene: Scene, lift: RecordedLift, drawn: NDArray[np.float3
     drawn : (K, n) float32
         The draws.
     """
-    found = find_decoys(drawn, lift.templates, most=decoy_count(scene.scheme))
-    faces = FaceStatistics.of(scene.attacker)
+    matches = find_decoys(drawn, lift.templates, most=decoy_count(system.scheme))
+    faces = FaceStatistics.of(system.attacker)
     return recovery_outcome(
-        scene,
-        strip_decoys(lift.templates, drawn, found.entries, faces),
+        system,
+        strip_decoys(lift.templates, drawn, matches.entries, faces),
         attack="known-database",
         variant="draws of the generator",
         knowledge=Knowledge.ALGORITHM,
@@ -220,19 +224,19 @@ def attack_with_draws(scene: Scene, lift: RecordedLift, drawn: NDArray[np.float3
             "draw comes twice, so it fails by construction."
         ),
         judged=False,
-        details={"drawn": len(drawn), **_search_details(found, lift, drawn)},
+        details={"drawn": len(drawn), **_search_details(matches, lift, drawn)},
     )
 
 
-def _told(scene: Scene, lift: RecordedLift) -> Outcome:
+def _told(system: System, lift: RecordedLift) -> AttackOutcome:
     """Give the attacker the decoys of every template: what a known pool would come to."""
     count, k, n = lift.decoys.shape
-    own = [np.arange(row * k, (row + 1) * k) for row in range(count)]
+    positions = [np.arange(row * k, (row + 1) * k) for row in range(count)]
     guesses = strip_decoys(
-        lift.templates, lift.decoys.reshape(-1, n), own, FaceStatistics.of(scene.attacker)
+        lift.templates, lift.decoys.reshape(-1, n), positions, FaceStatistics.of(system.attacker)
     )
     return recovery_outcome(
-        scene,
+        system,
         guesses,
         attack="known-database",
         variant="the template's own decoys",
@@ -249,24 +253,24 @@ def _told(scene: Scene, lift: RecordedLift) -> Outcome:
 
 
 def _search_details(
-    found: Found, lift: RecordedLift, database: NDArray[np.float32]
+    matches: DecoyMatches, lift: RecordedLift, database: NDArray[np.float32]
 ) -> dict[str, Json]:
     """How many decoys were found, and how far decoys and strangers lie."""
     count, k, _ = lift.decoys.shape
     hits, false, whole = 0, 0, 0
-    inside = np.zeros(found.distances.shape, dtype=np.bool_)
-    for row, chosen in enumerate(found.entries):
+    inside = np.zeros(matches.distances.shape, dtype=np.bool_)
+    for row, chosen in enumerate(matches.entries):
         inside[row] = (database @ lift.decoys[row].T).max(axis=1) > 1 - 1e-6
         hit = int(np.count_nonzero(inside[row, chosen]))
         hits += hit
         false += len(chosen) - hit
         whole += int(hit == k == len(chosen))
-    strangers = np.where(inside, np.inf, found.distances)
+    strangers = np.where(inside, np.inf, matches.distances)
     return {
         "decoys_found": rate(hits, count * k).to_json(),
         "templates_with_all_decoys_found": rate(whole, count).to_json(),
         "false_finds": false,
-        "largest_distance_of_a_decoy": float(found.distances[inside].max())
+        "largest_distance_of_a_decoy": float(matches.distances[inside].max())
         if inside.any()
         else None,
         "smallest_distance_of_another_entry": float(strangers.min()),
@@ -274,12 +278,14 @@ def _search_details(
 
 
 def _remainder_details(
-    scene: Scene, lift: RecordedLift, database: NDArray[np.float32], found: Found
+    system: System, lift: RecordedLift, database: NDArray[np.float32], matches: DecoyMatches
 ) -> dict[str, Json]:
     """Return what the plain removal of docs/method.md §4.2 reaches, for comparison."""
     cosines = []
-    for row, chosen in enumerate(found.entries):
+    for row, chosen in enumerate(matches.entries):
         template = lift.templates[row]
         rest = remainder(template.foot.astype(np.float64), template.project(database[chosen]))
-        cosines.append(rest @ scene.victims.enrolled[row] / max(float(np.linalg.norm(rest)), 1e-12))
+        cosines.append(
+            rest @ system.victims.enrolled[row] / max(float(np.linalg.norm(rest)), 1e-12)
+        )
     return {"cosine_of_plain_remainder_mean": float(np.mean(cosines))}

@@ -7,11 +7,11 @@ neighbour, or the point of the template nearest to it, is a guess of the hidden 
 import numpy as np
 from numpy.typing import NDArray
 
-from attacks.outcomes import POOLED, Knowledge, Outcome, Property
+from attacks.outcomes import POOLED, AttackOutcome, Knowledge, Property
 from attacks.recovery import recovery_outcome
-from attacks.scene import Scene
 from attacks.stored.known_database import find_decoys
 from attacks.stored.recording import decoy_count
+from attacks.system import System
 from templates.contract.canonical import Json
 from templates.decoys import DecoyPool
 from templates.distances import Metric, pairwise_distances
@@ -52,36 +52,36 @@ def nearest_points(points: NDArray[np.floating], templates: SubspaceBatch) -> ND
     )
 
 
-def nearest_neighbour_attack(scene: Scene) -> list[Outcome]:
+def nearest_neighbour_attack(system: System) -> list[AttackOutcome]:
     """Victim in the gallery or not, decoys in the gallery or not.
 
     Nobody owns generated decoys, so with a generator they are in no gallery.
     """
-    outcomes = [_identify(scene, scene.attacker), _guess(scene, scene.attacker)]
-    if scene.scheme.decoys == POOLED and isinstance(scene.source, DecoyPool):
-        gallery = np.concatenate([scene.attacker, scene.source.entries[0]])
-        outcomes += [_identify(scene, gallery), _guess(scene, gallery)]
+    outcomes = [_identify(system, system.attacker), _guess(system, system.attacker)]
+    if system.scheme.decoys == POOLED and isinstance(system.source, DecoyPool):
+        gallery = np.concatenate([system.attacker, system.source.entries[0]])
+        outcomes += [_identify(system, gallery), _guess(system, gallery)]
     return outcomes
 
 
-def _variant(scene: Scene, gallery: NDArray[np.float32], victim: str) -> str:
-    decoys = "in" if len(gallery) > len(scene.attacker) else "not in"
+def _variant(system: System, gallery: NDArray[np.float32], victim: str) -> str:
+    decoys = "in" if len(gallery) > len(system.attacker) else "not in"
     return f"victim {victim} the gallery, decoys {decoys} it"
 
 
-def _decoys_in(scene: Scene, gallery: NDArray[np.float32]) -> list[NDArray[np.int64]] | None:
-    if len(gallery) == len(scene.attacker):
+def _decoys_in(system: System, gallery: NDArray[np.float32]) -> list[NDArray[np.int64]] | None:
+    if len(gallery) == len(system.attacker):
         return None
-    return find_decoys(gallery, scene.templates, most=decoy_count(scene.scheme)).entries
+    return find_decoys(gallery, system.templates, most=decoy_count(system.scheme)).entries
 
 
-def _identify(scene: Scene, others: NDArray[np.float32]) -> Outcome:
-    gallery = np.concatenate([others, scene.victims.fresh])
+def _identify(system: System, others: NDArray[np.float32]) -> AttackOutcome:
+    gallery = np.concatenate([others, system.victims.fresh])
     truth = np.arange(len(others), len(gallery))
-    skip = _decoys_in(scene, others)
+    skip = _decoys_in(system, others)
 
     def identified(metric: Metric, passed: list[NDArray[np.int64]] | None) -> int:
-        first = nearest_entries(gallery, scene.templates, metric=metric, skip=passed)[:, 0]
+        first = nearest_entries(gallery, system.templates, metric=metric, skip=passed)[:, 0]
         return int(np.count_nonzero(first == truth))
 
     details: dict[str, Json] = {
@@ -91,9 +91,9 @@ def _identify(scene: Scene, others: NDArray[np.float32]) -> Outcome:
     if skip is not None:
         naive = identified(Metric.SPHERICAL, None)
         details["without_skipping_decoys"] = rate(naive, len(truth)).to_json()
-    return Outcome(
+    return AttackOutcome(
         attack="nearest-neighbour",
-        variant=_variant(scene, others, "in"),
+        variant=_variant(system, others, "in"),
         breaks=Property.UNLINKABILITY,
         knowledge=Knowledge.ALGORITHM,
         assumption=(
@@ -101,7 +101,7 @@ def _identify(scene: Scene, others: NDArray[np.float32]) -> Outcome:
             "of the victim; success is the victim at rank 1. Not judged: whoever can match a "
             "template against photos can do this, in any system."
         ),
-        scheme=scene.scheme,
+        scheme=system.scheme,
         measured=rate(identified(Metric.SPHERICAL, skip), len(truth)),
         chance=1 / len(gallery),
         judged=False,
@@ -109,20 +109,20 @@ def _identify(scene: Scene, others: NDArray[np.float32]) -> Outcome:
     )
 
 
-def _guess(scene: Scene, gallery: NDArray[np.float32]) -> Outcome:
-    skip = _decoys_in(scene, gallery)
+def _guess(system: System, gallery: NDArray[np.float32]) -> AttackOutcome:
+    skip = _decoys_in(system, gallery)
     details: dict[str, Json] = {"gallery": len(gallery)}
-    truth = scene.victims.enrolled.astype(np.float64)
+    truth = system.victims.enrolled.astype(np.float64)
     for metric in (Metric.EUCLIDEAN, Metric.SPHERICAL):
-        first = nearest_entries(gallery, scene.templates, metric=metric, skip=skip)[:, 0]
+        first = nearest_entries(gallery, system.templates, metric=metric, skip=skip)[:, 0]
         cosines = np.einsum("ij,ij->i", gallery[first].astype(np.float64), truth)
         details[f"cosine_of_neighbour_to_truth_mean_{metric}"] = float(cosines.mean())
-    guesses = nearest_points(gallery[first], scene.templates)
+    guesses = nearest_points(gallery[first], system.templates)
     return recovery_outcome(
-        scene,
+        system,
         guesses,
         attack="nearest-neighbour",
-        variant=_variant(scene, gallery, "not in"),
+        variant=_variant(system, gallery, "not in"),
         knowledge=Knowledge.ALGORITHM,
         assumption=(
             "The attacker has a gallery of other people's faces, passes over those at distance 0, "

@@ -7,10 +7,10 @@ No attacker has it. It bounds from above what a search among K neighbours could 
 import numpy as np
 from numpy.typing import NDArray
 
-from attacks.outcomes import Knowledge, Outcome, Property
+from attacks.outcomes import AttackOutcome, Knowledge, Property
 from attacks.recovery import fmr_of, score_guesses
-from attacks.scene import Scene
 from attacks.stored.nearest_neighbour import nearest_entries, nearest_points
+from attacks.system import System
 from templates.contract.canonical import Json
 
 NEIGHBOURS = (1, 2, 5, 10, 20, 50, 100)
@@ -34,32 +34,34 @@ def best_of(
     return np.asarray(gallery[entries[np.arange(len(entries)), best]])
 
 
-def oracle_attack(scene: Scene, *, neighbours: tuple[int, ...] = NEIGHBOURS) -> list[Outcome]:
+def oracle_attack(
+    system: System, *, neighbours: tuple[int, ...] = NEIGHBOURS
+) -> list[AttackOutcome]:
     """Curve over K, for the neighbour itself and for the nearest unit-length point to it.
 
     The outcome of either is that of the largest K.
     """
-    gallery, truth = scene.attacker, scene.victims.enrolled
+    gallery, truth = system.attacker, system.victims.enrolled
     counts = sorted({min(count, len(gallery)) for count in neighbours})
-    entries = nearest_entries(gallery, scene.templates, count=counts[-1])
+    entries = nearest_entries(gallery, system.templates, count=counts[-1])
     outcomes = []
     for projected in (False, True):
         curve: list[Json] = []
         for count in counts:
             chosen = best_of(gallery, entries[:, :count], truth)
-            guesses = nearest_points(chosen, scene.templates) if projected else chosen
-            recovery = score_guesses(scene, guesses)
+            guesses = nearest_points(chosen, system.templates) if projected else chosen
+            recovery = score_guesses(system, guesses)
             distances = np.sqrt(np.maximum(2 - 2 * recovery.to_truth, 0))
             curve.append(
                 {
                     "neighbours": count,
                     "distance_to_truth_mean": float(distances.mean()),
                     "cosine_to_truth_mean": float(recovery.to_truth.mean()),
-                    "matched": recovery.matched[scene.level.name].to_json(),
+                    "matched": recovery.matched[system.level.name].to_json(),
                 }
             )
         outcomes.append(
-            Outcome(
+            AttackOutcome(
                 attack="oracle",
                 variant="projected" if projected else "neighbour",
                 breaks=Property.IRREVERSIBILITY,
@@ -74,10 +76,10 @@ def oracle_attack(scene: Scene, *, neighbours: tuple[int, ...] = NEIGHBOURS) -> 
                     )
                     + " with a fresh photo of the victim."
                 ),
-                scheme=scene.scheme,
-                level=scene.level.name,
-                measured=recovery.matched[scene.level.name],
-                chance=fmr_of(scene.level),
+                scheme=system.scheme,
+                level=system.level.name,
+                measured=recovery.matched[system.level.name],
+                chance=fmr_of(system.level),
                 judged=False,
                 details={**recovery.details(), "curve": curve},
             )

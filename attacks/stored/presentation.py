@@ -14,19 +14,22 @@ from numpy.typing import NDArray
 
 from attacks.decisions import Scores, score
 from attacks.linkage import secret_rotation
-from attacks.outcomes import POOLED, Knowledge, Outcome, Property
+from attacks.outcomes import POOLED, AttackOutcome, Knowledge, Property
 from attacks.recovery import fmr_of
-from attacks.scene import Scene
-from attacks.stored.nearest_neighbour import nearest_points
+from attacks.stored.honest_probes import (
+    honest_embedding,
+    honest_flats,
+    honest_lift,
+    points_inside,
+)
 from attacks.stored.wolf_ascent import Ground, ascend_points, ascend_subspaces
 from attacks.stored.wolves import ALONG_MEAN, CENTRAL, axis_wolves, canonical
+from attacks.system import System
 from templates.contract.canonical import Json
 from templates.contract.document import Calibration, Contract, Level, Rate
 from templates.decoys import DecoyGenerator
-from templates.errors import InvalidEmbedding
 from templates.keys.randomness import Keystream
 from templates.keys.rotation import rotate
-from templates.space.embedding import unit_rows
 from templates.space.subspace import SubspaceBatch
 from verify.cohort import COHORT_SIZE, Probes, make_cohort, people_like
 from verify.comparisons import through_wire
@@ -41,7 +44,7 @@ STARTS = 6
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Bench:
+class OwnTemplates:
     """What the attacker lifts on their own.
 
     Parameters
@@ -61,93 +64,48 @@ class Bench:
         return Ground.of(self.targets, self.cohort[:COHORT_CLIMBED], rule)
 
 
-def attacker_bench(scene: Scene) -> Bench:
+def lift_own_templates(system: System) -> OwnTemplates:
     """Lift the attacker's faces, and a cohort with the generator that clients have.
 
     The cohort of a pool's service is made with a generator; the attacker fits one to their own
     faces. Templates are lifted with the scheme's decoys: see ``wolf_knowledge``.
     """
-    faces = np.random.default_rng(scene.seed).permutation(scene.attacker)[: 2 * TARGETS]
-    source = scene.lifter.source
-    known = source if isinstance(source, DecoyGenerator) else DecoyGenerator.fit(scene.attacker)
+    faces = np.random.default_rng(system.seed).permutation(system.attacker)[: 2 * TARGETS]
+    source = system.lifter.source
+    known = source if isinstance(source, DecoyGenerator) else DecoyGenerator.fit(system.attacker)
     half = len(faces) // 2
-    with Keystream.seeded("audit", scene.seed, str(scene.scheme), "attacker's cohort") as stream:
+    with Keystream.seeded("audit", system.seed, str(system.scheme), "attacker's cohort") as stream:
         cohort = make_cohort(
             known,
-            strategy=scene.lifter.strategy,
-            m=scene.scheme.dim,
+            strategy=system.lifter.strategy,
+            m=system.scheme.dim,
             stream=stream,
             size=COHORT_SIZE,
-            hidden=people_like(known, scene.attacker),
+            hidden=people_like(known, system.attacker),
         )
-    return Bench(
-        targets=scene.lift(faces[:half], "attacker's targets"),
-        held_out=scene.lift(faces[half:], "attacker's held-out targets"),
+    return OwnTemplates(
+        targets=system.lift(faces[:half], "attacker's targets"),
+        held_out=system.lift(faces[half:], "attacker's held-out targets"),
         cohort=cohort,
     )
 
 
-def wolf_knowledge(scene: Scene) -> Knowledge:
+def wolf_knowledge(system: System) -> Knowledge:
     """Return what lifting as the service does takes: a generator is public, a pool is secret."""
-    return Knowledge.DECOYS if scene.scheme.decoys == POOLED else Knowledge.ALGORITHM
+    return Knowledge.DECOYS if system.scheme.decoys == POOLED else Knowledge.ALGORITHM
 
 
-def presentation_attack(scene: Scene) -> list[Outcome]:
+def presentation_attack(system: System) -> list[AttackOutcome]:
     """All probes, raw and, where the contract takes them, lifted.
 
     Of each the decision with input checks and cohort test is judged; the threshold alone, without
     input checks, stands beside it.
     """
-    bench = attacker_bench(scene)
-    outcomes = _raw(scene, bench)
-    if scene.lifted is not None:
-        outcomes += _lifted(scene, scene.lifted, bench)
+    own = lift_own_templates(system)
+    outcomes = _raw(system, own)
+    if system.lifted is not None:
+        outcomes += _lifted(system, system.lifted, own)
     return outcomes
-
-
-def honest_embedding(probes: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Return which raw probes (P, n) pass the service's input check."""
-    passed = np.ones(len(probes), dtype=np.bool_)
-    for row, probe in enumerate(probes):
-        try:
-            unit_rows(probe, n=probes.shape[1], most=1)
-        except InvalidEmbedding:
-            passed[row] = False
-    return passed
-
-
-def honest_lift(probes: SubspaceBatch, calibration: Calibration) -> NDArray[np.bool_]:
-    """Return which lifted probes have a foot point that the calibration takes for honest."""
-    low, high = calibration.foot_point_norm or (1.0, 0.0)
-    return np.asarray((low <= probes.foot_norms) & (probes.foot_norms <= high))
-
-
-def points_inside(templates: SubspaceBatch, *, seed: int) -> NDArray[np.float32]:
-    """Return a random unit vector of every template, (T, n): at distance 0 from it."""
-    directions = np.random.default_rng(seed).standard_normal((len(templates), templates.n))
-    return nearest_points(directions, templates).astype(np.float32)
-
-
-def flats_inside(templates: SubspaceBatch, m: int, *, foot_norm: float) -> SubspaceBatch:
-    """Return an affine subspace of dimension m inside every template, at distance 0 from it.
-
-    Where the template has more dimensions, the foot point is moved along one of them to have the
-    norm of an honest lift's.
-    """
-    if templates.m <= m:
-        return templates
-    norms = templates.foot_norms[:, None]
-    height = np.sqrt(np.maximum(foot_norm**2 - norms**2, 0))
-    return SubspaceBatch(
-        (templates.feet + height * templates.bases[:, m]).astype(np.float32), templates.bases[:, :m]
-    )
-
-
-def honest_flats(templates: SubspaceBatch, calibration: Calibration) -> SubspaceBatch:
-    """Return ``flats_inside`` of a foot point norm that the calibration takes for honest."""
-    low, high = calibration.foot_point_norm or (0.0, 1.0)
-    # Near the lower end: a foot point can be made longer inside a template, and not shorter.
-    return flats_inside(templates, calibration.probe_m, foot_norm=low + 0.1 * (high - low))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -175,24 +133,24 @@ class Trial:
     knowledge: Knowledge = Knowledge.ALGORITHM
 
 
-def _raw(scene: Scene, bench: Bench) -> list[Outcome]:
-    calibration, n = scene.points, scene.templates.n
+def _raw(system: System, own: OwnTemplates) -> list[AttackOutcome]:
+    calibration, n = system.points, system.templates.n
     zero = np.zeros((1, n), dtype=np.float32)
-    plain = _plain_wolves(scene.attacker)
-    starts = np.concatenate([plain, scene.attacker[:STARTS]])
-    inside = points_inside(scene.templates, seed=scene.seed)
-    turned = rotate(inside, secret_rotation(scene, "replay")).astype(np.float32)
+    plain = _plain_wolves(system.attacker)
+    starts = np.concatenate([plain, system.attacker[:STARTS]])
+    inside = points_inside(system.templates, seed=system.seed)
+    turned = rotate(inside, secret_rotation(system, "replay")).astype(np.float32)
 
     def wolf(variant: str, does: str, made: Callable[[Level], NDArray[np.float32]]) -> Trial:
-        found = []
-        for rule in _rules(scene, calibration):
+        best = []
+        for rule in _rules(system, calibration):
             candidates = made(rule)
-            shares = accepted_shares(candidates, bench, scene.contract, calibration, rule)
-            found.append(candidates[[int(np.argmax(shares))]])
-        return Trial(variant, does, found[0], found[1], wolf_knowledge(scene))
+            shares = accepted_shares(candidates, own, system.contract, calibration, rule)
+            best.append(candidates[[int(np.argmax(shares))]])
+        return Trial(variant, does, best[0], best[1], wolf_knowledge(system))
 
     def climbed(rule: Level) -> NDArray[np.float32]:
-        return ascend_points(starts, bench.ground(rule))
+        return ascend_points(starts, own.ground(rule))
 
     trials = [
         Trial("zero embedding", "sends the zero vector", zero, zero),
@@ -222,42 +180,42 @@ def _raw(scene: Scene, bench: Bench) -> list[Outcome]:
             turned,
         ),
     ]
-    return [each for trial in trials for each in _outcomes(scene, calibration, trial)]
+    return [outcome for trial in trials for outcome in _outcomes(system, calibration, trial)]
 
 
-def _lifted(scene: Scene, calibration: Calibration, bench: Bench) -> list[Outcome]:
-    m, n = calibration.probe_m, scene.templates.n
+def _lifted(system: System, calibration: Calibration, own: OwnTemplates) -> list[AttackOutcome]:
+    m, n = calibration.probe_m, system.templates.n
     low, high = calibration.foot_point_norm or (0.0, 1.0)
-    rng = np.random.default_rng(scene.seed)
-    wolves = axis_wolves(scene.attacker, m, foot_norm=(low + high) / 2, seed=scene.seed)
+    rng = np.random.default_rng(system.seed)
+    wolves = axis_wolves(system.attacker, m, foot_norm=(low + high) / 2, seed=system.seed)
     central = SubspaceBatch.of(
-        [canonical(np.zeros(n), rng.standard_normal((m, n))) for _ in range(len(scene.templates))]
+        [canonical(np.zeros(n), rng.standard_normal((m, n))) for _ in range(len(system.templates))]
     )
-    inside = honest_flats(scene.templates, calibration)
-    turned = inside.rotated(secret_rotation(scene, "replay"))
+    inside = honest_flats(system.templates, calibration)
+    turned = inside.rotated(secret_rotation(system, "replay"))
 
     def shares(probes: SubspaceBatch, rule: Level) -> NDArray[np.float64]:
-        return accepted_shares(probes, bench, scene.contract, calibration, rule)
+        return accepted_shares(probes, own, system.contract, calibration, rule)
 
     def wolf(variant: str, does: str, made: Callable[[Level], SubspaceBatch]) -> Trial:
-        found = []
-        for rule in _rules(scene, calibration):
-            received = through_wire(made(rule), contract_id=scene.contract.contract_id)
+        best = []
+        for rule in _rules(system, calibration):
+            received = through_wire(made(rule), contract_id=system.contract.contract_id)
             honest = honest_lift(received, calibration)
             # Without the cohort test there are no input checks either: see `_outcomes`.
             if np.isfinite(rule.cohort_threshold) and honest.any():
                 received = received[honest]
-            found.append(received[np.array([np.argmax(shares(received, rule))])])
-        return Trial(variant, does, found[0], found[1], wolf_knowledge(scene))
+            best.append(received[np.array([np.argmax(shares(received, rule))])])
+        return Trial(variant, does, best[0], best[1], wolf_knowledge(system))
 
     def family(name: str) -> SubspaceBatch:
-        return SubspaceBatch.of([each.subspace for each in wolves if each.family == name])
+        return SubspaceBatch.of([axis.subspace for axis in wolves if axis.family == name])
 
     def climbed(rule: Level) -> SubspaceBatch:
-        starts = SubspaceBatch.of([each.subspace for each in wolves])
+        starts = SubspaceBatch.of([axis.subspace for axis in wolves])
         starts = starts[honest_lift(starts, calibration)]
         leading = starts[np.argsort(-shares(starts, rule))[:STARTS]]
-        return ascend_subspaces(leading, bench.ground(rule))
+        return ascend_subspaces(leading, own.ground(rule))
 
     trials = [
         Trial(
@@ -297,7 +255,7 @@ def _lifted(scene: Scene, calibration: Calibration, bench: Bench) -> list[Outcom
             turned,
         ),
     ]
-    return [each for trial in trials for each in _outcomes(scene, calibration, trial)]
+    return [outcome for trial in trials for outcome in _outcomes(system, calibration, trial)]
 
 
 def _plain_wolves(faces: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -309,34 +267,34 @@ def _plain_wolves(faces: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(rows / np.linalg.norm(rows, axis=1, keepdims=True), dtype=np.float32)
 
 
-def _rules(scene: Scene, calibration: Calibration) -> tuple[Level, Level]:
+def _rules(system: System, calibration: Calibration) -> tuple[Level, Level]:
     """Return the service's default level, and the same without the cohort test."""
-    level = calibration.level(scene.contract.default_level)
+    level = calibration.level(system.contract.default_level)
     return level, replace(level, cohort_threshold=-np.inf)
 
 
 def accepted_shares(
-    probes: Probes, bench: Bench, contract: Contract, calibration: Calibration, level: Level
+    probes: Probes, own: OwnTemplates, contract: Contract, calibration: Calibration, level: Level
 ) -> NDArray[np.float64]:
     """Share of the attacker's held-out templates that accept each probe, by their own cohort.
 
     Ties, such as where none accepts, are broken by the mean similarity.
     """
-    scores = score(probes, bench.held_out, contract, calibration, cohort=bench.cohort)
+    scores = score(probes, own.held_out, contract, calibration, cohort=own.cohort)
     # Similarities lie in [-1, 1]: their mean, scaled, never outweighs one acceptance.
-    tie = scores.similarities.mean(axis=1) / (4 * len(bench.held_out))
+    tie = scores.similarities.mean(axis=1) / (4 * len(own.held_out))
     return np.asarray(scores.at(level).accepted.mean(axis=1) + tie, dtype=np.float64)
 
 
-def _outcomes(scene: Scene, calibration: Calibration, trial: Trial) -> list[Outcome]:
+def _outcomes(system: System, calibration: Calibration, trial: Trial) -> list[AttackOutcome]:
     """Judge the service's decision, and report that of the threshold alone."""
-    default = scene.contract.default_level
+    default = system.contract.default_level
     passed = _passed(trial.probes, calibration)
     judged, alone = {}, {}
     by_level: dict[str, Json] = {}
     alone_by_level: dict[str, Json] = {}
-    scores = _scored(scene, trial.probes, calibration)
-    bare = scores if trial.alone is trial.probes else _scored(scene, trial.alone, calibration)
+    scores = _scored(system, trial.probes, calibration)
+    bare = scores if trial.alone is trial.probes else _scored(system, trial.alone, calibration)
     for level in calibration.levels:
         accepted = scores.at(level).accepted
         judged[level.name] = accepted & passed
@@ -346,11 +304,11 @@ def _outcomes(scene: Scene, calibration: Calibration, trial: Trial) -> list[Outc
             "with_input_checks": _counted(judged[level.name]),
         }
         alone_by_level[level.name] = _counted(alone[level.name])
-    judged_outcome = Outcome(
+    judged_outcome = AttackOutcome(
         attack="presentation",
         breaks=Property.IMPERSONATION,
         knowledge=trial.knowledge,
-        scheme=scene.scheme,
+        scheme=system.scheme,
         level=default,
         chance=fmr_of(calibration.level(default)),
         variant=trial.variant,
@@ -389,11 +347,11 @@ def _passed(probes: Probes, calibration: Calibration) -> NDArray[np.bool_]:
     return honest_embedding(probes)
 
 
-def _scored(scene: Scene, probes: Probes, calibration: Calibration) -> Scores:
+def _scored(system: System, probes: Probes, calibration: Calibration) -> Scores:
     """One trial a victim: probe i meets template i, or the only probe meets all; (V,) each."""
     if len(probes) > 1:
-        return score(probes, scene.templates, scene.contract, calibration, paired=True)
-    every = score(probes, scene.templates, scene.contract, calibration)
+        return score(probes, system.templates, system.contract, calibration, paired=True)
+    every = score(probes, system.templates, system.contract, calibration)
     return Scores(every.similarities[0], every.cohort_scores[0])
 
 

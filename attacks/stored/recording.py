@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attacks.outcomes import Scheme
-from attacks.scene import Scene
+from attacks.system import System
 from templates.decoys import Attributes, DecoySource
 from templates.keys.randomness import Keystream
 from templates.space.lifting import Strategy
@@ -71,14 +71,14 @@ class RecordedLift:
 
 
 def recorded_lift(
-    scene: Scene,
+    system: System,
     descriptors: NDArray[np.float32],
     purpose: str,
     *,
     source: DecoySource | None = None,
     noise: float = 0.0,
 ) -> RecordedLift:
-    """Lift (N, n) descriptors as the scene's service does, and record the decoys.
+    """Lift (N, n) descriptors as the system's service does, and record the decoys.
 
     One descriptor at a time: lifting draws again where a decoy comes twice, and only then is the
     last draw the one that was used.
@@ -86,19 +86,19 @@ def recorded_lift(
     Parameters
     ----------
     source
-        Instead of the scene's.
+        Instead of the system's.
     noise
         See ``RecordingSource``.
     """
-    recording = RecordingSource(source or scene.lifter.source, noise=noise)
-    lifter = replace(scene.lifter, source=recording)
+    recording = RecordingSource(source or system.lifter.source, noise=noise)
+    lifter = replace(system.lifter, source=recording)
     feet = np.empty_like(descriptors)
-    bases = np.empty((len(descriptors), scene.scheme.dim, recording.n), dtype=np.float32)
-    decoys = np.empty((len(descriptors), decoy_count(scene.scheme), recording.n), dtype=np.float32)
-    with Keystream.seeded("audit", scene.seed, str(scene.scheme), purpose) as stream:
+    bases = np.empty((len(descriptors), system.scheme.dim, recording.n), dtype=np.float32)
+    decoys = np.empty((len(descriptors), decoy_count(system.scheme), recording.n), dtype=np.float32)
+    with Keystream.seeded("audit", system.seed, str(system.scheme), purpose) as stream:
         for row in range(len(descriptors)):
             one = slice(row, row + 1)
-            lifted = lifter.lift(descriptors[one], m=scene.scheme.dim, stream=stream)
+            lifted = lifter.lift(descriptors[one], m=system.scheme.dim, stream=stream)
             feet[one], bases[one] = lifted.feet, lifted.bases
             if decoys.shape[1]:
                 decoys[one] = recording.last

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from templates.contract.document import Level
 from templates.space.subspace import SubspaceBatch
 
-Floats = NDArray[np.float32]
+Array32 = NDArray[np.float32]
 
 ROUNDS = 60
 _FIRST_STEP, _LAST_STEP = 0.3, 0.01
@@ -41,9 +41,9 @@ class Ground:
         Of the level that the wolf is made for.
     """
 
-    feet: Floats
-    rows: Floats
-    radii: Floats
+    feet: Array32
+    rows: Array32
+    radii: Array32
     targets: int
     similarity_threshold: float
     cohort_threshold: float
@@ -61,7 +61,7 @@ class Ground:
             cohort_threshold=level.cohort_threshold,
         )
 
-    def slopes(self, similarities: Floats) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def slopes(self, similarities: Array32) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Objective, shape (S,), and its slope by every similarity, shape (S, K).
 
         Parameters
@@ -70,11 +70,11 @@ class Ground:
             Of S probes to the K subspaces.
         """
         values = similarities.astype(np.float64)
-        mine, cohort = values[:, : self.targets], values[:, self.targets :]
+        of_targets, cohort = values[:, : self.targets], values[:, self.targets :]
         mean = cohort.mean(axis=1, keepdims=True)
         spread = np.maximum(cohort.std(axis=1, ddof=1, keepdims=True), 1e-6)
-        score = (mine - mean) / spread
-        near = _logistic((mine - self.similarity_threshold) / spread)
+        score = (of_targets - mean) / spread
+        near = _logistic((of_targets - self.similarity_threshold) / spread)
         singular = _logistic(score - self.cohort_threshold)
         product = near * singular / self.targets
         # The cohort's spread is a mere unit of length in `near`, and constant there.
@@ -91,7 +91,7 @@ class Ground:
         return product.sum(axis=1), slopes
 
 
-def ascend_points(starts: Floats, ground: Ground, *, rounds: int = ROUNDS) -> Floats:
+def ascend_points(starts: Array32, ground: Ground, *, rounds: int = ROUNDS) -> Array32:
     """Climb with raw probes: unit rows (S, n) to unit rows (S, n)."""
     points = _unit(starts.astype(np.float32))
     best, best_value = points, np.full(len(points), -np.inf)
@@ -120,11 +120,11 @@ def ascend_subspaces(
     return SubspaceBatch(np.stack([foot for foot, _ in ends]), np.stack([e for _, e in ends]))
 
 
-def _ascend(foot: Floats, basis: Floats, ground: Ground, rounds: int) -> tuple[Floats, Floats]:
+def _ascend(foot: Array32, basis: Array32, ground: Ground, rounds: int) -> tuple[Array32, Array32]:
     norm = float(np.linalg.norm(foot))
     radius = np.float32(np.sqrt(max(0.0, 1 - norm**2)))
     best_foot, best_basis, best_value = foot, basis, -np.inf
-    v: Floats | None = None
+    v: Array32 | None = None
     for number, step in enumerate(_steps(rounds)):
         # The best v moves little in a step: it is searched for anew now and then only.
         again = None if number % _SEARCH_EVERY == 0 else v
@@ -147,8 +147,8 @@ def _ascend(foot: Floats, basis: Floats, ground: Ground, rounds: int) -> tuple[F
 
 
 def _closest(
-    foot: Floats, basis: Floats, radius: np.float32, ground: Ground, known: Floats | None
-) -> tuple[Floats, Floats, Floats]:
+    foot: Array32, basis: Array32, radius: np.float32, ground: Ground, known: Array32 | None
+) -> tuple[Array32, Array32, Array32]:
     """Similarities (K,), the best v (K, m_E) and the nearest points (K, n) of the subspaces.
 
     Found as docs/method.md §3.5 says, from both signs of the leading singular vector; or, where a v
@@ -180,7 +180,7 @@ def _closest(
     return ground.feet @ foot + best_value, best_v, nearest
 
 
-def _leading(square: Floats) -> Floats:
+def _leading(square: Array32) -> Array32:
     """Leading eigenvectors of positive matrices (K, m, m): a column of a power, normalised."""
     power = square
     for _ in range(3):
@@ -198,6 +198,6 @@ def _logistic(x: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(1 / (1 + np.exp(-np.clip(x, -60, 60))))
 
 
-def _unit(rows: NDArray[np.floating]) -> Floats:
+def _unit(rows: NDArray[np.floating]) -> Array32:
     lengths = np.linalg.norm(rows, axis=-1, keepdims=True)
     return np.asarray(rows / np.maximum(lengths, 1e-12), dtype=np.float32)

@@ -49,14 +49,14 @@ def axis_wolves(faces: NDArray[np.float32], m: int, *, foot_norm: float, seed: i
                 mix = np.linalg.qr(rng.standard_normal((len(taken), m)))[0]
                 yield mix.T @ taken
 
-    found = []
+    wolves = []
     for basis in bases():
-        found.append(Wolf(CENTRAL, canonical(np.zeros_like(mean), basis)))
+        wolves.append(Wolf(CENTRAL, canonical(np.zeros_like(mean), basis)))
         for factor in _FOOT_FACTORS:
             direction = mean - basis.T @ (basis @ mean)
             foot = factor * foot_norm * direction / np.linalg.norm(direction)
-            found.append(Wolf(ALONG_MEAN, canonical(foot, basis)))
-    return found
+            wolves.append(Wolf(ALONG_MEAN, canonical(foot, basis)))
+    return wolves
 
 
 def canonical(foot: Array, basis: Array) -> AffineSubspace:

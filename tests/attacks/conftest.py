@@ -1,13 +1,13 @@
-"""Small synthetic scenes (n = 64) that attacks act on."""
+"""Small synthetic systems (n = 64) that attacks act on."""
 
 import numpy as np
 import pytest
 
-from attacks.cast import Cast, make_cast
 from attacks.outcomes import GENERATED, Scheme
-from attacks.scene import Scene, stage
+from attacks.population import Population, draw_population
+from attacks.system import System, enroll_victims
 from templates.contract.binding import Binding
-from templates.decoys import DecoyGenerator, DecoyPool
+from templates.decoys import DecoyPool, DecoySource
 from templates.keys.rotation import ROTATION_VERSION
 from templates.space.lifting import Strategy
 from tests.verify.synthetic import N, draw_people, make_generator
@@ -21,14 +21,22 @@ OPTIONS = CalibrationOptions(
 
 
 @pytest.fixture(scope="session")
-def small_cast() -> Cast:
+def small_population() -> Population:
     people = draw_people(360, photos=(3, 2, 2), noise=0.5, seed=8)
-    return make_cast(people.descriptors, people.names, victims=40, owners=2, seed=1)
+    return draw_population(people.descriptors, people.names, victims=40, owners=2, seed=1)
 
 
-def staged(cast: Cast, scheme: Scheme, source: DecoyGenerator | None) -> Scene:
-    """Stage with a contract of fewer comparisons than the audit's own, for the tests' time."""
-    chosen = source or DecoyPool(cast.attacker)
+def small_system(
+    population: Population,
+    scheme: Scheme,
+    source: DecoySource | None,
+    *,
+    options: CalibrationOptions = OPTIONS,
+    pool_of_owners: bool = False,
+    seed: int = 4,
+) -> System:
+    """Enroll with a contract of fewer comparisons than the audit's own, for the tests' time."""
+    chosen = source or DecoyPool(population.attacker)
     binding = Binding(
         embedder_sha256=EMBEDDER,
         preprocessing=PREPROCESSING,
@@ -39,30 +47,30 @@ def staged(cast: Cast, scheme: Scheme, source: DecoyGenerator | None) -> Scene:
         rotation_version=ROTATION_VERSION,
     )
     contract = calibrate(
-        cast.calibration, cast.names, binding=binding, source=chosen, options=OPTIONS
+        population.calibration, population.names, binding=binding, source=chosen, options=options
     ).contract
-    return stage(
-        cast,
+    return enroll_victims(
+        population,
         scheme,
         source,
         embedder_sha256=EMBEDDER,
         preprocessing=PREPROCESSING,
-        pool_of_owners=False,
+        pool_of_owners=pool_of_owners,
         contract=contract,
-        seed=4,
+        seed=seed,
     )
 
 
 @pytest.fixture(scope="session")
-def scene(small_cast: Cast) -> Scene:
+def system(small_population: Population) -> System:
     """Adversarial, m = 6, generated decoys of the people's own kind."""
-    return staged(small_cast, Scheme("adversarial", GENERATED, 6), make_generator())
+    return small_system(small_population, Scheme("adversarial", GENERATED, 6), make_generator())
 
 
 @pytest.fixture(scope="session")
-def weak_scene(small_cast: Cast) -> Scene:
+def weak_system(small_population: Population) -> System:
     """Random lifting, m = 2: hides next to nothing, so every attack must succeed on it."""
-    return staged(small_cast, Scheme("random", None, 2), None)
+    return small_system(small_population, Scheme("random", None, 2), None)
 
 
 @pytest.fixture(scope="session")

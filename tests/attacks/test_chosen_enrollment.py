@@ -12,7 +12,7 @@ from attacks.chosen_enrollment import (
 )
 from attacks.errors import AuditError
 from attacks.outcomes import Knowledge, Property
-from attacks.scene import Scene
+from attacks.system import System
 from templates.keys.randomness import Keystream
 from templates.space.subspace import SubspaceBatch
 from tests.verify.synthetic import N, random_rotation, unit
@@ -27,9 +27,9 @@ def alignment(estimate: np.ndarray, rotation: np.ndarray) -> float:
     return float(np.trace(estimate.T @ rotation) / len(rotation))
 
 
-def test_enough_accounts_fix_the_rotation(scene: Scene) -> None:
+def test_enough_accounts_fix_the_rotation(system: System) -> None:
     rotation = random_rotation()
-    sent = scene.lift(scene.attacker[:20], "test of chosen enrollment")
+    sent = system.lift(system.attacker[:20], "test of chosen enrollment")
     stolen = in_another_basis(sent).rotated(rotation)
     assert np.abs(stolen.bases - sent.rotated(rotation).bases).max() > 0.1  # no row is its image
     estimate = estimate_from_sets(Sides(sent, stolen))
@@ -37,10 +37,10 @@ def test_enough_accounts_fix_the_rotation(scene: Scene) -> None:
     assert alignment(estimate, rotation) > 0.999
 
 
-def test_the_pairs_alone_fix_it_too(scene: Scene) -> None:
+def test_the_pairs_alone_fix_it_too(system: System) -> None:
     """Without the refinement: foot points, and projections of those of others."""
     rotation = random_rotation(seed=6)
-    sent = scene.lift(scene.attacker[:20], "test of chosen enrollment")
+    sent = system.lift(system.attacker[:20], "test of chosen enrollment")
     stolen = in_another_basis(sent).rotated(rotation)
     assert alignment(estimate_from_sets(Sides(sent, stolen), steps=0), rotation) > 0.999
 
@@ -58,30 +58,30 @@ def test_the_polar_factor_is_found_where_lapack_gives_up(monkeypatch: pytest.Mon
     np.testing.assert_allclose(polar_factor(moment), usual, atol=1e-10)
 
 
-def test_templates_of_others_fix_nothing(scene: Scene) -> None:
+def test_templates_of_others_fix_nothing(system: System) -> None:
     rotation = random_rotation()
-    sent = scene.lift(scene.attacker[:20], "test of chosen enrollment")
-    others = scene.lift(scene.attacker[20:40], "others").rotated(rotation)
+    sent = system.lift(system.attacker[:20], "test of chosen enrollment")
+    others = system.lift(system.attacker[20:40], "others").rotated(rotation)
     assert abs(alignment(estimate_from_sets(Sides(sent, others)), rotation)) < 0.1
 
 
-def test_best_known_points_lie_in_their_templates_and_in_the_span(scene: Scene) -> None:
-    accounts = scene.lift(scene.attacker[:5], "accounts")
-    points = best_known_points(scene.templates, accounts, seed=0)
+def test_best_known_points_lie_in_their_templates_and_in_the_span(system: System) -> None:
+    accounts = system.lift(system.attacker[:5], "accounts")
+    points = best_known_points(system.templates, accounts, seed=0)
     rows = np.concatenate([accounts.feet, accounts.bases.reshape(-1, N)])
     span = np.linalg.qr(rows.T)[0]
     reached = np.linalg.norm(points @ span, axis=1)
     rng = np.random.default_rng(0)
     for index in range(3):
-        template = scene.templates[index]
+        template = system.templates[index]
         assert template.contains(points[index : index + 1].astype(np.float32), tol=1e-4).all()
         inside = unit(rng.normal(size=(5000, template.m))) @ template.basis
         drawn = template.foot + template.radius * inside
         assert np.linalg.norm(drawn @ span, axis=1).max() <= reached[index] + 1e-4
 
 
-def test_victims_are_opened_with_enough_accounts_and_not_with_one(scene: Scene) -> None:
-    one, enough = chosen_enrollment(scene, accounts=(1, 20, 10_000))
+def test_victims_are_opened_with_enough_accounts_and_not_with_one(system: System) -> None:
+    one, enough = chosen_enrollment(system, accounts=(1, 20, 10_000))
     assert [each.details["accounts"] for each in (one, enough)] == [1, 20]
     assert float(str(enough.details["alignment"])) > 0.999
     assert enough.measured.value == 1.0
@@ -90,9 +90,9 @@ def test_victims_are_opened_with_enough_accounts_and_not_with_one(scene: Scene) 
     assert enough.judged
     assert enough.knowledge is Knowledge.TEMPLATES
     assert enough.breaks is Property.IMPERSONATION
-    assert [one, enough] == chosen_enrollment(scene, accounts=(1, 20))
+    assert [one, enough] == chosen_enrollment(system, accounts=(1, 20))
 
 
-def test_an_attacker_without_faces_is_refused(scene: Scene) -> None:
+def test_an_attacker_without_faces_is_refused(system: System) -> None:
     with pytest.raises(AuditError, match="faces"):
-        chosen_enrollment(replace(scene, attacker=scene.attacker[:0]))
+        chosen_enrollment(replace(system, attacker=system.attacker[:0]))

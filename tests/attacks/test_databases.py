@@ -11,7 +11,7 @@ from attacks.databases import (
     whitened_cosines,
 )
 from attacks.errors import AuditError
-from attacks.scene import Scene
+from attacks.system import System
 from templates.decoys import DecoyGenerator
 from templates.keys.randomness import Keystream
 from templates.space.subspace import SubspaceBatch
@@ -91,16 +91,16 @@ def test_signatures_are_invariant_and_link_where_nothing_is_hidden() -> None:
     assert (apart.argmax(axis=1) == np.arange(50)).mean() < 0.15
 
 
-def test_outcomes_name_the_accounts_and_leave_out_those_beyond_the_faces(scene: Scene) -> None:
-    outcomes = link_databases(scene, accounts=(0, 5, 10_000), strangers=150, permutations=200)
+def test_outcomes_name_the_accounts_and_leave_out_those_beyond_the_faces(system: System) -> None:
+    outcomes = link_databases(system, accounts=(0, 5, 10_000), strangers=150, permutations=200)
     assert {each.details["accounts"] for each in outcomes} == {0, 5}
     assert len(outcomes) == 2 + 3
     assert all(0 <= each.measured.value <= 1 and each.judged for each in outcomes)
 
 
-def of_axes(scene: Scene, spread: np.ndarray, seed: int) -> Scene:
-    """The scene with victims, attacker and decoys that are spread like this along the axes."""
-    n = scene.templates.n
+def of_axes(system: System, spread: np.ndarray, seed: int) -> System:
+    """The system with victims, attacker and decoys that are spread like this along the axes."""
+    n = system.templates.n
     rng = np.random.default_rng(seed)
 
     def draw(count: int) -> np.ndarray:
@@ -108,12 +108,12 @@ def of_axes(scene: Scene, spread: np.ndarray, seed: int) -> Scene:
 
     enrolled, source = draw(40), DecoyGenerator.fit(draw(2000))
     return replace(
-        scene,
-        lifter=replace(scene.lifter, source=source),
+        system,
+        lifter=replace(system.lifter, source=source),
         source=source,
         attacker=draw(300),
         victims=replace(
-            scene.victims,
+            system.victims,
             enrolled=enrolled,
             fresh=unit(enrolled + 0.3 * draw(40)),
         ),
@@ -121,8 +121,8 @@ def of_axes(scene: Scene, spread: np.ndarray, seed: int) -> Scene:
 
 
 @pytest.mark.long
-def test_two_databases_of_uneven_axes_are_linked_with_many_accounts(scene: Scene) -> None:
-    people = of_axes(scene, np.geomspace(1.0, 0.05, scene.templates.n), seed=1)
+def test_two_databases_of_uneven_axes_are_linked_with_many_accounts(system: System) -> None:
+    people = of_axes(system, np.geomspace(1.0, 0.05, system.templates.n), seed=1)
     rows = link_databases(people, accounts=(300,), strangers=1000, permutations=200)
     feet, nearest, _signatures = rows  # signatures have a control of their own above
     assert nearest.variant == "300 accounts, estimated rotations, nearest points"
@@ -131,8 +131,8 @@ def test_two_databases_of_uneven_axes_are_linked_with_many_accounts(scene: Scene
 
 
 @pytest.mark.long
-def test_databases_of_even_axes_without_accounts_are_not_linked(scene: Scene) -> None:
-    noise = of_axes(scene, np.ones(scene.templates.n), seed=2)
+def test_databases_of_even_axes_without_accounts_are_not_linked(system: System) -> None:
+    noise = of_axes(system, np.ones(system.templates.n), seed=2)
     nobody = replace(noise, victims=replace(noise.victims, fresh=noise.victims.enrolled[::-1]))
     for people, accounts in ((noise, (0,)), (nobody, (0, 300))):
         rows = link_databases(people, accounts=accounts, strangers=500, permutations=200)
@@ -140,6 +140,6 @@ def test_databases_of_even_axes_without_accounts_are_not_linked(scene: Scene) ->
             assert row.measured.value <= float(str(row.details["null_95_percent"])), row.variant
 
 
-def test_no_strangers_are_refused(scene: Scene) -> None:
+def test_no_strangers_are_refused(system: System) -> None:
     with pytest.raises(AuditError, match="strangers"):
-        link_databases(replace(scene), strangers=0)
+        link_databases(replace(system), strangers=0)

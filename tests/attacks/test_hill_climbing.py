@@ -11,16 +11,16 @@ from attacks.hill_climbing import (
     climbing_outcomes,
     in_process,
 )
-from attacks.rehearsal import Prior, rehearse, rehearse_scene
-from attacks.scene import Scene
+from attacks.prior import Prior, attacker_prior, learn_prior
+from attacks.system import System
 from tests.verify.synthetic import unit
 
 SCORED = (Climber.GRADIENT, Climber.REGRESSION)
 
 
 @pytest.fixture(scope="module")
-def prior(scene: Scene) -> Prior:
-    return rehearse_scene(scene)
+def prior(system: System) -> Prior:
+    return attacker_prior(system)
 
 
 def towards(target: np.ndarray, *, accept_at: float, score: bool = True) -> Ask:
@@ -33,28 +33,28 @@ def towards(target: np.ndarray, *, accept_at: float, score: bool = True) -> Ask:
     return ask
 
 
-def test_in_process_answers_are_the_service_s(scene: Scene) -> None:
-    ask = in_process(scene, [3], scores=True)[3]
-    mine, other = ask(scene.victims.fresh[3]), ask(scene.victims.fresh[4])
-    foot, basis = scene.templates.feet[3], scene.templates.bases[3]
-    e = scene.victims.fresh[3].astype(float)
-    expected = e @ foot + scene.templates.radii[3] * np.linalg.norm(basis @ e)
+def test_in_process_answers_are_the_service_s(system: System) -> None:
+    ask = in_process(system, [3], scores=True)[3]
+    mine, other = ask(system.victims.fresh[3]), ask(system.victims.fresh[4])
+    foot, basis = system.templates.feet[3], system.templates.bases[3]
+    e = system.victims.fresh[3].astype(float)
+    expected = e @ foot + system.templates.radii[3] * np.linalg.norm(basis @ e)
     assert mine.score == pytest.approx(expected, abs=1e-4)
     assert mine.accepted
     assert not other.accepted
-    assert in_process(scene, [3], scores=False)[3](scene.victims.fresh[3]).score is None
+    assert in_process(system, [3], scores=False)[3](system.victims.fresh[3]).score is None
 
 
 @pytest.mark.parametrize("climber", SCORED)
-def test_scores_lead_to_acceptance(scene: Scene, prior: Prior, climber: Climber) -> None:
-    victims = in_process(scene, range(8), scores=True)
+def test_scores_lead_to_acceptance(system: System, prior: Prior, climber: Climber) -> None:
+    victims = in_process(system, range(8), scores=True)
     climbs = climb(victims, prior, climber, most_attempts=200, seed=0)
     assert sum(each.accepted_at is not None for each in climbs) >= 7
     assert climbs == climb(victims, prior, climber, most_attempts=200, seed=0)
 
 
-def test_regression_needs_fewer_attempts_than_a_blind_search(scene: Scene, prior: Prior) -> None:
-    victims = in_process(scene, range(10), scores=True)
+def test_regression_needs_fewer_attempts_than_a_blind_search(system: System, prior: Prior) -> None:
+    victims = in_process(system, range(10), scores=True)
     reached = {
         climber: np.median(
             [
@@ -68,9 +68,9 @@ def test_regression_needs_fewer_attempts_than_a_blind_search(scene: Scene, prior
 
 
 @pytest.mark.parametrize("climber", SCORED)
-def test_scores_that_are_noise_lead_nowhere(scene: Scene, prior: Prior, climber: Climber) -> None:
+def test_scores_that_are_noise_lead_nowhere(system: System, prior: Prior, climber: Climber) -> None:
     """The decisions are the service's; the scores that come with them are drawn."""
-    real = in_process(scene, range(12), scores=False)
+    real = in_process(system, range(12), scores=False)
     rng = np.random.default_rng(7)
 
     def noisy(ask: Ask) -> Ask:
@@ -106,12 +106,12 @@ def test_an_attack_ends_at_its_last_attempt(prior: Prior) -> None:
         assert len(asked) == 23
 
 
-def test_the_dictionary_opens_more_rehearsed_templates_than_its_faces_unsorted(
-    scene: Scene,
+def test_the_dictionary_opens_more_own_templates_than_its_faces_unsorted(
+    system: System,
 ) -> None:
-    templates = scene.lift(scene.attacker[-40:], "test of the dictionary")
-    ordered = rehearse(scene.attacker, templates, rate_of_chance=0.01).faces
-    assert sorted(map(tuple, ordered)) == sorted(map(tuple, scene.attacker[:-40].astype(float)))
+    templates = system.lift(system.attacker[-40:], "test of the dictionary")
+    ordered = learn_prior(system.attacker, templates, rate_of_chance=0.01).faces
+    assert sorted(map(tuple, ordered)) == sorted(map(tuple, system.attacker[:-40].astype(float)))
 
     def opened(faces: np.ndarray) -> int:
         """Templates to which one of these faces is as near as only 2 % of all pairs are."""
@@ -120,7 +120,7 @@ def test_the_dictionary_opens_more_rehearsed_templates_than_its_faces_unsorted(
         scores = e @ templates.feet.T + templates.radii * inside
         return int((scores >= bar).any(axis=0).sum())
 
-    everyone = scene.attacker[:-40].astype(float)
+    everyone = system.attacker[:-40].astype(float)
     inside = np.linalg.norm(np.einsum("tmn,en->etm", templates.bases, everyone), axis=2)
     bar = np.quantile(everyone @ templates.feet.T + templates.radii * inside, 0.98)
     rng = np.random.default_rng(0)
@@ -136,19 +136,19 @@ def test_climbers_that_need_scores_say_so(prior: Prior) -> None:
             climb({0: ask}, prior, climber, most_attempts=5, seed=0)
 
 
-def test_outcomes_count_what_a_lockout_lets_through(scene: Scene) -> None:
+def test_outcomes_count_what_a_lockout_lets_through(system: System) -> None:
     reached = [2, 5, 6, 50, 51, None]
     climbs = [Climb(Climber.REGRESSION, at or 100, at) for at in reached]
-    rows = climbing_outcomes(climbs, scene.scheme, scene.level, most_attempts=100)
+    rows = climbing_outcomes(climbs, system.scheme, system.level, most_attempts=100)
     assert [row.details["limit"] for row in rows] == [5, 50, 100]
     assert [(row.measured.errors, row.measured.trials) for row in rows] == [(2, 6), (4, 6), (5, 6)]
-    fmr = scene.level.target_fmr
+    fmr = system.level.target_fmr
     assert fmr is not None
     assert rows[0].chance == pytest.approx(1 - (1 - fmr) ** 5)
     assert "sends as photos" not in rows[0].assumption
     plain = [Climb(Climber.DICTIONARY, 1, 1)]
-    (told, *_) = climbing_outcomes(plain, scene.scheme, scene.level, most_attempts=100)
+    (told, *_) = climbing_outcomes(plain, system.scheme, system.level, most_attempts=100)
     assert "sends as photos, or as embeddings" in told.assumption
     mixed = [*climbs, Climb(Climber.GRADIENT, 1, 1)]
     with pytest.raises(AuditError, match="one climber"):
-        climbing_outcomes(mixed, scene.scheme, scene.level, most_attempts=100)
+        climbing_outcomes(mixed, system.scheme, system.level, most_attempts=100)

@@ -3,7 +3,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from attacks.cast import Cast
 from attacks.errors import AuditError
 from attacks.likelihood import (
     face_precision,
@@ -13,11 +12,12 @@ from attacks.likelihood import (
     precision,
 )
 from attacks.outcomes import GENERATED, Scheme
-from attacks.scene import Scene
+from attacks.population import Population
+from attacks.system import System
 from templates.decoys import DecoyGenerator
 from templates.keys.randomness import Keystream
 from templates.space.subspace import SubspaceBatch
-from tests.attacks.conftest import staged
+from tests.attacks.conftest import small_system
 from tests.verify.synthetic import unit
 
 N, M = 32, 5
@@ -76,14 +76,16 @@ def test_no_unit_point_of_the_span_is_likelier() -> None:
         assert np.linalg.norm(outside) < 1e-6
 
 
-def test_a_generator_of_another_kind_than_the_victims_is_seen_through(small_cast: Cast) -> None:
+def test_a_generator_of_another_kind_than_the_victims_is_seen_through(
+    small_population: Population,
+) -> None:
     """Decoys vary along half of the axes, people along all: the same, as an audit reports it."""
-    n = small_cast.attacker.shape[1]
+    n = small_population.attacker.shape[1]
     rng = np.random.default_rng(4)
     narrow = np.where(np.arange(n) < n // 2, 1.0, 0.02)
     other = DecoyGenerator.fit(unit(rng.normal(size=(600, n)) * narrow))
-    scene = staged(small_cast, Scheme("adversarial", GENERATED, 6), other)
-    for row in find_least_decoy_like(scene, draws=2000):
+    system = small_system(small_population, Scheme("adversarial", GENERATED, 6), other)
+    for row in find_least_decoy_like(system, draws=2000):
         assert row.measured.value > 0.9, row.variant
         assert float(str(row.details["cosine_to_truth_mean"])) > 0.8
         assert row.judged
@@ -98,26 +100,26 @@ def test_few_faces_have_a_precision_too() -> None:
     np.testing.assert_array_equal(face_precision(many), precision(many))
 
 
-def test_guesses_are_what_the_outcomes_report(scene: Scene) -> None:
-    guesses = likeliest_guesses(scene, draws=1000)
-    for row in find_least_decoy_like(scene, draws=1000):
-        mine = cosines(guesses[row.variant], scene.victims.enrolled).mean()
+def test_guesses_are_what_the_outcomes_report(system: System) -> None:
+    guesses = likeliest_guesses(system, draws=1000)
+    for row in find_least_decoy_like(system, draws=1000):
+        mine = cosines(guesses[row.variant], system.victims.enrolled).mean()
         assert float(str(row.details["cosine_to_truth_mean"])) == pytest.approx(mine, abs=1e-6)
 
 
-def test_outcomes_with_and_without_faces(scene: Scene, strangers: np.ndarray) -> None:
-    outcomes = find_least_decoy_like(scene, draws=1000)
+def test_outcomes_with_and_without_faces(system: System, strangers: np.ndarray) -> None:
+    outcomes = find_least_decoy_like(system, draws=1000)
     assert [each.variant for each in outcomes] == ["generator", "generator and faces"]
-    noise = replace(scene, templates=scene.lift(strangers, "noise"))
+    noise = replace(system, templates=system.lift(strangers, "noise"))
     for row in find_least_decoy_like(noise, draws=1000):
         assert row.measured.value <= 0.1
 
 
-def test_random_lifting_has_no_decoys_to_be_unlike(weak_scene: Scene) -> None:
-    assert find_least_decoy_like(weak_scene) == []
-    assert likeliest_guesses(weak_scene) == {}
+def test_random_lifting_has_no_decoys_to_be_unlike(weak_system: System) -> None:
+    assert find_least_decoy_like(weak_system) == []
+    assert likeliest_guesses(weak_system) == {}
 
 
-def test_a_covariance_needs_more_draws_than_dimensions(scene: Scene) -> None:
+def test_a_covariance_needs_more_draws_than_dimensions(system: System) -> None:
     with pytest.raises(AuditError, match="draws"):
-        find_least_decoy_like(scene, draws=64)
+        find_least_decoy_like(system, draws=64)

@@ -6,8 +6,8 @@ import pytest
 from PIL import Image
 
 from attacks.linkage import SCORES, foot_lengths, link, nearest_similarities
-from attacks.outcomes import POOLED, Knowledge, Outcome, Property, Scheme
-from attacks.scene import Scene
+from attacks.outcomes import POOLED, AttackOutcome, Knowledge, Property, Scheme
+from attacks.system import System
 from models.pack import ModelPack
 from templates.decoys import DecoyPool
 from templates.space.lifting import Strategy
@@ -16,12 +16,12 @@ from verify import labelled_folder
 from verify.comparisons import Lifter
 
 
-def by_variant(outcomes: list[Outcome]) -> dict[str, Outcome]:
+def by_variant(outcomes: list[AttackOutcome]) -> dict[str, AttackOutcome]:
     return {each.variant: each for each in outcomes}
 
 
-def test_templates_link_without_a_rotation_and_when_the_keys_leak(scene: Scene) -> None:
-    rows = by_variant(link(scene, liftings=3))
+def test_templates_link_without_a_rotation_and_when_the_keys_leak(system: System) -> None:
+    rows = by_variant(link(system, liftings=3))
     assert len(rows) == 3 * len(SCORES)
     control = rows["no rotation, nearest points"]
     leaked = rows["keys leaked, nearest points"]
@@ -33,33 +33,33 @@ def test_templates_link_without_a_rotation_and_when_the_keys_leak(scene: Scene) 
     assert not control.judged
 
 
-def test_secret_rotations_unlink(scene: Scene) -> None:
-    rows = by_variant(link(scene, liftings=3))
+def test_secret_rotations_unlink(system: System) -> None:
+    rows = by_variant(link(system, liftings=3))
     for name in SCORES:
         row = rows[f"secret rotations, {name}"]
         assert row.measured.value <= float(str(row.details["null_95_percent"])), name
 
 
-def test_different_people_do_not_link(scene: Scene, strangers: np.ndarray) -> None:
-    others = replace(scene, victims=replace(scene.victims, fresh=strangers))
+def test_different_people_do_not_link(system: System, strangers: np.ndarray) -> None:
+    others = replace(system, victims=replace(system.victims, fresh=strangers))
     row = by_variant(link(others, liftings=2))["no rotation, nearest points"]
     assert row.measured.value <= float(str(row.details["null_95_percent"]))
 
 
-def test_only_lengths_survive_a_rotation(scene: Scene) -> None:
-    turned = scene.templates.rotated(random_rotation())
+def test_only_lengths_survive_a_rotation(system: System) -> None:
+    turned = system.templates.rotated(random_rotation())
     np.testing.assert_allclose(
-        foot_lengths(scene.templates, scene.templates),
-        foot_lengths(scene.templates, turned),
+        foot_lengths(system.templates, system.templates),
+        foot_lengths(system.templates, turned),
         atol=1e-6,
     )
-    apart = nearest_similarities(scene.templates, turned)
+    apart = nearest_similarities(system.templates, turned)
     assert np.diagonal(apart).mean() < 0.9
 
 
 @pytest.mark.long
 def test_real_faces_link_without_a_rotation_and_not_with_it(
-    scene: Scene, mbf_pack_dir: Path, lfw_aligned: Path
+    system: System, mbf_pack_dir: Path, lfw_aligned: Path
 ) -> None:
     """Issue 4, "what must be seen" 4; two photos each of 60 people, and decoys of 200 others."""
     folder = labelled_folder(lfw_aligned)
@@ -74,11 +74,11 @@ def test_real_faces_link_without_a_rotation_and_not_with_it(
     rows = np.concatenate(
         [pack.embed(np.stack(crops[start : start + 32])) for start in range(0, len(crops), 32)]
     )
-    victims = replace(scene.victims, enrolled=rows[:60], fresh=rows[60:120])
-    lifter = Lifter(Strategy.ADVERSARIAL, DecoyPool(rows[120:]), scene.contract.contract_id)
+    victims = replace(system.victims, enrolled=rows[:60], fresh=rows[60:120])
+    lifter = Lifter(Strategy.ADVERSARIAL, DecoyPool(rows[120:]), system.contract.contract_id)
     # Two of 200: shared decoys, at similarity 1, are rare enough not to blur what mates show.
     scheme = Scheme("adversarial", POOLED, 2)
-    faces = replace(scene, scheme=scheme, lifter=lifter, victims=victims)
+    faces = replace(system, scheme=scheme, lifter=lifter, victims=victims)
     faces = replace(faces, templates=faces.lift(rows[:60], "victims"))
     found = by_variant(link(faces, liftings=3))
     assert found["no rotation, nearest points"].measured.value > 0.8

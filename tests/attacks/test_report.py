@@ -1,7 +1,7 @@
 import json
 from typing import Any
 
-from attacks.outcomes import Estimate, Knowledge, Outcome, Property, Scheme
+from attacks.outcomes import AttackOutcome, Estimate, Knowledge, Property, Scheme
 from attacks.report import document
 from attacks.report_tables import markdown
 from verify.metrics import rate
@@ -10,9 +10,9 @@ SCHEME = Scheme("adversarial", "generator", 16)
 OTHER = Scheme("adversarial", "pool", 16)
 
 
-def outcomes(scheme: Scheme, hits: int) -> list[Outcome]:
+def outcomes(scheme: Scheme, hits: int) -> list[AttackOutcome]:
     return [
-        Outcome(
+        AttackOutcome(
             attack="foot-point",
             breaks=Property.IRREVERSIBILITY,
             knowledge=Knowledge.TEMPLATE,
@@ -23,7 +23,7 @@ def outcomes(scheme: Scheme, hits: int) -> list[Outcome]:
             chance=0.001,
             details={"cosine_to_truth_mean": 0.2875},
         ),
-        Outcome(
+        AttackOutcome(
             attack="linkage",
             variant="secret rotations, nearest points",
             breaks=Property.UNLINKABILITY,

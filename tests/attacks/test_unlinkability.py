@@ -16,20 +16,20 @@ def gaussian_scores(shift: float, *, people: int = 150, liftings: int = 6) -> np
 
 
 def test_local_d_is_the_papers_formula_bin_by_bin() -> None:
-    mated, non_mated = np.array([0.0, 2.0, 6.0, 12.0]), np.array([30.0, 40.0, 30.0, 0.0])
+    genuine, impostor = np.array([0.0, 2.0, 6.0, 12.0]), np.array([30.0, 40.0, 30.0, 0.0])
     expected = []
-    for a, b in zip(mated / 20, non_mated / 100, strict=True):
+    for a, b in zip(genuine / 20, impostor / 100, strict=True):
         ratio = np.inf if b == 0 else a / b
         with np.errstate(invalid="ignore"):
             value = 1.0 if np.isinf(ratio) else 2 * ratio / (1 + ratio) - 1
         expected.append(value if ratio > 1 else 0.0)
-    np.testing.assert_allclose(local_d(mated, non_mated), expected, atol=1e-12)
-    assert global_d(mated, non_mated) == pytest.approx(np.dot(mated / 20, expected))
+    np.testing.assert_allclose(local_d(genuine, impostor), expected, atol=1e-12)
+    assert global_d(genuine, impostor) == pytest.approx(np.dot(genuine / 20, expected))
 
 
 def test_prior_odds_scale_the_likelihood_ratio() -> None:
-    mated, non_mated = np.array([1.0, 3.0]), np.array([3.0, 1.0])
-    np.testing.assert_allclose(local_d(mated, non_mated, omega=2.0), [0.0, 2 * 6 / 7 - 1])
+    genuine, impostor = np.array([1.0, 3.0]), np.array([3.0, 1.0])
+    np.testing.assert_allclose(local_d(genuine, impostor, omega=2.0), [0.0, 2 * 6 / 7 - 1])
 
 
 def test_d_sys_of_shifted_gaussians_is_the_integral() -> None:

@@ -2,7 +2,7 @@ import math
 
 import pytest
 
-from attacks.outcomes import Estimate, Knowledge, Measured, Outcome, Property, Scheme
+from attacks.outcomes import AttackOutcome, Estimate, Knowledge, Measured, Property, Scheme
 from attacks.verdict import LIMITS, Status, headlines, judge
 from verify.metrics import rate, wilson
 
@@ -18,8 +18,8 @@ def outcome(
     attack: str = "some attack",
     judged: bool = True,
     scheme: Scheme = SCHEME,
-) -> Outcome:
-    return Outcome(
+) -> AttackOutcome:
+    return AttackOutcome(
         attack=attack,
         breaks=breaks,
         knowledge=knowledge,
@@ -31,7 +31,7 @@ def outcome(
     )
 
 
-def only_cell(*outcomes: Outcome, limits: dict[str, float] | None = None):
+def only_cell(*outcomes: AttackOutcome, limits: dict[str, float] | None = None):
     (verdict,) = judge(outcomes, limits=limits)
     (cell,) = verdict.cells
     return cell

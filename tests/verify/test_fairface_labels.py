@@ -1,6 +1,9 @@
 import pytest
 
-from verify.fairface_labels import AGES, repaired_age
+from verify.datasets import DatasetError
+from verify.fairface_labels import AGES, label_files, read_labels, repaired_age
+
+HEADER = "file,age,gender,race,service_test\n"
 
 
 @pytest.mark.parametrize(
@@ -20,3 +23,55 @@ from verify.fairface_labels import AGES, repaired_age
 )
 def test_ages_that_a_spreadsheet_made_dates_of_are_repaired(cell, age):
     assert repaired_age(cell) == age
+
+
+def test_labels_are_found_by_the_path_of_the_photo(tmp_path):
+    file = tmp_path / "fairface_label_train.csv"
+    file.write_text(HEADER + "train/1.jpg,Oct-19,Female,East Asian,FALSE\n", encoding="utf-8-sig")
+    labels = read_labels(file)
+    label = labels[(tmp_path / "train" / "1.jpg").resolve()]
+    assert (label.age, label.gender, label.race) == ("10-19", "Female", "East Asian")
+    assert label.attributes.gender == "Female"
+    (tmp_path / "train").mkdir()
+    assert label_files(tmp_path / "train") == [file.resolve()]
+    assert label_files(tmp_path) == [file]
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("train/1.jpg,99,Female,Black,FALSE", "line 2: the age is none of"),
+        ("train/1.jpg,3-9,female,Black,FALSE", "line 2: the gender is none of Male, Female"),
+        ("train/1.jpg,3-9,Female,Martian,FALSE", "line 2: the race is none of"),
+        ("train/1.jpg,3-9,,Black,FALSE", "line 2: a cell is empty"),
+        ("train/1.jpg", "line 2: a cell is empty"),
+        ("train/\0.jpg,3-9,Female,Black,FALSE", "line 2: the file has a name with characters"),
+        ("train/\u202e.jpg,3-9,Female,Black,FALSE", "line 2: the file has a name with"),
+    ],
+)
+def test_a_wrong_line_is_named(tmp_path, line, said):
+    file = tmp_path / "labels.csv"
+    file.write_text(HEADER + line + "\n")
+    with pytest.raises(DatasetError, match=said):
+        read_labels(file)
+
+
+def test_missing_columns_are_named(tmp_path):
+    file = tmp_path / "labels.csv"
+    file.write_text("file,age\n")
+    with pytest.raises(DatasetError, match="lacks the columns gender, race"):
+        read_labels(file)
+
+
+def test_a_file_that_is_no_text_is_refused(tmp_path):
+    file = tmp_path / "labels.csv"
+    file.write_bytes(b"\xff\xfe\x00\x00")
+    with pytest.raises(DatasetError, match="not a CSV file"):
+        read_labels(file)
+
+
+def test_the_real_labels_are_read_whole(fairface):
+    labels = read_labels(fairface / "fairface_label_train.csv")
+    photos = {path.resolve() for path in (fairface / "train").iterdir()}
+    assert photos <= set(labels)
+    assert {label.age for label in labels.values()} == set(AGES)

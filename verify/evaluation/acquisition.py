@@ -77,18 +77,36 @@ class Acquired:
     mirrored: NDArray[np.float32] | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class EmbeddedSet:
+    """A set with its embeddings.
+
+    Parameters
+    ----------
+    aligned
+        Whether its photos were taken for aligned crops; None where they were not embedded here.
+    pictures_sha256
+        Of all pictures; empty where they were not read.
+    """
+
+    pairs: VerificationSet
+    acquired: Acquired
+    aligned: bool | None
+    pictures_sha256: str
+
+
 def digests(pairs: VerificationSet) -> list[str]:
     """SHA-256 of every picture, in the order of the set; a picture that cannot be read has none.
 
     One picture is in memory at a time.
     """
-    found = []
+    contents = []
     for picture in pairs.pictures:
         try:
-            found.append(hashlib.sha256(picture.read()).hexdigest())
+            contents.append(hashlib.sha256(picture.read()).hexdigest())
         except OSError:
-            found.append("")
-    return found
+            contents.append("")
+    return contents
 
 
 def digest_of_pictures(contents: Sequence[str]) -> str:
@@ -129,7 +147,7 @@ def acquire(
         extractor = Extractor(pack, aligned=source.aligned, cache=cache, mirrored=source.mirrored)
         sources = [picture.source for picture in unique]
         done = [extractor.extract(sources, progress=progress)]
-        keys = [str(named(each)) for each in sources]
+        keys = [str(named(photo)) for photo in sources]
     else:
         keys = [picture.name for picture in unique]
         chunks = [unique[start : start + CHUNK] for start in range(0, len(unique), CHUNK)]
@@ -187,15 +205,15 @@ def _extract(source: PackSource, chunk: list[EncodedImage | MarkedPhoto]) -> Ext
 def from_file(pairs: VerificationSet, embeddings: EmbeddingsFile) -> Acquired:
     """Take the descriptors of a set from a file of embeddings; absent ones failed to acquire."""
     positions = match(embeddings, pairs)
-    found = positions >= 0
+    present = positions >= 0
     rows = np.full(len(positions), -1, dtype=np.int64)
-    rows[found] = np.arange(int(found.sum()))
+    rows[present] = np.arange(int(present.sum()))
     return Acquired(
-        np.ascontiguousarray(embeddings.descriptors[positions[found]]),
+        np.ascontiguousarray(embeddings.descriptors[positions[present]]),
         rows,
         tuple(
             Failure(Path(picture.name), "not_in_file", "The file of embeddings lacks the photo.")
-            for picture, there in zip(pairs.pictures, found.tolist(), strict=True)
+            for picture, there in zip(pairs.pictures, present.tolist(), strict=True)
             if not there
         ),
     )
@@ -206,13 +224,13 @@ def are_aligned(pairs: VerificationSet, size: int) -> bool:
 
     Photos out of a camera, and those of LFW (250 × 250), are larger.
     """
-    found = False
+    any_read = False
     for picture in pairs.pictures:
         try:
-            seen = image_size(picture.read())
+            size_read = image_size(picture.read())
         except OSError:
             continue
-        if seen not in (None, (size, size)):
+        if size_read not in (None, (size, size)):
             return False
-        found = found or seen is not None
-    return found
+        any_read = any_read or size_read is not None
+    return any_read

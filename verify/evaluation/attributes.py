@@ -6,8 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from templates.decoys.pool import DecoyPool
-from templates.decoys.source import Attributes
+from templates.decoys.source import Attributes, DecoySource
 from templates.errors import DecoyError
+from verify.evaluation.acquisition import EmbeddedSet
+from verify.evaluation.labels_file import Labels
+from verify.evaluation.plan import EvaluationError
 
 _ROWS = 1024
 
@@ -48,6 +51,47 @@ def predict_attributes(
     genders = _voted(descriptors, entries, [label.gender for label in labels], k)
     races = _voted(descriptors, entries, [label.race for label in labels], k)
     return [Attributes(gender, race) for gender, race in zip(genders, races, strict=True)]
+
+
+def known_attributes(
+    faces: EmbeddedSet, labels: Labels | None, decoys: Sequence[DecoySource]
+) -> tuple[list[Attributes], int]:
+    """Gender and race of every embedded photo: as labelled, else predicted from the labelled pool.
+
+    Returns
+    -------
+    attributes
+        One for each row of embeddings.
+    predicted
+        How many were predicted.
+
+    Raises
+    ------
+    EvaluationError
+        A label is none that the pool knows.
+    """
+    pool = next(source for source in decoys if isinstance(source, DecoyPool) and source.labelled)
+    entries = pool.entries[1] or ()
+    vocabulary = {
+        "gender": {label.gender for label in entries if label.gender is not None},
+        "race": {label.race for label in entries if label.race is not None},
+    }
+    attributes = predict_attributes(faces.acquired.descriptors, pool)
+    predicted = len(attributes)
+    for picture, row in zip(faces.pairs.pictures, faces.acquired.rows.tolist(), strict=True):
+        own = {} if labels is None or row < 0 else labels.find(picture.name)
+        if not vocabulary.keys() <= own.keys():
+            continue
+        for attribute, values in vocabulary.items():
+            if own[attribute] not in values:
+                raise EvaluationError(
+                    f"the label file says {attribute} {own[attribute]!r} of {picture.name}; "
+                    f"the decoy pool knows {', '.join(sorted(values))}: hybrid+ needs one "
+                    "vocabulary for both"
+                )
+        attributes[row] = Attributes(gender=own["gender"], race=own["race"])
+        predicted -= 1
+    return attributes, predicted
 
 
 def _voted(
@@ -113,13 +157,13 @@ def resembling_rows(
     int64
         Their numbers, ascending.
     """
-    found = np.zeros(len(rows), dtype=np.bool_)
+    resembles = np.zeros(len(rows), dtype=np.bool_)
     for start in range(0, len(rows), _ROWS):
         tile = rows[start : start + _ROWS]
         for other in range(0, len(others), _ROWS):
             cosines = tile @ others[other : other + _ROWS].T
-            found[start : start + _ROWS] |= (cosines >= np.float64(cosine)).any(axis=1)
-    return np.flatnonzero(found).astype(np.int64)
+            resembles[start : start + _ROWS] |= (cosines >= np.float64(cosine)).any(axis=1)
+    return np.flatnonzero(resembles).astype(np.int64)
 
 
 def _require_dimension(descriptors: NDArray[np.float32], pool: DecoyPool) -> None:

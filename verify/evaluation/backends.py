@@ -105,7 +105,7 @@ def spread(
                     raise
                 raise BackendError(
                     "a worker ended in the middle of its work, most often because memory ran out: "
-                    "use fewer --jobs, or larger workers; the same command goes on where it stopped"
+                    "use fewer jobs, or larger workers; the same command goes on where it stopped"
                 ) from None
             yield index, sealed.open(key)
 
@@ -180,7 +180,7 @@ def _cluster(scheduler: str, parcel: Parcel) -> Iterator[None]:
         )
     except (OSError, TimeoutError, ValueError):
         raise BackendError(
-            f"no Dask scheduler answers at {scheduler}: start one, or leave out --backend"
+            f"no Dask scheduler answers at {scheduler}: start one, or work on this machine"
         ) from None
     with client:
         try:

@@ -53,7 +53,7 @@ class Checkpoints:
         make_folder(self._folder)
         self._base = base
         self._sources = sources
-        self._attributes = [[each.gender, each.race] for each in attributes]
+        self._attributes = [[labels.gender, labels.race] for labels in attributes]
         self._flipped = None if flipped is None else hashlib.sha256(flipped.tobytes()).hexdigest()
 
     def _file(self, unit: Unit) -> Path:
@@ -73,11 +73,13 @@ class Checkpoints:
         try:
             # Opened here, because NumPy leaves a file open that is no archive.
             with self._file(unit).open("rb") as file, np.load(file, allow_pickle=False) as saved:
-                found = [np.asarray(saved[f"column_{i}"]) for i in range(columns)]
+                columns_found = [np.asarray(saved[f"column_{i}"]) for i in range(columns)]
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
             return None
-        whole = all(column.shape == (pairs,) and column.dtype == np.float64 for column in found)
-        return found if whole else None
+        whole = all(
+            column.shape == (pairs,) and column.dtype == np.float64 for column in columns_found
+        )
+        return columns_found if whole else None
 
     def save(self, unit: Unit, runs: Sequence[Run]) -> None:
         """Write the similarities of a unit, at once or not at all."""

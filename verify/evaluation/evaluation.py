@@ -16,7 +16,7 @@ from verify.evaluation.acquisition import Acquired
 from verify.evaluation.backends import SOFTWARE, Backend, spread
 from verify.evaluation.checkpoints import Checkpoints
 from verify.evaluation.material import Material, Source
-from verify.evaluation.plan import Plan, units_of
+from verify.evaluation.plan import EvaluationPlan, units_of
 from verify.evaluation.rows import SetFacts
 from verify.evaluation.runs import Run, run_unit
 from verify.evaluation.scoring import SCORING_VERSION, unit_layout
@@ -134,7 +134,7 @@ def evaluate_set(
     facts: SetFacts,
     kept: NDArray[np.int64],
     *,
-    plan: Plan,
+    plan: EvaluationPlan,
     out: Path,
     backend: Backend,
     progress: Advance,
@@ -165,12 +165,12 @@ def evaluate_set(
         for unit, layout in zip(units, layouts, strict=True)
     ]
     shared = (material, plan.targets)
-    found: list[list[Run]] = [[] for _ in units]
+    runs_of_unit: list[list[Run]] = [[] for _ in units]
     seconds = [0.0 for _ in units]
     for index, (runs, taken) in spread(backend, _run, shared, zip(units, known, strict=True)):
         if known[index] is None:
             checkpoints.save(units[index], runs)
-        found[index], seconds[index] = runs, taken
+        runs_of_unit[index], seconds[index] = runs, taken
         progress(1)
     source_of = {
         cell: unit.source if isinstance(unit, LiftUnit) else None
@@ -181,7 +181,7 @@ def evaluate_set(
         Work(unit, taken, resumed=column is not None)
         for unit, taken, column in zip(units, seconds, known, strict=True)
     ]
-    runs = [run for each in found for run in each]
+    runs = [run for unit_runs in runs_of_unit for run in unit_runs]
     return Evaluated(facts, material, kept, runs, source_of, work)
 
 

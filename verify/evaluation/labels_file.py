@@ -50,12 +50,12 @@ class Labels:
     _stems: Mapping[str, Mapping[str, str]] = field(init=False, compare=False)
 
     def __post_init__(self) -> None:
-        found: defaultdict[str, list[Mapping[str, str]]] = defaultdict(list)
+        by_stem: defaultdict[str, list[Mapping[str, str]]] = defaultdict(list)
         for name, row in self.of.items():
-            found[_stem(name)].append(row)
+            by_stem[_stem(name)].append(row)
         # Where rows differ in their suffix only, each speaks for its own file alone; a row
         # without suffix speaks for the others.
-        alone = {stem: rows[0] for stem, rows in found.items() if len(rows) == 1}
+        alone = {stem: rows[0] for stem, rows in by_stem.items() if len(rows) == 1}
         plain = {name: row for name, row in self.of.items() if _stem(name) == name}
         object.__setattr__(self, "_stems", alone | plain)
 
@@ -140,7 +140,7 @@ def _read(path: Path, reader: "_csv.Reader") -> Labels:
             made[key] = _labels(attributes, key)
             for attribute, label in made[key].items():
                 groups[attribute].setdefault(label, number)
-            if crowded := [each for each in kept if len(groups[each]) > MAX_GROUPS]:
+            if crowded := [name for name in kept if len(groups[name]) > MAX_GROUPS]:
                 faults.append(
                     f"the column {crowded[0]} has more than {MAX_GROUPS} different labels, which "
                     "are names or numbers and no groups: remove the column, or put its values "

@@ -10,7 +10,7 @@ from verify.evaluation.units import Search
 from verify.metrics import equal_error_rate, resolvable, threshold_at_fmr
 from verify.tenfold import TenFold, best_grid_threshold, best_threshold, ten_fold
 
-Floats = NDArray[np.float64]
+Array64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class ErrorsAt:
 
 
 @dataclass(frozen=True)
-class Measures:
+class VerificationMeasures:
     """All figures of one run.
 
     Parameters
@@ -66,13 +66,13 @@ COLLISION = 1e-3
 
 
 def measure(
-    similarities: Floats,
+    similarities: Array64,
     same: NDArray[np.bool_],
     folds: NDArray[np.int64],
     *,
     targets: Sequence[float],
     search: Search = "exact",
-) -> Measures:
+) -> VerificationMeasures:
     """Measure one run.
 
     Parameters
@@ -84,53 +84,53 @@ def measure(
     search
         ``grid`` is the literature's, for raw descriptors.
     """
-    mated, non_mated = similarities[same], similarities[~same]
-    return Measures(
+    genuine, impostor = similarities[same], similarities[~same]
+    return VerificationMeasures(
         ten_fold=ten_fold(
             similarities,
             same,
             folds,
             search=best_threshold if search == "exact" else best_grid_threshold,
         ),
-        eer=equal_error_rate(mated, non_mated)[0],
-        auc=area_under_roc(mated, non_mated),
-        d_prime=d_prime(mated, non_mated),
+        eer=equal_error_rate(genuine, impostor)[0],
+        auc=area_under_roc(genuine, impostor),
+        d_prime=d_prime(genuine, impostor),
         at=tuple(
-            errors_at(mated, non_mated, target)
+            errors_at(genuine, impostor, target)
             for target in targets
-            if resolvable(target, non_mated.size)
+            if resolvable(target, impostor.size)
         ),
-        collisions=int(np.count_nonzero(2 - 2 * non_mated < COLLISION**2)),
+        collisions=int(np.count_nonzero(2 - 2 * impostor < COLLISION**2)),
     )
 
 
-def errors_at(mated: Floats, non_mated: Floats, target: float) -> ErrorsAt:
+def errors_at(genuine: Array64, impostor: Array64, target: float) -> ErrorsAt:
     """Count both errors at the lowest threshold whose FMR is at most the target."""
-    threshold = threshold_at_fmr(non_mated, target)
+    threshold = threshold_at_fmr(impostor, target)
     return ErrorsAt(
         target=target,
         threshold=threshold,
-        errors=int(np.count_nonzero(mated < threshold)),
-        trials=mated.size,
-        fmr_errors=int(np.count_nonzero(non_mated >= threshold)),
-        fmr_trials=non_mated.size,
+        errors=int(np.count_nonzero(genuine < threshold)),
+        trials=genuine.size,
+        fmr_errors=int(np.count_nonzero(impostor >= threshold)),
+        fmr_trials=impostor.size,
     )
 
 
-def area_under_roc(mated: Floats, non_mated: Floats) -> float:
+def area_under_roc(genuine: Array64, impostor: Array64) -> float:
     """Probability that a genuine pair is more alike than an impostor pair; ties count half."""
     # Imported here, because it takes a second to load, and most commands need none.
     from scipy.stats import rankdata
 
-    ranks = rankdata(np.concatenate([mated, non_mated]))
-    wins = ranks[: mated.size].sum() - mated.size * (mated.size + 1) / 2
-    return float(wins / (mated.size * non_mated.size))
+    ranks = rankdata(np.concatenate([genuine, impostor]))
+    wins = ranks[: genuine.size].sum() - genuine.size * (genuine.size + 1) / 2
+    return float(wins / (genuine.size * impostor.size))
 
 
-def d_prime(mated: Floats, non_mated: Floats) -> float:
+def d_prime(genuine: Array64, impostor: Array64) -> float:
     """Separation of the two distributions in pooled standard deviations; 0 where both are one."""
-    spread = np.sqrt((mated.var() + non_mated.var()) / 2)
-    gap = float(mated.mean() - non_mated.mean())
+    spread = np.sqrt((genuine.var() + impostor.var()) / 2)
+    gap = float(genuine.mean() - impostor.mean())
     if spread > 0:
         return float(gap / spread)
     return float(np.copysign(np.inf, gap)) if gap else 0.0

@@ -23,7 +23,7 @@ class EvaluationError(VeilfaceError):
 
 
 @dataclass(frozen=True)
-class Plan:
+class EvaluationPlan:
     """What is to be evaluated.
 
     Parameters
@@ -81,7 +81,23 @@ class Plan:
             raise EvaluationError("at least one repeat is needed")
 
 
-def units_of(plan: Plan, sources: Sequence[Source], *, n: int) -> list[Unit]:
+def default_strategies(sources: Sequence[Source], *, raw_flip: bool) -> tuple[str, ...]:
+    """All strategies that the decoys allow but the sub- ones.
+
+    Parameters
+    ----------
+    raw_flip
+        Whether embeddings with the mirror image are there beside those without.
+    """
+    able = set(WITHOUT_DECOYS) - (set() if raw_flip else {RAW_FLIP})
+    if sources:
+        able |= {Strategy.ADVERSARIAL, Strategy.HYBRID}
+    if any(isinstance(source, DecoyPool) and source.labelled for source in sources):
+        able |= {Strategy.HYBRID_PLUS}
+    return tuple(name for name in STRATEGIES if name in able)
+
+
+def units_of(plan: EvaluationPlan, sources: Sequence[Source], *, n: int) -> list[Unit]:
     """List the units of work, long ones first.
 
     Raises
@@ -131,12 +147,14 @@ def _check_dims(strategy: Strategy, dims: Sequence[int], n: int) -> None:
         )
 
 
-def _fitting(strategy: Strategy, sources: Sequence[Source], plan: Plan) -> list[int | None]:
+def _fitting(
+    strategy: Strategy, sources: Sequence[Source], plan: EvaluationPlan
+) -> list[int | None]:
     """Positions of the sources that the strategy can draw from."""
     if strategy is Strategy.RANDOM:
         return [None]
     pools_only = strategy is Strategy.HYBRID_PLUS or strategy.sub_databases is not None
-    found: list[int | None] = [
+    places: list[int | None] = [
         place
         for place, source in enumerate(sources)
         if (
@@ -145,7 +163,7 @@ def _fitting(strategy: Strategy, sources: Sequence[Source], plan: Plan) -> list[
         )
         or not (pools_only or isinstance(source, DecoyPool))
     ]
-    if not found:
+    if not places:
         what = (
             "a pool with gender and race labels"
             if strategy is Strategy.HYBRID_PLUS
@@ -154,16 +172,16 @@ def _fitting(strategy: Strategy, sources: Sequence[Source], plan: Plan) -> list[
             else "decoys"
         )
         raise EvaluationError(
-            f"{strategy} lifting needs {what}: make one with `veilface decoys build` and name it "
-            "with --decoys, or leave the strategy out"
+            f"{strategy} lifting needs {what}: make one with `veilface decoys build`, or "
+            "leave the strategy out"
         )
-    for place in found:
+    for place in places:
         if place is not None:
             _check_size(strategy, sources[place], plan)
-    return found
+    return places
 
 
-def _check_size(strategy: Strategy, source: Source, plan: Plan) -> None:
+def _check_size(strategy: Strategy, source: Source, plan: EvaluationPlan) -> None:
     if not isinstance(source, DecoyPool):
         return
     needed = strategy.decoys(max(plan.dims))
@@ -173,5 +191,5 @@ def _check_size(strategy: Strategy, source: Source, plan: Plan) -> None:
         raise EvaluationError(
             f"{strategy} lifting with m = {max(plan.dims)} draws {needed} decoys, and {where} has "
             f"{len(source) // parts} entries: make a larger pool, take smaller dimensions"
-            + ("" if plan.shared_decoys else ", or give --shared-decoys")
+            + ("" if plan.shared_decoys else ", or share the decoys")
         )

@@ -18,13 +18,13 @@ from verify.evaluation.material import Material
 REPLICATES = 400
 GRID_POINTS = 49
 
-Floats = NDArray[np.float64]
+Array64 = NDArray[np.float64]
 Interval = Literal["subject-bootstrap", "pair-bootstrap"]
 
 
 def replicate_weights(
     material: Material, *, seed: int, replicates: int = REPLICATES
-) -> Iterator[tuple[Floats, Floats]]:
+) -> Iterator[tuple[Array64, Array64]]:
     """Draw people with replacement; pairs, where the set does not name people.
 
     One replicate is in memory at a time.
@@ -54,7 +54,7 @@ def replicate_weights(
         yield weights[same], weights[~same]
 
 
-def fmr_grid(impostor_pairs: int) -> Floats:
+def fmr_grid(impostor_pairs: int) -> Array64:
     """FMR values of curves: from the least that the pairs resolve (3 / trials) to 1."""
     return np.geomspace(min(1.0, 3 / impostor_pairs), 1.0, GRID_POINTS)
 
@@ -64,14 +64,14 @@ class OperatingPoints:
 
     Parameters
     ----------
-    mated, non_mated : (G,), (I,) float64
+    genuine, impostor : (G,), (I,) float64
         Similarities of genuine and impostor trials.
     """
 
-    def __init__(self, mated: Floats, non_mated: Floats) -> None:
-        self._genuine_order = np.argsort(mated, kind="stable")
-        self._impostor_order = np.argsort(-non_mated, kind="stable")
-        ranked = non_mated[self._impostor_order]
+    def __init__(self, genuine: Array64, impostor: Array64) -> None:
+        self._genuine_order = np.argsort(genuine, kind="stable")
+        self._impostor_order = np.argsort(-impostor, kind="stable")
+        ranked = impostor[self._impostor_order]
         # To accept k impostor pairs and reject the next, cut halfway between the two.
         cuts = np.empty(ranked.size + 1)
         cuts[0] = np.nextafter(ranked[0], np.inf)
@@ -82,11 +82,11 @@ class OperatingPoints:
         # A cut inside a run of equal similarities cannot be made: take the one before the run.
         tied = np.concatenate([[False], ranked[1:] == ranked[:-1], [False]])
         self._possible = np.maximum.accumulate(np.where(tied, 0, np.arange(tied.size)))
-        self._missed = np.searchsorted(mated[self._genuine_order], cuts, side="left")
+        self._missed = np.searchsorted(genuine[self._genuine_order], cuts, side="left")
 
     def fnmr(
-        self, fmrs: Floats, *, genuine: Floats | None = None, impostor: Floats | None = None
-    ) -> Floats:
+        self, fmrs: Array64, *, genuine: Array64 | None = None, impostor: Array64 | None = None
+    ) -> Array64:
         """FNMR at the lowest threshold whose FMR is at most each of ``fmrs``.
 
         Parameters
@@ -99,11 +99,11 @@ class OperatingPoints:
         -------
         ndarray of float64, shape (F,)
         """
-        mine = np.ones(self._genuine_order.size) if genuine is None else genuine
-        theirs = np.ones(self._impostor_order.size) if impostor is None else impostor
-        accepted = np.concatenate([[0.0], np.cumsum(theirs[self._impostor_order])])
+        genuine_weights = np.ones(self._genuine_order.size) if genuine is None else genuine
+        impostor_weights = np.ones(self._impostor_order.size) if impostor is None else impostor
+        accepted = np.concatenate([[0.0], np.cumsum(impostor_weights[self._impostor_order])])
         # Sums of weights are exact; only the product with a target needs room for rounding.
         allowed = fmrs * accepted[-1] * (1 + 1e-12)
         k = np.searchsorted(accepted, allowed, side="right") - 1
-        below = np.concatenate([[0.0], np.cumsum(mine[self._genuine_order])])
+        below = np.concatenate([[0.0], np.cumsum(genuine_weights[self._genuine_order])])
         return np.asarray(below[self._missed[self._possible[k]]] / below[-1])

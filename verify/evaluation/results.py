@@ -9,15 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from models.extraction import Failure
 from templates.contract.binding import Binding
 from templates.decoys import DecoyPool
 from templates.keys.rotation import ROTATION_VERSION
 from templates.space.lifting import Strategy
+from verify.evaluation.acquisition import EmbeddedSet
 from verify.evaluation.backends import SOFTWARE
 from verify.evaluation.evaluation import Evaluated, Work
 from verify.evaluation.material import Source
-from verify.evaluation.plan import Plan
+from verify.evaluation.plan import EvaluationPlan
+from verify.evaluation.readers import notes
 from verify.evaluation.rows import (
     Json,
     curve_json,
@@ -28,7 +29,6 @@ from verify.evaluation.rows import (
 )
 from verify.evaluation.scoring import decoy_kind, unit_layout
 from verify.evaluation.units import Cell, Mode
-from verify.evaluation.verification_set import VerificationSet
 from verify.tenfold import FOLDS
 
 FORMAT = "veilface evaluation"
@@ -98,37 +98,33 @@ class SourceFacts:
 class SetResult:
     """One set and what was found on it; ``sources`` are the decoys as they were used on it."""
 
-    pairs: VerificationSet
+    faces: EmbeddedSet
     evaluated: Evaluated
     sources: Sequence[SourceFacts]
-    failures: tuple[Failure, ...]
-    aligned: bool | None
-    pictures_sha256: str
-    notes: tuple[str, ...]
 
     def json(self) -> Json:
         """Counts, hashes and failures to acquire."""
-        facts = self.evaluated.facts
+        facts, pairs = self.evaluated.facts, self.faces.pairs
         return {
-            "name": self.pairs.name,
-            "kind": self.pairs.kind,
-            "images": len(self.pairs.pictures),
-            "pairs": len(self.pairs),
-            "genuine": self.pairs.genuine,
-            "impostor": self.pairs.impostor,
-            "people": None if self.pairs.people is None else len(set(self.pairs.people)),
-            "aligned": self.aligned,
-            "pictures_sha256": self.pictures_sha256,
-            "protocol_files": [list(entry) for entry in self.pairs.protocol_files],
+            "name": pairs.name,
+            "kind": pairs.kind,
+            "images": len(pairs.pictures),
+            "pairs": len(pairs),
+            "genuine": pairs.genuine,
+            "impostor": pairs.impostor,
+            "people": None if pairs.people is None else len(set(pairs.people)),
+            "aligned": self.faces.aligned,
+            "pictures_sha256": self.faces.pictures_sha256,
+            "protocol_files": [list(entry) for entry in pairs.protocol_files],
             "failures": [
                 {"image": failure.path.as_posix(), "code": failure.code, "reason": failure.reason}
-                for failure in self.failures
+                for failure in self.faces.acquired.failures
             ],
             "failed_genuine": facts.failed_genuine,
             "failed_impostor": facts.failed_impostor,
             "fta": facts.fta,
             "decoys": [{**each.json(), "left_out": each.left_out} for each in self.sources],
-            "notes": list(self.notes),
+            "notes": notes(pairs),
         }
 
 
@@ -142,7 +138,7 @@ def software() -> Json:
 
 
 def document(
-    plan: Plan,
+    plan: EvaluationPlan,
     model: Model,
     sources: Sequence[SourceFacts],
     sets: Sequence[SetResult],
@@ -159,9 +155,9 @@ def document(
     rows: list[Json] = []
     runs: list[Json] = []
     curves: list[Json] = []
-    for each in sets:
-        evaluated = each.evaluated
-        for (cell, search), found in sorted(
+    for result in sets:
+        evaluated = result.evaluated
+        for (cell, search), cell_runs in sorted(
             grouped(evaluated.runs).items(), key=lambda entry: _order(plan, *entry[0])
         ):
             place = evaluated.source_of[cell]
@@ -170,7 +166,7 @@ def document(
                 row_json(
                     cell,
                     search,
-                    found,
+                    cell_runs,
                     evaluated.facts,
                     seed=plan.seed,
                     n=model.n,
@@ -178,9 +174,9 @@ def document(
                     contract_id=contract_id(model, cell, source),
                 )
             )
-            runs += [run_json(run, each.pairs.name) for run in found]
+            runs += [run_json(run, result.faces.pairs.name) for run in cell_runs]
             if search == "exact":
-                curves.append(curve_json(cell, found, evaluated.facts))
+                curves.append(curve_json(cell, cell_runs, evaluated.facts))
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -192,18 +188,19 @@ def document(
         "decoys": [
             {**source.json(), "file": source.file, "sha256": source.sha256} for source in sources
         ],
-        "datasets": [each.json() for each in sets],
+        "datasets": [result.json() for result in sets],
         "rows": rows,
         "groups": list(groups),
         "group_summaries": list(group_summaries),
         "timings": list(timings),
         "work": [
-            {"dataset": each.pairs.name, **entry}
-            for each in sets
-            for entry in _work(each.evaluated)
+            {"dataset": result.faces.pairs.name, **entry}
+            for result in sets
+            for entry in _work(result.evaluated)
         ],
         "refused": refused_targets(
-            plan.targets, {each.pairs.name: each.evaluated.facts.impostor for each in sets}
+            plan.targets,
+            {result.faces.pairs.name: result.evaluated.facts.impostor for result in sets},
         ),
         "runs": runs,
         "curves": curves,
@@ -249,7 +246,7 @@ def contract_id(model: Model, cell: Cell, source: Source | None) -> str | None:
     ).contract_id
 
 
-def _order(plan: Plan, cell: Cell, search: str) -> tuple[Any, ...]:
+def _order(plan: EvaluationPlan, cell: Cell, search: str) -> tuple[Any, ...]:
     """Rows as the plan names them; raw first, stolen tokens after the others."""
     modes = list(Mode)
     plain = cell.strategy.removesuffix("-stolen")

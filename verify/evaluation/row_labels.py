@@ -55,12 +55,12 @@ def raw_row(rows: Iterable[Row], dataset: str) -> Row | None:
 
     The rows of subspaces are swept exactly too, so that the two differ in the lifting only.
     """
-    found = {
+    by_search = {
         str(row.get("threshold_search")): row
         for row in sorted(rows, key=lambda row: str(row["metric"]), reverse=True)
         if row["dataset"] == dataset and row["strategy"] == "raw"
     }
-    return found.get("exact") or found.get("grid")
+    return by_search.get("exact") or by_search.get("grid")
 
 
 def preferred_metric(rows: Iterable[Row]) -> str | None:

@@ -142,8 +142,8 @@ def _finite(value: float) -> float | None:
 
 
 def _at(runs: Sequence[Run], place: int, facts: SetFacts) -> Json:
-    each = [run.measures.at[place] for run in runs]
-    errors, fmr_errors = _mean(e.errors for e in each), _mean(e.fmr_errors for e in each)
+    errors_at = [run.measures.at[place] for run in runs]
+    errors, fmr_errors = _mean(e.errors for e in errors_at), _mean(e.fmr_errors for e in errors_at)
     value, fmr = errors / facts.genuine, fmr_errors / facts.impostor
     low, high = wilson(errors, facts.genuine)
     # With few errors, resampling what was seen knows nothing of what was not: hence both.
@@ -156,7 +156,7 @@ def _at(runs: Sequence[Run], place: int, facts: SetFacts) -> Json:
         "interval": facts.interval,
         "trials": facts.genuine,
         "errors_mean": errors,
-        "threshold_mean": _mean(e.threshold for e in each),
+        "threshold_mean": _mean(e.threshold for e in errors_at),
         "fmr": fmr,
         "fmr_errors_mean": fmr_errors,
         "far": fmr * (1 - facts.fta),

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from templates.distances.blas import single_threaded
 from verify.evaluation.material import Material
-from verify.evaluation.measures import Measures, measure
+from verify.evaluation.measures import VerificationMeasures, measure
 from verify.evaluation.resampling import (
     REPLICATES,
     OperatingPoints,
@@ -18,7 +18,7 @@ from verify.evaluation.resampling import (
 from verify.evaluation.scoring import Scores, score_unit, unit_layout
 from verify.evaluation.units import Cell, Lifted, RawUnit, Search, Unit
 
-Floats = NDArray[np.float64]
+Array64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -44,9 +44,9 @@ class Run:
     lifted: Lifted | None
     seed: int | None
     search: Search
-    measures: Measures
-    similarities: Floats
-    curve: Floats
+    measures: VerificationMeasures
+    similarities: Array64
+    curve: Array64
     replicates: NDArray[np.float32]
 
 
@@ -55,7 +55,7 @@ def run_unit(
     unit: Unit,
     *,
     targets: Sequence[float],
-    known: Sequence[Floats] | None = None,
+    known: Sequence[Array64] | None = None,
 ) -> list[Run]:
     """Compute the runs of a unit.
 
@@ -84,7 +84,9 @@ def run_unit(
             ("grid", "exact") if isinstance(unit, RawUnit) else ("exact",)
         )
         runs = [
-            _run(material, unit, each, search, targets) for each in scores for search in searches
+            _run(material, unit, unit_scores, search, targets)
+            for unit_scores in scores
+            for search in searches
         ]
         _add_replicates(material, runs)
     return runs
@@ -120,5 +122,5 @@ def _add_replicates(material: Material, runs: Sequence[Run]) -> None:
     grid = fmr_grid(int(np.count_nonzero(~same)))
     wanted = [np.concatenate([[errors.target for errors in run.measures.at], grid]) for run in runs]
     for row, (genuine, impostor) in enumerate(replicate_weights(material, seed=0)):
-        for run, each, fmrs in zip(runs, points, wanted, strict=True):
-            run.replicates[row] = each.fnmr(fmrs, genuine=genuine, impostor=impostor)
+        for run, run_points, fmrs in zip(runs, points, wanted, strict=True):
+            run.replicates[row] = run_points.fnmr(fmrs, genuine=genuine, impostor=impostor)

@@ -39,10 +39,10 @@ def timings(material: Material, cells: Sequence[tuple[Cell, int | None]]) -> lis
     probes, others = rows[:_SIDE], rows[_SIDE:]
     with single_threaded():
         raw = _median(lambda: probes @ others.T)
-        found = []
+        measured = []
         for cell, source in cells:
             micro = raw if cell.mode is Mode.RAW else _of(material, cell, source, probes, others)
-            found.append(
+            measured.append(
                 {
                     **cell_json(cell),
                     "n": material.n,
@@ -50,7 +50,7 @@ def timings(material: Material, cells: Sequence[tuple[Cell, int | None]]) -> lis
                     "ratio_to_raw": micro / raw,
                 }
             )
-    return found
+    return measured
 
 
 def _of(

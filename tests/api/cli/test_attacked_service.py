@@ -15,14 +15,14 @@ import pytest
 
 from api.cli.attacked_service import Ask, attacked_service, leaves_on_sigterm
 from api.http.errors import StartError
-from attacks.cast import make_cast
 from attacks.hill_climbing import in_process
 from attacks.outcomes import GENERATED, Scheme
-from attacks.scene import Scene
+from attacks.population import draw_population
+from attacks.system import System
 from templates.contract import wire
 from templates.keys.sealing import MasterKeyring
 from templates.store import TemplateStore
-from tests.attacks.conftest import staged
+from tests.attacks.conftest import small_system
 from tests.leaks import LeakSearch
 from tests.verify.synthetic import draw_people, make_generator, unit
 
@@ -40,31 +40,31 @@ class Attacked:
 
 
 @pytest.fixture(scope="module")
-def scene() -> Scene:
+def system() -> System:
     people = draw_people(340, photos=(3, 2, 2), noise=0.5, seed=12)
-    cast = make_cast(people.descriptors, people.names, victims=20, owners=2, seed=5)
-    return staged(cast, Scheme("adversarial", GENERATED, 6), make_generator())
+    population = draw_population(people.descriptors, people.names, victims=20, owners=2, seed=5)
+    return small_system(population, Scheme("adversarial", GENERATED, 6), make_generator())
 
 
-def wires(scene: Scene) -> list[bytes]:
-    contract_id = scene.contract.contract_id
-    return [wire.encode(scene.templates[i], contract_id=contract_id) for i in range(VICTIMS)]
+def wires(system: System) -> list[bytes]:
+    contract_id = system.contract.contract_id
+    return [wire.encode(system.templates[i], contract_id=contract_id) for i in range(VICTIMS)]
 
 
 @pytest.fixture(scope="module")
-def attacked(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Attacked]:
+def attacked(system: System, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Attacked]:
     outside = tmp_path_factory.mktemp("temporary")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tempfile, "tempdir", str(outside))
-        with attacked_service(scene.contract, scene.source, wires(scene)) as (scored, deciding):
+        with attacked_service(system.contract, system.source, wires(system)) as (scored, deciding):
             (folder,) = outside.iterdir()
             yield Attacked(scored, deciding, folder, outside)
         assert list(outside.iterdir()) == []
 
 
-def test_scores_are_those_of_the_scene_s_own_decisions(scene: Scene, attacked: Attacked) -> None:
-    mine = in_process(scene, range(VICTIMS), scores=True)
-    probes = [*scene.victims.fresh[:VICTIMS], *scene.attacker[:8], scene.templates.feet[0]]
+def test_scores_are_those_of_the_system_s_own_decisions(system: System, attacked: Attacked) -> None:
+    mine = in_process(system, range(VICTIMS), scores=True)
+    probes = [*system.victims.fresh[:VICTIMS], *system.attacker[:8], system.templates.feet[0]]
     for number, ask in enumerate(attacked.scored):
         for probe in probes:
             probe = unit(probe)
@@ -74,18 +74,18 @@ def test_scores_are_those_of_the_scene_s_own_decisions(scene: Scene, attacked: A
             assert theirs.accepted == expected.accepted
 
 
-def test_the_key_without_the_right_gets_no_score(scene: Scene, attacked: Attacked) -> None:
-    for probe in (scene.victims.fresh[0], scene.attacker[0]):
+def test_the_key_without_the_right_gets_no_score(system: System, attacked: Attacked) -> None:
+    for probe in (system.victims.fresh[0], system.attacker[0]):
         answer = attacked.deciding[0](probe)
         assert answer.score is None
         assert answer.accepted == attacked.scored[0](probe).accepted
 
 
-def test_the_victim_is_accepted_and_strangers_are_not(scene: Scene, attacked: Attacked) -> None:
+def test_the_victim_is_accepted_and_strangers_are_not(system: System, attacked: Attacked) -> None:
     for number, ask in enumerate(attacked.deciding):
-        assert ask(scene.victims.enrolled[number]).accepted
-        assert ask(scene.victims.fresh[number]).accepted
-    others = scene.victims.fresh[VICTIMS : VICTIMS + 10]
+        assert ask(system.victims.enrolled[number]).accepted
+        assert ask(system.victims.fresh[number]).accepted
+    others = system.victims.fresh[VICTIMS : VICTIMS + 10]
     assert sum(attacked.deciding[0](probe).accepted for probe in others) == 0
 
 
@@ -96,9 +96,9 @@ def test_the_folder_is_the_owner_s_alone(attacked: Attacked) -> None:
 
 
 def test_nothing_of_probes_and_templates_stands_in_the_log(
-    scene: Scene, attacked: Attacked
+    system: System, attacked: Attacked
 ) -> None:
-    probe = unit(np.random.default_rng(3).normal(size=scene.templates.n))
+    probe = unit(np.random.default_rng(3).normal(size=system.templates.n))
     attacked.scored[0](probe)
     attacked.deciding[1](probe)
     log = (attacked.folder / "serve.log").read_bytes()
@@ -106,9 +106,9 @@ def test_nothing_of_probes_and_templates_stands_in_the_log(
     search = LeakSearch(
         vectors={
             "probe": probe,
-            "foot point": scene.templates.feet[0],
-            "basis": scene.templates.bases[0],
-            "victim": scene.victims.enrolled[0],
+            "foot point": system.templates.feet[0],
+            "basis": system.templates.bases[0],
+            "victim": system.victims.enrolled[0],
         }
     )
     assert search.find(log) == []
@@ -123,7 +123,7 @@ def test_a_probe_that_is_refused_is_said_without_its_numbers(attacked: Attacked)
 
 
 def test_a_template_that_is_refused_is_said_and_nothing_stays(
-    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    system: System, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     answers = {"error": {"code": "contract_mismatch", "message": "Another contract."}}
@@ -144,7 +144,7 @@ def test_a_template_that_is_refused_is_said_and_nothing_stays(
     monkeypatch.setattr("api.cli.attacked_service.running_service", refusing)
     with (
         pytest.raises(StartError, match=r"refused a victim's template: contract_mismatch$"),
-        attacked_service(scene.contract, scene.source, wires(scene)),
+        attacked_service(system.contract, system.source, wires(system)),
     ):
         pytest.fail("a template was enrolled that was refused")
     assert list(tmp_path.iterdir()) == []

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from api.cli import audit_fairface, descriptors
+from api.cli import audit_fairface, audit_report, descriptors
 from models.demo import DEMO_NOTICE
 from tests.api.cli.audit_bench import (
     TRAIN,
@@ -226,7 +226,7 @@ def test_only_the_photos_that_the_limits_ask_for_are_embedded(
     def recorded(_description: str) -> Iterator[Callable[[float], None]]:
         yield shares.append
 
-    monkeypatch.setattr(audit_fairface, "share_done", recorded)
+    monkeypatch.setattr(audit_report, "share_done", recorded)
     few = ("--attack", "100", "--attacked", "50", "--attackers", "knn", "--attributes", "gender")
     ran = run(*faces.asked, *few, "--out", faces.root / "few", "--json")
     assert ran.status in (0, 1), ran.stderr

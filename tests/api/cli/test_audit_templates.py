@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-import attacks.cast
-import attacks.scene
-from api.cli import audit_attacks, audit_templates
-from attacks.cast import Cast
+import attacks.audit
+import attacks.population
+import attacks.system
 from attacks.databases import link_databases
 from attacks.outcomes import Knowledge, Property
-from attacks.scene import Scene
+from attacks.population import Population
 from attacks.stored import presentation
+from attacks.system import System
 from attacks.verdict import LIMITS, Status
 from models.demo import DEMO_NOTICE
 from tests.api.cli.audit_bench import are_pictures, both, documented, draw_people, named_in
@@ -35,8 +35,8 @@ class TemplateAudit:
     root: Path
     asked: tuple[str | Path, ...]
     first: Ran
-    casts: list[Cast]
-    scenes: list[Scene]
+    populations: list[Population]
+    systems: list[System]
     left: list[Path]
 
     @property
@@ -51,11 +51,11 @@ def on_small_material(patch: pytest.MonkeyPatch) -> None:
         few = replace(named["options"], lifted_probes=100, lifted_impostor_pairs=6_000, steps=10)
         return calibrate(*given, **{**named, "options": few})
 
-    patch.setattr(attacks.scene, "calibrate", fewer)
+    patch.setattr(attacks.system, "calibrate", fewer)
     patch.setattr(presentation, "TARGETS", 40)
     patch.setattr(presentation, "STARTS", 2)
     patch.setattr(
-        audit_attacks,
+        attacks.audit,
         "link_databases",
         partial(link_databases, accounts=(30,), strangers=150, permutations=200),
     )
@@ -72,30 +72,33 @@ def people(world: World, tmp_path_factory: pytest.TempPathFactory) -> Iterator[T
         *("--aligned", "--cache", root / "people.cache", "--victims", "20", "--owners", "100"),
         *("--contract", world.data / "contract.json", "--no-learned"),
     )
-    casts: list[Cast] = []
-    scenes: list[Scene] = []
+    populations: list[Population] = []
+    systems: list[System] = []
     with pytest.MonkeyPatch.context() as patch:
         on_small_material(patch)
         patch.setattr(tempfile, "tempdir", str(root / "temporary"))
-        make_cast, stage = attacks.cast.make_cast, attacks.scene.stage
+        draw_population, enroll_victims = (
+            attacks.population.draw_population,
+            attacks.system.enroll_victims,
+        )
 
-        def recorded_cast(*given: Any, **named: Any) -> Cast:
-            casts.append(make_cast(*given, **named))
-            return casts[-1]
+        def recorded_population(*given: Any, **named: Any) -> Population:
+            populations.append(draw_population(*given, **named))
+            return populations[-1]
 
-        def recorded_stage(*given: Any, **named: Any) -> Scene:
-            scenes.append(stage(*given, **named))
-            return scenes[-1]
+        def recorded_enrollment(*given: Any, **named: Any) -> System:
+            systems.append(enroll_victims(*given, **named))
+            return systems[-1]
 
-        patch.setattr(audit_templates, "make_cast", recorded_cast)
-        patch.setattr(audit_templates, "stage", recorded_stage)
+        patch.setattr(attacks.audit, "draw_population", recorded_population)
+        patch.setattr(attacks.audit, "enroll_victims", recorded_enrollment)
         first = run(
             *asked, "--no-comparison", "--climbed", "1", "--attempts", "50",
             "--max-success-with-key", "0", "--out", root / "out", "--json",
         )  # fmt: skip
         assert "error: " not in first.stderr, first.stderr
         left = list((root / "temporary").iterdir())
-        yield TemplateAudit(root, asked, first, casts[:], scenes[:], left)
+        yield TemplateAudit(root, asked, first, populations[:], systems[:], left)
 
 
 @pytest.fixture(scope="module")
@@ -218,22 +221,27 @@ def test_the_service_of_the_contract_is_audited(people_report: Any, world: World
 
 
 def test_nothing_of_people_and_templates_stands_in_the_report(people: TemplateAudit) -> None:
-    (cast,) = people.casts
+    (population,) = people.populations
     rows = np.concatenate(
         [
-            *(cast.victims.enrolled, cast.victims.fresh, cast.owners.enrolled, cast.owners.fresh),
-            *(cast.attacker, cast.calibration),
+            *(
+                population.victims.enrolled,
+                population.victims.fresh,
+                population.owners.enrolled,
+                population.owners.fresh,
+            ),
+            *(population.attacker, population.calibration),
         ]
     )
     vectors = {f"face {i}": row for i, row in enumerate(rows)}
-    for scene in people.scenes:
-        for number, template in enumerate(scene.templates.bases):
-            vectors[f"{scene.scheme}, basis {number}"] = template
-            vectors[f"{scene.scheme}, foot {number}"] = scene.templates.feet[number]
+    for system in people.systems:
+        for number, template in enumerate(system.templates.bases):
+            vectors[f"{system.scheme}, basis {number}"] = template
+            vectors[f"{system.scheme}, foot {number}"] = system.templates.feet[number]
     search = LeakSearch(vectors=vectors)
     written = b"\n".join(file.read_bytes() for file in sorted(people.out.iterdir()))
     said = (people.first.stdout + people.first.stderr).encode()
     assert search.find(written + said) == []
-    assert search.find(said + people.scenes[0].templates.feet[3].tobytes()) != []
+    assert search.find(said + people.systems[0].templates.feet[3].tobytes()) != []
     assert b"drawn-0" not in written + said
     assert b"person-6" not in written + said

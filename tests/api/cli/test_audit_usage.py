@@ -9,8 +9,9 @@ from typing import Any
 
 import pytest
 
-from api.cli import audit_fairface, audit_templates
+from api.cli import audit_templates
 from attacks.learned import extra
+from attacks.population import LEAST_FITTED
 from models.pack import ModelPack
 from templates.decoys import DecoyGenerator
 from templates.decoys.fitting import MIN_DESCRIPTORS
@@ -25,9 +26,9 @@ FAIRFACE_USAGE: list[tuple[list[str], str]] = [
     (["--strategy", "raw,homomorphic"], "--strategy takes of raw, random, adversarial, hybrid"),
     (["--attackers", "knn,oracle"], "--attackers takes of knn, logistic, svm"),
     (["--dim", "two"], "--dim takes whole numbers such as 2,4, not 'two'"),
-    (["--dim", "2,256"], "dimensions go from 1 to 255 with this pack, not 256"),
-    (["--dim", "0"], "dimensions go from 1 to 255 with this pack, not 0"),
-    (["--generated-dim", "300"], "dimensions go from 1 to 255 with this pack, not 300"),
+    (["--dim", "2,256"], "--dim takes dimensions from 1 to 255, not 256"),
+    (["--dim", "0"], "--dim takes dimensions from 1 to 255, not 0"),
+    (["--generated-dim", "300"], "--generated-dim takes dimensions from 1 to 255, not 300"),
     (["--generated-dim", "x"], "--generated-dim takes whole numbers such as 16,32, not 'x'"),
     (["--service-dim", "32", "--generated-dim", "2,4"], "--generated-dim"),
     (["--service-dim", "32", "--generated-dim", ""], "--generated-dim"),
@@ -163,7 +164,7 @@ def test_options_of_a_wrong_kind_are_refused(
 
 
 def test_the_least_pool_is_what_a_generator_is_fitted_to() -> None:
-    assert audit_templates.FITTED_FACES == audit_fairface.LEAST_LIFTING == MIN_DESCRIPTORS
+    assert LEAST_FITTED == MIN_DESCRIPTORS
 
 
 def test_a_folder_without_label_files_is_refused(
@@ -233,7 +234,7 @@ def test_an_absent_evaluation_is_said(world: World, fairface_root: Path, tmp_pat
 def test_too_few_people_are_refused(world: World, tmp_path: Path) -> None:
     cache = tmp_path / "faces.cache"
     for sizes, reason in (
-        (("--victims", "20", "--owners", "100"), "ask for fewer with --victims and --owners"),
+        (("--victims", "20", "--owners", "100"), "ask for fewer victims and decoy owners"),
         (("--victims", "51", "--owners", "100"), "need 151 people with two photos or more, and 50"),
     ):
         ran = templates(world, world.labelled, *sizes, "--dim", "4", "--cache", cache)
@@ -253,7 +254,7 @@ def test_a_folder_that_is_too_small_is_refused(world: World, tmp_path: Path) -> 
     refused(
         templates(world, tmp_path / "people", *asked),
         "the attacker has 100 faces, a third of the people who are neither victims nor decoy "
-        "owners, and needs 200: ask for fewer with --victims and --owners",
+        "owners, and needs 200: ask for fewer victims and decoy owners",
         1,
     )
     for number in range(400, 420):

@@ -8,11 +8,10 @@ import psutil
 import pytest
 from distributed import LocalCluster
 
-from api.cli import evaluation_inputs
 from models.pack import ModelPack
 from tests.api.cli.conftest import run
 from tests.api.cli.evaluation_bench import secrets
-from verify.evaluation import evaluation
+from verify.evaluation import embedder, evaluation
 
 
 @pytest.fixture(scope="module")
@@ -58,10 +57,10 @@ def test_a_cluster_gives_the_same_bits(bench, results, cluster, tmp_path, monkey
 
 
 def test_a_worker_without_the_pack_is_said_in_one_sentence(bench, cluster, tmp_path, monkeypatch):
-    plain: Callable[..., Any] = evaluation_inputs.PackSource
+    plain: Callable[..., Any] = embedder.PackSource
     absent = tmp_path / "elsewhere"
     monkeypatch.setattr(
-        evaluation_inputs, "PackSource", lambda **named: plain(**(named | {"folder": absent}))
+        embedder, "PackSource", lambda **named: plain(**(named | {"folder": absent}))
     )
     ran = run(*bench.full, "--backend", address(cluster), "--out", tmp_path / "out")
     assert (ran.status, ran.stdout) == (1, "")

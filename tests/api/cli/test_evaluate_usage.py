@@ -62,7 +62,7 @@ FAILED: list[tuple[list[str], str]] = [
 def test_what_cannot_be_done_is_said_before_any_face_is_embedded(
     bench, tmp_path, monkeypatch, arguments, reason, status
 ):
-    monkeypatch.setattr(evaluate, "acquire_faces", None)
+    monkeypatch.setattr(evaluate, "run_evaluation", None)
     for name in ("embed", "embed_both"):
         monkeypatch.setattr(ModelPack, name, None)
     rows = np.eye(32, dtype=np.float32)

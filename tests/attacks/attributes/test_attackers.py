@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from attacks.attributes.attackers import TRAINED, Lesson
+from attacks.attributes.attackers import TRAINED, TrainingSet
 from attacks.attributes.features import Features
 
 N, F = 400, 12
@@ -18,14 +18,14 @@ def made(signal: bool, chance: np.random.Generator) -> tuple[Features, np.ndarra
     return Features(chance.standard_normal((N, 4)).astype(np.float32) / 20, derived), codes
 
 
-def lesson(signal: bool) -> tuple[Lesson, Features, np.ndarray]:
+def training(signal: bool) -> tuple[TrainingSet, Features, np.ndarray]:
     chance = np.random.default_rng(8)
     (features, codes), (held, held_codes), (unseen, truth) = (
         made(signal, chance) for _ in range(3)
     )
     third = chance.integers(2, size=N)
     return (
-        Lesson(
+        TrainingSet(
             features,
             {"side": codes, "noise": third},
             held,
@@ -40,14 +40,14 @@ def lesson(signal: bool) -> tuple[Lesson, Features, np.ndarray]:
 
 @pytest.mark.parametrize("name", TRAINED)
 def test_finds_a_rule(name: str) -> None:
-    known, unseen, truth = lesson(signal=True)
+    known, unseen, truth = training(signal=True)
     scores = TRAINED[name](known).scores(unseen)
     assert np.mean(np.argmax(scores["side"], axis=1) == truth) > 0.85
 
 
 @pytest.mark.parametrize("name", TRAINED)
 def test_finds_none_in_noise(name: str) -> None:
-    known, unseen, truth = lesson(signal=False)
+    known, unseen, truth = training(signal=False)
     found = int(np.sum(np.argmax(TRAINED[name](known).scores(unseen)["side"], axis=1) == truth))
     # Four standard deviations of a fair coin.
     assert abs(found - N / 2) < 4 * np.sqrt(N / 4)
@@ -55,7 +55,7 @@ def test_finds_none_in_noise(name: str) -> None:
 
 @pytest.mark.parametrize("name", TRAINED)
 def test_never_predicts_a_class_without_training_faces(name: str) -> None:
-    known, unseen, _ = lesson(signal=True)
+    known, unseen, _ = training(signal=True)
     scores = TRAINED[name](known).scores(unseen)["noise"]
     assert scores.shape == (N, 4)
     assert np.argmax(scores, axis=1).max() <= 1
@@ -64,6 +64,6 @@ def test_never_predicts_a_class_without_training_faces(name: str) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("name", TRAINED)
 def test_a_seed_gives_the_same_scores(name: str) -> None:
-    known, unseen, _ = lesson(signal=True)
+    known, unseen, _ = training(signal=True)
     one, same = (TRAINED[name](known).scores(unseen)["side"] for _ in "ab")
     np.testing.assert_array_equal(one, same)

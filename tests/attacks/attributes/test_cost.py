@@ -24,11 +24,11 @@ def test_the_pairs_are_those_that_one_scheme_searches(most: int) -> None:
     plan = AttributePlan(
         attackers=(), feature_ks=(10,), gallery_most=most, training_most=100, lifts=2
     )
-    bench = prepare(
+    setup = prepare(
         Split(faces(20, seed=1), faces(120, seed=2), faces(30, seed=3)), plan=plan, seed=1
     )
     done: list[int] = []
-    run_scheme(bench, Scheme("random", None, 4), progress=done.append)
+    run_scheme(setup, Scheme("random", None, 4), progress=done.append)
     assert sum(done) == (4 + 1) * full_pairs(plan, faces=120, templates=30)
 
 

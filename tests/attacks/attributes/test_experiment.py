@@ -5,11 +5,11 @@ import functools
 import numpy as np
 import pytest
 
-from attacks.attributes import seen
+from attacks.attributes import observations
 from attacks.attributes.experiment import run_scheme, work_of
 from attacks.attributes.faces import Split
 from attacks.attributes.measures import Leakage
-from attacks.attributes.plan import AttributePlan, Bench, prepare, schemes_of
+from attacks.attributes.plan import AttributePlan, Setup, prepare, schemes_of
 from attacks.attributes.rows import AttributeRow, strongest
 from attacks.errors import AuditError
 from attacks.outcomes import GENERATED, POOLED, RAW_SCHEME, Knowledge, Scheme
@@ -22,7 +22,7 @@ Found = dict[tuple[str, str], AttributeRow]
 
 
 @functools.cache
-def bench(strength: float = 0.28) -> Bench:
+def setup(strength: float = 0.28) -> Setup:
     lifting, attack, attacked = (
         faces(count, seed=seed, strength=strength) for count, seed in ((240, 1), (500, 2), (400, 3))
     )
@@ -31,7 +31,7 @@ def bench(strength: float = 0.28) -> Bench:
 
 @functools.cache
 def attacked(scheme: Scheme, strength: float = 0.28) -> tuple[AttributeRow, ...]:
-    return tuple(run_scheme(bench(strength), scheme))
+    return tuple(run_scheme(setup(strength), scheme))
 
 
 def by_attacker(scheme: Scheme, strength: float = 0.28) -> Found:
@@ -107,7 +107,7 @@ def test_decoys_that_are_spread_unlike_faces_point_at_the_descriptor() -> None:
     other = faces(1000, seed=7, strength=0.0).descriptors
     other[:, ::2] *= 0.3
     other /= np.linalg.norm(other, axis=1, keepdims=True)
-    parts = bench().split
+    parts = setup().split
     flat = prepare(parts, plan=PLAN, seed=5, generator=DecoyGenerator.fit(other))
     for scheme, more in ((OURS, 0.0), (Scheme("adversarial", GENERATED, 12), 0.05)):
         found = {(row.attacker, row.attribute): row for row in run_scheme(flat, scheme)}
@@ -129,7 +129,7 @@ def test_tiles_change_nothing_but_the_memory(monkeypatch: pytest.MonkeyPatch) ->
     small = Split(faces(60, seed=1), faces(80, seed=2), faces(30, seed=3))
     some = prepare(small, plan=plan, seed=1)
     whole = run_scheme(some, RAW_SCHEME)
-    monkeypatch.setattr(seen, "_TILE_ROWS", 7)
+    monkeypatch.setattr(observations, "_TILE_ROWS", 7)
     assert [row.measures for row in run_scheme(some, RAW_SCHEME)] == [r.measures for r in whole]
 
 

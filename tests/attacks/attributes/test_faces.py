@@ -1,4 +1,4 @@
-"""Who plays which part."""
+"""How faces are divided."""
 
 from typing import Any
 

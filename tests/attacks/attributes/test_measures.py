@@ -1,4 +1,4 @@
-"""Measures against independent computations, and leakage on both sides of chance."""
+"""InferenceMeasures against independent computations, and leakage on both sides of chance."""
 
 import itertools
 import math

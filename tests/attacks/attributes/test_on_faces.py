@@ -7,7 +7,7 @@ import pytest
 from attacks.attributes.experiment import run_scheme
 from attacks.attributes.faces import LabelledFaces, split
 from attacks.attributes.measures import Leakage
-from attacks.attributes.plan import AttributePlan, Bench, prepare
+from attacks.attributes.plan import AttributePlan, Setup, prepare
 from attacks.attributes.rows import AttributeRow
 from attacks.outcomes import POOLED, RAW_SCHEME, Scheme
 from models.extraction import Extractor
@@ -31,7 +31,7 @@ def labelled(root: Path, part: str, count: int, extractor: Extractor) -> Labelle
 
 
 @pytest.fixture(scope="module")
-def bench(fairface: Path, mbf_pack_dir: Path) -> Bench:
+def setup(fairface: Path, mbf_pack_dir: Path) -> Setup:
     # FairFace's photos are small: on this canvas all but a few are found, in a quarter of the time.
     extractor = Extractor(ModelPack.load(mbf_pack_dir, detector_size=320), quality=None)
     train = labelled(fairface, "train", TRAIN, extractor)
@@ -40,23 +40,23 @@ def bench(fairface: Path, mbf_pack_dir: Path) -> Bench:
     return prepare(parts, plan=AttributePlan(feature_ks=(10, 50)), seed=0)
 
 
-def by_attacker(bench: Bench, scheme: Scheme) -> dict[tuple[str, str], AttributeRow]:
-    rows = run_scheme(bench, scheme)
+def by_attacker(setup: Setup, scheme: Scheme) -> dict[tuple[str, str], AttributeRow]:
+    rows = run_scheme(setup, scheme)
     # The paper's metric comes first, and dictionaries keep the last.
     return {(row.attacker, row.attribute): row for row in reversed(rows)}
 
 
-def test_random_lifting_conceals_nothing(bench: Bench) -> None:
-    raw, lifted = (by_attacker(bench, s) for s in (RAW_SCHEME, Scheme("random", None, 4)))
+def test_random_lifting_conceals_nothing(setup: Setup) -> None:
+    raw, lifted = (by_attacker(setup, s) for s in (RAW_SCHEME, Scheme("random", None, 4)))
     for attacker in ("knn", "logistic", "svm"):
         before, after = raw[attacker, "gender"], lifted[attacker, "gender"]
         assert before.measures.leakage is after.measures.leakage is Leakage.ABOVE
         assert abs(before.accuracy - after.accuracy) < 0.08
 
 
-def test_adversarial_lifting_conceals_from_all_but_who_holds_the_pool(bench: Bench) -> None:
-    raw = by_attacker(bench, RAW_SCHEME)
-    found = by_attacker(bench, Scheme("adversarial", POOLED, 16))
+def test_adversarial_lifting_conceals_from_all_but_who_holds_the_pool(setup: Setup) -> None:
+    raw = by_attacker(setup, RAW_SCHEME)
+    found = by_attacker(setup, Scheme("adversarial", POOLED, 16))
     for attacker in ("knn", "logistic", "svm"):
         assert found[attacker, "gender"].accuracy < raw[attacker, "gender"].accuracy - 0.15
     low = raw["svm", "gender"].measures.accuracy.ci_low
@@ -64,8 +64,8 @@ def test_adversarial_lifting_conceals_from_all_but_who_holds_the_pool(bench: Ben
     assert found["strip", "gender"].measures.leakage is Leakage.ABOVE
 
 
-def test_the_rule_beats_the_neighbours_on_hybrid_plus(bench: Bench) -> None:
-    found = by_attacker(bench, Scheme("hybrid+", POOLED, 8))
+def test_the_rule_beats_the_neighbours_on_hybrid_plus(setup: Setup) -> None:
+    found = by_attacker(setup, Scheme("hybrid+", POOLED, 8))
     assert found["knn", "gender"].measures.leakage is Leakage.BELOW
     assert found["rule", "gender"].accuracy == 1.0
     assert found["rule", "race"].accuracy > found["knn", "race"].accuracy + 0.2

@@ -7,49 +7,49 @@ import pytest
 from attacks.errors import AuditError
 from attacks.learned import invert, train
 from attacks.learned.inverter import Inverter
-from attacks.scene import Scene
+from attacks.system import System
 from templates.space.subspace import SubspaceBatch
 from tests.verify.synthetic import random_rotation
 
 pytest.importorskip("torch")
 
 
-def trained(scene: Scene, *, epochs: int = 3) -> Inverter:
+def trained(system: System, *, epochs: int = 3) -> Inverter:
     return train(
-        scene.attacker,
-        lambda rows, epoch: scene.lift(rows, f"test {epoch}"),
+        system.attacker,
+        lambda rows, epoch: system.lift(rows, f"test {epoch}"),
         seconds=1e9,
         epochs=epochs,
         seed=0,
     )
 
 
-def test_another_basis_of_the_same_template_changes_nothing(scene: Scene) -> None:
-    inverter = trained(scene)
-    turn = random_rotation(scene.templates.m)
+def test_another_basis_of_the_same_template_changes_nothing(system: System) -> None:
+    inverter = trained(system)
+    turn = random_rotation(system.templates.m)
     other = SubspaceBatch(
-        scene.templates.feet,
-        np.ascontiguousarray(np.einsum("ab,tbn->tan", turn, scene.templates.bases), np.float32),
+        system.templates.feet,
+        np.ascontiguousarray(np.einsum("ab,tbn->tan", turn, system.templates.bases), np.float32),
     )
-    np.testing.assert_allclose(inverter(scene.templates), inverter(other), atol=1e-4)
+    np.testing.assert_allclose(inverter(system.templates), inverter(other), atol=1e-4)
 
 
-def test_an_untrained_network_gives_the_foot_point(scene: Scene) -> None:
-    guesses = trained(scene, epochs=0)(scene.templates)
-    feet = scene.templates.feet / scene.templates.foot_norms[:, None]
+def test_an_untrained_network_gives_the_foot_point(system: System) -> None:
+    guesses = trained(system, epochs=0)(system.templates)
+    feet = system.templates.feet / system.templates.foot_norms[:, None]
     np.testing.assert_allclose(guesses, feet, atol=1e-5)
 
 
-def test_one_seed_gives_one_network(scene: Scene) -> None:
-    first, second = trained(scene, epochs=2), trained(scene, epochs=2)
-    np.testing.assert_array_equal(first(scene.templates), second(scene.templates))
+def test_one_seed_gives_one_network(system: System) -> None:
+    first, second = trained(system, epochs=2), trained(system, epochs=2)
+    np.testing.assert_array_equal(first(system.templates), second(system.templates))
 
 
 @pytest.mark.long
-def test_training_beats_the_foot_point_where_decoys_differ_from_faces(scene: Scene) -> None:
+def test_training_beats_the_foot_point_where_decoys_differ_from_faces(system: System) -> None:
     """Faces on one half of the axes, decoys on the other: a network must tell them apart."""
     rng = np.random.default_rng(0)
-    half = scene.templates.n // 2
+    half = system.templates.n // 2
 
     def rows(count: int) -> np.ndarray:
         drawn = np.zeros((count, 2 * half), dtype=np.float32)
@@ -74,22 +74,22 @@ def test_training_beats_the_foot_point_where_decoys_differ_from_faces(scene: Sce
 
 
 def test_outcomes_on_weak_templates_and_on_noise(
-    scene: Scene, weak_scene: Scene, strangers: np.ndarray
+    system: System, weak_system: System, strangers: np.ndarray
 ) -> None:
-    _, (weak,) = invert(weak_scene, seconds=1e9, epochs=2, seed=0)
+    _, (weak,) = invert(weak_system, seconds=1e9, epochs=2, seed=0)
     assert weak.measured.value > 0.8
-    noise = replace(scene, templates=scene.lift(strangers, "noise"))
+    noise = replace(system, templates=system.lift(strangers, "noise"))
     _, (row,) = invert(noise, strangers, seconds=1e9, epochs=2, seed=0)
     assert row.measured.value <= 0.1
-    assert row.details["faces"] == len(scene.attacker) + len(strangers)
+    assert row.details["faces"] == len(system.attacker) + len(strangers)
 
 
-def test_too_few_faces_are_refused(scene: Scene) -> None:
+def test_too_few_faces_are_refused(system: System) -> None:
     with pytest.raises(AuditError, match="40 faces"):
-        train(scene.attacker[:10], lambda rows, epoch: scene.lift(rows, "x"), seed=0)
+        train(system.attacker[:10], lambda rows, epoch: system.lift(rows, "x"), seed=0)
 
 
-def test_without_torch_the_remedy_is_named(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_torch_the_remedy_is_named(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "torch", None)
     with pytest.raises(AuditError, match=r'pip install "veilface\[torch\]"'):
-        invert(scene, seed=0)
+        invert(system, seed=0)

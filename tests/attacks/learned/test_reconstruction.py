@@ -7,7 +7,7 @@ import pytest
 from attacks.errors import AuditError
 from attacks.learned import decoder, reconstruct, score_images, train_decoder
 from attacks.learned.decoder import SIZE, Images, resized
-from attacks.scene import Scene
+from attacks.system import System
 
 pytest.importorskip("torch")
 pytest.importorskip("skimage")
@@ -38,19 +38,19 @@ def symmetric(rows: np.ndarray) -> np.ndarray:
 
 
 @pytest.fixture
-def mirrored(scene: Scene) -> Scene:
-    """The scene with people whose descriptors are of mirror-symmetric pictures."""
+def mirrored(system: System) -> System:
+    """The system with people whose descriptors are of mirror-symmetric pictures."""
     people = replace(
-        scene.victims,
-        enrolled=symmetric(scene.victims.enrolled),
-        fresh=symmetric(scene.victims.fresh),
+        system.victims,
+        enrolled=symmetric(system.victims.enrolled),
+        fresh=symmetric(system.victims.fresh),
     )
-    return replace(scene, victims=people)
+    return replace(system, victims=people)
 
 
 @pytest.mark.long
 def test_the_raw_descriptor_is_drawn_and_noise_is_not(
-    mirrored: Scene, monkeypatch: pytest.MonkeyPatch
+    mirrored: System, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(decoder, "_CHANNELS", (32, 16, 8, 8))  # pictures of 64 cells need no more
     rng = np.random.default_rng(0)
@@ -79,7 +79,7 @@ def test_the_raw_descriptor_is_drawn_and_noise_is_not(
     assert rows["foot point"].judged
 
 
-def test_scores_of_a_perfect_drawing_and_of_a_wrong_one(mirrored: Scene) -> None:
+def test_scores_of_a_perfect_drawing_and_of_a_wrong_one(mirrored: System) -> None:
     fresh = mirrored.victims.enrolled
     photos = paint(fresh)
     perfect = score_images(photos, photos, fresh, embed=embed)
@@ -93,7 +93,7 @@ def test_scores_of_a_perfect_drawing_and_of_a_wrong_one(mirrored: Scene) -> None
     assert shifted.cosines.mean() < -0.9
 
 
-def test_one_seed_draws_one_face(mirrored: Scene) -> None:
+def test_one_seed_draws_one_face(mirrored: System) -> None:
     faces = mirrored.victims.enrolled
     drawn = [
         train_decoder(paint(faces), faces, seconds=1e9, epochs=1, seed=3)(faces) for _ in range(2)
@@ -110,7 +110,7 @@ def test_resizing_keeps_the_mean() -> None:
     assert resized(images, 112).shape == (2, 112, 112, 3)
 
 
-def test_what_does_not_fit_is_refused(mirrored: Scene) -> None:
+def test_what_does_not_fit_is_refused(mirrored: System) -> None:
     faces = mirrored.victims.enrolled
     with pytest.raises(AuditError, match="photo and a guess"):
         reconstruct(mirrored, paint(faces), faces, paint(faces)[:3], embed=embed, seed=0)
@@ -121,7 +121,7 @@ def test_what_does_not_fit_is_refused(mirrored: Scene) -> None:
 
 
 def test_without_the_extra_the_remedy_is_named(
-    mirrored: Scene, monkeypatch: pytest.MonkeyPatch
+    mirrored: System, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "skimage.metrics", None)
     faces = mirrored.victims.enrolled

@@ -3,11 +3,11 @@ from dataclasses import replace
 import numpy as np
 
 from attacks.stored.impersonation import impersonation_attack
-from tests.attacks.stored.staging import OWNERS, VICTIMS, M, count, counts, noise, scene, share
+from tests.attacks.stored.systems import OWNERS, VICTIMS, M, count, counts, noise, share, system_of
 
 
 def test_the_owner_of_a_decoy_is_accepted() -> None:
-    (outcome,) = impersonation_attack(scene("pool"))
+    (outcome,) = impersonation_attack(system_of("pool"))
     assert counts(outcome)[1] == VICTIMS * M
     assert share(outcome) > 0.95
     assert share(outcome) > 100 * outcome.chance
@@ -16,15 +16,15 @@ def test_the_owner_of_a_decoy_is_accepted() -> None:
 
 
 def test_noise_in_place_of_the_owners_is_rejected() -> None:
-    staged = scene("pool")
-    assert staged.owners is not None
-    nobody = replace(staged.owners, fresh=noise(OWNERS, staged.templates.n))
-    (outcome,) = impersonation_attack(replace(staged, owners=nobody))
+    system = system_of("pool")
+    assert system.owners is not None
+    nobody = replace(system.owners, fresh=noise(OWNERS, system.templates.n))
+    (outcome,) = impersonation_attack(replace(system, owners=nobody))
     assert counts(outcome)[0] <= 2
 
 
 def test_people_of_a_generator_are_rejected_like_strangers() -> None:
-    (outcome,) = impersonation_attack(scene("generator"))
+    (outcome,) = impersonation_attack(system_of("generator"))
     assert share(outcome) < 0.01
     strangers = outcome.details["strangers"]
     assert outcome.chance == count(strangers)[0] / count(strangers)[1]
@@ -33,9 +33,9 @@ def test_people_of_a_generator_are_rejected_like_strangers() -> None:
 
 def test_people_may_be_given_for_the_fit() -> None:
     """The half that is fitted comes to the templates, and the other half says what chance is."""
-    staged = scene("generator")
-    faces = noise(300, staged.templates.n, seed=4)
-    (outcome,) = impersonation_attack(staged, faces=faces)
+    system = system_of("generator")
+    faces = noise(300, system.templates.n, seed=4)
+    (outcome,) = impersonation_attack(system, faces=faces)
     assert outcome.details["fitted_to"] == 150
     assert counts(outcome)[1] == 150 * VICTIMS
     assert count(outcome.details["strangers"])[1] == 150 * VICTIMS
@@ -44,11 +44,11 @@ def test_people_may_be_given_for_the_fit() -> None:
 
 def test_the_people_of_a_generator_of_very_few_are_accepted() -> None:
     """A fit takes 100 people: here photos of four, of whom its decoys are mixtures then."""
-    staged = scene("generator")
-    n = staged.templates.n
+    system = system_of("generator")
+    n = system.templates.n
     four = np.tile(noise(4, n, seed=4), (25, 1)) + 0.2 * noise(100, n, seed=5)
     fitted = (four / np.linalg.norm(four, axis=1, keepdims=True)).astype(np.float32)
-    (outcome,) = impersonation_attack(staged, faces=np.concatenate([fitted, noise(100, n, seed=6)]))
+    (outcome,) = impersonation_attack(system, faces=np.concatenate([fitted, noise(100, n, seed=6)]))
     assert outcome.details["fitted_to"] == 100
     assert counts(outcome)[1] == 100 * VICTIMS
     assert share(outcome) > 0.5

@@ -10,7 +10,7 @@ from attacks.stored.intersection import (
     same_descriptor,
 )
 from templates.decoys import DecoyPool
-from tests.attacks.stored.staging import VICTIMS, counts, noise, number, scene, share
+from tests.attacks.stored.systems import VICTIMS, counts, noise, number, share, system_of
 
 
 def subspaces(count: int, m: int, n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -59,7 +59,7 @@ def test_the_common_point_is_not_bettered_nearby() -> None:
 
 
 def test_two_lifts_of_one_descriptor_meet_in_it() -> None:
-    stored, exact = same_descriptor(scene("generator"), lifts=(2,))
+    stored, exact = same_descriptor(system_of("generator"), lifts=(2,))
     assert number(exact.details["largest_error_where_unique"]) < 1e-5
     assert number(stored.details["largest_error_where_unique"]) < 2e-3
     assert share(stored) == share(exact) == 1
@@ -68,32 +68,32 @@ def test_two_lifts_of_one_descriptor_meet_in_it() -> None:
 
 
 def test_a_small_pool_makes_two_lifts_share_decoys() -> None:
-    staged = scene("pool")
-    assert isinstance(staged.source, DecoyPool)
-    few = staged.source.subset(np.arange(12))
-    narrow = replace(staged, source=few, lifter=replace(staged.lifter, source=few))
+    system = system_of("pool")
+    assert isinstance(system.source, DecoyPool)
+    few = system.source.subset(np.arange(12))
+    narrow = replace(system, source=few, lifter=replace(system.lifter, source=few))
     (_, exact) = same_descriptor(narrow, lifts=(2,))
     assert number(exact.details["templates_that_share_a_decoy"]) > VICTIMS / 2
 
 
 def test_photos_of_one_person_lead_to_the_person() -> None:
-    staged = scene("generator")
+    system = system_of("generator")
     rng = np.random.default_rng(0)
-    centres = noise(20, staged.templates.n, seed=5)
+    centres = noise(20, system.templates.n, seed=5)
     photos = []
     for centre in centres:
-        rows = centre + 0.35 * noise(6, staged.templates.n, seed=int(rng.integers(1 << 30)))
+        rows = centre + 0.35 * noise(6, system.templates.n, seed=int(rng.integers(1 << 30)))
         photos.append((rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32))
-    two, five = different_photos(staged, photos, lifts=(2, 5, 10))
+    two, five = different_photos(system, photos, lifts=(2, 5, 10))
     assert share(five) > 0.9
     assert number(five.details["cosine_to_truth_mean"]) > number(
         two.details["cosine_to_truth_mean"]
     )
     assert five.details["people"] == 20
     assert five.judged
-    (few,) = different_photos(staged, photos[:19], lifts=(5,))
+    (few,) = different_photos(system, photos[:19], lifts=(5,))
     assert not few.judged
     assert "Not judged" in few.assumption
-    strangers = [noise(6, staged.templates.n, seed=100 + row) for row in range(20)]
-    (none,) = different_photos(staged, strangers, lifts=(5,))
+    strangers = [noise(6, system.templates.n, seed=100 + row) for row in range(20)]
+    (none,) = different_photos(system, strangers, lifts=(5,))
     assert counts(none)[0] <= 1

@@ -14,11 +14,20 @@ from attacks.stored.known_database import (
 from attacks.stored.recording import RecordingSource, recorded_lift
 from templates.decoys import DecoyPool
 from templates.keys.randomness import Keystream
-from tests.attacks.stored.staging import VICTIMS, M, cast, count, noise, number, scene, share
+from tests.attacks.stored.systems import (
+    VICTIMS,
+    M,
+    count,
+    noise,
+    number,
+    population,
+    share,
+    system_of,
+)
 
 
 def test_a_known_pool_gives_every_decoy_and_the_descriptor() -> None:
-    exact, *perturbed = known_database_attack(scene("pool"))
+    exact, *perturbed = known_database_attack(system_of("pool"))
     assert count(exact.details["decoys_found"]) == (VICTIMS * M, VICTIMS * M)
     assert exact.details["false_finds"] == 0
     assert number(exact.details["cosine_to_truth_mean"]) > 0.95
@@ -30,7 +39,7 @@ def test_a_known_pool_gives_every_decoy_and_the_descriptor() -> None:
 
 
 def test_draws_of_a_generator_find_nothing() -> None:
-    outcome, told = known_database_attack(scene("generator"))
+    outcome, told = known_database_attack(system_of("generator"))
     assert (outcome.knowledge, told.knowledge) == (Knowledge.ALGORITHM, Knowledge.DECOYS)
     assert not outcome.judged
     assert not told.judged
@@ -43,37 +52,37 @@ def test_draws_of_a_generator_find_nothing() -> None:
 
 def test_a_decoy_among_the_draws_is_found() -> None:
     """What no draw can be: some of the templates' own decoys, among other draws."""
-    staged = scene("generator")
-    lift = recorded_lift(staged, staged.victims.enrolled, "decoys of a generator")
+    system = system_of("generator")
+    lift = recorded_lift(system, system.victims.enrolled, "decoys of a generator")
     with Keystream.seeded("other draws") as stream:
-        others = staged.lifter.source.draw(1, 500, stream=stream)[0]
-    one = attack_with_draws(staged, lift, np.concatenate([others, lift.decoys[:, 2]]))
+        others = system.lifter.source.draw(1, 500, stream=stream)[0]
+    one = attack_with_draws(system, lift, np.concatenate([others, lift.decoys[:, 2]]))
     assert count(one.details["decoys_found"]) == (VICTIMS, VICTIMS * M)
     assert one.details["false_finds"] == 0
-    every = np.concatenate([others, lift.decoys.reshape(-1, staged.templates.n)])
-    all_found = attack_with_draws(staged, lift, every)
+    every = np.concatenate([others, lift.decoys.reshape(-1, system.templates.n)])
+    all_found = attack_with_draws(system, lift, every)
     assert count(all_found.details["decoys_found"]) == (VICTIMS * M, VICTIMS * M)
     assert share(all_found) > 0.95
 
 
 def test_a_pool_of_other_people_finds_nothing() -> None:
-    staged = scene("pool")
-    found = find_decoys(noise(500, staged.templates.n), staged.templates, most=M)
+    system = system_of("pool")
+    found = find_decoys(noise(500, system.templates.n), system.templates, most=M)
     assert all(len(entries) == 0 for entries in found.entries)
 
 
 def test_a_template_of_noise_gives_noise() -> None:
-    staged = scene("pool")
-    victims = replace(staged.victims, fresh=noise(VICTIMS, staged.templates.n, seed=1))
-    outcome = known_database_attack(replace(staged, victims=victims))[0]
+    system = system_of("pool")
+    victims = replace(system.victims, fresh=noise(VICTIMS, system.templates.n, seed=1))
+    outcome = known_database_attack(replace(system, victims=victims))[0]
     # The decoys are found all the same; what they hide is matched with noise.
     assert count(outcome.details["decoys_found"])[0] == VICTIMS * M
     assert count(outcome.measured.to_json())[0] <= 1
 
 
 def test_random_lifting_has_no_decoys() -> None:
-    staged = scene("generator")
-    assert known_database_attack(replace(staged, scheme=Scheme("random", None, M))) == []
+    system = system_of("generator")
+    assert known_database_attack(replace(system, scheme=Scheme("random", None, M))) == []
 
 
 def test_orthogonal_decoys_leave_exactly_the_descriptor() -> None:
@@ -106,16 +115,16 @@ def test_the_likeliest_point_maximises_the_density_over_the_subspace() -> None:
 
 
 def test_the_recorded_decoys_lie_in_the_templates() -> None:
-    staged = scene("pool")
-    lift = recorded_lift(staged, staged.victims.enrolled[:5], "recorded")
+    system = system_of("pool")
+    lift = recorded_lift(system, system.victims.enrolled[:5], "recorded")
     for row in range(5):
         assert lift.templates[row].contains(lift.decoys[row], tol=2e-3).all()
-    again = recorded_lift(staged, staged.victims.enrolled[:5], "recorded")
+    again = recorded_lift(system, system.victims.enrolled[:5], "recorded")
     assert np.array_equal(again.templates.bases, lift.templates.bases)
 
 
 def test_perturbed_decoys_are_as_far_away_as_they_were_moved() -> None:
-    pool = DecoyPool(cast().attacker)
+    pool = DecoyPool(population().attacker)
     source = RecordingSource(pool, noise=0.1)
     with Keystream.seeded("perturbed") as stream:
         drawn = source.draw(4, 3, stream=stream)

@@ -10,12 +10,21 @@ from attacks.stored.nearest_neighbour import (
 )
 from attacks.stored.oracle import best_of, oracle_attack
 from templates.distances import Metric
-from tests.attacks.stored.staging import OWNERS, VICTIMS, count, counts, noise, number, scene, share
+from tests.attacks.stored.systems import (
+    OWNERS,
+    VICTIMS,
+    count,
+    counts,
+    noise,
+    number,
+    share,
+    system_of,
+)
 
 
 def test_the_nearest_entry_is_that_of_brute_force() -> None:
-    staged = scene("pool")
-    templates = staged.templates[:4]
+    system = system_of("pool")
+    templates = system.templates[:4]
     gallery = noise(50, templates.n)
     bases = templates.bases.astype(np.float64)
     for metric in Metric:
@@ -36,7 +45,7 @@ def test_the_nearest_entry_is_that_of_brute_force() -> None:
 
 
 def test_the_nearest_point_is_a_unit_vector_of_the_template_and_the_best_one() -> None:
-    templates = scene("pool").templates[:5]
+    templates = system_of("pool").templates[:5]
     points = noise(5, templates.n)
     found = nearest_points(points, templates)
     rng = np.random.default_rng(0)
@@ -48,7 +57,7 @@ def test_the_nearest_point_is_a_unit_vector_of_the_template_and_the_best_one() -
 
 
 def test_a_victim_in_the_gallery_is_recognised() -> None:
-    found = {outcome.variant: outcome for outcome in nearest_neighbour_attack(scene("pool"))}
+    found = {outcome.variant: outcome for outcome in nearest_neighbour_attack(system_of("pool"))}
     plain = found["victim in the gallery, decoys not in it"]
     beside = found["victim in the gallery, decoys in it"]
     assert share(plain) > 0.9
@@ -61,19 +70,19 @@ def test_a_victim_in_the_gallery_is_recognised() -> None:
 
 
 def test_without_the_victim_the_neighbour_is_somebody_else() -> None:
-    staged = scene("generator")
-    hidden = nearest_neighbour_attack(staged)[1]
+    system = system_of("generator")
+    hidden = nearest_neighbour_attack(system)[1]
     assert hidden.judged
     assert share(hidden) < 0.5
     # Positive control: the victim's own photo among the attacker's faces.
-    known = replace(staged, attacker=np.concatenate([staged.attacker, staged.victims.fresh]))
+    known = replace(system, attacker=np.concatenate([system.attacker, system.victims.fresh]))
     assert share(nearest_neighbour_attack(known)[1]) > 0.9
 
 
 def test_noise_is_not_recognised() -> None:
-    staged = scene("generator")
-    others = staged.lift(noise(VICTIMS, staged.templates.n), "noise")
-    identify, guess = nearest_neighbour_attack(replace(staged, templates=others))
+    system = system_of("generator")
+    others = system.lift(noise(VICTIMS, system.templates.n), "noise")
+    identify, guess = nearest_neighbour_attack(replace(system, templates=others))
     assert counts(identify)[0] <= 2
     assert counts(guess)[0] <= 2
 
@@ -88,7 +97,7 @@ def test_the_oracle_names_the_nearest_of_the_neighbours() -> None:
 
 
 def test_the_oracle_comes_nearer_with_more_neighbours_and_when_projected() -> None:
-    neighbour, projected = oracle_attack(scene("generator"), neighbours=(1, 10, 100))
+    neighbour, projected = oracle_attack(system_of("generator"), neighbours=(1, 10, 100))
     for outcome in (neighbour, projected):
         assert not outcome.judged
         curve = outcome.details["curve"]
@@ -99,7 +108,7 @@ def test_the_oracle_comes_nearer_with_more_neighbours_and_when_projected() -> No
 
 
 def test_the_oracle_of_noise_finds_no_victim() -> None:
-    staged = scene("generator")
-    victims = replace(staged.victims, fresh=noise(VICTIMS, staged.templates.n, seed=8))
-    for outcome in oracle_attack(replace(staged, victims=victims), neighbours=(50,)):
+    system = system_of("generator")
+    victims = replace(system.victims, fresh=noise(VICTIMS, system.templates.n, seed=8))
+    for outcome in oracle_attack(replace(system, victims=victims), neighbours=(50,)):
         assert counts(outcome)[0] <= 2

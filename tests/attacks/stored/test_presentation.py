@@ -5,25 +5,24 @@ import numpy as np
 import pytest
 
 from attacks.decisions import decide
-from attacks.outcomes import Knowledge, Outcome
-from attacks.stored.presentation import (
-    attacker_bench,
+from attacks.outcomes import AttackOutcome, Knowledge
+from attacks.stored.honest_probes import (
     flats_inside,
     honest_embedding,
     honest_lift,
     points_inside,
-    presentation_attack,
 )
+from attacks.stored.presentation import lift_own_templates, presentation_attack
 from attacks.stored.wolf_ascent import Ground, ascend_points, ascend_subspaces
 from attacks.stored.wolves import axis_wolves
 from templates.distances import paired_distances
 from templates.space.subspace import SubspaceBatch
-from tests.attacks.stored.staging import VICTIMS, counts, noise, scene, share
+from tests.attacks.stored.systems import VICTIMS, counts, noise, share, system_of
 
 
 @cache
-def found(decoys: str) -> dict[str, Outcome]:
-    return {outcome.variant: outcome for outcome in presentation_attack(scene(decoys))}
+def found(decoys: str) -> dict[str, AttackOutcome]:
+    return {outcome.variant: outcome for outcome in presentation_attack(system_of(decoys))}
 
 
 @pytest.mark.long
@@ -64,36 +63,36 @@ def test_a_wolf_that_knows_the_pool_opens_many_templates() -> None:
 
 
 def test_points_and_flats_inside_are_at_distance_0() -> None:
-    staged = scene("generator")
-    points = points_inside(staged.templates, seed=0)
+    system = system_of("generator")
+    points = points_inside(system.templates, seed=0)
     assert np.linalg.norm(points, axis=1) == pytest.approx(1, abs=1e-3)
-    flats = flats_inside(staged.templates, 3, foot_norm=0.5)
+    flats = flats_inside(system.templates, 3, foot_norm=0.5)
     assert flats.m == 3
     assert flats.foot_norms == pytest.approx(0.5, abs=2e-3)
     for probes in (points, flats):
-        assert paired_distances(probes, staged.templates, metric="spherical").max() < 0.01
+        assert paired_distances(probes, system.templates, metric="spherical").max() < 0.01
 
 
 def test_the_input_checks_are_those_of_the_service() -> None:
     rows = noise(3, 64) * np.array([[1.0], [1.01], [0.0]], dtype=np.float32)
     assert honest_embedding(rows).tolist() == [True, False, False]
-    staged = scene("generator")
-    calibration = staged.lifted
+    system = system_of("generator")
+    calibration = system.lifted
     assert calibration is not None
     assert calibration.foot_point_norm is not None
-    honest = staged.lift(noise(20, 64), "honest", m=calibration.probe_m)
+    honest = system.lift(noise(20, 64), "honest", m=calibration.probe_m)
     assert honest_lift(honest, calibration).all()
     zero = SubspaceBatch(0 * honest.feet, honest.bases)
     assert not honest_lift(zero, calibration).any()
 
 
 def ground_of(*, cohort_test: bool) -> Ground:
-    staged = scene("generator")
-    bench = attacker_bench(staged)
-    level = staged.level
+    system = system_of("generator")
+    own = lift_own_templates(system)
+    level = system.level
     if not cohort_test:
         level = replace(level, cohort_threshold=-np.inf)
-    return Ground.of(bench.targets, bench.cohort, level)
+    return Ground.of(own.targets, own.cohort, level)
 
 
 @pytest.mark.parametrize("cohort_test", [False, True])
@@ -113,22 +112,22 @@ def test_the_slopes_are_those_of_finite_differences(cohort_test: bool) -> None:
 
 
 def test_climbing_raises_the_share_that_accepts() -> None:
-    staged = scene("generator")
-    rule = replace(staged.level, cohort_threshold=-np.inf)
-    bench = attacker_bench(staged)
-    ground = Ground.of(bench.targets, bench.cohort, rule)
-    starts = noise(4, staged.templates.n)
+    system = system_of("generator")
+    rule = replace(system.level, cohort_threshold=-np.inf)
+    own = lift_own_templates(system)
+    ground = Ground.of(own.targets, own.cohort, rule)
+    starts = noise(4, system.templates.n)
     ends = ascend_points(starts, ground)
     assert np.linalg.norm(ends, axis=1) == pytest.approx(1, abs=1e-5)
 
     def mean_near(probes: np.ndarray | SubspaceBatch, lifted: bool) -> float:
-        calibration = staged.lifted if lifted else staged.points
+        calibration = system.lifted if lifted else system.points
         assert calibration is not None
-        return float(decide(probes, bench.targets, staged.contract, calibration, rule).near.mean())
+        return float(decide(probes, own.targets, system.contract, calibration, rule).near.mean())
 
     assert mean_near(ends, False) > mean_near(starts, False)
-    assert staged.lifted is not None
-    wolves = axis_wolves(staged.attacker, staged.lifted.probe_m, foot_norm=0.5, seed=0)
+    assert system.lifted is not None
+    wolves = axis_wolves(system.attacker, system.lifted.probe_m, foot_norm=0.5, seed=0)
     first = SubspaceBatch.of([wolf.subspace for wolf in wolves[1:4]])
     climbed = ascend_subspaces(first, ground)
     for wolf in climbed:
@@ -138,7 +137,7 @@ def test_climbing_raises_the_share_that_accepts() -> None:
 
 
 def test_the_same_seed_gives_the_same_figures() -> None:
-    again = presentation_attack(scene("generator"))
+    again = presentation_attack(system_of("generator"))
     assert [outcome.to_json() for outcome in again] == [
         outcome.to_json() for outcome in found("generator").values()
     ]

@@ -82,7 +82,7 @@ def die(shared: object, item: object) -> None:
 
 @pytest.mark.filterwarnings("ignore:A worker stopped:UserWarning")
 def test_a_worker_that_ends_in_the_middle_is_said(tmp_path: Path) -> None:
-    with pytest.raises(BackendError, match="most often because memory ran out: use fewer --jobs"):
+    with pytest.raises(BackendError, match="most often because memory ran out: use fewer jobs"):
         list(spread(Backend(None, 2), die, None, range(2)))
 
 

@@ -12,17 +12,17 @@ from templates.distances import Metric
 from tests.verify.evaluation.materials import N, material, pool
 from verify.datasets import DatasetError
 from verify.evaluation import evaluation
-from verify.evaluation.acquisition import Acquired
+from verify.evaluation.acquisition import Acquired, EmbeddedSet
 from verify.evaluation.backends import Backend
 from verify.evaluation.evaluation import Evaluated, evaluate_set, prepare
 from verify.evaluation.measures import measure
-from verify.evaluation.plan import Plan
+from verify.evaluation.plan import EvaluationPlan
 from verify.evaluation.results import Model, SetResult, document
 from verify.evaluation.rows import SetFacts, collision_floor, row_json
 from verify.evaluation.units import Cell, Mode
 from verify.evaluation.verification_set import PictureBytes, VerificationSet, contiguous_folds
 
-PLAN = Plan(
+PLAN = EvaluationPlan(
     ("raw", "random", "adversarial", "biohashing"), dims=(2, 3), repeats=2, targets=(0.1, 1e-4)
 )
 
@@ -42,7 +42,11 @@ def verification_set(pairs: int = 100, people: int = 30) -> VerificationSet:
 
 
 def run(
-    out: Path, plan: Plan = PLAN, *, jobs: int = 1, advance: Callable[[int], None] = lambda _: None
+    out: Path,
+    plan: EvaluationPlan = PLAN,
+    *,
+    jobs: int = 1,
+    advance: Callable[[int], None] = lambda _: None,
 ) -> Evaluated:
     known = material()
     facts = SetFacts("made", 50, 50, 0, 0, 0.0, names_people=True)
@@ -57,9 +61,10 @@ def run(
     )
 
 
-def document_of(evaluated: Evaluated, plan: Plan = PLAN) -> dict[str, Any]:
+def document_of(evaluated: Evaluated, plan: EvaluationPlan = PLAN) -> dict[str, Any]:
     pairs = verification_set()
-    whole = SetResult(pairs, evaluated, (), (), True, "0" * 64, ())
+    acquired = Acquired(np.empty((0, N), np.float32), np.empty(0, np.int64), ())
+    whole = SetResult(EmbeddedSet(pairs, acquired, True, "0" * 64), evaluated, ())
     return document(
         plan, Model(N, {}), [], [whole], options={}, timings=[], groups=[], group_summaries=[]
     )
@@ -186,7 +191,7 @@ def test_pairs_without_a_descriptor_are_counted(tmp_path: Path) -> None:
 
 
 def test_rates_with_failures_follow_the_standard(tmp_path: Path) -> None:
-    evaluated = run(tmp_path, Plan(("raw",), targets=(0.1,)))
+    evaluated = run(tmp_path, EvaluationPlan(("raw",), targets=(0.1,)))
     facts = SetFacts("made", 50, 50, 3, 2, 0.04, names_people=False)
     (first, *_) = evaluated.runs
     row = row_json(first.cell, "grid", [first], facts, seed=0, n=N, source=None, contract_id=None)
@@ -223,7 +228,7 @@ def test_folds_of_the_made_up_set_are_those_of_the_literature() -> None:
 
 
 def test_what_was_computed_on_other_descriptors_is_not_found(tmp_path: Path) -> None:
-    plan = Plan(("raw", "random"), dims=(2,), repeats=1)
+    plan = EvaluationPlan(("raw", "random"), dims=(2,), repeats=1)
     run(tmp_path, plan)
     again = run(tmp_path, plan)
     assert all(work.resumed for work in again.work)
@@ -242,7 +247,7 @@ def test_what_was_computed_on_other_descriptors_is_not_found(tmp_path: Path) -> 
 
 
 def test_classes_without_spread_give_a_document(tmp_path: Path) -> None:
-    evaluated = run(tmp_path, Plan(("raw",)))
+    evaluated = run(tmp_path, EvaluationPlan(("raw",)))
     first = evaluated.runs[0]
     flat = np.where(evaluated.material.same, 1.0, 0.0)
     folds = evaluated.material.folds

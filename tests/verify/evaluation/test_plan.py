@@ -2,12 +2,14 @@ import pytest
 
 from templates.space.lifting import Strategy
 from tests.verify.evaluation.materials import pool
-from verify.evaluation.plan import EvaluationError, Plan, units_of
+from verify.evaluation.plan import EvaluationError, EvaluationPlan, units_of
 from verify.evaluation.units import HashUnit, LiftUnit, RawUnit
 
 
 def test_the_paper_s_table_is_five_seeds_of_every_cell() -> None:
-    plan = Plan(("raw", "random", "adversarial", "hybrid", "biohashing"), dims=(2, 4), seed=10)
+    plan = EvaluationPlan(
+        ("raw", "random", "adversarial", "hybrid", "biohashing"), dims=(2, 4), seed=10
+    )
     units = units_of(plan, [pool()], n=24)
     lifted = [unit for unit in units if isinstance(unit, LiftUnit)]
     assert len(lifted) == 3 * 2 * 5
@@ -32,7 +34,7 @@ def test_a_strategy_without_its_decoys_is_refused(
     strategies: tuple[str, ...], sources: list, message: str
 ) -> None:
     with pytest.raises(EvaluationError, match=message):
-        units_of(Plan(strategies), sources, n=24)
+        units_of(EvaluationPlan(strategies), sources, n=24)
 
 
 @pytest.mark.parametrize(
@@ -47,7 +49,7 @@ def test_a_strategy_without_its_decoys_is_refused(
 )
 def test_a_plan_that_cannot_be_is_refused(changes: dict, message: str) -> None:
     with pytest.raises(EvaluationError, match=message):
-        Plan(**{"strategies": ("raw",), **changes})
+        EvaluationPlan(**{"strategies": ("raw",), **changes})
 
 
 @pytest.mark.parametrize(
@@ -61,4 +63,4 @@ def test_a_plan_that_cannot_be_is_refused(changes: dict, message: str) -> None:
 )
 def test_dimensions_must_fit(strategy: str, dims: tuple[int, ...], message: str) -> None:
     with pytest.raises(EvaluationError, match=message):
-        units_of(Plan((strategy,), dims=dims), [pool()], n=24)
+        units_of(EvaluationPlan((strategy,), dims=dims), [pool()], n=24)

@@ -147,8 +147,8 @@ def _pair(
         photos.append(photo)
     first, second = photos
     if (first.identity == second.identity) != same:
-        found = f"{first.identity} and {second.identity}"
-        return f"pairs {found} as {'one person' if same else 'two people'}"
+        both = f"{first.identity} and {second.identity}"
+        return f"pairs {both} as {'one person' if same else 'two people'}"
     return first, second
 
 
@@ -157,10 +157,10 @@ def _is_index(text: str) -> bool:
 
 
 def _files(root: Path, keys: Sequence[str]) -> dict[str, PictureFile]:
-    found = {key: PictureFile(key, root / key) for key in keys if (root / key).is_file()}
-    absent = [_Photo(key) for key in keys if key not in found]
+    pictures = {key: PictureFile(key, root / key) for key in keys if (root / key).is_file()}
+    absent = [_Photo(key) for key in keys if key not in pictures]
     if not absent:
-        return found
+        return pictures
     folders = _identity_folders(root, {photo.identity for photo in absent})
     faults: list[str] = []
     for photo in absent:
@@ -171,7 +171,7 @@ def _files(root: Path, keys: Sequence[str]) -> dict[str, PictureFile]:
         ]
         shown = [one.relative_to(root).as_posix() for one in candidates]
         if len(candidates) == 1:
-            found[photo.path] = PictureFile(shown[0], candidates[0])
+            pictures[photo.path] = PictureFile(shown[0], candidates[0])
         elif candidates:
             faults.append(f"{photo.path} may be {' or '.join(shown[:3])}")
         elif photo.identity in folders:
@@ -182,7 +182,7 @@ def _files(root: Path, keys: Sequence[str]) -> dict[str, PictureFile]:
         raise DatasetError(
             faults_in(root, "expected each photo of the protocol once below it", faults)
         )
-    return found
+    return pictures
 
 
 def _identity_folders(root: Path, identities: set[str]) -> dict[str, list[Path]]:

@@ -58,7 +58,7 @@ def _name(photo: Photo) -> str:
 def _files(root: Path, pairs: Sequence[NamedPair], keys: Sequence[str]) -> dict[str, PictureFile]:
     base = _photo_root(root, {pair.first[0] for pair in pairs})
     listed: dict[str, dict[str, list[Path]]] = {}
-    found: dict[str, PictureFile] = {}
+    pictures: dict[str, PictureFile] = {}
     faults: list[str] = []
     for key in keys:
         person, stem = key.split("/")
@@ -67,7 +67,7 @@ def _files(root: Path, pairs: Sequence[NamedPair], keys: Sequence[str]) -> dict[
         candidates = listed[person].get(stem, [])
         if len(candidates) == 1:
             name = candidates[0].relative_to(base).as_posix()
-            found[key] = PictureFile(name, candidates[0])
+            pictures[key] = PictureFile(name, candidates[0])
         elif candidates:
             faults.append(f"{key} is there {len(candidates)} times with different suffixes")
         else:
@@ -76,7 +76,7 @@ def _files(root: Path, pairs: Sequence[NamedPair], keys: Sequence[str]) -> dict[
         raise DatasetError(
             faults_in(base, f"expected the photos that {PAIRS} names ({suffixes()})", faults)
         )
-    return found
+    return pictures
 
 
 def _photo_root(root: Path, people: set[str]) -> Path:
@@ -94,12 +94,12 @@ def _photo_root(root: Path, people: set[str]) -> Path:
 
 def photos_in(folder: Path) -> dict[str, list[Path]]:
     """Photos of a folder by their names without suffix; empty where there is no folder."""
-    found: dict[str, list[Path]] = {}
+    pictures: dict[str, list[Path]] = {}
     if folder.is_dir():
         for file in sorted(folder.iterdir()):
             if file.suffix.lower() in SUFFIXES and file.is_file():
-                found.setdefault(file.stem, []).append(file)
-    return found
+                pictures.setdefault(file.stem, []).append(file)
+    return pictures
 
 
 def suffixes() -> str:

@@ -66,8 +66,8 @@ def read_variable(data: bytes, name: str) -> Array | None:
             room -= len(unpacked)
             kind, body = next(_elements(unpacked, order, padded=False), (0, b""))
         if kind == _MATRIX:
-            found, array = _matrix(body, order, 0, wanted=name)
-            if found == name:
+            stored_name, array = _matrix(body, order, 0, wanted=name)
+            if stored_name == name:
                 return array
     return None
 

@@ -19,26 +19,26 @@ PUBLISHED = {
 def notes(benchmark: VerificationSet) -> list[str]:
     """Say where a set differs from the published one, and what in it is unusual."""
     name, pairs = benchmark.name, len(benchmark)
-    found = []
+    sentences = []
     published = PUBLISHED.get(name)
     if published is not None and pairs != published:
-        found.append(f"{name} has {pairs:,} pairs, the published set has {published:,}")
+        sentences.append(f"{name} has {pairs:,} pairs, the published set has {published:,}")
     if unequal_folds(benchmark.same, benchmark.folds):
         sizes = np.bincount(benchmark.folds, minlength=FOLDS)
-        found.append(
+        sentences.append(
             f"{name}: folds differ in their numbers of genuine or impostor pairs "
             f"({sizes.min():,} to {sizes.max():,} pairs a fold)"
         )
     if own := int(np.count_nonzero(benchmark.first == benchmark.second)):
-        found.append(f"{name}: {_pairs(own)} a photo with itself")
+        sentences.append(f"{name}: {_pairs(own)} a photo with itself")
     if twice := pairs - len(np.unique(_unordered(benchmark), axis=0)):
-        found.append(f"{name}: {_pairs(twice)} the same two photos as another pair")
+        sentences.append(f"{name}: {_pairs(twice)} the same two photos as another pair")
     if benchmark.people is not None:
         people = np.unique(np.array(benchmark.people), return_inverse=True)[1]
         agree = (people[benchmark.first] == people[benchmark.second]) == benchmark.same
         if wrong := int(np.count_nonzero(~agree)):
-            found.append(f"{name}: {_pairs(wrong)} people whose names contradict the label")
-    return found
+            sentences.append(f"{name}: {_pairs(wrong)} people whose names contradict the label")
+    return sentences
 
 
 def _pairs(count: int) -> str:

@@ -58,13 +58,13 @@ def _file(path: Path, *, pictures: bool) -> VerificationSet:
 
 def _folder(path: Path, *, pictures: bool) -> list[VerificationSet]:
     marks = {"LFW": PAIRS, "CFP": LIST.format("F"), "AgeDB-30": PROTOCOL}
-    found = _marks(path, marks)
-    if not found:
+    kinds = _marks(path, marks)
+    if not kinds:
         # An archive that was unpacked into a folder of its own.
         inside = sorted(one for one in path.iterdir() if one.is_dir() and one.name[0] != ".")
         if len(inside) == 1:
-            path, found = inside[0], _marks(inside[0], marks)
-    match found:
+            path, kinds = inside[0], _marks(inside[0], marks)
+    match kinds:
         case ["LFW"]:
             return [read_lfw(path, pictures=pictures)]
         case ["CFP"]:
@@ -78,8 +78,8 @@ def _folder(path: Path, *, pictures: bool) -> list[VerificationSet]:
                 f"{path} is a folder with {seen or 'nothing'} in it and no protocol. "
                 f"Understood are: {LAYOUTS}"
             )
-    seen = " and ".join(marks[kind] for kind in found)
-    raise DatasetError(f"{path} holds {seen}: which of {' and '.join(found)} is it? Separate them")
+    seen = " and ".join(marks[kind] for kind in kinds)
+    raise DatasetError(f"{path} holds {seen}: which of {' and '.join(kinds)} is it? Separate them")
 
 
 def _marks(path: Path, marks: dict[str, str]) -> list[str]:

@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 
 from attacks.errors import AuditError
 from attacks.recovery import fmr_of
-from attacks.scene import Scene
+from attacks.system import System
 from templates.distances import Metric, pairwise_distances, similarity
 from templates.space.subspace import SubspaceBatch
 
-REHEARSALS = 400
+PRIOR_TEMPLATES = 400
 MOST_FACES = 1500
 _NOISE = 0.002
 
-Floats = NDArray[np.float64]
+Array64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -44,15 +44,15 @@ class Prior:
         the residual of the fit, which is no noise but what they miss of a smooth function.
     """
 
-    faces: Floats
-    mean: Floats
-    axes: Floats
-    trend: Floats
-    kernel: Floats
+    faces: Array64
+    mean: Array64
+    axes: Array64
+    trend: Array64
+    kernel: Array64
     noise: float
 
 
-def rehearse(
+def learn_prior(
     faces: NDArray[np.floating], templates: SubspaceBatch, *, rate_of_chance: float
 ) -> Prior:
     """Learn from templates that the attacker lifted from faces of its own.
@@ -92,8 +92,8 @@ def rehearse(
     )
 
 
-def _cover(scores: Floats, chance: float) -> NDArray[np.int64]:
-    """Order of probes by how many rehearsed templates each opens that none before it does.
+def _cover(scores: Array64, chance: float) -> NDArray[np.int64]:
+    """Order of probes by how many of the attacker's templates each opens that none before it does.
 
     Greedy set cover. Scores are standardised per probe, over the templates, as the cohort test
     does; a pair counts where it is among the highest, of twice the share of chance so that the
@@ -118,10 +118,10 @@ def _cover(scores: Floats, chance: float) -> NDArray[np.int64]:
     return np.concatenate([np.asarray(order, dtype=np.int64), rest[np.argsort(-peaks)]])
 
 
-def rehearse_scene(scene: Scene, *, rehearsals: int = REHEARSALS) -> Prior:
-    """Rehearse with the scene's attacker: lift some of its faces as the service does."""
-    count = min(rehearsals, len(scene.attacker) // 2)
+def attacker_prior(system: System, *, most: int = PRIOR_TEMPLATES) -> Prior:
+    """Learn the prior of the system's attacker, from templates of some of its faces."""
+    count = min(most, len(system.attacker) // 2)
     if count < 2:
-        raise AuditError("an attacker that rehearses needs faces of four people or more")
-    templates = scene.lift(scene.attacker[-count:], "rehearsal of a climb")
-    return rehearse(scene.attacker, templates, rate_of_chance=fmr_of(scene.level))
+        raise AuditError("a prior is learnt on faces of four people or more")
+    templates = system.lift(system.attacker[-count:], "rehearsal of a climb")
+    return learn_prior(system.attacker, templates, rate_of_chance=fmr_of(system.level))

@@ -18,7 +18,7 @@ from attacks.attributes.features import Features, features_of
 from attacks.attributes.known_decoys import Flags, find_decoys, never_seen, strip
 from attacks.attributes.likely_points import guesses
 from attacks.attributes.neighbours import METRICS, Attacked, merged, nearest_neighbours, vote
-from attacks.attributes.plan import Bench, Side
+from attacks.attributes.plan import Setup, Side
 from attacks.errors import AuditError
 from attacks.outcomes import GENERATED, POOLED, RAW_SCHEME, Scheme
 from templates.distances import Metric
@@ -36,7 +36,7 @@ _TILE_ROWS = 256
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Seen:
+class Observations:
     """What the attackers compute from the templates of some faces, and the truth of these."""
 
     features: Features
@@ -49,9 +49,9 @@ class Seen:
     """Classes that no decoy has (hybrid+)."""
     truth: ByAttribute
 
-    def take(self, rows: Codes) -> "Seen":
+    def take(self, rows: Codes) -> "Observations":
         """Return some of the rows."""
-        return Seen(
+        return Observations(
             self.features.take(rows),
             {m: {a: codes[rows] for a, codes in by.items()} for m, by in self.votes.items()},
             None if self.guessed is None else self.guessed.take(rows),
@@ -60,7 +60,7 @@ class Seen:
         )
 
     @classmethod
-    def stack(cls, parts: "list[Seen]") -> "Seen":
+    def stack(cls, parts: "list[Observations]") -> "Observations":
         """Put the rows of all parts under each other."""
         first = parts[0]
         guessed = [part.guessed for part in parts if part.guessed is not None]
@@ -76,56 +76,56 @@ class Seen:
         )
 
 
-def see_victims(bench: Bench, scheme: Scheme, progress: Progress | None) -> Seen:
+def observe_attacked(setup: Setup, scheme: Scheme, progress: Progress | None) -> Observations:
     """Lift the attacked faces with the deployment's decoys, and look at their templates.
 
     ``progress`` is called with the work that was just done; see `search_work`.
     """
-    stream = Keystream.seeded("attributes", bench.seed, "attacked", *_parts(scheme))
-    look = _Look(bench, scheme, bench.side, True, progress)
-    return _see(look, bench.split.attacked, stream)
+    stream = Keystream.seeded("attributes", setup.seed, "attacked", *_parts(scheme))
+    observer = _Observer(setup, scheme, setup.side, True, progress)
+    return _observe(observer, setup.split.attacked, stream)
 
 
-def see_own(
-    bench: Bench, scheme: Scheme, progress: Progress | None
-) -> tuple[Seen, NDArray[np.bool_]]:
+def observe_own(
+    setup: Setup, scheme: Scheme, progress: Progress | None
+) -> tuple[Observations, NDArray[np.bool_]]:
     """Lift the attacker's own faces, fold by fold; which of them are held out.
 
     They are searched among the nearby faces only.
     """
-    parts, held = [], []
-    for number, fold in enumerate(bench.folds):
-        look = _Look(bench, scheme, fold.side, False, progress)
-        for turn in range(_lifts(bench, scheme)):
+    parts, held_out = [], []
+    for number, fold in enumerate(setup.folds):
+        observer = _Observer(setup, scheme, fold.side, False, progress)
+        for turn in range(_lifts(setup, scheme)):
             stream = Keystream.seeded(
-                "attributes", bench.seed, "own", number, turn, *_parts(scheme)
+                "attributes", setup.seed, "own", number, turn, *_parts(scheme)
             )
-            parts.append(_see(look, fold.own, stream, entries=fold.entries))
-            held.append(fold.held)
-    return Seen.stack(parts), np.concatenate(held)
+            parts.append(_observe(observer, fold.own, stream, entries=fold.entries))
+            held_out.append(fold.held)
+    return Observations.stack(parts), np.concatenate(held_out)
 
 
-def search_work(bench: Bench, scheme: Scheme) -> int:
+def search_work(setup: Setup, scheme: Scheme) -> int:
     """Work of the searches for one scheme: (template, face) pairs, each as often as rows meet.
 
     A pair of a face and a template of dimension m is m + 1 products of two descriptors; of two
     points, one.
     """
-    victims = len(bench.split.attacked) * _work_of_one(scheme, bench.side, len(bench.side.gallery))
+    victims = len(setup.split.attacked) * _work_of_one(scheme, setup.side, len(setup.side.gallery))
     own = sum(
         len(fold.own) * _work_of_one(scheme, fold.side, len(fold.side.nearby))
-        for fold in bench.folds
+        for fold in setup.folds
     )
-    return victims + _lifts(bench, scheme) * own
+    return victims + _lifts(setup, scheme) * own
 
 
-def own_templates(bench: Bench, scheme: Scheme) -> int:
+def own_templates(setup: Setup, scheme: Scheme) -> int:
     """Number of templates that the attacker lifts."""
-    return _lifts(bench, scheme) * sum(len(fold.own) for fold in bench.folds)
+    return _lifts(setup, scheme) * sum(len(fold.own) for fold in setup.folds)
 
 
-def _lifts(bench: Bench, scheme: Scheme) -> int:
-    return 1 if scheme == RAW_SCHEME else bench.plan.lifts_of(len(bench.split.attack))
+def _lifts(setup: Setup, scheme: Scheme) -> int:
+    return 1 if scheme == RAW_SCHEME else setup.plan.lifts_of(len(setup.split.attack))
 
 
 def _work_of_one(scheme: Scheme, side: Side, gallery: int) -> int:
@@ -139,39 +139,39 @@ def _work_of_one(scheme: Scheme, side: Side, gallery: int) -> int:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class _Look:
+class _Observer:
     """How templates of one side are looked at; ``whole`` is whether all of the gallery votes."""
 
-    bench: Bench
+    setup: Setup
     scheme: Scheme
     side: Side
     whole: bool
     progress: Progress | None
 
-    def advance(self, each: int) -> Progress | None:
+    def advance(self, products: int) -> Progress | None:
         """Return a callback that counts a pair as so many products."""
         report = self.progress
-        return None if report is None else lambda pairs: report(each * pairs)
+        return None if report is None else lambda pairs: report(products * pairs)
 
 
-def _see(
-    look: _Look, faces: LabelledFaces, stream: Keystream, *, entries: Codes | None = None
-) -> Seen:
+def _observe(
+    observer: _Observer, faces: LabelledFaces, stream: Keystream, *, entries: Codes | None = None
+) -> Observations:
     """Lift faces and compute all that attackers need of the templates.
 
     ``entries`` are the faces' own positions in the side's pool, where they are in it.
     """
     tiles = (
         (attacked, faces.take(rows), None if entries is None else entries[rows])
-        for rows, attacked in _lifted(look.bench, look.scheme, faces, look.side, stream)
+        for rows, attacked in _lifted(observer.setup, observer.scheme, faces, observer.side, stream)
     )
-    work = (partial(_see_tile, look, *tile) for tile in tiles)
-    return Seen.stack(list(_in_order(work, look.bench.plan.threads)))
+    work = (partial(_observe_tile, observer, *tile) for tile in tiles)
+    return Observations.stack(list(_in_order(work, observer.setup.plan.threads)))
 
 
-def _in_order(work: Iterable[Callable[[], Seen]], threads: int) -> Iterator[Seen]:
+def _in_order(work: Iterable[Callable[[], Observations]], threads: int) -> Iterator[Observations]:
     """Do the work on so many cores; one piece more than there are cores is made ahead."""
-    waiting: deque[Future[Seen]] = deque()
+    waiting: deque[Future[Observations]] = deque()
     with single_threaded(), ThreadPoolExecutor(threads) as pool:
         for piece in work:
             waiting.append(pool.submit(piece))
@@ -181,10 +181,12 @@ def _in_order(work: Iterable[Callable[[], Seen]], threads: int) -> Iterator[Seen
             yield waiting.popleft().result()
 
 
-def _see_tile(look: _Look, attacked: Attacked, faces: LabelledFaces, own: Codes | None) -> Seen:
-    plan, side = look.bench.plan, look.side
-    metrics = METRICS if look.scheme != RAW_SCHEME else METRICS[:1]
-    advance = look.advance(look.scheme.dim + 1)
+def _observe_tile(
+    observer: _Observer, attacked: Attacked, faces: LabelledFaces, own: Codes | None
+) -> Observations:
+    plan, side = observer.setup.plan, observer.side
+    metrics = METRICS if observer.scheme != RAW_SCHEME else METRICS[:1]
+    advance = observer.advance(observer.scheme.dim + 1)
     near = nearest_neighbours(
         attacked,
         side.nearby.descriptors,
@@ -194,7 +196,7 @@ def _see_tile(look: _Look, attacked: Attacked, faces: LabelledFaces, own: Codes 
     )
     features = features_of(attacked, side.axes, near, side.nearby, ks=plan.feature_ks)
     after = len(side.nearby)
-    if look.whole and after < len(side.gallery):
+    if observer.whole and after < len(side.gallery):
         beyond = nearest_neighbours(
             attacked,
             side.gallery.descriptors[after:],
@@ -205,17 +207,17 @@ def _see_tile(look: _Look, attacked: Attacked, faces: LabelledFaces, own: Codes 
         near = {m: merged(near[m], beyond[m], after=after, k=plan.k) for m in metrics}
     votes = {
         metric: {
-            name: vote(found, side.gallery.labels[name], len(classes), k=plan.k)
+            name: vote(neighbours, side.gallery.labels[name], len(classes), k=plan.k)
             for name, classes in side.gallery.classes.items()
         }
-        for metric, found in near.items()
+        for metric, neighbours in near.items()
     }
-    guessed, absent = _guessed(look, attacked, features, own)
-    return Seen(features, votes, guessed, absent, dict(faces.labels))
+    guessed, absent = _guessed(observer, attacked, features, own)
+    return Observations(features, votes, guessed, absent, dict(faces.labels))
 
 
 def _lifted(
-    bench: Bench, scheme: Scheme, faces: LabelledFaces, side: Side, stream: Keystream
+    setup: Setup, scheme: Scheme, faces: LabelledFaces, side: Side, stream: Keystream
 ) -> Iterator[tuple[Codes, Attacked]]:
     """Yield positions of faces and their templates, a tile at a time."""
     rows = _TILE_BYTES // (4 * faces.n * max(1, scheme.dim))
@@ -235,7 +237,7 @@ def _lifted(
                 tile.descriptors,
                 strategy=scheme.strategy,
                 m=scheme.dim,
-                source=bench.source(scheme, side),
+                source=setup.source(scheme, side),
                 stream=stream,
                 attributes=tile.decoy_attributes() if plus else None,
             ),
@@ -243,21 +245,21 @@ def _lifted(
 
 
 def _guessed(
-    look: _Look, attacked: Attacked, features: Features, own: Codes | None
+    observer: _Observer, attacked: Attacked, features: Features, own: Codes | None
 ) -> tuple[Features | None, dict[str, Flags]]:
     """Guess the descriptors of whoever knows the pool or the generator.
 
     Of the pool's decoys also which classes they leave out (hybrid+).
     """
-    scheme, side = look.scheme, look.side
+    scheme, side = observer.scheme, observer.side
     if scheme.decoys is None or not isinstance(attacked, SubspaceBatch):
         return None, {}
     if scheme.decoys == GENERATED:
         if side.form is None:
             raise AuditError("schemes with generated decoys need a decoy generator")
         points = guesses(attacked, side.form)
-        found = _features_of_points(look, points)
-        return Features(points, np.hstack([found.derived, features.derived])), {}
+        point_features = _features_of_points(observer, points)
+        return Features(points, np.hstack([point_features.derived, features.derived])), {}
     strategy = Strategy(scheme.strategy)
     entries = side.entries
     decoys = find_decoys(
@@ -265,26 +267,26 @@ def _guessed(
         entries.descriptors,
         most=strategy.decoys(scheme.dim),
         skip=own,
-        progress=look.advance(scheme.dim + 1),
+        progress=observer.advance(scheme.dim + 1),
     )
-    found = _features_of_points(look, strip(attacked, entries.descriptors, decoys))
+    point_features = _features_of_points(observer, strip(attacked, entries.descriptors, decoys))
     if strategy is not Strategy.HYBRID_PLUS:
-        return found, {}
+        return point_features, {}
     absent = {
         name: never_seen(decoys, entries.labels[name], len(entries.classes[name]))
         for name in ("gender", "race")
     }
-    return found, absent
+    return point_features, absent
 
 
-def _features_of_points(look: _Look, points: NDArray[np.float32]) -> Features:
-    ks, side = look.bench.plan.feature_ks, look.side
+def _features_of_points(observer: _Observer, points: NDArray[np.float32]) -> Features:
+    ks, side = observer.setup.plan.feature_ks, observer.side
     near = nearest_neighbours(
         points,
         side.nearby.descriptors,
         k=max(ks),
         metrics=METRICS[:1],
-        progress=look.advance(1),
+        progress=observer.advance(1),
     )
     return features_of(points, side.axes, near, side.nearby, ks=ks)
 

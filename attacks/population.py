@@ -1,8 +1,8 @@
-"""Who plays which part in an audit of templates.
+"""The disjoint groups of people that an audit of templates needs.
 
 An audit needs people with two photos or more: victims, whose fresh photo tells whether an attack
 succeeded; and decoy owners, who try to log in where they are a decoy. The others calibrate, or
-belong to the attacker. Nobody plays two parts.
+belong to the attacker. Nobody is in two groups.
 """
 
 from collections.abc import Sequence
@@ -17,11 +17,13 @@ from templates.space.embedding import unit_descriptors
 ENROLLED_PHOTOS = 3
 """Most photos that are averaged into a victim's template."""
 LEAST_ALBUM = 3
+LEAST_FITTED = 100
+"""Least that a decoy generator is fitted to."""
 LEAST_CALIBRATION = 200
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Person:
+class Subjects:
     """Two descriptors of each of some people, rows in one order.
 
     Parameters
@@ -44,16 +46,16 @@ class Person:
     def __len__(self) -> int:
         return len(self.enrolled)
 
-    def first(self, count: int) -> "Person":
+    def first(self, count: int) -> "Subjects":
         """Return the first of them."""
-        return Person(
+        return Subjects(
             self.enrolled[:count], self.fresh[:count], self.photos[:count], self.shown[:count]
         )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Cast:
-    """The parts.
+class Population:
+    """The groups.
 
     Parameters
     ----------
@@ -74,8 +76,8 @@ class Cast:
         Descriptors of all photos, (k, n), of each victim who has three or more.
     """
 
-    victims: Person
-    owners: Person
+    victims: Subjects
+    owners: Subjects
     attacker: NDArray[np.float32]
     calibration: NDArray[np.float32]
     names: tuple[str, ...]
@@ -83,15 +85,15 @@ class Cast:
     albums: tuple[NDArray[np.float32], ...]
 
 
-def make_cast(
+def draw_population(
     descriptors: NDArray[np.float32],
     identities: Sequence[str],
     *,
     victims: int,
     owners: int,
     seed: int,
-) -> Cast:
-    """Give everybody of a labelled folder a part, at random.
+) -> Population:
+    """Divide the people of a labelled folder into groups, at random.
 
     Parameters
     ----------
@@ -114,12 +116,12 @@ def make_cast(
         raise AuditError(f"{len(identities)} names do not fit {len(rows)} descriptors")
     rng = np.random.default_rng(seed)
     photos = np.split(np.argsort(person_of, kind="stable"), np.bincount(person_of).cumsum()[:-1])
-    several = rng.permutation([i for i, mine in enumerate(photos) if len(mine) > 1])
+    several = rng.permutation([i for i, photo_rows in enumerate(photos) if len(photo_rows) > 1])
     if len(several) < victims + owners:
         raise AuditError(
             f"{victims} victims and {owners} decoy owners need {victims + owners} people with two "
-            f"photos or more, and {len(several)} are there: ask for fewer with --victims and "
-            "--owners, or give a larger folder"
+            f"photos or more, and {len(several)} are there: ask for fewer victims and decoy "
+            "owners, or give a larger folder"
         )
     attacked, owning = several[:victims], several[victims : victims + owners]
     others = rng.permutation(np.setdiff1d(np.arange(len(people)), several[: victims + owners]))
@@ -131,7 +133,7 @@ def make_cast(
             "least: ask for fewer victims and decoy owners, or give a larger folder"
         )
     chosen = np.concatenate([photos[person] for person in calibrating])
-    return Cast(
+    return Population(
         victims=_people(rows, [rng.permutation(photos[i]) for i in attacked], ENROLLED_PHOTOS),
         owners=_people(rows, [rng.permutation(photos[i]) for i in owning], 1),
         attacker=rows[[rng.choice(photos[i]) for i in known]].astype(np.float32),
@@ -144,33 +146,37 @@ def make_cast(
     )
 
 
-def without_decoy_people(cast: Cast, *, seed: int) -> tuple[NDArray[np.float32], Cast]:
+def without_decoy_people(
+    population: Population, *, seed: int
+) -> tuple[NDArray[np.float32], Population]:
     """Set half of the calibrating people aside, and the decoy owners, to fit decoys to.
 
     Returns
     -------
     descriptors : (D, n) float32
         Their photos.
-    cast
+    population
         Without them among those who calibrate.
     """
-    people = np.random.default_rng([seed, 1]).permutation(np.unique(cast.names))
-    fitted = np.isin(cast.names, people[: len(people) // 2])
+    people = np.random.default_rng([seed, 1]).permutation(np.unique(population.names))
+    fitted = np.isin(population.names, people[: len(people) // 2])
     kept = replace(
-        cast,
-        calibration=cast.calibration[~fitted],
-        names=tuple(np.asarray(cast.names)[~fitted].tolist()),
-        rows=cast.rows[~fitted],
+        population,
+        calibration=population.calibration[~fitted],
+        names=tuple(np.asarray(population.names)[~fitted].tolist()),
+        rows=population.rows[~fitted],
     )
-    return np.concatenate([cast.calibration[fitted], cast.owners.enrolled, cast.owners.fresh]), kept
+    return np.concatenate(
+        [population.calibration[fitted], population.owners.enrolled, population.owners.fresh]
+    ), kept
 
 
-def _people(rows: NDArray[np.float64], photos: Sequence[NDArray[np.int64]], most: int) -> Person:
-    taken = [mine[: min(most, len(mine) - 1)] for mine in photos]
-    means = np.stack([rows[mine].mean(axis=0) for mine in taken])
-    return Person(
+def _people(rows: NDArray[np.float64], photos: Sequence[NDArray[np.int64]], most: int) -> Subjects:
+    taken = [photo_rows[: min(most, len(photo_rows) - 1)] for photo_rows in photos]
+    means = np.stack([rows[photo_rows].mean(axis=0) for photo_rows in taken])
+    return Subjects(
         enrolled=(means / np.linalg.norm(means, axis=1, keepdims=True)).astype(np.float32),
-        fresh=rows[[mine[-1] for mine in photos]].astype(np.float32),
-        photos=np.array([len(mine) for mine in taken], dtype=np.int64),
-        shown=np.array([mine[0] for mine in taken], dtype=np.int64),
+        fresh=rows[[photo_rows[-1] for photo_rows in photos]].astype(np.float32),
+        photos=np.array([len(photo_rows) for photo_rows in taken], dtype=np.int64),
+        shown=np.array([photo_rows[0] for photo_rows in taken], dtype=np.int64),
     )

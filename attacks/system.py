@@ -1,17 +1,16 @@
 """One scheme in service: templates of victims, the contract that decides, what an attacker has."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from attacks.cast import ENROLLED_PHOTOS, Cast, Person
 from attacks.errors import AuditError
 from attacks.outcomes import POOLED, Scheme
+from attacks.population import ENROLLED_PHOTOS, Population, Subjects
 from templates.contract.canonical import Json
 from templates.contract.document import Binding, Calibration, Contract, Level
-from templates.contract.nobody import Nobody
 from templates.decoys import DecoyPool, DecoySource
 from templates.distances import DEFAULT_STEPS, Metric
 from templates.errors import Uncalibrated
@@ -32,7 +31,7 @@ _STRANGERS = 50
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Scene:
+class System:
     """What attacks on templates act on.
 
     Nothing is rotated: a tenant's rotation changes no distance inside the tenant. Attacks that
@@ -66,10 +65,10 @@ class Scene:
     scheme: Scheme
     contract: Contract
     lifter: Lifter
-    victims: Person
+    victims: Subjects
     templates: SubspaceBatch
     source: DecoySource | None
-    owners: Person | None
+    owners: Subjects | None
     attacker: NDArray[np.float32]
     raw_thresholds: Mapping[str, float]
     seed: int
@@ -91,16 +90,18 @@ class Scene:
 
         The largest is where lifted wolves open most (docs/method.md §4.7).
         """
-        found = [each for each in self.contract.calibrations if each.mode == "s2s"]
-        return max(found, key=lambda each: each.probe_m, default=None)
+        calibrations = [
+            calibration for calibration in self.contract.calibrations if calibration.mode == "s2s"
+        ]
+        return max(calibrations, key=lambda calibration: calibration.probe_m, default=None)
 
     @property
     def level(self) -> Level:
         """The level that the service decides with by default."""
         return self.points.level(self.contract.default_level)
 
-    def first(self, count: int) -> "Scene":
-        """Return the scene with the first victims only, for attacks that take long."""
+    def first(self, count: int) -> "System":
+        """Return the system with the first victims only, for attacks that take long."""
         return replace(self, victims=self.victims.first(count), templates=self.templates[:count])
 
     def lift(
@@ -145,8 +146,8 @@ def raw_thresholds(
     }
 
 
-def stage(
-    cast: Cast,
+def enroll_victims(
+    population: Population,
     scheme: Scheme,
     source: DecoySource | None,
     *,
@@ -155,15 +156,14 @@ def stage(
     pool_of_owners: bool,
     contract: Contract | None = None,
     lifted_probes: bool = True,
-    progress: Callable[[str, float], None] = lambda _what, _share: None,
     seed: int,
-) -> Scene:
+) -> System:
     """Enroll the victims under a scheme, and calibrate where no contract is given.
 
     Parameters
     ----------
     source
-        Of ``scheme.decoys``; its pool's entries are ``cast.owners.enrolled`` where
+        Of ``scheme.decoys``; its pool's entries are ``population.owners.enrolled`` where
         ``pool_of_owners``.
     contract
         The contract that a service uses; it must be of this scheme and source.
@@ -177,11 +177,11 @@ def stage(
     ContractMismatch
         The contract is of another model or other decoys.
     """
-    n = cast.victims.enrolled.shape[1]
+    n = population.victims.enrolled.shape[1]
     strategy = Strategy(scheme.strategy)
     if scheme.decoys is not None and source is None:
-        raise AuditError(f"{scheme} needs decoys: name a file of `decoys build` with --decoys")
-    chosen = source or DecoyPool(cast.attacker)
+        raise AuditError(f"{scheme} needs decoys")
+    chosen = source or DecoyPool(population.attacker)
     binding = Binding(
         embedder_sha256=embedder_sha256,
         preprocessing=dict(preprocessing),
@@ -192,23 +192,7 @@ def stage(
         rotation_version=ROTATION_VERSION,
     )
     if contract is None:
-        cohort, nobody = _cohort(cast, chosen, strategy, scheme.dim, seed)
-        contract = calibrate(
-            cast.calibration,
-            cast.names,
-            binding=binding,
-            source=chosen,
-            options=CalibrationOptions(
-                probe_dims=(0, min(LIFTED_PROBE_DIM, scheme.dim)) if lifted_probes else (0,),
-                metric=Metric.SPHERICAL,
-                lifted_probes=500,
-                lifted_impostor_pairs=60_000,
-                seed=seed,
-            ),
-            cohort=cohort,
-            nobody=nobody,
-            progress=progress,
-        ).contract
+        contract = _calibrated(population, binding, chosen, lifted_probes=lifted_probes, seed=seed)
     elif contract.binding != binding:
         raise AuditError(
             "the contract is of another scheme, model or decoy source than the audit's: give the "
@@ -216,7 +200,7 @@ def stage(
         )
     lifter = Lifter(strategy, chosen, contract.contract_id)
     with Keystream.seeded("audit", seed, str(scheme), "victims") as stream:
-        templates = lifter.lift(cast.victims.enrolled, m=scheme.dim, stream=stream)
+        templates = lifter.lift(population.victims.enrolled, m=scheme.dim, stream=stream)
     levels = {
         level.name: level.target_fmr
         for level in contract.calibration("p2s").levels
@@ -226,37 +210,43 @@ def stage(
         raise Uncalibrated(
             f"an audit judges by a level with a target FMR, and {contract.default_level} has none"
         )
-    return Scene(
+    return System(
         scheme=scheme,
         contract=contract,
         lifter=lifter,
-        victims=cast.victims,
+        victims=population.victims,
         templates=templates,
         source=None if scheme.decoys is None else chosen,
-        owners=cast.owners if pool_of_owners and scheme.decoys == POOLED else None,
-        attacker=cast.attacker,
-        raw_thresholds=raw_thresholds(cast.calibration, cast.names, levels),
+        owners=population.owners if pool_of_owners and scheme.decoys == POOLED else None,
+        attacker=population.attacker,
+        raw_thresholds=raw_thresholds(population.calibration, population.names, levels),
         seed=seed,
     )
 
 
-def _cohort(
-    cast: Cast, source: DecoySource, strategy: Strategy, m: int, seed: int
-) -> tuple[SubspaceBatch, Nobody]:
-    """Make the cohort as ``calibrate`` does, of a seed: one audit gives the same figures twice.
+def _calibrated(
+    population: Population,
+    binding: Binding,
+    source: DecoySource,
+    *,
+    lifted_probes: bool,
+    seed: int,
+) -> Contract:
+    """Calibrate as a service does, with a cohort of a seed: an audit gives the same figures twice.
 
     The strangers are few: an audit enrolls no template that a client sent.
     """
-    person = np.unique(cast.names, return_inverse=True)[1]
+    person = np.unique(population.names, return_inverse=True)[1]
     means = np.stack(
         [
-            cast.calibration[np.flatnonzero(person == one)[:ENROLLED_PHOTOS]].mean(axis=0)
+            population.calibration[np.flatnonzero(person == one)[:ENROLLED_PHOTOS]].mean(axis=0)
             for one in range(person.max() + 1)
         ]
     )
     people = np.asarray(means / np.linalg.norm(means, axis=1, keepdims=True), dtype=np.float32)
     generator = client_source(source)
     hidden = people_like(generator, people)
+    strategy, m = binding.strategy, binding.m
     with Keystream.seeded("audit", seed, strategy, m, "cohort") as stream:
         cohort = make_cohort(generator, strategy=strategy, m=m, stream=stream, hidden=hidden)
         nobody = make_nobody(
@@ -268,9 +258,24 @@ def _cohort(
             stream=stream,
             size=_STRANGERS,
         )
-    return cohort, nobody
+    options = CalibrationOptions(
+        probe_dims=(0, min(LIFTED_PROBE_DIM, m)) if lifted_probes else (0,),
+        metric=Metric.SPHERICAL,
+        lifted_probes=500,
+        lifted_impostor_pairs=60_000,
+        seed=seed,
+    )
+    return calibrate(
+        population.calibration,
+        population.names,
+        binding=binding,
+        source=source,
+        options=options,
+        cohort=cohort,
+        nobody=nobody,
+    ).contract
 
 
-def owners_pool(cast: Cast, made_with: str | None) -> DecoyPool:
+def owners_pool(population: Population, made_with: str | None) -> DecoyPool:
     """Return the pool of real people that the decoy owners make up."""
-    return DecoyPool(cast.owners.enrolled, made_with=made_with)
+    return DecoyPool(population.owners.enrolled, made_with=made_with)

@@ -3,10 +3,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from attacks.attribute_outcomes import ATTACK, attribute_outcomes
+from attacks.attributes.audit import ATTACK, attribute_outcomes
 from attacks.attributes.measures import Leakage, measure
 from attacks.attributes.rows import AttributeRow
-from attacks.outcomes import RAW_SCHEME, Knowledge, Outcome, Property, Scheme
+from attacks.outcomes import RAW_SCHEME, AttackOutcome, Knowledge, Property, Scheme
 from attacks.verdict import judge
 from verify.metrics import wilson
 
@@ -41,7 +41,7 @@ def row(
     )
 
 
-def only(rows: list[AttributeRow]) -> Outcome:
+def only(rows: list[AttributeRow]) -> AttackOutcome:
     (outcome,) = attribute_outcomes(rows, audited=SERVICE)
     return outcome
 

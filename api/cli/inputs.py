@@ -1,0 +1,99 @@
+"""Lists, files and decoys that bulk commands are given."""
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+from api.cli.errors import CommandError, UsageError
+from api.cli.files import read_bounded
+from api.process.preparation import require_made_with
+from models.pack import ModelPack
+from templates.contract.canonical import Json
+from templates.decoys import DecoySource, load_source
+from templates.keys.sealing import Sealer
+
+T = TypeVar("T")
+_MAX_JSON_BYTES = 64 * 2**20
+
+
+def listed(text: str, kind: Callable[[str], T], option: str, *, expected: str) -> tuple[T, ...]:
+    """Read a list with commas.
+
+    Parameters
+    ----------
+    expected
+        Said where something is not of the kind.
+
+    Raises
+    ------
+    UsageError
+        Something in it is not of the kind, or it is empty.
+    """
+    parts = [part.strip() for part in text.split(",") if part.strip()]
+    try:
+        values = tuple(kind(part) for part in parts)
+    except ValueError:
+        raise UsageError(f"{option} takes {expected}, not {text!r}") from None
+    if not values:
+        raise UsageError(f"{option} takes {expected}, and is empty")
+    return values
+
+
+def listed_names(text: str, names: Sequence[str], option: str) -> tuple[str, ...]:
+    """Read a list of some of the names."""
+
+    def known(name: str) -> str:
+        if name not in names:
+            raise ValueError(name)
+        return name
+
+    return listed(text, known, option, expected=f"of {', '.join(names)}")
+
+
+def listed_dims(text: str, option: str, *, n: int, example: str) -> tuple[int, ...]:
+    """Read dimensions m of subspaces of Rⁿ, each once."""
+    dims = tuple(
+        dict.fromkeys(listed(text, int, option, expected=f"whole numbers such as {example}"))
+    )
+    wrong = [m for m in dims if not 1 <= m < n]
+    if wrong:
+        raise UsageError(f"{option} takes dimensions from 1 to {n - 1}, not {wrong[0]}")
+    return dims
+
+
+def read_json(file: Path) -> Any:
+    """Read a JSON file, such as a report that another command wrote."""
+    try:
+        return json.loads(read_bounded(file, _MAX_JSON_BYTES))
+    except (ValueError, RecursionError):
+        raise CommandError(f"{file.name} is no JSON file") from None
+
+
+def named_file(file: Path | None) -> dict[str, Json] | None:
+    """Name and SHA-256 of a file that figures depend on."""
+    if file is None:
+        return None
+    with file.open("rb") as stream:
+        return {"file": file.name, "sha256": hashlib.file_digest(stream, "sha256").hexdigest()}
+
+
+def load_decoys(file: Path, sealer: Sealer, pack: ModelPack) -> DecoySource:
+    """Load a file of `decoys build` that was made with this pack.
+
+    Raises
+    ------
+    CommandError
+        Its decoys have another dimension.
+    ContractMismatch
+        It was made with another model or another preprocessing.
+    """
+    source = load_source(file, sealer)
+    if source.n != pack.info.n:
+        raise CommandError(
+            f"the decoys have {source.n} numbers each, the pack gives {pack.info.n}; build the "
+            "decoys with this pack"
+        )
+    require_made_with(source, pack)
+    return source

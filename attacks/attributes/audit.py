@@ -1,0 +1,210 @@
+"""The audit of attributes: what the templates of FairFace tell of gender, race and age."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from attacks.attributes.cost import measure_cost
+from attacks.attributes.experiment import run_scheme, work_of
+from attacks.attributes.faces import LabelledFaces, Split, near_duplicates, split
+from attacks.attributes.plan import AttributePlan, prepare
+from attacks.attributes.rows import AttributeRow, strongest
+from attacks.outcomes import AttackOutcome, Knowledge, Property, Scheme
+from attacks.population import LEAST_FITTED
+from models.extraction import Extraction
+from verify.fairface_labels import CLASSES, Label
+
+PAPER_LIFTING = 10_000
+LIFTING_SHARE = 0.3
+"""Of the training faces, where they are too few for the paper's 10,000."""
+
+ATTACK = "attribute-inference"
+_HAS = {
+    Knowledge.ALGORITHM: "One template, how templates are lifted, and labelled faces of other "
+    "people, which it lifts itself to learn from",
+    Knowledge.DECOYS: "The same, and the pool that the decoys were drawn from",
+}
+
+
+def default_lifting(training: int) -> int:
+    """Size of the lifting database: the paper's, or three tenths of a smaller training set."""
+    return min(PAPER_LIFTING, max(LEAST_FITTED, int(LIFTING_SHARE * training)))
+
+
+def labelled_faces(
+    photos: Extraction, labels: Mapping[Path, Label], attributes: Sequence[str]
+) -> LabelledFaces:
+    """Join the photos that were embedded with their labels."""
+    return LabelledFaces.of_names(
+        photos.descriptors,
+        {name: [str(getattr(labels[path], name)) for path in photos.paths] for name in attributes},
+        {name: CLASSES[name] for name in attributes},
+    )
+
+
+def _sample(labels: Mapping[Path, Label], most: int | None, seed: int) -> Mapping[Path, Label]:
+    """Choose at most so many photos at random; all where None."""
+    if most is None or most >= len(labels):
+        return labels
+    photos = list(labels)
+    chosen = np.random.default_rng([seed, 3]).permutation(len(photos))[:most]
+    return {photos[index]: labels[photos[index]] for index in sorted(chosen.tolist())}
+
+
+@dataclass(frozen=True, kw_only=True)
+class AttributeAuditPlan:
+    """What is inferred from the templates of which schemes, and how.
+
+    Parameters
+    ----------
+    schemes, attributes
+        What is attacked, and what is inferred.
+    attackers
+        Their settings.
+    lifting
+        Training faces that are the lifting database; see :func:`default_lifting`.
+    attack, attacked
+        Most training faces that the attacker has, and most validation faces that are attacked;
+        None for all.
+    drop_duplicates
+        Cosine from which an attacked face resembles a training face too much; None to keep all.
+    seed
+        Of all that is random.
+    """
+
+    schemes: tuple[Scheme, ...]
+    attributes: tuple[str, ...]
+    attackers: AttributePlan
+    lifting: int
+    attack: int | None = None
+    attacked: int | None = None
+    drop_duplicates: float | None = None
+    seed: int = 0
+
+    def sample(
+        self, train: Mapping[Path, Label], validation: Mapping[Path, Label]
+    ) -> tuple[Mapping[Path, Label], Mapping[Path, Label]]:
+        """Choose the photos that take part, so that no others are embedded.
+
+        A face costs a hundred times what an attack on it does.
+        """
+        most = None if self.attack is None else self.lifting + self.attack
+        return _sample(train, most, self.seed), _sample(validation, self.attacked, self.seed)
+
+
+@dataclass(frozen=True, eq=False)
+class AttributeAudit:
+    """What an audit found; ``cost`` has the time of the neighbour search for each dimension."""
+
+    rows: list[AttributeRow]
+    cost: list[dict[str, Any]]
+    split: Split
+    duplicates: int
+
+    def settings(self) -> dict[str, int]:
+        """Return the sizes of the parts, for the report."""
+        return {
+            "lifting": len(self.split.lifting),
+            "attack": len(self.split.attack),
+            "attacked": len(self.split.attacked),
+            "duplicates_dropped": self.duplicates,
+        }
+
+
+def run_attribute_audit(
+    plan: AttributeAuditPlan,
+    train: LabelledFaces,
+    validation: LabelledFaces,
+    *,
+    progress: Callable[[float], None] = lambda _share: None,
+) -> AttributeAudit:
+    """Infer attributes from the templates of validation faces.
+
+    Parameters
+    ----------
+    train, validation
+        FairFace's two parts, or the photos of them that ``plan.sample`` chose.
+    progress
+        Called with the share of the attacks that is done, which rises to 1.
+
+    Raises
+    ------
+    AuditError
+        There are too few faces for the plan.
+    """
+    attack, duplicates = plan.attack, 0
+    if plan.drop_duplicates is not None:
+        dropped = near_duplicates(
+            validation.descriptors, train.descriptors, cosine=plan.drop_duplicates
+        )
+        validation = validation.take(np.setdiff1d(np.arange(len(validation)), dropped))
+        duplicates = len(dropped)
+    if attack is not None:
+        # Which photos give no embedding is not known beforehand.
+        attack = min(attack, max(1, len(train) - plan.lifting))
+    parts = split(
+        train,
+        validation,
+        lifting=plan.lifting,
+        attack=attack,
+        attacked_most=plan.attacked,
+        seed=plan.seed,
+    )
+    setup = prepare(parts, plan=plan.attackers, seed=plan.seed)
+    total = sum(work_of(setup, scheme) for scheme in plan.schemes)
+    done = 0
+    progress(0.0)
+
+    def advance(work: int) -> None:
+        nonlocal done
+        done += work
+        progress(done / total)
+
+    rows: list[AttributeRow] = []
+    for scheme in plan.schemes:
+        rows += run_scheme(setup, scheme, progress=advance)
+    # One scheme of each dimension: the search takes the same time whatever the decoys.
+    timed = {scheme.dim: scheme for scheme in plan.schemes if scheme.dim}.values()
+    cost = [
+        {**scheme.to_json(), **measure_cost(n=train.n, m=scheme.dim).to_json()} for scheme in timed
+    ]
+    return AttributeAudit(rows, cost, parts, duplicates)
+
+
+def attribute_outcomes(rows: Sequence[AttributeRow], *, audited: Scheme) -> list[AttackOutcome]:
+    """Report the strongest attacker on each scheme and attribute, by what it knows.
+
+    The strongest is chosen on faces of the attacker's own (see ``attributes.rows.strongest``).
+    Chance is what its very predictions would score dealt out at random: an attacker who knows
+    nothing stays below the majority's share, and would seem to know something.
+
+    Parameters
+    ----------
+    rows
+        Of all schemes.
+    audited
+        The scheme that is judged; the others are reported to compare with.
+    """
+    return [
+        AttackOutcome(
+            attack=ATTACK,
+            variant=f"{attribute} by {row.attacker}",
+            breaks=Property.CONFIDENTIALITY,
+            knowledge=knowledge,
+            assumption=f"{_HAS[knowledge]}; success is the right {attribute}.",
+            scheme=scheme,
+            measured=row.measures.accuracy,
+            chance=row.chance_of_predictions,
+            judged=scheme == audited,
+            details={
+                "majority": row.chance,
+                "balanced_accuracy": row.measures.balanced_accuracy,
+                "leakage": str(row.measures.leakage),
+                "chosen_among": "the attacker's own held-out faces",
+            },
+        )
+        for (scheme, attribute, knowledge), row in strongest(rows).items()
+    ]
