@@ -172,7 +172,7 @@ def _schemes(plan: AuditPlan, source: DecoySource, population: Population) -> li
     if plan.contract is not None:
         strategy, dims = plan.contract.binding.strategy, (plan.contract.binding.m,)
     kind = POOLED if isinstance(source, DecoyPool) else GENERATED
-    decoys = kind if strategy is not Strategy.RANDOM else None
+    decoys = kind if strategy.needs_decoys else None
     schemes = [
         _AuditedScheme(Scheme(strategy, decoys, m), source, False, plan.contract) for m in dims
     ]

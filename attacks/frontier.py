@@ -127,7 +127,7 @@ def frontier(results: Row, rows: Sequence[Row], *, most_lost: float) -> dict[str
         point for point in points if point.accuracy >= least and point.scheme.decoys == GENERATED
     ]
     chosen = _recommended(able)
-    said = f"{accuracies.dataset}: raw descriptors reach {100 * accuracies.raw:.2f} %. " + (
+    said = f"{accuracies.dataset}: raw embeddings reach {100 * accuracies.raw:.2f} %. " + (
         f"Recommended: {chosen.scheme}, the least leakage among those that lose at most "
         f"{100 * most_lost:g} points, or as little within its interval and more accurate."
         if chosen

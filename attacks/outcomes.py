@@ -73,7 +73,7 @@ class Scheme:
 
     def __str__(self) -> str:
         if self.strategy == RAW:
-            return "raw descriptors"
+            return "raw embeddings"
         source = {GENERATED: ", generated decoys", POOLED: ", decoys of a pool"}
         return f"{self.strategy}, m = {self.dim}{source.get(self.decoys or '', '')}"
 

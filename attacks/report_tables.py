@@ -56,7 +56,7 @@ def _verdicts(report: Row) -> Iterable[str]:
     yield (
         "Each cell is the strongest attack that was made: its measure with the 95 % interval, what "
         "guessing would reach, and how it stands against the limit. *Unresolved*: only the upper "
-        "bound exceeds the limit. What an empty cell would need is named in docs/privacy.md."
+        "bound exceeds the limit. Where a cell is empty, no attack of ours fits it."
     )
     for verdict in report["verdicts"]:
         cells: dict[tuple[str, str], list[str]] = {}

@@ -163,7 +163,7 @@ def calibrate(
     path = out or settings.resolved_contract_file
     done.contract.save(path, sealer)
     share_rate = None
-    if strategy is not Strategy.RANDOM:
+    if strategy.needs_decoys:
         share_rate = share_found(
             extraction.descriptors,
             [name_of[path] for path in extraction.paths],

@@ -43,7 +43,6 @@ from templates.errors import DecoyError, StoreBusy
 from templates.keys.randomness import Keystream
 from templates.keys.rotation import tenant_rotation
 from templates.keys.sealing import MasterKeyring
-from templates.space.lifting import Strategy
 from templates.store import TemplateStore
 from templates.store.audit_log import By
 from templates.store.subject_rows import Source, SubjectTemplate
@@ -237,7 +236,7 @@ class Runtime:
         ApiError
             ``model_unavailable``.
         """
-        if self.source is None and self.contract.binding.strategy is not Strategy.RANDOM:
+        if self.source is None and self.contract.binding.strategy.needs_decoys:
             raise _lacking("decoys file")
 
     def require_template_enrollment(self, tenant: str) -> None:

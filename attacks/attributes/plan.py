@@ -279,8 +279,8 @@ def schemes_of(
         Strategy.HYBRID_PLUS,
     ):
         for m in dims:
-            if strategy is Strategy.RANDOM or strategy.decoys(m):
-                source = None if strategy is Strategy.RANDOM else POOLED
+            if strategy.decoys(m) or not strategy.needs_decoys:
+                source = POOLED if strategy.needs_decoys else None
                 schemes.append(Scheme(str(strategy), source, m))
     schemes += [Scheme(str(Strategy.ADVERSARIAL), GENERATED, m) for m in generated_dims]
     return schemes

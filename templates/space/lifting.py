@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from enum import StrEnum
+from typing import assert_never
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -32,11 +33,22 @@ class Strategy(StrEnum):
     SUB_ADVERSARIAL = "sub-adversarial"
     SUB_HYBRID = "sub-hybrid"
 
+    @property
+    def needs_decoys(self) -> bool:
+        """Whether directions lead to decoys, which a source has to give."""
+        return self is not Strategy.RANDOM
+
     def decoys(self, m: int) -> int:
         """Number of decoys among ``m`` directions: all, half (rounded down) or none."""
-        if self is Strategy.RANDOM:
-            return 0
-        return m if self in (Strategy.ADVERSARIAL, Strategy.SUB_ADVERSARIAL) else m // 2
+        match self:
+            case Strategy.RANDOM:
+                return 0
+            case Strategy.ADVERSARIAL | Strategy.SUB_ADVERSARIAL:
+                return m
+            case Strategy.HYBRID | Strategy.HYBRID_PLUS | Strategy.SUB_HYBRID:
+                return m // 2
+            case _:
+                assert_never(self)
 
     @property
     def sub_databases(self) -> int | None:
@@ -139,7 +151,7 @@ def _check(
         raise LiftingError(f"unknown lifting strategy; choose one of {names}") from None
     if not 1 <= m < n:
         raise LiftingError(f"m = {m} is out of range: 1 <= m < n = {n}")
-    if strategy is not Strategy.RANDOM:
+    if strategy.needs_decoys:
         if strategy.decoys(m) == 0:
             raise LiftingError(f"{strategy} lifting with m = {m} has no decoy: use m >= 2")
         if source is None:

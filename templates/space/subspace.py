@@ -75,9 +75,7 @@ def span_basis(directions: NDArray[np.float64]) -> NDArray[np.float64]:
         except np.linalg.LinAlgError:
             factor = np.zeros((1, 1, 1))
         if np.diagonal(factor, axis1=1, axis2=2).min() < _LEAST_PIVOT:
-            raise LiftingError(
-                "the directions of a subspace are linearly dependent: draw other decoys"
-            )
+            raise LiftingError("the directions of a subspace are linearly dependent: draw others")
         rows = np.linalg.inv(factor) @ rows
     return np.asarray(rows)
 

@@ -13,7 +13,12 @@ from verify.evaluation.material import Source
 from verify.evaluation.units import RAW, RAW_FLIP, HashUnit, LiftUnit, Mode, RawUnit, Unit
 
 STRATEGIES = (RAW, RAW_FLIP, *(strategy.value for strategy in Strategy), *(h.value for h in Hash))
-WITHOUT_DECOYS = (RAW, RAW_FLIP, Strategy.RANDOM.value, *(scheme.value for scheme in Hash))
+WITHOUT_DECOYS = (
+    RAW,
+    RAW_FLIP,
+    *(strategy.value for strategy in Strategy if not strategy.needs_decoys),
+    *(scheme.value for scheme in Hash),
+)
 DIMS = (2, 4, 8, 16)
 TARGETS = (1e-2, 1e-3, 1e-4)
 
@@ -137,7 +142,7 @@ def units_of(plan: EvaluationPlan, sources: Sequence[Source], *, n: int) -> list
 
 
 def _check_dims(strategy: Strategy, dims: Sequence[int], n: int) -> None:
-    least = 2 if strategy.decoys(1) == 0 and strategy is not Strategy.RANDOM else 1
+    least = 2 if strategy.needs_decoys and strategy.decoys(1) == 0 else 1
     most = min(n - 1, MAX_M)
     wrong = [m for m in dims if not least <= m <= most]
     if wrong or not dims:
@@ -151,7 +156,7 @@ def _fitting(
     strategy: Strategy, sources: Sequence[Source], plan: EvaluationPlan
 ) -> list[int | None]:
     """Positions of the sources that the strategy can draw from."""
-    if strategy is Strategy.RANDOM:
+    if not strategy.needs_decoys:
         return [None]
     pools_only = strategy is Strategy.HYBRID_PLUS or strategy.sub_databases is not None
     places: list[int | None] = [

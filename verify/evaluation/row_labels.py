@@ -3,10 +3,12 @@
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from templates.space.lifting import Strategy
+
 Row = Mapping[str, Any]
 
 RAW = ("raw", "raw+flip")
-LIFTINGS = ("random", "adversarial", "hybrid", "hybrid+", "sub-adversarial", "sub-hybrid")
+LIFTINGS = tuple(strategy.value for strategy in Strategy)
 HASHES = ("biohashing", "biohashing-stolen", "mlp-hash", "mlp-hash-stolen")
 ORDER = RAW + LIFTINGS + HASHES
 METRIC_NAMES = {"spherical": "spherical", "euclidean": "Euclidean", "hamming": "Hamming"}

@@ -46,15 +46,13 @@ DECISIONS = 3
 """Times that a probe is decided while others may replace the template before the record; then they
 must wait for it."""
 
-Decide = Callable[[Verifier, bytes | StandIn], Decision]
-
 
 @dataclass(frozen=True)
 class Probe:
-    """What a request asks to be compared: how to decide, and what keeps it from a second use."""
+    """What is compared, how, and what keeps it from a second use."""
 
     kind: str
-    decide: Decide
+    compare: Callable[[Verifier, bytes | StandIn], Decision]
     nonce: Nonce | None
 
 
@@ -101,7 +99,8 @@ async def verify(
             else:
                 probe = await _sent_probe(request, runtime, caller, subject, query)
         decision = await gate.compute(
-            partial(_decide, runtime, caller, subject, probe, by(request)), key=caller.prefix
+            partial(_decide_and_record, runtime, caller, subject, probe, by(request)),
+            key=caller.prefix,
         )
     request.state.log["security_level"] = decision.level
     request.state.log["decision"] = "accept" if decision.accepted else "reject"
@@ -132,7 +131,7 @@ async def _photo_probe(
 
     embedded: list[NDArray[np.float32]] = []
 
-    def decide(verifier: Verifier, stored: bytes | StandIn) -> Decision:
+    def compare(verifier: Verifier, stored: bytes | StandIn) -> Decision:
         if not embedded:  # a probe may be decided more than once
             with step("photo"):
                 embedded.append(
@@ -141,7 +140,7 @@ async def _photo_probe(
         with step("decide"):
             return verifier.decide_embedding(embedded[0], stored, level=level)
 
-    return Probe("photo", decide, nonce=None)
+    return Probe("photo", compare, nonce=None)
 
 
 async def _sent_probe(
@@ -174,25 +173,27 @@ async def _sent_probe(
     )
     level = _level(runtime, caller, asked)
 
-    def decide(verifier: Verifier, stored: bytes | StandIn) -> Decision:
+    def compare(verifier: Verifier, stored: bytes | StandIn) -> Decision:
         with step("decide"):
             if isinstance(sent, bytes):
                 return verifier.decide_template(sent, stored, level=level)
             return verifier.decide_embedding(sent, stored, level=level)
 
-    return Probe(kind, decide, nonce)
+    return Probe(kind, compare, nonce)
 
 
 def _level(runtime: Runtime, caller: Caller, asked: str | None) -> str:
     return runtime.levels.in_force(asked, lowest_of_key=caller.lowest_level)
 
 
-def _decide(runtime: Runtime, caller: Caller, subject: str, probe: Probe, who: By) -> Decision:
+def _decide_and_record(
+    runtime: Runtime, caller: Caller, subject: str, probe: Probe, who: By
+) -> Decision:
     """Decide and record; a template that was replaced or erased meanwhile accepts nobody."""
     attempts, contract_id = runtime.store.attempts, runtime.contract.contract_id
 
-    def decide(attempt: Attempt) -> Decision:
-        return probe.decide(*_compared(runtime, caller, subject, attempt))
+    def compare(attempt: Attempt) -> Decision:
+        return probe.compare(*_verifier_and_template(runtime, caller, subject, attempt))
 
     for _ in range(DECISIONS):
         # A retired rotation: the template was turned into a newer one between the two looks.
@@ -202,8 +203,8 @@ def _decide(runtime: Runtime, caller: Caller, subject: str, probe: Probe, who: B
                 attempt = attempts.begin(
                     caller.tenant, subject, contract_id=contract_id, nonce=probe.nonce
                 )
-                verifier, stored = _compared(runtime, caller, subject, attempt)
-            decision = probe.decide(verifier, stored)
+                verifier, stored = _verifier_and_template(runtime, caller, subject, attempt)
+            decision = probe.compare(verifier, stored)
             with step("record"):
                 attempts.conclude(
                     caller.tenant,
@@ -217,14 +218,14 @@ def _decide(runtime: Runtime, caller: Caller, subject: str, probe: Probe, who: B
                 )
             return decision
     return attempts.decide_alone(
-        caller.tenant, subject, decide, contract_id=contract_id, nonce=probe.nonce, by=who
+        caller.tenant, subject, compare, contract_id=contract_id, nonce=probe.nonce, by=who
     )
 
 
-def _compared(
+def _verifier_and_template(
     runtime: Runtime, caller: Caller, subject: str, attempt: Attempt
 ) -> tuple[Verifier, bytes | StandIn]:
-    """Return the subject's template, or that of nobody, and what compares with it."""
+    """Return what compares with the subject's template, and that template, or one of nobody."""
     template, tenant = attempt.template, caller.tenant
     lifted = None
     if "scores" in caller.rights and not caller.sees_enrollment:

@@ -238,3 +238,7 @@ def test_descriptors_must_be_finite_unit_vectors():
 def test_an_empty_batch_gives_an_empty_batch():
     assert len(lift(np.zeros((0, N)), strategy="random", m=3, stream=Keystream.seeded(1))) == 0
     assert len(lift(np.zeros((0, N)), strategy="random", m=3)) == 0
+
+
+def test_who_needs_decoys_has_some_among_its_directions() -> None:
+    assert all(strategy.needs_decoys == (strategy.decoys(8) > 0) for strategy in Strategy)
