@@ -114,7 +114,7 @@ def run_audit(
         raise AuditError(
             f"the attacker has {len(population.attacker)} faces, a third of the people who are "
             f"neither victims nor decoy owners, and needs {2 * LEAST_FITTED}: ask for fewer "
-            "victims and decoy owners, or give a larger folder"
+            "people (victims, owners), or give a larger folder"
         )
     # Faces that the attacker has beside their own third: one of each person of no other part.
     known = population.attacker[:0]

@@ -129,7 +129,7 @@ def oracle_figure(outcomes: Sequence[Row]) -> Figure | None:
             )
         axes.set_xscale("log")
         axes.set_xlabel("neighbours K that the oracle chooses from")
-        axes.set_ylabel("mean distance to the descriptor")
+        axes.set_ylabel("mean distance to the embedding")
         axes.set_ylim(0, None)
         axes.axhline(2**0.5, color=QUIET, linewidth=1.2, linestyle=(0, (1.2, 1.4)))
         axes.annotate(

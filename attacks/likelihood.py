@@ -160,7 +160,7 @@ def likeliest_guesses(
     if system.source is None:
         return {}
     if draws <= system.templates.n:
-        raise AuditError("a covariance needs more draws than the descriptor has dimensions")
+        raise AuditError("a covariance needs more draws than the embedding has dimensions")
     with Keystream.seeded("audit", system.seed, "decoys that the attacker draws") as stream:
         decoys = client_source(system.source).draw(draws, 1, stream=stream)[:, 0, :]
     against = precision(decoys)

@@ -113,7 +113,7 @@ def draw_population(
     rows = unit_descriptors(descriptors)
     people, person_of = np.unique(np.asarray(identities, dtype=np.str_), return_inverse=True)
     if len(person_of) != len(rows):
-        raise AuditError(f"{len(identities)} names do not fit {len(rows)} descriptors")
+        raise AuditError(f"{len(identities)} names do not fit {len(rows)} embeddings")
     rng = np.random.default_rng(seed)
     photos = np.split(np.argsort(person_of, kind="stable"), np.bincount(person_of).cumsum()[:-1])
     several = rng.permutation([i for i, photo_rows in enumerate(photos) if len(photo_rows) > 1])

@@ -414,10 +414,12 @@ def _read(path: Path, stated: PackFile) -> _Graph:
 def _pick(graphs: Sequence[_Graph], folder: Path) -> tuple[_Graph, _Graph | None]:
     embedders = [graph for graph in graphs if graph.role is Role.EMBEDDER]
     detectors = [graph for graph in graphs if graph.role in DETECTORS]
-    for kind, graphs in (("embedders", embedders), ("detectors", detectors)):
-        if len(graphs) > 1:
-            names = " and ".join(graph.path.name for graph in graphs)
-            raise PackError(f"{folder} has {len(graphs)} {kind}: {names}; leave one of them there.")
+    for kind, several in (("embedders", embedders), ("detectors", detectors)):
+        if len(several) > 1:
+            names = " and ".join(graph.path.name for graph in several)
+            raise PackError(
+                f"{folder} has {len(several)} {kind}: {names}; leave one of them there."
+            )
     blind = [graph for graph in graphs if graph.role is Role.SCRFD_WITHOUT_KEYPOINTS]
     if blind and not detectors:
         raise PackError(

@@ -142,3 +142,13 @@ def test_a_page_may_name_its_own_sections(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     page.write_text("## 1. One\n\nSee [§1](#1-one) and §2.\n")
     assert len([*unresolved(page.read_text(), page, tmp_path)]) == 1
+
+
+def test_every_source_that_a_page_names_exists() -> None:
+    named = [
+        (page.name, path)
+        for page in (*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"))
+        for path in re.findall(r"`([a-z]\w*/[\w/.-]+\.(?:py|js))`", page.read_text("utf-8"))
+    ]
+    assert len(named) > 30
+    assert [(page, path) for page, path in named if not (ROOT / path).exists()] == []

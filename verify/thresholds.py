@@ -215,4 +215,6 @@ def level_name(target: float) -> str:
         exponent = round(-math.log10(target))
         if exponent and math.isclose(target, 10.0**-exponent, rel_tol=1e-9):
             return f"fmr-1e-{exponent}"
-    raise ContractError(f"{target:g} is no FMR target: use powers of ten below 1, such as 0.001")
+    raise ContractError(
+        f"{target:g} is not an FMR target: use powers of ten below 1, such as 0.001"
+    )

@@ -233,5 +233,5 @@ def _labels(root: Path, part: str) -> dict[Path, Label]:
 def _read_results(file: Path) -> Any:
     results = read_json(file)
     if not isinstance(results, dict) or results.get("format") != "veilface evaluation":
-        raise CommandError(f"{file.name} is no results.json of `veilface evaluate`")
+        raise CommandError(f"{file.name} is not a results.json of `veilface evaluate`")
     return results

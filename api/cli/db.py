@@ -62,7 +62,7 @@ def upgrade(*, settings: Settings, as_json: AsJson = False) -> None:
     if adoption.rows and not as_json:
         say(f"Authenticated the {adoption.rows} rows there were.")
     for prefix in adoption.refused:
-        message(f"key {prefix} is not as the audit log tells: it no longer works; replace it")
+        message(f"key {prefix} does not match the audit log and no longer works; replace it")
 
 
 @app.command()
@@ -194,7 +194,7 @@ def template_enrollment(
     allow: Annotated[
         bool | None,
         typer.Option(
-            "--allow/--forbid", help="Unset: say what holds; nothing changes.", show_default=False
+            "--allow/--forbid", help="Unset: show the current setting.", show_default=False
         ),
     ] = None,
     as_json: AsJson = False,

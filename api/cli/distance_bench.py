@@ -29,7 +29,7 @@ from templates.keys.randomness import Keystream
 from templates.space.subspace import SubspaceBatch
 from verify.evaluation.units import Mode
 
-Floats = NDArray[np.float32]
+Array32 = NDArray[np.float32]
 Task = Callable[[], object]
 
 MODES = (Mode.POINT, Mode.SUBSPACE)
@@ -157,7 +157,7 @@ def measure(question: Question, *, progress: Callable[[int], None] = lambda _: N
             stream = Keystream.seeded("distance bench", question.seed, n, m)
             templates = face_like_templates(question.count, m, n, stream=stream)
             for mode in question.modes:
-                probes: Floats | SubspaceBatch = (
+                probes: Array32 | SubspaceBatch = (
                     face_like(question.count, n, stream=stream)
                     if mode is Mode.POINT
                     else face_like_templates(question.count, m, n, stream=stream)
@@ -168,12 +168,12 @@ def measure(question: Question, *, progress: Callable[[int], None] = lambda _: N
     return rows
 
 
-def face_like(count: int, n: int, *, stream: Keystream) -> Floats:
+def face_like(count: int, n: int, *, stream: Keystream) -> Array32:
     """Descriptors of nobody, (count, n) unit rows spread like faces: a mean, a steep spectrum."""
     scales = 1 / np.sqrt(1 + np.arange(n) / 8)
     rows = stream.normal((count, n)) * scales + 0.3 * (np.arange(n) == 0)
     rows /= np.linalg.norm(rows, axis=1, keepdims=True)
-    descriptors: Floats = rows.astype(np.float32)
+    descriptors: Array32 = rows.astype(np.float32)
     return descriptors
 
 
@@ -275,13 +275,13 @@ def _once(task: Task) -> float:
     return (time.perf_counter_ns() - start) / 1e6
 
 
-def _tasks(probes: Floats | SubspaceBatch, templates: SubspaceBatch, question: Question) -> _Tasks:
+def _tasks(probes: Array32 | SubspaceBatch, templates: SubspaceBatch, question: Question) -> _Tasks:
     make = _on_processor if question.device is None else _on_device
     return make(probes, templates, question)
 
 
 def _on_processor(
-    probes: Floats | SubspaceBatch, templates: SubspaceBatch, question: Question
+    probes: Array32 | SubspaceBatch, templates: SubspaceBatch, question: Question
 ) -> _Tasks:
     left, right = _stacked(probes), _stacked(templates)
     mine = probes.feet if isinstance(probes, SubspaceBatch) else probes
@@ -307,7 +307,7 @@ def _on_processor(
 
 
 def _on_device(
-    probes: Floats | SubspaceBatch, templates: SubspaceBatch, question: Question
+    probes: Array32 | SubspaceBatch, templates: SubspaceBatch, question: Question
 ) -> _Tasks:
     """The same with tensors that are on the device before the time begins."""
     import torch
@@ -362,7 +362,7 @@ def _on_device(
         raise MemoryError(f"on {device}") from error
 
 
-def _stacked(side: Floats | SubspaceBatch) -> Floats:
+def _stacked(side: Array32 | SubspaceBatch) -> Array32:
     """Rows whose products with those of another side are the Gram matrix."""
     if not isinstance(side, SubspaceBatch):
         return side

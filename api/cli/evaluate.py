@@ -154,6 +154,10 @@ def evaluate(
     Example: `veilface evaluate lfw.bin --pack buffalo_l --decoys decoys.veil --out lfw-results`
     """
     require_extra("evaluate")
+    try:
+        where = Backend.parse(backend, jobs=jobs or default_jobs())
+    except BackendError as error:
+        raise UsageError(str(error)) from None
     sets = open_all(datasets, pictures=embeddings is None)
     report = None if audit is None else read_audit(audit)
     names = None
@@ -164,7 +168,6 @@ def evaluate(
     sources = open_sources(decoys or [], settings, embedder)
     decoy_sources = [facts.source for facts in sources]
     try:
-        where = Backend.parse(backend, jobs=jobs or default_jobs())
         plan = EvaluationPlan(
             strategies=names or default_strategies(decoy_sources, raw_flip=raw_flip),
             dims=listed(dim, int, "--dim", expected="whole numbers such as 2,4"),
@@ -176,7 +179,7 @@ def evaluate(
             targets=tuple(sorted(_rates(fmr), reverse=True)),
         )
         units_of(plan, decoy_sources, n=embedder.model.n)
-    except (BackendError, EvaluationError) as error:
+    except EvaluationError as error:
         raise UsageError(str(error)) from None
     known = None if labels is None else read_labels(labels)
     if cache is not None and where.scheduler is not None:

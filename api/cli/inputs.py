@@ -68,7 +68,7 @@ def read_json(file: Path) -> Any:
     try:
         return json.loads(read_bounded(file, _MAX_JSON_BYTES))
     except (ValueError, RecursionError):
-        raise CommandError(f"{file.name} is no JSON file") from None
+        raise CommandError(f"{file.name} is not a JSON file") from None
 
 
 def named_file(file: Path | None) -> dict[str, Json] | None:

@@ -214,7 +214,7 @@ def rotate_tenant(
     """Give a tenant a new secret rotation, and move its stored templates to it.
 
     Nobody has to enroll again, and the service may run meanwhile; the key of the old rotation is
-    dropped at the end. That is enough if only that key may be known. A stolen template stays a
+    dropped at the end. That is enough if only that key may have leaked. A stolen template stays a
     credential whatever happens to ours: with `--stolen`, only people enrolled from now on get the
     new rotation; the others are listed, and verified as before until they enroll again with new
     photos. Run it with `--stolen --finish` to see who is left, and again when nobody is: `--finish`

@@ -150,15 +150,15 @@ def read_audit_report(path: Path) -> AuditReport:
     name = f"audit_report_file {path}"
     try:
         if path.stat().st_size > MAX_REPORT_BYTES:
-            raise StartError(f"{name} has more than {MAX_REPORT_BYTES} bytes; it is no report")
+            raise StartError(f"{name} has more than {MAX_REPORT_BYTES} bytes; it is not a report")
         document = json.loads(path.read_bytes())
     except OSError as error:
         raise StartError(f"{name} cannot be read: {error.strerror}") from error
     except (ValueError, RecursionError):
-        raise StartError(f"{name} is no JSON; name the report.json of `veilface audit`") from None
+        raise StartError(f"{name} is not JSON; name the report.json of `veilface audit`") from None
     if not isinstance(document, dict) or not _is_report(document):
         raise StartError(
-            f"{name} is no report of `veilface audit`, version {VERSION}; name its report.json"
+            f"{name} is not a report of `veilface audit`, version {VERSION}; name its report.json"
         )
     return AuditReport(document)
 

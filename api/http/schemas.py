@@ -60,7 +60,7 @@ class TemplateRequest(_Shape):
 
 
 class VerifyRequest(_Shape):
-    """A probe that is no photo, signed: exactly one of embedding and template."""
+    """A probe that is not a photo, signed: exactly one of embedding and template."""
 
     embedding: list[float] | None = Field(None, description="Unit-norm, of the contract's n.")
     template: str | None = Field(None, description="Base64 of a lifted probe's wire bytes.")

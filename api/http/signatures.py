@@ -1,4 +1,4 @@
-"""The signature of a probe that is no photo: checked before anything is computed."""
+"""The signature of a probe that is not a photo: checked before anything is computed."""
 
 import hmac
 import time
@@ -75,6 +75,6 @@ def checked_nonce(
 def _field(name: str, rule: str) -> ApiError:
     return ApiError(
         "validation_failed",
-        f"a probe that is no photo is signed: {name} must be {rule}",
+        f"a probe that is not a photo is signed: {name} must be {rule}",
         {"field": name},
     )

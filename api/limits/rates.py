@@ -153,7 +153,7 @@ class InRedis:
             )
         except (ValueError, limits.errors.ConfigurationError):
             raise StartError(
-                "setting rate_limit_storage: this is no URL of a Redis server"
+                "setting rate_limit_storage: this is not the URL of a Redis server"
             ) from None
         self._limiter = SlidingWindowCounterRateLimiter(storage)
         # OSError and TimeoutError too: not all of them are wrapped by the client library.

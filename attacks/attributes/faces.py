@@ -172,7 +172,7 @@ def split(
     if train.n != attacked.n or dict(train.classes) != dict(attacked.classes):
         raise AuditError(
             "the faces to train with and those to attack differ in the dimension of their "
-            "descriptors or in their classes"
+            "embeddings or in their classes"
         )
     left = len(train) - lifting
     wanted = left if attack is None else attack

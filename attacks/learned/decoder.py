@@ -125,7 +125,7 @@ def train_decoder(
         raise AuditError("a decoder is trained on RGB images, uint8 of shape (A, s, s, 3)")
     if len(images) != len(descriptors) or len(images) < LEAST_IMAGES:
         raise AuditError(
-            f"a decoder needs {LEAST_IMAGES} images or more and a descriptor of each, seen "
+            f"a decoder needs {LEAST_IMAGES} images or more and an embedding of each, seen "
             f"{len(images)} and {len(descriptors)}"
         )
     started = monotonic()

@@ -221,7 +221,7 @@ def invert(
             attack="inverter",
             knowledge=Knowledge.ALGORITHM,
             assumption="One template, how templates are lifted, and faces of other people, lifted "
-            "to train a network that maps a template to its descriptor; success is a match of "
+            "to train a network that maps a template to its embedding; success is a match of "
             "the guess with a fresh photo",
             details={
                 "faces": len(known),

@@ -18,7 +18,7 @@ from verify.metrics import rate
 Embed = Callable[[Images], NDArray[np.float32]]
 """uint8 (B, s, s, 3) RGB crops of the embedder's size → (B, n) unit rows."""
 
-RAW, FOOT, NOISE = "raw descriptor", "foot point", "noise"
+RAW, FOOT, NOISE = "raw embedding", "foot point", "noise"
 
 
 @dataclass(frozen=True, eq=False, repr=False)

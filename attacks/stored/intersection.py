@@ -132,12 +132,12 @@ def same_descriptor(system: System, *, lifts: Sequence[int] = LIFTS) -> list[Att
                     system,
                     guesses,
                     attack="intersection",
-                    variant=f"{count} lifts of one descriptor, {form}",
+                    variant=f"{count} lifts of one embedding, {form}",
                     knowledge=Knowledge.TEMPLATES,
                     assumption=(
-                        f"The attacker has {count} templates of one descriptor ({form}) and takes "
+                        f"The attacker has {count} templates of one embedding ({form}) and takes "
                         "the point where they meet; success is a match with a fresh photo of the "
-                        "victim. Not judged: the service lifts a descriptor once."
+                        "victim. Not judged: the service lifts an embedding once."
                     ),
                     judged=False,
                     details={

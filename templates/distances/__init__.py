@@ -293,10 +293,10 @@ def _labels(labels: Labels | None, probes: Any, templates: Any) -> Labels | None
     given = [np.asarray(side) for side in labels]
     if any(side.dtype.kind not in "iub" for side in given):
         raise TemplateError("labels are whole numbers; number the names, as np.unique does")
-    mine, theirs = (np.array(side, dtype=np.int64) for side in given)
-    if mine.shape != (len(probes),) or theirs.shape != (len(templates),):
+    left, right = (np.array(side, dtype=np.int64) for side in given)
+    if left.shape != (len(probes),) or right.shape != (len(templates),):
         raise TemplateError(
-            f"labels of shapes {mine.shape} and {theirs.shape} do not fit {len(probes)} probes "
+            f"labels of shapes {left.shape} and {right.shape} do not fit {len(probes)} probes "
             f"and {len(templates)} templates"
         )
-    return mine, theirs
+    return left, right

@@ -63,16 +63,16 @@ class Rows(NamedTuple):
 def pairwise(probes: Any, templates: SubspaceBatch, *, metric: Metric, steps: int) -> Doubles:
     """Distances of every probe, a point or a subspace, to every template, shape (P, T)."""
     out = np.empty((len(probes), len(templates)))
-    theirs = Rows.cleaned(templates)
+    right = Rows.cleaned(templates)
     if isinstance(probes, SubspaceBatch):
-        mine = Rows.cleaned(probes)
+        left = Rows.cleaned(probes)
         i, j = (side.ravel() for side in np.indices(out.shape))
-        out[i, j] = pairs(mine, theirs, i, j, metric=metric, steps=steps)
+        out[i, j] = pairs(left, right, i, j, metric=metric, steps=steps)
         return out
     for rows in parts(len(probes), _POINTS):
         points = probes[None, rows].astype(np.float64)
-        for columns in _chunks(len(templates), 3 * points.size + theirs.bases[0].size):
-            some = Rows.of(theirs, columns)
+        for columns in _chunks(len(templates), 3 * points.size + right.bases[0].size):
+            some = Rows.of(right, columns)
             out[rows, columns] = _POINT_DISTANCES[metric](points, some).T
     return out
 
@@ -91,14 +91,14 @@ def pairs(
     lifted = not isinstance(probes, np.ndarray)
     rows = templates.bases.shape[1] + (probes.bases.shape[1] if lifted else 0)
     for part in _chunks(len(i), 2 * rows * templates.feet.shape[1]):
-        theirs = Rows.of(templates, j[part])
+        right = Rows.of(templates, j[part])
         if not lifted:
             points = probes[i[part], None].astype(np.float64)
-            out[part] = _POINT_DISTANCES[metric](points, theirs)[:, 0]
+            out[part] = _POINT_DISTANCES[metric](points, right)[:, 0]
         elif metric is Metric.EUCLIDEAN:
-            out[part] = _euclidean_subspaces(Rows.of(probes, i[part]), theirs)
+            out[part] = _euclidean_subspaces(Rows.of(probes, i[part]), right)
         else:
-            out[part] = _spherical_subspaces(Rows.of(probes, i[part]), theirs, steps)
+            out[part] = _spherical_subspaces(Rows.of(probes, i[part]), right, steps)
     return out
 
 
@@ -115,19 +115,19 @@ def _inside(rows: Doubles, bases: Doubles) -> Doubles:
 # --- points, (N or 1, k, n), to N subspaces, as (N, k) -------------------------------------------
 
 
-def _euclidean_points(points: Doubles, theirs: Rows) -> Doubles:
-    gaps: Doubles = points - theirs.feet[:, None]
+def _euclidean_points(points: Doubles, right: Rows) -> Doubles:
+    gaps: Doubles = points - right.feet[:, None]
     for _ in range(2):  # once more, because the stored basis is orthonormal to float32 only
-        gaps -= _inside(gaps, theirs.bases)
+        gaps -= _inside(gaps, right.bases)
     return np.asarray(np.linalg.norm(gaps, axis=2))
 
 
-def _spherical_points(points: Doubles, theirs: Rows) -> Doubles:
-    scales, radii = spheres(theirs.feet)
+def _spherical_points(points: Doubles, right: Rows) -> Doubles:
+    scales, radii = spheres(right.feet)
     units = normalised(points)
-    nearest: Doubles = _directions(units @ theirs.bases.transpose(0, 2, 1)) @ theirs.bases
+    nearest: Doubles = _directions(units @ right.bases.transpose(0, 2, 1)) @ right.bases
     nearest *= radii[:, None, None]
-    nearest += (theirs.feet * scales[:, None])[:, None]
+    nearest += (right.feet * scales[:, None])[:, None]
     gaps = np.linalg.norm(units - nearest, axis=2)
     # A zero probe has no direction: similarity 0 with everything.
     return np.asarray(np.where(units.any(axis=2), gaps, np.sqrt(2.0)))
@@ -139,30 +139,30 @@ _POINT_DISTANCES = {Metric.EUCLIDEAN: _euclidean_points, Metric.SPHERICAL: _sphe
 # --- K subspaces to as many others, as (K,) ------------------------------------------------------
 
 
-def _euclidean_subspaces(mine: Rows, theirs: Rows) -> Doubles:
+def _euclidean_subspaces(left: Rows, right: Rows) -> Doubles:
     """Residual of q − p after least squares on the rows of both bases.
 
     By the eigenvectors of their Gram matrix without those that only rounding keeps apart (the
     minimum-norm solution). It is 0 only if the residual is, and defined for parallel and for
     intersecting subspaces.
     """
-    rows = np.concatenate([mine.bases, theirs.bases], axis=1)
+    rows = np.concatenate([left.bases, right.bases], axis=1)
     columns = rows.transpose(0, 2, 1)
     values, vectors = np.linalg.eigh(rows @ columns)
     inverse = np.where(values > _SHARED_ANGLE2, 1 / np.maximum(values, _SHARED_ANGLE2), 0)
-    gaps = (theirs.feet - mine.feet)[:, :, None]
+    gaps = (right.feet - left.feet)[:, :, None]
     for _ in range(2):  # the second pass removes the first one's rounding
         inside = vectors.transpose(0, 2, 1) @ (rows @ gaps)
         gaps = gaps - columns @ (vectors @ (inverse[:, :, None] * inside))
     return np.asarray(np.linalg.norm(gaps[:, :, 0], axis=1))
 
 
-def _spherical_subspaces(mine: Rows, theirs: Rows, steps: int) -> Doubles:
+def _spherical_subspaces(left: Rows, right: Rows, steps: int) -> Doubles:
     """Difference of the closest points that the iteration finds."""
-    _, problem = problem_of(mine, theirs)
+    _, problem = problem_of(left, right)
     _, v = maximise(problem, _starts(problem), steps)
     u = problem.g + _times(problem.b, v)
-    x, y = _point_of_sphere(mine, u), _point_of_sphere(theirs, v)
+    x, y = _point_of_sphere(left, u), _point_of_sphere(right, v)
     return np.asarray(np.linalg.norm(x - y, axis=1))
 
 
@@ -215,14 +215,14 @@ class Problem(NamedTuple):
         return type(self)(*(part[index] for part in self))
 
 
-def problem_of(mine: Rows, theirs: Rows) -> tuple[Doubles, Problem]:
+def problem_of(left: Rows, right: Rows) -> tuple[Doubles, Problem]:
     """Products p·q of K pairs, (K,), and the problems of the rest of the similarity."""
-    (scale, s), (their_scale, t) = spheres(mine.feet), spheres(theirs.feet)
-    p, q = mine.feet * scale[:, None], theirs.feet * their_scale[:, None]
-    b = (s * t)[:, None, None] * (mine.bases @ theirs.bases.transpose(0, 2, 1))
+    (scale, s), (their_scale, t) = spheres(left.feet), spheres(right.feet)
+    p, q = left.feet * scale[:, None], right.feet * their_scale[:, None]
+    b = (s * t)[:, None, None] * (left.bases @ right.bases.transpose(0, 2, 1))
     return np.einsum("ki,ki->k", p, q), Problem(
-        s[:, None] * _times(mine.bases, q),
-        t[:, None] * _times(theirs.bases, p),
+        s[:, None] * _times(left.bases, q),
+        t[:, None] * _times(right.bases, p),
         b,
         np.ascontiguousarray(b.transpose(0, 2, 1)),
     )

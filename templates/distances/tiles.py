@@ -39,8 +39,8 @@ from templates.distances.metric import (
 from templates.distances.rounded import RoundedSubspaces
 from templates.space.subspace import SubspaceBatch
 
-Floats = NDArray[np.float32]
-Probes = Floats | SubspaceBatch
+Array32 = NDArray[np.float32]
+Probes = Array32 | SubspaceBatch
 
 # Rows of the product of a tile; the probes have half: 2 MiB.
 _TILE_SIDE = 1024
@@ -72,7 +72,7 @@ def pairwise(
     metric: Metric,
     steps: int,
     threads: int | None = None,
-) -> Floats:
+) -> Array32:
     """All distances, (P, T)."""
     out = np.empty((len(probes), len(templates)), dtype=np.float32)
     solver = _Solver(probes, templates, metric, steps)
@@ -80,11 +80,11 @@ def pairwise(
         for block in solver.blocks(len(spaces)):
             rows = out[block.first : block.first + block.grid.probes]
 
-            def work(block: _Block, space: _ThreadSpace, rows: Floats = rows) -> None:
+            def work(block: _Block, space: _ThreadSpace, rows: Array32 = rows) -> None:
                 while solver.compute(block, space, rows.reshape(-1), len(templates)) >= 0:
                     pass
 
-            def correct(number: int, block: _Block = block, rows: Floats = rows) -> None:
+            def correct(number: int, block: _Block = block, rows: Array32 = rows) -> None:
                 solver.correct(block, number, rows[block.grid.tile(number)])
 
             block.run(work, spaces)
@@ -136,7 +136,7 @@ def counts_within(
 
 def paired(
     probes: SubspaceBatch, templates: SubspaceBatch, *, metric: Metric, steps: int
-) -> Floats:
+) -> Array32:
     """Distances of probe i to template i, (P,)."""
     out = np.empty(len(probes), dtype=np.float32)
     solver = _Solver(probes, templates, metric, steps)
@@ -171,31 +171,33 @@ class _Nearest:
         self.indices = np.full((count, k), -1, dtype=np.int64)
         self._labels, self._of_templates = labels, of_templates
 
-    def take(self, rows: slice, columns: slice, distances: Floats) -> None:
+    def take(self, rows: slice, columns: slice, distances: Array32) -> None:
         """Merge a tile."""
-        mine, theirs = self._labels[0][rows], self._labels[1][columns]
+        row_labels, column_labels = self._labels[0][rows], self._labels[1][columns]
         if self._of_templates:
             height, width = rows.stop - rows.start, columns.stop - columns.start
             turned = np.empty((width, _whole(height)), dtype=np.float32)
             turned[:, :height] = distances.reshape(height, -1)[:, :width].T
             distances = turned.reshape(-1)
-            rows, columns, mine, theirs = columns, rows, theirs, mine
+            rows, columns, row_labels, column_labels = columns, rows, column_labels, row_labels
         count, best, places = columns.stop - columns.start, self.distances, self.indices
-        keep_nearest(distances, count, columns.start, mine, theirs, best[rows], places[rows])
+        keep_nearest(
+            distances, count, columns.start, row_labels, column_labels, best[rows], places[rows]
+        )
 
 
 class _Counts:
     """Numbers of pairs by threshold; thresholds ascend."""
 
-    def __init__(self, thresholds: Floats, labels: Labels) -> None:
+    def __init__(self, thresholds: Array32, labels: Labels) -> None:
         self.counts = np.zeros(len(thresholds), dtype=np.int64)
         self._thresholds, self._labels = thresholds, labels
 
-    def take(self, rows: slice, columns: slice, distances: Floats) -> None:
+    def take(self, rows: slice, columns: slice, distances: Array32) -> None:
         """Count a tile."""
-        mine, theirs = self._labels[0][rows], self._labels[1][columns]
+        row_labels, column_labels = self._labels[0][rows], self._labels[1][columns]
         count = columns.stop - columns.start
-        count_within(distances, count, self._thresholds, mine, theirs, self.counts)
+        count_within(distances, count, self._thresholds, row_labels, column_labels, self.counts)
 
 
 def traverse(
@@ -283,7 +285,7 @@ class _ThreadSpace:
     its spaces to the next.
     """
 
-    spare: list[Floats] = []  # noqa: RUF012
+    spare: list[Array32] = []  # noqa: RUF012
 
     def __init__(self, solver: "_Solver", *, collecting: bool) -> None:
         sizes = solver.sizes(collecting=collecting)
@@ -391,26 +393,26 @@ class _Solver:
         return packed, self._columns, product, self._scratch, pairs if collecting else 0
 
     def blocks(self, threads: int) -> Iterator[_Block]:
-        """Stack the rows of the probes, block by block in the same room."""
+        """Stack the rows of the probes, block by block in the same memory."""
         if not self._columns:
             return
         numbers = max(1, self._rows) * (self._m + 1) * self._templates.n
         step = self._rows * max(1, _BLOCK_BYTES // (4 * numbers))
-        room = None
+        stacked = None
         for part in parts(len(self._probes), step):
             if isinstance(self._probes, SubspaceBatch):
                 count = part.stop - part.start
-                if room is None:
-                    room = np.empty((count, self._m + 1, self._templates.n), dtype=np.float32)
-                mine = self._stack_probes(self._probes[part], room[:count], threads)
-                rows = room[:count].reshape(-1, self._templates.n)
+                if stacked is None:
+                    stacked = np.empty((count, self._m + 1, self._templates.n), dtype=np.float32)
+                terms = self._stack_probes(self._probes[part], stacked[:count], threads)
+                rows = stacked[:count].reshape(-1, self._templates.n)
             else:
-                rows, mine = self._take_points(self._probes[part])
+                rows, terms = self._take_points(self._probes[part])
             batch = self._templates
-            sides = Sides(_locked(rows), mine, self._m, batch.feet, batch.bases)
-            yield _Block(part.start, sides, self._grid(len(mine)))
+            sides = Sides(_locked(rows), terms, self._m, batch.feet, batch.bases)
+            yield _Block(part.start, sides, self._grid(len(terms)))
 
-    def _take_points(self, points: Floats) -> tuple[Floats, Floats]:
+    def _take_points(self, points: Array32) -> tuple[Array32, Array32]:
         squares = _squares(points)
         if not self._options.spherical:
             return points, squares
@@ -422,20 +424,20 @@ class _Solver:
             squares = _squares(points)
         return points, np.reciprocal(np.sqrt(np.maximum(squares, _TINY)))
 
-    def _stack_probes(self, probes: SubspaceBatch, room: Floats, threads: int) -> Floats:
+    def _stack_probes(self, probes: SubspaceBatch, stacked: Array32, threads: int) -> Array32:
         """Stack the rows of lifted probes, probe after probe; return the squares of their feet."""
         squares = np.empty(len(probes), dtype=np.float32)
 
         def one(part: slice) -> None:
-            self._stack(probes[part], room[part])
+            self._stack(probes[part], stacked[part])
             squares[part] = _squares(probes.feet[part])
 
-        step = len(probes) if room.size < _SMALL_BLOCK else self._rows
+        step = len(probes) if stacked.size < _SMALL_BLOCK else self._rows
         share(one, parts(len(probes), step), threads)
         return squares
 
-    def _stack(self, batch: SubspaceBatch, room: Floats) -> None:
-        feet, bases = room[:, 0], room[:, 1:]
+    def _stack(self, batch: SubspaceBatch, stacked: Array32) -> None:
+        feet, bases = stacked[:, 0], stacked[:, 1:]
         if self._options.spherical:
             scales, radii = (part.astype(np.float32) for part in exact.spheres(batch.feet))
             np.multiply(batch.feet, scales[:, None], out=feet)
@@ -443,12 +445,12 @@ class _Solver:
         else:
             feet[:], bases[:] = batch.feet, batch.bases
 
-    def compute(self, block: _Block, space: _ThreadSpace, out: Floats, stride: int) -> int:
+    def compute(self, block: _Block, space: _ThreadSpace, out: Array32, stride: int) -> int:
         """Write the distances of some of the next tiles, −1 where they are not exact."""
         task = block.sides, block.grid, self._options, space.kernel, block.counter
         return compute(*task, out, stride, block.inexact)
 
-    def correct(self, block: _Block, number: int, out: Floats) -> None:
+    def correct(self, block: _Block, number: int, out: Array32) -> None:
         """Compute the pairs of a tile exactly that are −1 in ``out``, (R, T or more)."""
         rows, columns = block.grid.tile(number)
         table = out[:, : columns.stop - columns.start]
@@ -456,23 +458,23 @@ class _Solver:
         if i.size:
             table[i, j] = self._exact(i + rows.start + block.first, j + columns.start)
 
-    def paired(self, part: slice) -> Floats:
+    def paired(self, part: slice) -> Array32:
         """Distances of probes to the templates of the same positions."""
         probes, batch = self._probes[part], self._templates
         assert isinstance(probes, SubspaceBatch)  # noqa: S101
         count, m_d, m_e, n = len(probes), self._m, batch.m, batch.n
         wide = _whole(count)
-        mine = np.empty((count, m_d + 1, n), dtype=np.float32)
-        self._stack(probes, mine)
-        theirs = np.empty((m_e + 1, wide, n), dtype=np.float32)
+        left = np.empty((count, m_d + 1, n), dtype=np.float32)
+        self._stack(probes, left)
+        right = np.empty((m_e + 1, wide, n), dtype=np.float32)
         squares = np.empty(wide, dtype=np.float32)
         product = np.zeros((m_d + 1, m_e + 1, wide), dtype=np.float32)
         flat, work = product.reshape(-1), np.zeros(self._scratch, dtype=np.float32)
-        space = Space(theirs.reshape(-1), squares, flat, work, np.zeros(1, dtype=np.int64))
+        space = Space(right.reshape(-1), squares, flat, work, np.zeros(1, dtype=np.int64))
         pack(batch.feet, batch.bases, part.start, count, self._options.spherical, space, wide)
         squares[:count] += _squares(probes.feet)
         with np.errstate(over="ignore", invalid="ignore"):  # such pairs are computed again
-            product[:, :, :count] = (mine @ theirs[:, :count].transpose(1, 2, 0)).transpose(1, 2, 0)
+            product[:, :, :count] = (left @ right[:, :count].transpose(1, 2, 0)).transpose(1, 2, 0)
         out = np.empty(wide, dtype=np.float32)
         tile = Tile(flat, np.zeros(1, dtype=np.float32), squares, m_d, m_e)
         if solve(tile, self._options, work, Result(out, wide, count)):
@@ -485,13 +487,13 @@ class _Solver:
         return exact.pairs(self._probes, self._templates, i, j, **options)
 
 
-def _squares(rows: Floats) -> Floats:
+def _squares(rows: Array32) -> Array32:
     squares = np.empty(len(rows), dtype=np.float32)
     square(_locked(rows), squares)
     return squares
 
 
-def _locked(array: Floats) -> Floats:
+def _locked(array: Array32) -> Array32:
     """View that cannot be written, as those of a batch: kernels are compiled for one kind."""
     view = array.view()
     view.flags.writeable = False

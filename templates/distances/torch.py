@@ -186,17 +186,17 @@ def _placed(probes: Any, templates: Any, device: str | None) -> tuple[Side, Subs
         elif isinstance(side, np.ndarray):
             side = torch.tensor(side, dtype=torch.float32, device=there)
         sides.append(side)
-    mine, theirs = sides
-    if mine.device != theirs.device:
-        raise TemplateError(f"the probes are on {mine.device}, the templates on {theirs.device}")
-    return mine, theirs
+    left, right = sides
+    if left.device != right.device:
+        raise TemplateError(f"the probes are on {left.device}, the templates on {right.device}")
+    return left, right
 
 
 def _drop(table: Tensor, labels: Labels | None, rows: slice, columns: slice, value: int) -> None:
     """Overwrite the pairs of a tile that have equal labels."""
     if labels is not None:
-        mine, theirs = (torch.as_tensor(side, device=table.device) for side in labels)
-        table.masked_fill_(mine[rows, None] == theirs[columns], value)
+        left, right = (torch.as_tensor(side, device=table.device) for side in labels)
+        table.masked_fill_(left[rows, None] == right[columns], value)
 
 
 # --- one tile ------------------------------------------------------------------------------------
@@ -222,17 +222,17 @@ def _tiles(
 def _distances(probes: Side, templates: SubspaceTensors, metric: Metric, steps: int) -> Tensor:
     """Distances of one tile, shape (P, T)."""
     spherical = metric is Metric.SPHERICAL
-    mine, theirs = (_on_sphere(side) if spherical else side for side in (probes, templates))
+    left, right = (_on_sphere(side) if spherical else side for side in (probes, templates))
     shape = -1, len(probes), templates.m + 1, len(templates)
-    gram = (stacked(mine) @ stacked(theirs).T).view(shape)
+    gram = (stacked(left) @ stacked(right).T).view(shape)
     # Products of every pair: (P · T, m_D + 1, m_E + 1), m_D = 0 for points.
     block = gram.permute(1, 3, 0, 2).flatten(0, 1).contiguous()
     if spherical:
-        gains = block[:, 0, 1:].norm(dim=1) if isinstance(mine, Tensor) else _gains(block, steps)
+        gains = block[:, 0, 1:].norm(dim=1) if isinstance(left, Tensor) else _gains(block, steps)
         squared = 2 - 2 * (block[:, 0, 0] + gains)
     else:
-        gaps = (_squares(mine)[:, None] + _squares(theirs)).flatten() - 2 * block[:, 0, 0]
-        lifted = not isinstance(mine, Tensor)
+        gaps = (_squares(left)[:, None] + _squares(right)).flatten() - 2 * block[:, 0, 0]
+        lifted = not isinstance(left, Tensor)
         squared = _schur(block, gaps) if lifted else gaps - block[:, 0, 1:].square().sum(dim=1)
     distances = squared.clamp(min=0).sqrt().view(shape[1], shape[3])
     near = torch.nonzero(~((distances >= NEAR) & (distances < torch.inf)), as_tuple=True)

@@ -82,7 +82,7 @@ class Client:
     def request(
         self, method: str, path: str, *, sign: bool = True, **options: Any
     ) -> httpx.Response:
-        """Send a request; a probe that is no photo is signed as a client would, unless told not."""
+        """Send a request; a probe that is not a photo is signed as by a client, unless told not."""
         headers = {**self.headers, **options.pop("headers", {})}
         authorization = headers.get("Authorization", "")
         if sign and isinstance(authorization, str):

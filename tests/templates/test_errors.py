@@ -1,12 +1,16 @@
-"""The tree in the docstring of ``templates.errors`` is the tree of classes."""
+"""The trees in the docstrings of the errors modules are the trees of classes."""
 
 import re
 from collections.abc import Iterator
 from importlib import import_module
+from types import ModuleType
 
-from templates import errors
+import pytest
 
-ROOMS = ("templates", "enroll", "verify", "attacks", "api")
+from models import errors as model_errors
+from templates import errors as template_errors
+
+PACKAGES = ("templates", "models", "enroll", "verify", "attacks", "api")
 
 
 def drawn(text: str) -> Iterator[tuple[str, str | None]]:
@@ -23,14 +27,18 @@ def drawn(text: str) -> Iterator[tuple[str, str | None]]:
 def defined(kind: type[Exception]) -> Iterator[tuple[str, str | None]]:
     """Every subclass that the packages define, with its base."""
     for child in kind.__subclasses__():
-        if child.__module__.split(".")[0] in ROOMS:
+        if child.__module__.split(".")[0] in PACKAGES:
             yield child.__name__, kind.__name__
             yield from defined(child)
 
 
-def test_the_tree_is_true() -> None:
+@pytest.mark.parametrize(
+    ("errors", "root"),
+    [(template_errors, template_errors.VeilfaceError), (model_errors, model_errors.ModelError)],
+)
+def test_the_tree_is_true(errors: ModuleType, root: type[Exception]) -> None:
     assert errors.__doc__ is not None
     for module in re.findall(r"``([a-z]+\.[\w.]+)``", errors.__doc__):
         import_module(module)
     tree = sorted(drawn(errors.__doc__), key=str)
-    assert tree == sorted([("VeilfaceError", None), *defined(errors.VeilfaceError)], key=str)
+    assert tree == sorted([(root.__name__, None), *defined(root)], key=str)

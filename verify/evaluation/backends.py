@@ -57,7 +57,7 @@ class Backend:
         except ValueError:
             whole = None
         if not whole or parts.path not in ("", "/") or parts.query:
-            raise BackendError(f"{text} is no backend: use local, or dask://HOST:PORT")
+            raise BackendError(f"{text} is not a backend: use local, or dask://HOST:PORT")
         return cls(f"{schemes[parts.scheme]}://{parts.netloc}", jobs)
 
 

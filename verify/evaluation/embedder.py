@@ -132,7 +132,7 @@ class PackEmbedder:
             raise EvaluationError(
                 f"the pack has no detector, and the photos of {pairs.name} are not all crops of "
                 f"{size} x {size}: use a pack with a detector, or say that they are "
-                "aligned crops of another size"
+                "crops of another size (aligned)"
             )
         return aligned
 

@@ -79,7 +79,7 @@ def read_embeddings(file: Path) -> EmbeddingsFile:
         raise DatasetError(f"{file} cannot be read: {error.strerror or 'broken'}") from None
     except Exception as error:  # zipfile and NumPy raise whatever a broken archive causes
         raise DatasetError(
-            f"{file} is no readable .npz archive ({type(error).__name__}); {_KEYS}"
+            f"{file} is not a readable .npz archive ({type(error).__name__}); {_KEYS}"
         ) from None
     faults = [f"{name!a} occurs twice" for name in _repeated(names)]
     for place in np.flatnonzero(~(np.isfinite(lengths) & (lengths > 0))).tolist():

@@ -123,8 +123,8 @@ def _embedded(
     if not len(faces.acquired.descriptors):
         raise EvaluationError(
             f"{pairs.name}: no photo gave an embedding, the first because of "
-            f"{failures[0].code}; are these photos of faces, and do the options on alignment and "
-            "on the file of embeddings fit them?"
+            f"{failures[0].code}; are these photos of faces, and does what was said of "
+            "them (aligned, embeddings) fit?"
         )
     if failures:
         note(

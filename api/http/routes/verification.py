@@ -82,7 +82,7 @@ CODES = (
 async def verify(
     request: Request, caller: Verifies, subject: SubjectDep, runtime: RuntimeDep, gate: GateDep
 ) -> Response:
-    """Rights: `verify`, and `embeddings` for a probe that is no photo.
+    """Rights: `verify`, and `embeddings` for a probe that is not a photo.
 
     A level below the lowest that the deployment or the key allows is `forbidden`.
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float32]
+Array32 = NDArray[np.float32]
 Integers = NDArray[np.int64]
 
 
@@ -24,12 +24,12 @@ class Options(NamedTuple):
 class Tile(NamedTuple):
     """Products of R probes and C templates; C is a multiple of 16."""
 
-    product: Floats
+    product: Array32
     """(R · (m_d + 1) · (m_e + 1) · C,): the rows of a probe, p and D, or only its point, with the
     rows q and E of the templates, the templates side by side."""
-    mine: Floats
+    probe_terms: Array32
     """(R,): ‖p‖², or 1/‖e‖ of points with the spherical metric."""
-    theirs: Floats
+    template_squares: Array32
     """(C,): ‖q‖²."""
     m_d: int
     """Dimension of the probes; 0 of points."""
@@ -39,7 +39,7 @@ class Tile(NamedTuple):
 class Result(NamedTuple):
     """Where the distances of a tile go."""
 
-    distances: Floats
+    distances: Array32
     """Flat; row r begins at ``r · stride``."""
     stride: int
     width: int

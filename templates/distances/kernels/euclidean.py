@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from templates.distances.kernels.arguments import Floats, Options, Result, Tile
+from templates.distances.kernels.arguments import Array32, Options, Result, Tile
 from templates.distances.kernels.lanes import (
     ALL,
     LANES,
@@ -26,14 +26,14 @@ _EPS = np.float32(np.finfo(np.float32).eps)
 
 
 def scratch_size(m_d: int, m_e: int) -> int:
-    """Floats of working space that :func:`euclidean_subspaces` needs."""
+    """Numbers of working space that :func:`euclidean_subspaces` needs."""
     high, low = max(m_d, m_e), min(m_d, m_e)
     stride = low + _PAD
     return LANES * (high * stride + stride * stride + 2 * stride)
 
 
 @compiled
-def euclidean_subspaces(tile: Tile, options: Options, work: Floats, out: Result) -> int:
+def euclidean_subspaces(tile: Tile, options: Options, work: Array32, out: Result) -> int:
     """Distances by one Cholesky factorisation, for sixteen pairs at once.
 
     With M = D Eᵀ, a = D q and b = −E p, the squared distance is the last pivot of the
@@ -51,7 +51,7 @@ def euclidean_subspaces(tile: Tile, options: Options, work: Floats, out: Result)
         Number of groups of pairs with a −1: a distance that is not above the least, whose square
         overflows, or of a nearly singular pair.
     """
-    product, columns, m_d, m_e = tile.product, len(tile.theirs), tile.m_d, tile.m_e
+    product, columns, m_d, m_e = tile.product, len(tile.template_squares), tile.m_d, tile.m_e
     swapped = m_e > m_d
     high, low = (m_e, m_d) if swapped else (m_d, m_e)
     wide = low + _PAD
@@ -66,7 +66,7 @@ def euclidean_subspaces(tile: Tile, options: Options, work: Floats, out: Result)
     smallest = every(np.float32(100) * _EPS)
     limit = every(options.least * options.least)
     found = 0
-    for i in range(len(tile.mine)):
+    for i in range(len(tile.probe_terms)):
         for j in range(0, columns, LANES):
             origin = i * (m_d + 1) * (m_e + 1) * columns + j
             for a in range(high):
@@ -74,7 +74,7 @@ def euclidean_subspaces(tile: Tile, options: Options, work: Floats, out: Result)
                     x = load(product, origin + (a + 1) * down + (e + 1) * across)
                     store(work, (a * wide + e) * LANES, x)
                 store(work, (a * wide + low) * LANES, load(product, origin + (a + 1) * down))
-            gap = every(tile.mine[i]) + load(tile.theirs, j)
+            gap = every(tile.probe_terms[i]) + load(tile.template_squares, j)
             gap = fma(every(np.float32(-2)), load(product, origin), gap)
             sound = ALL
             squared = zero

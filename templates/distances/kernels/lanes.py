@@ -5,8 +5,8 @@ points and 1.5 to 2.3 × for pairs of subspaces with m = 16 (interleaved medians
 products): LLVM's vectoriser cannot keep sums of several arrays in registers. The compiler splits a
 vector where the processor's are shorter, so the code runs everywhere.
 
-Compiled kernels are cached by the text of their own file. After a change in this one the caches
-are stale: ``make clean``.
+Compiled kernels are cached by the text of their own file. After a change in this one, or of a
+number in ``metric.py``, the caches are stale: ``make clean``.
 """
 
 import operator

@@ -26,12 +26,12 @@ def points(tile: Tile, options: Options, out: Result) -> int:
     Squared, ‖e‖² + ‖p‖² − 2 e·p − ‖D e‖² (paper eq. 1), or 2 − 2 sim with the similarity
     (e·p + s‖D e‖)/‖e‖ from the rows p and s D (docs/method.md §3.4).
     """
-    product, columns, m = tile.product, len(tile.theirs), tile.m_e
+    product, columns, m = tile.product, len(tile.template_squares), tile.m_e
     zero, two, minus_two = every(np.float32(0)), every(np.float32(2)), every(np.float32(-2))
     limit, unknown = every(options.least * options.least), every(np.float32(-1))
     found = 0
-    for i in range(len(tile.mine)):
-        own = every(tile.mine[i])
+    for i in range(len(tile.probe_terms)):
+        own = every(tile.probe_terms[i])
         for j in range(0, columns, LANES):
             place = i * (m + 1) * columns + j
             dots, inside = load(product, place), zero
@@ -42,7 +42,7 @@ def points(tile: Tile, options: Options, out: Result) -> int:
             if options.spherical:
                 squared = larger(fma(minus_two, (dots + root(inside)) * own, two), zero)
             else:
-                squared = fma(minus_two, dots, own + load(tile.theirs, j)) - inside
+                squared = fma(minus_two, dots, own + load(tile.template_squares, j)) - inside
             known = less(limit, squared) & less(squared, every(OVERFLOW))
             found += known != ALL
             distance = blend(known, root(squared), unknown)

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from templates.distances.kernels.lanes import ALL, LANES, compiled, every, inlined, less, load
 
-Floats = NDArray[np.float32]
+Array32 = NDArray[np.float32]
 Integers = NDArray[np.int64]
 
 
@@ -18,12 +18,12 @@ def _before(distance: np.float32, column: int, other: np.float32, there: int) ->
 
 @compiled
 def keep_nearest(
-    distances: Floats,
+    distances: Array32,
     columns: int,
     first: int,
-    mine: Integers,
-    theirs: Integers,
-    best: Floats,
+    row_labels: Integers,
+    column_labels: Integers,
+    best: Array32,
     places: Integers,
 ) -> None:
     """Merge a tile into the K nearest of every row; the order of tiles does not matter.
@@ -34,21 +34,21 @@ def keep_nearest(
         C is ``columns`` rounded up to a multiple of 16; the rest of each row is passed over.
     first
         Number of the tile's first column.
-    mine, theirs : (R,) and (columns,) int64
+    row_labels, column_labels : (R,) and (columns,) int64
         Pairs with equal labels are passed over; empty arrays where all count.
     best, places : (R, K)
         Distances in ascending order and their columns, updated; of equal ones, the lowest column.
     """
     k = best.shape[1]
     stride = columns + (-columns) % LANES
-    labelled = len(mine) > 0
+    labelled = len(row_labels) > 0
     for i in range(len(best)):
         for j in range(0, columns, LANES):
             beyond = less(every(best[i, k - 1]), load(distances, i * stride + j))
             if beyond == ALL:
                 continue
             for c in range(j, min(j + LANES, columns)):
-                if labelled and mine[i] == theirs[c]:
+                if labelled and row_labels[i] == column_labels[c]:
                     continue
                 distance, column = distances[i * stride + c], first + c
                 if not _before(distance, column, best[i, k - 1], places[i, k - 1]):
@@ -64,18 +64,18 @@ def keep_nearest(
 
 @compiled
 def count_within(
-    distances: Floats,
+    distances: Array32,
     columns: int,
-    thresholds: Floats,
-    mine: Integers,
-    theirs: Integers,
+    thresholds: Array32,
+    row_labels: Integers,
+    column_labels: Integers,
     counts: Integers,
 ) -> None:
     """Count the distances whose first threshold is this one.
 
     Parameters
     ----------
-    distances, columns, mine, theirs
+    distances, columns, row_labels, column_labels
         As of :func:`keep_nearest`.
     thresholds : (S,) float32
         Ascending.
@@ -83,7 +83,7 @@ def count_within(
         ``counts[s]`` grows by the number of distances in (thresholds[s − 1], thresholds[s]].
     """
     last = len(thresholds) - 1
-    labelled = len(mine) > 0
+    labelled = len(row_labels) > 0
     stride = columns + (-columns) % LANES
     limit = every(thresholds[last])
     for i in range(len(distances) // stride):
@@ -93,7 +93,9 @@ def count_within(
                 continue
             for c in range(j, min(j + LANES, columns)):
                 distance = distances[i * stride + c]
-                if not distance <= thresholds[last] or (labelled and mine[i] == theirs[c]):
+                if not distance <= thresholds[last] or (
+                    labelled and row_labels[i] == column_labels[c]
+                ):
                     continue
                 low, high = 0, last
                 while low < high:

@@ -20,7 +20,7 @@ the subspaces is a line or a plane, v is a sign or an angle, and the angle is sa
 
 import numpy as np
 
-from templates.distances.kernels.arguments import Floats, Integers, Options, Result, Tile
+from templates.distances.kernels.arguments import Array32, Integers, Options, Result, Tile
 from templates.distances.kernels.lanes import (
     ALL,
     LANES,
@@ -59,7 +59,7 @@ _LONGEST_TURN = np.float32(0.2)
 
 
 def scratch_size(m_d: int, m_e: int) -> int:
-    """Floats of working space that :func:`spherical_subspaces` needs."""
+    """Numbers of working space that :func:`spherical_subspaces` needs."""
     high, low = max(m_d, m_e), min(m_d, m_e)
     stride = low + _PAD
     problem = (low + 2) * stride
@@ -70,7 +70,7 @@ def scratch_size(m_d: int, m_e: int) -> int:
 
 
 @inlined
-def _products(work: Floats, problem: int, v: int, w: int, m: int) -> tuple[Lanes, Lanes, Lanes]:
+def _products(work: Array32, problem: int, v: int, w: int, m: int) -> tuple[Lanes, Lanes, Lanes]:
     """Write w = G v; return h·v, c·v and v·w."""
     stride = m + _PAD
     zero = every(np.float32(0))
@@ -94,7 +94,7 @@ def _products(work: Floats, problem: int, v: int, w: int, m: int) -> tuple[Lanes
 
 @inlined
 def _advance(
-    work: Floats, problem: int, v: int, following: int, m: int
+    work: Array32, problem: int, v: int, following: int, m: int
 ) -> tuple[Lanes, Lanes, Lanes]:
     """Write the next step of the alternation after v; return F(v), λ and λμ, μ = ‖h + Bᵀu‖."""
     stride = m + _PAD
@@ -117,13 +117,13 @@ def _advance(
 
 
 @inlined
-def _scale(work: Floats, v: int, factor: Lanes, m: int) -> None:
+def _scale(work: Array32, v: int, factor: Lanes, m: int) -> None:
     for k in range(m):
         store(work, v + k * LANES, load(work, v + k * LANES) * factor)
 
 
 @inlined
-def _normalise(work: Floats, v: int, m: int) -> None:
+def _normalise(work: Array32, v: int, m: int) -> None:
     length = every(np.float32(0))
     for k in range(m):
         x = load(work, v + k * LANES)
@@ -132,7 +132,7 @@ def _normalise(work: Floats, v: int, m: int) -> None:
 
 
 @inlined
-def _keep(work: Floats, bits: int, chosen: int, other: int, m: int) -> None:
+def _keep(work: Array32, bits: int, chosen: int, other: int, m: int) -> None:
     """Overwrite ``other`` with ``chosen`` in the lanes of ``bits``."""
     for k in range(m):
         place = other + k * LANES
@@ -141,7 +141,7 @@ def _keep(work: Floats, bits: int, chosen: int, other: int, m: int) -> None:
 
 @inlined
 def _factorise(
-    work: Floats, problem: int, factor: int, inverses: int, lam: Lanes, mu: Lanes, m: int
+    work: Array32, problem: int, factor: int, inverses: int, lam: Lanes, mu: Lanes, m: int
 ) -> int:
     """Cholesky factor R of S = RᵀR; return the bits of the lanes where S is positive definite."""
     stride = m + _PAD
@@ -167,7 +167,7 @@ def _factorise(
 
 
 @inlined
-def _solve(work: Floats, factor: int, inverses: int, x: int, m: int) -> None:
+def _solve(work: Array32, factor: int, inverses: int, x: int, m: int) -> None:
     """Replace x by S⁻¹x."""
     stride = m + _PAD
     for k in range(m):
@@ -189,7 +189,7 @@ def _solve(work: Floats, factor: int, inverses: int, x: int, m: int) -> None:
 
 
 @compiled
-def _start(work: Floats, problem: int, v: int, w: int, m: int, powers: int) -> None:
+def _start(work: Array32, problem: int, v: int, w: int, m: int, powers: int) -> None:
     """Write a power of G times its largest column, nearly its leading eigenvector, into v.
 
     Its sign is the one with the larger F. ``powers`` is even: v and w exchange their parts.
@@ -223,7 +223,7 @@ def _start(work: Floats, problem: int, v: int, w: int, m: int, powers: int) -> N
 
 @compiled
 def _ascend(
-    work: Floats, problem: int, free: int, v: int, m: int, steps: int, guarded: bool
+    work: Array32, problem: int, free: int, v: int, m: int, steps: int, guarded: bool
 ) -> tuple[Lanes, Lanes, Lanes]:
     """Accelerated alternation from v; return the last value, λ and μ."""
     size = (m + _PAD) * LANES
@@ -269,7 +269,7 @@ def _ascend(
 
 
 @compiled
-def _prove(work: Floats, problem: int, free: int, m: int, steps: int) -> tuple[Lanes, int]:
+def _prove(work: Array32, problem: int, free: int, m: int, steps: int) -> tuple[Lanes, int]:
     """Plain steps, then Newton's on the bound; return the value found and the proven lanes."""
     stride = m + _PAD
     size = stride * LANES
@@ -341,7 +341,7 @@ def _prove(work: Floats, problem: int, free: int, m: int, steps: int) -> tuple[L
 
 
 @inlined
-def _of_one(work: Floats, problem: int) -> Lanes:
+def _of_one(work: Array32, problem: int) -> Lanes:
     """Maximum over v = ±1, where one subspace is a line."""
     row = (1 + _PAD) * LANES
     g, c = load(work, problem), load(work, problem + row)
@@ -353,7 +353,7 @@ def _of_one(work: Floats, problem: int) -> Lanes:
 
 
 @inlined
-def _of_two(work: Floats, problem: int) -> Lanes:
+def _of_two(work: Array32, problem: int) -> Lanes:
     """Maximum over v on the circle: its best samples on either side of G's larger column."""
     row = (2 + _PAD) * LANES
     g11, g12 = load(work, problem), load(work, problem + LANES)
@@ -409,7 +409,7 @@ def _of_two(work: Floats, problem: int) -> Lanes:
 
 @compiled
 def _finish(
-    work: Floats,
+    work: Array32,
     waiting: int,
     best: int,
     dots: int,
@@ -418,7 +418,7 @@ def _finish(
     options: Options,
     places: Integers,
     count: int,
-    out: Floats,
+    out: Array32,
 ) -> int:
     """Solve the gathered problems and write their distances."""
     size = (m + _PAD) * LANES
@@ -449,7 +449,7 @@ def _distance(similarity: Lanes) -> Lanes:
 
 
 @compiled
-def spherical_subspaces(tile: Tile, options: Options, work: Floats, out: Result) -> int:
+def spherical_subspaces(tile: Tile, options: Options, work: Array32, out: Result) -> int:
     """Distances between the parts of two subspaces that lie on the unit sphere.
 
     Parameters
@@ -464,7 +464,7 @@ def spherical_subspaces(tile: Tile, options: Options, work: Floats, out: Result)
     int
         Number of −1, or of groups with one: distances that are not above the least.
     """
-    product, columns, m_d, m_e = tile.product, len(tile.theirs), tile.m_d, tile.m_e
+    product, columns, m_d, m_e = tile.product, len(tile.template_squares), tile.m_d, tile.m_e
     swapped = m_e > m_d
     high, low = (m_e, m_d) if swapped else (m_d, m_e)
     wide = low + _PAD
@@ -480,7 +480,7 @@ def spherical_subspaces(tile: Tile, options: Options, work: Floats, out: Result)
     places = np.zeros(LANES, dtype=np.int64)
     held = found = 0
     zero = every(np.float32(0))
-    for i in range(len(tile.mine)):
+    for i in range(len(tile.probe_terms)):
         for j in range(0, columns, LANES):
             origin = i * (m_d + 1) * (m_e + 1) * columns + j
             of_h = problem + (low + 1) * wide * LANES

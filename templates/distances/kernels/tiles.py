@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from templates.distances.kernels.arguments import Floats, Integers, Options, Result, Tile
+from templates.distances.kernels.arguments import Array32, Integers, Options, Result, Tile
 from templates.distances.kernels.euclidean import euclidean_subspaces
 from templates.distances.kernels.lanes import LANES, compiled, inlined, take
 from templates.distances.kernels.points import points
@@ -50,28 +50,28 @@ class Grid(NamedTuple):
 class Sides(NamedTuple):
     """Probes and templates of a problem."""
 
-    stacked: Floats
+    stacked: Array32
     """Points (P, n), or the rows of lifted probes, probe after probe, (P · (m_d + 1), n)."""
-    mine: Floats
+    probe_terms: Array32
     """(P,), as of a tile."""
     m_d: int
-    feet: Floats
-    bases: Floats
+    feet: Array32
+    bases: Array32
 
 
 class Space(NamedTuple):
     """Working space of a thread, for the largest tile."""
 
-    packed: Floats
-    squares: Floats
-    product: Floats
-    work: Floats
+    packed: Array32
+    squares: Array32
+    product: Array32
+    work: Array32
     first: Integers
     """(1,): the first of the templates that are packed, or −1."""
 
 
 @inlined
-def _square(row: Floats) -> float:
+def _square(row: Array32) -> float:
     """Squared length; several sums, because a processor adds several numbers at once."""
     n = len(row)
     s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
@@ -89,7 +89,7 @@ def _square(row: Floats) -> float:
 
 
 @compiled
-def square(rows: Floats, out: Floats) -> None:
+def square(rows: Array32, out: Array32) -> None:
     """Write the squared lengths of rows, at most the largest float32 number."""
     for i in range(len(rows)):
         out[i] = np.float32(min(_square(rows[i]), np.float64(_MOST)))
@@ -97,7 +97,7 @@ def square(rows: Floats, out: Floats) -> None:
 
 @compiled
 def pack(
-    feet: Floats, bases: Floats, first: int, count: int, spherical: bool, space: Space, wide: int
+    feet: Array32, bases: Array32, first: int, count: int, spherical: bool, space: Space, wide: int
 ) -> None:
     """Stack the rows of some templates, all feet first, (m + 1, wide, n), with zeros behind them.
 
@@ -131,7 +131,7 @@ def pack(
 
 
 @compiled
-def solve(tile: Tile, options: Options, work: Floats, out: Result) -> int:
+def solve(tile: Tile, options: Options, work: Array32, out: Result) -> int:
     """Write the distances of a tile; return the number of −1, or of groups with one."""
     if tile.m_d == 0:
         return points(tile, options, out)
@@ -147,7 +147,7 @@ def compute(
     options: Options,
     space: Space,
     counter: Integers,
-    out: Floats,
+    out: Array32,
     stride: int,
     inexact: Integers,
 ) -> int:
@@ -185,7 +185,7 @@ def compute(
             space.packed[: columns * n].reshape(columns, n).T,
             product.reshape(rows, columns),
         )
-        tile = Tile(product, sides.mine[row:end], space.squares[:wide], m_d, m_e)
+        tile = Tile(product, sides.probe_terms[row:end], space.squares[:wide], m_d, m_e)
         if stride:
             result = Result(out[row * stride + first :], stride, count)
         else:

@@ -208,11 +208,11 @@ def test_sizes_that_do_not_fit_are_refused(
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
-        (b"strategy,accuracy\n", "is no JSON file"),
-        (b"\xff\xfe\x00", "is no JSON file"),
-        (b"[" * 100_000, "is no JSON file"),
-        (b"[1]", "is no results.json of `veilface evaluate`"),
-        (json.dumps({"format": "veilface audit"}).encode(), "is no results.json of `veilface"),
+        (b"strategy,accuracy\n", "is not a JSON file"),
+        (b"\xff\xfe\x00", "is not a JSON file"),
+        (b"[" * 100_000, "is not a JSON file"),
+        (b"[1]", "is not a results.json of `veilface evaluate`"),
+        (json.dumps({"format": "veilface audit"}).encode(), "is not a results.json of `veilface"),
     ],
     ids=["csv", "binary", "deep", "list", "audit"],
 )
@@ -234,7 +234,7 @@ def test_an_absent_evaluation_is_said(world: World, fairface_root: Path, tmp_pat
 def test_too_few_people_are_refused(world: World, tmp_path: Path) -> None:
     cache = tmp_path / "faces.cache"
     for sizes, reason in (
-        (("--victims", "20", "--owners", "100"), "ask for fewer victims and decoy owners"),
+        (("--victims", "20", "--owners", "100"), "ask for fewer people (victims, owners)"),
         (("--victims", "51", "--owners", "100"), "need 151 people with two photos or more, and 50"),
     ):
         ran = templates(world, world.labelled, *sizes, "--dim", "4", "--cache", cache)
@@ -254,7 +254,7 @@ def test_a_folder_that_is_too_small_is_refused(world: World, tmp_path: Path) -> 
     refused(
         templates(world, tmp_path / "people", *asked),
         "the attacker has 100 faces, a third of the people who are neither victims nor decoy "
-        "owners, and needs 200: ask for fewer victims and decoy owners",
+        "owners, and needs 200: ask for fewer people (victims, owners)",
         1,
     )
     for number in range(400, 420):

@@ -18,7 +18,7 @@ from verify.datasets import DatasetError
 def test_what_json_cannot_hold_is_refused(tmp_path, text):
     file = tmp_path / "report.json"
     file.write_text(text, encoding="utf-8")
-    with pytest.raises(CommandError, match=r"report\.json is no JSON file"):
+    with pytest.raises(CommandError, match=r"report\.json is not a JSON file"):
         read_audit(file)
 
 

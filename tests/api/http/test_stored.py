@@ -303,13 +303,13 @@ def test_nobody_audited(client: Client) -> None:
     ("text", "words"),
     [
         (None, "cannot be read"),
-        ("{", "is no JSON"),
-        ("[]", "is no report"),
-        ('{"format": "veilface evaluation", "version": 1}', "is no report"),
-        (json.dumps(report(verdicts=[{"cells": [{"value": 1}]}])), "is no report"),
-        (json.dumps(report(passed="yes")), "is no report"),
+        ("{", "is not JSON"),
+        ("[]", "is not a report"),
+        ('{"format": "veilface evaluation", "version": 1}', "is not a report"),
+        (json.dumps(report(verdicts=[{"cells": [{"value": 1}]}])), "is not a report"),
+        (json.dumps(report(passed="yes")), "is not a report"),
         *(
-            (json.dumps(report(verdicts=[{**report()["verdicts"][1], **part}])), "is no report")
+            (json.dumps(report(verdicts=[{**report()["verdicts"][1], **part}])), "is not a report")
             for part in (
                 {"passed": None},
                 {"strategy": None},

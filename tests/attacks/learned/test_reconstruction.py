@@ -67,12 +67,12 @@ def test_the_raw_descriptor_is_drawn_and_noise_is_not(
         seed=0,
     )
     rows = {each.variant: each for each in outcomes}
-    assert list(rows) == ["raw descriptor", "foot point", "noise again", "noise"]
-    assert rows["raw descriptor"].measured.value > 0.5
+    assert list(rows) == ["raw embedding", "foot point", "noise again", "noise"]
+    assert rows["raw embedding"].measured.value > 0.5
     assert rows["noise"].measured.value <= 0.15
     assert rows["noise again"].measured.value <= 0.15
     quality = [
-        float(str(rows[name].details["psnr_mean_db"])) for name in ("raw descriptor", "noise")
+        float(str(rows[name].details["psnr_mean_db"])) for name in ("raw embedding", "noise")
     ]
     assert quality[0] > quality[1] + 1
     assert not rows["noise"].judged

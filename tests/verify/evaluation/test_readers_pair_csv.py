@@ -108,7 +108,7 @@ def test_people(tmp_path: Path) -> None:
         (table(HEADER, ",b,1", OTHER), "line 2 has no path in path_a"),
         (table(HEADER, "a\0,b,1", OTHER), "line 2 has no path in path_a"),
         (table(HEADER, "a,b", OTHER), "line 2 has 2 cells, not 3"),
-        (table(HEADER, '"a"x,b,1', OTHER), "line 2 is no CSV"),
+        (table(HEADER, '"a"x,b,1', OTHER), "line 2 is not CSV"),
         (table("path_a,path_b", SAME, OTHER), "no column same"),
         (table(f"{HEADER},score", SAME, OTHER), "unknown column 'score'"),
         (table(f"{HEADER},same", SAME, OTHER), "names a column twice"),

@@ -125,7 +125,7 @@ def _fault_of(name: str, value: Any) -> str:
     """Return what is wrong with a value of the right kind, empty where nothing is."""
     if isinstance(value, str):
         if len(value) > MAX_TEXT or not value.isprintable():
-            return f"{name} is no printable text of at most {MAX_TEXT} characters"
+            return f"{name} is not printable text of at most {MAX_TEXT} characters"
     elif name in ("accuracy", "chance"):
         # What is no number compares false.
         if not 0 <= value <= 1:

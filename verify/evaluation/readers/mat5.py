@@ -58,7 +58,7 @@ def read_variable(data: bytes, name: str) -> Array | None:
     if data[:8] == b"\x89HDF\r\n\x1a\n" or data[:10] == b"MATLAB 7.3" or version == 0x0200:
         raise RefusedMat("it is of MATLAB 7.3; save it again with save(…, '-v7')")
     if order is None or version != 0x0100:
-        raise RefusedMat("it is no MATLAB file of version 5 to 7")
+        raise RefusedMat("it is not a MATLAB file of version 5 to 7")
     room = MAX_UNPACKED
     for kind, body in _elements(data[128:], order, padded=False):
         if kind == _COMPRESSED:

@@ -111,7 +111,7 @@ def _rows(text: str, faults: list[str]) -> list[_Row]:
                 )
             )
     except csv.Error as error:
-        faults.append(f"line {reader.line_num} is no CSV ({error})")
+        faults.append(f"line {reader.line_num} is not CSV ({error})")
     return rows
 
 

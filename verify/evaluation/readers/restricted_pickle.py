@@ -190,7 +190,7 @@ class _Machine:
     def append(self, values: list[object]) -> None:
         target = self.pop()
         if not isinstance(target, list):
-            raise RefusedPickle("values are appended to what is no list")
+            raise RefusedPickle("values are appended to what is not a list")
         target += values
         self.push(target)
 
