@@ -120,7 +120,7 @@ def draw_population(
     if len(several) < victims + owners:
         raise AuditError(
             f"{victims} victims and {owners} decoy owners need {victims + owners} people with two "
-            f"photos or more, and {len(several)} are there: ask for fewer victims and decoy "
+            f"photos or more, and {len(several)} are there: ask for fewer people "
             "owners, or give a larger folder"
         )
     attacked, owning = several[:victims], several[victims : victims + owners]
@@ -130,7 +130,7 @@ def draw_population(
     if len(calibrating) < LEAST_CALIBRATION:
         raise AuditError(
             f"{len(calibrating)} people are left to calibrate on, and {LEAST_CALIBRATION} are the "
-            "least: ask for fewer victims and decoy owners, or give a larger folder"
+            "least: ask for fewer people (victims, owners), or give a larger folder"
         )
     chosen = np.concatenate([photos[person] for person in calibrating])
     return Population(

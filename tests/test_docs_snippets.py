@@ -148,6 +148,7 @@ DRAWINGS = {
     ("docs/architecture.md", "                models"),
     ("docs/architecture.md", "bytes ─▶ protocol"),
     ("docs/architecture.md", "set ─▶ reader"),
+    ("docs/distances.md", "__init__ ──▶ tiles"),
     ("docs/distances.md", "probes, templates ──stack──▶"),
     ("docs/rest.md", "veilface-probe-1"),
 }

@@ -327,7 +327,7 @@ def test_no_more_compute_at_once_than_there_are_slots() -> None:
 
 
 def test_overload_is_an_answer(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(client.app.state.gate, "_room", 0)
+    monkeypatch.setattr(client.app.state.gate, "_free_places", 0)
     for answer in (
         client.put(ENROLL, files=images(photo(1))),
         client.post(VERIFY, json={"embedding": [1.0]}),

@@ -82,11 +82,11 @@ def test_no_log_line_holds_anything_private(
 
         # A defect in any package, with the worst possible text.
         for where, name in (
-            (runtime.store, "get"),
-            (runtime.store, "describe"),
-            (runtime.store, "erase"),
-            (runtime.store, "put"),
-            (runtime.store, "list"),
+            (runtime.store.subjects, "get"),
+            (runtime.store.subjects, "describe"),
+            (runtime.store.erasures, "erase"),
+            (runtime.store.subjects, "put"),
+            (runtime.store.subjects, "list"),
             (runtime.store.api_keys, "verify"),
         ):
             with monkeypatch.context() as patch:

@@ -312,10 +312,12 @@ def test_distances_obey_the_order_of_the_sets(m: int, k: int, seed: int, metric:
     subspaces = pairwise_distances(a, b, **options)
     points = pairwise_distances(x, b, **options)
     raw = np.linalg.norm(x[:, None] - y[None], axis=2)
+    # The iteration may stop short of the nearest points of two spheres (docs/method.md §3.5).
+    short = 1e-4 if metric == "spherical" else 1e-6
     assert np.isfinite(subspaces).all()
-    assert (subspaces <= points + 1e-6).all()
+    assert (subspaces <= points + short).all()
     assert (points <= raw + 1e-6).all()
-    np.testing.assert_allclose(pairwise_distances(b, a, **options), subspaces.T, atol=1e-6)
+    np.testing.assert_allclose(pairwise_distances(b, a, **options), subspaces.T, atol=short)
     euclidean = pairwise_distances(a, b, metric="euclidean", dtype=np.float64)
     assert (euclidean <= subspaces + 1e-6).all()
     # A larger set is nearer: the first m directions of a, and those with more.

@@ -66,7 +66,7 @@ ZERO = ROWS * np.array([[1], [0], [1]])
         ({"descriptors": ROWS}, "no array paths"),
         ({"paths": PATHS[:2], "descriptors": ROWS}, "expected .N,. and .N, n."),
         ({"paths": PATHS, "descriptors": ROWS[0]}, "expected .N,. and .N, n."),
-        ({"paths": PATHS[:0], "descriptors": ROWS[:0]}, "expected .N,.|no readable"),
+        ({"paths": PATHS[:0], "descriptors": ROWS[:0]}, "expected .N,.|not a readable"),
         ({"paths": PATHS, "descriptors": ROWS.astype(int)}, "descriptors is of type i8"),
         ({"paths": PATHS, "descriptors": ROWS.astype(complex)}, "descriptors is of type c16"),
         ({"paths": PATHS.astype("S"), "descriptors": ROWS}, "paths is of type S1"),
@@ -97,9 +97,9 @@ def npy(header: str, data: bytes = b"") -> bytes:
             npy("{'descr': '<f4', 'fortran_order': False, 'shape': (3, 4)}", bytes(49)),
             "not as long",
         ),
-        (npy("__import__('os').system('true')"), "no readable"),
-        (b"PK", "no readable"),
-        (b"", "no readable"),
+        (npy("__import__('os').system('true')"), "not a readable"),
+        (b"PK", "not a readable"),
+        (b"", "not a readable"),
     ],
 )
 def test_hostile_arrays_take_no_memory(tmp_path: Path, descriptors: bytes, message: str) -> None:
