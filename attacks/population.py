@@ -121,7 +121,7 @@ def draw_population(
         raise AuditError(
             f"{victims} victims and {owners} decoy owners need {victims + owners} people with two "
             f"photos or more, and {len(several)} are there: ask for fewer people "
-            "owners, or give a larger folder"
+            "(victims, owners), or give a larger folder"
         )
     attacked, owning = several[:victims], several[victims : victims + owners]
     others = rng.permutation(np.setdiff1d(np.arange(len(people)), several[: victims + owners]))
