@@ -15,6 +15,7 @@ from models.cache import EmbeddingCache
 from models.extraction import Extraction, Extractor
 from models.pack import ModelPack
 from models.sessions import default_workers
+from templates.keys.private_file import make_folder
 
 BULK = ("pack", "providers", "data_dir", "database_url", "master_key_file")
 
@@ -53,6 +54,14 @@ def bulk_pack(settings: Settings, *, flip: bool, why: str) -> ModelPack:
     )
 
 
+def open_cache(cache: Path | None, settings: Settings) -> EmbeddingCache | None:
+    """Open the sealed cache of embeddings, where one is named; make the folder that it goes to."""
+    if cache is None:
+        return None
+    make_folder(cache.parent)
+    return EmbeddingCache.open_file(cache, file_sealer(open_keyring(settings)))
+
+
 def extract(
     pack: ModelPack,
     photos: Sequence[Path],
@@ -68,9 +77,7 @@ def extract(
     CommandError
         No photo gave an embedding.
     """
-    kept = None
-    if cache is not None:
-        kept = EmbeddingCache.open_file(cache, file_sealer(open_keyring(settings)))
+    kept = open_cache(cache, settings)
     extraction = Extractor(pack, aligned=aligned, cache=kept).extract(photos)
     if kept is not None:
         kept.flush()

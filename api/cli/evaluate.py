@@ -6,12 +6,11 @@ from typing import Annotated
 import typer
 
 from api.cli.console import demo_notice, emit, message, progress, say, show
-from api.cli.descriptors import BULK, Cache, Flip
+from api.cli.descriptors import BULK, Cache, Flip, open_cache
 from api.cli.errors import UsageError, require_extra
 from api.cli.evaluation_inputs import (
     default_jobs,
     open_all,
-    open_cache,
     open_embedder,
     open_sources,
     wants_raw_flip,

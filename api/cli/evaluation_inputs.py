@@ -10,7 +10,6 @@ from api.cli.errors import CommandError, UsageError
 from api.process.opening import file_sealer, open_keyring
 from api.process.preparation import recorded_of, require_made_with
 from api.settings import Settings
-from models.cache import EmbeddingCache
 from models.sessions import default_workers
 from templates.decoys import DecoyGenerator, DecoyPool, load_source
 from templates.decoys.pool import POOL_MAGIC
@@ -144,13 +143,6 @@ def open_sources(
     if len(set(kinds)) != len(kinds):
         raise UsageError("give one pool and one generator at most: rows name the kind only")
     return sources
-
-
-def open_cache(cache: Path | None, settings: Settings) -> EmbeddingCache | None:
-    """Open the sealed cache of embeddings, where one is named."""
-    if cache is None:
-        return None
-    return EmbeddingCache.open_file(cache, file_sealer(open_keyring(settings)))
 
 
 def default_jobs() -> int:

@@ -107,8 +107,8 @@ def test_the_kernels_are_compiled_before_the_server_is_ready(tmp_path: Path) -> 
         server.stop()
     named = {name.split("-")[0].split(".")[1] for name in ready}
     assert {
-        "euclidean_points",
-        "spherical_points",
+        "compute",
+        "solve",
         "squares_inside",
         "euclidean_subspaces",
         "spherical_subspaces",
