@@ -9,9 +9,11 @@ Given vectors (embeddings, decoys, model inputs) and byte strings (photo files, 
 - all of that inside base64 (either alphabet, any alignment) and hexadecimal (either case).
 
 Runs are looked up by four consecutive numbers (or eight bytes), at every byte position of the
-blob, and a hit is then compared number by number. The comparison has a tolerance, because a server
-that embeds a photo again may differ in the last bits. It finds no run shorter than seven numbers,
-nothing that was compressed or encrypted, and no sum of a vector with something else.
+blob; a hit is then compared number by number with the vector, before and behind it too, until seven
+agree. Four alone are met by chance: a border of a picture is in many files. The comparison has a
+tolerance, because a server that embeds a photo again may differ in the last bits. It finds no run
+shorter than seven numbers, nothing that was compressed or encrypted, and no sum of a vector with
+something else.
 """
 
 import base64
@@ -25,7 +27,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
 RUN = 4  # numbers in a window
-STRIDE = 4  # between two windows of a vector: every run of RUN + STRIDE - 1 numbers holds one
+STRIDE = 4  # between two windows of a vector: every run of LEAST numbers holds one
+LEAST = RUN + STRIDE - 1
 BYTES = 16  # bytes of a byte string that must agree
 BYTE_STRIDE = 16
 TEXT_RUN = 6
@@ -74,12 +77,13 @@ class LeakSearch:
             for sign, label in ((1.0, name), (-1.0, f"{name}, negated")):
                 self._names.append(label)
                 flat.append(sign * np.asarray(values, dtype=np.float64).ravel())
-        self._windows, self._window_owner = _windows_of(flat, RUN, STRIDE)
+        self._flat = flat
+        self._windows, self._window_owner, self._window_start = _windows_of(flat, RUN, STRIDE)
         self._tables = {
             name: _Table(_keys_of(_top_halves(self._windows, name))) for name in _FLOATS
         }
         short = [vector if len(vector) <= _MOST_AS_TEXT else vector[:0] for vector in flat]
-        text_windows, self._text_owner = _windows_of(short, TEXT_RUN, 3, spread=0.02)
+        text_windows, self._text_owner, _ = _windows_of(short, TEXT_RUN, 3, spread=0.02)
         self._text = KDTree(text_windows) if len(text_windows) else None
         self._string_names = list(strings or {})
         self._chunks, self._chunk_owner = _chunks_of(list((strings or {}).values()))
@@ -129,11 +133,16 @@ class LeakSearch:
             keys |= halves[start : start + count] << np.uint64(16 * place)
         order = "little" if little else "big"
         for offset, row in self._tables[name].hits(keys):
-            numbers = _numbers(raw[offset : offset + RUN * size].tobytes(), name, little=little)
-            wanted = self._windows[row]
-            if np.allclose(numbers, wanted, rtol=RELATIVE, atol=1e-7):
-                owner = self._names[self._window_owner[row]]
-                yield Leak(owner, f"{name}, {order}-endian", offset)
+            owner, start = self._window_owner[row], self._window_start[row]
+            before = min(LEAST - RUN, start, offset // size)
+            data = raw[offset - before * size : offset + LEAST * size]
+            data = data[: len(data) // size * size]
+            wanted = self._flat[owner][start - before : start + LEAST]
+            count = min(len(data) // size, len(wanted))
+            numbers = _numbers(data[: count * size].tobytes(), name, little=little)
+            agree = np.isclose(numbers, wanted[:count], rtol=RELATIVE, atol=1e-7)
+            if _longest_run(agree) >= min(LEAST, len(self._flat[owner])):
+                yield Leak(self._names[owner], f"{name}, {order}-endian", offset)
 
     def _find_text(self, blob: bytes) -> Iterator[Leak]:
         if self._text is None:
@@ -146,6 +155,11 @@ class LeakSearch:
             distances, nearest = np.asarray(matches[0]), np.asarray(matches[1])
             for at in np.flatnonzero(np.isfinite(distances)):
                 yield Leak(self._names[self._text_owner[nearest[at]]], "decimals", offsets[at])
+
+
+def _longest_run(agree: NDArray[np.bool_]) -> int:
+    ends = np.flatnonzero(np.diff(np.concatenate([[False], agree, [False]])))
+    return int((ends[1::2] - ends[::2]).max(initial=0))
 
 
 class _Table:
@@ -174,18 +188,24 @@ def _slot(keys: NDArray[np.uint64]) -> NDArray[np.int64]:
 
 def _windows_of(
     vectors: Sequence[NDArray[np.float64]], run: int, stride: int, *, spread: float = 1e-3
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Windows of all vectors and the vector each is of; flat ones (a black border) say nothing."""
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
+    """Windows of all vectors, the vector each is of, and its place in it.
+
+    Flat ones (a black border) say nothing.
+    """
     parts, owners = [np.empty((0, run))], [np.empty(0, dtype=np.int64)]
+    starts = [np.empty(0, dtype=np.int64)]
     for owner, vector in enumerate(vectors):
         if len(vector) < run:
             continue
         rows = np.lib.stride_tricks.sliding_window_view(vector, run)[::stride]
         varied = rows.max(axis=1) - rows.min(axis=1) > spread
-        rows = rows[varied & (np.abs(rows).min(axis=1) > 1e-6)]
-        parts.append(rows)
-        owners.append(np.full(len(rows), owner, dtype=np.int64))
-    return np.ascontiguousarray(np.concatenate(parts)), np.concatenate(owners)
+        kept = np.flatnonzero(varied & (np.abs(rows).min(axis=1) > 1e-6))
+        parts.append(rows[kept])
+        owners.append(np.full(len(kept), owner, dtype=np.int64))
+        starts.append(kept * stride)
+    windows = np.ascontiguousarray(np.concatenate(parts))
+    return windows, np.concatenate(owners), np.concatenate(starts)
 
 
 def _chunks_of(strings: Sequence[bytes]) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
