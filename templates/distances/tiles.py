@@ -7,10 +7,8 @@ nearest, or counts. Every thread has a collector of its own; what they hold toge
 on which thread got which tile.
 """
 
-import os
 import threading
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
@@ -37,6 +35,7 @@ from templates.distances.metric import (
     parts,
 )
 from templates.distances.rounded import RoundedSubspaces
+from templates.distances.threads import share
 from templates.space.subspace import SubspaceBatch
 
 Array32 = NDArray[np.float32]
@@ -58,7 +57,6 @@ _SHORT = np.float32(1e-12)
 _TINY = np.float32(np.finfo(np.float32).tiny)
 _NO_LABELS = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
 
-_Item = TypeVar("_Item")
 _Kept = TypeVar("_Kept", bound="_Nearest | _Counts")
 
 
@@ -238,44 +236,7 @@ def traverse(
     return list(collectors.values())
 
 
-# --- threads, and their memory -------------------------------------------------------------------
-
-_pool = ThreadPoolExecutor(_MOST_THREADS, thread_name_prefix="veilface-distances")
-
-
-def _renew_pool() -> None:
-    """A child of a fork has none of the threads."""
-    global _pool
-    _pool = ThreadPoolExecutor(_MOST_THREADS, thread_name_prefix="veilface-distances")
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_renew_pool)
-
-
-def share(function: Callable[[_Item], object], items: Sequence[_Item], threads: int) -> None:
-    """Call a function with every item, on this thread and helpers; raise the first failure."""
-    waiting = iter(items)
-    failures: list[BaseException] = []
-
-    def work() -> None:
-        for item in waiting:
-            try:
-                function(item)
-            except BaseException as failure:
-                failures.append(failure)
-            if failures:
-                return
-
-    helpers = [_pool.submit(work) for _ in range(min(threads, len(items)) - 1)]
-    # The calling thread works too: it holds a core already, and leaves the others the rest.
-    work()
-    for helper in helpers:
-        # Who has not begun by now has nothing left to do.
-        if not helper.cancel():
-            helper.result()
-    if failures:
-        raise failures[0]
+# --- the memory of threads -----------------------------------------------------------------------
 
 
 class _ThreadSpace:

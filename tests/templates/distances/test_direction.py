@@ -9,13 +9,14 @@ FOLDER = Path(__file__).parents[3] / "templates" / "distances"
 PREFIX = "templates.distances"
 MAY = {
     "__init__": {"exact", "metric", "tiles", "torch"},
-    "tiles": {"blas", "exact", "kernels", "metric", "rounded"},
+    "tiles": {"blas", "exact", "kernels", "metric", "rounded", "threads"},
     "torch": {"exact", "metric"},
     "rounded": {"exact", "kernels", "metric"},
     "exact": {"metric"},
     "kernels": {"metric"},
     "metric": set(),
     "blas": set(),
+    "threads": set(),
 }
 
 

@@ -7,7 +7,7 @@ import threading
 
 import pytest
 
-from templates.distances.tiles import share
+from templates.distances.threads import share
 from tests.patience import PATIENCE_S
 
 
@@ -28,6 +28,21 @@ def meet(count: int) -> None:
 def test_the_caller_and_its_helpers_share_the_items() -> None:
     meet(3)
     meet(3)
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="the system places threads alone")
+def test_helpers_may_run_wherever_the_caller_may() -> None:
+    barrier = threading.Barrier(3, timeout=PATIENCE_S)
+    allowed: list[set[int]] = []
+
+    def work(_: int) -> None:
+        barrier.wait()
+        allowed.append(os.sched_getaffinity(0))
+
+    for _ in range(2):
+        allowed.clear()
+        share(work, range(3), 3)
+        assert allowed == [os.sched_getaffinity(0)] * 3
 
 
 def test_every_item_is_done_once_however_few_the_threads() -> None:
