@@ -12,6 +12,7 @@ import typer
 from rich.table import Table
 
 from api.cli.console import demo_notice, emit, say, share_done, show, table
+from api.cli.errors import FAILED
 from api.process.preparation import recorded_of
 from attacks.outcomes import Scheme
 from attacks.report import Document
@@ -20,7 +21,6 @@ from attacks.verdict import LIMITS
 from models.pack import ModelPack
 from templates.keys.private_file import make_folder, replace_public
 
-FAILED = 1
 Out = Annotated[Path, typer.Option(help="Folder of the report.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed for everything random.")]
 

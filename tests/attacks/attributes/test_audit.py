@@ -3,11 +3,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from attacks.attributes.audit import ATTACK, attribute_outcomes
+from attacks.attributes.audit import (
+    ATTACK,
+    AttributeAuditPlan,
+    attribute_outcomes,
+    run_attribute_audit,
+)
 from attacks.attributes.measures import Leakage, measure
+from attacks.attributes.plan import AttributePlan
 from attacks.attributes.rows import AttributeRow
 from attacks.outcomes import RAW_SCHEME, AttackOutcome, Knowledge, Property, Scheme
 from attacks.verdict import judge
+from tests.attacks.attributes.people import faces
 from verify.metrics import wilson
 
 SERVICE = Scheme("adversarial", "generator", 32)
@@ -128,3 +135,25 @@ def test_predictions_that_know_nothing_are_no_leakage(deal: np.ndarray) -> None:
 
 def test_no_rows_are_no_outcomes() -> None:
     assert attribute_outcomes([], audited=SERVICE) == []
+
+
+def test_an_audit_reports_its_progress_and_the_sizes_of_its_parts() -> None:
+    shares: list[float] = []
+    plan = AttributeAuditPlan(
+        schemes=(RAW_SCHEME, Scheme("adversarial", "pool", 4)),
+        attributes=("gender",),
+        attackers=AttributePlan(feature_ks=(10,), lifts=2),
+        lifting=110,
+        attack=120,
+        attacked=30,
+    )
+    audit = run_attribute_audit(plan, faces(230, seed=1), faces(40, seed=2), progress=shares.append)
+    assert shares == sorted(shares)
+    assert (shares[0], shares[-1]) == (0, 1)
+    assert {row.scheme for row in audit.rows} == set(plan.schemes)
+    assert audit.settings() == {
+        "lifting": 110,
+        "attack": 120,
+        "attacked": 30,
+        "duplicates_dropped": 0,
+    }

@@ -1,0 +1,44 @@
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from attacks import audit
+from attacks.audit import AuditPlan, run_audit
+from models.extraction import Extraction
+from models.pack import ModelPack
+from tests.attacks.stored.systems import OWNERS, VICTIMS, M, generator, system_of
+from tests.verify.synthetic import draw_people
+
+
+def test_an_audit_of_two_schemes_reports_its_progress(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The people are real to the audit; its systems and attacks are small ones."""
+    people = draw_people(900, photos=(4, 2, 3), noise=0.35, seed=3)
+    faces = Extraction(people.descriptors, [Path(str(i)) for i in range(len(people.names))], [], 0)
+    pack = SimpleNamespace(info=SimpleNamespace(embedder_sha256="ab" * 32, preprocessing={}))
+    schemes: list[Any] = []
+
+    def enroll(_population: object, scheme: Any, *_: object, **options: Any) -> Any:
+        schemes.append((str(scheme), options["pool_of_owners"]))
+        return system_of("generator")
+
+    monkeypatch.setattr(audit, "enroll_victims", enroll)
+    monkeypatch.setattr(audit, "_attacks", lambda *_: [list, list, list])
+    shares: list[float] = []
+    result = run_audit(
+        AuditPlan(dims=(M,), victims=VICTIMS, owners=OWNERS),
+        faces,
+        people.names,
+        pack=cast("ModelPack", pack),
+        decoys=generator(),
+        aligned=True,
+        start_service=None,
+        progress=shares.append,
+    )
+    assert shares == sorted(shares)
+    assert (len(shares), shares[0], shares[-1]) == (7, 0, 1)
+    assert [name for name, compared in schemes if compared] == result.comparisons
+    assert len(schemes) == len(result.schemes) == 2
+    assert result.settings["victims"] == VICTIMS
+    assert not result.settings["service"]
