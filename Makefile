@@ -3,14 +3,19 @@ PYTHON ?= python3
 UV := $(or $(shell command -v uv),.bootstrap/bin/uv)
 VENV := .venv/bin
 
-PYTEST = $(VENV)/pytest --numprocesses=logical --maxprocesses=8 --dist=worksteal $(PYTEST_ARGS)
+# A worker for each core, so one thread for each matrix library: several, with more threads than
+# cores between them, mostly wait for each other.
+PYTEST = OMP_NUM_THREADS=1 $(VENV)/pytest --numprocesses=logical --maxprocesses=8 --dist=worksteal $(PYTEST_ARGS)
 
-.PHONY: demo extras test test-all lint types audit sbom lock clean
+# Bytecode is kept: without it, every process that a test starts compiles all that it imports.
+unexport PYTHONDONTWRITEBYTECODE
+
+.PHONY: demo extras test test-all lint types audit sbom wheels lock clean
 
 demo: .venv/core
 	$(VENV)/veilface demo
 
-# What the service does without and some commands need: `make extras EXTRAS=decoys,evaluate`.
+# What the service does without and some commands need: `make extras EXTRAS=evaluate,audit`.
 EXTRAS ?= all
 extras: .venv/core
 	$(UV) pip install --quiet --python $(VENV)/python --constraint requirements-dev.lock -e ".[$(EXTRAS)]"
@@ -43,6 +48,16 @@ sbom: | $(UV)
 	mkdir -p dist
 	$(UV) tool run --quiet --from cyclonedx-bom==7.5.0 cyclonedx-py requirements requirements.lock \
 		--output-reproducible --output-file dist/sbom.json
+
+# The wheels of both distributions; that of the client must do alone, in an environment of its own.
+wheels: | $(UV)
+	rm -rf dist/wheels .bootstrap/alone
+	for folder in . clients/python; do $(UV) build --quiet --wheel --out-dir dist/wheels \
+		--build-constraints deploy/build.lock --require-hashes $$folder || exit 1; done
+	$(UV) venv --quiet --python '>=3.11' .bootstrap/alone
+	$(UV) pip install --quiet --python .bootstrap/alone/bin/python --constraint requirements.lock dist/wheels/veilface_client-*.whl
+	.bootstrap/alone/bin/python -I -W error -c "import veilface_client, sys; sys.exit('api' in sys.modules)"
+	.bootstrap/alone/bin/veilface-client --version
 
 .venv/core: requirements.lock pyproject.toml | $(UV)
 	test -x $(VENV)/python || $(UV) venv --quiet --python '>=3.11' .venv

@@ -8,10 +8,12 @@ so.
 
 import ipaddress
 import os
+import re
 import shlex
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
+from urllib.parse import urlsplit
 
 import limits
 from pydantic import Field, ValidationError, ValidationInfo, field_validator
@@ -25,13 +27,43 @@ from pydantic_settings import (
 
 from api.http.errors import StartError
 from templates.contract.levels import LEVEL_NAME
+from templates.contract.liveness_policy import LivenessPolicy
 
 ENV_PREFIX = "VEILFACE_"
 CONFIG_VARIABLE = "VEILFACE_CONFIG"
 DEFAULT_CONFIG_FILE = Path("veilface.toml")
 MIB = 1024 * 1024
 OFF = "off"
-NO_PROXIES = "none"
+NONE = NO_PROXIES = "none"
+
+_ORIGIN = re.compile(
+    r"(?:https://(?!.*:443$)|http://(?!.*:80$))(?:[a-z0-9.-]+|\[[0-9a-f:]+\])(?::[0-9]{1,5})?"
+)
+
+
+_HOST = re.compile(r"[a-z0-9._-]+|[0-9a-f:.]+")
+
+
+def _is_endpoint(url: str) -> bool:
+    """Whether events may be sent to a URL, and can be."""
+    try:
+        parts = urlsplit(url)
+        host, port = parts.hostname or "", parts.port
+        host.encode("idna")  # as the resolver does: no empty label, none that is too long
+    except ValueError:
+        return False
+    if not url.isascii() or not url.isprintable() or " " in url or "@" in parts.netloc:
+        return False
+    if _HOST.fullmatch(host) is None or port == 0:
+        return False
+    return parts.scheme == "https" or (parts.scheme == "http" and _is_loopback(host))
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
 def config_file() -> Path | None:
@@ -91,6 +123,11 @@ class Settings(BaseSettings):
         None,
         description="The contract that `veilface calibrate` wrote. Unset: `contract.json` in "
         "`data_dir`.",
+    )
+    accept_weak_privacy: bool = Field(
+        False,
+        description="Serve a contract whose privacy failed its limit, or was not measured. The "
+        "log and the page say so.",
     )
     decoys_file: Path | None = Field(
         None,
@@ -163,6 +200,12 @@ class Settings(BaseSettings):
         "and from nobody else, `X-Forwarded-For` and `X-Forwarded-Proto` are believed. `none`: "
         "from nobody. `*`: from everybody, so that a client can choose its address.",
     )
+    cors_origins: str = Field(
+        NONE,
+        description="Origins of web pages that may call `/v1/` from a browser, separated by "
+        "commas, as `https://HOST` or `https://HOST:PORT`: exactly these, and never with cookies. "
+        "`none`: the service's own page alone. `*` is refused (docs/rest.md says why).",
+    )
     rate_limit_key: str = Field(
         "600/minute",
         description="Requests that one API key may make in any such time, as `COUNT/second`, "
@@ -188,12 +231,26 @@ class Settings(BaseSettings):
         "the contract's default decides, or this level if the default is below it. Unset: any. An "
         "API key may have a stricter one of its own.",
     )
-    lockout_after: int = Field(
-        5,
+    liveness: LivenessPolicy = Field(
+        LivenessPolicy.OFF,
+        description="What a verification must pass as a sign of a living person: `off`, `passive` "
+        "(the photos look live), `active` (a challenge of head movements) or `both` "
+        "(docs/liveness.md). The contract or an API key may ask for more.",
+    )
+    liveness_levels: str | None = Field(
+        None,
+        description="The same for single security levels, as `LEVEL=POLICY`, separated by commas: "
+        "what a level asks for comes on top of `liveness`. It binds no client that may choose "
+        "another level (docs/liveness.md). Unset: no level asks for more.",
+    )
+    lockout_after: int | None = Field(
+        None,
         ge=0,
         le=1000,
         description="Rejected verifications of one subject in a row after which it is locked for "
-        "a while; 0: never.",
+        "a while; 0: never. Unset: 5, or 10 where every verification must look live (`passive` or "
+        "`both`) and the contract's liveness calibration shows that attacks are resisted "
+        "(docs/liveness.md).",
     )
     lockout_first_s: float = Field(
         30.0,
@@ -247,7 +304,12 @@ class Settings(BaseSettings):
         description="Largest photo, in pixels; checked before decoding, which takes up to 17 "
         "bytes a pixel.",
     )
-    max_images: int = Field(10, ge=1, le=10, description="Maximum number of photos per enrollment.")
+    max_images: int = Field(
+        10,
+        ge=1,
+        le=10,
+        description="Maximum number of photos per enrollment; a verification takes five at most.",
+    )
     default_tenant: str = Field(
         "default",
         pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$",
@@ -266,10 +328,25 @@ class Settings(BaseSettings):
         description="Seconds between two rounds in which a worker removes expired records and, "
         "on SQLite, empties the write-ahead log; the first is at the start.",
     )
+    webhook_url: str | None = Field(
+        None,
+        description="Where enrollments, erasures and lockouts are told, as `https://…`, or "
+        "`http://127.0.0.1:…` on this machine (docs/webhooks.md). Only this setting names it. "
+        "Unset: nowhere.",
+    )
+    webhook_secret_file: Path | None = Field(
+        None,
+        validate_default=True,
+        description="File with the secrets that webhooks are signed with, mode 0600, one a line as "
+        "`whsec_` and base64; the first is current.",
+    )
     log_level: Literal["debug", "info", "warning", "error"] = Field(
         "info", description="Least severe log line that is written."
     )
     web_page: bool = Field(True, description="Serve the web page at `/` (docs/web-page.md).")
+    api_docs: bool = Field(
+        True, description="Serve the reference of the API at `/docs`, for whoever reaches it."
+    )
     audit_report_file: Path | None = Field(
         None,
         description="The `report.json` that `veilface audit templates` or `veilface audit "
@@ -341,6 +418,19 @@ class Settings(BaseSettings):
                     ) from None
         return ",".join(names)
 
+    @field_validator("cors_origins")
+    @classmethod
+    def _known_origins(cls, value: str) -> str:
+        origins = [part.strip() for part in value.split(",") if part.strip()]
+        if not origins or origins == [NONE]:
+            return NONE
+        if not all(map(_ORIGIN.fullmatch, origins)):
+            raise ValueError(
+                "list origins as browsers send them, separated by commas: https://HOST or "
+                "https://HOST:PORT, in lower case, without a path, the scheme's own port or *"
+            )
+        return ",".join(origins)
+
     @field_validator("operations_port")
     @classmethod
     def _apart(cls, value: int | None, info: ValidationInfo) -> int | None:
@@ -355,6 +445,25 @@ class Settings(BaseSettings):
             raise ValueError("give tls_certificate and tls_key, or neither")
         return value
 
+    @field_validator("webhook_url")
+    @classmethod
+    def _known_endpoint(cls, value: str | None) -> str | None:
+        if not value:
+            return None
+        if not _is_endpoint(value):
+            raise ValueError(
+                "write https://HOST/PATH or https://HOST:PORT/PATH in ASCII, without a password; "
+                "http is for this machine alone, as http://127.0.0.1:PORT/PATH"
+            )
+        return value
+
+    @field_validator("webhook_secret_file")
+    @classmethod
+    def _both_of_webhooks(cls, value: Path | None, info: ValidationInfo) -> Path | None:
+        if (value is None) != (info.data.get("webhook_url") is None):
+            raise ValueError("give webhook_url and webhook_secret_file, or neither")
+        return value
+
     @field_validator("lockout_longest_s")
     @classmethod
     def _not_below_the_first(cls, value: float, info: ValidationInfo) -> float:
@@ -365,15 +474,22 @@ class Settings(BaseSettings):
     @field_validator("lockout_disable_at")
     @classmethod
     def _not_before_a_lock(cls, value: int, info: ValidationInfo) -> int:
-        if value < info.data.get("lockout_after", value):
+        if value < (info.data.get("lockout_after") or 0):
             raise ValueError("must not be below lockout_after")
+        return value
+
+    @field_validator("liveness_levels")
+    @classmethod
+    def _known_policies(cls, value: str | None) -> str | None:
+        if value is not None:
+            _policies(value)
         return value
 
     @field_validator("master_key_variable", "master_key_command")
     @classmethod
     def _one_source_of_keys(cls, value: str | None, info: ValidationInfo) -> str | None:
         earlier = [info.data.get(name) for name in ("master_key_file", "master_key_variable")]
-        if value is not None and any(found is not None for found in earlier):
+        if value is not None and any(source is not None for source in earlier):
             raise ValueError(
                 "give one of master_key_file, master_key_variable and master_key_command"
             )
@@ -437,9 +553,33 @@ class Settings(BaseSettings):
         return self.decoys_file or self.data_dir / "decoys.veil"
 
     @property
+    def liveness_of_levels(self) -> dict[str, LivenessPolicy]:
+        """What single security levels ask for on top of ``liveness``."""
+        return _policies(self.liveness_levels or "")
+
+    @property
+    def allowed_origins(self) -> frozenset[str]:
+        """Origins of other pages that may call."""
+        return frozenset() if self.cors_origins == NONE else frozenset(self.cors_origins.split(","))
+
+    @property
     def resolved_compute_slots(self) -> int:
         """Compute slots, with the default filled in."""
         return self.compute_slots or processors()
+
+
+def _policies(text: str) -> dict[str, LivenessPolicy]:
+    policies: dict[str, LivenessPolicy] = {}
+    for part in filter(None, (part.strip() for part in text.split(","))):
+        level, _, policy = part.partition("=")
+        known = policy in list(LivenessPolicy)
+        if not (known and LEVEL_NAME.fullmatch(level)) or level in policies:
+            raise ValueError(
+                "write LEVEL=POLICY once for each level, separated by commas; a policy is one of "
+                + ", ".join(LivenessPolicy)
+            )
+        policies[level] = LivenessPolicy(policy)
+    return policies
 
 
 def processors() -> int:

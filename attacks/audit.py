@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -10,29 +10,38 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attacks.chosen_enrollment import chosen_enrollment
+from attacks.comparer import link_by_comparer
 from attacks.databases import link_databases
+from attacks.decision_walk import VICTIMS, reconstruct_from_decisions
 from attacks.errors import AuditError
+from attacks.further_faces import SAME_PHOTO, FurtherFaces, strangers_among
 from attacks.hill_climbing import Ask, climb_service, dictionary_outcomes
+from attacks.holder_keys import Guess, guess_with_and_without_holder_keys
 from attacks.learned import FaceCrops, invert, reconstruct
 from attacks.learned.inverter import SECONDS, Inverter
-from attacks.likelihood import find_least_decoy_like, likeliest_guesses
+from attacks.likelihood import (
+    find_least_decoy_like,
+    likeliest_guess,
+    likeliest_guesses,
+    simulate_unlimited,
+)
 from attacks.linkage import link
 from attacks.outcomes import GENERATED, POOLED, AttackOutcome, Scheme
 from attacks.population import LEAST_FITTED, Population, draw_population, without_decoy_people
 from attacks.renewability import renew
+from attacks.several_templates import several_templates
 from attacks.stored import template_attacks
+from attacks.stored.foot_point import foot_points
 from attacks.system import System, enroll_victims, owners_pool
 from models.extraction import Extraction
 from models.pack import ModelPack
 from templates.contract import wire
 from templates.contract.binding import embedding_id
 from templates.contract.document import Contract
-from templates.decoys import DecoyGenerator, DecoyPool, DecoySource
+from templates.decoys import NOISE_ENERGY, DecoyGenerator, DecoyPool, DecoySource
 from templates.space.lifting import Strategy
 from verify.evaluation.attributes import resembling
 
-SAME_PHOTO = 0.999
-"""Cosine from which two embeddings are of one photo."""
 LINKED = 120
 """Victims whose templates are linked across tenants: every two of them are compared."""
 
@@ -50,7 +59,9 @@ class AuditPlan:
 
     The contract of a service says its own scheme; without one, each of ``strategy`` and ``dims`` is
     calibrated on people who are not attacked. ``comparison`` adds templates with decoys of the
-    ``owners``. ``training_seconds`` is for each network; None trains no inverter.
+    ``owners``. ``training_seconds`` is for each network; None trains no inverter. ``decoy_faces``:
+    the number of faces that the generator was fitted to, where it is known; without it, no
+    attacker without limit is simulated.
     """
 
     strategy: Strategy = Strategy.ADVERSARIAL
@@ -62,6 +73,7 @@ class AuditPlan:
     climbed: int = 10
     attempts: int = 1000
     training_seconds: float | None = 120.0
+    decoy_faces: int | None = None
     reconstruction: bool = False
     seed: int = 0
 
@@ -85,6 +97,7 @@ def run_audit(
     decoys: DecoySource | None,
     aligned: bool,
     start_service: StartService | None,
+    further: Sequence[FurtherFaces] = (),
     progress: Callable[[float], None] = lambda _share: None,
 ) -> AuditResult:
     """Attack the templates of some people, under every scheme of a plan.
@@ -99,6 +112,8 @@ def run_audit(
         Whether the photos are aligned crops.
     start_service
         None where no service is attacked.
+    further
+        Faces that the attacker has beside those of ``faces``; the victims are left out.
     progress
         Called with the share that is done, which rises to 1.
 
@@ -122,18 +137,28 @@ def run_audit(
         fitted, population = without_decoy_people(population, seed=plan.seed)
         info = pack.info
         space = embedding_id(embedder_sha256=info.embedder_sha256, preprocessing=info.preprocessing)
-        decoys = DecoyGenerator.fit(fitted, made_with=space)
+        decoys = DecoyGenerator.fit(fitted, made_with=space, noise=NOISE_ENERGY / info.n)
+        plan = replace(plan, decoy_faces=len(fitted))
     else:
         known = population.owners.enrolled
         if isinstance(decoys, DecoyPool):
             _require_strangers(decoys, population)
+    beside = [
+        strangers_among(more, faces.descriptors, identities, population.victims.shown)
+        for more in further
+    ]
+    brought = np.concatenate([known[:0], *(more.descriptors for more in beside)])
+    kind = " and ".join(["the audited set", *(more.name for more in beside)])
     schemes = _schemes(plan, decoys, population)
     crops = FaceCrops(pack, faces, aligned=aligned) if plan.reconstruction else None
     result = AuditResult(
         [],
         [],
         [str(audited.scheme) for audited in schemes if audited.pool_of_owners],
-        _settings(plan, population, decoys, service=start_service is not None),
+        {
+            **_settings(plan, population, decoys, service=start_service is not None),
+            "further_attacker_faces": [more.to_json() for more in beside],
+        },
     )
     progress(0.0)
     for number, audited in enumerate(schemes):
@@ -148,8 +173,10 @@ def run_audit(
             seed=plan.seed,
         )
         result.schemes.append({**audited.scheme.to_json(), **_operating_point(system)})
-        attacker_faces = known[:0] if audited.pool_of_owners else known
-        attacks = _attacks(plan, system, population, faces, attacker_faces, crops, start_service)
+        attacker_faces = brought if audited.pool_of_owners else np.concatenate([known, brought])
+        attacks = _attacks(
+            plan, system, population, faces, attacker_faces, crops, start_service, kind
+        )
         for done, attack in enumerate(attacks, start=1):
             result.outcomes.extend(attack())
             progress((number + done / len(attacks)) / len(schemes))
@@ -212,6 +239,7 @@ def _settings(
         "calibration": "of the people" if plan.contract is None else "of the contract",
         "contract_id": None if plan.contract is None else plan.contract.contract_id,
         "decoy_source_id": decoys.source_id,
+        "decoy_faces": plan.decoy_faces,
         "service": service,
         "attempts": plan.attempts if service else None,
         "training_seconds": plan.training_seconds,
@@ -228,25 +256,39 @@ def _attacks(
     known: NDArray[np.float32],
     crops: FaceCrops | None,
     start_service: StartService | None,
+    kind: str,
 ) -> list[Callable[[], list[AttackOutcome]]]:
     """All attacks on a scheme, in the order of the report."""
-    inverters: list[Inverter] = []
+    inverters: dict[str, Inverter] = {}
     likeliest = cache(lambda: likeliest_guesses(system, known))
     seconds = plan.training_seconds
+
+    def likelihood() -> list[AttackOutcome]:
+        outcomes = find_least_decoy_like(system, known, kind=kind, guesses=likeliest())
+        return outcomes + simulate_unlimited(
+            system, known, kind=kind, fitted_to=plan.decoy_faces, measured=outcomes
+        )
 
     def learned() -> list[AttackOutcome]:
         if seconds is None:
             return []
         inverter, outcomes = invert(system, known, seconds=seconds, seed=plan.seed)
-        inverters.append(inverter)
+        inverters["inverter"] = inverter
         return outcomes
+
+    def holders() -> list[AttackOutcome]:
+        guesses: dict[str, Guess] = {
+            "foot-point": foot_points,
+            "decoy-likelihood": likeliest_guess(system, known),
+        }
+        return guess_with_and_without_holder_keys(system, guesses | inverters)
 
     def drawn() -> list[AttackOutcome]:
         if crops is None:
             return []
         guesses = dict(likeliest())
-        for inverter in inverters:
-            guesses["inverter"] = inverter(system.templates)
+        for name, inverter in inverters.items():
+            guesses[name] = inverter(system.templates)
         return reconstruct(
             system,
             crops.of(population.rows),
@@ -271,14 +313,18 @@ def _attacks(
             )
 
     return [
-        lambda: find_least_decoy_like(system, known, guesses=likeliest()),
-        lambda: template_attacks(system, photos=population.albums),
+        likelihood,
+        lambda: template_attacks(system),
         learned,
+        holders,
+        lambda: several_templates(system, population.albums, likeliest_guess(system, known)),
         drawn,
         lambda: link(system, liftings=3, most_people=LINKED),
+        lambda: link_by_comparer(system, population.mates),
         lambda: link_databases(system, most_people=LINKED),
-        lambda: renew(system, photos=population.albums, guesses=likeliest()),
+        lambda: renew(system, guesses=likeliest()),
         lambda: chosen_enrollment(system),
         lambda: dictionary_outcomes(system),
+        lambda: reconstruct_from_decisions(system.first(VICTIMS)),
         climbs,
     ]

@@ -1,13 +1,17 @@
-"""A tenant's rotation from accounts whose templates the attacker sent itself.
+"""A tenant's rotations from accounts whose templates the attacker sent itself.
 
 Who may send templates knows what it enrolled: not the descriptor only, as of an account that was
 enrolled from photos (``attacks.databases``), but the whole set. The service stores the set's image
 under R in a basis of its own drawing, so no row of it is known to be the image of another. What no
 basis changes is the foot point, and the orthogonal projection on the directions: so every product
 of projections, applied to a foot point, gives a pair (x, R x), and some N² pairs of N accounts fix
-R. Not in the paper, which has no rotation; docs/method.md §4.9 has the measure without accounts.
+an R that they have in common. Templates of version 1 did, and it was the victims' too: a control
+shows that it opens them. Since then each template has a rotation of its own, and what the attacker
+finds out of its own ones is nobody else's. Not in the paper, which has no rotation;
+docs/method.md §4.9 has the measure without accounts.
 """
 
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -16,19 +20,22 @@ from scipy.linalg import svd
 
 from attacks.decisions import decide
 from attacks.errors import AuditError
-from attacks.linkage import secret_rotation
-from attacks.outcomes import AttackOutcome, Knowledge, Property
+from attacks.linkage import rotations_of, turned, turned_back
+from attacks.outcomes import AttackOutcome, Knowledge, Leaked, Property
 from attacks.recovery import fmr_of
 from attacks.stored.honest_probes import honest_embedding, points_inside
 from attacks.stored.nearest_neighbour import nearest_points
 from attacks.system import System
+from templates.contract.canonical import Json
 from templates.keys.randomness import Keystream
+from templates.keys.rotation import Rotation
+from templates.space.embedding import normalised
 from templates.space.subspace import SubspaceBatch
 from verify.comparisons import through_wire
 from verify.metrics import rate
 
 ACCOUNTS = (2, 5, 10, 20, 80)
-"""Accounts that the attacker enrolls: n / (m + 1) fix the rotation, and half of them open most."""
+"""Accounts that the attacker enrolls: n / (m + 1) fix a common rotation, half of them nearly."""
 ALIGNMENTS = 30
 """Most steps of the estimate; with enough accounts it is settled after two."""
 _ENOUGH_PAIRS = 2
@@ -97,7 +104,7 @@ class _Stacked(NamedTuple):
     @classmethod
     def of(cls, batch: SubspaceBatch) -> "_Stacked":
         feet = batch.feet.astype(np.float64)
-        return cls(_unit(feet), batch.bases.astype(np.float64))
+        return cls(normalised(feet), batch.bases.astype(np.float64))
 
     def project(self, number: int, points: Array64) -> Array64:
         """Orthogonal projection of (K, n) points on the directions of one template."""
@@ -124,7 +131,7 @@ def _product_pairs(sent: _Stacked, stolen: _Stacked) -> Array64:
             # A foot point is orthogonal to its own directions, and P P = P: both give no new pair.
             lengths = np.linalg.norm(here, axis=1)
             new = (lengths > _LEAST) & (lengths < 1 - _LEAST)
-            products[0].append(_unit(here[new]))
+            products[0].append(normalised(here[new]))
             products[1].append(there[new] / lengths[new, None])
         points, images = np.concatenate(products[0]), np.concatenate(products[1])
         moment += images.T @ points
@@ -141,10 +148,6 @@ def polar_factor(moment: Array64) -> Array64:
         # divide and conquer may not converge; QR iteration does, several times slower.
         left, _values, right = svd(moment, lapack_driver="gesvd")
     return np.asarray(left @ right)
-
-
-def _unit(rows: Array64) -> Array64:
-    return np.asarray(rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-300))
 
 
 def best_known_points(stolen: SubspaceBatch, accounts: SubspaceBatch, *, seed: int) -> Array64:
@@ -177,7 +180,8 @@ def chosen_enrollment(
     -------
     list of AttackOutcome
         Named ``chosen-enrollment``, one for each number of accounts; ``alignment`` in ``details``
-        is tr(R̂ᵀR) / n, 1 where the rotation is known.
+        is the largest tr(R̂ᵀR) / n of a victim's R, 1 where it is known. Then two controls that are
+        not judged: the largest number with one rotation for all templates, and the tenant's key.
 
     Raises
     ------
@@ -187,50 +191,101 @@ def chosen_enrollment(
     numbers = [number for number in sorted(set(accounts)) if 1 <= number <= len(system.attacker)]
     if not numbers:
         raise AuditError("an attacker that enrolls templates of its own needs faces to lift")
-    rotation = secret_rotation(system, "chosen enrollment")
-    sent = system.lift(system.attacker[: max(numbers)], "templates that the attacker enrolls")
-    enrolled = _as_stored(system, sent, rotation)
-    victims = through_wire(
-        system.templates.rotated(rotation), contract_id=system.contract.contract_id
-    )
+    most, people = max(numbers), len(system.templates)
+    tenant = "chosen enrollment"
+    of_accounts = rotations_of(system, tenant, "account", most)
+    of_victims = rotations_of(system, tenant, "victim", people)
+    sent = system.lift(system.attacker[:most], "templates that the attacker enrolls")
     outcomes = []
-    for number in numbers:
-        sides = Sides(sent[:number], enrolled[:number])
+    common = of_accounts[:1]
+    for number, enrolled, rotations, judged in (
+        *((number, of_accounts[:number], of_victims, True) for number in numbers),
+        (most, common * most, common * people, False),
+    ):
+        sides = Sides(sent[:number], _as_stored(system, sent[:number], enrolled))
         estimate = estimate_from_sets(sides)
+        victims = _through_wire(system, turned(system.templates, rotations))
         points = best_known_points(victims, sides.stolen, seed=system.seed) @ estimate
-        probes = np.ascontiguousarray(points, dtype=np.float32)
-        decided = decide(
-            probes, system.templates, system.contract, system.points, system.level, paired=True
-        )
-        accepted = decided.accepted & honest_embedding(probes)
         outcomes.append(
-            AttackOutcome(
-                attack="chosen-enrollment",
-                variant=f"{number} accounts",
-                breaks=Property.IMPERSONATION,
-                knowledge=Knowledge.TEMPLATES,
+            _outcome(
+                system,
+                points,
+                variant=f"{number} accounts" + ("" if judged else ", one rotation for all"),
+                leaked=Leaked.MASTER_KEY,
                 assumption=f"The right to send templates and embeddings, with which the attacker "
                 f"has enrolled {number} templates of its own lifting, and the tenant's whole "
-                "stolen database, whose key is secret; it estimates the rotation from the "
+                "stolen database, whose key is secret; it estimates a rotation from the "
                 "templates that it sent and what became of them, and sends a unit point of every "
-                "victim's template, turned back, as an embedding; success is acceptance by "
-                "threshold and cohort test",
-                scheme=system.scheme,
-                level=system.level.name,
-                measured=rate(int(np.count_nonzero(accepted)), len(accepted)),
-                chance=fmr_of(system.level),
-                details={
-                    "accounts": number,
-                    "alignment": float(np.einsum("ij,ij->", estimate, rotation) / sent.n),
-                    "accepted_without_cohort_test": float(decided.near.mean()),
-                },
+                "victim's template, turned back, as an embedding; success is acceptance"
+                + ("" if judged else " (a control: all templates are turned alike)"),
+                judged=judged,
+                details={"accounts": number, "alignment": _alignment(estimate, rotations)},
             )
         )
-    return outcomes
+    stolen = _through_wire(system, turned(system.templates, of_victims))
+    return [
+        *outcomes,
+        _outcome(
+            system,
+            points_inside(turned_back(stolen, of_victims), seed=system.seed),
+            variant="the tenant's key",
+            leaked=Leaked.HOLDER_KEYS,
+            assumption="The right to send embeddings, the tenant's whole stolen database, and its "
+            "key, which gives every template's rotation; success is acceptance of a unit point of "
+            "the template (a control)",
+            judged=False,
+            details={},
+        ),
+    ]
 
 
-def _as_stored(system: System, sent: SubspaceBatch, rotation: Array64) -> SubspaceBatch:
-    """Rotate and store templates as the service does: in a fresh basis, and in float16."""
+def _outcome(
+    system: System,
+    points: NDArray[np.floating],
+    *,
+    variant: str,
+    leaked: Leaked,
+    assumption: str,
+    judged: bool,
+    details: Mapping[str, Json],
+) -> AttackOutcome:
+    """Send one point for each victim; report acceptance."""
+    probes = np.ascontiguousarray(points, dtype=np.float32)
+    decided = decide(
+        probes, system.templates, system.contract, system.points, system.level, paired=True
+    )
+    accepted = decided & honest_embedding(probes)
+    return AttackOutcome(
+        attack="chosen-enrollment",
+        variant=variant,
+        breaks=Property.IMPERSONATION,
+        leaked=leaked,
+        knowledge=Knowledge.TEMPLATES,
+        assumption=assumption,
+        scheme=system.scheme,
+        level=system.level.name,
+        measured=rate(int(np.count_nonzero(accepted)), len(accepted)),
+        chance=fmr_of(system.level),
+        judged=judged,
+        details=details,
+    )
+
+
+def _alignment(estimate: Array64, rotations: Sequence[Rotation]) -> float:
+    """Largest tr(R̂ᵀR) / n of the rotations R."""
+    n = len(estimate)
+    # tr(R̂ᵀR) is the sum of the products of the columns of R̂, and of R, which are R e.
+    columns = np.ascontiguousarray(estimate.T)
+    eye = np.eye(n)
+    return max(float(np.vdot(columns, one.turned(eye))) / n for one in set(rotations))
+
+
+def _as_stored(system: System, sent: SubspaceBatch, rotations: Sequence[Rotation]) -> SubspaceBatch:
+    """Turn and store templates as the service does: in a fresh basis, and in float16."""
     with Keystream.seeded("audit", system.seed, "bases of the service") as stream:
         spanned = SubspaceBatch.through(sent.feet, sent.bases, stream=stream)
-    return through_wire(spanned.rotated(rotation), contract_id=system.contract.contract_id)
+    return _through_wire(system, turned(spanned, rotations))
+
+
+def _through_wire(system: System, batch: SubspaceBatch) -> SubspaceBatch:
+    return through_wire(batch, contract_id=system.contract.contract_id)

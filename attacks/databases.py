@@ -1,22 +1,26 @@
-"""Linking two stolen databases whose tenants rotate: what many templates tell of the rotation.
+"""Linking two stolen databases whose tenants rotate: what many templates tell of the rotations.
 
-A secret rotation hides one template, but it is one for all templates of a tenant. The attacker
-knows how un-rotated templates are spread (decoys come from a generator that clients have), so the
-mean and the second moments of a stolen database tell which axes were turned where, and accounts
-of the attacker's own, in both databases, tell more. Neither is in the paper.
+A secret rotation hides one template. Were it one for all templates of a tenant, as in version 1,
+the mean and the second moments of a stolen database would tell which axes were turned where, for
+the attacker knows how un-rotated templates are spread (decoys come from a generator that clients
+have); and accounts of the attacker's own, in both databases, would tell more. Where each template
+has a rotation of its own, no two have anything in common to estimate. Both are measured: the first
+as a control that the attack is one. Neither is in the paper.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from attacks.errors import AuditError
-from attacks.linkage import linkage_outcome, nearest_similarities, secret_rotation
-from attacks.outcomes import AttackOutcome, Knowledge
+from attacks.linkage import linkage_outcome, nearest_similarities, rotations_of, turned
+from attacks.outcomes import AttackOutcome, Knowledge, Leaked
 from attacks.system import System
 from attacks.unlinkability import unlinkability
 from templates.keys.randomness import Keystream
+from templates.keys.rotation import Rotation
 from templates.space.subspace import SubspaceBatch
 from verify.cohort import client_source
 
@@ -82,7 +86,7 @@ def estimate_rotation(
     *,
     steps: int = ALIGNMENTS,
 ) -> Array64:
-    """Estimate the rotation of a tenant from its database.
+    """Estimate the rotation of a tenant that has one for all, from its database.
 
     Parameters
     ----------
@@ -144,7 +148,7 @@ def signature_cosines(
     """Cosines of signatures: similarities to the accounts inside each tenant, (T, U).
 
     A signature holds inner products of foot points and spherical similarities, which no rotation
-    changes; every entry is standardised over the templates of its tenant.
+    that both sides share changes; every entry is standardised over the templates of its tenant.
     """
     sides = []
     for batch, accounts in ((left, left_accounts), (right, right_accounts)):
@@ -167,23 +171,38 @@ class _Database:
     moments: Moments
 
 
-def _steal(
+@dataclass(frozen=True, eq=False, repr=False)
+class _Tenant:
+    """A tenant's templates before they are turned: of the victims, of the accounts, of others."""
+
+    name: str
+    lifted: SubspaceBatch
+    victims: int
+    accounts: int
+
+    def own_rotations(self, system: System) -> list[Rotation]:
+        """One of each template."""
+        return rotations_of(system, f"database {self.name}", "template", len(self.lifted))
+
+    def stolen(self, rotations: Sequence[Rotation]) -> _Database:
+        """The database, each template in its rotation."""
+        stored = turned(self.lifted, rotations)
+        last = self.victims + self.accounts
+        return _Database(stored[: self.victims], stored[self.victims : last], Moments.of(stored))
+
+
+def _enrolled(
     system: System,
     tenant: str,
     people: NDArray[np.float32],
     own: NDArray[np.float32],
     strangers: int,
-) -> _Database:
+) -> _Tenant:
     with Keystream.seeded("audit", system.seed, "strangers", tenant) as stream:
         others = client_source(system.lifter.source).draw(strangers, 1, stream=stream)[:, 0, :]
     members = np.ascontiguousarray(np.concatenate([people, own, others]), dtype=np.float32)
     lifted = system.lift(members, f"database of the {tenant} tenant")
-    stolen = lifted.rotated(secret_rotation(system, tenant, "database"))
-    return _Database(
-        victims=stolen[: len(people)],
-        accounts=stolen[len(people) : len(people) + len(own)],
-        moments=Moments.of(stolen),
-    )
+    return _Tenant(tenant, lifted, len(people), len(own))
 
 
 def link_databases(
@@ -209,6 +228,7 @@ def link_databases(
     list of AttackOutcome
         Named ``database-linkage``: for each number of accounts, by the estimated rotation
         (whitened foot points, and nearest points) and, where there are accounts, by signatures.
+        Last, for the largest number, a control that is not judged: one rotation for a tenant.
 
     Raises
     ------
@@ -219,40 +239,59 @@ def link_databases(
         raise AuditError("the moments of a database need strangers: ask for one or more")
     numbers = [number for number in sorted(set(accounts)) if number <= len(system.attacker)]
     own = system.attacker[: max(numbers, default=0)]
-    first = _steal(system, "first", system.victims.enrolled[:most_people], own, strangers)
-    second = _steal(system, "second", system.victims.fresh[:most_people], own, strangers)
+    tenants = [
+        _enrolled(system, name, people[:most_people], own, strangers)
+        for name, people in (("first", system.victims.enrolled), ("second", system.victims.fresh))
+    ]
     with Keystream.seeded("audit", system.seed, "strangers", "attacker") as stream:
         drawn = client_source(system.lifter.source).draw(strangers, 1, stream=stream)[:, 0, :]
     lifted = Moments.of(system.lift(drawn, "database lifted by the attacker"))
-    outcomes = []
-    for number in numbers:
-        left, right = (
-            side.victims.rotated(
-                estimate_rotation(side.moments, lifted, side.accounts.feet[:number], own[:number]).T
-            )
-            for side in (first, second)
+    rotated = [tenant.own_rotations(system) for tenant in tenants]
+    alike = [[own_rotations[0]] * len(own_rotations) for own_rotations in rotated]
+    stolen, control = (
+        [tenant.stolen(turns) for tenant, turns in zip(tenants, side, strict=True)]
+        for side in (rotated, alike)
+    )
+    settings = [(number, stolen) for number in numbers] + [(len(own), control)] * bool(numbers)
+    return [
+        linkage_outcome(
+            system,
+            unlinkability(score[None], permutations=permutations, seed=system.seed),
+            attack="database-linkage",
+            variant=f"{number} accounts, {'one rotation a tenant, ' if sides is control else ''}"
+            f"{name}",
+            leaked=Leaked.MASTER_KEY,
+            knowledge=Knowledge.TEMPLATES,
+            assumption=f"The whole databases of two tenants, whose keys are secret, how templates "
+            f"are lifted, and {number} accounts with both, with the descriptors enrolled there; "
+            "success is D_sys of the templates of the people in both"
+            + (" (a control: each tenant has one rotation for all)" if sides is control else ""),
+            judged=sides is stolen,
+            details={"accounts": number, "strangers": strangers},
         )
-        scores = {
-            "estimated rotations, foot points": whitened_cosines(left, right, lifted),
-            "estimated rotations, nearest points": nearest_similarities(left, right),
-        }
-        if number:
-            scores["signatures"] = signature_cosines(
-                first.victims, second.victims, first.accounts[:number], second.accounts[:number]
-            )
-        outcomes += [
-            linkage_outcome(
-                system,
-                unlinkability(score[None], permutations=permutations, seed=system.seed),
-                attack="database-linkage",
-                variant=f"{number} accounts, {name}",
-                knowledge=Knowledge.TEMPLATES,
-                assumption=f"The whole databases of two tenants, whose keys are secret, how "
-                f"templates are lifted, and {number} accounts with both, with the descriptors "
-                "enrolled there; success is D_sys of the templates of the people in both",
-                judged=True,
-                details={"accounts": number, "strangers": strangers},
-            )
-            for name, score in scores.items()
-        ]
-    return outcomes
+        for number, sides in settings
+        for name, score in _scores(sides, lifted, own[:number]).items()
+    ]
+
+
+def _scores(
+    sides: Sequence[_Database], lifted: Moments, own: NDArray[np.float32]
+) -> dict[str, Array64]:
+    """Scores of the victims of both tenants, with the accounts of these descriptors."""
+    number = len(own)
+    left, right = (
+        side.victims.rotated(
+            estimate_rotation(side.moments, lifted, side.accounts.feet[:number], own).T
+        )
+        for side in sides
+    )
+    scores = {
+        "estimated rotations, foot points": whitened_cosines(left, right, lifted),
+        "estimated rotations, nearest points": nearest_similarities(left, right),
+    }
+    if number:
+        first, second = sides
+        scores["signatures"] = signature_cosines(
+            first.victims, second.victims, first.accounts[:number], second.accounts[:number]
+        )
+    return scores

@@ -1,4 +1,4 @@
-"""The decision of the service, on arrays: threshold alone, and with the cohort test."""
+"""The decision of the service, on arrays."""
 
 from typing import NamedTuple
 
@@ -8,28 +8,18 @@ from numpy.typing import NDArray
 from templates.contract.document import Calibration, Contract, Level
 from templates.distances import paired_distances, pairwise_distances, similarity
 from templates.space.subspace import SubspaceBatch
-from verify.cohort import Probes, cohort_statistics
-
-
-class Decisions(NamedTuple):
-    """What was accepted; bool of shape (P, T), or (P,) where probes and templates are paired."""
-
-    near: NDArray[np.bool_]
-    """By the similarity threshold alone."""
-    accepted: NDArray[np.bool_]
-    """By the threshold and the cohort test, as the service does."""
+from verify.cohort import Probes, cohort_statistics, expected_similarity
 
 
 class Scores(NamedTuple):
     """What decisions rest on; float64 of shape (P, T), or (P,) where paired."""
 
     similarities: NDArray[np.float64]
-    cohort_scores: NDArray[np.float64]
+    scores: NDArray[np.float64]
 
-    def at(self, level: Level) -> Decisions:
+    def at(self, level: Level) -> NDArray[np.bool_]:
         """Decide at a level."""
-        near = self.similarities >= level.similarity_threshold
-        return Decisions(near, near & (self.cohort_scores >= level.cohort_threshold))
+        return np.asarray(self.scores >= level.threshold)
 
 
 def score(
@@ -53,17 +43,20 @@ def score(
     paired
         Probe i meets template i only.
     cohort
-        Instead of the contract's, which is secret: an attacker tries with one of their own.
+        Instead of the contract's, which is secret, for lifted probes: an attacker tries with one of
+        their own.
     """
     compare = paired_distances if paired else pairwise_distances
     distances = compare(probes, templates, metric=calibration.metric, steps=calibration.steps)
     similarities = np.asarray(similarity(distances), dtype=np.float64)
-    means, spreads = cohort_statistics(
-        probes,
-        contract.cohort if cohort is None else cohort,
-        metric=calibration.metric,
-        steps=calibration.steps,
-    )
+    if cohort is not None and isinstance(probes, SubspaceBatch):
+        means, spreads = cohort_statistics(
+            probes, cohort, metric=calibration.metric, steps=calibration.steps
+        )
+    else:
+        means, spreads = expected_similarity(
+            probes, contract, metric=calibration.metric, steps=calibration.steps
+        )
     if not paired:
         means, spreads = means[:, None], spreads[:, None]
     return Scores(similarities, (similarities - means) / spreads)
@@ -78,7 +71,7 @@ def decide(
     *,
     paired: bool = False,
     cohort: SubspaceBatch | None = None,
-) -> Decisions:
+) -> NDArray[np.bool_]:
     """Decide at one level; see :func:`score`."""
     scores = score(probes, templates, contract, calibration, paired=paired, cohort=cohort)
     return scores.at(level)

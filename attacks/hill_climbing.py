@@ -14,13 +14,11 @@ from numpy.typing import NDArray
 
 from attacks.decisions import decide
 from attacks.errors import AuditError
-from attacks.outcomes import AttackOutcome, Knowledge, Property, Scheme
+from attacks.outcomes import AttackOutcome, Knowledge, Leaked, Property, Scheme
 from attacks.prior import Array64, Prior, attacker_prior
 from attacks.recovery import fmr_of
 from attacks.system import System
 from templates.contract.document import Level
-from templates.distances import pairwise_distances, similarity
-from templates.space.subspace import SubspaceBatch
 from verify.metrics import rate
 
 LOCKOUTS = (5, 50)
@@ -138,7 +136,7 @@ def _regression(prior: Prior, asked: _Asked, rng: np.random.Generator) -> None:
     """Gaussian-process regression with the prior's kernel, asked where it is highest.
 
     It climbs what the scores add to the mean over all templates, and not the sum: what every
-    template is near to is a wolf, which the cohort test rejects.
+    template is near to is a wolf, whose score is no higher for it.
     """
     linear, square = prior.kernel
     moment = prior.axes @ prior.axes
@@ -258,7 +256,8 @@ def climbing_outcomes(
             attack="hill-climbing",
             variant=f"{climber}, {'scores' if scored else 'decisions only'}, {limit} attempts",
             breaks=Property.IMPERSONATION,
-            knowledge=Knowledge.KEY if scored else Knowledge.ALGORITHM,
+            leaked=Leaked.DATABASE,
+            knowledge=Knowledge.RIGHT if scored else Knowledge.ALGORITHM,
             assumption="How templates are lifted, faces of other people, and "
             + (
                 "the rights to send embeddings and to see scores"
@@ -303,9 +302,7 @@ def dictionary_outcomes(
         As of :func:`climbing_outcomes`.
     """
     faces = attacker_prior(system).faces[:most_attempts].astype(np.float32)
-    accepted = decide(
-        faces, system.templates, system.contract, system.points, system.level
-    ).accepted
+    accepted = decide(faces, system.templates, system.contract, system.points, system.level)
     climbs = [
         Climb(
             Climber.DICTIONARY,
@@ -349,22 +346,3 @@ def climb_service(
             )
         ]
     return outcomes
-
-
-def in_process(system: System, victims: Sequence[int], *, scores: bool) -> dict[int, Ask]:
-    """Return the system's own decisions on some victims, as a service would answer."""
-
-    def answers(template: SubspaceBatch) -> Ask:
-        def ask(probe: NDArray[np.float32]) -> Answer:
-            points = system.points
-            accepted = decide(probe[None], template, system.contract, points, system.level).accepted
-            if not scores:
-                return Answer(bool(accepted[0, 0]))
-            distance = pairwise_distances(
-                probe[None], template, metric=points.metric, steps=points.steps
-            )
-            return Answer(bool(accepted[0, 0]), float(similarity(distance)[0, 0]))
-
-        return ask
-
-    return {number: answers(system.templates[number : number + 1]) for number in victims}

@@ -8,28 +8,34 @@ whose decoys are real, nor in the measurements of docs/method.md §7.2, whose de
 of one set.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from attacks.errors import AuditError
-from attacks.outcomes import AttackOutcome, Knowledge
-from attacks.recovery import recovery_outcome
-from attacks.stored.face_statistics import FaceStatistics
+from attacks.outcomes import GENERATED, AttackOutcome, Knowledge, Leaked, Property
+from attacks.population import Subjects
+from attacks.privacy import DRAWS, SimulatedPeople, decoy_moments, extrapolate, face_counts
+from attacks.recovery import fmr_of, recovery_outcome
+from attacks.second_order import (
+    Moments,
+    drawn_towards,
+    likeliest_descriptors,
+    second_moment,
+    without_noise_moment,
+)
+from attacks.stored.recording import decoy_count
 from attacks.system import System
 from templates.contract.document import Rate
-from templates.decoys import DecoySource
 from templates.keys.randomness import Keystream
-from templates.space.lifting import Strategy, lift
+from templates.space.lifting import Strategy, plain_strategy
 from templates.space.subspace import SubspaceBatch
-from verify.cohort import client_source, plain_strategy
-from verify.metrics import rate
+from verify.cohort import client_source
 
-DRAWS = 6000
 SHRINKAGE = 1e-3
 """Share of the largest variance that is added to all: axes below it count alike."""
-MOST_LIFTED = 300
 _TILE = 64
 
 Array64 = NDArray[np.float64]
@@ -39,21 +45,6 @@ def precision(rows: NDArray[np.floating], *, shrinkage: float = SHRINKAGE) -> Ar
     """Inverse of the covariance of (K, n) rows, with a share of its largest variance added."""
     variances, axes = np.linalg.eigh(np.cov(np.asarray(rows, dtype=np.float64).T))
     return np.asarray((axes / (variances + shrinkage * variances[-1])) @ axes.T)
-
-
-def face_precision(faces: NDArray[np.floating]) -> Array64:
-    """Inverse of the covariance of an attacker's faces, (A, n).
-
-    With as many faces as dimensions, :func:`precision`, as for decoys: what the two are compared
-    by is the tail of small variances, which the shrinkage of Ledoit and Wolf levels. On LFW with
-    1,160 faces and n = 512, its use gave fewer people away: 67 for 82 % at m = 64 with decoys of
-    FairFace, 15 for 48 % at m = 16 with decoys of LFW. With fewer faces the tail is 0, and theirs,
-    as in ``attacks.stored``, is the better: with 400 it gave 59 for 40 % at m = 64.
-    """
-    if len(faces) >= faces.shape[1]:
-        return precision(faces)
-    whitening = FaceStatistics.of(faces).whitening
-    return np.asarray(whitening @ whitening)
 
 
 def likeliest_points(templates: SubspaceBatch, form: Array64) -> Array64:
@@ -82,55 +73,7 @@ def likeliest_points(templates: SubspaceBatch, form: Array64) -> Array64:
     return out
 
 
-def share_found(
-    descriptors: NDArray[np.floating],
-    identities: Sequence[str],
-    source: DecoySource,
-    *,
-    strategy: Strategy,
-    m: int,
-    cosine: float,
-    draws: int = DRAWS,
-    most: int = MOST_LIFTED,
-    seed: int = 0,
-) -> Rate:
-    """Share of people's templates whose descriptor the decoys' statistics give away.
-
-    For a calibration, to tell an operator whose decoys are spread unlike the people. Half of the
-    people stand for the attacker's faces, the means of the others are lifted and guessed; the
-    better of the two forms of :func:`find_least_decoy_like` counts.
-
-    Parameters
-    ----------
-    descriptors, identities : (N, n), N names
-        Of the calibration.
-    source, strategy, m
-        How they are lifted.
-    cosine
-        A guess succeeds that is as near as this to the descriptor that was lifted.
-    most
-        Most people who are lifted.
-    """
-    names, person = np.unique(np.asarray(identities), return_inverse=True)
-    order = np.random.default_rng(seed).permutation(len(names))
-    hidden = order[: min(most, len(order) // 2)]
-    faces = np.asarray(descriptors)[~np.isin(person, hidden)]
-    means = np.stack([np.asarray(descriptors)[person == one].mean(axis=0) for one in hidden])
-    means /= np.linalg.norm(means, axis=1, keepdims=True)
-    nobody = client_source(source)
-    with Keystream.seeded("decoy likelihood", seed) as stream:
-        lifted = lift(means, strategy=plain_strategy(strategy), m=m, source=source, stream=stream)
-        decoys = nobody.draw(draws, 1, stream=stream)[:, 0, :]
-    against = precision(decoys)
-    most_found = 0
-    for form in (against, against - face_precision(faces)):
-        guesses = likeliest_points(lifted, form)
-        hits = np.einsum("ij,ij->i", guesses, means) >= cosine
-        most_found = max(most_found, int(np.count_nonzero(hits)))
-    return rate(most_found, len(means))
-
-
-GENERATOR, GENERATOR_AND_FACES = "generator", "generator and faces"
+GENERATOR = "generator"
 
 
 def likeliest_guesses(
@@ -149,29 +92,41 @@ def likeliest_guesses(
     Returns
     -------
     dict of ndarray of float64, shape (V, n)
-        By what they rest on, ``generator`` and ``generator and faces``; unit rows. Empty where the
-        scheme takes no decoys.
+        By what they rest on; unit rows. ``generator``: the point that is least like a decoy,
+        where the scheme takes decoys only. ``1160 faces`` and other numbers: of
+        ``attacks.second_order``, with so many faces; the last one has them all.
 
     Raises
     ------
     AuditError
         There are no more draws than dimensions.
     """
-    if system.source is None:
-        return {}
     if draws <= system.templates.n:
         raise AuditError("a covariance needs more draws than the embedding has dimensions")
-    with Keystream.seeded("audit", system.seed, "decoys that the attacker draws") as stream:
-        decoys = client_source(system.source).draw(draws, 1, stream=stream)[:, 0, :]
-    against = precision(decoys)
-    forms = {
-        GENERATOR: against,
-        GENERATOR_AND_FACES: against - face_precision(_known(system, faces)),
-    }
-    return {name: likeliest_points(system.templates, form) for name, form in forms.items()}
+    count = decoy_count(system.scheme)
+    guesses: dict[str, Array64] = {}
+    decoys: Moments | None = None
+    if system.source is not None and count:
+        with Keystream.seeded("audit", system.seed, "decoys that the attacker draws") as stream:
+            drawn = client_source(system.source).draw(draws, 1, stream=stream)[:, 0, :]
+        decoys = Moments.of(second_moment(drawn))
+        if count == system.scheme.dim:
+            guesses[GENERATOR] = likeliest_points(system.templates, precision(drawn))
+    known = known_faces(system, faces)
+    shuffled = np.random.default_rng(system.seed).permutation(known)
+    for number in face_counts(len(known)):
+        some = shuffled[:number]
+        prior = np.eye(system.templates.n) / system.templates.n if decoys is None else decoys.moment
+        noise = 0.0 if decoys is None or system.source is None else system.source.noise
+        moments = Moments.of(drawn_towards(some, prior, noise=noise))
+        guesses[f"{number} faces"] = likeliest_descriptors(
+            system.templates, moments, decoys, count=count
+        )
+    return guesses
 
 
-def _known(system: System, faces: NDArray[np.float32] | None) -> NDArray[np.float32]:
+def known_faces(system: System, faces: NDArray[np.float32] | None) -> NDArray[np.float32]:
+    """Return the attacker's faces with those that it has beside the system's."""
     return system.attacker if faces is None else np.concatenate([system.attacker, faces])
 
 
@@ -179,6 +134,7 @@ def find_least_decoy_like(
     system: System,
     faces: NDArray[np.float32] | None = None,
     *,
+    kind: str = "the audited set",
     draws: int = DRAWS,
     guesses: Mapping[str, Array64] | None = None,
 ) -> list[AttackOutcome]:
@@ -186,29 +142,151 @@ def find_least_decoy_like(
 
     Parameters
     ----------
+    kind
+        Where the attacker's faces are from, in words.
     guesses
         What that function returned for them, where it was called before.
 
     Returns
     -------
     list of AttackOutcome
-        Named ``decoy-likelihood``, one for each guess.
+        Named ``decoy-likelihood``, one for each guess, and a control that is not judged: the guess
+        with all faces, scored against fresh photos of other victims.
     """
     if guesses is None:
         guesses = likeliest_guesses(system, faces, draws=draws)
-    counts = {GENERATOR: 0, GENERATOR_AND_FACES: len(_known(system, faces))}
-    return [
-        recovery_outcome(
+
+    def outcome(name: str, people: Subjects | None = None) -> AttackOutcome:
+        number = 0 if name == GENERATOR else int(name.split()[0])
+        control = people is not None
+        return recovery_outcome(
             system,
-            guess,
+            guesses[name],
             attack="decoy-likelihood",
-            variant=name,
+            variant="photos of other people" if control else name,
             knowledge=Knowledge.ALGORITHM,
-            assumption=f"One template and the {name}: the guess is the point of the template that "
-            "is least like a decoy"
-            + (" and most like a face" if counts[name] else "")
-            + "; success is a match of the guess with a fresh photo",
-            details={"draws": draws, "faces": counts[name]},
+            assumption=f"One template, the decoy generator and {number} faces of {kind}: the guess "
+            "is the point of the template that is least like a decoy"
+            + (" and most like a face, given what decoys do" if number else "")
+            + "; success is a match of the guess with a fresh photo"
+            + (" of another victim (a control)" if control else ""),
+            people=people,
+            judged=not control,
+            details={"draws": draws, "faces": number, "faces_from": kind},
         )
-        for name, guess in guesses.items()
+
+    outcomes = [outcome(name) for name in guesses]
+    return [*outcomes, outcome(list(guesses)[-1], system.victims.mismatched())]
+
+
+def likeliest_guess(
+    system: System, faces: NDArray[np.float32] | None = None
+) -> Callable[[SubspaceBatch], Array64]:
+    """Return the guess with all faces of :func:`likeliest_guesses`, for templates of any people."""
+    known = replace(system, attacker=known_faces(system, faces))
+    moments, decoys = attacker_moments(known)
+    count = decoy_count(system.scheme)
+    return lambda templates: likeliest_descriptors(templates, moments, decoys, count=count)
+
+
+def attacker_moments(system: System) -> tuple[Moments, Moments | None]:
+    """Second moments of faces, as far as the system's attacker can tell them, and of decoys.
+
+    None for those of a scheme without decoys; the prior of faces is isotropic then.
+    """
+    if system.source is None or not decoy_count(system.scheme):
+        n = system.templates.n
+        return Moments.of(drawn_towards(system.attacker, np.eye(n) / n)), None
+    decoys = decoy_moments(system.source, seed=system.seed)
+    faces = drawn_towards(system.attacker, decoys.moment, noise=system.source.noise)
+    return Moments.of(faces), decoys
+
+
+def simulate_unlimited(
+    system: System,
+    faces: NDArray[np.float32] | None = None,
+    *,
+    kind: str = "the audited set",
+    fitted_to: int | None,
+    measured: Sequence[AttackOutcome] = (),
+) -> list[AttackOutcome]:
+    """Report the attacker who knows the people's second moments exactly, on simulated people.
+
+    Parameters
+    ----------
+    faces
+        Beside the system's; their second moments are the simulated people's.
+    kind
+        Where the faces are from, in words.
+    fitted_to
+        Number of faces that the generator was fitted to: as many draws are fitted to anew. None
+        where that is not known, or decoys are adapted to a sample: the people are lifted with the
+        generator itself then, and differ from its draws as far as the faces tell. That is an
+        estimate, and not judged.
+    measured
+        Outcomes of :func:`find_least_decoy_like`, which ``details`` extrapolates beside.
+
+    Returns
+    -------
+    list of AttackOutcome
+        One, named ``decoy-likelihood``; none for decoys of a pool and without decoys.
+    """
+    if system.scheme.decoys != GENERATED or system.source is None:
+        return []
+    known = known_faces(system, faces)
+    strategy = plain_strategy(Strategy(system.scheme.strategy))
+    decoys = decoy_moments(system.source, seed=system.seed)
+    people = SimulatedPeople.draw(
+        known.mean(axis=0, dtype=np.float64),
+        without_noise_moment(
+            drawn_towards(known, decoys.moment, noise=system.source.noise), system.source.noise
+        ),
+        np.einsum("ij,ij->i", system.victims.enrolled, system.victims.fresh),
+        fitted_to=fitted_to,
+        source=system.source if fitted_to is None else None,
+        noise=system.source.noise,
+        seed=system.seed,
+    )
+    level = system.level
+    theft = people.theft(
+        strategy,
+        system.scheme.dim,
+        match_cosine=system.raw_thresholds[level.name],
+        seed=system.seed,
+    )
+    points = [
+        (int(str(row.details["faces"])), row.measured)
+        for row in measured
+        if row.judged and row.details["faces"] and isinstance(row.measured, Rate)
+    ]
+    return [
+        AttackOutcome(
+            attack="decoy-likelihood",
+            variant="unlimited faces, simulated",
+            breaks=Property.IRREVERSIBILITY,
+            leaked=Leaked.HOLDER_KEYS,
+            knowledge=Knowledge.ALGORITHM,
+            assumption="One template, the decoy generator and the exact second moments of the "
+            f"people: simulated with people drawn with the moments of {len(known)} faces of "
+            f"{kind}, and "
+            + (
+                "the decoy generator as it is"
+                if fitted_to is None
+                else f"a generator fitted to {fitted_to} of them"
+            )
+            + "; success is a match of the guess with a fresh photo, which is drawn as near as "
+            "real ones are",
+            scheme=system.scheme,
+            level=level.name,
+            measured=theft.found,
+            chance=fmr_of(level),
+            judged=fitted_to is not None,
+            details={
+                "faces": "unlimited",
+                "photos_of_other_people": theft.control.to_json(),
+                "faces_from": kind,
+                "generator_fitted_to": fitted_to,
+                "extrapolated_from_finite": extrapolate(points),
+            },
+        )
     ]

@@ -1,26 +1,27 @@
-"""Whether templates of one person, held by two tenants, can be told from those of two people.
+"""Whether two templates of one person, of two tenants or of one, can be told from two people's.
 
-Without a secret, templates link by what they are for (docs/method.md §4.9). A secret rotation of
-each tenant leaves of a single template nothing but its foot point's length: two affine subspaces of
-one dimension are images of each other under a rotation exactly if their feet are equally long. So
-``foot-length`` is all that an attacker with one template of each side can compare. An attacker with
-both whole databases has more: see ``attacks.databases``.
+Without a secret, templates link by what they are for (docs/method.md §4.9). A rotation of each,
+drawn by the Haar measure, leaves of a template nothing but its foot point's length: two affine
+subspaces of one dimension are images of each other under a rotation exactly if their feet are
+equally long. Ours are taken to be as good, so that ``foot lengths`` is all that an attacker without
+a tenant's key can compare. With the key every rotation is derived, and undone.
+``attacks.databases`` has both whole databases.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from attacks.outcomes import AttackOutcome, Knowledge, Property
+from attacks.outcomes import AttackOutcome, Knowledge, Leaked, Property
 from attacks.system import System
 from attacks.unlinkability import Unlinkability, unlinkability
 from templates.contract.canonical import Json
 from templates.distances import Metric, pairwise_distances, similarity
 from templates.keys.randomness import KEY_BYTES, Keystream
-from templates.keys.rotation import tenant_rotation
-from templates.space.subspace import SubspaceBatch
+from templates.keys.rotation import Rotation, TenantRotation, holder_rotation
+from templates.space.subspace import SubspaceBatch, Turn
 
 LIFTINGS = 4
 """Times that every victim is lifted for both tenants, with other decoys and other keys."""
@@ -59,38 +60,37 @@ SCORES: Mapping[str, Score] = {
 @dataclass(frozen=True)
 class _Setting:
     name: str
-    knowledge: Knowledge
-    rotated: bool
-    leaked: bool
+    leaked: Leaked
     judged: bool
     assumption: str
 
 
-_SUCCESS = "; success is D_sys of the two tenants' templates of the same people"
+_SUCCESS = "; success is D_sys of the templates of the same people"
 _SETTINGS = (
     _Setting(
-        "no rotation",
-        Knowledge.TEMPLATE,
-        rotated=False,
-        leaked=False,
-        judged=False,
-        assumption="One template of each of two tenants that use no rotation, which the service "
-        "never does" + _SUCCESS + " (a control: here templates link by design)",
-    ),
-    _Setting(
         "secret rotations",
-        Knowledge.ALGORITHM,
-        rotated=True,
-        leaked=False,
+        Leaked.MASTER_KEY,
         judged=True,
         assumption="One rotated template of each of two tenants, and how templates are lifted, "
         "but not the tenants' keys" + _SUCCESS,
     ),
     _Setting(
+        "one tenant",
+        Leaked.MASTER_KEY,
+        judged=True,
+        assumption="Two rotated templates of one tenant, and how templates are lifted, but not the "
+        "tenant's key" + _SUCCESS,
+    ),
+    _Setting(
+        "holder's key kept",
+        Leaked.MASTER_KEY,
+        judged=True,
+        assumption="Two templates that each person has enrolled under one key of their own, and "
+        "every secret of the deployment, but not that key" + _SUCCESS,
+    ),
+    _Setting(
         "keys leaked",
-        Knowledge.KEY,
-        rotated=True,
-        leaked=True,
+        Leaked.HOLDER_KEYS,
         judged=True,
         assumption="One rotated template of each of two tenants, and the rotation keys of both"
         + _SUCCESS,
@@ -98,10 +98,42 @@ _SETTINGS = (
 )
 
 
-def secret_rotation(system: System, *tenant: str | int) -> Array64:
-    """Return the rotation of a tenant of the experiment."""
-    with Keystream.seeded("audit", system.seed, "tenant key", *tenant) as stream:
-        return tenant_rotation(stream.token(KEY_BYTES), system.templates.n)
+def rotations_of(system: System, tenant: str, templates: str, count: int) -> list[Rotation]:
+    """Return the rotations of some templates of a tenant of the experiment, one for each."""
+    with Keystream.seeded("audit", system.seed, "tenant key", tenant) as stream:
+        rotation = TenantRotation(stream.token(KEY_BYTES), system.templates.n)
+    return [rotation.of(f"{templates} {number}") for number in range(count)]
+
+
+def holder_rotations_of(system: System, enrollment: str, count: int) -> list[Rotation]:
+    """Return the rotations of an enrollment of some people, each under a key of their own."""
+    with Keystream.seeded("audit", system.seed, "holder keys") as stream:
+        keys = [stream.token(KEY_BYTES) for _ in range(count)]
+    return [
+        holder_rotation(key, f"{enrollment} {number}", system.templates.n)
+        for number, key in enumerate(keys)
+    ]
+
+
+def turned(batch: SubspaceBatch, rotations: Sequence[Rotation]) -> SubspaceBatch:
+    """Turn each template by its rotation."""
+    return _each_turned(batch, [rotation.turned for rotation in rotations])
+
+
+def turned_back(batch: SubspaceBatch, rotations: Sequence[Rotation]) -> SubspaceBatch:
+    """Undo :func:`turned`."""
+    return _each_turned(batch, [rotation.turned_back for rotation in rotations])
+
+
+def _each_turned(batch: SubspaceBatch, turns: Sequence[Turn]) -> SubspaceBatch:
+    pairs = zip(batch, turns, strict=True)
+    return SubspaceBatch.of([template.turned_by(turn) for template, turn in pairs])
+
+
+def turned_points(points: NDArray[np.floating], rotations: Sequence[Rotation]) -> Array64:
+    """Turn each point, (V, n), by its rotation."""
+    pairs = zip(points, rotations, strict=True)
+    return np.concatenate([rotation.turned(point[None]) for point, rotation in pairs])
 
 
 def linkage_outcome(
@@ -110,7 +142,8 @@ def linkage_outcome(
     *,
     attack: str,
     variant: str,
-    knowledge: Knowledge,
+    leaked: Leaked,
+    knowledge: Knowledge = Knowledge.ALGORITHM,
     assumption: str,
     judged: bool,
     details: Mapping[str, Json] | None = None,
@@ -120,6 +153,7 @@ def linkage_outcome(
         attack=attack,
         variant=variant,
         breaks=Property.UNLINKABILITY,
+        leaked=leaked,
         knowledge=knowledge,
         assumption=assumption,
         scheme=system.scheme,
@@ -137,10 +171,10 @@ def link(
     permutations: int = 500,
     most_people: int = 400,
 ) -> list[AttackOutcome]:
-    """Link two tenants' templates of the victims, one by one.
+    """Link two templates of each victim, one by one.
 
-    One tenant has enrolled each victim from ``system.victims.enrolled``, the other from the fresh
-    photo. All pairs of two victims are impostor pairs.
+    One tenant has enrolled each victim from ``system.victims.enrolled``, the other, or the same
+    one again, from the fresh photo. All pairs of two victims are impostor pairs.
 
     Parameters
     ----------
@@ -162,15 +196,23 @@ def link(
     for number in range(liftings):
         first = system.lift(enrolled, f"linkage, first tenant {number}")
         second = system.lift(fresh, f"linkage, second tenant {number}")
-        keys = secret_rotation(system, "first", number), secret_rotation(system, "second", number)
-        hidden = first.rotated(keys[0]), second.rotated(keys[1])
-        opened = hidden[0].rotated(keys[0].T), hidden[1].rotated(keys[1].T)
+        count = len(first)
+        left = rotations_of(system, f"first {number}", "template", count)
+        right = rotations_of(system, f"second {number}", "template", count)
+        again = rotations_of(system, f"first {number}", "another template", count)
+        hidden = turned(first, left), turned(second, right)
+        sides = {
+            "secret rotations": hidden,
+            "one tenant": (hidden[0], turned(second, again)),
+            "holder's key kept": (
+                turned(first, holder_rotations_of(system, f"first {number}", count)),
+                turned(second, holder_rotations_of(system, f"second {number}", count)),
+            ),
+            "keys leaked": (turned_back(hidden[0], left), turned_back(hidden[1], right)),
+        }
         for setting in _SETTINGS:
-            sides = (first, second)
-            if setting.rotated:
-                sides = opened if setting.leaked else hidden
             for name, score in SCORES.items():
-                scores.setdefault((setting.name, name), []).append(score(*sides))
+                scores.setdefault((setting.name, name), []).append(score(*sides[setting.name]))
     return [
         linkage_outcome(
             system,
@@ -179,7 +221,7 @@ def link(
             ),
             attack="linkage",
             variant=f"{setting.name}, {name}",
-            knowledge=setting.knowledge,
+            leaked=setting.leaked,
             assumption=setting.assumption,
             judged=setting.judged,
             details={"liftings": liftings},

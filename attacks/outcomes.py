@@ -24,13 +24,25 @@ class Property(StrEnum):
     """Nobody is accepted but the person. Not of ISO/IEC 24745, and what the service exists for."""
 
 
-class Knowledge(StrEnum):
-    """What the attacker has. Each but the last includes the ones before it.
+class Leaked(StrEnum):
+    """What was stolen, as ISO/IEC 30136 asks to say; each includes the ones before it.
 
-    Attacks on irreversibility and confidentiality are granted the un-rotated template in every
-    column: whoever has the master key has the rotation too. Unlinkability, renewability and
-    impersonation are what the rotation is for, and there it is secret up to ``KEY``.
+    No attack begins at the database alone, which is ciphertext: what is measured there needs
+    nothing of it.
     """
+
+    DATABASE = "database"
+    """Nothing, or the database without the master key."""
+    MASTER_KEY = "master key"
+    """Database and every secret of the deployment, of templates whose holders keep a key: each is
+    still turned by a rotation that nothing stolen gives."""
+    HOLDER_KEYS = "holder keys"
+    """Every key that a template's rotations need: un-rotated templates. Where no holder keeps a
+    key, the master key gives as much."""
+
+
+class Knowledge(StrEnum):
+    """What the attacker has beside what was stolen. Each but the last includes the one before."""
 
     TEMPLATE = "template"
     """One template, and that descriptors are of unit length."""
@@ -38,8 +50,8 @@ class Knowledge(StrEnum):
     """How templates are lifted, the model, the decoy generator (clients have it), other faces."""
     DECOYS = "decoys"
     """The decoy pool, which is a secret of the deployment."""
-    KEY = "key"
-    """The tenant's rotation, or a right that the service gives."""
+    RIGHT = "right"
+    """A right whose answers tell what a template holds: scores, or thousands of decisions."""
     TEMPLATES = "templates"
     """The algorithm, and several templates: of the victim, or of a whole tenant."""
 
@@ -136,8 +148,8 @@ class AttackOutcome:
         What distinguishes it from the other outcomes of this attack on this scheme; may be empty.
     breaks
         The property that its success breaks.
-    knowledge
-        What the attacker has.
+    leaked, knowledge
+        What was stolen, and what the attacker has beside it.
     assumption
         One sentence: what the attacker has and does, and what counts as success.
     scheme
@@ -158,6 +170,7 @@ class AttackOutcome:
     attack: str
     variant: str = ""
     breaks: Property
+    leaked: Leaked
     knowledge: Knowledge
     assumption: str
     scheme: Scheme
@@ -175,6 +188,7 @@ class AttackOutcome:
             "attack": self.attack,
             "variant": self.variant,
             "property": str(self.breaks),
+            "leaked": str(self.leaked),
             "knowledge": str(self.knowledge),
             "assumption": self.assumption,
             **self.scheme.to_json(),

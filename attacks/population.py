@@ -52,6 +52,10 @@ class Subjects:
             self.enrolled[:count], self.fresh[:count], self.photos[:count], self.shown[:count]
         )
 
+    def mismatched(self) -> "Subjects":
+        """Give each the next one's fresh photo: the control of an attack."""
+        return replace(self, fresh=np.roll(self.fresh, 1, axis=0))
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Population:
@@ -74,6 +78,8 @@ class Population:
         Their rows of the folder's descriptors.
     albums
         Descriptors of all photos, (k, n), of each victim who has three or more.
+    mates
+        Those of the attacker's people with two photos or more, as victims are enrolled.
     """
 
     victims: Subjects
@@ -83,6 +89,7 @@ class Population:
     names: tuple[str, ...]
     rows: NDArray[np.int64]
     albums: tuple[NDArray[np.float32], ...]
+    mates: Subjects
 
 
 def draw_population(
@@ -143,6 +150,11 @@ def draw_population(
         albums=tuple(
             rows[photos[i]].astype(np.float32) for i in attacked if len(photos[i]) >= LEAST_ALBUM
         ),
+        mates=_people(
+            rows,
+            [rng.permutation(photos[i]) for i in known if len(photos[i]) > 1],
+            ENROLLED_PHOTOS,
+        ),
     )
 
 
@@ -173,10 +185,13 @@ def without_decoy_people(
 
 def _people(rows: NDArray[np.float64], photos: Sequence[NDArray[np.int64]], most: int) -> Subjects:
     taken = [photo_rows[: min(most, len(photo_rows) - 1)] for photo_rows in photos]
-    means = np.stack([rows[photo_rows].mean(axis=0) for photo_rows in taken])
+    means = np.array([rows[photo_rows].mean(axis=0) for photo_rows in taken])
+    means = means.reshape(-1, rows.shape[1])  # of nobody too
     return Subjects(
         enrolled=(means / np.linalg.norm(means, axis=1, keepdims=True)).astype(np.float32),
-        fresh=rows[[photo_rows[-1] for photo_rows in photos]].astype(np.float32),
+        fresh=rows[np.array([photo_rows[-1] for photo_rows in photos], dtype=np.int64)].astype(
+            np.float32
+        ),
         photos=np.array([len(photo_rows) for photo_rows in taken], dtype=np.int64),
         shown=np.array([photo_rows[0] for photo_rows in taken], dtype=np.int64),
     )

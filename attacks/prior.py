@@ -95,7 +95,7 @@ def learn_prior(
 def _cover(scores: Array64, chance: float) -> NDArray[np.int64]:
     """Order of probes by how many of the attacker's templates each opens that none before it does.
 
-    Greedy set cover. Scores are standardised per probe, over the templates, as the cohort test
+    Greedy set cover. Scores are standardised per probe, over the templates, as the decision
     does; a pair counts where it is among the highest, of twice the share of chance so that the
     counts are not too few to choose by.
     """

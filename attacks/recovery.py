@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attacks.decisions import score
-from attacks.outcomes import AttackOutcome, Knowledge, Property
+from attacks.outcomes import AttackOutcome, Knowledge, Leaked, Property
 from attacks.population import Subjects
 from attacks.system import System
 from templates.contract.canonical import Json
@@ -28,7 +28,7 @@ class Recovery:
         protection, the guess is then taken for the person.
     accepted
         By level: guesses that the service accepts against a template lifted anew from the fresh
-        photo, with the cohort test: a service that has replaced the stolen template.
+        photo: a service that has replaced the stolen template.
     """
 
     to_truth: NDArray[np.float64]
@@ -68,7 +68,11 @@ def score_guesses(
     truth = attacked.enrolled.astype(np.float64)
     fresh = attacked.fresh.astype(np.float64)
     to_fresh = np.einsum("ij,ij->i", unit, fresh)
-    renewed = system.lift(attacked.fresh, "renewed from the fresh photo")
+    renewed = (
+        system.renewed
+        if people is None
+        else system.lift(attacked.fresh, "renewed from the fresh photo")
+    )
     probes = np.ascontiguousarray(unit, dtype=np.float32)
     matched: dict[str, Rate] = {}
     accepted: dict[str, Rate] = {}
@@ -76,7 +80,7 @@ def score_guesses(
     for level in system.levels:
         hits = to_fresh >= system.raw_thresholds[level.name]
         matched[level.name] = rate(int(np.count_nonzero(hits)), len(hits))
-        opened = scores.at(level).accepted & (lengths[:, 0] > 0)
+        opened = scores.at(level) & (lengths[:, 0] > 0)
         accepted[level.name] = rate(int(np.count_nonzero(opened)), len(opened))
     return Recovery(
         to_truth=np.einsum("ij,ij->i", unit, truth),
@@ -96,6 +100,7 @@ def recovery_outcome(
     guesses: NDArray[np.floating],
     *,
     attack: str,
+    leaked: Leaked = Leaked.HOLDER_KEYS,
     knowledge: Knowledge,
     assumption: str,
     variant: str = "",
@@ -110,6 +115,7 @@ def recovery_outcome(
         attack=attack,
         variant=variant,
         breaks=breaks,
+        leaked=leaked,
         knowledge=knowledge,
         assumption=assumption,
         scheme=system.scheme,

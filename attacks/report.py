@@ -7,7 +7,7 @@ from attacks.outcomes import AttackOutcome
 from attacks.verdict import LIMITS, headlines, judge
 
 FORMAT = "veilface audit"
-VERSION = 1
+VERSION = 2
 Document = dict[str, Any]
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from attacks.outcomes import Knowledge, Property, Scheme
+from attacks.outcomes import Knowledge, Leaked, Property, Scheme
 from attacks.verdict import LIMITS
 from verify.evaluation.markdown_cells import (
     MISSING,
@@ -21,8 +21,13 @@ _KNOWLEDGE = {
     Knowledge.TEMPLATE: "template only",
     Knowledge.ALGORITHM: "+ algorithm",
     Knowledge.DECOYS: "+ decoys",
-    Knowledge.KEY: "+ key or right",
+    Knowledge.RIGHT: "+ right",
     Knowledge.TEMPLATES: "k templates",
+}
+_LEAKED = {
+    Leaked.DATABASE: "nothing, or the database only",
+    Leaked.MASTER_KEY: "+ master key; the holder keeps a key",
+    Leaked.HOLDER_KEYS: "+ holder's key; or + master key, where no holder keeps one",
 }
 
 
@@ -56,24 +61,37 @@ def _verdicts(report: Row) -> Iterable[str]:
     yield (
         "Each cell is the strongest attack that was made: its measure with the 95 % interval, what "
         "guessing would reach, and how it stands against the limit. *Unresolved*: only the upper "
-        "bound exceeds the limit. Where a cell is empty, no attack of ours fits it."
+        "bound exceeds the limit. Where a cell is empty, no attack of ours fits it. The "
+        "columns say what leaked."
+    )
+    yield (
+        "The database alone holds ciphertext only: no attack begins there, and what stands in its "
+        "column uses the service. A template that its holder keeps is not in the database, "
+        "whatever key leaked; once stolen from the holder too, it is as one from the database."
     )
     for verdict in report["verdicts"]:
-        cells: dict[tuple[str, str], list[str]] = {}
+        cells: dict[tuple[str, str], dict[str, list[str]]] = {}
         for cell in verdict["cells"]:
-            cells.setdefault((cell["property"], cell["knowledge"]), []).append(_verdict_cell(cell))
+            line = cells.setdefault((cell["property"], cell["knowledge"]), {})
+            line.setdefault(cell["leaked"], []).append(_verdict_cell(cell))
         lines = [
-            [str(prop), *("<br>".join(cells.get((prop, known), [MISSING])) for known in Knowledge)]
+            [
+                str(prop),
+                _KNOWLEDGE[known],
+                *("<br>".join(cells[prop, known].get(leaked, [MISSING])) for leaked in Leaked),
+            ]
             for prop in Property
+            for known in Knowledge
+            if (prop, known) in cells
         ]
         title = f"### {plain(str(Scheme.of(verdict)))}"
         if verdict["comparison"]:
             title += " (comparison)"
         yield title
         yield table(
-            ["property", *(_KNOWLEDGE[known] for known in Knowledge)],
+            ["property", "attacker has", *(_LEAKED[leaked] for leaked in Leaked)],
             lines,
-            [True] * (1 + len(Knowledge)),
+            [True] * (2 + len(Leaked)),
         )
     yield "### Limits"
     yield table(
@@ -90,6 +108,8 @@ def _verdict_cell(cell: Row) -> str:
     name = plain(cell["attack"]) + (f" ({plain(cell['variant'])})" if cell["variant"] else "")
     status = cell["status"]
     shown = f"**{status}**" if status == "fail" else status
+    if cell["reason"]:
+        shown += f", by design: {plain(cell['reason'])}"
     return (
         f"{significant(cell['value'])} [{significant(cell['ci_low'])}, "
         f"{significant(cell['ci_high'])}], chance {significant(cell['chance'])}: {name}: {shown}"
@@ -231,10 +251,20 @@ def _outcomes(outcomes: Sequence[Row]) -> Iterable[str]:
     for scheme in dict.fromkeys(Scheme.of(row) for row in shown):
         yield f"### {plain(str(scheme))}: attacks"
         yield table(
-            ["attack", "knows", "level", "success", "chance", "cosine to truth", "judged"],
+            [
+                "attack",
+                "leaked",
+                "knows",
+                "level",
+                "success",
+                "chance",
+                "cosine to truth",
+                "judged",
+            ],
             [
                 [
                     plain(row["attack"] + (f": {row['variant']}" if row["variant"] else "")),
+                    plain(row["leaked"]),
                     plain(row["knowledge"]),
                     plain(row["level"]),
                     _measured(row),
@@ -245,7 +275,7 @@ def _outcomes(outcomes: Sequence[Row]) -> Iterable[str]:
                 for row in shown
                 if Scheme.of(row) == scheme
             ],
-            [True, True, True, False, False, False, True],
+            [True, True, True, True, False, False, False, True],
         )
     yield "### What each attacker has and does"
     said = dict.fromkeys((row["attack"], row["variant"], row["assumption"]) for row in shown)

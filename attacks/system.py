@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,14 +13,14 @@ from attacks.population import ENROLLED_PHOTOS, Population, Subjects
 from templates.contract.canonical import Json
 from templates.contract.document import Binding, Calibration, Contract, Level
 from templates.decoys import DecoyPool, DecoySource
-from templates.distances import DEFAULT_STEPS, Metric
+from templates.distances import Metric
 from templates.errors import Uncalibrated
 from templates.keys.randomness import Keystream
 from templates.keys.rotation import ROTATION_VERSION
 from templates.space.lifting import Strategy
 from templates.space.subspace import SubspaceBatch
 from verify import CalibrationOptions, calibrate
-from verify.cohort import client_source, make_cohort, people_like
+from verify.cohort import client_source, people_like
 from verify.comparisons import Lifter
 from verify.metrics import most_errors, threshold_at_fmr
 from verify.strangers import make_nobody
@@ -27,15 +28,14 @@ from verify.strangers import make_nobody
 LIFTED_PROBE_DIM = 8
 """Dimension of the lifted probes that wolves are tried with, the best of docs/method.md §4.7."""
 _TILE = 1024
-_STRANGERS = 50
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class System:
     """What attacks on templates act on.
 
-    Nothing is rotated: a tenant's rotation changes no distance inside the tenant. Attacks that
-    cross tenants rotate by themselves.
+    Nothing is rotated: a probe is turned as the template that it is compared with, and no distance
+    changes. Attacks on what is stored, by who lacks the tenant's key, rotate by themselves.
 
     Parameters
     ----------
@@ -99,6 +99,11 @@ class System:
     def level(self) -> Level:
         """The level that the service decides with by default."""
         return self.points.level(self.contract.default_level)
+
+    @cached_property
+    def renewed(self) -> SubspaceBatch:
+        """Templates of the victims' fresh photos, lifted once."""
+        return self.lift(self.victims.fresh, "renewed from the fresh photo")
 
     def first(self, count: int) -> "System":
         """Return the system with the first victims only, for attacks that take long."""
@@ -232,10 +237,7 @@ def _calibrated(
     lifted_probes: bool,
     seed: int,
 ) -> Contract:
-    """Calibrate as a service does, with a cohort of a seed: an audit gives the same figures twice.
-
-    The strangers are few: an audit enrolls no template that a client sent.
-    """
+    """Calibrate as a service does, with strangers of a seed: audits give the same figures twice."""
     person = np.unique(population.names, return_inverse=True)[1]
     means = np.stack(
         [
@@ -245,21 +247,12 @@ def _calibrated(
     )
     people = np.asarray(means / np.linalg.norm(means, axis=1, keepdims=True), dtype=np.float32)
     generator = client_source(source)
-    hidden = people_like(generator, people)
-    strategy, m = binding.strategy, binding.m
-    with Keystream.seeded("audit", seed, strategy, m, "cohort") as stream:
-        cohort = make_cohort(generator, strategy=strategy, m=m, stream=stream, hidden=hidden)
-        nobody = make_nobody(
-            generator,
-            strangers=(hidden,),
-            cohort=cohort,
-            metric=Metric.SPHERICAL,
-            steps=DEFAULT_STEPS,
-            stream=stream,
-            size=_STRANGERS,
-        )
+    with Keystream.seeded("audit", seed, binding.strategy, binding.m, "strangers") as stream:
+        strangers = people_like(generator, people)
+        nobody = make_nobody(generator, strangers=(strangers,), stream=stream)
     options = CalibrationOptions(
-        probe_dims=(0, min(LIFTED_PROBE_DIM, m)) if lifted_probes else (0,),
+        probe_dims=(0, min(LIFTED_PROBE_DIM, binding.m)) if lifted_probes else (0,),
+        probe_photos=(1,),
         metric=Metric.SPHERICAL,
         lifted_probes=500,
         lifted_impostor_pairs=60_000,
@@ -271,7 +264,6 @@ def _calibrated(
         binding=binding,
         source=source,
         options=options,
-        cohort=cohort,
         nobody=nobody,
     ).contract
 

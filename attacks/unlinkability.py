@@ -199,7 +199,7 @@ def _bootstrap(
         pairs = weights[:, None] * weights
         pairs[own, own] = 0.0
         impostor = sum(
-            np.bincount(each.ravel(), weights=pairs.ravel(), minlength=count) for each in bin_of
+            np.bincount(bins.ravel(), weights=pairs.ravel(), minlength=count) for bins in bin_of
         )
         out[index] = global_d(weights @ mates, np.asarray(impostor))
     return out

@@ -1,4 +1,4 @@
-"""The verdict: what an attacker achieves at best, by property and knowledge, against limits.
+"""The verdict: what an attacker achieves at best, by property, theft and knowledge, against limits.
 
 Every cell of the table holds the strongest attack that was made: the one that exceeds chance most.
 A cell fails where its measure exceeds the limit that the operator set, and is *unresolved* where
@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
-from attacks.outcomes import AttackOutcome, Knowledge, Property, Scheme
+from attacks.outcomes import AttackOutcome, Knowledge, Leaked, Property, Scheme
 from templates.contract.canonical import Json
 
 
@@ -46,6 +46,7 @@ class Limit:
 
 FOOT_POINT = "foot-point-success"
 CLIMBING = "climbing-success"
+WITH_KEY, WITHOUT_KEY = "success-with-key", "success-without-key"
 LIMITS: tuple[Limit, ...] = (
     Limit(
         FOOT_POINT,
@@ -83,14 +84,15 @@ LIMITS: tuple[Limit, ...] = (
         "share of templates opened by trying faces within a lockout's 5 or 50 attempts",
     ),
     Limit(
-        "success-with-key",
+        WITH_KEY,
         1.0,
-        "any of these for an attacker who also has the tenant's key, or a right to scores",
+        "what no template withstands: success by a right to scores or thousands of decisions, or "
+        "where every key leaked and templates are linked, replayed, or several of one person",
     ),
     Limit(
-        "success-with-templates",
-        0.1,
-        "recovery or acceptance for an attacker with several templates, or whole databases",
+        WITHOUT_KEY,
+        0.02,
+        "recovery or acceptance from templates that are still turned by a secret rotation",
     ),
 )
 _BY_PROPERTY = {
@@ -100,15 +102,26 @@ _BY_PROPERTY = {
     Property.CONFIDENTIALITY: "attribute-leakage",
     Property.IMPERSONATION: "false-acceptance",
 }
-_OF_ONE_TEMPLATE = (Property.IRREVERSIBILITY, Property.IMPERSONATION)
-"""Properties that a single template should have: with several, another limit counts."""
+_OF_A_TEMPLATE = (Property.IRREVERSIBILITY, Property.CONFIDENTIALITY)
+"""Properties that one template should have without any rotation."""
+_BY_DESIGN = {
+    Property.IRREVERSIBILITY: "templates of several photos of one person come near each other in "
+    "the person",
+    Property.UNLINKABILITY: "un-rotated templates of one person are near each other, by which the "
+    "service knows the person",
+    Property.RENEWABILITY: "the renewed template holds the same face, and the same photos give the "
+    "same template again",
+    Property.IMPERSONATION: "an un-rotated template holds vectors that it accepts",
+}
+"""Why no template can hold what is without a limit."""
+_BY_ANSWERS = "answers tell what a template is near to, and no lock ends them once one was accepted"
 _BY_ATTACK = {"foot-point": FOOT_POINT, "hill-climbing": CLIMBING}
 """Attacks with a limit of their own, and so a cell of their own."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """The strongest attack on one property with one knowledge, and how it stands.
+    """The strongest attack on one property, of one theft and knowledge, and how it stands.
 
     Parameters
     ----------
@@ -139,6 +152,15 @@ class Cell:
         return Status.UNRESOLVED if self.high > self.most else Status.PASS
 
     @property
+    def reason(self) -> str | None:
+        """Why a cell without a limit cannot hold; None where the operator set or lifted one."""
+        if self.status is not Status.UNLIMITED or self.limit != WITH_KEY:
+            return None
+        if self.outcome.knowledge is Knowledge.RIGHT:
+            return _BY_ANSWERS
+        return _BY_DESIGN.get(self.outcome.breaks)
+
+    @property
     def rank(self) -> tuple[int, float]:
         """What the strongest attack is chosen by: a doubt counts more than a small success."""
         return _GRAVITY.index(self.status), self.excess
@@ -147,6 +169,7 @@ class Cell:
         """Return a cell of ``verdict`` of the report."""
         return {
             "property": str(self.outcome.breaks),
+            "leaked": str(self.outcome.leaked),
             "knowledge": str(self.outcome.knowledge),
             "attack": self.outcome.attack,
             "variant": self.outcome.variant,
@@ -160,12 +183,13 @@ class Cell:
             "limit": self.limit,
             "most": self.most,
             "status": str(self.status),
+            "reason": self.reason,
         }
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """The cells of one scheme, in the order of properties and knowledge."""
+    """The cells of one scheme, in the order of properties, thefts and knowledge."""
 
     scheme: Scheme
     cells: tuple[Cell, ...]
@@ -192,7 +216,7 @@ class Verdict:
 def judge(
     outcomes: Iterable[AttackOutcome], *, limits: Mapping[str, float] | None = None
 ) -> list[Verdict]:
-    """Judge every scheme by the strongest attack on each property with each knowledge.
+    """Judge every scheme by the strongest attack on each property, theft and knowledge.
 
     Parameters
     ----------
@@ -207,16 +231,16 @@ def judge(
         One a scheme, in the order of their first outcome.
     """
     most = {limit.name: limit.default for limit in LIMITS} | dict(limits or {})
-    by_scheme: dict[Scheme, dict[tuple[Property, Knowledge, str], Cell]] = {}
+    by_scheme: dict[Scheme, dict[tuple[Property, Leaked, Knowledge, str], Cell]] = {}
     for outcome in outcomes:
         if not outcome.judged:
             continue
         cell = cell_of(outcome, most)
         cells = by_scheme.setdefault(outcome.scheme, {})
-        key = (outcome.breaks, outcome.knowledge, cell.limit)
+        key = (outcome.breaks, outcome.leaked, outcome.knowledge, cell.limit)
         if key not in cells or cell.rank > cells[key].rank:
             cells[key] = cell
-    properties, knowledge = list(Property), list(Knowledge)
+    properties, thefts, knowledge = list(Property), list(Leaked), list(Knowledge)
     return [
         Verdict(
             scheme,
@@ -224,7 +248,12 @@ def judge(
                 cells[key]
                 for key in sorted(
                     cells,
-                    key=lambda key: (properties.index(key[0]), knowledge.index(key[1]), key[2]),
+                    key=lambda key: (
+                        properties.index(key[0]),
+                        thefts.index(key[1]),
+                        knowledge.index(key[2]),
+                        key[3],
+                    ),
                 )
             ),
         )
@@ -234,11 +263,7 @@ def judge(
 
 def cell_of(outcome: AttackOutcome, most: Mapping[str, float]) -> Cell:
     """Compare one outcome with its limit."""
-    name = _BY_ATTACK.get(outcome.attack, _BY_PROPERTY[outcome.breaks])
-    if outcome.knowledge is Knowledge.KEY:
-        name = "success-with-key"
-    elif outcome.knowledge is Knowledge.TEMPLATES and outcome.breaks in _OF_ONE_TEMPLATE:
-        name = "success-with-templates"
+    name = _limit_of(outcome)
     measured = outcome.measured
     value, low, high = measured.value, measured.ci_low, measured.ci_high
     if outcome.breaks is Property.CONFIDENTIALITY:
@@ -247,6 +272,21 @@ def cell_of(outcome: AttackOutcome, most: Mapping[str, float]) -> Cell:
         # D_sys below its null is chance, and tells nothing.
         value, low, high = (max(0.0, bound - outcome.chance) for bound in (value, low, high))
     return Cell(outcome, name, most[name], value, low, high)
+
+
+def _limit_of(outcome: AttackOutcome) -> str:
+    several = outcome.knowledge is Knowledge.TEMPLATES
+    of_a_template = outcome.breaks in _OF_A_TEMPLATE and not several
+    if outcome.knowledge is Knowledge.RIGHT:
+        return WITH_KEY
+    if outcome.leaked is Leaked.HOLDER_KEYS and not of_a_template:
+        return WITH_KEY
+    if outcome.leaked is Leaked.MASTER_KEY and outcome.breaks in (
+        Property.IRREVERSIBILITY,
+        Property.IMPERSONATION,
+    ):
+        return WITHOUT_KEY
+    return _BY_ATTACK.get(outcome.attack, _BY_PROPERTY[outcome.breaks])
 
 
 def _distance(chance: float, value: float, low: float, high: float) -> tuple[float, float, float]:
@@ -281,7 +321,8 @@ def _sentence(cell: Cell) -> str:
     outcome = cell.outcome
     name = outcome.attack + (f" ({outcome.variant})" if outcome.variant else "")
     bound = "" if cell.status is Status.UNLIMITED else f", limit {cell.most:.3g}"
+    reason = "" if cell.reason is None else f" By design: {cell.reason}."
     return (
-        f"{outcome.breaks} {_SAID[cell.status]}: {name}, attacker with {outcome.knowledge}: "
-        f"{cell.excess:.3g} [{cell.low:.3g}, {cell.high:.3g}]{bound}."
+        f"{outcome.breaks} {_SAID[cell.status]}: {name}, leaked {outcome.leaked}, attacker with "
+        f"{outcome.knowledge}: {cell.excess:.3g} [{cell.low:.3g}, {cell.high:.3g}]{bound}.{reason}"
     )

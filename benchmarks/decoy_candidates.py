@@ -43,6 +43,7 @@ class SampledSource:
 
     source_id = "experiment"
     made_with: str | None = None
+    noise: float = 0.0
 
     def __init__(self, sample: Sampler, n: int) -> None:
         self.n = n

@@ -58,9 +58,11 @@ def database(kind: str, work: Path) -> Iterator[str]:
 
 
 @contextmanager
-def service(env: dict[str, str], *, workers: int, log: Path) -> Iterator[str]:
+def service(
+    env: dict[str, str], *, workers: int, log: Path, port: int | None = None
+) -> Iterator[str]:
     """``veilface serve`` on a free port; yields its base URL once it is ready."""
-    port = free_port()
+    port = port or free_port()
     with log.open("wb") as sink:
         process = subprocess.Popen(
             [str(VEILFACE), "serve", "--port", str(port), "--workers", str(workers)],
@@ -84,4 +86,4 @@ def service(env: dict[str, str], *, workers: int, log: Path) -> Iterator[str]:
             yield url
         finally:
             process.terminate()
-            process.wait(timeout=30)
+            process.wait()

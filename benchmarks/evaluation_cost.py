@@ -24,9 +24,9 @@ _EVERY_SECONDS = 0.2
 def memory_of(process: psutil.Process) -> int:
     """Proportional set size of a process and all below it, in bytes."""
     total = 0
-    for each in [process, *process.children(recursive=True)]:
+    for member in [process, *process.children(recursive=True)]:
         try:
-            total += each.memory_full_info().pss
+            total += member.memory_full_info().pss
         except psutil.Error:  # it ended meanwhile
             continue
     return total

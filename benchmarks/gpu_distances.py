@@ -90,8 +90,8 @@ def largest_error(
 ) -> float:
     """Largest difference of similarity to the reference in float64, on a few pairs."""
     some, others = probes[:_CHECKED], templates[:_CHECKED]
-    mine = some.cpu().numpy() if isinstance(some, Tensor) else _batch(some)
-    expected = pairwise_distances(mine, _batch(others), metric=metric, dtype=np.float64)
+    checked = some.cpu().numpy() if isinstance(some, Tensor) else _batch(some)
+    expected = pairwise_distances(checked, _batch(others), metric=metric, dtype=np.float64)
     seen = pairwise(some, others, metric=metric, steps=DEFAULT_STEPS).double().cpu().numpy()
     return float(np.abs(similarity(seen) - similarity(expected)).max())
 
@@ -104,7 +104,7 @@ def matrix(m: int, n: int, device: torch.device) -> list[dict[str, Any]]:
     """Time all distances of 1000 probes to 1000 templates, both modes and both metrics."""
     generator = torch.Generator(device).manual_seed(m * n)
     templates = templates_of(_SIZE, m, n, generator)
-    found = []
+    rows = []
     for mode, probes in (
         ("point to subspace", descriptors(_SIZE, n, generator)),
         ("subspace to subspace", templates_of(_SIZE, m, n, generator)),
@@ -121,7 +121,7 @@ def matrix(m: int, n: int, device: torch.device) -> list[dict[str, Any]]:
                 return pairwise(probes, templates, metric=metric, steps=DEFAULT_STEPS)
 
             bare, whole = milliseconds([product, distances])
-            found.append(
+            rows.append(
                 {
                     "mode": mode,
                     "metric": str(metric),
@@ -133,14 +133,14 @@ def matrix(m: int, n: int, device: torch.device) -> list[dict[str, Any]]:
                     "largest_error": largest_error(probes, templates, metric),
                 }
             )
-    return found
+    return rows
 
 
 def search(device: torch.device, m: int = 8, n: int = 512) -> list[dict[str, Any]]:
     """Time the nearest of 100,000 templates for 100,000 probes, both modes and both metrics."""
     generator = torch.Generator(device).manual_seed(1)
     templates = templates_of(_MANY, m, n, generator)
-    found = []
+    rows = []
     for mode, probes in (
         ("point to subspace", descriptors(_MANY, n, generator)),
         ("subspace to subspace", templates_of(_MANY, m, n, generator)),
@@ -150,9 +150,9 @@ def search(device: torch.device, m: int = 8, n: int = 512) -> list[dict[str, Any
             search_one(probes[:_SIZE], templates[:_SIZE])
             torch.cuda.synchronize()
             torch.cuda.reset_peak_memory_stats()
-            held = torch.cuda.memory_allocated()
+            before = torch.cuda.memory_allocated()
             seconds = once(functools.partial(search_one, probes, templates)) / 1000
-            found.append(
+            rows.append(
                 {
                     "mode": mode,
                     "metric": str(metric),
@@ -160,10 +160,10 @@ def search(device: torch.device, m: int = 8, n: int = 512) -> list[dict[str, Any
                     "n": n,
                     "seconds": seconds,
                     "pairs_per_second": _MANY**2 / seconds,
-                    "memory_mib": (torch.cuda.max_memory_allocated() - held) / 2**20,
+                    "memory_mib": (torch.cuda.max_memory_allocated() - before) / 2**20,
                 }
             )
-    return found
+    return rows
 
 
 def table(rows: list[dict[str, Any]]) -> str:

@@ -58,9 +58,9 @@ def rows_of(
             level = system.level
             outcomes = [*foot_point_attack(system), *nearest_neighbour_attack(system)]
             outcomes += find_least_decoy_like(system)
-            judged = [each for each in outcomes if each.judged]
-            best = max(judged, key=lambda each: each.measured.value)
-            foot = next(each for each in judged if each.attack == "foot-point")
+            judged = [outcome for outcome in outcomes if outcome.judged]
+            best = max(judged, key=lambda outcome: outcome.measured.value)
+            foot = next(outcome for outcome in judged if outcome.attack == "foot-point")
             named = "none" if decoys is None else kind
             lines.append(
                 f"| {strategy} | {named} | {m} | {100 * level.fnmr.value:.2f} "

@@ -91,7 +91,7 @@ def private_outcome(
             counts.genuine += 1
             counts.genuine_rejected += not accepted(person.name, probes[photo])
     there = [person for person in people if person.name not in counts.refused_enrollments]
-    for person, photo in impostor_attempts(there, impostors):
+    for person, (photo,) in impostor_attempts(there, impostors):
         counts.impostor += 1
         counts.impostor_accepted += accepted(person.name, probes[photo])
     return counts, seconds
@@ -99,7 +99,7 @@ def private_outcome(
 
 def key_of(env: dict[str, str]) -> str:
     """An API key that may enroll and verify, with photos and with templates."""
-    rights = [word for each in ("enroll", "verify", "embeddings") for word in ("--right", each)]
+    rights = [word for right in ("enroll", "verify", "embeddings") for word in ("--right", right)]
     veilface("db", "template-enrollment", "--allow", env=env)
     token: str = json.loads(veilface("keys", "create", "--json", *rights, env=env))["token"]
     return token

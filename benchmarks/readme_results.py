@@ -1,4 +1,4 @@
-"""The results table of the README, made from the ``results.json`` of one or more evaluations.
+"""The results table of docs/evaluation.md, made from the ``results.json`` of evaluations.
 
 Every number in it comes from the files; the table stands between two markers, so that it can be
 made anew without touching the text around it.
@@ -7,7 +7,7 @@ Example
 -------
 ::
 
-    python -m benchmarks.readme_results one/results.json two/results.json --write README.md
+    python -m benchmarks.readme_results one/results.json two/results.json --write docs/evaluation.md
     python -m benchmarks.readme_results results.json --keep docs/results/lfw.json
 """
 
@@ -230,12 +230,12 @@ def written_into(text: str, block: str) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Print the table, or write it into a README; 0, or 1 with the reason on stderr."""
-    parser = argparse.ArgumentParser(description="Make the README's results table.")
+    """Print the table, or write it into a page; 0, or 1 with the reason on stderr."""
+    parser = argparse.ArgumentParser(description="Make the results table of docs/evaluation.md.")
     parser.add_argument(
         "results", type=Path, nargs="+", metavar="RESULTS.json", help="of one model and one LFW"
     )
-    parser.add_argument("--write", type=Path, metavar="README.md")
+    parser.add_argument("--write", type=Path, metavar="PAGE.md")
     parser.add_argument(
         "--keep",
         type=Path,

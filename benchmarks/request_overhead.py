@@ -29,7 +29,7 @@ import numpy.typing as npt
 from api.process.runtime import Runtime
 from api.settings import load_settings
 from benchmarks.deployment import service, veilface
-from benchmarks.end_to_end import UNLIMITED, Person, enroll_photos, people_of, verify_photo
+from benchmarks.end_to_end import UNLIMITED, Person, enroll_photos, people_of, verify_photos
 from models.decoding import decode_image
 from models.pack import ModelPack
 
@@ -129,7 +129,7 @@ def bare_inference(pack: ModelPack, image: npt.NDArray[np.uint8]) -> None:
 
 def request(client: httpx.Client, person: Person, photo: Path) -> None:
     """Verify one photo over HTTP."""
-    verify_photo(client, person.name, photo, "fmr-1e-3").raise_for_status()
+    verify_photos(client, person.name, (photo,), "fmr-1e-3").raise_for_status()
 
 
 def steps_of(
@@ -150,7 +150,7 @@ def steps_of(
         stored = clock.time("fetch and decrypt", runtime.store.subjects.get, tenant, person.name)
         if stored is None:
             raise SystemExit(f"{person.name} is not enrolled")
-        clock.time("compare and decide", verifier.decide_embedding, embedding, stored.wire)
+        clock.time("compare and decide", verifier.decide_embedding, embedding, stored)
     runtime.close()
     return clock.medians()
 

@@ -233,6 +233,7 @@ def main() -> None:
     args.cache, args.pool, args.strategy = None, False, "adversarial"
     args.work.mkdir(parents=True, exist_ok=True)
     limits = {
+        "VEILFACE_ACCEPT_WEAK_PRIVACY": "true",
         "VEILFACE_RATE_LIMIT_KEY": "off",
         "VEILFACE_RATE_LIMIT_ADDRESS": "off",
         "VEILFACE_QUEUE_LIMIT": "96",

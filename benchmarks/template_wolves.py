@@ -33,10 +33,10 @@ from templates.contract.nobody import TILT
 from templates.decoys import DecoyGenerator
 from templates.keys.randomness import Keystream
 from templates.keys.rotation import ROTATION_VERSION
+from templates.space.embedding import normalised
 from templates.space.lifting import Strategy, lift
 from templates.space.subspace import AffineSubspace, SubspaceBatch
 from verify import CalibrationOptions, calibrate, labelled_folder
-from verify.cohort import cohort_statistics
 
 Floats = NDArray[np.float32]
 
@@ -52,7 +52,7 @@ HONEST = 600
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Faces:
-    """Embeddings (N, n), and how each one's similarities to the cohort lie, (N,)."""
+    """Embeddings (N, n), and what the contract expects of each, (N,)."""
 
     points: Floats
     means: Floats
@@ -60,11 +60,8 @@ class Faces:
 
     @classmethod
     def of(cls, points: Floats, contract: Contract) -> "Faces":
-        """Compare faces with the contract's cohort."""
-        rule = contract.calibrations[0]
-        means, spreads = cohort_statistics(
-            points, contract.cohort, metric=rule.metric, steps=rule.steps
-        )
+        """Ask the contract what it expects of faces."""
+        means, spreads = contract.expectation.statistics(points)
         return cls(points, means.astype(np.float32), spreads.astype(np.float32))
 
     def accepted(self, template: AffineSubspace, contract: Contract) -> dict[str, float]:
@@ -73,13 +70,7 @@ class Faces:
         near = near + template.radius * np.linalg.norm(self.points @ template.basis.T, axis=1)
         z = (near - self.means) / self.spreads
         return {
-            level.name: round(
-                100
-                * float(
-                    np.mean((near >= level.similarity_threshold) & (z >= level.cohort_threshold))
-                ),
-                2,
-            )
+            level.name: round(100 * float(np.mean(z >= level.threshold)), 2)
             for level in contract.calibrations[0].levels
         }
 
@@ -98,7 +89,6 @@ def ascend(
     others, other_means, other_spreads = (
         torch.from_numpy(a) for a in (watched.points, watched.means, watched.spreads)
     )
-    unit = float(climbed.spreads.mean())
     optimiser = torch.optim.Adam([foot, basis], lr=0.01)
     best: tuple[float, AffineSubspace | None] = (-1.0, None)
     for number in range(ROUNDS):
@@ -111,10 +101,7 @@ def ascend(
         rows = torch.randint(0, len(points), (BATCH,))
         near = points[rows] @ p + radius * torch.linalg.norm(points[rows] @ span.T, dim=1)
         z = (near - means[rows]) / spreads[rows]
-        share = (
-            torch.sigmoid((near - rule.similarity_threshold) / unit)
-            * torch.sigmoid(z - rule.cohort_threshold)
-        ).mean()
+        share = torch.sigmoid(z - rule.threshold).mean()
         loss, score = -torch.log(share + 1e-6), 0.0
         if limit is not None:
             similarities = others @ p + radius * torch.linalg.norm(others @ span.T, dim=1)
@@ -143,11 +130,6 @@ def starts(faces: Floats, honest: AffineSubspace, m: int) -> dict[str, AffineSub
     return {"axes": canonical(mean, axes[:m]), "honest": honest}
 
 
-def unit(rows: NDArray[np.floating]) -> Floats:
-    """Rows of norm 1."""
-    return np.asarray(rows / np.linalg.norm(rows, axis=-1, keepdims=True), dtype=np.float32)
-
-
 def crops(data: Path, cache: Path) -> tuple[Floats, NDArray[np.str_]]:
     """Embeddings and names of LFW's aligned crops; ``cache`` saves a second extraction."""
     if not cache.exists():
@@ -165,7 +147,7 @@ def stored(data: Path, name: str) -> tuple[Floats, NDArray[np.str_]]:
     """Embeddings and names of one file of embeddings."""
     file = np.load(data / "embeddings" / f"{name}.npz")
     names = [str(path).split("/")[0] for path in file["paths"]]
-    return unit(file["emb_mbf"].astype(np.float32)), np.array(names)
+    return normalised(file["emb_mbf"].astype(np.float32)), np.array(names)
 
 
 def main() -> None:
@@ -198,10 +180,10 @@ def main() -> None:
         source=source,
         options=CalibrationOptions(most_cells=4_000_000),
     ).contract  # fmt: skip
-    limit, rule = contract.template_stranger_score, contract.calibrations[0]
+    limit = contract.template_stranger_score
 
     def score(template: AffineSubspace) -> float:
-        return contract.nobody.score(template, metric=rule.metric, steps=rule.steps)
+        return contract.nobody.score(template, contract.expectation)
 
     def lifted(rows: Floats, seed: str) -> SubspaceBatch:
         with Keystream.seeded(seed) as stream:
@@ -210,8 +192,10 @@ def main() -> None:
             )
 
     victims, first = np.unique(names[enrolled], return_index=True)
-    means = unit(
-        np.stack([descriptors[enrolled][names[enrolled] == each][:3].mean(0) for each in victims])
+    means = normalised(
+        np.stack(
+            [descriptors[enrolled][names[enrolled] == victim][:3].mean(0) for victim in victims]
+        )
     )
     strangers = Faces.of(descriptors[enrolled][first], contract)
     for kind, rows in (("lfw", means[:HONEST]), ("fairface", fairface[-HONEST:])):

@@ -2,7 +2,9 @@
 
 One connection asks a running service about an enrolled subject and about one that does not exist,
 with the probe of a stranger, in an order drawn at random, many times. Both are rejected in the same
-words; this compares how long it took. The lockout is off (with it the sixth attempt on either is
+words; this compares how long it took. So it does for a subject whose template needs a holder's key,
+with a key that is not theirs, with theirs, and without one; beside it the one that does not exist
+is asked about with a key, and without. The lockout is off (with it the sixth attempt on either is
 refused), and so are the rate limits.
 
 The test, chosen before the first run: the area under the ROC curve of an attacker who calls the
@@ -19,6 +21,7 @@ Example
 """
 
 import argparse
+import base64
 import json
 import os
 import time
@@ -36,6 +39,13 @@ from benchmarks.service_load import Prepared, prepared_probes
 from models.pack import ModelPack
 
 BOUND = 0.03
+COMPARED = {
+    "enrolled": ("enrolled", "unknown"),
+    "needs a key, another was sent": ("other key", "unknown, key"),
+    "needs a key, it was sent": ("right key", "unknown, key"),
+    "needs a key, none was sent": ("no key", "unknown"),
+    "enrolled, a key was sent": ("enrolled, key", "unknown, key"),
+}
 
 
 def auc(slow: NDArray[np.float64], fast: NDArray[np.float64]) -> tuple[float, float, float]:
@@ -77,11 +87,15 @@ def compare(known: NDArray[np.float64], unknown: NDArray[np.float64]) -> dict[st
     }
 
 
-def ask(client: httpx.Client, token: str, subject: str, probe: Prepared) -> float:
+def ask(
+    client: httpx.Client, token: str, subject: str, probe: Prepared, key: str | None = None
+) -> float:
     """Seconds until the answer, which must be a rejection."""
     own = Prepared(subject, probe.kind, probe.body, probe.signed, probe.key)
     body, kind = own.request()
     headers = {"Authorization": f"Bearer {token}", "Content-Type": kind}
+    if key is not None:
+        headers["Veilface-Holder-Key"] = key
     started = time.perf_counter()
     answer = client.post(f"/v1/subjects/{subject}/verify", content=body, headers=headers)
     took = time.perf_counter() - started
@@ -127,20 +141,37 @@ def main() -> None:
         address = stack.enter_context(service(env, workers=1, log=args.work / "serve.log"))
         client = stack.enter_context(httpx.Client(base_url=address, timeout=60))
         client.headers["Authorization"] = f"Bearer {token}"
-        victim, stranger = people_of(args.data / "lfw" / "photos")[:2]
+        victim, stranger, keyed = people_of(args.data / "lfw" / "photos")[:3]
+        right, other = (base64.urlsafe_b64encode(os.urandom(32)).decode() for _ in range(2))
         enroll_photos(client, victim, None).raise_for_status()
+        client.headers["Veilface-Holder-Key"] = right
+        enroll_photos(client, keyed, None).raise_for_status()
+        del client.headers["Veilface-Holder-Key"]
+        unknown = "x" + victim.name[1:]
+        cases: dict[str, tuple[str, str | None]] = {
+            "enrolled": (victim.name, None),
+            "enrolled, key": (victim.name, other),
+            "unknown": (unknown, None),
+            "unknown, key": (unknown, other),
+            "other key": (keyed.name, other),
+            "right key": (keyed.name, right),
+            "no key": (keyed.name, None),
+        }
         pack = ModelPack.load(args.pack, threads=1)
         report: dict[str, Any] = {"database": args.database, "lockout": "off", "kinds": {}}
         for kind in args.kind.split(","):
             probe = prepared_probes(kind, [stranger], client, pack, asking, args.probe_dim)[0]
-            subjects = (victim.name, "x" + victim.name[1:])
-            for subject in subjects * 20:
-                ask(client, asking, subject, probe)
-            times = np.empty((args.pairs, 2))
-            for row in times:
-                for which in rng.permutation(2):
-                    row[which] = ask(client, asking, subjects[which], probe)
-            report["kinds"][kind] = compare(times[:, 0], times[:, 1])
+            for subject, key in [*cases.values()] * 20:
+                ask(client, asking, subject, probe, key)
+            times = {case: np.empty(args.pairs) for case in cases}
+            for turn in range(args.pairs):
+                for case in rng.permutation(list(cases)):
+                    subject, key = cases[case]
+                    times[case][turn] = ask(client, asking, subject, probe, key)
+            report["kinds"][kind] = {
+                name: compare(times[known], times[beside])
+                for name, (known, beside) in COMPARED.items()
+            }
     print(json.dumps(report, indent=2))
 
 

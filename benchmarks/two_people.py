@@ -26,14 +26,12 @@ from PIL import Image
 
 from attacks.decisions import decide
 from benchmarks.hostile_probes import Faces, contract_of
-from enroll import InconsistentImages
-from enroll.enroller import mean_descriptor
 from models.extraction import Extractor
 from models.pack import ModelPack
 from templates.contract.document import Contract
 from templates.decoys import DecoyGenerator
 from templates.keys.randomness import Keystream
-from templates.space.agreement import weakest_split
+from templates.space.agreement import InconsistentImages, mean_embedding, weakest_split
 from templates.space.lifting import lift
 from verify import labelled_folder
 from verify.metrics import rate
@@ -109,7 +107,7 @@ def enrolled_means(
     for attempt in attempts:
         rows = faces.descriptors[list(attempt.enrolled)]
         try:
-            means.append(mean_descriptor(rows, consistency=contract.photo_consistency))
+            means.append(mean_embedding(rows, consistency=contract.photo_consistency))
         except InconsistentImages:
             continue
         passed.append(attempt)
@@ -140,7 +138,7 @@ def both_accepted(
         decide(
             faces.descriptors[[attempt.fresh[side] for attempt in attempts]],
             templates, contract, calibration, level, paired=True,
-        ).accepted
+        )
         for side in (0, 1)
     ]  # fmt: skip
     return int(np.count_nonzero(accepted[0] & accepted[1]))
@@ -217,7 +215,7 @@ def main() -> None:
     single = np.array([counts[name] == 1 and name not in known for name in crops.names])
     calibrating = np.isin(crops.names, [name for name in several[half:] if name not in known])
     source = DecoyGenerator.fit(crops.descriptors[single])
-    contract = contract_of(pack, crops.only(calibrating), source, args.dim, (0,))
+    contract = contract_of(crops.only(calibrating), source, args.dim, (0,))
     print(f"photo consistency {contract.photo_consistency:.3f}, {contract.recorded}")
     attackers = crops.only(attacking)
     own_paths = [path for path, kept in zip(paths, attacking, strict=True) if kept]

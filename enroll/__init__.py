@@ -4,13 +4,9 @@ Imports the layer below only: ``templates`` and ``models``.
 """
 
 from enroll.enroller import Enroller, Enrollment, PhotoResult
-from enroll.errors import EnrollmentError, InconsistentImages, PhotoRejected
 
 __all__ = [
     "Enroller",
     "Enrollment",
-    "EnrollmentError",
-    "InconsistentImages",
-    "PhotoRejected",
     "PhotoResult",
 ]

@@ -1,8 +1,10 @@
 """From photos, embeddings or a client's template to the one private template that is stored.
 
 The order matters: the photos' embeddings are averaged first and lifted once, because two lifts of
-one person meet in that person's descriptor (docs/method.md §4.6). Randomness is fresh for every
-template and dropped with it. The tenant's rotation comes last, so that clients never need it.
+one person meet in that person's descriptor (docs/method.md §4.6). For the same reason the photos
+decide the decoys, under a secret of the deployment: enrolled again, they give the same set. The
+template's rotations come last, the holder's and then the tenant's, so that clients never need the
+tenant's.
 """
 
 import secrets
@@ -12,19 +14,19 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from enroll.errors import InconsistentImages, PhotoRejected
 from models.decoding import DEFAULT_LIMITS, ImageLimits
-from models.errors import ModelError
 from models.pack import FacePolicy, ModelPack
+from models.photos import embed_photos
 from models.quality import DEFAULT_QUALITY, QualityLimits
 from templates.contract import wire
 from templates.contract.document import Contract
 from templates.decoys import Attributes, DecoySource
 from templates.errors import ContractMismatch, InvalidTemplate
 from templates.keys.randomness import Keystream
-from templates.space.agreement import weakest_split
+from templates.keys.rotation import HolderKey, TenantRotation, holder_rotation
+from templates.space.agreement import mean_embedding
 from templates.space.embedding import unit_rows
-from templates.space.lifting import Strategy, lift
+from templates.space.lifting import Strategy, lift, lift_stream
 from templates.space.subspace import AffineSubspace
 
 MAX_PHOTOS = 10
@@ -48,17 +50,21 @@ class Enrollment:
     wire
         Rotated template in the wire format. Private: to be sealed, never logged.
     template_id
-        Random name of this template, 32 hexadecimal digits.
+        Random name of this template, 32 hexadecimal digits; its rotation is derived from it.
     contract_id
         Contract that the template belongs to.
     per_photo
         One result per photo; empty for a client's template.
+    holder_salt
+        Random; the holder's rotation is derived from it and the holder's key. None where the
+        template needs no key.
     """
 
     wire: bytes = field(repr=False)
     template_id: str
     contract_id: str
     per_photo: tuple[PhotoResult, ...]
+    holder_salt: str | None = None
 
 
 class Enroller:
@@ -70,8 +76,10 @@ class Enroller:
         Contract that the templates will carry.
     source
         Decoy source; its id must be the contract's.
-    rotation : (n, n) float64
-        The tenant's orthogonal rotation.
+    rotation
+        What gives each template of the tenant its rotation.
+    lift_secret
+        32 secret bytes of the deployment, which decoys are drawn under.
 
     Raises
     ------
@@ -80,18 +88,24 @@ class Enroller:
     """
 
     def __init__(
-        self, contract: Contract, source: DecoySource, *, rotation: NDArray[np.float64]
+        self,
+        contract: Contract,
+        source: DecoySource,
+        *,
+        rotation: TenantRotation,
+        lift_secret: bytes,
     ) -> None:
         contract.binding.require_source(source_id=source.source_id)
         n = contract.binding.n
-        if source.n != n or rotation.shape != (n, n):
+        if source.n != n or rotation.n != n:
             raise ContractMismatch(
                 f"the contract is for embeddings of {n} numbers; the decoy source gives "
-                f"{source.n}, the rotation turns {rotation.shape[0]}"
+                f"{source.n}, the rotation turns {rotation.n}"
             )
         self._contract = contract
         self._source = source
         self._rotation = rotation
+        self._lift_secret = lift_secret
 
     def from_photos(
         self,
@@ -99,6 +113,7 @@ class Enroller:
         photos: Sequence[bytes],
         *,
         attributes: Attributes | None = None,
+        holder_key: HolderKey | None = None,
         policy: FacePolicy = FacePolicy.SINGLE,
         quality: QualityLimits | None = DEFAULT_QUALITY,
         limits: ImageLimits = DEFAULT_LIMITS,
@@ -108,7 +123,8 @@ class Enroller:
         Parameters
         ----------
         policy, quality, limits
-            See ``ModelPack.embed_photo``; ``attributes`` see ``from_embeddings``.
+            See ``ModelPack.embed_photo``; ``attributes`` and ``holder_key`` see
+            ``from_embeddings``.
 
         Raises
         ------
@@ -125,17 +141,14 @@ class Enroller:
         )
         if not 1 <= len(photos) <= MAX_PHOTOS:
             raise ValueError(f"an enrollment has 1 to {MAX_PHOTOS} photos, not {len(photos)}")
-        samples = []
-        for index, photo in enumerate(photos):
-            try:
-                sample = pack.embed_photo(photo, policy=policy, quality=quality, limits=limits)
-            except ModelError as error:
-                raise PhotoRejected(index, error, count=len(photos)) from error
-            samples.append(sample)
-        return self.from_embeddings(
-            np.stack([sample.embedding for sample in samples]),
+        samples = embed_photos(pack, photos, policy=policy, quality=quality, limits=limits)
+        embeddings = np.stack([sample.embedding for sample in samples])
+        return self._lifted(
+            unit_rows(embeddings, n=info.n, most=MAX_PHOTOS),
+            photos,
             attributes=attributes,
-            qualities=[sample.quality for sample in samples],
+            holder_key=holder_key,
+            results=[PhotoResult(index, sample.quality) for index, sample in enumerate(samples)],
         )
 
     def from_embeddings(
@@ -143,7 +156,7 @@ class Enroller:
         embeddings: NDArray[np.floating],
         *,
         attributes: Attributes | None = None,
-        qualities: Sequence[object] | None = None,
+        holder_key: HolderKey | None = None,
     ) -> Enrollment:
         """Enroll from 1 to 10 unit embeddings of one person, (k, n).
 
@@ -151,8 +164,9 @@ class Enroller:
         ----------
         attributes
             The subject's gender and race, for hybrid+ only. Used here and forgotten.
-        qualities
-            One quality record per embedding, handed through to the result.
+        holder_key
+            32 secret bytes without which the template accepts nobody; it is not kept. None: the
+            template needs no key.
 
         Raises
         ------
@@ -162,27 +176,51 @@ class Enroller:
             Where the embeddings part into two groups less alike than ``photo_consistency``.
         """
         rows = unit_rows(embeddings, n=self._contract.binding.n, most=MAX_PHOTOS)
-        descriptor = mean_descriptor(rows, consistency=self._contract.photo_consistency)
-        binding = self._contract.binding
-        named = [attributes or Attributes()] if binding.strategy is Strategy.HYBRID_PLUS else None
-        # Without a stream, lift draws from a fresh one and drops it.
-        lifted = lift(
-            descriptor[None],
-            strategy=binding.strategy,
-            m=binding.m,
-            source=self._source,
-            attributes=named,
+        return self._lifted(
+            rows,
+            [row.tobytes() for row in rows],
+            attributes=attributes,
+            holder_key=holder_key,
+            results=[PhotoResult(index) for index in range(len(rows))],
         )
-        records = qualities if qualities is not None else [None] * len(rows)
-        results = [PhotoResult(index, entry) for index, entry in enumerate(records)]
-        return self._finish(lifted[0], per_photo=tuple(results))
 
-    def from_template(self, data: bytes) -> Enrollment:
+    def _lifted(
+        self,
+        rows: NDArray[np.float32],
+        photos: Sequence[bytes],
+        *,
+        attributes: Attributes | None,
+        holder_key: HolderKey | None,
+        results: Sequence[PhotoResult],
+    ) -> Enrollment:
+        contract, binding = self._contract, self._contract.binding
+        descriptor = mean_embedding(rows, consistency=contract.photo_consistency)
+        named = [attributes or Attributes()] if binding.strategy is Strategy.HYBRID_PLUS else None
+        with lift_stream(
+            self._lift_secret, contract_id=contract.contract_id, photos=photos
+        ) as stream:
+            lifted = lift(
+                descriptor[None],
+                strategy=binding.strategy,
+                m=binding.m,
+                source=self._source,
+                stream=stream,
+                attributes=named,
+            )
+        turned, salt = self._turned_by_holder(lifted[0], holder_key)
+        return self._finish(turned, per_photo=tuple(results), holder_salt=salt)
+
+    def from_template(self, data: bytes, *, holder_key: HolderKey | None = None) -> Enrollment:
         """Enroll a template that a client lifted, in the wire format, un-rotated.
 
         The set is kept; its basis is drawn anew. A template that lies near strangers, as a wolf
         does, is refused. One that was laid through a few dozen people is not: nothing tells it
         from a lift of one of them.
+
+        Parameters
+        ----------
+        holder_key
+            See ``from_embeddings``.
 
         Raises
         ------
@@ -192,22 +230,28 @@ class Enroller:
             Where the template belongs to another contract.
         """
         contract, subspace = self._contract, self._received(data)
-        rule = contract.calibrations[0]
-        score = contract.nobody.score(subspace, metric=rule.metric, steps=rule.steps)
+        score = contract.nobody.score(subspace, contract.expectation)
         # NaN is not below the limit either.
         if not score <= contract.template_stranger_score:
             raise InvalidTemplate(
                 "the template lies nearer to strangers than the contract recorded of honest ones: "
                 "lift photos of one person with the contract's decoys"
             )
-        return self._of(subspace)
+        turned, salt = self._turned_by_holder(subspace, holder_key)
+        return self._of(turned, holder_salt=salt)
 
-    def from_export(self, data: bytes) -> Enrollment:
-        """Enroll the template of an export that this service sealed, un-rotated.
+    def from_export(self, data: bytes, *, holder_salt: str | None = None) -> Enrollment:
+        """Enroll the template of an export that a service sealed, without the tenant's rotation.
 
-        As :meth:`from_template`, for a template that was made of photos by the service itself.
+        As :meth:`from_template`, for a template that was made of photos by the service itself, or
+        that a holder's rotation turns still.
+
+        Parameters
+        ----------
+        holder_salt
+            Of the holder's rotation; None where the template needs no key.
         """
-        return self._of(self._received(data))
+        return self._of(self._received(data), holder_salt=holder_salt)
 
     def _received(self, data: bytes) -> AffineSubspace:
         """Decode a template, and check whether it is one of the contract."""
@@ -228,39 +272,37 @@ class Enroller:
             )
         return subspace
 
-    def _of(self, subspace: AffineSubspace) -> Enrollment:
-        # The client knows its rows. Rotated as they are, they would be pairs (x, R x) of the
-        # tenant's rotation for whoever sees them stored; of a fresh basis only the set is known.
+    def _of(self, subspace: AffineSubspace, *, holder_salt: str | None) -> Enrollment:
+        # The client knows its rows. Turned as they are, they would be pairs (x, R x) of the
+        # template's rotation for whoever sees them stored; of a fresh basis only the set is known.
         with Keystream.fresh() as stream:
             spanned = AffineSubspace.through(subspace.foot, subspace.basis, stream=stream)
-        return self._finish(spanned, per_photo=())
+        return self._finish(spanned, per_photo=(), holder_salt=holder_salt)
+
+    def _turned_by_holder(
+        self, subspace: AffineSubspace, key: HolderKey | None
+    ) -> tuple[AffineSubspace, str | None]:
+        """Turn a template by a new rotation of its holder's; returns it with the salt."""
+        if key is None:
+            return subspace, None
+        salt = secrets.token_hex(16)
+        rotation = holder_rotation(key, salt, self._contract.binding.n)
+        return subspace.turned_by(rotation.turned), salt
 
     def _finish(
-        self, subspace: AffineSubspace, *, per_photo: tuple[PhotoResult, ...]
+        self,
+        subspace: AffineSubspace,
+        *,
+        per_photo: tuple[PhotoResult, ...],
+        holder_salt: str | None,
     ) -> Enrollment:
-        contract_id = self._contract.contract_id
-        rotated = subspace.rotated(self._rotation)
+        contract_id, template_id = self._contract.contract_id, secrets.token_hex(16)
+        rotation = self._rotation.of(template_id, self._contract.binding.rotation_version)
+        turned = subspace.turned_by(rotation.turned)
         return Enrollment(
-            wire=wire.encode(rotated, contract_id=contract_id, dtype=WIRE_DTYPE),
-            template_id=secrets.token_hex(16),
+            wire=wire.encode(turned, contract_id=contract_id, dtype=WIRE_DTYPE),
+            template_id=template_id,
             contract_id=contract_id,
             per_photo=per_photo,
+            holder_salt=holder_salt,
         )
-
-
-def mean_descriptor(rows: NDArray[np.float32], *, consistency: float) -> NDArray[np.float32]:
-    """Average the unit rows of one person and normalise, (k, n) to (n,).
-
-    Raises
-    ------
-    InconsistentImages
-        Where the rows part into two groups that agree less than ``consistency``
-        (``templates.space.agreement``), or cancel.
-    """
-    mean = rows.astype(np.float64).mean(axis=0)
-    norm = float(np.linalg.norm(mean))
-    if len(rows) > 1:
-        split = weakest_split(rows)
-        if split.agreement < consistency or norm < 1e-6:
-            raise InconsistentImages(split.apart, split.others)
-    return np.asarray(mean / norm, dtype=np.float32)

@@ -25,15 +25,15 @@ from models.errors import (
     ProviderUnavailable,
 )
 from models.extraction import Extraction, Extractor, Failure
+from models.faces import FaceSample
+from models.liveness import PassiveLiveness
 from models.pack import (
     DetectorInfo,
     FacePolicy,
-    FaceSample,
-    GraphReport,
     ModelPack,
     PackInfo,
-    inspect,
 )
+from models.pack_graphs import GraphReport, inspect
 from models.quality import Quality, QualityLimits
 
 __all__ = [
@@ -59,6 +59,7 @@ __all__ = [
     "NoFace",
     "PackError",
     "PackInfo",
+    "PassiveLiveness",
     "ProviderUnavailable",
     "Quality",
     "QualityLimits",

@@ -243,7 +243,7 @@ def _attribute(name: str, value: int | list[int]) -> bytes:
     if isinstance(value, int):
         kind, values = 2, [(Attribute.INT, value)]
     else:
-        kind, values = 7, [(Attribute.INTS, each) for each in value]
+        kind, values = 7, [(Attribute.INTS, number) for number in value]
     return message((Attribute.NAME, name), *values, (Attribute.TYPE, kind))
 
 

@@ -7,6 +7,7 @@
     ├── PackError                a model pack that is broken, unknown or ambiguous
     ├── ProviderUnavailable      an accelerator was asked for and is not there
     ├── CacheError               an embedding cache that is not one
+    ├── PhotoRejected            one of several photos was refused; ``cause`` says why
     └── FaceError(code)          a picture that was read, with no usable face in it
         ├── NoFace
         ├── MultipleFaces
@@ -98,3 +99,27 @@ class LowQuality(FaceError):
     """
 
     code = "low_quality"
+
+
+class PhotoRejected(ModelError):
+    """One photo of a set was refused, and the set with it.
+
+    Parameters
+    ----------
+    index
+        Position of the photo in the set, from 0. Words count from 1.
+    cause
+        What was wrong with it; it has its own code and message.
+    count
+        Photos in the set.
+    """
+
+    def __init__(self, index: int, cause: ModelError, *, count: int) -> None:
+        self.index = index
+        self.cause = cause
+        self._place = f"photo {index + 1} of {count}: " if count > 1 else ""
+        super().__init__(self.placed(str(cause)))
+
+    def placed(self, message: str) -> str:
+        """Say which photo a message is about; of a single one there is no need to."""
+        return self._place + message

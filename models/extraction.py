@@ -33,6 +33,8 @@ from models.sessions import default_workers
 CHUNK = 128
 """Photos embedded together. Their crops are in memory at once, photos only one per thread."""
 _QUIET_SECONDS = 2.0
+_KEPT_SECONDS = 15.0
+"""Between two writes of the cache, at least: what a killed run loses."""
 
 Advance = Callable[[int], None]
 
@@ -202,6 +204,7 @@ class Extractor:
         failures: list[Failure] = []
         cached = 0
         bar = _Bar(len(files), progress)
+        keep_after = time.monotonic() + _KEPT_SECONDS
         try:
             with bar, ThreadPoolExecutor(self._workers) as pool:
                 for start in range(0, len(files), CHUNK):
@@ -219,6 +222,7 @@ class Extractor:
                         )
                         done.append(path)
                     bar.advance(len(chunk))
+                    keep_after = self._keep(keep_after)
         finally:
             if self._cache is not None:
                 self._cache.flush()
@@ -230,6 +234,15 @@ class Extractor:
         ]
         mirrored = kinds[1] if len(kinds) == 2 else None
         return Extraction(kinds[0], done, failures, cached, mirrored)
+
+    def _keep(self, after: float) -> float:
+        """Write the cache if it is time to; when to do so next, however large the file grows."""
+        began = time.monotonic()
+        if self._cache is None or began < after:
+            return after
+        self._cache.flush()
+        ended = time.monotonic()
+        return ended + max(_KEPT_SECONDS, 20 * (ended - began))
 
     def _settings_digest(self, preprocessing: Mapping[str, object]) -> bytes:
         """Everything besides the picture that an embedding depends on."""
@@ -257,8 +270,8 @@ class Extractor:
                 marks = source.keypoints
                 content = hashlib.sha256(content + marks.tobytes()).digest()
             key = tuple(hashlib.sha256(kind + content).digest() for kind in self._kinds)
-            known = () if self._cache is None else tuple(self._cache.get(each) for each in key)
-            embeddings = tuple(each for each in known if each is not None)
+            known = () if self._cache is None else tuple(self._cache.get(part) for part in key)
+            embeddings = tuple(embedding for embedding in known if embedding is not None)
             if len(embeddings) == len(key):
                 return _Prepared(key, embedding=embeddings)
             if marks is not None:
@@ -267,9 +280,9 @@ class Extractor:
             elif self._aligned:
                 crop = self._pack.as_aligned(decode_image(data, limits=self._limits))
             else:
-                crop, _, _ = self._pack.crop_photo(
+                crop = self._pack.crop_photo(
                     data, policy=self._policy, quality=self._quality, limits=self._limits
-                )
+                ).crop
             return _Prepared(key, crop=crop)
         except (ImageError, FaceError) as error:
             return _Prepared((), failure=Failure(path, error.code, str(error)))
@@ -289,8 +302,8 @@ class Extractor:
         result = dict(zip(unique, zip(*kinds, strict=True), strict=True))
         if self._cache is not None:
             for key, embeddings in result.items():
-                for each, embedding in zip(key, embeddings, strict=True):
-                    self._cache.put(each, embedding)
+                for part, embedding in zip(key, embeddings, strict=True):
+                    self._cache.put(part, embedding)
         return result
 
 
@@ -347,12 +360,14 @@ class _Bar:
                 TextColumn("Embedding faces"),
                 BarColumn(),
                 MofNCompleteColumn(),
+                TextColumn("{task.fields[speed]:.0f} photos/s"),
                 TimeRemainingColumn(),
                 console=Console(stderr=True),
             )
             self._progress.start()
-            self._progress.add_task("faces", total=self._total)
-        self._progress.update(self._progress.task_ids[0], completed=self._done)
+            self._progress.add_task("faces", total=self._total, speed=0.0)
+        speed = self._done / max(time.monotonic() - self._started, 1e-3)
+        self._progress.update(self._progress.task_ids[0], completed=self._done, speed=speed)
 
     def __exit__(
         self,

@@ -91,10 +91,10 @@ class Message:
 
     def messages(self, *fields: int) -> list["Message"]:
         """Return what is nested in a field, or in a field of what is nested, and so on."""
-        found = [self]
+        messages = [self]
         for field in fields:
-            found = [Message(part) for each in found for part in each._parts(field)]
-        return found
+            messages = [Message(part) for message in messages for part in message._parts(field)]
+        return messages
 
     def text(self, field: int) -> str:
         """Return a string; empty where there is none."""

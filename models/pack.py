@@ -1,9 +1,9 @@
 """Model packs: user-supplied weights that together turn a photo into an embedding."""
 
-import hashlib
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from enum import StrEnum
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +18,16 @@ from models.demo import DEMO_DIMENSION, is_demo_model, require_face
 from models.detection import DEFAULT_SIZE, Detector, find_faces
 from models.embedding import Embedder, Preprocessing
 from models.errors import ImageError, ModelError, PackError
-from models.pack_file import PackFile, Triple, read_pack_file
-from models.quality import DEFAULT_QUALITY, Quality, QualityLimits, check, measure, select_face
+from models.faces import FaceCrop, FaceSample
+from models.liveness import PassiveLiveness
+from models.liveness_graphs import open_liveness
+from models.pack_file import PackFile, Triple
+from models.pack_graphs import PackGraph, locate, pick, read_graph
+from models.quality import DEFAULT_QUALITY, QualityLimits, check, measure, select_face
 from models.scrfd import Scrfd
 from models.sessions import Session
-from models.signature import DETECTORS, Role, Signature, classify, read_signature
+from models.signature import Role
 from models.yunet import YuNet
-
-_SUFFIX = ".onnx"
-# A ResNet-100 embedder has 260 MB; protobuf itself ends at 2 GiB.
-_MAX_MODEL_BYTES = 2**30
 
 
 class FacePolicy(StrEnum):
@@ -35,18 +35,6 @@ class FacePolicy(StrEnum):
 
     SINGLE = "single"
     LARGEST = "largest"
-
-
-@dataclass(frozen=True)
-class GraphReport:
-    """What one ``.onnx`` file of a pack is, and why."""
-
-    file: str
-    role: Role
-    reason: str
-    sha256: str
-    inputs: str
-    outputs: str
 
 
 @dataclass(frozen=True)
@@ -85,39 +73,8 @@ class PackInfo:
     detector: DetectorInfo | None
 
 
-@dataclass(frozen=True, eq=False)
-class FaceSample:
-    """One face of a photo, embedded.
-
-    Attributes
-    ----------
-    embedding
-        float32, shape (n,), unit norm. Never shown by ``repr``.
-    quality
-        What was measured.
-    box
-        x1, y1, x2, y2 in pixels of the upright photo; ``None`` for crops that came aligned.
-    """
-
-    embedding: NDArray[np.float32] = field(repr=False)
-    quality: Quality
-    box: tuple[float, float, float, float] | None
-
-
-@dataclass(frozen=True)
-class _Graph:
-    """One file of a pack, read once: what is hashed is what runs."""
-
-    path: Path
-    model: bytes = field(repr=False)
-    sha256: str
-    signature: Signature
-    role: Role
-    reason: str
-
-
 class ModelPack:
-    """An embedder with its preprocessing and, usually, a detector.
+    """An embedder with its preprocessing and, usually, a detector; perhaps liveness graphs.
 
     Make one with `load`. All methods are safe from several threads at once.
 
@@ -134,8 +91,16 @@ class ModelPack:
     True
     """
 
-    def __init__(self, info: PackInfo, *, embedder: Embedder, detector: Detector | None) -> None:
+    def __init__(
+        self,
+        info: PackInfo,
+        *,
+        embedder: Embedder,
+        detector: Detector | None,
+        liveness: Callable[[], PassiveLiveness | None] = lambda: None,
+    ) -> None:
         self.info = info
+        self._open_liveness = liveness
         self._embedder = embedder
         self._detector = detector
         self._demo = (
@@ -174,9 +139,9 @@ class ModelPack:
         ProviderUnavailable
             If a requested provider is absent or does not start.
         """
-        location, stated = _locate(Path(path))
-        graphs = [_read(file, stated) for file in location.files]
-        embedder_graph, detector_graph = _pick(graphs, location.folder)
+        location, stated = locate(Path(path))
+        graphs = [read_graph(file, stated) for file in location.files]
+        embedder_graph, detector_graph = pick(graphs, location.folder)
         embedder = _embedder(embedder_graph, stated, flip, providers, threads)
         detector = detector_info = None
         if detector_graph is not None:
@@ -198,7 +163,27 @@ class ModelPack:
             preprocessing=embedder.preprocessing.as_dict(),
             detector=detector_info,
         )
-        return cls(info, embedder=embedder, detector=detector)
+        liveness = partial(
+            open_liveness,
+            [graph for graph in graphs if graph.role is Role.LIVENESS],
+            stated,
+            location.folder,
+            detects=detector is not None,
+            providers=providers,
+            threads=threads,
+        )
+        return cls(info, embedder=embedder, detector=detector, liveness=liveness)
+
+    @cached_property
+    def liveness(self) -> PassiveLiveness | None:
+        """The liveness graphs, loaded when they are first asked for; ``None`` where none are.
+
+        Raises
+        ------
+        PackError
+            If they cannot be used. A pack whose liveness nobody asks for works all the same.
+        """
+        return self._open_liveness()
 
     @property
     def crop_size(self) -> int:
@@ -260,25 +245,46 @@ class ModelPack:
         policy: FacePolicy = FacePolicy.SINGLE,
         quality: QualityLimits | None = DEFAULT_QUALITY,
         limits: ImageLimits = DEFAULT_LIMITS,
-    ) -> tuple[NDArray[np.uint8], Quality, Face | None]:
-        """Decode, find the face, align and check it: `embed_photo` without the embedding."""
+        liveness: bool = False,
+    ) -> FaceCrop:
+        """Decode, find the face, align and check it: `embed_photo` without the embedding.
+
+        Parameters and errors as there. The whole picture is dropped: with `liveness` the face is
+        scored on it before.
+        """
+        if liveness and self.liveness is None:
+            raise PackError(
+                f"The pack {self.info.name} has no liveness graph; add one to its folder"
+                " (docs/liveness.md)."
+            )
         image = decode_image(data, limits=limits)
+        face = score = None
         if self._detector is None:
             crop = self.as_aligned(image)
-            measured = measure(crop, None)
-            face = None
         else:
             face = select_face(
                 self.detect(image), single=policy is FacePolicy.SINGLE, limits=quality
             )
             crop = self.align(image, face)
-            measured = measure(crop, face)
+        taken = FaceCrop(crop=crop, quality=measure(crop, face), face=face)
         if quality is not None:
-            recommended = 0.0 if self._detector is None else self._detector.recommended_score
-            check(measured, quality, recommended_score=recommended)
-            if self._demo:
-                require_face(crop)
-        return crop, measured, face
+            self.require_quality(taken, quality)
+        if liveness and self.liveness is not None and taken.box is not None:
+            score = self.liveness.score(image, taken.box)
+        return replace(taken, liveness=score)
+
+    def require_quality(self, taken: FaceCrop, limits: QualityLimits = DEFAULT_QUALITY) -> None:
+        """Refuse a face that fails a limit, by what this pack's detector recommends.
+
+        Raises
+        ------
+        FaceError
+            `FaceTooSmall` or `LowQuality`; `NoFace` of the demo model.
+        """
+        recommended = 0.0 if self._detector is None else self._detector.recommended_score
+        check(taken.quality, limits, recommended_score=recommended)
+        if self._demo:
+            require_face(taken.crop)
 
     def embed_photo(
         self,
@@ -287,6 +293,7 @@ class ModelPack:
         policy: FacePolicy = FacePolicy.SINGLE,
         quality: QualityLimits | None = DEFAULT_QUALITY,
         limits: ImageLimits = DEFAULT_LIMITS,
+        liveness: bool = False,
     ) -> FaceSample:
         """From the bytes of a photo to the embedding of its face.
 
@@ -304,9 +311,13 @@ class ModelPack:
             Limits; ``None`` checks nothing but that there is a face.
         limits
             Of the decoder.
+        liveness
+            Also say how live the face looks; the pack needs a liveness graph.
 
         Raises
         ------
+        PackError
+            If liveness is asked of a pack that has no graph for it.
         ImageError
             If the bytes are no acceptable picture.
         FaceError
@@ -314,12 +325,15 @@ class ModelPack:
         ModelError
             If inference fails.
         """
-        crop, measured, face = self.crop_photo(data, policy=policy, quality=quality, limits=limits)
-        box = None
-        if face is not None:
-            x1, y1, x2, y2 = (float(value) for value in face.box)
-            box = (x1, y1, x2, y2)
-        return FaceSample(embedding=self.embed(crop[None])[0], quality=measured, box=box)
+        taken = self.crop_photo(
+            data, policy=policy, quality=quality, limits=limits, liveness=liveness
+        )
+        return FaceSample(
+            embedding=self.embed(taken.crop[None])[0],
+            quality=taken.quality,
+            box=taken.box,
+            liveness=taken.liveness,
+        )
 
     def as_aligned(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Take a square picture as an aligned crop, resized to the embedder's size.
@@ -343,97 +357,8 @@ class ModelPack:
         return np.asarray(cv2.resize(image, (size, size), interpolation=shrink), dtype=np.uint8)
 
 
-def inspect(path: str | Path) -> list[GraphReport]:
-    """What every graph of a pack is, and why; unusable packs are reported, not refused.
-
-    Raises
-    ------
-    PackError
-        If there is no ``.onnx`` file, ``pack.toml`` is broken, or a file is no ONNX model.
-    """
-    location, stated = _locate(Path(path))
-    return [
-        GraphReport(
-            file=graph.path.name,
-            role=graph.role,
-            reason=graph.reason,
-            sha256=graph.sha256,
-            inputs=_shapes(graph.signature.inputs),
-            outputs=_shapes(graph.signature.outputs),
-        )
-        for graph in (_read(file, stated) for file in location.files)
-    ]
-
-
-def _shapes(tensors: Sequence[Any]) -> str:
-    return ", ".join(
-        f"{tensor.name}[{', '.join('?' if d is None else str(d) for d in tensor.shape)}]"
-        for tensor in tensors
-    )
-
-
-@dataclass(frozen=True)
-class _Location:
-    name: str
-    folder: Path
-    files: list[Path]
-
-
-def _locate(path: Path) -> tuple[_Location, PackFile]:
-    if path.is_file():
-        if path.suffix.lower() != _SUFFIX:
-            raise PackError(f"{path} is not an .onnx file; name a pack folder or an embedder.")
-        return _Location(path.stem, path.parent, [path]), read_pack_file(path.parent)
-    if not path.is_dir():
-        raise PackError(f"{path} does not exist; name a folder of .onnx files or one embedder.")
-    for folder in (path, path / path.resolve().name):
-        # Hidden files are leftovers of archives ("._model.onnx" of macOS).
-        files = sorted(
-            file
-            for file in folder.glob("[!.]*")
-            if file.suffix.lower() == _SUFFIX and file.is_file()
-        )
-        if files:
-            return _Location(path.resolve().name, folder, files), read_pack_file(folder)
-    raise PackError(f"{path} has no .onnx files; put the weights of a pack there.")
-
-
-def _read(path: Path, stated: PackFile) -> _Graph:
-    try:
-        if path.stat().st_size > _MAX_MODEL_BYTES:
-            raise PackError(f"{path} is larger than {_MAX_MODEL_BYTES} bytes: not a face model.")
-        model = path.read_bytes()
-    except OSError as error:
-        raise PackError(f"{path} cannot be read: {error.strerror}.") from error
-    signature = read_signature(model, name=str(path))
-    role, reason = classify(signature, input_size=stated.input_size)
-    digest = hashlib.sha256(model).hexdigest()
-    return _Graph(path, model, digest, signature, role, reason)
-
-
-def _pick(graphs: Sequence[_Graph], folder: Path) -> tuple[_Graph, _Graph | None]:
-    embedders = [graph for graph in graphs if graph.role is Role.EMBEDDER]
-    detectors = [graph for graph in graphs if graph.role in DETECTORS]
-    for kind, several in (("embedders", embedders), ("detectors", detectors)):
-        if len(several) > 1:
-            names = " and ".join(graph.path.name for graph in several)
-            raise PackError(
-                f"{folder} has {len(several)} {kind}: {names}; leave one of them there."
-            )
-    blind = [graph for graph in graphs if graph.role is Role.SCRFD_WITHOUT_KEYPOINTS]
-    if blind and not detectors:
-        raise PackError(
-            f"{blind[0].path} is a SCRFD detector without keypoints and cannot align faces; use"
-            " the variant with keypoints (its name mostly ends in kps or bnkps)."
-        )
-    if not embedders:
-        seen = "; ".join(f"{graph.path.name}: {graph.reason}" for graph in graphs)
-        raise PackError(f"{folder} has no embedder. Seen: {seen}.")
-    return embedders[0], detectors[0] if detectors else None
-
-
 def _embedder(
-    graph: _Graph,
+    graph: PackGraph,
     stated: PackFile,
     flip: bool,
     providers: Sequence[str],
@@ -468,7 +393,9 @@ def _embedder(
         raise PackError(f"{graph.path} was routed as an embedder and fails: {error}") from error
 
 
-def _detector(graph: _Graph, size: int, providers: Sequence[str], threads: int | None) -> Detector:
+def _detector(
+    graph: PackGraph, size: int, providers: Sequence[str], threads: int | None
+) -> Detector:
     if size < 32 or size % 32:
         raise PackError(f"The detector size must be a multiple of 32, not {size}.")
     image = graph.signature.inputs[0]

@@ -11,13 +11,24 @@
     [detector]
     input_size = 640
 
-Every key is optional; an unknown one is an error.
+    [[liveness]]             # one for each liveness graph, by its file
+    file = "liveness.onnx"
+    crop_scale = 2.7         # sides of the crop over those of the face's box
+    crop = "box"             # or "square"
+    input_size = 80
+    channel_order = "bgr"    # or "rgb"
+    input_range = [0, 255]   # what the pixel values 0 and 255 become
+    live_class = 1
+    score = "softmax"        # or "difference", of two logits
+
+Every key but ``file`` is optional; an unknown one is an error.
 """
 
 import tomllib
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeVar
 
 from models.errors import PackError
 
@@ -26,20 +37,53 @@ _MAX_BYTES = 64 * 1024
 _KEYS = {
     "embedder": {"mean", "scale", "channel_order", "input_size"},
     "detector": {"input_size"},
+    "liveness": {
+        "file",
+        "crop_scale",
+        "crop",
+        "input_size",
+        "channel_order",
+        "input_range",
+        "live_class",
+        "score",
+    },
 }
 
 Triple = tuple[float, float, float]
+Word = TypeVar("Word", bound=str)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LivenessStatement:
+    """What is stated of one liveness graph; ``None`` where the file is silent."""
+
+    crop_scale: float | None = None
+    crop: Literal["box", "square"] | None = None
+    input_size: int | None = None
+    channel_order: str | None = None
+    input_range: tuple[float, float] | None = None
+    live_class: int | None = None
+    score: Literal["softmax", "difference"] | None = None
+
+
+PREPROCESSINGS: dict[str, tuple[Triple, Triple]] = {
+    "arcface": ((127.5, 127.5, 127.5), (127.5, 127.5, 127.5)),
+    "imagenet": ((123.675, 116.28, 103.53), (58.395, 57.12, 57.375)),
+    "raw": ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)),
+}
+"""Mean and scale of RGB pixels from 0 to 255, by the name of the convention."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PackFile:
-    """The stated values; ``None`` where the file is silent."""
+    """The stated values; ``None`` where the file is silent. Liveness graphs by their file."""
 
     mean: Triple | None = None
     scale: Triple | None = None
     channel_order: str | None = None
     input_size: int | None = None
     detector_size: int | None = None
+    liveness: Mapping[str, LivenessStatement] = field(default_factory=dict)
 
 
 def read_pack_file(folder: Path) -> PackFile:
@@ -62,14 +106,16 @@ def read_pack_file(folder: Path) -> PackFile:
     for table, content in document.items():
         if table not in _KEYS:
             raise PackError(f"{path}: unknown table or key '{table}'; known are {_listed(_KEYS)}.")
-        if not isinstance(content, dict):
-            raise PackError(f"{path}: '{table}' must be a table, written [{table}].")
-        unknown = sorted(set(content) - _KEYS[table])
-        if unknown:
-            raise PackError(
-                f"{path}: unknown key '{unknown[0]}' in [{table}]; known are"
-                f" {_listed(_KEYS[table])}."
-            )
+        written = f"[[{table}]]" if table == "liveness" else f"[{table}]"
+        for part in content if table == "liveness" and isinstance(content, list) else [content]:
+            if not isinstance(part, dict) or (table == "liveness" and part is content):
+                raise PackError(f"{path}: '{table}' must be a table, written {written}.")
+            unknown = sorted(set(part) - _KEYS[table])
+            if unknown:
+                raise PackError(
+                    f"{path}: unknown key '{unknown[0]}' in {written}; known are"
+                    f" {_listed(_KEYS[table])}."
+                )
     embedder, detector = document.get("embedder", {}), document.get("detector", {})
     scale = _triple(path, "scale", embedder)
     if scale is not None and min(abs(value) for value in scale) == 0:
@@ -77,10 +123,75 @@ def read_pack_file(folder: Path) -> PackFile:
     return PackFile(
         mean=_triple(path, "mean", embedder),
         scale=scale,
-        channel_order=_channel_order(path, embedder),
-        input_size=_size(path, "embedder", embedder, multiple=16, least=112),
-        detector_size=_size(path, "detector", detector, multiple=32, least=32),
+        channel_order=_choice(path, "channel_order", embedder, "rgb", "bgr"),
+        input_size=_size(path, "[embedder]", embedder, multiple=16, least=112),
+        detector_size=_size(path, "[detector]", detector, multiple=32, least=32),
+        liveness=_liveness(path, document.get("liveness", [])),
     )
+
+
+def _liveness(path: Path, tables: list[dict[str, Any]]) -> dict[str, LivenessStatement]:
+    stated: dict[str, LivenessStatement] = {}
+    for table in tables:
+        file = table.get("file")
+        if not isinstance(file, str) or not file:
+            raise PackError(f"{path}: [[liveness]] needs 'file', the name of its .onnx file.")
+        if file in stated:
+            raise PackError(f"{path}: [[liveness]] states {file} twice.")
+        stated[file] = LivenessStatement(
+            crop_scale=_number(path, "crop_scale", table, least=0.5, most=8),
+            crop=_choice(path, "crop", table, "box", "square"),
+            input_size=_size(path, "[[liveness]]", table, multiple=1, least=16),
+            channel_order=_choice(path, "channel_order", table, "rgb", "bgr"),
+            input_range=_range(path, table),
+            live_class=_live_class(path, table),
+            score=_choice(path, "score", table, "softmax", "difference"),
+        )
+    return stated
+
+
+def _number(
+    path: Path, key: str, table: dict[str, Any], *, least: float, most: float
+) -> float | None:
+    value = table.get(key)
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value <= most:
+        raise PackError(f"{path}: '{key}' must be a number from {least:g} to {most:g}.")
+    return float(value)
+
+
+def _range(path: Path, table: dict[str, Any]) -> tuple[float, float] | None:
+    value = table.get("input_range")
+    if value is None:
+        return None
+    if (
+        not isinstance(value, list)
+        or len(value) != 2
+        or not all(
+            isinstance(number, int | float) and not isinstance(number, bool) and abs(number) < 1e6
+            for number in value
+        )
+        or value[0] >= value[1]
+    ):
+        raise PackError(f"{path}: 'input_range' must be two numbers that ascend, such as [0, 1].")
+    return float(value[0]), float(value[1])
+
+
+def _live_class(path: Path, table: dict[str, Any]) -> int | None:
+    value = table.get("live_class")
+    if value is not None and (
+        isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 16
+    ):
+        raise PackError(f"{path}: 'live_class' must be a whole number from 0 to 15.")
+    return value
+
+
+def pack_file_text(preprocessing: str) -> str:
+    """Write the ``pack.toml`` of an embedder that was trained by one of ``PREPROCESSINGS``."""
+    mean, scale = PREPROCESSINGS[preprocessing]
+    rows = (f"mean = {list(mean)}", f"scale = {list(scale)}", 'channel_order = "rgb"')
+    return "\n".join(["[embedder]", *rows]) + "\n"
 
 
 def _listed(names: Any) -> str:
@@ -100,10 +211,11 @@ def _triple(path: Path, key: str, table: dict[str, Any]) -> Triple | None:
     return (float(numbers[0]), float(numbers[1]), float(numbers[2]))
 
 
-def _channel_order(path: Path, table: dict[str, Any]) -> str | None:
-    value = table.get("channel_order")
-    if value is not None and value not in ("rgb", "bgr"):
-        raise PackError(f'{path}: \'channel_order\' must be "rgb" or "bgr", not {value!r}.')
+def _choice(path: Path, key: str, table: dict[str, Any], *values: Word) -> Word | None:
+    value = table.get(key)
+    if value is not None and value not in values:
+        expected = " or ".join(f'"{word}"' for word in values)
+        raise PackError(f"{path}: '{key}' must be {expected}, not {value!r}.")
     return value
 
 
@@ -120,7 +232,7 @@ def _size(
         or value % multiple
     ):
         raise PackError(
-            f"{path}: 'input_size' in [{table}] must be a multiple of {multiple} from {least} to"
+            f"{path}: 'input_size' in {table} must be a multiple of {multiple} from {least} to"
             f" 2048, not {value!r}."
         )
     return value

@@ -25,6 +25,7 @@ class Role(StrEnum):
     YUNET = "yunet"
     GENDER_AGE = "gender-age"
     LANDMARKS = "landmarks"
+    LIVENESS = "liveness"
     EMBEDDER = "embedder"
     UNKNOWN = "unknown"
 
@@ -43,11 +44,12 @@ class Tensor:
 
 @dataclass(frozen=True)
 class Signature:
-    """The part of a graph that routing looks at."""
+    """The part of a graph that routing looks at; ``output_node`` makes the first output."""
 
     inputs: tuple[Tensor, ...]
     outputs: tuple[Tensor, ...]
     first_nodes: tuple[str, ...]
+    output_node: str
 
     @property
     def image_size(self) -> tuple[int | None, int | None] | None:
@@ -93,13 +95,22 @@ def _signature(model: Message, name: str) -> Signature:
             " that its hash covers the weights."
         )
     # Up to IR version 3 the weights were listed among the inputs as well.
-    weights = {each.text(onnx_file.Tensor.NAME) for each in graph.messages(Graph.INITIALIZER)}
+    weights = {weight.text(onnx_file.Tensor.NAME) for weight in graph.messages(Graph.INITIALIZER)}
     inputs = map(_tensor, graph.messages(Graph.INPUT))
     return Signature(
-        inputs=tuple(each for each in inputs if each.name not in weights),
+        inputs=tuple(tensor for tensor in inputs if tensor.name not in weights),
         outputs=tuple(map(_tensor, graph.messages(Graph.OUTPUT))),
         first_nodes=tuple(node.text(Node.OP_TYPE) for node in nodes[:FIRST_NODES]),
+        output_node=_output_node(graph, nodes),
     )
+
+
+def _output_node(graph: Message, nodes: list[Message]) -> str:
+    outputs = graph.messages(Graph.OUTPUT)
+    # A value's name is field 1. A node's text is that of its last output; those that end a graph
+    # of one output have one.
+    name = outputs[0].text(1) if outputs else ""
+    return next((n.text(Node.OP_TYPE) for n in nodes if n.text(Node.OUTPUT) == name), "")
 
 
 def _tensors(model: Message) -> Iterator[Message]:
@@ -154,6 +165,8 @@ def classify(signature: Signature, *, input_size: int | None = None) -> tuple[Ro
     values = [output.shape[-1] if output.shape else None for output in signature.outputs]
     if size == (96, 96) and values == [3]:
         return Role.GENDER_AGE, "96 x 96 input and 3 output values; ignored"
+    if size == (80, 80) and values == [3]:
+        return Role.LIVENESS, "80 x 80 input and 3 output values (MiniFASNet)"
     if size == (192, 192):
         return Role.LANDMARKS, "192 x 192 input; ignored"
     return _embedder(signature, size, input_size)
@@ -187,6 +200,12 @@ def _embedder(
         )
     if len(signature.outputs) != 1 or len(signature.outputs[0].shape) != 2:
         return Role.UNKNOWN, "no known detector, and not exactly one output (batch, values)"
+    if signature.outputs[0].shape[1] in (2, 3):
+        return (
+            Role.UNKNOWN,
+            f"{signature.outputs[0].shape[1]} output values are no embedding; a liveness graph is"
+            " stated in pack.toml, under [[liveness]]",
+        )
     inside = "inside" if signature.normalises else "outside"
     return (
         Role.EMBEDDER,

@@ -12,6 +12,7 @@
     │   ├── ContractMismatch     a template, pack or decoy source of another contract
     │   └── Uncalibrated         no calibration for the requested mode, metric, dimension or level
     ├── SealError                a ciphertext that does not open, or a key that cannot be used
+    │   └── ForeignTemplate      a sealed template that was altered, or is another owner's [16]
     ├── StoreError
     │   ├── StoreUnavailable     the database does not answer
     │   │   └── StoreBusy        it answers, but this request not now
@@ -19,15 +20,15 @@
     │   ├── InvalidIdentifier    a subject id, tenant name or cursor that breaks the rules [1]
     │   ├── UnknownTenant        no tenant of this name [1]
     │   │   ├── AlteredTenant    its row is not as this program left it [11]
-    │   │   └── RetiredRotation  no rotation of this epoch any more [11]
+    │   │   └── RetiredRotation  no rotation key of this epoch any more [11]
     │   ├── LockedOut            too many failed attempts on the subject [12]
     │   ├── Replayed             a signed probe that was seen before [12]
     │   ├── BrokenAuditLog       an audit log whose head or key is missing or forged [13]
-    │   ├── ExportSuperseded     an export older than the last enrollment or erasure [14]
+    │   ├── ExportSuperseded     an export from before an erasure, or of a retired key [14]
+    │   ├── EnrollmentConflict   another template than the one that a write may replace [17]
+    │   ├── TemplateNotStored    the subject's holder keeps the template, and did not send it [15]
     │   └── IdempotencyConflict  a key that was used for another request, or still runs [2]
-    ├── EnrollmentError [3]
-    │   ├── PhotoRejected        one photo has no usable face
-    │   └── InconsistentImages   the photos do not show one and the same person
+    ├── InconsistentImages [3]   photos that do not show one and the same person
     ├── DatasetError [4]         a dataset that cannot be read
     ├── EvaluationError [5]      an evaluation that cannot be made as it was asked for
     ├── BackendError [6]         a place to work, such as a cluster, that cannot be used
@@ -39,11 +40,13 @@
         └── UsageError           wrong usage of a command
 
 Each is defined here, or next to what raises it: [1] ``templates.store.identifiers``,
-[2] ``templates.store.idempotency``, [3] ``enroll.errors``, [4] ``verify.datasets``,
+[2] ``templates.store.idempotency``, [3] ``templates.space.agreement``, [4] ``verify.datasets``,
 [5] ``verify.evaluation.plan``, [6] ``verify.evaluation.backends``, [7] ``attacks.errors``,
 [8] ``api.http.errors``, [9] ``api.process.preparation``, [10] ``api.cli.errors``,
 [11] ``templates.store.tenants``, [12] ``templates.store.lockout``,
-[13] ``templates.store.audit_log``, [14] ``templates.store.transfers``.
+[13] ``templates.store.audit_log``, [14] ``templates.store.transfers``,
+[15] ``templates.store.subject_rows``, [16] ``templates.store.envelope``,
+[17] ``templates.store.subjects``.
 
 Messages name the cause and the remedy. They never hold a number of a descriptor, a template or
 an image, nor a key.

@@ -9,14 +9,22 @@ A ``conftest.py`` imports the fixtures it needs::
     from tests.databases import database_url, postgres_database, postgres_url  # noqa: F401
 """
 
+import functools
 import os
 import secrets
+import tempfile
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import psycopg
 import pytest
+import sqlalchemy as sa
 from sqlalchemy.engine import make_url
+
+from templates.store import migrate
+from templates.store.database import Database
 
 DEFAULT_SERVER = "postgresql://postgres@127.0.0.1:5432/postgres"
 
@@ -27,9 +35,9 @@ def postgres_server() -> str:
     return server.replace("postgresql+psycopg://", "postgresql://")
 
 
-@pytest.fixture(scope="session")
-def postgres_database() -> Iterator[str]:
-    """URL of an empty database of this test run's own."""
+@contextmanager
+def empty_database() -> Iterator[str]:
+    """Make a database on the server, and drop it after the block; gives its URL."""
     server = postgres_server()
     try:
         connection = psycopg.connect(server, autocommit=True, connect_timeout=3)
@@ -45,6 +53,13 @@ def postgres_database() -> Iterator[str]:
         connection.execute(f'ALTER DATABASE "{name}" SET synchronous_commit TO off')
         yield make_url(server).set(database=name).render_as_string(hide_password=False)
         connection.execute(f'DROP DATABASE "{name}" WITH (FORCE)')
+
+
+@pytest.fixture(scope="session")
+def postgres_database() -> Iterator[str]:
+    """URL of an empty database of this test run's own."""
+    with empty_database() as url:
+        yield url
 
 
 @pytest.fixture
@@ -67,3 +82,46 @@ def database_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
         return f"sqlite:///{tmp_path / 'veilface.db'}"
     url: str = request.getfixturevalue("postgres_url")
     return url
+
+
+def migrate_ahead(url: str) -> None:
+    """Give an empty database the tables of this program, as its migrations make them.
+
+    Its upgrade then finds nothing to do; the migrations take longer than most tests of the store.
+    """
+    database = make_url(url)
+    if database.get_backend_name() == "postgresql":
+        with psycopg.connect(url, autocommit=True) as connection:
+            connection.execute(_statements())
+    elif database.database is not None:
+        path = Path(database.database)
+        path.touch(0o600, exist_ok=False)
+        path.write_bytes(_migrated())
+
+
+@functools.cache
+def _migrated() -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "migrated.db"
+        database = Database(f"sqlite:///{file}")
+        migrate.upgrade(database)
+        database.close()
+        assert {path.name for path in Path(folder).iterdir()} == {file.name, f"{file.name}-turn"}
+        return file.read_bytes()
+
+
+@functools.cache
+def _statements() -> bytes:
+    """What the migrations ask of PostgreSQL, to be asked at once."""
+    asked: list[str] = []
+
+    def note(_: Any, cursor: Any, statement: str, parameters: Any, *__: Any) -> None:
+        if not statement.startswith("SELECT"):
+            asked.append(psycopg.ClientCursor(cursor.connection).mogrify(statement, parameters))
+
+    with empty_database() as url:
+        database = Database(url)
+        sa.event.listen(database.engine, "before_cursor_execute", note)
+        migrate.upgrade(database)
+        database.close()
+    return ";".join(asked).encode()

@@ -14,13 +14,11 @@ from models.decoding import decode_image
 from models.extraction import Extractor
 from models.pack import FacePolicy, ModelPack
 from templates.decoys import DecoyPool
-from templates.keys.randomness import Keystream
 from templates.keys.sealing import KeyringSealer, MasterKeyring
 from templates.space.lifting import Strategy
 from verify import CalibrationOptions, calibrate
-from verify.cohort import make_cohort
 
-PEOPLE = 6
+PEOPLE = 4
 PHOTOS = 3
 M = 8
 PROBE_M = 4
@@ -71,19 +69,11 @@ def make_material(
     paths = [path for name in strangers for path in sorted((crops / name).glob("*.jpg"))[:4]]
     labelled = Extractor(pack, cache=cache, aligned=True).extract(paths)
     binding = binding_for(pack, source, strategy=Strategy.HYBRID, m=M)
-    cohort = make_cohort(
-        source,
-        strategy=binding.strategy,
-        m=M,
-        stream=Keystream.fresh(),
-        size=40,  # its sealed bytes are searched, too
-    )
     contract = calibrate(
         labelled.descriptors,
         [path.parent.name for path in labelled.paths],
         binding=binding,
         source=source,
-        cohort=cohort,
         options=CalibrationOptions(probe_dims=(0, PROBE_M), targets=(1e-2,)),
     ).contract
     contract.save(folder / "contract.json", sealer)
@@ -109,7 +99,7 @@ def _files(folder: Path) -> list[Path]:
 
 
 def _photo(pack: ModelPack, data: bytes) -> Photo:
-    crop, _, _ = pack.crop_photo(data, policy=FacePolicy.LARGEST, quality=None)
+    crop = pack.crop_photo(data, policy=FacePolicy.LARGEST, quality=None).crop
     return Photo(data, decode_image(data), crop, pack.embed(crop[None])[0])
 
 

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from templates.contract.wire import decode, encode
-from templates.keys.rotation import tenant_rotation
+from templates.keys.rotation import Rotation, TenantRotation
 from templates.keys.sealing import MasterKeyring
 from templates.space.lifting import Strategy, lift
 from templates.store import TemplateStore
@@ -81,6 +81,7 @@ class OpenedTemplate:
     """The arrays of a decrypted template as they are on the wire: foot point, then basis."""
 
     rows: NDArray[np.float64] = field(repr=False)
+    rotation: Rotation = field(repr=False)
 
 
 @dataclass(repr=False)
@@ -93,6 +94,7 @@ class ServiceTraces:
     folder: Path
     subjects: list[str]
     token: str = ""
+    holder_key: bytes = field(default_factory=lambda: secrets.token_bytes(32), repr=False)
     decisions: dict[str, list[str]] = field(default_factory=dict)
     refused: list[str] = field(default_factory=list)
     expected_refusals: list[str] = field(default_factory=list)
@@ -108,7 +110,6 @@ class ServiceTraces:
     files_hidden: str = ""
     open_during_upload: dict[str, bytes] = field(default_factory=dict)
     templates: dict[str, OpenedTemplate] = field(default_factory=dict)
-    rotation: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
     lifted: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
     victim: Victim = Victim("", "", "", "", b"", b"")
     contract_answer: Any = None
@@ -127,6 +128,11 @@ class ServiceTraces:
         return np.concatenate([(mean / np.linalg.norm(mean))[None], rows])
 
     @property
+    def burst(self) -> list[Photo]:
+        """Photos of one person that are verified together."""
+        return self.material.enrolled[1][:2]
+
+    @property
     def vectors(self) -> dict[str, NDArray[Any]]:
         """Every array that must not be found in the clear."""
         photos = list(itertools.chain(*self.material.enrolled))
@@ -135,17 +141,21 @@ class ServiceTraces:
             f"embedding of probe photo {i}": photo.embedding
             for i, photo in enumerate([*self.material.probes, self.material.large])
         }
+        mean = np.mean([photo.embedding for photo in self.burst], axis=0, dtype=np.float64)
+        embedded |= {"plain mean of a burst": mean, "mean of a burst": mean / np.linalg.norm(mean)}
         for number, subject in enumerate(self.subjects):
             rows = self.descriptors_of(subject)
             embedded[f"descriptor {number}"] = rows[0]
             embedded[f"plain mean {number}"] = rows[1:].mean(axis=0)
         embedded |= {f"decoy {i}": row for i, row in enumerate(self.pool)}
         embedded |= {f"lifted probe, row {i}": row for i, row in enumerate(self.lifted)}
-        turned = {f"{name}, rotated": self.rotation @ row for name, row in embedded.items()}
-        stored = {}
+        turned, stored = {}, {}
+        rows = np.stack(list(embedded.values()))
         for number, template in enumerate(self.templates.values()):
             stored[f"template {number}, rotated"] = template.rows
-            stored[f"template {number}"] = template.rows @ self.rotation
+            stored[f"template {number}"] = template.rotation.turned_back(template.rows)
+            for name, row in zip(embedded, template.rotation.turned(rows), strict=True):
+                turned[f"{name}, turned as template {number}"] = row
         inputs = {
             f"model input {i}": ((p.crop - self.material.mean) / self.material.scale).transpose(
                 2, 0, 1
@@ -221,6 +231,7 @@ def exercise(material: Material, folder: Path, *, database_url: str) -> ServiceT
         "VEILFACE_DATA_DIR": str(folder / "data"),
         "VEILFACE_DATABASE_URL": database_url,
         "VEILFACE_PACK": str(material.pack_dir),
+        "VEILFACE_ACCEPT_WEAK_PRIVACY": "true",
         "VEILFACE_LOG_LEVEL": "debug",
         "VEILFACE_MAX_REQUEST_BYTES": str(3 * 1024 * 1024),
     }
@@ -241,6 +252,7 @@ def exercise(material: Material, folder: Path, *, database_url: str) -> ServiceT
         with httpx.Client(base_url=url, headers=headers, timeout=PATIENCE_S) as client:
             client.event_hooks["response"] = [lambda answer: _keep(traces, answer)]
             _enroll_and_verify(traces, client, process.pid)
+            _enroll_with_a_key(traces, client)
             _send_bad_requests(traces, client)
             _open_the_store(traces)
             _look(traces, "running")
@@ -268,7 +280,7 @@ def _await_ready(process: "subprocess.Popen[bytes]", folder: Path) -> str:
         if "listens on " in told:
             url = told.split("listens on ", 1)[1].split()[0]
             try:
-                if httpx.get(f"{url}/health/ready").status_code == 200:
+                if httpx.get(f"{url}/health/ready", timeout=PATIENCE_S).status_code == 200:
                     return url
             except httpx.TransportError:
                 pass
@@ -314,6 +326,9 @@ def _enroll_and_verify(traces: ServiceTraces, client: httpx.Client, pid: int) ->
         decide("impostor", subject, files=form(stranger, name="image"))
     probe = material.probes[1].embedding
     decide("embedding", traces.subjects[1], json={"embedding": probe.astype(float).tolist()})
+    decide("burst", traces.subjects[1], files=form(*traces.burst))
+    rows = [photo.embedding.astype(float).tolist() for photo in traces.burst]
+    decide("embeddings", traces.subjects[1], json={"embeddings": rows})
     wire = _lifted(traces)
     decide("lifted", traces.subjects[1], json={"template": base64.b64encode(wire).decode()})
 
@@ -336,6 +351,40 @@ def _enroll_and_verify(traces: ServiceTraces, client: httpx.Client, pid: int) ->
             "Content-Length": str(len(body)),
         },
     )
+
+
+def _enroll_with_a_key(traces: ServiceTraces, client: httpx.Client) -> None:
+    """Somebody else, whose template needs a key; it is sent in each place where it may stand."""
+    key = base64.urlsafe_b64encode(traces.holder_key).decode()
+    path, largest = f"/v1/subjects/{secrets.token_hex(8)}", {"face": "largest"}
+    photos = traces.material.enrolled[1]
+    header, text = {"Veilface-Holder-Key": key}, key.rstrip("=")
+    answer = client.put(
+        f"{path}/enrollment",
+        files=form(*photos),
+        data={**largest, "holder_key": text},
+        headers={"Idempotency-Key": "keyed"},
+    )
+    assert (answer.status_code, answer.json()["holder_key"]) == (201, True), answer.text
+
+    def verify(**options: Any) -> httpx.Response:
+        return client.post(
+            f"{path}/verify", **signed(f"{path}/verify", f"Bearer {traces.token}", options)
+        )
+
+    numbers = photos[0].embedding.astype(float).tolist()
+    answers = [
+        verify(files=form(photos[0], name="image"), data=largest, headers=header),
+        verify(json={"embedding": numbers, "holder_key": key}),
+    ]
+    assert [answer.json()["decision"] for answer in answers] == ["accept"] * 2
+    assert verify(json={"embedding": numbers}).json()["decision"] == "reject"
+    refused = [
+        verify(json={"embedding": numbers, "holder_key": key[:-2]}),
+        verify(json={"embedding": numbers, "holder_key": key}, headers=header),
+        verify(json={"embedding": numbers}, params={"holder_key": key}),
+    ]
+    assert [answer.status_code for answer in refused] == [422] * 3
 
 
 def _lifted(traces: ServiceTraces) -> bytes:
@@ -420,7 +469,7 @@ def _open_the_store(traces: ServiceTraces) -> None:
     )
     try:
         key = store.tenants.rotation_key("default").key
-        traces.rotation = tenant_rotation(key, traces.material.pool.shape[1])
+        rotation = TenantRotation(key, traces.material.pool.shape[1])
         for subject in traces.subjects:
             opened = store.subjects.get("default", subject)
             assert opened is not None
@@ -429,7 +478,7 @@ def _open_the_store(traces: ServiceTraces) -> None:
             rows = payload.astype(np.float64).reshape(m + 1, n)
             # The reader's foot point agrees: these are the arrays of the format, foot first.
             assert np.allclose(decode(opened.wire).subspace.foot, rows[0], atol=1e-3)
-            traces.templates[subject] = OpenedTemplate(rows)
+            traces.templates[subject] = OpenedTemplate(rows, rotation.of(opened.template_id))
         pseudonym = store.signer.pseudonym("default", traces.subjects[0])
     finally:
         store.close()

@@ -47,13 +47,15 @@ WHOLE_PAGES = {
     ("docs/tutorial.md", "sh"): "tests/test_tutorial.py",
     ("docs/client.md", "sh"): "tests/clients/test_docs.py",
     ("docs/client.md", "python"): "tests/clients/test_docs.py",
+    ("docs/webhooks.md", "python"): "tests/api/process/test_webhooks.py",
 }
 # Blocks that another test executes: page and first line.
 ELSEWHERE = {
     ("CONTRIBUTING.md", "make demo"): "tests/test_project.py",
     ("README.md", "make demo"): "tests/test_readme.py",
     ("README.md", "PACK=~/.insightface/models/buffalo_l"): "tests/test_readme.py",
-    ("README.md", "URL=http://127.0.0.1:8421/v1/subjects"): "tests/test_readme.py",
+    ("README.md", ". .venv/bin/activate"): "tests/test_readme.py",
+    ("docs/evaluation.md", "LFW=~/lfw.bin"): "tests/test_readme.py",
     ("docs/cli.md", "veilface demo"): "tests/test_tutorial.py",
 }
 # Blocks of commands that are executed here, in this process, on a tiny deployment.
@@ -61,13 +63,14 @@ HERE = {
     ("docs/cli.md", first)
     for first in (
         "veilface enroll alice alice-1.jpg alice-2.jpg alice-3.jpg --pack buffalo_l",
-        "veilface verify alice today.jpg --pack buffalo_l --level fmr-1e-3",
+        "veilface verify alice now-1.jpg now-2.jpg now-3.jpg --pack buffalo_l --level fmr-1e-3",
         "veilface models inspect ~/.insightface/models/buffalo_l",
         "veilface keys create --right enroll --right verify --label web-shop",
         "veilface keys list --tenant default",
         "veilface keys revoke 3f9a1c0b7d2e",
         "veilface keys replace 3f9a1c0b7d2e --grace-hours 48",
         "veilface keys rotate-tenant --tenant default",
+        "veilface keys renew",
         "veilface keys master --master-key-file /etc/veilface/master.key",
         "veilface keys rotate --retire",
         "veilface keys rewrap --retire",
@@ -93,17 +96,24 @@ LIVE = [
 ]  # fmt: skip
 # Blocks of which only the command lines are checked, and why.
 PARSED = {
-    ("docs/cli.md", "veilface models inspect buffalo_l"): SAME_IN_README,
+    ("docs/cli.md", "veilface setup lfw --faces fairface/train --pack buffalo_l"): SAME_IN_README,
+    ("docs/cli.md", "veilface decoys build fairface/train --pack buffalo_l"): (
+        "tests/api/cli/conftest.py runs these commands on drawn faces"
+    ),
+    ("docs/cli.md", "veilface models fetch buffalo_sc --from https://example.org/buffalo_sc.zip"): (
+        "tests/api/cli/test_models_fetch.py fetches from an address of its own"
+    ),
     ("docs/cli.md", "veilface serve --pack buffalo_l --data-dir veilface-data --workers 2"): (
         SAME_IN_README
     ),
     ("docs/cli.md", "veilface calibrate lfw --pack buffalo_l --decoys decoys.veil "
      "--out contract.json \\"): OWN_DATA,
-    ("docs/cli.md", "veilface decoys build fairface/train --pack buffalo_l --out decoys.veil"): (
-        OWN_DATA
-    ),
+    ("docs/cli.md", "veilface decoys build fairface/train utkface --like volunteers "
+     "--pack buffalo_l --out decoys.veil"): OWN_DATA,
     ("docs/cli.md", "veilface evaluate lfw.bin --pack buffalo_l --decoys decoys.veil "
      "--out lfw-results"): OWN_DATA,
+    ("docs/cli.md", "veilface evaluate liveness photos --pack buffalo_l --contract contract.json "
+     "--decoys decoys.veil \\"): OWN_DATA,
     ("docs/cli.md", "veilface audit fairface fairface --pack buffalo_l --cache fairface.cache "
      "--out audit-fairface"): OWN_DATA,
     ("docs/cli.md", "veilface audit templates lfw --pack buffalo_l --out audit-templates"): (
@@ -127,6 +137,12 @@ PARSED = {
     ("docs/evaluation.md", "veilface evaluate ~/lfw --pack $PACK --labels labels.csv "
      "--strategy raw,random --out groups"): OWN_DATA,
     ("docs/evaluation.md", "dask scheduler --host 127.0.0.1 --port 8786 &"): OWN_DATA,
+    ("docs/liveness.md", "veilface calibrate --liveness booth --bpcer 0.05 --pack buffalo_l "
+     "--out contract.json"): OWN_DATA,
+    ("docs/liveness.md", "veilface evaluate liveness other-booth --pack buffalo_l "
+     "--contract contract.json --decoys decoys.veil \\"): OWN_DATA,
+    ("docs/liveness.md", "python -m benchmarks.liveness nuaa celeba_spoof_part --pack MINIFASNET "
+     "--pack MINIFASNET_SE \\"): OWN_DATA,
     ("docs/measurements.md", "veilface decoys build fairface/train --pack $PACK --kind pool "
      "--out pool.veil"): OWN_DATA,
     ("docs/operations.md", "veilface serve --host 0.0.0.0 --tls-certificate chain.pem "
@@ -150,6 +166,7 @@ DRAWINGS = {
     ("docs/architecture.md", "set ─▶ reader"),
     ("docs/distances.md", "__init__ ──▶ tiles"),
     ("docs/distances.md", "probes, templates ──stack──▶"),
+    ("docs/oidc.md", "application ──/authorize──▶"),
     ("docs/rest.md", "veilface-probe-1"),
 }
 PACKAGES = ("templates", "models", "enroll", "verify", "attacks", "api")
@@ -277,6 +294,8 @@ def command_lines(code: str, program: str = "veilface") -> Iterator[list[str]]:
 def descend(words: list[str]) -> tuple[Any, list[str], list[str]]:
     """The command that words begin with, its name, and what is left."""
     command, name, rest = typer.main.get_command(app), ["veilface"], list(words)
+    if (both := " ".join(rest[:2])) in COMMANDS:  # a command of two words is one name
+        rest[:2] = [both]
     while hasattr(command, "commands") and rest and rest[0] in command.commands:
         name.append(rest[0])
         command = load(rest[0]) if len(name) == 2 else command.commands[rest[0]]
@@ -516,7 +535,7 @@ def fail_once(deployment: Deployment, subject: str) -> None:
         subject,
         accepted=False,
         template_id=held.template_id,
-        contract_id=held.contract_id,
+        contract_ids=[held.contract_id],
         level="fmr-1e-3",
         nonce=None,
         by=By(),
@@ -532,7 +551,8 @@ def test_commands_do_what_the_page_says(tmp_path: Path, monkeypatch: pytest.Monk
     (home / ".insightface" / "models" / "buffalo_l").symlink_to(tmp_path / "tiny")
     (tmp_path / "buffalo_l").symlink_to(tmp_path / "tiny")
     (tmp_path / "veilface-data").symlink_to(tmp_path / "data")
-    for name, shot in (("alice-1", 0), ("alice-2", 1), ("alice-3", 2), ("today", 3)):
+    names = [f"{stem}-{number}" for stem in ("alice", "now") for number in (1, 2, 3)]
+    for shot, name in enumerate(names):
         (tmp_path / f"{name}.jpg").write_bytes(photo(1, shot))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HOME", str(home))

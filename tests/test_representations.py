@@ -73,4 +73,4 @@ def test_the_walk_sees_what_would_show() -> None:
 
 def test_scores_do_not_show() -> None:
     scores = np.full(3, 0.123, dtype=np.float32)
-    assert "0.123" not in repr(Genuine(scores, scores, np.arange(3)))
+    assert "0.123" not in repr(Genuine(scores, scores, np.arange(3), np.zeros(3, np.bool_)))

@@ -5,21 +5,30 @@ Imports the layer below only: ``templates`` and ``models``.
 
 from verify.calibration import Calibrated, CalibrationReport, calibrate
 from verify.calibration_mode import CalibrationOptions
+from verify.challenge import MAX_FRAMES, MIN_FRAMES, Movement, draw_movements
 from verify.datasets import DatasetError, LabelledFolder, labelled_folder, read_lfw_pairs
 from verify.decision import Decision
+from verify.photo_probe import MAX_PROBE_PHOTOS, PhotoProbe
 from verify.stand_ins import StandIn, lift_stand_in
-from verify.verifier import Verifier
+from verify.verifier import OpenedTemplate, Verifier
 
 __all__ = [
+    "MAX_FRAMES",
+    "MAX_PROBE_PHOTOS",
+    "MIN_FRAMES",
     "Calibrated",
     "CalibrationOptions",
     "CalibrationReport",
     "DatasetError",
     "Decision",
     "LabelledFolder",
+    "Movement",
+    "OpenedTemplate",
+    "PhotoProbe",
     "StandIn",
     "Verifier",
     "calibrate",
+    "draw_movements",
     "labelled_folder",
     "lift_stand_in",
     "read_lfw_pairs",

@@ -8,22 +8,33 @@ from numpy.typing import NDArray
 
 from templates.contract.canonical import Json
 from templates.contract.document import Binding, Calibration, Contract
+from templates.contract.expectation import PointExpectation
 from templates.contract.nobody import Nobody
 from templates.decoys import Attributes, DecoySource
 from templates.errors import ContractError
 from templates.keys.randomness import Keystream
 from templates.space.embedding import unit_descriptors
-from templates.space.subspace import SubspaceBatch
-from verify.calibration_mode import CalibrationOptions, CalibrationRun, calibrate_mode
-from verify.cohort import COHORT_SIZE, client_source, make_cohort, people_like, plain_strategy
+from templates.space.lifting import plain_strategy
+from verify.calibration_mode import (
+    CalibrationOptions,
+    CalibrationRun,
+    ModeResult,
+    calibrate_lifted,
+    calibrate_points,
+    point_sets,
+)
+from verify.cohort import client_source, people_like
 from verify.comparisons import Lifter, Progress, honest_norms
 from verify.consistency import Consistency, photo_consistency
+from verify.expectation import fit_expectation
+from verify.group_rates import PeopleGroups, PhotoLabels, people_groups
 from verify.raw_pairs import SuspiciousPair, suspicious_pairs
 from verify.strangers import honest_score, make_nobody, strangers_like
 from verify.tenfold import Pair, TenFold, pair_arrays, random_pairs, require_folds
-from verify.trials import TrialPlan, chosen_photos, enrolled_means, plan_trials
+from verify.trials import ProbeSets, TrialPlan, chosen_photos, enrolled_means, plan_trials
 
-DEFAULT_LEVEL = "fmr-1e-3"
+DEFAULT_LEVELS = ("fmr-1e-4", "fmr-1e-3", "fmr-1e-2")
+"""The first that all calibrations resolve is the default; 1e-4 is NIST SP 800-63B-4's."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +47,8 @@ class CalibrationReport:
         How ``photo_consistency`` was set.
     unresolved
         Sentences about the FMR targets that the data cannot resolve.
+    left_out
+        Sentences about the groups whose trials are too few for ``worst_group`` to heed them.
     suspicious
         People who may be one person under two names: look at them before believing a threshold
         at FMR 1e-4 or below, then name them in ``aliases`` (docs/method.md §7.3).
@@ -48,6 +61,7 @@ class CalibrationReport:
 
     consistency: Consistency
     unresolved: tuple[str, ...]
+    left_out: tuple[str, ...]
     suspicious: tuple[SuspiciousPair, ...]
     suspicious_above: float
     ten_folds: tuple[TenFold, ...]
@@ -80,8 +94,9 @@ def calibrate(
     exclude: Collection[str] = (),
     aliases: Mapping[str, str] | None = None,
     attributes: Sequence[Attributes] | None = None,
+    labels: PhotoLabels | None = None,
     pairs: Sequence[Pair] | None = None,
-    cohort: SubspaceBatch | None = None,
+    expectation: PointExpectation | None = None,
     nobody: Nobody | None = None,
     recorded: Mapping[str, Json] | None = None,
     dataset: str = "labelled folder",
@@ -90,10 +105,10 @@ def calibrate(
     """Calibrate a contract on the private templates of labelled people.
 
     Every person is enrolled once, on up to ``photos_per_enrollment`` averaged photos, lifted and
-    passed through the wire format as in the service. Genuine probes are the photos that were left
-    out. Impostor trials are all cross-identity pairs in p-to-s, and a stated random subset of
-    them in s-to-s. A level's two thresholds stand at one marginal quantile, chosen so that the
-    joint FMR is at most the target (docs/method.md §6.2).
+    passed through the wire format as in the service; of many people, ``most_templates``. Genuine
+    probes are the photos that were left out. Impostor trials are all cross-identity pairs or a
+    random subset of them, as the contract states. A level's threshold is the smallest score at
+    which the FMR is at most the target (docs/method.md §6.2).
 
     Parameters
     ----------
@@ -109,11 +124,13 @@ def calibrate(
         Second names of one person, mapped to the first.
     attributes
         One per descriptor, for hybrid+; without them hybrid+ is calibrated on decoys of any label.
+    labels
+        Of every descriptor, for rates by group of people; none without them.
     pairs
         Pairs of the ten-fold protocol, as positions in ``descriptors``; balanced random pairs
         where None. Pairs of excluded people are left out.
-    cohort
-        A contract's cohort, to keep it; by default a new one is drawn from fresh randomness.
+    expectation
+        A contract's, to keep it; by default it is fitted to what is drawn afresh.
     nobody
         A contract's strangers, to keep them with their cohort; by default new ones are drawn.
     recorded
@@ -131,7 +148,9 @@ def calibrate(
     Raises
     ------
     ContractError
-        Where the data are too few for a single level, or do not fit the binding.
+        Where the data are too few for a single level, or do not fit the binding; where
+        ``worst_group`` is asked for and nobody is labelled; where the
+        similarity to templates of nobody does not follow its closed form.
     ContractMismatch
         Where ``source`` is not the binding's.
     """
@@ -150,21 +169,40 @@ def calibrate(
         )
     data = np.ascontiguousarray(unit[kept], dtype=np.float32)
     rng = np.random.default_rng(options.seed)
-    plan = plan_trials(names, photos_per_enrollment=options.photos_per_enrollment, rng=rng)
+    plan = plan_trials(
+        names,
+        photos_per_enrollment=options.photos_per_enrollment,
+        rng=rng,
+        most_templates=None if labels is not None else options.most_templates,
+    )
+    groups: tuple[PeopleGroups, ...] = ()
+    if labels is not None:
+        groups = people_groups(labels, kept, plan.person_of, people=len(plan.people))
+    if options.worst_group and not groups:
+        raise ContractError("thresholds by the worst group need labels of the people")
+    placed = _protocol_pairs(options, pairs, kept, plan, rng)
+    consistency = photo_consistency(
+        data, plan.person_of, photos=options.photos_per_enrollment, rng=rng
+    )
     run = _lay_out(
         data,
         plan,
         binding=binding,
         source=source,
         options=options,
-        cohort=cohort,
+        expectation=expectation,
         nobody=nobody,
         attributes=None if attributes is None else [attributes[index] for index in kept],
-        pairs=_protocol_pairs(options, pairs, kept, plan, rng),
+        pairs=placed,
+        groups=groups,
+        consistency=consistency,
         facts={
             "dataset": dataset,
+            **({"groups_from": labels.source} if labels is not None else {}),
+            "worst_group": options.worst_group,
             "photos": len(data),
             "people": len(plan.people),
+            "templates": len(plan.compared),
             "excluded_photos": len(identities) - len(data),
             "photos_per_enrollment": options.photos_per_enrollment,
             "protocol": options.protocol,
@@ -172,29 +210,30 @@ def calibrate(
         },
         progress=progress,
     )
-    consistency = photo_consistency(
-        data, plan.person_of, photos=options.photos_per_enrollment, rng=rng
-    )
-    calibrations: list[Calibration] = []
-    unresolved: list[str] = []
-    ten_folds: list[TenFold] = []
-    for number, probe_m in enumerate(options.probe_dims):
-        part = replace(run, progress=_part_of(progress, number, len(options.probe_dims)))
-        entry, missing, folds = calibrate_mode(part, probe_m, rng)
-        calibrations.append(entry)
-        unresolved += missing
-        ten_folds += [folds] if folds else []
-    contract = _contract(run, binding, calibrations, consistency, recorded or {})
+    results: list[ModeResult] = []
+    sets = point_sets(run, rng) if 0 in options.probe_dims else []
+    dims = [dim for dim in options.probe_dims if dim]
+    kinds: list[ProbeSets | int] = [*sets, *dims]
+    for number, kind in enumerate(kinds):
+        part = replace(run, progress=_part_of(progress, number, len(kinds)))
+        results.append(
+            calibrate_lifted(part, kind, rng)
+            if isinstance(kind, int)
+            else calibrate_points(part, kind)
+        )
+    calibrations = [result.calibration for result in results]
+    contract = _contract(run, binding, calibrations, recorded or {})
     return Calibrated(
         contract,
         CalibrationReport(
             consistency=consistency,
-            unresolved=tuple(unresolved),
+            unresolved=tuple(sentence for one in results for sentence in one.unresolved),
+            left_out=tuple(sentence for one in results for sentence in one.left_out),
             suspicious=tuple(
                 suspicious_pairs(data, plan.person_of, plan.people, above=options.suspicious_above)
             ),
             suspicious_above=options.suspicious_above,
-            ten_folds=tuple(ten_folds),
+            ten_folds=tuple(one.folds for one in results if one.folds is not None),
         ),
     )
 
@@ -203,9 +242,9 @@ def _contract(
     run: CalibrationRun,
     binding: Binding,
     calibrations: Sequence[Calibration],
-    consistency: Consistency,
     recorded: Mapping[str, Json],
 ) -> Contract:
+    consistency = run.consistency
     return Contract(
         binding=binding,
         recorded={
@@ -216,15 +255,15 @@ def _contract(
         calibrations=tuple(calibrations),
         default_level=_default_level(calibrations),
         photo_consistency=consistency.threshold,
+        probe_consistency=consistency.probe_threshold,
         template_foot_point_norm=honest_norms(run.templates.foot_norms),
         template_stranger_score=honest_score(
             run.nobody,
+            run.expectation,
             run.templates,
-            halves=run.halves,
-            metric=run.options.metric,
-            steps=run.options.steps,
+            people=run.plan.compared if run.halves else None,
         ),
-        cohort=run.cohort,
+        expectation=run.expectation,
         nobody=run.nobody,
     )
 
@@ -236,14 +275,16 @@ def _lay_out(
     binding: Binding,
     source: DecoySource,
     options: CalibrationOptions,
-    cohort: SubspaceBatch | None,
+    expectation: PointExpectation | None,
     nobody: Nobody | None,
     attributes: Sequence[Attributes] | None,
     pairs: tuple[Pair, ...],
+    groups: tuple[PeopleGroups, ...],
+    consistency: Consistency,
     facts: Mapping[str, Json],
     progress: Progress,
 ) -> CalibrationRun:
-    """Enroll everybody, and draw the cohort and the strangers where none are given."""
+    """Enroll everybody; fit the expectation and draw the strangers where none are given."""
     service = Lifter(binding.strategy, source, binding.contract_id)
     generator = client_source(source)
     client = Lifter(plain_strategy(binding.strategy), generator, binding.contract_id)
@@ -251,47 +292,44 @@ def _lay_out(
     means = enrolled_means(data, plan)
     with Keystream.seeded("calibration templates", options.seed) as stream:
         templates = service.lift(
-            means,
+            means[plan.compared],
             m=binding.m,
             stream=stream,
-            attributes=attributes and [attributes[photos[0]] for photos in plan.enrolled],
+            attributes=attributes
+            and [attributes[plan.enrolled[person][0]] for person in plan.compared],
         )
     halves = False
-    if cohort is None or nobody is None:
+    if expectation is None or nobody is None:
         hidden = people_like(generator, means)
-    if cohort is None:
-        with Keystream.fresh() as stream:
-            cohort = make_cohort(
+    if expectation is None:
+        progress("fitting expected similarities", 0.0)
+        with Keystream.seeded("expectation", options.seed) as stream:
+            expectation = fit_expectation(
                 generator,
-                strategy=binding.strategy,
+                hidden,
+                strategy=client.strategy,
                 m=binding.m,
+                metric=options.metric,
                 stream=stream,
-                size=COHORT_SIZE,
-                hidden=hidden,
             )
     if nobody is None:
         progress("drawing strangers", 0.0)
         sources = strangers_like(generator, hidden, data, plan.person_of)
         halves = len(sources) == 2
         with Keystream.fresh() as stream:
-            nobody = make_nobody(
-                generator,
-                strangers=sources,
-                cohort=cohort,
-                metric=options.metric,
-                steps=options.steps,
-                stream=stream,
-            )
+            nobody = make_nobody(generator, strangers=sources, stream=stream)
     return CalibrationRun(
         descriptors=data,
         plan=plan,
         templates=templates,
-        cohort=cohort,
+        expectation=expectation,
         nobody=nobody,
         halves=halves,
         service=service,
         client=client,
         pairs=pairs,
+        groups=groups,
+        consistency=consistency,
         options=options,
         facts=facts,
         progress=progress,
@@ -325,13 +363,17 @@ def _protocol_pairs(
 
 
 def _default_level(calibrations: Sequence[Calibration]) -> str:
-    """FMR 1e-3 where all calibrations resolve it, else the strictest target that all do.
+    """Return the first of ``DEFAULT_LEVELS`` that all calibrations resolve, or what they share.
+
+    Those of several probe photos do not count: one of fewer photos decides where one lacks a level.
 
     The laxest target is resolved by all of them, or the level of the ten-fold protocol is there.
     """
-    shared = set.intersection(*({level.name for level in c.levels} for c in calibrations))
+    single = [entry for entry in calibrations if entry.probe_photos == 1]
+    shared = set.intersection(*({level.name for level in entry.levels} for entry in single))
+    for name in DEFAULT_LEVELS:
+        if name in shared:
+            return name
     levels = [level for level in calibrations[0].levels if level.name in shared]
-    if any(level.name == DEFAULT_LEVEL for level in levels):
-        return DEFAULT_LEVEL
     targeted = [level for level in levels if level.target_fmr is not None]
     return (targeted or levels)[-1].name

@@ -1,19 +1,22 @@
-"""One calibration of a contract: one mode, one metric, one probe dimension."""
+"""One calibration of a contract: one mode, one metric, one kind of probe."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from templates.contract.canonical import Json
-from templates.contract.document import Calibration, Level
+from templates.contract.document import Calibration
+from templates.contract.expectation import PointExpectation
 from templates.contract.nobody import Nobody
 from templates.distances import DEFAULT_STEPS, Metric
 from templates.errors import ContractError
 from templates.keys.randomness import Keystream
 from templates.space.subspace import SubspaceBatch
+from verify.cohort import cohort_statistics
 from verify.comparisons import (
     Lifter,
     Progress,
@@ -22,17 +25,21 @@ from verify.comparisons import (
     pair_similarities,
     point_trials,
 )
+from verify.consistency import Consistency
+from verify.group_rates import PeopleGroups, group_rates, worst_group_threshold
+from verify.metrics import threshold_at_fmr
 from verify.tenfold import Pair, TenFold, pair_arrays, ten_fold
 from verify.thresholds import (
+    EXPECTED_ERRORS,
     TARGETS,
     Genuine,
     Impostors,
-    JointTails,
+    highest_scores,
     level_name,
     make_level,
     resolved_targets,
 )
-from verify.trials import TrialPlan
+from verify.trials import ProbeSets, TrialPlan, probe_sets
 
 Protocol: TypeAlias = Literal["fmr", "ten-fold"]
 
@@ -51,6 +58,11 @@ class CalibrationOptions:
         The distance that will decide.
     probe_dims
         Dimensions of the probes: 0 for raw ones, others for lifted ones.
+    probe_photos
+        Numbers of photos that raw probes are the means of; those beyond 1 are calibrated where
+        ``least_people`` have as many photos left over after the enrollment.
+    least_people
+        See ``probe_photos``.
     targets
         FMR targets, powers of ten; those that the data cannot resolve are left out and reported.
     photos_per_enrollment
@@ -59,29 +71,70 @@ class CalibrationOptions:
         Raw cosine from which two people are reported as suspiciously alike. On LFW with ArcFace
         descriptors the cosine of different people passes 0.37 once in 100,000 pairs, and half of
         the same person's pairs reach 0.6.
+    most_templates
+        Most people whose templates are compared with; the others only probe. All where people are
+        labelled.
     most_cells
-        Most p-to-s comparisons, which bounds memory: 20 bytes a comparison.
+        Most p-to-s comparisons: FMR 1e-6 is resolved by 10 million.
+    averaged_cells
+        As ``most_cells``, for probes of several photos; FMR 1e-5 is resolved by a million, of
+        300,000 pairs of people: 125 people with so many photos and ``most_templates`` others.
+    grouped
+        By how much both are larger where people are labelled: a group has a part of the trials.
     lifted_probes, lifted_impostor_pairs
         Size of the random subset of s-to-s comparisons, for each probe dimension.
+    worst_group
+        Set every threshold of ``fmr`` so that no group of people with trials enough to set it by
+        exceeds the target either; needs labels.
     seed
-        Seed of every random choice but the cohort's.
+        Seed of every random choice but the strangers' and the cohort's.
     """
 
     protocol: Protocol = "fmr"
     metric: Metric = Metric.SPHERICAL
     steps: int = DEFAULT_STEPS
     probe_dims: tuple[int, ...] = (0,)
+    probe_photos: tuple[int, ...] = (1, 2, 3, 5)
+    least_people: int = 50
     targets: tuple[float, ...] = TARGETS
     photos_per_enrollment: int = 3
     suspicious_above: float = 0.5
-    most_cells: int = 40_000_000
+    most_templates: int = 2_400
+    most_cells: int = 12_000_000
+    averaged_cells: int = 1_500_000
+    grouped: float = 10 / 3
     lifted_probes: int = 2_000
     lifted_impostor_pairs: int = 300_000
+    worst_group: bool = False
     seed: int = 0
 
     def __post_init__(self) -> None:
         for target in self.targets:
             level_name(target)  # refuses what has no name, before anything is computed
+        if 1 not in self.probe_photos:
+            raise ContractError("probes of one photo are always calibrated")
+
+
+@dataclass(frozen=True)
+class ModeResult:
+    """A calibration, and what an operator should read beside it.
+
+    Parameters
+    ----------
+    calibration
+        With all levels that the trials resolve.
+    unresolved
+        Sentences about the targets that they do not.
+    left_out
+        Sentences about the groups that ``worst_group`` could not heed.
+    folds
+        Result of the ten-fold protocol; None under protocol ``fmr``.
+    """
+
+    calibration: Calibration
+    unresolved: list[str]
+    left_out: list[str]
+    folds: TenFold | None
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -94,82 +147,126 @@ class CalibrationRun:
     descriptors: NDArray[np.float32]
     plan: TrialPlan
     templates: SubspaceBatch
-    cohort: SubspaceBatch
+    expectation: PointExpectation
     nobody: Nobody
     halves: bool
     service: Lifter
     client: Lifter
     pairs: tuple[Pair, ...]
+    groups: tuple[PeopleGroups, ...]
+    consistency: Consistency
     options: CalibrationOptions
     facts: Mapping[str, Json]
     progress: Progress
 
+    @cached_property
+    def cohort(self) -> SubspaceBatch:
+        """The cohort of the contract that is being made."""
+        return self.nobody.cohort(strategy=self.client.strategy, m=self.templates.m)
 
-def calibrate_mode(
-    run: CalibrationRun, probe_m: int, rng: np.random.Generator
-) -> tuple[Calibration, list[str], TenFold | None]:
-    """Calibrate one probe dimension: 0 is p-to-s."""
+
+def point_sets(run: CalibrationRun, rng: np.random.Generator) -> list[ProbeSets]:
+    """Choose the raw probes of every number of photos that the people allow."""
+    templates, options = len(run.templates), run.options
+    times = options.grouped if run.groups else 1
+    chosen = []
+    for photos in sorted(options.probe_photos):
+        cells = options.most_cells if photos == 1 else options.averaged_cells
+        most = max(1, int(times * cells) // templates)
+        sets = probe_sets(run.plan, photos, most=most, rng=rng)
+        genuine = run.plan.person_of[sets.photos[: sets.genuine, 0]]
+        if photos == 1 or len(np.unique(genuine)) >= options.least_people:
+            chosen.append(sets)
+    return chosen
+
+
+def calibrate_points(run: CalibrationRun, sets: ProbeSets) -> ModeResult:
+    """Calibrate raw probes of one number of photos."""
+    photos = sets.photos.shape[1]
+    impostors, genuine = point_trials(
+        run.descriptors,
+        run.plan,
+        run.templates,
+        run.expectation,
+        sets,
+        consistency=run.consistency.probe_threshold,
+        progress=run.progress,
+    )
+    return _calibration(run, impostors, genuine, probe_m=0, probe_photos=photos, norms=None)
+
+
+def calibrate_lifted(run: CalibrationRun, probe_m: int, rng: np.random.Generator) -> ModeResult:
+    """Calibrate lifted probes of one dimension."""
     options = run.options
-    norms: tuple[float, float] | None = None
-    if probe_m == 0:
-        impostors, genuine = point_trials(
+    with Keystream.seeded("calibration probes", options.seed, probe_m) as stream:
+        trials = lifted_trials(
             run.descriptors,
             run.plan,
             run.templates,
             run.cohort,
+            run.client,
+            probe_m=probe_m,
             metric=options.metric,
             steps=options.steps,
-            most_cells=options.most_cells,
+            most_probes=options.lifted_probes,
+            impostor_pairs=options.lifted_impostor_pairs,
             rng=rng,
+            stream=stream,
             progress=run.progress,
         )
-    else:
-        with Keystream.seeded("calibration probes", options.seed, probe_m) as stream:
-            trials = lifted_trials(
-                run.descriptors,
-                run.plan,
-                run.templates,
-                run.cohort,
-                run.client,
-                probe_m=probe_m,
-                metric=options.metric,
-                steps=options.steps,
-                most_probes=options.lifted_probes,
-                impostor_pairs=options.lifted_impostor_pairs,
-                rng=rng,
-                stream=stream,
-                progress=run.progress,
-            )
-        impostors, genuine = trials.impostors, trials.genuine
-        norms = honest_norms(trials.foot_norms)
-    everything = len(run.plan.person_of) * (len(run.plan.people) - 1)
-    tails = JointTails(impostors)
+    return _calibration(
+        run,
+        trials.impostors,
+        trials.genuine,
+        probe_m=probe_m,
+        probe_photos=1,
+        norms=honest_norms(trials.foot_norms),
+    )
+
+
+def _calibration(
+    run: CalibrationRun,
+    impostors: Impostors,
+    genuine: Genuine,
+    *,
+    probe_m: int,
+    probe_photos: int,
+    norms: tuple[float, float] | None,
+) -> ModeResult:
+    """Set the levels that the trials resolve."""
+    options = run.options
     kept, unresolved = resolved_targets(impostors, options.targets)
+    thresholds, left_out = _thresholds(run, impostors, kept)
     levels = [
-        make_level(
-            level_name(target),
-            target,
-            tails.for_target(target),
-            impostors,
-            genuine,
-            seed=options.seed,
-        )
-        for target in kept
+        make_level(level_name(target), target, threshold, impostors, genuine, seed=options.seed)
+        for target, threshold in zip(kept, thresholds, strict=True)
     ]
     folds = None
-    if options.protocol == "ten-fold":
+    if options.protocol == "ten-fold" and probe_photos == 1:
         folds = _ten_fold(run, probe_m)
-        levels.append(_accuracy_level(folds, tails, impostors, genuine, seed=options.seed))
+        levels.append(
+            make_level(
+                ACCURACY_LEVEL, None, folds.threshold_mean, impostors, genuine, seed=options.seed
+            )
+        )
     if not levels:
         raise ContractError("the data resolve no level: " + "; ".join(unresolved))
+    if run.groups and not probe_m:
+        levels = [
+            replace(level, groups=group_rates(level, run.groups, impostors, genuine))
+            for level in levels
+        ]
+    everything = len(run.plan.person_of) * (len(run.plan.people) - 1)
     facts: dict[str, Json] = {
         **run.facts,
         "genuine_trials": len(genuine.people),
         "impostor_trials": impostors.trials,
         "impostor_people_pairs": impostors.person_pairs,
         "impostor_sample": "all cross-identity pairs"
-        if impostors.trials == everything
-        else f"random subset of {everything} cross-identity pairs",
+        if impostors.trials == everything and probe_photos == 1
+        else f"{impostors.trials} of {everything} cross-identity pairs"
+        if probe_photos == 1
+        else f"means of {probe_photos} photos of one person",
     }
     if folds is not None:
         facts["ten_fold_accuracy"] = folds.accuracy_mean
@@ -178,13 +275,41 @@ def calibrate_mode(
         mode="s2s" if probe_m else "p2s",
         metric=options.metric,
         probe_m=probe_m,
+        probe_photos=probe_photos,
         steps=options.steps,
         levels=tuple(levels),
         foot_point_norm=norms,
         calibrated_on=facts,
     )
-    where = f"probe m = {probe_m}: " if probe_m else "raw probes: "
-    return calibration, [where + sentence for sentence in unresolved], folds
+    where = f"probe m = {probe_m}: " if probe_m else f"raw probes of {probe_photos} photo(s): "
+    return ModeResult(
+        calibration,
+        [where + sentence for sentence in unresolved],
+        [where + sentence for sentence in left_out],
+        folds,
+    )
+
+
+def _thresholds(
+    run: CalibrationRun, impostors: Impostors, targets: Sequence[float]
+) -> tuple[list[float], list[str]]:
+    """Set a threshold for each target, the largest first; name the groups that are not heeded."""
+    highest = highest_scores(impostors, targets)
+    thresholds: list[float] = []
+    unheeded = []
+    for target in targets:
+        threshold = threshold_at_fmr(highest, target, trials=impostors.trials)
+        if run.options.worst_group:
+            threshold, left_out = worst_group_threshold(threshold, target, run.groups, impostors)
+            # A group that only laxer targets resolve must not make those the stricter levels.
+            threshold = max([threshold, *thresholds[-1:]])
+            if left_out:
+                unheeded.append(
+                    f"FMR {target:g} needs {EXPECTED_ERRORS / target:.0f} impostor trials within a "
+                    f"group to set a threshold by, and these have fewer: {', '.join(left_out)}"
+                )
+        thresholds.append(threshold)
+    return thresholds, unheeded
 
 
 def _ten_fold(run: CalibrationRun, probe_m: int) -> TenFold:
@@ -198,7 +323,7 @@ def _ten_fold(run: CalibrationRun, probe_m: int) -> TenFold:
         templates = run.service.lift(run.descriptors[enrolled], m=run.templates.m, stream=stream)
         raw = run.descriptors[probing]
         probes = run.client.lift(raw, m=probe_m, stream=stream) if probe_m else raw
-    scores = pair_similarities(
+    close = pair_similarities(
         probes,
         templates,
         positions.astype(np.int64),
@@ -206,13 +331,11 @@ def _ten_fold(run: CalibrationRun, probe_m: int) -> TenFold:
         metric=options.metric,
         steps=options.steps,
     )
-    return ten_fold(scores, *pair_arrays(run.pairs))
-
-
-def _accuracy_level(
-    folds: TenFold, tails: JointTails, impostors: Impostors, genuine: Genuine, *, seed: int
-) -> Level:
-    """Ten-fold similarity threshold, with the cohort test at the same marginal quantile."""
-    similarity = folds.threshold_mean
-    _, cohort = tails.at_rank(min(tails.rank_of(similarity), impostors.trials))
-    return make_level(ACCURACY_LEVEL, None, (similarity, cohort), impostors, genuine, seed=seed)
+    if isinstance(probes, SubspaceBatch):
+        statistics = cohort_statistics(
+            probes, run.cohort, metric=options.metric, steps=options.steps
+        )
+    else:
+        statistics = run.expectation.statistics(probes)
+    means, spreads = (part[positions] for part in statistics)
+    return ten_fold((close - means) / spreads, *pair_arrays(run.pairs))

@@ -9,19 +9,28 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from templates.contract import wire
+from templates.contract.expectation import PointExpectation
 from templates.decoys import Attributes, DecoySource
-from templates.distances import Metric, paired_distances, pairwise_distances, similarity
+from templates.distances import (
+    DEFAULT_STEPS,
+    Metric,
+    paired_distances,
+    pairwise_distances,
+    similarity,
+)
 from templates.keys.randomness import Keystream
 from templates.space.lifting import Strategy, lift
 from templates.space.subspace import SubspaceBatch
 from verify.cohort import Probes, cohort_statistics
 from verify.thresholds import Genuine, Impostors
-from verify.trials import Indices, TrialPlan, impostor_groups
+from verify.trials import Indices, ProbeSets, TrialPlan, impostor_groups
 
 WIRE_DTYPE: wire.WireDtype = "float16"
-PROBE_TILE = 256
+PROBE_TILE = 1024
+"""Probes at a time: templates are laid out anew for each tile."""
 PAIR_TILE_BYTES = 128 * 2**20
 
 Progress = Callable[[str, float], None]
@@ -80,65 +89,80 @@ def point_trials(
     descriptors: NDArray[np.float32],
     plan: TrialPlan,
     templates: SubspaceBatch,
-    cohort: SubspaceBatch,
+    expectation: PointExpectation,
+    sets: ProbeSets,
     *,
-    metric: Metric,
-    steps: int,
-    most_cells: int,
-    rng: np.random.Generator,
+    consistency: float,
     progress: Progress,
 ) -> tuple[Impostors, Genuine]:
-    """Compare raw probes with everybody's template: all cross-identity pairs.
+    """Compare raw probes with the template of everybody who is compared.
 
-    Where photos × people exceeds ``most_cells``, impostor probes are a random subset of the
-    photos, so that memory stays bounded; all genuine probes are kept.
+    Parameters
+    ----------
+    templates
+        One for each of ``plan.compared``.
+    sets
+        The photos of every probe; those of more than one are averaged.
+    consistency
+        Least agreement of the photos of one probe: genuine ones below it are refused. Impostor
+        trials are all compared.
     """
-    people = len(plan.people)
-    limit = max(1, most_cells // people)
-    extra = np.setdiff1d(np.arange(len(plan.person_of)), plan.genuine)
-    if len(plan.genuine) >= limit:
-        chosen = np.sort(rng.choice(plan.genuine, limit, replace=False))
-    else:
-        room = min(len(extra), limit - len(plan.genuine))
-        chosen = np.sort(np.concatenate([plan.genuine, rng.choice(extra, room, replace=False)]))
-    owners = plan.person_of[chosen]
-    similarities = np.empty((len(chosen), people), dtype=np.float32)
-    scores = np.empty_like(similarities)
-    for start in range(0, len(chosen), PROBE_TILE):
+    people, compared = len(plan.people), len(plan.compared)
+    owners = plan.person_of[sets.photos[sets.impostor, 0]]
+    scores = np.empty((len(owners), compared), dtype=np.float32)
+    what = f"comparing probes of {sets.photos.shape[1]} photo(s) with templates"
+    for start in range(0, len(owners), PROBE_TILE):
         rows = slice(start, start + PROBE_TILE)
-        probes = descriptors[chosen[rows]]
-        distances = pairwise_distances(probes, templates, metric=metric, steps=steps)
-        similarities[rows] = similarity(distances)
-        means, spreads = cohort_statistics(probes, cohort, metric=metric, steps=steps)
-        scores[rows] = (similarities[rows] - means[:, None]) / spreads[:, None]
-        progress("comparing photos with templates", min(1.0, (start + PROBE_TILE) / len(chosen)))
-    position = np.searchsorted(chosen, plan.genuine)
-    kept = position < len(chosen)
-    kept[kept] = chosen[position[kept]] == plan.genuine[kept]
-    own, position = plan.person_of[plan.genuine[kept]], position[kept]
-    genuine = Genuine(similarities[position, own], scores[position, own], own)
-    rows_index = np.arange(len(chosen))
-    similarities[rows_index, owners] = -np.inf
-    scores[rows_index, owners] = -np.inf
+        probes = sets.means(descriptors, sets.impostor[rows])
+        distances = pairwise_distances(probes, templates, metric=expectation.metric)
+        means, spreads = expectation.statistics(probes)
+        scores[rows] = (similarity(distances) - means[:, None]) / spreads[:, None]
+        progress(what, min(1.0, (start + PROBE_TILE) / len(owners)))
+    with_template = np.flatnonzero(plan.template_of[owners] >= 0)
+    scores[with_template, plan.template_of[owners[with_template]]] = -np.inf
+    own = plan.person_of[sets.photos[: sets.genuine, 0]]
+    probes = sets.means(descriptors, slice(sets.genuine))
+    means, spreads = expectation.statistics(probes)
+    close = pair_similarities(
+        probes,
+        templates,
+        np.arange(len(own)),
+        plan.template_of[own],
+        metric=expectation.metric,
+        steps=DEFAULT_STEPS,
+    )
+    genuine = Genuine(
+        ((close - means) / spreads).astype(np.float32),
+        own,
+        _enrolled_photos(plan, own),
+        refused=sets.disagreeing(descriptors, consistency=consistency),
+    )
     probes_of = np.bincount(owners, minlength=people).astype(np.float64)
 
     def people_of(flat: Indices) -> Indices:
-        return np.stack([owners[flat // people], flat % people], axis=1)
+        return np.stack([owners[flat // compared], plan.compared[flat % compared]], axis=1)
 
     def weighted_trials(weights: NDArray[np.float64]) -> float:
         probe_weights = probes_of * weights
-        return float(probe_weights.sum() * weights.sum() - probe_weights @ weights)
+        others = weights[plan.compared]
+        return float(probe_weights.sum() * others.sum() - probe_weights[plan.compared] @ others)
 
     probing = int(np.count_nonzero(probes_of))
+    both = int(np.count_nonzero(probes_of[plan.compared]))
     return Impostors(
-        similarities=similarities.reshape(-1),
-        cohort_scores=scores.reshape(-1),
-        trials=len(chosen) * (people - 1),
+        scores=scores.reshape(-1),
+        trials=len(owners) * compared - len(with_template),
         people=people,
-        person_pairs=probing * (people - 1) - probing * (probing - 1) // 2,
+        # Unordered: of two who both probe and are compared there are two trials, and one pair.
+        person_pairs=probing * compared - both - both * (both - 1) // 2,
         people_of=people_of,
         weighted_trials=weighted_trials,
     ), genuine
+
+
+def _enrolled_photos(plan: TrialPlan, people: Indices) -> Indices:
+    """Return how many photos made the template of each of some people."""
+    return np.array([len(photos) for photos in plan.enrolled], dtype=np.int64)[people]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -182,47 +206,45 @@ def lifted_trials(
     probes = lifter.lift(descriptors[chosen], m=probe_m, stream=stream)
     means, spreads = np.empty(len(chosen)), np.empty(len(chosen))
     scores: list[NDArray[np.float32]] = []
-    cohort_scores: list[NDArray[np.float32]] = []
     met: list[Indices] = []
     for rows, people in impostor_groups(plan, len(chosen), pairs=impostor_pairs, rng=rng):
         group = probes[rows]
         means[rows], spreads[rows] = cohort_statistics(group, cohort, metric=metric, steps=steps)
-        distances = pairwise_distances(group, templates[people], metric=metric, steps=steps)
-        close = np.asarray(similarity(distances), dtype=np.float32)
-        z = ((close - means[rows, None]) / spreads[rows, None]).astype(np.float32)
+        distances = pairwise_distances(
+            group, templates[plan.template_of[people]], metric=metric, steps=steps
+        )
+        z = ((similarity(distances) - means[rows, None]) / spreads[rows, None]).astype(np.float32)
         others = owners[rows, None] != people[None, :]
         row, column = np.nonzero(others)
-        scores.append(close[others])
-        cohort_scores.append(z[others])
+        scores.append(z[others])
         met.append(np.stack([owners[rows][row], people[column]], axis=1))
         progress(what, rows.stop / len(chosen))
     pair_people = np.concatenate(met)
     own = owners[: len(genuine_photos)]
     first = np.arange(len(own), dtype=np.int64)
-    genuine_similarities = pair_similarities(
-        probes, templates, first, own, metric=metric, steps=steps
+    close = pair_similarities(
+        probes, templates, first, plan.template_of[own], metric=metric, steps=steps
     )
     keys, repeats = np.unique(pair_people, axis=0, return_counts=True)
     unordered = np.unique(np.sort(keys, axis=1), axis=0)
 
+    shape = (len(plan.people), len(plan.people))
+    counts = csr_array((repeats.astype(np.float64), (keys[:, 0], keys[:, 1])), shape=shape)
+
     def weighted_trials(weights: NDArray[np.float64]) -> float:
-        return float(np.sum(repeats * weights[keys[:, 0]] * weights[keys[:, 1]]))
+        return float(weights @ np.asarray(counts @ weights))
 
     impostors = Impostors(
-        similarities=np.concatenate(scores),
-        cohort_scores=np.concatenate(cohort_scores),
+        scores=np.concatenate(scores),
         trials=len(pair_people),
         people=len(plan.people),
         person_pairs=len(unordered),
         people_of=lambda flat: pair_people[flat],
         weighted_trials=weighted_trials,
     )
-    genuine_scores = ((genuine_similarities - means[: len(own)]) / spreads[: len(own)]).astype(
-        np.float32
-    )
-    return LiftedTrials(
-        impostors, Genuine(genuine_similarities, genuine_scores, own), probes.foot_norms
-    )
+    z = ((close - means[: len(own)]) / spreads[: len(own)]).astype(np.float32)
+    genuine = Genuine(z, own, _enrolled_photos(plan, own), refused=np.zeros(len(own), np.bool_))
+    return LiftedTrials(impostors, genuine, probes.foot_norms)
 
 
 def pair_similarities(

@@ -1,11 +1,15 @@
-"""How alike the photos of one enrollment must be, from the people of the calibration.
+"""How alike photos of one person must be, from the people of the calibration.
 
 Two people who enroll as one are both accepted later: their mean lies between them. An ordinary
 pair of people cannot, but somebody who may choose finds a partner, and even one photo in a thousand
 pairs of strangers is much for that. So the limit stands as far from strangers as photos of one
 person allow.
+
+A probe is compared once and then forgotten: nobody gains a lasting place by mixing two people in
+it. So its photos need only agree as those of strangers do not, and fewer genuine ones are refused.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,18 +41,18 @@ class Consistency:
     threshold
         Least agreement of the photos of one enrollment (``templates.space.agreement``); for two
         photos, their raw cosine.
+    probe_threshold
+        Least agreement of the photos of one probe.
     fmr
         Pairs of photos of different people that reach it.
     refused
         Genuine sets of photos that it refuses.
-    match_cosine
-        Raw cosine at FMR 1e-3, from which on a single photo is taken for a match elsewhere.
     """
 
     threshold: float
+    probe_threshold: float
     fmr: Rate
     refused: Rate
-    match_cosine: float
 
 
 def photo_consistency(
@@ -58,11 +62,12 @@ def photo_consistency(
     photos: int,
     rng: np.random.Generator,
 ) -> Consistency:
-    """Set the limit: as strict as genuine sets of photos allow, between two raw FMRs.
+    """Set the limits. Of an enrollment: as strict as genuine sets allow, between two raw FMRs.
 
     It is the smaller of two values: the raw cosine at FMR 1e-6, and the agreement that all but
     2 % of the genuine sets of ``photos`` photos reach. It is at least the raw cosine at FMR 1e-3,
-    so that mislabelled photos among the genuine sets cannot lower it further.
+    so that mislabelled photos among the genuine sets cannot lower it further. A probe's limit is
+    that raw cosine at FMR 1e-3.
 
     Parameters
     ----------
@@ -96,10 +101,19 @@ def photo_consistency(
     threshold = max(lax, min(strict, float(genuine[allowed])))
     return Consistency(
         threshold=threshold,
+        probe_threshold=lax,
         fmr=rate(int(np.count_nonzero(impostor >= np.float64(threshold))), impostor.size),
         refused=rate(int(np.count_nonzero(genuine < threshold)), len(genuine)),
-        match_cosine=lax,
     )
+
+
+def match_cosine(
+    descriptors: NDArray[np.float32], identities: Sequence[str], *, seed: int = 0
+) -> float:
+    """Raw cosine at FMR 1e-3 of labelled unit descriptors, (N, n): a match without any template."""
+    person_of = np.unique(np.asarray(identities), return_inverse=True)[1]
+    impostor = impostor_cosines(descriptors, person_of, rng=np.random.default_rng(seed))
+    return impostor_tail(impostor, lax_fmr=LAXEST_FMR).lax
 
 
 @dataclass(frozen=True)

@@ -1,31 +1,39 @@
 """What a verification answers."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias
 
-Reason: TypeAlias = Literal["match", "no_match"]
+from verify.challenge import LivenessFailure
+
+Reason: TypeAlias = Literal["match", "no_match", "liveness"]
+Liveness: TypeAlias = Literal["passed", "failed", "not_checked"]
 
 
 @dataclass(frozen=True)
 class Decision:
-    """Accept or reject, and by which thresholds.
+    """Accept or reject, and by which threshold.
 
     Parameters
     ----------
     accepted
-        Whether the probe reached both thresholds of the level.
+        Whether the probe's score reached the level's threshold.
     reason
-        ``match`` or ``no_match``; a subject that does not exist is also ``no_match``.
+        ``match`` or ``no_match``; a subject that does not exist is also ``no_match``. ``liveness``
+        where the probe is not taken for a living person's, whether it matches or not.
     level
         Security level that decided.
     fmr
         The level's target FMR; for a level without a target, the FMR seen in calibration.
     contract_id, calibration_id
-        What the thresholds belong to.
-    similarity, distance, cohort_score
-        Scores, for keys with the right to them: returned to anyone else they let an attacker
+        What the threshold belongs to.
+    similarity, distance, score
+        For keys with the right to them: returned to anyone else they let an attacker
         climb (docs/method.md §4.8). Left out of ``repr``, so that no log line holds them by
         accident.
+    liveness
+        Whether a living person made the probe, where that was checked.
+    liveness_failure
+        Why not; for keys with the right to scores, like these.
     """
 
     accepted: bool
@@ -36,4 +44,18 @@ class Decision:
     calibration_id: str
     similarity: float = field(repr=False)
     distance: float = field(repr=False)
-    cohort_score: float = field(repr=False)
+    score: float = field(repr=False)
+    liveness: Liveness = "not_checked"
+    liveness_failure: LivenessFailure | None = None
+
+    def with_liveness(self, failure: LivenessFailure | None) -> "Decision":
+        """Return the decision on a probe whose liveness was checked: a failure rejects."""
+        if failure is None:
+            return replace(self, liveness="passed")
+        return replace(
+            self,
+            accepted=False,
+            reason="liveness",
+            liveness="failed",
+            liveness_failure=failure,
+        )

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import csr_array
 from scipy.special import ndtri
 
 from templates.contract.document import Rate
@@ -60,12 +61,6 @@ def rate(errors: int, trials: int) -> Rate:
     """Rate with its Wilson interval, for trials that are independent."""
     low, high = wilson(errors, trials)
     return Rate(errors=errors, trials=trials, ci_low=low, ci_high=high)
-
-
-def false_match_rate(impostor: ArrayLike, threshold: float) -> Rate:
-    """Share of impostor similarities at or above the threshold."""
-    scores = np.asarray(impostor, dtype=np.float64)
-    return rate(int(np.count_nonzero(scores >= threshold)), scores.size)
 
 
 def false_non_match_rate(genuine: ArrayLike, threshold: float) -> Rate:
@@ -225,6 +220,11 @@ def subject_bootstrap(
         )
         first, second = np.divmod(keys, people)
         within = first == second
+        counted = repeats.astype(np.float64)
+        alone = np.bincount(first[within], weights=counted[within], minlength=people)
+        between = csr_array(
+            (counted[~within], (first[~within], second[~within])), shape=(people, people)
+        )
         generator = np.random.default_rng(seed)
         rates = []
         for _ in range(replicates):
@@ -232,8 +232,7 @@ def subject_bootstrap(
             weights = np.bincount(drawn, minlength=people).astype(np.float64)
             total = weighted_trials(weights)
             if total > 0:
-                other = np.where(within, 1.0, weights[second])
-                rates.append(float(np.sum(repeats * weights[first] * other)) / total)
+                rates.append(float(weights @ (alone + between @ weights)) / total)
         if rates:
             lower, upper = np.percentile(np.clip(rates, 0.0, 1.0), [2.5, 97.5])
             low, high = min(low, float(lower)), max(high, float(upper))

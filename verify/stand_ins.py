@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 
 from templates.contract.document import Contract
 from templates.keys.randomness import Keystream
+from templates.space.lifting import plain_strategy
 from templates.space.subspace import AffineSubspace
-from verify.cohort import plain_strategy
 
 
 @dataclass(frozen=True)
@@ -29,10 +29,16 @@ class StandIn:
     lifted
         The subject's own, of :func:`lift_stand_in`, where the distance will be told; ``wire``
         serves where it will not.
+    template_id
+        Any, as long as a real one: a rotation is derived from it, as from a real one.
+    holder_salt
+        None: no key would be the holder's.
     """
 
     wire: bytes = field(repr=False)
     lifted: AffineSubspace | None = field(default=None, repr=False)
+    template_id: str = "0" * 32
+    holder_salt: str | None = None
 
 
 def lift_stand_in(contract: Contract, digest: bytes) -> AffineSubspace:
@@ -46,7 +52,7 @@ def lift_stand_in(contract: Contract, digest: bytes) -> AffineSubspace:
 
     Notes
     -----
-    It is *not* in the tenant's rotation: the distance of a probe to it is the one that both would
+    It is in *no* rotation: the distance of a probe to it is the one that both would
     have when turned.
     """
     if len(digest) != 32:

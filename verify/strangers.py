@@ -4,17 +4,17 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm, t
+from scipy.special import ndtr, stdtrit
 
+from templates.contract.expectation import PointExpectation
 from templates.contract.nobody import Nobody
 from templates.decoys import DecoyGenerator, DecoySource
-from templates.distances import Metric
 from templates.errors import ContractError, DecoyError
-from templates.keys.randomness import Keystream
+from templates.keys.randomness import KEY_BYTES, Keystream
 from templates.space.subspace import SubspaceBatch
-from verify.cohort import client_source, cohort_statistics
+from verify.cohort import client_source, people_like
 
-STRANGERS = 2_000
+STRANGERS = 1_000
 SCORED = 600
 """Templates that the limit is set by, at most."""
 DEVIATIONS = 6.0
@@ -39,11 +39,12 @@ def strangers_like(
         The decoys of clients: everybody may know it, so that a wolf can be made that lies near
         real faces, and not near those that it draws.
     hidden
-        What the cohort's descriptors are drawn from (:func:`verify.cohort.people_like`).
+        What descriptors of nobody are drawn from (:func:`verify.cohort.people_like`).
     photos : (N, n) float32
-        Descriptors of the calibration. Where ``hidden`` is ``source``, people are fewer than n;
-        then one generator is fitted to the photos of every second of them, and one to the others,
-        where that is possible: of those who were fitted to a few people, many lie near them.
+        Descriptors of the calibration. Where ``hidden`` is ``source`` without its noise, people are
+        fewer than n; then one generator is fitted to the photos of every second of them, and one to
+        the others, where that is possible: of those who were fitted to a few people, many lie near
+        them.
     person_of : (N,) int64
         Person of every photo.
 
@@ -52,27 +53,24 @@ def strangers_like(
     tuple
         One source; or that of people with even numbers, and that of those with odd ones.
     """
-    if hidden is not source:
+    if hidden.source_id != people_like(source, None).source_id:
         return (hidden,)
     halves = [photos[person_of % 2 == half] for half in (0, 1)]
     try:
         return tuple(DecoyGenerator.fit(half[:: -(-len(half) // _FITTED) or 1]) for half in halves)
     except DecoyError:
         # They are too few, hardly vary, or lie in a small subspace.
-        return (source,)
+        return (hidden,)
 
 
 def make_nobody(
     source: DecoySource,
     *,
     strangers: Sequence[DecoySource],
-    cohort: SubspaceBatch,
-    metric: Metric,
-    steps: int,
     stream: Keystream,
     size: int = STRANGERS,
 ) -> Nobody:
-    """Draw strangers who do not exist.
+    """Draw strangers who do not exist, and the seed of a cohort.
 
     Parameters
     ----------
@@ -80,22 +78,23 @@ def make_nobody(
         The contract's decoy source.
     strangers
         What they are drawn from, in equal shares (:func:`strangers_like`).
-    cohort, metric, steps
-        The contract's.
     stream
-        Fresh for a service: the strangers are a secret.
+        Fresh for a service: strangers and seed are secrets.
     """
     generator = client_source(source)
     if not isinstance(generator, DecoyGenerator):
         raise ContractError("strangers are lifted with a decoy generator")
     share = size // len(strangers)
     people = np.concatenate([crowd.draw(share, 1, stream=stream)[:, 0] for crowd in strangers])
-    means, spreads = cohort_statistics(people, cohort, metric=metric, steps=steps)
-    return Nobody(people, means.astype(np.float32), spreads.astype(np.float32), generator)
+    return Nobody.of(people, generator, seed=stream.token(KEY_BYTES))
 
 
 def honest_score(
-    nobody: Nobody, templates: SubspaceBatch, *, halves: bool, metric: Metric, steps: int
+    nobody: Nobody,
+    expectation: PointExpectation,
+    templates: SubspaceBatch,
+    *,
+    people: NDArray[np.int64] | None = None,
 ) -> float:
     """Largest score of an honest template: what a Gaussian reaches once in a thousand million.
 
@@ -104,17 +103,21 @@ def honest_score(
     Parameters
     ----------
     templates
-        Of the calibration's people, in their order; the first ``SCORED`` count.
-    halves
-        Whether the strangers are of two sources: each template is then held against those that
-        its person had no part in.
+        Of the calibration's people; the first ``SCORED`` count.
+    people
+        Their numbers, where the strangers are of two sources (:func:`strangers_like`): each
+        template is then held against those that its person had no part in.
     """
-    middle = len(nobody.people) // 2
-    parts = [nobody[middle:], nobody[:middle]] if halves else [nobody]
-    scores = [
-        parts[number % len(parts)].score(template, metric=metric, steps=steps)
-        for number, template in enumerate(templates[:SCORED])
-    ]
+    middle = len(nobody) // 2
+    chosen = templates[:SCORED]
+    scores = np.empty(len(chosen))
+    if people is None:
+        scores[:] = nobody.scores(chosen, expectation)
+    else:
+        for half, rows in enumerate((slice(middle, None), slice(middle))):
+            own = np.flatnonzero(people[:SCORED] % 2 == half)
+            if len(own):
+                scores[own] = nobody.scores(chosen[own], expectation, rows=rows)
     count = len(scores)
-    reach = t.isf(norm.sf(DEVIATIONS), count - 1) * np.sqrt(1 + 1 / count)
+    reach = -stdtrit(count - 1, ndtr(-DEVIATIONS)) * np.sqrt(1 + 1 / count)
     return float(np.mean(scores) + reach * np.std(scores, ddof=1))

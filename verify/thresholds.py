@@ -1,9 +1,4 @@
-"""Both thresholds of a level, at the same marginal quantile (docs/method.md §6.2).
-
-Setting each test alone at the target FMR would halve the joint FMR and waste genuine users. So
-both thresholds are set at one marginal quantile q, and q is the largest at which the *joint* FMR
-on the impostor trials is at most the target.
-"""
+"""The threshold of a level, for a stated false match rate on impostor trials."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -14,7 +9,7 @@ from numpy.typing import NDArray
 
 from templates.contract.document import Level, Rate
 from templates.errors import ContractError
-from verify.metrics import between, most_errors, resolvable, subject_bootstrap
+from verify.metrics import most_errors, resolvable, subject_bootstrap
 
 TARGETS = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 
@@ -33,7 +28,7 @@ class Impostors:
 
     Parameters
     ----------
-    similarities, cohort_scores : (R,) float32
+    scores : (R,) float32
         Minus infinity marks a cell that is no trial (a probe against its own person).
     trials
         Number of cells that are trials.
@@ -47,8 +42,7 @@ class Impostors:
         Total weight of all trials under (people,) bootstrap weights.
     """
 
-    similarities: Scores
-    cohort_scores: Scores
+    scores: Scores
     trials: int
     people: int
     person_pairs: int
@@ -58,11 +52,22 @@ class Impostors:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Genuine:
-    """Genuine trials: (G,) similarities, cohort scores and people."""
+    """Genuine trials.
 
-    similarities: Scores
-    cohort_scores: Scores
+    Parameters
+    ----------
+    scores : (G,) float32
+    people : (G,) int64
+    enrolled_photos : (G,) int64
+        How many photos made each one's template.
+    refused : (G,) bool
+        Probes whose photos do not agree: the service refuses them before it compares.
+    """
+
+    scores: Scores
     people: NDArray[np.int64]
+    enrolled_photos: NDArray[np.int64]
+    refused: NDArray[np.bool_]
 
 
 def resolved_targets(
@@ -88,97 +93,31 @@ def resolved_targets(
     return kept, refused
 
 
-class JointTails:
-    """Upper tails of both impostor scores; finds joint thresholds, for falling targets cheaply."""
-
-    def __init__(self, impostors: Impostors) -> None:
-        self._trials = impostors.trials
-        self._sorted = tuple(
-            np.sort(scores) for scores in (impostors.similarities, impostors.cohort_scores)
-        )
-        self._tail = (impostors.similarities, impostors.cohort_scores)
-
-    def at_rank(self, rank: int) -> tuple[float, float]:
-        """Thresholds that accept the ``rank`` highest scores of either test, ties aside."""
-        if not 0 <= rank <= self._trials:
-            raise ValueError("a rank lies in 0 … the number of trials")
-        return self._marginal(0, rank), self._marginal(1, rank)
-
-    def for_target(self, target: float) -> tuple[float, float]:
-        """Thresholds at the largest common rank whose joint FMR is at most the target."""
-        allowed = most_errors(target, self._trials)
-        # At a rank k at most k trials pass both, so the search starts at the allowed count.
-        low, high = allowed, max(1, 2 * allowed)
-        while high < self._trials and self._joint(high) <= allowed:
-            low, high = high, min(self._trials, 2 * high)
-        if high >= self._trials and self._joint(self._trials) <= allowed:
-            return self.at_rank(self._trials)
-        self._shrink(high)
-        while high - low > 1:
-            middle = (low + high) // 2
-            if self._joint(middle) <= allowed:
-                low = middle
-            else:
-                high = middle
-        return self.at_rank(low)
-
-    def rank_of(self, similarity: float) -> int:
-        """Number of impostor trials at or above a similarity."""
-        scores = self._sorted[0]
-        return int(scores.size - np.searchsorted(scores, np.float64(similarity), side="left"))
-
-    def _marginal(self, test: int, rank: int) -> float:
-        scores = self._sorted[test]
-        position = scores.size - rank
-        if rank == 0:
-            return float(np.nextafter(np.float64(scores[-1]), np.inf))
-        accepted = np.float64(scores[position])
-        if rank == self._trials:
-            return float(accepted)
-        rejected = np.float64(scores[position - 1])
-        if rejected < accepted:
-            return between(float(rejected), float(accepted))
-        # A tie across the border: reject all of it, so that no rank accepts more than it says.
-        above = np.searchsorted(scores, accepted, side="right")
-        if above == scores.size:
-            return float(np.nextafter(accepted, np.inf))
-        return between(float(accepted), float(scores[above]))
-
-    def _joint(self, rank: int) -> int:
-        similarity, cohort = self.at_rank(rank)
-        return int(np.count_nonzero(_passes(*self._tail, similarity, cohort)))
-
-    def _shrink(self, rank: int) -> None:
-        """Forget trials that no later, stricter threshold can accept."""
-        similarity, cohort = self.at_rank(rank)
-        kept = _passes(*self._tail, similarity, cohort)
-        self._tail = (self._tail[0][kept], self._tail[1][kept])
-
-
-def _passes(
-    similarities: Scores, cohort_scores: Scores, similarity: float, cohort: float
-) -> NDArray[np.bool_]:
-    # A NumPy float64 keeps the comparison in float64, where a Python float would not.
-    return np.asarray(
-        (similarities >= np.float64(similarity)) & (cohort_scores >= np.float64(cohort))
-    )
+def highest_scores(impostors: Impostors, targets: Sequence[float]) -> Scores:
+    """Return the scores that thresholds for these targets, or lower ones, are set by."""
+    count = most_errors(max(targets, default=0.0), impostors.trials) + 2
+    scores = impostors.scores
+    if count >= len(scores):
+        return scores[np.isfinite(scores)]
+    tail = np.partition(scores, len(scores) - count)[-count:]
+    return tail[np.isfinite(tail)]
 
 
 def make_level(
     name: str,
     target: float | None,
-    thresholds: tuple[float, float],
+    threshold: float,
     impostors: Impostors,
     genuine: Genuine,
     *,
     seed: int,
 ) -> Level:
-    """Count both errors at given thresholds, with subject-bootstrap intervals."""
-    matched = np.flatnonzero(_passes(impostors.similarities, impostors.cohort_scores, *thresholds))
-    missed = genuine.people[
-        ~_passes(genuine.similarities, genuine.cohort_scores, *thresholds)
-    ].reshape(-1)
-    counts = np.bincount(genuine.people, minlength=impostors.people).astype(np.float64)
+    """Count both errors at a given threshold, with subject-bootstrap intervals."""
+    # A NumPy float64 keeps the comparison in float64, where a Python float would not.
+    bound = np.float64(threshold)
+    matched = np.flatnonzero(impostors.scores >= bound)
+    missed = ~(genuine.scores >= bound)
+    compared = ~genuine.refused
     fmr: Rate = subject_bootstrap(
         impostors.people_of(matched),
         people=impostors.people,
@@ -186,20 +125,33 @@ def make_level(
         weighted_trials=impostors.weighted_trials,
         seed=seed,
     )
-    fnmr: Rate = subject_bootstrap(
-        np.stack([missed, missed], axis=1),
-        people=impostors.people,
-        trials=len(genuine.people),
-        weighted_trials=lambda weights: float(counts @ weights),
-        seed=seed + 1,
-    )
+
+    def wrongly_rejected(tried: NDArray[np.bool_]) -> Rate:
+        counts = np.bincount(genuine.people[tried], minlength=impostors.people)
+        wrong = genuine.people[tried & (missed | genuine.refused)]
+        return subject_bootstrap(
+            np.stack([wrong, wrong], axis=1),
+            people=impostors.people,
+            trials=int(np.count_nonzero(tried)),
+            weighted_trials=lambda weights: float(counts @ weights),
+            seed=seed + 1,
+        )
+
     return Level(
         name=name,
         target_fmr=target,
-        similarity_threshold=thresholds[0],
-        cohort_threshold=thresholds[1],
+        threshold=threshold,
         fmr=fmr,
-        fnmr=fnmr,
+        fnmr=wrongly_rejected(compared),
+        fnmr_by_photos={
+            int(photos): wrongly_rejected(compared & (genuine.enrolled_photos == photos))
+            for photos in np.unique(genuine.enrolled_photos[compared])
+        },
+        frr_by_photos={
+            int(photos): wrongly_rejected(genuine.enrolled_photos == photos)
+            for photos in np.unique(genuine.enrolled_photos)
+            if genuine.refused.any()
+        },
     )
 
 

@@ -2,9 +2,12 @@
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+
+from templates.space.agreement import weakest_split
 
 Indices = NDArray[np.int64]
 
@@ -23,25 +26,45 @@ class TrialPlan:
         Person of every photo.
     enrolled
         For every person, the photos that are averaged into the one template.
+    compared : (T,) int64
+        People whose templates are made and compared with, in rising order; all others only probe.
     genuine : (G,) int64
-        Photos that are not enrolled and whose person is: the genuine probes. Nobody's own
+        Photos that are not enrolled, of people who are compared: the genuine probes. Nobody's own
         enrollment photo is ever a genuine probe.
     """
 
     people: tuple[str, ...]
     person_of: Indices
     enrolled: tuple[Indices, ...]
+    compared: Indices
     genuine: Indices
+
+    @cached_property
+    def template_of(self) -> Indices:
+        """Position of every person's template, (people,); -1 where there is none."""
+        positions = np.full(len(self.people), -1, dtype=np.int64)
+        positions[self.compared] = np.arange(len(self.compared))
+        return positions
 
 
 def plan_trials(
-    identities: Sequence[str], *, photos_per_enrollment: int, rng: np.random.Generator
+    identities: Sequence[str],
+    *,
+    photos_per_enrollment: int,
+    rng: np.random.Generator,
+    most_templates: int | None = None,
 ) -> TrialPlan:
     """Split every person's photos into enrollment and probes.
 
     A person with k ≥ 2 photos is enrolled on ``min(photos_per_enrollment, k - 1)`` of them,
     chosen at random, and probed by the others. A person with one photo is enrolled on it and
     gives impostor trials only.
+
+    Parameters
+    ----------
+    most_templates
+        Most people who are compared; those with two photos or more first, as they alone tell of
+        genuine probes. None for all.
     """
     if photos_per_enrollment < 1:
         raise ValueError("an enrollment needs at least one photo")
@@ -55,19 +78,97 @@ def plan_trials(
         take = min(photos_per_enrollment, max(1, len(photos) - 1))
         enrolled.append(np.sort(shuffled[:take]))
         genuine.append(np.sort(shuffled[take:]))
+    compared = np.arange(len(people), dtype=np.int64)
+    if most_templates is not None and len(people) > most_templates:
+        order = rng.permutation(compared)
+        order = order[np.argsort(counts[order] < 2, kind="stable")]
+        compared = np.sort(order[:most_templates])
+    probing = [genuine[person] for person in compared]
     return TrialPlan(
         people=tuple(map(str, people)),
         person_of=person_of.astype(np.int64).reshape(-1),
         enrolled=tuple(enrolled),
-        genuine=np.concatenate(genuine) if genuine else np.empty(0, dtype=np.int64),
+        compared=compared,
+        genuine=np.concatenate(probing) if probing else np.empty(0, dtype=np.int64),
     )
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ProbeSets:
+    """Photos that are averaged into probes.
+
+    Parameters
+    ----------
+    photos : (P, k) int64
+        Of one person each.
+    genuine
+        The first so many hold no photo that is enrolled.
+    impostor : (R,) int64
+        Those that are compared with everybody else's template: all, or a random subset.
+    """
+
+    photos: Indices
+    genuine: int
+    impostor: Indices
+
+    def means(self, descriptors: NDArray[np.float32], rows: slice | Indices) -> NDArray[np.float32]:
+        """Average and normalise the descriptors of some sets."""
+        if self.photos.shape[1] == 1:
+            return descriptors[self.photos[rows, 0]]
+        return unit_means(descriptors[self.photos[rows]])
+
+    def disagreeing(
+        self, descriptors: NDArray[np.float32], *, consistency: float
+    ) -> NDArray[np.bool_]:
+        """Tell which genuine sets a service refuses as photos of two people, (genuine,)."""
+        if self.photos.shape[1] == 1:
+            return np.zeros(self.genuine, dtype=np.bool_)
+        agreements = [
+            weakest_split(descriptors[photos]).agreement for photos in self.photos[: self.genuine]
+        ]
+        return np.array(agreements, dtype=np.float64) < consistency
+
+
+def probe_sets(plan: TrialPlan, photos: int, *, most: int, rng: np.random.Generator) -> ProbeSets:
+    """Choose sets of ``photos`` photos of one person, and ``most`` of them for impostor trials.
+
+    A person's photos are put in a random order around a circle, and every run of ``photos`` of them
+    is a set: as many sets as photos where those are more. Sets with photos that are enrolled make
+    impostor trials only. Impostors are drawn from all sets: people with many photos have most
+    genuine ones, and need not be like the others.
+    """
+    everybodys = np.split(
+        np.argsort(plan.person_of, kind="stable"),
+        np.cumsum(np.bincount(plan.person_of, minlength=len(plan.people)))[:-1],
+    )
+    left = [np.setdiff1d(everybodys[one], plan.enrolled[one]) for one in plan.compared]
+    genuine = _runs(left, photos, rng)
+    extra = _runs(everybodys, photos, rng)
+    if photos == 1:
+        extra = np.setdiff1d(extra, genuine)[:, None]
+    sets = np.concatenate([genuine, extra])
+    impostor = np.sort(rng.choice(len(sets), min(most, len(sets)), replace=False))
+    return ProbeSets(sets, len(genuine), impostor)
+
+
+def _runs(people: Sequence[Indices], length: int, rng: np.random.Generator) -> Indices:
+    runs = [np.empty((0, length), dtype=np.int64)]
+    for photos in people:
+        if len(photos) >= length:
+            shuffled = rng.permutation(photos).astype(np.int64)
+            starts = np.arange(len(photos) if len(photos) > length else 1)
+            runs.append(shuffled[(starts[:, None] + np.arange(length)) % len(photos)])
+    return np.concatenate(runs)
 
 
 def enrolled_means(descriptors: NDArray[np.float32], plan: TrialPlan) -> NDArray[np.float32]:
     """Average and normalise every person's enrolled photos, (people, n)."""
-    means = np.stack(
-        [descriptors[photos].mean(axis=0, dtype=np.float64) for photos in plan.enrolled]
-    )
+    return np.concatenate([unit_means(descriptors[photos][None]) for photos in plan.enrolled])
+
+
+def unit_means(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Average and normalise sets of descriptors, (S, k, n) to (S, n)."""
+    means = descriptors.mean(axis=1, dtype=np.float64)
     return np.asarray(means / np.linalg.norm(means, axis=1, keepdims=True), dtype=np.float32)
 
 
@@ -105,7 +206,7 @@ def impostor_groups(
     matrix product; the next group meets others. Together about ``pairs`` comparisons. Those of a
     probe with its own person are among them, and are no impostor trials.
     """
-    people_each = min(len(plan.people), -(-pairs // probes))
+    people_each = min(len(plan.compared), -(-pairs // probes))
     for start in range(0, probes, size):
-        people = np.sort(rng.choice(len(plan.people), size=people_each, replace=False))
+        people = np.sort(rng.choice(plan.compared, size=people_each, replace=False))
         yield slice(start, min(start + size, probes)), people.astype(np.int64)

@@ -1,6 +1,9 @@
 """A probe against a stored template becomes a decision."""
 
+import secrets
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,11 +15,37 @@ from templates.contract import wire
 from templates.contract.document import Calibration, Contract, Level
 from templates.distances import Metric, paired_distances, similarity
 from templates.errors import ContractMismatch, InvalidTemplate
+from templates.keys.randomness import KEY_BYTES
+from templates.keys.rotation import HolderKey, TenantRotation, holder_rotation
+from templates.space.agreement import mean_embedding
 from templates.space.embedding import unit_rows
-from templates.space.subspace import AffineSubspace, SubspaceBatch
-from verify.cohort import Probes, cohort_statistics
+from templates.space.subspace import AffineSubspace, SubspaceBatch, Turn
+from verify.challenge import Movement
+from verify.cohort import Probes, expected_similarity
 from verify.decision import Decision
+from verify.photo_probe import MAX_PROBE_PHOTOS, PhotoProbe, probe_of_frames, probe_of_photos
 from verify.stand_ins import StandIn
+
+_NO_SALT = "0" * 32
+
+
+class OpenedTemplate(Protocol):
+    """A stored template, decrypted; a :class:`StandIn` where the subject does not exist."""
+
+    @property
+    def wire(self) -> bytes:
+        """Its wire bytes."""
+        ...
+
+    @property
+    def template_id(self) -> str:
+        """The id that its rotation is derived from."""
+        ...
+
+    @property
+    def holder_salt(self) -> str | None:
+        """What its holder's rotation is derived from, with their key; None if it needs no key."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -30,16 +59,17 @@ class _Rule:
 class Verifier:
     """Decides for one contract and one tenant. Holds no state between calls; threads may share it.
 
-    Every decision needs both the similarity threshold and the cohort test of its level
-    (docs/method.md §6). Stored templates are rotated, the cohort is not, so the probe is turned for
-    the template only.
+    A probe is accepted where its score reaches the level's threshold (docs/method.md §6). Each
+    stored template is in a rotation of its own, templates of nobody are in none, so the probe is
+    turned for the stored one only. The holder's rotation is derived and applied for every probe,
+    whether a key was sent, or is needed, or not: the time tells neither.
 
     Parameters
     ----------
     contract
-        Whose calibrations and cohort decide.
-    rotation : (n, n) float64
-        The tenant's orthogonal rotation.
+        Whose calibrations decide.
+    rotation
+        What gives each template of the tenant its rotation.
 
     Raises
     ------
@@ -47,75 +77,134 @@ class Verifier:
         Where the rotation is of another dimension.
     """
 
-    def __init__(self, contract: Contract, *, rotation: NDArray[np.float64]) -> None:
+    def __init__(self, contract: Contract, *, rotation: TenantRotation) -> None:
         n = contract.binding.n
-        if rotation.shape != (n, n):
+        if rotation.n != n:
             raise ContractMismatch(
-                f"the contract is for embeddings of {n} numbers, the rotation turns "
-                f"{rotation.shape[0]}"
+                f"the contract is for embeddings of {n} numbers, the rotation turns {rotation.n}"
             )
         self._contract = contract
         self._rotation = rotation
+        self._nobodys_key = secrets.token_bytes(KEY_BYTES)
 
-    def decide_photo(
+    def embed_photos(
         self,
         pack: ModelPack,
-        photo: bytes,
-        stored: bytes | StandIn,
-        *,
-        level: str | None = None,
-        policy: FacePolicy = FacePolicy.SINGLE,
-        quality: QualityLimits | None = DEFAULT_QUALITY,
-        limits: ImageLimits = DEFAULT_LIMITS,
-    ) -> Decision:
-        """Decide for a photo file: :meth:`embed_photo`, then :meth:`decide_embedding`."""
-        embedding = self.embed_photo(pack, photo, policy=policy, quality=quality, limits=limits)
-        return self.decide_embedding(embedding, stored, level=level)
-
-    def embed_photo(
-        self,
-        pack: ModelPack,
-        photo: bytes,
+        photos: Sequence[bytes],
         *,
         policy: FacePolicy = FacePolicy.SINGLE,
         quality: QualityLimits | None = DEFAULT_QUALITY,
         limits: ImageLimits = DEFAULT_LIMITS,
     ) -> NDArray[np.float32]:
-        """Make a probe, (n,), of the face in a photo file.
+        """Make one probe, (n,), of 1 to 5 photo files of one person.
 
         Raises
         ------
         ContractMismatch
             Where the pack is not the contract's.
-        ModelError
-            Where the photo has no usable face.
+        PhotoRejected
+            Where one photo has no usable face.
+        InconsistentImages
+            Where the photos do not show one person.
         """
+        return self.photo_probe(
+            pack, photos, policy=policy, quality=quality, limits=limits
+        ).embedding
+
+    def photo_probe(
+        self,
+        pack: ModelPack,
+        photos: Sequence[bytes],
+        *,
+        passive: bool = False,
+        policy: FacePolicy = FacePolicy.SINGLE,
+        quality: QualityLimits | None = DEFAULT_QUALITY,
+        limits: ImageLimits = DEFAULT_LIMITS,
+    ) -> PhotoProbe:
+        """:meth:`embed_photos`, and with `passive` whether the photos look live.
+
+        Raises
+        ------
+        Uncalibrated
+            Where the contract has no liveness threshold.
+        """
+        self._require(pack)
+        if not 1 <= len(photos) <= MAX_PROBE_PHOTOS:
+            raise ValueError(f"a probe has 1 to {MAX_PROBE_PHOTOS} photos, not {len(photos)}")
+        return probe_of_photos(
+            pack,
+            self._contract,
+            photos,
+            passive=passive,
+            policy=policy,
+            quality=quality,
+            limits=limits,
+        )
+
+    def frames_probe(
+        self,
+        pack: ModelPack,
+        frames: Sequence[bytes],
+        movements: Sequence[Movement],
+        *,
+        passive: bool = False,
+        policy: FacePolicy = FacePolicy.SINGLE,
+        limits: ImageLimits = DEFAULT_LIMITS,
+    ) -> PhotoProbe:
+        """Make one probe of the frames of a challenge, and say whether they meet it.
+
+        Parameters and errors as in :func:`verify.photo_probe.probe_of_frames`.
+        """
+        self._require(pack)
+        return probe_of_frames(
+            pack, self._contract, frames, movements, passive=passive, policy=policy, limits=limits
+        )
+
+    def _require(self, pack: ModelPack) -> None:
         info = pack.info
         self._contract.binding.require_embedder(
             embedder_sha256=info.embedder_sha256, preprocessing=info.preprocessing, n=info.n
         )
-        sample = pack.embed_photo(photo, policy=policy, quality=quality, limits=limits)
-        return sample.embedding
+
+    def average(self, embeddings: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Make one probe, (n,), of 1 to 5 unit embeddings of one person, (k, n): their mean.
+
+        Raises
+        ------
+        InvalidEmbedding
+            Where an embedding is not a finite unit vector of n numbers.
+        InconsistentImages
+            As :meth:`embed_photos`.
+        """
+        rows = unit_rows(embeddings, n=self._contract.binding.n, most=MAX_PROBE_PHOTOS)
+        return mean_embedding(rows, consistency=self._contract.probe_consistency)
 
     def decide_embedding(
         self,
         embedding: NDArray[np.floating],
-        stored: bytes | StandIn,
+        stored: OpenedTemplate,
         *,
+        holder_key: HolderKey | None = None,
         level: str | None = None,
         metric: Metric | None = None,
+        photos: int = 1,
     ) -> Decision:
         """Decide for a unit-norm embedding, (n,).
 
         Parameters
         ----------
         stored
-            Wire bytes of the subject's template; a :class:`StandIn` where the subject does not
-            exist. The same work is then done on it, and the answer is a rejection.
+            The subject's template; a :class:`StandIn` where the subject does not exist. The same
+            work is then done on it, and the answer is a rejection.
+        holder_key
+            The 32 bytes that its holder keeps. A template that needs a key accepts nobody without
+            it; one that needs none ignores what is sent.
         level
             Name of a level; the contract's default where None.
         metric
             The contract's first p-to-s calibration decides where None.
+        photos
+            Photos of one person that the embedding is the normalised mean of.
 
         Raises
         ------
@@ -124,19 +213,22 @@ class Verifier:
         Uncalibrated
             Where the contract has no such level or metric.
         ContractMismatch, InvalidTemplate
-            Where the stored bytes are not a template of this contract.
+            Where the stored bytes are not a template that this contract serves.
         """
-        calibration = self._contract.calibration("p2s", metric)
-        rule = _Rule(calibration, calibration.level(level or self._contract.default_level))
+        name = level or self._contract.default_level
+        calibration = self._contract.calibration("p2s", metric, probe_photos=photos, level=name)
+        rule = _Rule(calibration, calibration.level(name))
         probe = unit_rows(embedding, n=self._contract.binding.n, most=1)
-        turned = (probe.astype(np.float64) @ self._rotation.T).astype(np.float32)
-        return self._decide(rule, probe, turned, stored)
+        template, turn = self._opened(stored, holder_key)
+        turned = turn(probe.astype(np.float64)).astype(np.float32)
+        return self._decide(rule, probe, turned, template, stored, has_key=holder_key is not None)
 
     def decide_template(
         self,
         probe: bytes,
-        stored: bytes | StandIn,
+        stored: OpenedTemplate,
         *,
+        holder_key: HolderKey | None = None,
         level: str | None = None,
         metric: Metric | None = None,
     ) -> Decision:
@@ -162,8 +254,10 @@ class Verifier:
         calibration = self._contract.calibration("s2s", metric, subspace.m)
         rule = _Rule(calibration, calibration.level(level or self._contract.default_level))
         self._require_honest_foot(subspace, calibration)
-        turned = SubspaceBatch.of([subspace.rotated(self._rotation)])
-        return self._decide(rule, SubspaceBatch.of([subspace]), turned, stored)
+        lifted = SubspaceBatch.of([subspace])
+        template, turn = self._opened(stored, holder_key)
+        turned = lifted.turned_by(turn)
+        return self._decide(rule, lifted, turned, template, stored, has_key=holder_key is not None)
 
     def _require_honest_foot(self, subspace: AffineSubspace, calibration: Calibration) -> None:
         if calibration.foot_point_norm is None:
@@ -175,41 +269,60 @@ class Verifier:
                 "lift a unit-norm embedding with the contract's decoys"
             )
 
-    def _template(self, stored: bytes | StandIn) -> SubspaceBatch:
+    def _opened(
+        self, stored: OpenedTemplate, holder_key: HolderKey | None
+    ) -> tuple[SubspaceBatch, Turn]:
+        """Decode a template; returns it with what probes are turned by, a stand-in's too."""
         binding = self._contract.binding
-        received = wire.decode(stored.wire if isinstance(stored, StandIn) else stored)
-        binding.require_contract(received.contract_id, what="the stored template")
+        received = wire.decode(stored.wire)
+        version = binding.require_contract(received.contract_id, what="the stored template")
         subspace = received.subspace
         if (subspace.n, subspace.m) != (binding.n, binding.m):
             raise InvalidTemplate("the stored template has dimensions other than the contract's")
         if isinstance(stored, StandIn) and stored.lifted is not None:
             subspace = stored.lifted
-        return SubspaceBatch.of([subspace])
+        by_tenant = self._rotation.of(stored.template_id, version)
+        by_holder = holder_rotation(
+            holder_key or self._nobodys_key, stored.holder_salt or _NO_SALT, binding.n
+        )
+        needs_key = stored.holder_salt is not None
+
+        def turn(points: NDArray[np.float64]) -> NDArray[np.float64]:
+            turned = by_holder.turned(points)
+            return by_tenant.turned(turned if needs_key else points)
+
+        return SubspaceBatch.of([subspace]), turn
 
     def _decide(
-        self, rule: _Rule, probe: Probes, turned: Probes, stored: bytes | StandIn
+        self,
+        rule: _Rule,
+        probe: Probes,
+        turned: Probes,
+        template: SubspaceBatch,
+        stored: OpenedTemplate,
+        *,
+        has_key: bool,
     ) -> Decision:
         calibration, level = rule.calibration, rule.level
         unknown = isinstance(stored, StandIn)
-        # A stand-in is not in the tenant's rotation, so neither is the probe: turning both leaves
-        # their distance as it is. The turned probe was computed in either case.
+        # A stand-in is in no rotation, so neither is the probe: turning both leaves their distance
+        # as it is. The turned probe was computed in either case.
         distances = paired_distances(
             probe if unknown else turned,
-            self._template(stored),
+            template,
             metric=calibration.metric,
             steps=calibration.steps,
         )
         distance = float(distances[0])
-        score = float(np.asarray(similarity(distances), dtype=np.float64)[0])
-        means, spreads = cohort_statistics(
-            probe, self._contract.cohort, metric=calibration.metric, steps=calibration.steps
+        close = float(np.asarray(similarity(distances), dtype=np.float64)[0])
+        means, spreads = expected_similarity(
+            probe, self._contract, metric=calibration.metric, steps=calibration.steps
         )
-        cohort_score = (score - float(means[0])) / float(spreads[0])
-        # Both tests are evaluated, and NaN fails either, so no input is accepted by an exception.
-        similar = score >= level.similarity_threshold
-        singular = cohort_score >= level.cohort_threshold
-        # The cohort test of a member of the cohort is no independent one: never accept by it.
-        accepted = bool(similar and singular and not unknown)
+        score = (close - float(means[0])) / float(spreads[0])
+        # NaN reaches no threshold, so no input is accepted by an exception. A stand-in never is,
+        # and neither is a probe without the key that its template needs, not even by chance.
+        could_match = not unknown and (has_key or stored.holder_salt is None)
+        accepted = bool(score >= level.threshold and could_match)
         return Decision(
             accepted=accepted,
             reason="match" if accepted else "no_match",
@@ -217,7 +330,7 @@ class Verifier:
             fmr=level.fmr.value if level.target_fmr is None else level.target_fmr,
             contract_id=self._contract.contract_id,
             calibration_id=calibration.calibration_id,
-            similarity=score,
+            similarity=close,
             distance=distance,
-            cohort_score=cohort_score,
+            score=score,
         )

@@ -16,25 +16,33 @@ from api.cli.errors import Commands
 
 COMMANDS = {
     "demo": "Enroll, verify and erase people through the real service, in under a minute.",
+    "setup": "Prepare a service from a model pack and folders of photos, and judge it.",
     "serve": "Start the REST service.",
     "enroll": "Enroll a person from photos, or replace their enrollment.",
-    "verify": "Check whether a photo shows a person; exit status 0 if accepted, 1 if rejected.",
+    "verify": "Check whether photos show a person; exit status 0 if accepted, 1 if rejected.",
     "lift": "Make a private template from photos on this machine, without any secret of the "
     "service.",
     "calibrate": "Calibrate on labelled people, and write the contract file.",
     "evaluate": "Evaluate face verification with private templates: the LFW / CFP / AgeDB "
     "protocol.",
+    "evaluate liveness": "Evaluate the pack's liveness graphs on live and attack photos "
+    "(ISO/IEC 30107-3).",
     "audit": "Attack private templates, and hold the results against your limits.",
     "decoys": "Make the decoys that hide an embedding inside its private template.",
     "keys": "Create, replace and revoke API keys; rotate keys; verify erasure receipts.",
-    "models": "Inspect model packs (the weights you supply).",
+    "models": "Fetch and inspect model packs (the weights you supply).",
     "db": "Migrate, check and clean up the database; set up tenants.",
     "audit-log": "Verify and read the audit log, a chain of lines.",
     "bench": "Time this machine, against the work that nothing can avoid.",
 }
 """The first paragraph of each command's help."""
 
-_MODULES = {"enroll": "subjects", "verify": "subjects", "audit-log": "audit_log"}
+_MODULES = {
+    "enroll": "subjects",
+    "verify": "subjects",
+    "audit-log": "audit_log",
+    "evaluate liveness": "evaluate_liveness",
+}
 
 _LOOKS: dict[str, Any] = {"rich_markup_mode": "markdown", "pretty_exceptions_enable": False}
 
@@ -58,7 +66,12 @@ class Veilface(Commands):
         self.commands = {name: TyperCommand(name, help=line) for name, line in COMMANDS.items()}
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Find the chosen command, and import it."""
+        """Find the chosen command, and import it; a command of two words goes before one of one.
+
+        So `evaluate liveness` is no data set of `evaluate`; a folder of that name is `./liveness`.
+        """
+        if (both := " ".join(args[:2])) in COMMANDS:
+            args = [both, *args[2:]]
         name, command, rest = super().resolve_command(ctx, args)
         return name, command and load(name), rest
 
@@ -75,8 +88,8 @@ app = typer.Typer(
     cls=Veilface,
     no_args_is_help=True,
     help="Face authentication that never stores a face embedding.\n\n"
-    "Start with `veilface demo`: it needs nothing. With your own weights: `decoys build`, then "
-    "`calibrate`, then `serve`. `docs/cli.md` shows every command with an example.",
+    "Start with `veilface demo`: it needs nothing. With your own weights: `setup`, then `serve`. "
+    "`docs/cli.md` shows every command with an example.",
     **_LOOKS,
 )
 

@@ -76,6 +76,7 @@ def attacked_service(
         quoted = str(folder).replace("\\", "\\\\").replace('"', '\\"')
         configuration = (
             f'data_dir = "{quoted}"\nmaster_key_file = "{quoted}/master.key"\n{UNLIMITED}'
+            "accept_weak_privacy = true\n"
         )
         replace_public(folder / "veilface.toml", configuration.encode())
         with running_service(folder) as client:

@@ -10,8 +10,8 @@ from api.cli.audit_report import Out, Seed, conclude, model_json, share_once_beg
 from api.cli.console import message
 from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, extract
 from api.cli.errors import CommandError, UsageError, require_extra
-from api.cli.inputs import listed_dims, listed_names, named_file, read_json
-from api.cli.options import AsJson, takes_settings
+from api.cli.inputs import fairface_labels, listed_dims, listed_names, named_file, read_json
+from api.cli.options import PROCESSOR, AsJson, Device, chosen_device, quick, takes_settings
 from api.process.preparation import DEFAULT_DIM, acquired_json
 from api.settings import Settings
 from attacks.attributes.attackers import TRAINED
@@ -27,8 +27,9 @@ from attacks.frontier import frontier, verification_accuracy
 from attacks.outcomes import GENERATED, Scheme
 from attacks.population import LEAST_FITTED
 from attacks.report import document
+from templates.distances import on_device
 from templates.space.lifting import Strategy
-from verify.fairface_labels import CLASSES, Label, read_labels
+from verify.fairface_labels import CLASSES
 
 STRATEGIES = (
     "raw",
@@ -138,7 +139,11 @@ def fairface(
     aligned: Aligned = False,
     flip: Flip = False,
     cache: Cache = None,
+    device: Device = PROCESSOR,
     out: Out = Path("audit-fairface"),
+    _quick: Annotated[
+        bool, quick(lifting=300, attack=700, attacked=300, dim="4,16", generated_dim="16,64")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Infer gender, race and age from templates: the paper's experiment, and stronger attackers.
@@ -149,6 +154,7 @@ def fairface(
     Example: `veilface audit fairface fairface --pack buffalo_l --out audit`
     """
     require_extra("audit")
+    torch_device = chosen_device(device)
     pack = bulk_pack(settings, flip=flip, why="an audit attacks embeddings of a model pack")
     wanted = listed_names(attributes, tuple(CLASSES), "--attributes")
     strategies = listed_names(strategy, STRATEGIES, "--strategy")
@@ -163,7 +169,9 @@ def fairface(
             generated_dim, "--generated-dim", n=pack.info.n, example="16,32"
         ),
     )
-    schemes = [each for each in grid if each.decoys == GENERATED or each.strategy in strategies]
+    schemes = [
+        scheme for scheme in grid if scheme.decoys == GENERATED or scheme.strategy in strategies
+    ]
     trained = [name for name in listed_names(attackers, ATTACKERS, "--attackers") if name != KNN]
     results = None if evaluation is None else _read_results(evaluation)
     audited = Scheme(str(Strategy.ADVERSARIAL), GENERATED, service_dim)
@@ -174,7 +182,7 @@ def fairface(
         )
     if results is not None:
         verification_accuracy(results, schemes)
-    labels = _labels(root, "train"), _labels(root, "val")
+    labels = fairface_labels(root, "train"), fairface_labels(root, "val")
     plan = AttributeAuditPlan(
         schemes=tuple(schemes),
         attributes=wanted,
@@ -190,7 +198,7 @@ def fairface(
         extraction = extract(pack, list(part), aligned=aligned, settings=settings, cache=cache)
         photos.append(extraction)
         faces.append(labelled_faces(extraction, part, wanted))
-    with share_once_begun("attacking templates") as report_share:
+    with share_once_begun("attacking templates") as report_share, on_device(torch_device):
         audit = run_attribute_audit(plan, *faces, progress=report_share)
     if drop_duplicates is not None:
         message(f"note: {audit.duplicates} faces resemble a training face and are not attacked")
@@ -208,6 +216,7 @@ def fairface(
             "audited": str(audited),
             "evaluation": named_file(evaluation),
             "flip": flip,
+            "device": device,
             "seed": seed,
         },
         cost=audit.cost,
@@ -219,15 +228,6 @@ def fairface(
     if results is not None:
         report["frontier"] = frontier(results, report["rows"], most_lost=max_accuracy_loss)
     conclude(report, out, pack, as_json=as_json, evaluation=results)
-
-
-def _labels(root: Path, part: str) -> dict[Path, Label]:
-    file = root / f"fairface_label_{part}.csv"
-    if not file.is_file():
-        raise CommandError(
-            f"{root} has no {file.name}; give the folder of FairFace, with its two label files"
-        )
-    return read_labels(file)
 
 
 def _read_results(file: Path) -> Any:

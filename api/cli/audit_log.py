@@ -59,40 +59,42 @@ def verify(
         checked_store(settings) as store,
         progress("verifying the audit log", _length(store.audit_log)) as advance,
     ):
-        found = store.audit_log.verify(anchor=kept, progress=advance)
+        report = store.audit_log.verify(anchor=kept, progress=advance)
         records = store.check_records()
-    intact = found.intact and not records
+    intact = report.intact and not records
     problems = [
-        {"sequence": each.sequence, "through": each.through, "problem": each.what}
-        for each in found.problems
+        {"sequence": problem.sequence, "through": problem.through, "problem": problem.what}
+        for problem in report.problems
     ]
     if as_json:
         emit(
             {
                 "intact": intact,
-                "lines": found.lines,
-                "head": str(found.head),
+                "lines": report.lines,
+                "head": str(report.head),
                 "problems": problems,
-                "unlisted": found.unlisted,
-                "records": [{"problem": each.what, "about": each.about} for each in records],
+                "unlisted": report.unlisted,
+                "records": [{"problem": record.what, "about": record.about} for record in records],
             }
         )
     elif intact:
         checked = "" if kept is None else f", and holds the head of line {kept.sequence}"
-        say(f"The audit log is intact: {found.lines} lines{checked}.")
+        say(f"The audit log is intact: {report.lines} lines{checked}.")
         say("API keys, tenants and counts of failed attempts are as it tells.")
     if not intact:
-        for each in found.problems[:PROBLEMS_SHOWN]:
-            through = "" if each.through in (None, each.sequence) else f" to {each.through}"
-            message(f"line {each.sequence}{through}: {each.what}")
-        more = len(problems) - PROBLEMS_SHOWN + found.unlisted
+        for problem in report.problems[:PROBLEMS_SHOWN]:
+            through = (
+                "" if problem.through in (None, problem.sequence) else f" to {problem.through}"
+            )
+            message(f"line {problem.sequence}{through}: {problem.what}")
+        more = len(problems) - PROBLEMS_SHOWN + report.unlisted
         if more > 0:
             message(f"… and {more} more")
         for record in records[:PROBLEMS_SHOWN]:
             message(f"{record.about}: {record.what}")
         if len(records) > PROBLEMS_SHOWN:
             message(f"… and {len(records) - PROBLEMS_SHOWN} more")
-        what = "the audit log was" if not found.intact else "records of the database were"
+        what = "the audit log was" if not report.intact else "records of the database were"
         message(f"error: {what} tampered with, or damaged")
         raise typer.Exit(1)
 
@@ -139,11 +141,11 @@ def show(
     written = 0
     with checked_store(settings) as store:
         name = tenant or (settings.default_tenant if subject is not None else None)
-        pseudonym = None if subject is None else store.signer.pseudonym(str(name), subject)
+        pseudonyms = () if subject is None else store.signer.pseudonyms(str(name), subject)
         for line in store.audit_log.lines(after=after):
             if name is not None and line.tenant != name:
                 continue
-            if pseudonym is not None and line.pseudonym != pseudonym:
+            if pseudonyms and line.pseudonym not in pseudonyms:
                 continue
             say(json.dumps(_described(line)))
             written += 1

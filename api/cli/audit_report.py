@@ -142,13 +142,14 @@ def verdict_tables(report: Document) -> list[Table]:
             ", for comparison" if verdict["comparison"] else ""
         )
         listing = table(
-            title, "property", "attacker has", "strongest attack", "reached (95 %)", "by chance",
-            "compared", "limit", "",
+            title, "property", "leaked", "attacker has", "strongest attack", "reached (95 %)",
+            "by chance", "compared", "limit", "",
         )  # fmt: skip
         for cell in verdict["cells"]:
             variant = f" ({cell['variant']})" if cell["variant"] else ""
             listing.add_row(
                 cell["property"],
+                cell["leaked"],
                 cell["knowledge"],
                 f"{cell['attack']}{variant}",
                 f"{cell['value']:.3g} ({cell['ci_low']:.2g}-{cell['ci_high']:.2g})",

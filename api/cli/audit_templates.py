@@ -12,8 +12,8 @@ from api.cli.audit_report import Out, Seed, conclude, model_json, share_once_beg
 from api.cli.console import message
 from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, extract
 from api.cli.errors import UsageError, require_extra
-from api.cli.inputs import listed_dims, load_decoys
-from api.cli.options import AsJson, takes_settings
+from api.cli.inputs import further_faces, listed_dims, load_decoys
+from api.cli.options import PROCESSOR, AsJson, Device, chosen_device, quick, takes_settings
 from api.process.opening import file_sealer, open_keyring
 from api.process.preparation import DEFAULT_DIM, acquired_json
 from api.settings import Settings
@@ -22,6 +22,7 @@ from attacks.learned.extra import need
 from attacks.population import LEAST_FITTED
 from attacks.report import document
 from templates.contract.document import Contract
+from templates.distances import on_device
 from templates.space.lifting import Strategy
 from verify import labelled_folder
 
@@ -39,8 +40,8 @@ def register(app: typer.Typer) -> None:
     "renewed-success",
     "false-acceptance",
     "climbing-success",
-    "success-with-templates",
     "success-with-key",
+    "success-without-key",
 )
 def templates(
     people: Annotated[
@@ -139,11 +140,34 @@ def templates(
             "attacked, and try to reconstruct the victims' faces. No picture is written.",
         ),
     ] = False,
+    attacker_faces: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Further faces that the attacker has: a folder of photos, or a `.npz` with "
+            "`paths` and `descriptors` of the same pack. May be given several times. Photos of "
+            "victims, and people who are named like them, are left out.",
+            show_default=False,
+        ),
+    ] = None,
+    decoy_faces: Annotated[
+        int | None,
+        typer.Option(
+            min=LEAST_FITTED,
+            help="Number of faces that the file of --decoys was fitted to: an attacker with "
+            "unlimited faces is then simulated. --fit-decoys knows it. Unset, as for decoys that "
+            "were adapted with --like: estimated with the decoys as they are, and not judged.",
+            show_default=False,
+        ),
+    ] = None,
     seed: Seed = 0,
     aligned: Aligned = False,
     flip: Flip = False,
     cache: Cache = None,
+    device: Device = PROCESSOR,
     out: Out = Path("audit-templates"),
+    _quick: Annotated[
+        bool, quick(victims=50, owners=100, climbed=2, attempts=200, training_seconds=20)
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Attack private templates: inversion, linkage, renewal, impersonation, climbing.
@@ -154,6 +178,7 @@ def templates(
     Example: `veilface audit templates lfw --pack buffalo_l --decoys decoys.veil --out audit`
     """
     require_extra("audit")
+    torch_device = chosen_device(device)
     if fit_decoys and (decoys is not None or contract is not None):
         raise UsageError("--fit-decoys fits decoys of its own: give no --decoys and no --contract")
     if learned or reconstruction:
@@ -164,6 +189,8 @@ def templates(
     pack = bulk_pack(settings, flip=flip, why="an audit attacks embeddings of a model pack")
     sealer = file_sealer(open_keyring(settings))
     loaded = None if contract is None else Contract.load(contract, sealer)
+    if loaded is not None:
+        loaded.binding.require_rotation_version()
     if loaded is not None and (strategy is not None or dim is not None):
         raise UsageError(
             "a contract says its strategy and dimension: leave out --strategy and --dim"
@@ -180,6 +207,7 @@ def templates(
         climbed=climbed,
         attempts=attempts,
         training_seconds=training_seconds if train else None,
+        decoy_faces=decoy_faces,
         reconstruction=reconstruction,
         seed=seed,
     )
@@ -191,7 +219,11 @@ def templates(
     labelled = labelled_folder(people)
     faces = extract(pack, labelled.paths, aligned=aligned, settings=settings, cache=cache)
     name_of = dict(zip(labelled.paths, labelled.identities, strict=True))
-    with share_once_begun("auditing") as report_share:
+    further = [
+        further_faces(path, pack, aligned=aligned, settings=settings, cache=cache)
+        for path in attacker_faces or ()
+    ]
+    with share_once_begun("auditing") as report_share, on_device(torch_device):
         result = run_audit(
             plan,
             faces,
@@ -200,6 +232,7 @@ def templates(
             decoys=source,
             aligned=aligned,
             start_service=attacked_service if service else None,
+            further=further,
             progress=report_share,
         )
     report = document(
@@ -213,6 +246,7 @@ def templates(
             **result.settings,
             "fit_decoys": fit_decoys,
             "flip": flip,
+            "device": device,
         },
         schemes=result.schemes,
         failure_to_acquire=acquired_json(faces),

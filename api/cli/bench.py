@@ -16,12 +16,11 @@ from api.cli.distance_bench import (
     machine,
     measure,
     memory_needed,
-    require_device,
 )
 from api.cli.errors import CommandError, UsageError
 from api.cli.inputs import listed
 from api.cli.options import AsJson
-from templates.distances import DEFAULT_STEPS, Metric
+from templates.distances import DEFAULT_STEPS, Metric, require_device
 from templates.errors import TemplateError
 
 C = TypeVar("C", bound=StrEnum)

@@ -6,15 +6,17 @@ from typing import Annotated, Any
 
 import typer
 
+from api.cli.calibrate_liveness import set_liveness_threshold, with_liveness_of
 from api.cli.console import demo_notice, emit, message, say, share_done, show, table
 from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, extract
 from api.cli.errors import CommandError, UsageError
 from api.cli.files import read_bounded, read_names
-from api.cli.inputs import load_decoys
+from api.cli.groups import estimated_labels, group_tables, labels_of
+from api.cli.inputs import fairface_labels, load_decoys
 from api.cli.options import AsJson, takes_settings
+from api.cli.verdict import improvements, shown_rate, verdict_lines
 from api.process.opening import file_sealer, open_keyring
 from api.process.preparation import (
-    DEFAULT_DIM,
     DEFAULT_PROBE_DIM,
     acquired,
     acquired_json,
@@ -22,21 +24,15 @@ from api.process.preparation import (
     default_probe_dims,
 )
 from api.settings import Settings
-from attacks.likelihood import share_found
-from templates.contract.document import Calibration, Contract, Rate
+from templates.contract.binding import MAX_M
+from templates.contract.document import Calibration, Contract
+from templates.contract.liveness_policy import LivenessPolicy
 from templates.distances import Metric
 from templates.space.lifting import Strategy
 from verify import CalibrationOptions, CalibrationReport, labelled_folder
+from verify.evaluation.labels_file import read_labels
 
 MOST_SHOWN = 20
-LEAST_DECOYS = 24
-"""Fewer decoys in a template are noted: its foot point, taken for a descriptor, matches a fresh
-photo of the person too often. At raw FMR 1e-3 on LFW: 20 % at 16 decoys, 8 % at 24, 4 % at 32.
-Even where decoys are spread just as the people are, other attacks need more (docs/privacy.md)."""
-
-
-MOST_FOUND = 0.1
-"""Share of descriptors found by the decoys' statistics from which on it is noted."""
 
 
 class Protocol(StrEnum):
@@ -54,13 +50,13 @@ def register(app: typer.Typer) -> None:
 @takes_settings(*BULK)
 def calibrate(
     folder: Annotated[
-        Path,
+        Path | None,
         typer.Argument(
             help="Labelled faces: one subfolder for each person, with photos in it (as LFW has "
-            "them).",
+            "them). Not with --liveness.",
             show_default=False,
         ),
-    ],
+    ] = None,
     *,
     settings: Settings,
     decoys: Annotated[
@@ -80,8 +76,14 @@ def calibrate(
         Strategy, typer.Option(help="How templates are lifted.")
     ] = Strategy.ADVERSARIAL,
     dim: Annotated[
-        int, typer.Option(min=1, max=128, help="Dimension m of stored templates.")
-    ] = DEFAULT_DIM,
+        int | None,
+        typer.Option(
+            min=1,
+            max=MAX_M,
+            help="Dimension m of stored templates. Unset: the smallest at which privacy passes.",
+            show_default=False,
+        ),
+    ] = None,
     probe_dims: Annotated[
         str | None,
         typer.Option(
@@ -115,9 +117,55 @@ def calibrate(
             show_default=False,
         ),
     ] = None,
+    labels: Annotated[
+        Path | None,
+        typer.Option(
+            help="A CSV `path,gender,race,age,...` of photos or people, as for `evaluate`: gives "
+            "error rates by group.",
+            show_default=False,
+        ),
+    ] = None,
+    fairface: Annotated[
+        Path | None,
+        typer.Option(
+            help="Instead of --labels, the folder of FairFace: gender, race and age are estimated "
+            "from its nearest training faces.",
+            show_default=False,
+        ),
+    ] = None,
+    worst_group: Annotated[
+        bool,
+        typer.Option(
+            "--worst-group",
+            help="Set every level of a target so that the FMR exceeds it in no group either, of "
+            "those with trials enough to set a threshold by.",
+        ),
+    ] = False,
     photos: Annotated[
         int, typer.Option(min=1, max=10, help="Most photos averaged into one template.")
     ] = 3,
+    liveness: Annotated[
+        Path | None,
+        typer.Option(
+            help="Instead of people, live and perhaps attack photos, as for `evaluate liveness`: "
+            "sets the liveness threshold of the contract file, and changes nothing else in it.",
+            show_default=False,
+        ),
+    ] = None,
+    bpcer: Annotated[
+        float,
+        typer.Option(
+            help="With --liveness: the share of live photos that may be taken for attacks."
+        ),
+    ] = 0.05,
+    liveness_policy: Annotated[
+        LivenessPolicy | None,
+        typer.Option(
+            help="With --liveness: what every verification by this contract must pass, beside what "
+            "settings and API keys ask for. Unset: what the contract file says.",
+            show_default=False,
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed for the random choices.")] = 0,
     as_json: AsJson = False,
 ) -> None:
@@ -128,19 +176,40 @@ def calibrate(
     cannot resolve are refused. The contract file belongs to the master key that is in force.
 
     Example: `veilface calibrate lfw --pack buffalo_l --decoys decoys.veil --out contract.json
-    --strategy adversarial --dim 32`
+    --strategy adversarial`
     """
+    path = out or settings.resolved_contract_file
+    if liveness is not None and folder is None:
+        set_liveness_threshold(
+            liveness, path, settings, bpcer=bpcer, policy=liveness_policy, as_json=as_json
+        )
+        return
+    if folder is None or liveness is not None:
+        raise UsageError("give the folder of labelled people, or --liveness and its photos")
+    if liveness_policy is not None:
+        raise UsageError("--liveness-policy goes with --liveness and its photos")
     dims = default_probe_dims(dim) if probe_dims is None else parse_dims(probe_dims)
     pack = bulk_pack(settings, flip=flip, why="a contract is bound to a model pack")
-    if dim >= pack.info.n:
+    if dim is not None and dim >= pack.info.n:
         raise UsageError(f"--dim must be below the {pack.info.n} numbers of an embedding")
+    if labels is not None and fairface is not None:
+        raise UsageError("give --labels or --fairface, not both: labels are better than estimates")
+    if worst_group and labels is None and fairface is None:
+        raise UsageError("--worst-group needs to know the groups: give --labels or --fairface")
+    known = None if labels is None else read_labels(labels)
+    faces = None if fairface is None else fairface_labels(fairface, "train")
     labelled = labelled_folder(folder)
-    name_of = dict(zip(labelled.paths, labelled.identities, strict=True))
     keyring = open_keyring(settings)
     sealer = file_sealer(keyring)
     source = load_decoys(decoys or settings.resolved_decoys_file, sealer, pack)
     exclude = frozenset() if exclude_people is None else read_names(exclude_people)
+    known_as = {} if aliases is None else read_aliases(aliases)
     extraction = extract(pack, labelled.paths, aligned=aligned, settings=settings, cache=cache)
+    groups = None if known is None else labels_of(extraction, known, labelled.root)
+    if faces is not None:
+        # FairFace's own photos are no aligned crops, whatever those of the people are.
+        like = extract(pack, list(faces), aligned=False, settings=settings, cache=cache)
+        groups = estimated_labels(extraction, like, faces)
     with share_done("calibrating") as report:
         done = calibrate_folder(
             labelled,
@@ -154,70 +223,39 @@ def calibrate(
                 metric=metric,
                 probe_dims=(0, *dims),
                 photos_per_enrollment=photos,
+                worst_group=worst_group,
                 seed=seed,
             ),
             exclude=exclude,
-            aliases={} if aliases is None else read_aliases(aliases),
+            aliases=known_as,
+            labels=groups,
             progress=lambda _what, share: report(share),
         )
-    path = out or settings.resolved_contract_file
-    done.contract.save(path, sealer)
-    share_rate = None
-    if strategy.needs_decoys:
-        share_rate = share_found(
-            extraction.descriptors,
-            [name_of[path] for path in extraction.paths],
-            source,
-            strategy=strategy,
-            m=dim,
-            cosine=done.report.consistency.match_cosine,
-            seed=seed,
-        )
-    for note in (concealment_note(strategy, dim), likeness_note(share_rate, strategy, dim)):
-        if note:
-            message(f"note: {note}")
+    contract = with_liveness_of(path, done.contract, pack, sealer)
+    contract.save(path, sealer)
     notice = demo_notice(pack.info.embedder_sha256, n=pack.info.n)
     if as_json:
         emit(
             {
                 "out": str(path),
                 **notice,
-                "contract": done.contract.public(),
+                "contract": contract.public(),
                 "failure_to_acquire": acquired_json(extraction),
-                "found_by_decoy_likelihood": None if share_rate is None else share_rate.to_json(),
+                "privacy_by_dimension": {
+                    str(m): judgement.to_json() for m, judgement in done.point.tried.items()
+                },
                 **_report_json(done.report),
             }
         )
         return
     for calibration in done.contract.calibrations:
         show(levels_table(calibration))
+    show(*group_tables(done.contract))
     _tell(done.contract, done.report)
     say(f"{acquired(extraction)}.")
     say(f"{path}: contract {done.contract.contract_id[:16]}.")
-
-
-def concealment_note(strategy: Strategy, m: int) -> str | None:
-    """Say what templates show whose directions have too few decoys among them, or None."""
-    if strategy.decoys(m) >= LEAST_DECOYS:
-        return None
-    return (
-        f"templates of strategy {strategy} and dimension {m} conceal little: the point of each "
-        "template nearest to the origin shows the face; use --strategy adversarial and "
-        f"--dim {DEFAULT_DIM} or more"
-    )
-
-
-def likeness_note(rate: Rate | None, strategy: Strategy, m: int) -> str | None:
-    """Say that the decoys are spread unlike the people, where their statistics give faces away."""
-    if rate is None or rate.value <= MOST_FOUND:
-        return None
-    return (
-        f"from {100 * rate.value:.0f} % of the templates of these people ({rate.errors} of "
-        f"{rate.trials}, {strategy}, m = {m}), who has the decoy generator finds the embedding: "
-        "the decoys are spread unlike these people. Build the decoys from thousands of other "
-        "people's photos of the same kind, then calibrate again: this line says what a change "
-        "gains (docs/privacy.md)"
-    )
+    for line in (*improvements(done.contract, done.point), *verdict_lines(done.contract.verdict)):
+        say(line)
 
 
 def parse_dims(text: str) -> tuple[int, ...]:
@@ -257,31 +295,35 @@ def read_aliases(file: Path) -> dict[str, str]:
 
 def levels_table(calibration: Calibration) -> Any:
     """Show what one calibration found."""
-    kind = "raw probes" if calibration.mode == "p2s" else f"lifted probes m={calibration.probe_m}"
-    columns = ("level", "similarity", "cohort score", "FMR seen (95 %)", "FNMR seen (95 %)")
+    photos = calibration.probe_photos
+    kind = (
+        f"lifted probes m={calibration.probe_m}"
+        if calibration.mode == "s2s"
+        else "raw probes of one photo"
+        if photos == 1
+        else f"raw probes, means of {photos} photos"
+    )
+    columns = ("level", "score", "FMR seen (95 %)", "FNMR seen (95 %)", "FNMR by photos enrolled")
     listing = table(f"{kind}, {calibration.metric} distance", *columns)
     for level in calibration.levels:
         listing.add_row(
             level.name,
-            f"{level.similarity_threshold:.4f}",
-            f"{level.cohort_threshold:.3f}",
+            f"{level.threshold:.3f}",
             shown_rate(level.fmr),
             shown_rate(level.fnmr),
+            ", ".join(
+                f"{number}: {100 * rate.value:.3g} %"
+                for number, rate in sorted(level.fnmr_by_photos.items())
+            ),
         )
     return listing
-
-
-def shown_rate(rate: Rate) -> str:
-    """Write a rate with its counts and interval."""
-    return (
-        f"{100 * rate.value:.3g} % ({rate.errors}/{rate.trials}; "
-        f"{100 * rate.ci_low:.2g}-{100 * rate.ci_high:.2g} %)"
-    )
 
 
 def _tell(contract: Contract, report: CalibrationReport) -> None:
     for sentence in report.unresolved:
         say(f"Not set: {sentence}.")
+    for sentence in report.left_out:
+        say(f"Not in the rule of the worst group: {sentence}.")
     if report.suspicious:
         say(
             f"{len(report.suspicious)} pairs of people are suspiciously alike (cosine above "
@@ -295,7 +337,8 @@ def _tell(contract: Contract, report: CalibrationReport) -> None:
     say(
         f"Default level: {contract.default_level}. Photos of one enrollment must agree to "
         f"{contract.photo_consistency:.3f}: {shown_rate(consistency.refused)} of the genuine sets "
-        f"do not; {shown_rate(consistency.fmr)} of the pairs of two people do."
+        f"do not; {shown_rate(consistency.fmr)} of the pairs of two people do. Photos of one probe "
+        f"must agree to {contract.probe_consistency:.3f}."
     )
 
 
@@ -303,10 +346,12 @@ def _report_json(report: CalibrationReport) -> dict[str, Any]:
     return {
         "photo_consistency": {
             "threshold": report.consistency.threshold,
+            "probe_threshold": report.consistency.probe_threshold,
             "fmr": report.consistency.fmr.to_json(),
             "refused": report.consistency.refused.to_json(),
         },
         "unresolved": list(report.unresolved),
+        "left_out_of_worst_group": list(report.left_out),
         "suspicious_above": report.suspicious_above,
         "suspicious": [
             {"first": pair.first, "second": pair.second, "cosine": pair.cosine}

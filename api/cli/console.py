@@ -51,8 +51,8 @@ def show(*tables: "Table") -> None:
 
     width = None if sys.stdout.isatty() else _WIDTH_OF_A_FILE
     console = Console(file=sys.stdout, width=width)
-    for each in tables:
-        console.print(each)
+    for listing in tables:
+        console.print(listing)
 
 
 def demo_notice(embedder_sha256: str, *, n: int) -> dict[str, str]:
@@ -87,6 +87,18 @@ def share_done(description: str) -> Iterator[Callable[[float], None]]:
     with _bar("TaskProgressColumn") as bar:
         task = bar.add_task(description, total=1.0)
         yield lambda share: bar.update(task, completed=share)
+
+
+@contextmanager
+def download(description: str) -> Iterator[Callable[[int | None], Advance]]:
+    """Show bytes on stderr while the block runs; call the result with their number, if known."""
+    with _bar("DownloadColumn") as bar:
+
+        def begin(total: int | None) -> Advance:
+            task = bar.add_task(description, total=total)
+            return lambda done: bar.advance(task, done)
+
+        yield begin
 
 
 def _bar(amount: str) -> "Progress":

@@ -95,12 +95,12 @@ def current(*, settings: Settings, as_json: AsJson = False) -> None:
 
     Example: `veilface db current --json`
     """
-    found = _revision(settings)
+    revision = _revision(settings)
     needed = head_revision()
     if as_json:
-        emit({"current": found, "needed": needed})
+        emit({"current": revision, "needed": needed})
     else:
-        say(f"The database is at {found or 'no schema yet'}; this version needs {needed}.")
+        say(f"The database is at {revision or 'no schema yet'}; this version needs {needed}.")
 
 
 @app.command()
@@ -256,7 +256,7 @@ def erase_tenant(
         emit(answer)
         return
     replace_private(out, json.dumps(answer, indent=2).encode())
-    counts = {each["item"]: each["count"] for each in receipt.claims["erased"]}
+    counts = {item["item"]: item["count"] for item in receipt.claims["erased"]}
     say(f"Erased tenant {tenant}: {counts.get('subjects', 0)} subjects. Receipt: {out}")
 
 

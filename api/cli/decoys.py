@@ -1,6 +1,8 @@
 """``veilface decoys``: the lifting database."""
 
+from collections.abc import Collection, Sequence
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -9,17 +11,22 @@ import typer
 
 from api.cli.console import demo_notice, emit, message, say
 from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, extract
-from api.cli.errors import CommandError, require_extra
+from api.cli.errors import CommandError, UsageError
 from api.cli.files import find_photos, is_left_out, read_names
 from api.cli.options import AsJson, takes_settings
 from api.process.opening import file_sealer, open_keyring
-from api.process.preparation import acquired, acquired_json, make_generator, make_pool
+from api.process.preparation import (
+    LikeSample,
+    acquired,
+    acquired_json,
+    make_generator,
+    make_pool,
+)
+from api.process.roles import FACES_PER_DIMENSION
 from api.settings import Settings
+from models.extraction import Extraction
 from templates.decoys import Attributes, DecoyGenerator
 from verify.fairface_labels import label_files, read_labels
-
-FACES_PER_DIMENSION = 4
-"""Below that many fitted faces, membership of the fit shows in the statistics (docs/decoys.md)."""
 
 app = typer.Typer(no_args_is_help=True)
 
@@ -40,13 +47,23 @@ def decoys() -> None:
 @takes_settings(*BULK)
 def build(
     photos: Annotated[
-        Path,
+        list[Path],
         typer.Argument(
-            metavar="SOURCE", help="Folder of face photos, at any depth.", show_default=False
+            metavar="SOURCE...",
+            help="Folders of face photos, at any depth.",
+            show_default=False,
         ),
     ],
     *,
     settings: Settings,
+    like: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Folder of some photos, 300 or more, of the kind that will be enrolled, of other "
+            "people than those: the decoys are spread as those are. May be given several times.",
+            show_default=False,
+        ),
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option(help="The file. Unset: `decoys.veil` in `data_dir`.", show_default=False),
@@ -75,7 +92,9 @@ def build(
     ] = None,
     limit: Annotated[
         int | None,
-        typer.Option(min=1, help="Take this many photos, chosen at random.", show_default=False),
+        typer.Option(
+            min=1, help="Take this many photos of SOURCE, chosen at random.", show_default=False
+        ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of that choice.")] = 0,
     aligned: Aligned = False,
@@ -83,31 +102,33 @@ def build(
     cache: Cache = None,
     as_json: AsJson = False,
 ) -> None:
-    """Make the lifting database from a folder of face photos.
+    """Make the lifting database from folders of face photos.
 
     Needs: a model pack, and photos of at least 100 people (better 2,000 or more) who will never be
     enrolled. FairFace labels are read if present; only a pool keeps them.
 
-    Example: `veilface decoys build fairface/train --pack buffalo_l --out decoys.veil`
+    Example: `veilface decoys build fairface/train utkface --like volunteers --pack buffalo_l --out
+    decoys.veil`
     """
-    if kind is Kind.GENERATOR:
-        require_extra("decoys")
+    if kind is Kind.POOL and like:
+        raise UsageError("--like adapts a generator; a pool is the photos as they are")
     pack = bulk_pack(settings, flip=flip, why="decoys are made with a model pack")
-    chosen = find_photos(photos)
-    found = len(chosen)
-    if exclude is not None:
-        names = read_names(exclude)
-        chosen = [photo for photo in chosen if not is_left_out(photo, photos, names)]
-    left_out = found - len(chosen)
-    if not chosen:
-        raise CommandError(f"{exclude} leaves no photo of {photos}")
+    names = frozenset() if exclude is None else read_names(exclude)
+    chosen, left_out = photos_of(photos, names)
+    sample, sample_left_out = photos_of(like or [], names)
+    left_out += sample_left_out
+    if not chosen or (like and not sample):
+        folders = ", ".join(map(str, photos if not chosen else like or []))
+        raise CommandError(f"{exclude} leaves no photo of {folders}")
     if limit is not None and limit < len(chosen):
         picked = np.random.default_rng(seed).choice(len(chosen), limit, replace=False)
         chosen = [chosen[index] for index in sorted(picked.tolist())]
     attributes = _labels(photos, labels)
-    extraction = extract(pack, chosen, aligned=aligned, settings=settings, cache=cache)
+    embed = partial(extract, pack, aligned=aligned, settings=settings, cache=cache)
+    extraction = embed(chosen)
+    kind_of = like_sample(embed(sample), like) if like else None
     source = (
-        make_generator(extraction, pack)
+        make_generator(extraction, pack, like=kind_of)
         if kind is Kind.GENERATOR
         else make_pool(extraction, attributes, pack)
     )
@@ -132,6 +153,7 @@ def build(
                 "made_with": source.made_with,
                 "n": source.n,
                 "descriptors": len(extraction.descriptors),
+                "like": len(kind_of.people) if kind_of else 0,
                 "labelled": labelled,
                 "left_out": left_out,
                 "failure_to_acquire": acquired_json(extraction),
@@ -140,8 +162,15 @@ def build(
         )
         return
     made = f"{kind} from {len(extraction.descriptors)} embeddings"
+    if kind_of is not None:
+        made += f", adapted to {len(kind_of.people)} of --like"
     say(f"{path}: {made}{', labelled' if labelled else ''}, id {source.source_id[:16]}.")
     say(f"{acquired(extraction)}{f'; {left_out:,} left out by --exclude' if left_out else ''}.")
+    if kind_of is not None:
+        message(
+            "note: never enroll the people of --like, and leave them out of the calibration: "
+            "`veilface calibrate --exclude-people`"
+        )
     if kind is Kind.POOL:
         message(
             "note: people in a pool are accepted by every template that uses them as a decoy; "
@@ -149,8 +178,22 @@ def build(
         )
 
 
-def _labels(photos: Path, named: Path | None) -> dict[Path, Attributes] | None:
-    files = [named] if named is not None else label_files(photos)
+def photos_of(folders: Sequence[Path], names: frozenset[str]) -> tuple[list[Path], int]:
+    """Photos of folders without those of the names, each once; and how many were left out."""
+    folder_of = {photo: folder for folder in folders for photo in find_photos(folder)}
+    kept = [photo for photo, folder in folder_of.items() if not is_left_out(photo, folder, names)]
+    return kept, len(folder_of) - len(kept)
+
+
+def like_sample(extraction: Extraction, folders: Collection[Path]) -> LikeSample:
+    """Tell people by their subfolders; a photo that is in none is a person of its own."""
+    alone = {photo for folder in folders for photo in folder.iterdir()}
+    people = [str(path if path in alone else path.parent) for path in extraction.paths]
+    return LikeSample(extraction, people)
+
+
+def _labels(folders: Sequence[Path], named: Path | None) -> dict[Path, Attributes] | None:
+    files = [named] if named is not None else [f for one in folders for f in label_files(one)]
     if not files:
         return None
     merged: dict[Path, Attributes] = {}

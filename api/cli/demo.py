@@ -10,8 +10,8 @@ from typing import Annotated, Any
 import typer
 
 from api.cli.console import emit, message, say, show, table
-from api.cli.errors import require_extra
 from api.cli.options import AsJson
+from api.cli.verdict import verdict_lines
 from api.demo.run import Outcome, run_demo
 from models.demo import DEMO_NOTICE
 
@@ -55,8 +55,6 @@ def demo(
     Example: `veilface demo`, or with real weights and faces
     `veilface demo --pack buffalo_l --faces lfw`
     """
-    if faces is not None:
-        require_extra("decoys")
     outcome = run_demo(
         folder, pack=pack, faces=faces, m=dim, say=lambda text: message(f"... {text}")
     )
@@ -130,6 +128,8 @@ def _print(outcome: Outcome) -> None:
             f"Erased {outcome.erased}: {outcome.rows_after_erasure} rows left, and a valid signed "
             f"receipt for the pseudonym {outcome.receipt['subject'][:16]}…"
         )
+    for line in verdict_lines(outcome.verdict):
+        say(line)
     folder = outcome.folder
     say(
         f"\nDone in {outcome.seconds:.0f} s. Start the service on the same data:\n\n"
@@ -155,6 +155,7 @@ def _program() -> str:
 def _json(outcome: Outcome) -> dict[str, Any]:
     value = dataclasses.asdict(outcome)
     value["folder"] = str(outcome.folder)
+    value["verdict"] = None if outcome.verdict is None else outcome.verdict.to_json()
     if outcome.demo_model:
         value["notice"] = DEMO_NOTICE
     return value

@@ -23,8 +23,13 @@ from threadpoolctl import ThreadpoolController, threadpool_limits
 
 from api.settings import processors
 from templates.contract.canonical import Json
-from templates.distances import DEFAULT_STEPS, Metric, pairwise_distances, warm_up
-from templates.errors import TemplateError
+from templates.distances import (
+    DEFAULT_STEPS,
+    Metric,
+    pairwise_distances,
+    require_device,
+    warm_up,
+)
 from templates.keys.randomness import Keystream
 from templates.space.subspace import SubspaceBatch
 from verify.evaluation.units import Mode
@@ -189,32 +194,16 @@ def memory_needed(question: Question) -> int:
     lifted = Mode.SUBSPACE in question.modes
     numbers = count * (m + 1)
     # Templates and their stacked rows in float32; while one side is made, several float64 copies.
-    held = (2 if lifted else 1) * 2 * 4 * numbers * n + 4 * 8 * numbers * n
-    return held + _band_bytes(numbers if lifted else count, numbers) + 2 * 4 * count * count
-
-
-def require_device(device: str) -> None:
-    """Refuse a device that torch cannot use.
-
-    Raises
-    ------
-    TemplateError
-        There is no torch, or no such device.
-    """
-    try:
-        from templates.distances.torch import usable
-
-        usable(device)
-    except ImportError:
-        raise TemplateError("a device needs the extra 'torch' of veilface") from None
+    inputs = (2 if lifted else 1) * 2 * 4 * numbers * n + 4 * 8 * numbers * n
+    return inputs + _band_bytes(numbers if lifted else count, numbers) + 2 * 4 * count * count
 
 
 def machine(question: Question) -> dict[str, Json]:
     """Facts that a time means nothing without."""
     libraries = ThreadpoolController().select(user_api="blas").lib_controllers
     # Other packages bring a matrix library of their own; the products are NumPy's.
-    own = [each for each in libraries if "numpy" in each.filepath] or libraries
-    names = [f"{each.internal_api} {each.version} ({_kind(each)})" for each in own]
+    own = [library for library in libraries if "numpy" in library.filepath] or libraries
+    names = [f"{library.internal_api} {library.version} ({_kind(library)})" for library in own]
     facts: dict[str, Json] = {
         "processors": processors(),
         "architecture": platform.machine(),
@@ -225,7 +214,7 @@ def machine(question: Question) -> dict[str, Json]:
         "device": question.device,
     }
     if question.device is None:
-        available = max((each.num_threads for each in libraries), default=1)
+        available = max((library.num_threads for library in libraries), default=1)
         return {**facts, "threads": question.threads or available}
     torch = import_module("torch")
     kind = torch.device(question.device).type
@@ -284,13 +273,13 @@ def _on_processor(
     probes: Array32 | SubspaceBatch, templates: SubspaceBatch, question: Question
 ) -> _Tasks:
     left, right = _stacked(probes), _stacked(templates)
-    mine = probes.feet if isinstance(probes, SubspaceBatch) else probes
+    feet = probes.feet if isinstance(probes, SubspaceBatch) else probes
     bands = list(_bands(len(left), len(right)))
-    table = np.empty((len(mine), len(templates)), dtype=np.float32)
+    table = np.empty((len(feet), len(templates)), dtype=np.float32)
     out = np.empty((len(left[bands[0]]), len(right)), dtype=np.float32)
 
     def points() -> None:
-        np.matmul(mine, templates.feet.T, out=table)
+        np.matmul(feet, templates.feet.T, out=table)
 
     def whole() -> None:
         for band in bands:
@@ -328,21 +317,21 @@ def _on_device(
         return run
 
     def prepared() -> _Tasks:
-        theirs = SubspaceTensors.of(templates, device)
-        mine: Any = (
+        template_tensors = SubspaceTensors.of(templates, device)
+        probe_tensors: Any = (
             SubspaceTensors.of(probes, device)
             if isinstance(probes, SubspaceBatch)
             else torch.tensor(probes, device=device)
         )
-        feet = mine.feet if isinstance(mine, SubspaceTensors) else mine
-        left, right = stacked(mine), stacked(theirs)
+        feet = probe_tensors.feet if isinstance(probe_tensors, SubspaceTensors) else probe_tensors
+        left, right = stacked(probe_tensors), stacked(template_tensors)
         bands = list(_bands(len(left), len(right)))
-        table = torch.empty(len(feet), len(theirs), device=device)
+        table = torch.empty(len(feet), len(template_tensors), device=device)
         out = torch.empty(len(left[bands[0]]), len(right), device=device)
 
         def points() -> None:
             with ieee_products(device):
-                torch.matmul(feet, theirs.feet.T, out=table)
+                torch.matmul(feet, template_tensors.feet.T, out=table)
 
         def whole() -> None:
             with ieee_products(device):
@@ -351,7 +340,11 @@ def _on_device(
                     torch.matmul(part, right.T, out=out[: len(part)])
 
         distances = {
-            metric: finished(partial(pairwise, mine, theirs, metric=metric, steps=DEFAULT_STEPS))
+            metric: finished(
+                partial(
+                    pairwise, probe_tensors, template_tensors, metric=metric, steps=DEFAULT_STEPS
+                )
+            )
             for metric in question.metrics
         }
         return _Tasks(finished(points), finished(whole), distances)

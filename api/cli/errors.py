@@ -20,8 +20,7 @@ USAGE = 2
 NO_DECISION = 3
 _FAILED_STATUS = {"verify": NO_DECISION}  # where 1 is an answer
 EXTRAS = {
-    "decoys": ("sklearn",),
-    "evaluate": ("joblib", "matplotlib", "sklearn"),
+    "evaluate": ("joblib", "matplotlib"),
     "audit": ("matplotlib", "sklearn"),
     "cluster": ("distributed",),
     "redis": ("redis",),

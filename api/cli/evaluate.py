@@ -17,7 +17,7 @@ from api.cli.evaluation_inputs import (
 )
 from api.cli.evaluation_report import read_audit, summary, write_results
 from api.cli.inputs import listed, named_file
-from api.cli.options import AsJson, takes_settings
+from api.cli.options import PROCESSOR, AsJson, Device, chosen_device, quick, takes_settings
 from api.settings import Settings
 from templates.distances import Metric
 from templates.keys.private_file import make_folder
@@ -135,6 +135,7 @@ def evaluate(
         int | None,
         typer.Option(min=1, help="Local processes. Unset: one a processor, 8 at most."),
     ] = None,
+    device: Device = PROCESSOR,
     audit: Annotated[
         Path | None,
         typer.Option(
@@ -143,6 +144,7 @@ def evaluate(
             show_default=False,
         ),
     ] = None,
+    _quick: Annotated[bool, quick(dim="4,16", metric="spherical", repeats=1)] = False,
     as_json: AsJson = False,
 ) -> None:
     """Evaluate face verification with private templates: the LFW / CFP / AgeDB protocol.
@@ -157,6 +159,7 @@ def evaluate(
         where = Backend.parse(backend, jobs=jobs or default_jobs())
     except BackendError as error:
         raise UsageError(str(error)) from None
+    torch_device = chosen_device(device, here=where.scheduler is None)
     sets = open_all(datasets, pictures=embeddings is None)
     report = None if audit is None else read_audit(audit)
     names = None
@@ -175,6 +178,7 @@ def evaluate(
             shared_decoys=shared_decoys,
             repeats=repeats,
             seed=seed,
+            device=torch_device,
             targets=tuple(sorted(_rates(fmr), reverse=True)),
         )
         units_of(plan, decoy_sources, n=embedder.model.n)

@@ -26,14 +26,14 @@ def find_photos(folder: Path) -> list[Path]:
     """
     if not folder.is_dir():
         raise CommandError(f"{folder} is not a folder")
-    found = sorted(
+    photos = sorted(
         path
         for path in folder.rglob("*")
         if path.suffix.lower() in PHOTO_SUFFIXES and path.is_file()
     )
-    if not found:
+    if not photos:
         raise CommandError(f"{folder} has no .jpg, .jpeg, .png or .webp file, at any depth")
-    return found
+    return photos
 
 
 def read_names(source: Path) -> frozenset[str]:

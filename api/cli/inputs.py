@@ -3,16 +3,21 @@
 import hashlib
 import json
 from collections.abc import Callable, Sequence
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, TypeVar
 
+from api.cli.descriptors import extract
 from api.cli.errors import CommandError, UsageError
-from api.cli.files import read_bounded
+from api.cli.files import find_photos, read_bounded
 from api.process.preparation import require_made_with
+from api.settings import Settings
+from attacks.further_faces import FurtherFaces
 from models.pack import ModelPack
 from templates.contract.canonical import Json
 from templates.decoys import DecoySource, load_source
 from templates.keys.sealing import Sealer
+from verify.evaluation.embeddings_file import read_embeddings
+from verify.fairface_labels import Label, read_labels
 
 T = TypeVar("T")
 _MAX_JSON_BYTES = 64 * 2**20
@@ -50,6 +55,24 @@ def listed_names(text: str, names: Sequence[str], option: str) -> tuple[str, ...
         return name
 
     return listed(text, known, option, expected=f"of {', '.join(names)}")
+
+
+def fairface_labels(root: Path, part: str) -> dict[Path, Label]:
+    """Read the labels of a part of FairFace, ``train`` or ``val``, by the path of the photo.
+
+    Raises
+    ------
+    CommandError
+        The folder has no such label file.
+    DatasetError
+        The file has faults.
+    """
+    file = root / f"fairface_label_{part}.csv"
+    if not file.is_file():
+        raise CommandError(
+            f"{root} has no {file.name}; give the folder of FairFace, with its two label files"
+        )
+    return read_labels(file)
 
 
 def listed_dims(text: str, option: str, *, n: int, example: str) -> tuple[int, ...]:
@@ -97,3 +120,30 @@ def load_decoys(file: Path, sealer: Sealer, pack: ModelPack) -> DecoySource:
         )
     require_made_with(source, pack)
     return source
+
+
+def further_faces(
+    source: Path, pack: ModelPack, *, aligned: bool, settings: Settings, cache: Path | None
+) -> FurtherFaces:
+    """Read an attacker's faces: a folder of photos, or a ``.npz`` as ``read_embeddings`` takes it.
+
+    People are named by the folder that a photo lies in, where it is not the source itself.
+
+    Raises
+    ------
+    CommandError
+        No photo gave an embedding.
+    DatasetError
+        The archive is broken.
+    """
+    if source.is_dir():
+        faces = extract(pack, find_photos(source), aligned=aligned, settings=settings, cache=cache)
+        names = tuple(
+            path.parent.name if path.parent.resolve() != source.resolve() else ""
+            for path in faces.paths
+        )
+        return FurtherFaces(source.resolve().name, faces.descriptors, names)
+    rows = read_embeddings(source)
+    return FurtherFaces(
+        source.name, rows.descriptors, tuple(PurePath(path).parent.name for path in rows.paths)
+    )

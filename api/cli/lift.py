@@ -12,8 +12,7 @@ from api.cli.console import demo_notice, emit, say
 from api.cli.errors import CommandError, UsageError
 from api.cli.files import read_bounded
 from api.cli.options import AsJson
-from enroll.enroller import MAX_PHOTOS, mean_descriptor
-from enroll.errors import InconsistentImages
+from enroll.enroller import MAX_PHOTOS
 from models.errors import ModelError
 from models.pack import FacePolicy, ModelPack
 from templates.contract import wire
@@ -22,9 +21,11 @@ from templates.contract.canonical import parse_object
 from templates.decoys import DecoyGenerator
 from templates.errors import ContractError
 from templates.keys.api_token import is_token
+from templates.keys.holder_key import encode_holder_key, read_holder_key
 from templates.keys.private_file import replace_private
 from templates.keys.probe_signature import signed_probe
 from templates.keys.randomness import Keystream
+from templates.space.agreement import InconsistentImages, mean_embedding
 from templates.space.lifting import lift as lift_descriptors
 
 TOKEN_VARIABLE = "VEILFACE_API_KEY"  # noqa: S105 - a name, not a secret
@@ -98,6 +99,13 @@ def lift(
             help="What several faces mean: an error, or the one that is largest and most central."
         ),
     ] = FacePolicy.SINGLE,
+    holder_key_file: Annotated[
+        Path | None,
+        typer.Option(
+            help="With `--out -`: private file with the holder's key, which the body will carry.",
+            show_default=False,
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Make a private template from photos on this machine, without any secret of the service.
@@ -117,9 +125,15 @@ def lift(
     if len(photos) > MAX_PHOTOS:
         raise UsageError(f"a template is made from 1 to {MAX_PHOTOS} photos, not {len(photos)}")
     token = _signing_token(subject, level, asked=probe and str(out) == "-")
+    holder_key: dict[str, str] = {}
+    if holder_key_file is not None:
+        if str(out) != "-":
+            raise UsageError("--holder-key-file goes with --out -: a template's file has no key")
+        holder_key = {"holder_key": encode_holder_key(read_holder_key(holder_key_file))}
     public = read_contract(contract)
     binding = public.binding
     m = public.dimension(probe=probe, dim=dim)
+    consistency = public.consistency(probe=probe)
     source = DecoyGenerator.load(generator)
     binding.require_source(source_id=source.source_id, made_with=source.made_with)
     models = ModelPack.load(pack, threads=1, flip=bool(binding.preprocessing.get("flip")))
@@ -129,7 +143,7 @@ def lift(
     )
     rows = np.stack([embed_file(models, photo, policy=face) for photo in photos])
     try:
-        descriptor = mean_descriptor(rows, consistency=public.photo_consistency)
+        descriptor = mean_embedding(rows, consistency=consistency)
     except InconsistentImages as error:
         raise CommandError(error.sentence([photo.name for photo in photos])) from None
     with Keystream.fresh() as stream:
@@ -140,9 +154,9 @@ def lift(
     notice = demo_notice(info.embedder_sha256, n=info.n)
     if str(out) == "-":
         if token is None or subject is None:
-            emit({"template": base64.b64encode(data).decode("ascii")})
+            emit({"template": base64.b64encode(data).decode("ascii"), **holder_key})
         else:
-            emit(signed_probe(token, subject, data, level=level))
+            emit({**signed_probe(token, subject, data, level=level), **holder_key})
         return
     replace_private(out, data)
     facts: dict[str, Any] = {
@@ -203,20 +217,31 @@ class PublicContract:
         self.binding = Binding.from_json(document.get("binding"))
         if document.get("contract_id") != self.binding.contract_id:
             raise ContractError("the contract_id is not the hash of the binding")
-        consistency = document.get("photo_consistency")
-        if not isinstance(consistency, int | float) or not -1 <= consistency <= 1:
-            raise ContractError("the contract lacks its photo_consistency")
-        self.photo_consistency = float(consistency)
+        self._document = document
         entries = document.get("calibrations")
-        if not isinstance(entries, list) or not all(isinstance(each, dict) for each in entries):
+        if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
             raise ContractError("the contract lacks its calibrations")
         self.probe_dimensions: list[int] = sorted(
             {
-                int(each["probe_m"])
-                for each in entries
-                if each.get("mode") == "s2s" and isinstance(each.get("probe_m"), int)
+                int(entry["probe_m"])
+                for entry in entries
+                if entry.get("mode") == "s2s" and isinstance(entry.get("probe_m"), int)
             }
         )
+
+    def consistency(self, *, probe: bool) -> float:
+        """Return the least agreement of the photos of one probe, or of one enrollment.
+
+        Raises
+        ------
+        ContractError
+            The contract lacks it.
+        """
+        name = "probe_consistency" if probe else "photo_consistency"
+        consistency = self._document.get(name)
+        if not isinstance(consistency, int | float) or not -1 <= consistency <= 1:
+            raise ContractError(f"the contract lacks its {name}")
+        return float(consistency)
 
     def dimension(self, *, probe: bool, dim: int | None) -> int:
         """Choose the dimension of the lift.

@@ -1,22 +1,180 @@
-"""``veilface models``: what is in a model pack."""
+"""``veilface models``: fetching model packs, and what is in one."""
 
+import re
+import sys
+import tempfile
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
-from api.cli.console import demo_notice, emit, say, show, table
+from api.cli.console import demo_notice, download, emit, message, say, show, table
+from api.cli.errors import CommandError, UsageError
 from api.cli.options import AsJson
-from models.errors import ModelError
-from models.pack import ModelPack
-from models.pack import inspect as inspect_pack
+from api.cli.pack_download import obtained, shown
+from models.errors import ModelError, PackError
+from models.known_packs import KNOWN_PACKS
+from models.liveness import LivenessGraph
+from models.pack import ModelPack, PackInfo
+from models.pack_file import FILE_NAME, pack_file_text
+from models.pack_graphs import inspect as inspect_pack
+from templates.keys.private_file import make_folder, replace_public
 
-app = typer.Typer(no_args_is_help=True, help="Inspect model packs (the weights you supply).")
+NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,63}")
+MAX_NAMES, MAX_NAME = 10, 100
+"""How many names of what an archive has beside graphs are shown, and characters of each."""
+
+app = typer.Typer(no_args_is_help=True)
 
 
 @app.callback()
 def models() -> None:
-    """Inspect model packs (the weights you supply)."""
+    """Fetch and inspect model packs (the weights you supply)."""
+
+
+@app.command()
+def fetch(
+    name: Annotated[
+        str,
+        typer.Argument(
+            help=f"Name of the pack, and of its folder. Known: {', '.join(KNOWN_PACKS)}.",
+            show_default=False,
+        ),
+    ],
+    *,
+    sources: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--from",
+            metavar="URL",
+            help="Address of a zip archive or an .onnx file, or a file of this machine; repeat for "
+            "a detector and an embedder that come apart.",
+            show_default=False,
+        ),
+    ] = None,
+    sha256: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="What the file must hash to, in hex; once for each --from, in the same order.",
+            show_default=False,
+        ),
+    ] = None,
+    into: Annotated[Path, typer.Option(help="Folder of the packs.")] = Path("packs"),
+    preprocessing: Annotated[
+        Literal["arcface", "imagenet", "raw"] | None,
+        typer.Option(
+            help="What the embedder was trained on, where its graph does not tell: `arcface` is "
+            "(x - 127.5) / 127.5, `imagenet` mean and deviation of each channel, `raw` 0 to 255. "
+            "Written to `pack.toml`.",
+            show_default=False,
+        ),
+    ] = None,
+    accept_licence: Annotated[
+        bool,
+        typer.Option("--accept-licence", help="You have read the licence and may use the weights."),
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Fetch a pack from an address that you name, and check that it can be used.
+
+    Shows licence and size first, and the SHA-256 of what came. Veilface keeps no addresses of
+    weights: take one from the owner of the pack. Only `.onnx` files and `pack.toml` are taken out
+    of an archive. Exit status 1: it cannot be fetched or used, and nothing is left of it.
+
+    Example: `veilface models fetch buffalo_sc --from https://example.org/buffalo_sc.zip`
+    """
+    if not NAME.fullmatch(name):
+        raise UsageError("a pack's name has letters, digits, and . _ - inside, 64 at most")
+    target = into / name
+    known = KNOWN_PACKS.get(name.lower())
+    message(
+        f"{name}: not a pack that Veilface knows; its licence is between you and its owner."
+        if known is None
+        else f"{name}: {known.contents}; {known.megabytes:g} MB; licence: {known.licence}."
+    )
+    if not sources:
+        raise UsageError(
+            f"name an address or a file with --from; or put the .onnx files into {target} yourself"
+        )
+    if sha256 and len(sha256) != len(sources):
+        raise UsageError("give --sha256 once for each --from, in the same order, or never")
+    if target.exists():
+        raise CommandError(f"{target} is there already; remove it, or take another name")
+    _require_licence(accept_licence)
+    pins: Sequence[str | None] = sha256 or [None] * len(sources)
+    make_folder(into)
+    with tempfile.TemporaryDirectory(prefix=".fetch-", dir=into) as scratch:
+        # Of the pack's own name, which what is wrong with it names.
+        folder = Path(scratch) / name
+        make_folder(folder)
+        digests = {}
+        for source, pin in zip(sources, pins, strict=True):
+            digests[shown(source)], left_out = _fetch_one(source, folder, pin)
+            message(f"{shown(source)}: SHA-256 {digests[shown(source)]}")
+            if left_out:
+                message(f"Left in the archive: {_some_of(left_out)}.")
+        if preprocessing is not None:
+            if (folder / FILE_NAME).exists():
+                raise UsageError(f"the archive has a {FILE_NAME}: leave out --preprocessing")
+            replace_public(folder / FILE_NAME, pack_file_text(preprocessing).encode())
+        pack = ModelPack.load(folder)
+        folder.rename(target)
+    if as_json:
+        emit({"out": str(target), "sha256": digests, "pack": _described(pack)})
+    else:
+        say(f"{target}: {_usable(pack.info)}")
+
+
+def _require_licence(accepted: bool) -> None:
+    if accepted:
+        return
+    if not sys.stdin.isatty():
+        raise UsageError("say --accept-licence once you have read the licence of the weights")
+    typer.confirm("Have you read the licence, and may you use the weights?", abort=True, err=True)
+
+
+def _fetch_one(source: str, folder: Path, pin: str | None) -> tuple[str, list[str]]:
+    with download("fetching") as begin:
+        return obtained(source, folder, sha256=pin, begin=begin)
+
+
+def _some_of(names: Sequence[str]) -> str:
+    first = ", ".join(name[:MAX_NAME] for name in names[:MAX_NAMES])
+    more = len(names) - MAX_NAMES
+    return f"{first}, and {more:,} more" if more > 0 else first
+
+
+def _described(pack: ModelPack) -> dict[str, object]:
+    info = pack.info
+    graphs, refusal = _liveness_graphs(pack)
+    return {
+        "name": info.name,
+        "n": info.n,
+        "embedder": info.embedder_file,
+        "embedder_sha256": info.embedder_sha256,
+        "preprocessing": info.preprocessing,
+        "detector": None if info.detector is None else info.detector.kind,
+        "liveness": [graph.as_dict() for graph in graphs],
+        "liveness_reason": refusal,
+    }
+
+
+def _liveness_graphs(pack: ModelPack) -> tuple[Sequence[LivenessGraph], str | None]:
+    """Liveness graphs, or why they cannot be used: the pack can be, without them."""
+    try:
+        return (() if pack.liveness is None else pack.liveness.members), None
+    except PackError as error:
+        return (), str(error)
+
+
+def _usable(info: PackInfo) -> str:
+    detector = (
+        "no detector: photos must be aligned square crops"
+        if info.detector is None
+        else f"detector {info.detector.kind}"
+    )
+    return f"{info.n} numbers per embedding, {detector}."
 
 
 @app.command()
@@ -36,15 +194,16 @@ def inspect(
     Example: `veilface models inspect ~/.insightface/models/buffalo_l`
     """
     graphs = inspect_pack(pack)
+    loaded: ModelPack | None
     try:
-        info, refusal = ModelPack.load(pack).info, None
+        loaded, refusal = ModelPack.load(pack), ""
     except ModelError as error:
-        info, refusal = None, str(error)
+        loaded, refusal = None, str(error)
     if as_json:
         emit(
             {
-                "usable": info is not None,
-                "reason": refusal,
+                "usable": loaded is not None,
+                "reason": refusal or None,
                 "graphs": [
                     {
                         "file": graph.file,
@@ -56,16 +215,7 @@ def inspect(
                     }
                     for graph in graphs
                 ],
-                "pack": None
-                if info is None
-                else {
-                    "name": info.name,
-                    "n": info.n,
-                    "embedder": info.embedder_file,
-                    "embedder_sha256": info.embedder_sha256,
-                    "preprocessing": info.preprocessing,
-                    "detector": None if info.detector is None else info.detector.kind,
-                },
+                "pack": None if loaded is None else _described(loaded),
             }
         )
     else:
@@ -73,15 +223,20 @@ def inspect(
         for graph in graphs:
             listing.add_row(graph.file, str(graph.role), graph.reason, graph.sha256[:16])
         show(listing)
-        if info is None:
+        if loaded is None:
             say(f"This pack cannot be used: {refusal}")
         else:
-            detector = (
-                "no detector: photos must be aligned square crops"
-                if info.detector is None
-                else f"detector {info.detector.kind}"
-            )
-            say(f"Usable: {info.n} numbers per embedding, {detector}.")
-    if info is None:
+            say(f"Usable: {_usable(loaded.info)}")
+            members, unusable = _liveness_graphs(loaded)
+            if unusable is not None:
+                say(f"Its liveness graphs cannot be used: {unusable}")
+            for member in members:
+                fed = member.expects
+                say(
+                    f"Liveness: {member.file}, {fed.crop} of the face times {fed.crop_scale:g}, "
+                    f"{fed.size} x {fed.size} {fed.channel_order.upper()}, class {fed.live_class} "
+                    f"is live, score {fed.score}."
+                )
+    if loaded is None:
         raise typer.Exit(1)
-    demo_notice(info.embedder_sha256, n=info.n)
+    demo_notice(loaded.info.embedder_sha256, n=loaded.info.n)

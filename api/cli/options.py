@@ -14,8 +14,10 @@ from typing import Annotated, Any, ParamSpec, TypeVar
 import typer
 from pydantic.fields import FieldInfo
 
+from api.cli.errors import UsageError
 from api.process.environment import variables_set
 from api.settings import CONFIG_VARIABLE, ENV_PREFIX, Settings, load_settings
+from templates.errors import TemplateError
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -36,6 +38,56 @@ Tenant = Annotated[
     str | None,
     typer.Option(help="Tenant. Unset: the setting `default_tenant`.", show_default=False),
 ]
+
+Device = Annotated[
+    str,
+    typer.Option(
+        help="Where distances in float32 are computed: `cpu`, or a device of torch such as `cuda` "
+        "(extra `torch`)."
+    ),
+]
+PROCESSOR = "cpu"
+
+
+def quick(**smaller: Any) -> Any:
+    """Make the option ``--quick``: it takes these defaults for options that are not given."""
+
+    def choose(ctx: typer.Context, asked: bool) -> bool:
+        if asked:
+            ctx.default_map = smaller
+        return asked
+
+    said = " ".join(f"--{name.replace('_', '-')} {value}" for name, value in smaller.items())
+    return typer.Option(
+        "--quick", is_eager=True, callback=choose, help=f"A first look in minutes: `{said}`."
+    )
+
+
+def chosen_device(device: str, *, here: bool = True) -> str | None:
+    """Check the device of a flag; None for the processor, which needs no torch.
+
+    Parameters
+    ----------
+    here
+        Whether this machine is to have it.
+
+    Raises
+    ------
+    UsageError
+        There is no torch, or no such device.
+    """
+    if device == PROCESSOR:
+        return None
+    if not here:
+        return device
+    # Imported here: whoever leaves the flag out starts sooner.
+    from templates.distances import require_device
+
+    try:
+        require_device(device)
+    except TemplateError as error:
+        raise UsageError(f"{error}; leave out --device to use the processor") from None
+    return device
 
 
 def takes_settings(*names: str) -> Callable[[Callable[..., R]], Callable[..., R]]:

@@ -10,10 +10,11 @@ import typer
 from api.cli.console import demo_notice, message, say
 from api.cli.errors import CommandError
 from api.cli.options import takes_settings
+from api.cli.verdict import verdict_lines
 from api.http.audit_report import open_audit_report
 from api.limits.rates import RateLimits
 from api.process.metrics import shared_directory
-from api.process.opening import key_beside_database
+from api.process.opening import key_beside_database, require_privacy
 from api.process.operations import tls_options
 from api.process.runtime import Runtime, bootstrap_token
 from api.process.supervisor import run_server
@@ -42,6 +43,11 @@ def serve(
 
     Example: `veilface serve --pack buffalo_l --data-dir veilface-data --workers 2`
     """
+    start(settings, check=check)
+
+
+def start(settings: Settings, *, check: bool = False) -> None:
+    """Open everything once, then serve until the process is told to stop."""
     token, demo = _opened_once(settings, check=check)
     if demo and not settings.demo:
         settings = settings.model_copy(update={"demo": True})
@@ -101,6 +107,10 @@ def _opened_once(settings: Settings, *, check: bool) -> tuple[str | None, bool]:
     if warning := key_beside_database(settings):
         message(f"warning: {warning}")
     try:
+        for line in verdict_lines(runtime.contract.verdict):
+            message(line)
+        if (weakness := require_privacy(runtime.contract, settings)) is not None:
+            message(f"warning: weak privacy is accepted: {weakness}")
         binding = runtime.contract.binding
         token = None if check else bootstrap_token(runtime.store, settings)
         if check and (warning := runtime.superseded_calibrations()) is not None:

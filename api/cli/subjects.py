@@ -1,25 +1,41 @@
 """``veilface enroll`` and ``veilface verify``: on this machine, against the store itself."""
 
+import base64
+import binascii
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from api.cli.console import demo_notice, emit, say
+from api.cli.console import demo_notice, emit, message, say
 from api.cli.errors import CommandError, UsageError
 from api.cli.files import read_bounded
 from api.cli.options import LOCAL, AsJson, Tenant, takes_settings
 from api.http.audit import operator
 from api.http.errors import ApiError
+from api.limits.admission import MAX_JSON_BYTES
+from api.process.opening import weak_privacy
 from api.process.runtime import Runtime
 from api.settings import Settings
 from enroll.enroller import MAX_PHOTOS
-from enroll.errors import InconsistentImages, PhotoRejected
-from models.errors import ModelError
+from models.errors import PhotoRejected
 from models.pack import FacePolicy, ModelPack
 from templates.decoys import Attributes
+from templates.keys.holder_key import (
+    new_holder_key,
+    read_holder_key,
+    wipe,
+    write_holder_key,
+)
+from templates.keys.private_file import create_private
+from templates.space.agreement import InconsistentImages
 from templates.store.audit_log import Entry
-from templates.store.subject_rows import Source
+from templates.store.subject_rows import Source, Storage, TemplateNotStored
+from templates.store.subjects import Precondition
+from verify import MAX_PROBE_PHOTOS, OpenedTemplate, Verifier
 
 Subject = Annotated[str, typer.Argument(help="Id of the person.", show_default=False)]
 Face = Annotated[
@@ -27,6 +43,12 @@ Face = Annotated[
     typer.Option(
         help="A photo with several faces: refuse it, or use the first by rank (large, and "
         "near the middle)."
+    ),
+]
+HolderKeyFile = Annotated[
+    Path | None,
+    typer.Option(
+        help="Private file with the holder's key: 43 characters of base64url.", show_default=False
     ),
 ]
 
@@ -56,35 +78,76 @@ def enroll(
     ] = None,
     tenant: Tenant = None,
     face: Face = FacePolicy.SINGLE,
+    held_template: Annotated[
+        Path | None,
+        typer.Option(
+            help="Write the sealed template to this new file, and store none: every verification "
+            "of the person then needs the file.",
+            show_default=False,
+        ),
+    ] = None,
+    holder_key_file: HolderKeyFile = None,
+    new_holder_key_file: Annotated[
+        Path | None,
+        typer.Option(
+            help="Make a holder's key, and write it into this file, which must not exist yet.",
+            show_default=False,
+        ),
+    ] = None,
+    no_replace: Annotated[
+        bool, typer.Option("--no-replace", help="Refuse a person who is enrolled already.")
+    ] = False,
+    replace: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TEMPLATE_ID",
+            help="Replace the enrollment with this template id only.",
+            show_default=False,
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Enroll a person from photos, or replace their enrollment.
 
     Needs: what `serve` needs (contract, decoys, pack); the service may run meanwhile. All photos
-    must show the same person. Only the private template is stored.
+    must show the same person. Only the private template is stored, or handed out to be kept by its
+    holder (`--held-template`): then the file is the only copy. With a holder's key it accepts
+    nobody without that key, which is not stored: who loses the file enrolls again.
 
     Example: `veilface enroll alice alice-1.jpg alice-2.jpg alice-3.jpg --pack buffalo_l`
     """
     if len(photos) > MAX_PHOTOS:
         raise UsageError(f"an enrollment has 1 to {MAX_PHOTOS} photos, not {len(photos)}")
+    if held_template is not None and os.path.lexists(held_template):
+        # It may be the only copy of somebody's template.
+        raise UsageError(f"{held_template} is there already: name a new file")
+    if no_replace and replace is not None:
+        raise UsageError("give --no-replace or --replace, not both")
+    may_replace_all = not no_replace and replace is None
+    if holder_key_file is not None and new_holder_key_file is not None:
+        raise UsageError("give --holder-key-file or --new-holder-key-file, not both")
+    if new_holder_key_file is not None:
+        holder_key: bytearray | None = new_holder_key()
+    else:
+        holder_key = None if holder_key_file is None else read_holder_key(holder_key_file)
     data = [read_bounded(photo, settings.max_image_bytes) for photo in photos]
     runtime = Runtime.open(settings)
     try:
         pack = _required_pack(runtime)
         name = _tenant(runtime, tenant)
         epoch = runtime.epoch(name)
-        try:
+        with _named(photos):
             enrollment = runtime.enroller(name, epoch).from_photos(
                 pack,
                 data,
                 attributes=Attributes(gender, race),
+                holder_key=holder_key,
                 policy=face,
                 limits=runtime.image_limits,
             )
-        except PhotoRejected as error:
-            raise CommandError(f"{photos[error.index].name}: {error.cause}") from None
-        except InconsistentImages as error:
-            raise CommandError(error.sentence([photo.name for photo in photos])) from None
+        if new_holder_key_file is not None and holder_key is not None:
+            # Before the enrollment, which is of no use without it.
+            write_holder_key(new_holder_key_file, holder_key)
         stored = runtime.put(
             name,
             subject,
@@ -92,11 +155,18 @@ def enroll(
             enrollment,
             source=Source.PHOTOS,
             photos=len(photos),
+            storage=Storage.SERVICE if held_template is None else Storage.HOLDER,
+            precondition=None if may_replace_all else Precondition(replace),
             by=operator(),
         )
+        if held_template is not None and stored.held_template is not None:
+            _hand_out(stored.held_template, held_template, subject)
+        if (weakness := weak_privacy(runtime.contract)) is not None:
+            message(f"warning: weak privacy: {weakness}")
         binding = runtime.contract.binding
         notice = demo_notice(binding.embedder_sha256, n=binding.n)
     finally:
+        wipe(holder_key)
         runtime.close()
     if as_json:
         emit(
@@ -106,19 +176,29 @@ def enroll(
                 "template_id": stored.template_id,
                 "contract_id": enrollment.contract_id,
                 "replaced": not stored.created,
+                "holder_key": enrollment.holder_salt is not None,
                 "photos": len(photos),
+                "storage": str(Storage.SERVICE if held_template is None else Storage.HOLDER),
                 **notice,
             }
         )
     else:
         done = "Enrolled" if stored.created else "Replaced the enrollment of"
-        say(f"{done} {subject} from {len(photos)} photos; stored {len(enrollment.wire)} bytes.")
+        size, where = len(enrollment.wire), "stored"
+        if held_template is not None:
+            where = f"wrote to {held_template}, and stored none of,"
+        say(f"{done} {subject} from {len(photos)} photos; {where} {size} bytes.")
 
 
 @takes_settings(*LOCAL)
 def verify(
     subject: Subject,
-    photo: Annotated[Path, typer.Argument(help="The photo to check.", show_default=False)],
+    photos: Annotated[
+        list[Path],
+        typer.Argument(
+            help=f"1 to {MAX_PROBE_PHOTOS} photos to check, of one person.", show_default=False
+        ),
+    ],
     *,
     settings: Settings,
     level: Annotated[
@@ -131,37 +211,48 @@ def verify(
     ] = None,
     tenant: Tenant = None,
     face: Face = FacePolicy.SINGLE,
+    held_template: Annotated[
+        Path | None,
+        typer.Option(
+            help="File that `enroll --held-template` wrote, of a person who keeps their template.",
+            show_default=False,
+        ),
+    ] = None,
+    holder_key_file: HolderKeyFile = None,
     as_json: AsJson = False,
 ) -> None:
-    """Check whether a photo shows a person; exit status 0 if accepted, 1 if rejected.
+    """Check whether photos show a person; exit status 0 if accepted, 1 if rejected.
 
-    Exit status 2 is wrong usage, such as a missing photo; 3 means that no decision was made, and
-    stderr says why. Needs: what `serve` needs; the service may run meanwhile. The decision goes
-    into the audit log; it neither counts towards the subject's lockout nor is stopped by it.
+    Several photos must show one person; they are averaged, and the right person is rejected less
+    often. Exit status 2 is wrong usage, such as a missing photo; 3 means that no decision was made,
+    and stderr says why. Needs: what `serve` needs; the service may run meanwhile. The decision goes
+    into the audit log; it neither counts towards the subject's lockout nor is stopped by it. An
+    enrollment that was made with a holder's key rejects everybody without the same one.
 
-    Example: `veilface verify alice today.jpg --pack buffalo_l --level fmr-1e-4`
+    Example: `veilface verify alice now-1.jpg now-2.jpg now-3.jpg --pack buffalo_l --level fmr-1e-4`
     """
-    if not photo.exists():
-        raise UsageError(f"no such photo: {photo}")
-    data = read_bounded(photo, settings.max_image_bytes)
+    if len(photos) > MAX_PROBE_PHOTOS:
+        raise UsageError(f"a verification takes 1 to {MAX_PROBE_PHOTOS} photos, not {len(photos)}")
+    for photo in photos:
+        if not photo.exists():
+            raise UsageError(f"no such photo: {photo}")
+    holder_key = None if holder_key_file is None else read_holder_key(holder_key_file)
+    data = [read_bounded(photo, settings.max_image_bytes) for photo in photos]
+    sealed = None if held_template is None else _handed_in(held_template)
     runtime = Runtime.open(settings)
     try:
         pack = _required_pack(runtime)
         name = _tenant(runtime, tenant)
-        read = runtime.read(name, subject)
-        if read is None:
-            raise CommandError(f"nobody is enrolled as {subject!r} in tenant {name}")
-        found, room = read
+        template, verifier = _opened(runtime, name, subject, sealed)
         try:
             level = runtime.levels.in_force(level)
         except ApiError as error:
             raise UsageError(error.message) from None
-        try:
-            decision = room.verifier.decide_photo(
-                pack, data, found.wire, level=level, policy=face, limits=runtime.image_limits
-            )
-        except ModelError as error:
-            raise CommandError(f"{photo.name}: {error}") from None
+        with _named(photos):
+            probe = verifier.embed_photos(pack, data, policy=face, limits=runtime.image_limits)
+        decision = verifier.decide_embedding(
+            probe, template, holder_key=holder_key, level=level, photos=len(photos)
+        )
         outcome = "accept" if decision.accepted else "reject"
         # Another action than the service's: what an operator tries is not counted by the lockout.
         pseudonym = runtime.store.signer.pseudonym(name, subject)
@@ -171,6 +262,7 @@ def verify(
         binding = runtime.contract.binding
         notice = demo_notice(binding.embedder_sha256, n=binding.n)
     finally:
+        wipe(holder_key)
         runtime.close()
     answer: dict[str, Any] = {
         "decision": outcome,
@@ -187,6 +279,54 @@ def verify(
         say(f"{answer['decision']}: {subject}, level {decision.level}, FMR {decision.fmr:g}")
     if not decision.accepted:
         raise typer.Exit(1)
+
+
+def _opened(
+    runtime: Runtime, tenant: str, subject: str, held_template: bytes | None
+) -> tuple[OpenedTemplate, Verifier]:
+    """Return the subject's template and its verifier; one of nobody where another was handed in."""
+    try:
+        read = runtime.read(tenant, subject, held_template=held_template)
+    except TemplateNotStored:
+        if held_template is None:
+            raise CommandError(
+                f"the holder of {subject!r} keeps the template: name its file with --held-template"
+            ) from None
+        return runtime.stand_ins.open(None), runtime.verifier(tenant, runtime.epoch(tenant))
+    if read is None:
+        raise CommandError(f"nobody is enrolled as {subject!r} in tenant {tenant}")
+    template, in_rotation = read
+    return template, in_rotation.verifier
+
+
+def _hand_out(sealed: bytes, path: Path, subject: str) -> None:
+    """Write a held template, in base64, to a new file of mode 0600."""
+    try:
+        create_private(path, base64.b64encode(sealed))
+    except OSError as error:
+        raise CommandError(
+            f"{subject!r} is enrolled, but its template could not be written and is lost "
+            f"({path}: {error.strerror}): enroll again"
+        ) from None
+
+
+def _handed_in(path: Path) -> bytes:
+    """Read what :func:`_hand_out` wrote."""
+    try:
+        return base64.b64decode(read_bounded(path, MAX_JSON_BYTES).strip(), validate=True)
+    except (binascii.Error, ValueError):
+        raise CommandError(f"{path} is not a held template: it is not base64") from None
+
+
+@contextmanager
+def _named(photos: Sequence[Path]) -> Iterator[None]:
+    """Say of what is wrong with a photo which file it is."""
+    try:
+        yield
+    except PhotoRejected as error:
+        raise CommandError(f"{photos[error.index].name}: {error.cause}") from None
+    except InconsistentImages as error:
+        raise CommandError(error.sentence([photo.name for photo in photos])) from None
 
 
 def _required_pack(runtime: Runtime) -> ModelPack:

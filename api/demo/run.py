@@ -8,7 +8,6 @@ What is printed is computed from the answers and from the database's file; :attr
 holds whatever did not go as promised.
 """
 
-import base64
 import math
 import shutil
 import tempfile
@@ -24,20 +23,23 @@ from api.demo.people import ENROLLED_PHOTOS, PROBE_PHOTOS, Cast, Scale, drawn_ca
 from api.demo.service import running_service
 from api.demo.storage import KEY_FILE, Stored, read_stored, rows_of
 from api.http.errors import StartError
-from api.http.receipts import verify_answer
-from api.process.opening import file_sealer
+from api.http.receipts import read_receipt_keys, verify_answer
+from api.process.opening import file_sealer, weak_privacy
 from api.process.preparation import calibrate_folder, default_probe_dims, make_generator
+from api.process.settings_file import settings_text
 from models.demo import build_demo_pack, is_demo_model
 from models.extraction import Extraction, Extractor
 from models.pack import ModelPack
 from templates.contract.document import Contract
+from templates.contract.verdict import Verdict
 from templates.keys.sealing import MasterKeyring
 from templates.space.lifting import Strategy
 from verify import CalibrationOptions, LabelledFolder
 
 MARKER = "# Written by `veilface demo`, which replaces this folder when it runs again."
 # A run fails if the level's FMR makes so many accepted impostors less likely than this.
-LEAST_LIKELY = 0.001
+LEAST_LIKELY = 1e-6
+"""Probability below which so many impostors are no chance: a sound demo does not fail by it."""
 
 Say = Callable[[str], None]
 
@@ -73,6 +75,7 @@ class Outcome:
     folder: Path
     pack: str
     contract_id: str
+    verdict: Verdict | None
     strategy: str
     people: tuple[Person, ...]
     levels: tuple[LevelCount, ...]
@@ -130,7 +133,7 @@ def run_demo(
         else:
             cast, decoy_photos, labelled = found_cast(faces, size)
         contract = _calibrate(folder, pack, decoy_photos, labelled, m=m, say=say)
-    _write_settings(folder, pack)
+    _write_settings(folder, pack, contract)
     say("starting the service")
     with running_service(folder) as client:
         return _play(client, folder, pack, contract, cast, say=say, started=started)
@@ -188,21 +191,25 @@ def _extract(pack: ModelPack, photos: Sequence[Path]) -> Extraction:
     return extraction
 
 
-def _write_settings(folder: Path, pack: Path) -> None:
-    def quoted(path: Path) -> str:
-        text = str(path.resolve()).replace("\\", "\\\\").replace('"', '\\"')
-        return f'"{text}"'
-
-    lines = [
-        MARKER,
-        f"data_dir = {quoted(folder)}",
-        "# Beside the database only here: a deployment keeps the two apart.",
-        f"master_key_file = {quoted(folder / KEY_FILE)}",
-        f"pack = {quoted(pack)}",
+def _write_settings(folder: Path, pack: Path, contract: Contract) -> None:
+    values: dict[str, Path | bool] = {
+        "data_dir": folder,
+        "master_key_file": folder / KEY_FILE,
+        "pack": pack,
+    }
+    comments = [
+        MARKER.removeprefix("# "),
+        "The master key is beside the database only here: a deployment keeps the two apart.",
     ]
     if is_demo_model(ModelPack.load(pack, threads=1).info.embedder_sha256):
-        lines.append("demo = true")
-    (folder / "veilface.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
+        values["demo"] = True
+    if weak_privacy(contract) is not None:
+        comments.append(
+            "So few people give no decoys that conceal a face; a deployment must not accept it."
+        )
+        values["accept_weak_privacy"] = True
+    text = settings_text(values, *comments)
+    (folder / "veilface.toml").write_text(text, encoding="utf-8")
 
 
 def _play(
@@ -252,6 +259,7 @@ def _play(
         folder=folder,
         pack=pack.name,
         contract_id=contract.contract_id,
+        verdict=contract.verdict,
         strategy=f"{binding.strategy}, m = {binding.m}, n = {binding.n}",
         people=people,
         levels=counts,
@@ -293,7 +301,7 @@ def _attempts(
         for photo in photos[ENROLLED_PHOTOS : ENROLLED_PHOTOS + PROBE_PHOTOS]
     ]
     probes += list(cast.strangers.items())
-    found = [
+    attempts = [
         _Attempt(name, True, level, False)
         for name in cast.enrolled
         if name not in enrolled
@@ -317,10 +325,10 @@ def _attempts(
                     accepted = False
                 else:
                     accepted = answer.json()["decision"] == "accept"
-                found.append(_Attempt(subject, owner == subject, level, accepted))
+                attempts.append(_Attempt(subject, owner == subject, level, accepted))
     for subject in enrolled:
         _lift(client, subject)
-    return found, lifted
+    return attempts, lifted
 
 
 def _lift(client: httpx.Client, subject: str) -> int:
@@ -352,9 +360,9 @@ def _count(
     attempts: Sequence[_Attempt], *, level: str, subject: str | None = None
 ) -> tuple[int, int, int, int]:
     """Genuine accepted, genuine trials, impostors accepted, impostor trials."""
-    mine = [a for a in attempts if a.level == level and subject in (None, a.subject)]
-    genuine = [a.accepted for a in mine if a.genuine]
-    impostors = [a.accepted for a in mine if not a.genuine]
+    chosen = [a for a in attempts if a.level == level and subject in (None, a.subject)]
+    genuine = [a.accepted for a in chosen if a.genuine]
+    impostors = [a.accepted for a in chosen if not a.genuine]
     return sum(genuine), len(genuine), sum(impostors), len(impostors)
 
 
@@ -368,8 +376,8 @@ def _erase(client: httpx.Client, name: str, photo: Path) -> tuple[dict[str, Any]
     answer = client.delete(f"/v1/subjects/{name}")
     if answer.status_code != httpx.codes.OK:
         return {}, [f"{name} was not erased: {_code(answer)}"]
-    public = base64.b64decode(client.get("/v1/contract").json()["receipt_key"]["public_key"])
-    claims = verify_answer(answer.json(), public)
+    keys = read_receipt_keys(client.get("/v1/contract").json()["receipt_key"])
+    claims, _ = verify_answer(answer.json(), keys)
     if not claims["held"]:
         faults.append("the receipt says that nothing was held")
     again = _send(client, "POST", f"/v1/subjects/{name}/verify", [photo])

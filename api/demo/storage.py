@@ -31,7 +31,7 @@ def read_stored(folder: Path, names: Sequence[str]) -> tuple[Stored, ...]:
     """Read the database's file as a thief would, and open it with the master key beside that."""
     url = f"sqlite:///{(folder / 'veilface.db').resolve()}"
     store = TemplateStore(url, MasterKeyring.load(folder / KEY_FILE))
-    found = []
+    stored = []
     try:
         for name in names:
             subject = store.subjects.get(TENANT, name)
@@ -39,7 +39,7 @@ def read_stored(folder: Path, names: Sequence[str]) -> tuple[Stored, ...]:
                 continue
             foot_norm = wire.decode(subject.wire).subspace.foot_norm
             ciphertext = _ciphertext(folder, name)
-            found.append(
+            stored.append(
                 Stored(
                     name=name,
                     n=subject.record.n,
@@ -52,7 +52,7 @@ def read_stored(folder: Path, names: Sequence[str]) -> tuple[Stored, ...]:
             )
     finally:
         store.close()
-    return tuple(found)
+    return tuple(stored)
 
 
 def _ciphertext(folder: Path, name: str) -> bytes:

@@ -21,10 +21,13 @@ from api.http.answers import error_answer
 from api.http.audit import note_refusal
 from api.http.audit_report import open_audit_report
 from api.http.context import RequestContext
+from api.http.cors import Cors
 from api.http.errors import ApiError, StartError, api_error
 from api.http.openapi import DESCRIPTION, allowed_methods
 from api.http.protocol import Protocol
+from api.http.reference import DescribedApi, operation_id
 from api.http.routes import (
+    challenges,
     contract,
     enrollment,
     health,
@@ -37,13 +40,14 @@ from api.http.routes import (
     verification,
 )
 from api.http.routes.page import page_routes
+from api.http.routes.reference import reference_routes
 from api.limits.admission import Gate
 from api.limits.rates import RateLimits
 from api.process.allocator import keep_few_arenas
 from api.process.housekeeping import purge_regularly
 from api.process.logging import configure, log, uvicorn_log_config
 from api.process.metrics import count_lockout, join_shared_directory, set_build
-from api.process.opening import retention_of
+from api.process.opening import require_privacy, retention_of
 from api.process.operations import (
     OPERATIONS_PATHS,
     Readiness,
@@ -53,12 +57,13 @@ from api.process.operations import (
 )
 from api.process.runtime import Runtime
 from api.process.supervised import end_with_supervisor, is_supervised, open_patiently, told_to_stop
+from api.process.webhooks import deliver
 from api.settings import ENV_PREFIX, NO_PROXIES, Settings, load_settings
 from models.errors import ModelError
 from templates.distances import warm_up
 from templates.distances.blas import single_threaded
 from templates.errors import VeilfaceError
-from verify.cohort import rounded_cohort
+from templates.keys.webhook_secret import read_webhook_secrets
 
 VERSION = version("veilface")
 GRACE_S = 20
@@ -88,7 +93,7 @@ def create_app(
                 finally:
                     app.state.readiness.stopping = True
 
-    app = FastAPI(
+    app = DescribedApi(
         title="Veilface",
         version=VERSION,
         description=DESCRIPTION,
@@ -97,6 +102,7 @@ def create_app(
         redoc_url=None,
         openapi_url="/v1/openapi.json",
         redirect_slashes=False,
+        generate_unique_id_function=operation_id,
     )
     app.state.settings = settings
     for routes in (
@@ -106,6 +112,7 @@ def create_app(
         photo_check,
         subjects,
         stored,
+        challenges,
         verification,
         lockout,
         transfer,
@@ -118,6 +125,8 @@ def create_app(
         _add_middleware(app, settings, operations_paths=OPERATIONS_PATHS)
     else:
         _add_middleware(app, settings, operations_paths=frozenset())
+    if settings.api_docs:
+        app.router.routes.extend(reference_routes(app))
     return app
 
 
@@ -137,6 +146,7 @@ def _add_middleware(app: FastAPI, settings: Settings, *, operations_paths: froze
         RequestContext,
         max_in_flight=settings.max_in_flight,
         operations_paths=operations_paths,
+        cors=Cors(settings.allowed_origins),
         demo=settings.demo,
         tls=settings.tls_certificate is not None,
     )
@@ -182,10 +192,15 @@ async def _open(
     )
     if (warning := await anyio.to_thread.run_sync(runtime.superseded_calibrations)) is not None:
         log(warning, severity=logging.WARNING, contract_id=runtime.contract.contract_id)
+    if (weakness := require_privacy(runtime.contract, settings)) is not None:
+        log(
+            "weak privacy is accepted: " + weakness,
+            severity=logging.WARNING,
+            contract_id=runtime.contract.contract_id,
+        )
     await anyio.to_thread.run_sync(runtime.note_calibrations)
     # No request is answered before this is done, so none waits for the compiler.
     await anyio.to_thread.run_sync(warm_up)
-    await anyio.to_thread.run_sync(rounded_cohort, runtime.contract.cohort)
     # What was made so far stays: looking through it for garbage would stop requests for 0.1 s.
     gc.collect()
     gc.freeze()
@@ -202,6 +217,9 @@ async def _open(
         )
     )
     tasks.start_soon(readiness.watch)
+    if settings.webhook_url is not None and settings.webhook_secret_file is not None:
+        secrets = read_webhook_secrets(settings.webhook_secret_file)
+        tasks.start_soon(partial(deliver, runtime.store.outbox, settings.webhook_url, secrets))
     if is_supervised():
         tasks.start_soon(end_with_supervisor)
     if settings.operations_port is not None:

@@ -11,7 +11,7 @@ from api.http.errors import StartError
 from api.settings import Settings
 from attacks.outcomes import GENERATED, POOLED, Scheme
 from attacks.report import FORMAT, VERSION
-from attacks.verdict import LIMITS
+from attacks.verdict import LIMITS, WITH_KEY
 from templates.contract.document import Binding, Contract
 from templates.decoys import DecoyGenerator, DecoyPool
 
@@ -19,12 +19,12 @@ MAX_REPORT_BYTES = 64 * 1024 * 1024
 MAX_HEADLINES = 40
 COMMAND = "veilface audit templates PEOPLE --contract contract.json"
 _CELL = (
-    "property", "knowledge", "attack", "variant", "value", "ci_low", "ci_high", "chance",
-    "compared", "compared_low", "compared_high", "limit", "most", "status",
+    "property", "leaked", "knowledge", "attack", "variant", "value", "ci_low", "ci_high", "chance",
+    "compared", "compared_low", "compared_high", "limit", "most", "status", "reason",
 )  # fmt: skip
-_TEXTS = ("property", "knowledge", "attack")
+_TEXTS = ("property", "leaked", "knowledge", "attack")
 _NUMBERS = ("value", "compared", "most")
-_TEXTS_OR_NONE = ("variant", "limit", "status")
+_TEXTS_OR_NONE = ("variant", "limit", "status", "reason")
 _NUMBERS_OR_NONE = ("ci_low", "ci_high", "chance", "compared_low", "compared_high")
 _MEMBERS: dict[str, type] = {
     "kind": str,
@@ -121,16 +121,16 @@ NOT_AUDITED: dict[str, Any] = {
 
 
 def strongest(cells: list[dict[str, Any]]) -> dict[str, Any] | None:
-    """Return the attack that succeeds most against one template, without the tenant's key.
+    """Return the attack that succeeds most, but for those that no template withstands.
 
     Getting the face back counts before everything else; where no such attack was made, the attack
     that is furthest above its chance.
     """
-    without_key = [cell for cell in cells if cell["knowledge"] not in ("key", "templates")]
-    inverting = [cell for cell in without_key if cell["property"] == "irreversibility"]
+    withstood = [cell for cell in cells if cell["limit"] != WITH_KEY]
+    inverting = [cell for cell in withstood if cell["property"] == "irreversibility"]
     if inverting:
         return max(inverting, key=lambda cell: float(cell["value"]))
-    return max(without_key, key=lambda cell: float(cell["compared"]), default=None)
+    return max(withstood, key=lambda cell: float(cell["compared"]), default=None)
 
 
 def open_audit_report(settings: Settings) -> "AuditReport | None":

@@ -11,6 +11,7 @@ from api.http.errors import ApiError
 from api.limits.admission import Gate
 from api.limits.rates import RateLimits
 from api.process.runtime import Runtime
+from templates.contract.liveness_policy import LivenessPolicy
 from templates.keys.api_token import is_token, probe_key
 
 _bearer = HTTPBearer(
@@ -30,6 +31,7 @@ class Caller:
     rights: frozenset[str]
     token: str = field(repr=False, compare=False)
     lowest_level: str | None = None
+    liveness: LivenessPolicy | None = None
 
     @property
     def probe_key(self) -> bytes:
@@ -95,6 +97,7 @@ async def caller(
         rights=frozenset(map(str, api_key.rights)),
         token=token,
         lowest_level=api_key.lowest_level,
+        liveness=api_key.liveness,
     )
 
 

@@ -23,10 +23,12 @@ from api.settings import Settings
 from templates.contract.canonical import too_many_parts
 
 MAX_FIELD_BYTES = 4096
+LONG_FIELDS = {"held_template": MAX_JSON_BYTES}
+"""Text fields that may be longer, and how long: what fits into a JSON body fits into a form."""
 MAX_FIELDS = 16
-MAX_JSON_PARTS = 16_384
-"""Values in a JSON body, counted before it is parsed: four times the longest embedding, the longest
-list of any request. Without it 4 MiB of small objects take 120 MiB."""
+MAX_JSON_PARTS = 24_576
+"""Values in a JSON body, counted before it is parsed: six of the longest embeddings, where no
+request has more than five. Without it 4 MiB of small objects take 120 MiB."""
 MAX_PARSED_AT_ONCE = 64 * 1024
 """Bytes of JSON that are parsed on the event loop; more go to a thread."""
 
@@ -38,14 +40,16 @@ class Form:
     files: tuple[tuple[str, bytes], ...] = field(repr=False)
     fields: Mapping[str, str] = field(repr=False)
 
-    def images(self, name: str) -> list[bytes]:
-        """Return the files of one field.
+    def images(self, *names: str) -> list[bytes]:
+        """Return the files of one field: of that of ``names`` that the first file came under.
 
         Raises
         ------
         ApiError
             ``validation_failed`` if a file came under another name, or the field as plain text.
         """
+        came = [key for key, _ in self.files if key in names]
+        name = came[0] if came else names[0]
         stray = sorted({key for key, _ in self.files if key != name} | ({name} & set(self.fields)))
         if stray:
             raise ApiError(
@@ -74,7 +78,6 @@ class _InMemoryParser(MultiPartParser):
             stream_limited(request, max_bytes),
             max_files=float("inf"),
             max_fields=MAX_FIELDS,
-            max_part_size=MAX_FIELD_BYTES,
         )
         self._max_images = max_images
         self._max_image_bytes = max_image_bytes
@@ -99,6 +102,7 @@ class _InMemoryParser(MultiPartParser):
     def on_headers_finished(self) -> None:
         super().on_headers_finished()
         self._image_bytes = 0
+        self.max_part_size = LONG_FIELDS.get(self._current_part.field_name, MAX_FIELD_BYTES)
         if self._current_files > self._max_images:
             raise ApiError(
                 "too_many_images",

@@ -14,6 +14,7 @@ from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from api.http.answers import error_answer
+from api.http.cors import Cors
 from api.http.errors import ERROR_CODES, ApiError
 from api.limits.admission import overloaded
 from api.limits.rates import RateLimits
@@ -124,6 +125,8 @@ class RequestContext:
         Requests that are answered at the same time; the next one is refused unread.
     operations_paths
         Paths that have a limit of their own, and no rate limit: an overload must be seen from them.
+    cors
+        Which pages of other origins may call.
     demo, tls
         What the headers of every answer say.
     """
@@ -134,11 +137,13 @@ class RequestContext:
         *,
         max_in_flight: int,
         operations_paths: Collection[str] = frozenset(),
+        cors: Cors | None = None,
         demo: bool = False,
         tls: bool = False,
     ) -> None:
         self._app = app
         self._operations_paths = operations_paths
+        self._cors = Cors(()) if cors is None else cors
         self._limit = _InFlightLimit(max_in_flight, IN_FLIGHT)
         self._operations_limit = _InFlightLimit(OPERATIONS_IN_FLIGHT)
         self._headers = dict(SECURITY_HEADERS)
@@ -183,7 +188,7 @@ class RequestContext:
                 status = message["status"]
                 headers = MutableHeaders(scope=message)
                 headers["X-Request-ID"] = request_id
-                for name, value in self._headers.items():
+                for name, value in (self._headers | self._cors.headers(scope)).items():
                     headers.setdefault(name, value)
             await deliver(message)
 
@@ -236,7 +241,7 @@ class RequestContext:
             if not operations:
                 rate_limits: RateLimits = scope["app"].state.rate_limits
                 await rate_limits.count_address(scope)
-            await self._app(scope, body.receive, send)
+            await (self._cors.preflight(scope) or self._app)(scope, body.receive, send)
         except ApiError as refusal:
             await refuse(refusal)
         finally:

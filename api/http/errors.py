@@ -10,8 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from enroll.errors import InconsistentImages, PhotoRejected
-from models.errors import FaceError, ImageError, ModelError
+from models.errors import FaceError, ImageError, ModelError, PhotoRejected
 from templates.errors import (
     ContractMismatch,
     DecoyError,
@@ -23,9 +22,12 @@ from templates.errors import (
     Uncalibrated,
     VeilfaceError,
 )
+from templates.space.agreement import InconsistentImages
 from templates.store.idempotency import IdempotencyConflict
 from templates.store.identifiers import InvalidIdentifier, UnknownTenant
 from templates.store.lockout import LockedOut, Replayed
+from templates.store.subject_rows import TemplateNotStored
+from templates.store.subjects import EnrollmentConflict
 from templates.store.tenants import RetiredRotation
 from templates.store.transfers import ExportSuperseded
 
@@ -69,11 +71,14 @@ ERROR_CODES: dict[str, ErrorCode] = {
             401,
             "The API key is missing, unknown or revoked, or the `hmac` of a probe is wrong.",
         ),
-        ErrorCode("replayed", 401, "The signed probe was used before, or has expired."),
+        ErrorCode(
+            "replayed", 401, "The signed probe or the challenge was used before, or has expired."
+        ),
         ErrorCode(
             "forbidden",
             403,
-            "The API key lacks the right or asks for too low a level, or the tenant forbids it.",
+            "The API key lacks the right or asks for too low a level, the tenant forbids it, or "
+            "liveness is asked for and the probe cannot show it.",
         ),
         ErrorCode("not_enrolled", 404, "Nobody is enrolled under this id."),
         ErrorCode("not_found", 404, "There is nothing at this path."),
@@ -85,13 +90,26 @@ ERROR_CODES: dict[str, ErrorCode] = {
             "The Idempotency-Key was used for another request, or the first is still running.",
         ),
         ErrorCode(
+            "enrollment_conflict",
+            409,
+            "The subject has another template than the one that `If-None-Match` or `If-Match` "
+            "lets the request replace.",
+        ),
+        ErrorCode(
             "export_superseded",
             409,
-            "The subject was erased or enrolled again after the export was made.",
+            "The subject was erased or enrolled again after the export was made, "
+            "or the export's key was retired.",
+        ),
+        ErrorCode(
+            "template_not_stored",
+            409,
+            "The subject's holder keeps the template: it can be verified with it, and not exported "
+            "or shown.",
         ),
         ErrorCode("image_too_large", 413, "The photo is too large, in bytes or pixels."),
         ErrorCode("request_too_large", 413, "The request body is too large."),
-        ErrorCode("too_many_images", 413, "The enrollment has too many photos."),
+        ErrorCode("too_many_images", 413, "The request has too many photos."),
         ErrorCode("no_face", 422, "No face was found in the photo."),
         ErrorCode("multiple_faces", 422, "The photo shows more than one face."),
         ErrorCode("face_too_small", 422, "The face is too small in the photo."),
@@ -150,7 +168,7 @@ def api_error(error: Exception) -> ApiError | None:
         if known is None:
             return None
         details = {"image": error.index, **known.details}
-        return ApiError(known.code, f"{error.place}: {known.message}", details, known.headers)
+        return ApiError(known.code, error.placed(known.message), details, known.headers)
     if isinstance(error, InconsistentImages):
         return ApiError("inconsistent_images", str(error), {"photos": list(error.photos)})
     if isinstance(error, ImageError | FaceError):
@@ -158,6 +176,8 @@ def api_error(error: Exception) -> ApiError | None:
         return ApiError(error.code, str(error), details)
     if isinstance(error, LockedOut):
         return _locked_out(error)
+    if isinstance(error, EnrollmentConflict):
+        return ApiError("enrollment_conflict", str(error), {"template_id": error.template_id})
     for kind, code, public in _TABLE:
         if isinstance(error, kind):
             status = ERROR_CODES[code].status
@@ -188,6 +208,7 @@ _TABLE: tuple[tuple[type[Exception], str, str | None], ...] = (
     (InvalidIdentifier, "validation_failed", None),
     (IdempotencyConflict, "idempotency_conflict", None),
     (ExportSuperseded, "export_superseded", None),
+    (TemplateNotStored, "template_not_stored", None),
     (Replayed, "replayed", None),
     (RetiredRotation, "store_unavailable", "the tenant's rotation is being renewed; send it again"),
     # The key was good a moment ago: its tenant was erased meanwhile.

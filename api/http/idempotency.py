@@ -1,7 +1,8 @@
 """Writes that carry an Idempotency-Key: done once, answered as often as asked.
 
 Only successes are kept. A write that was refused changed nothing, so its key is given back and the
-client may send a better photo under the same key.
+client may send a better photo under the same key. Neither is an answer kept that holds a template
+for its holder: the store would have it for a day, and the next one with the same key replaces it.
 """
 
 import contextlib
@@ -16,6 +17,7 @@ from starlette.responses import Response
 
 from api.http.answers import answer
 from api.http.auth import Caller
+from api.http.preconditions import etag
 from api.process.runtime import Runtime
 from templates.errors import StoreError
 from templates.keys.sealing import encode_parts
@@ -24,11 +26,17 @@ from templates.store.idempotency import Answer
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a write answers: it holds no subject id, because it is kept for a day."""
+    """What a write answers, its template id included.
+
+    It holds no subject id, because it is kept for a day.
+
+    Not `kept`, because it holds what the store must not: asked again, the write is done again.
+    """
 
     status: int
     body: Mapping[str, Any]
     replayed: bool = False
+    kept: bool = True
 
 
 async def once(
@@ -87,15 +95,16 @@ async def once(
             raise
         # The write is done; that its record could not be kept must not turn it into a failure.
         with contextlib.suppress(StoreError):
-            records.finish(
-                claim, status=outcome.status, body=json.dumps(dict(outcome.body)).encode()
-            )
+            if outcome.kept:
+                records.finish(
+                    claim, status=outcome.status, body=json.dumps(dict(outcome.body)).encode()
+                )
+            else:
+                records.release(claim)
         return outcome
 
     outcome = await run(guarded)
-    return answer(
-        request,
-        {**outcome.body, **(add or {})},
-        status=outcome.status,
-        headers={"Idempotency-Replayed": "true"} if outcome.replayed else None,
-    )
+    headers = {"ETag": etag(outcome.body["template_id"])}
+    if outcome.replayed:
+        headers["Idempotency-Replayed"] = "true"
+    return answer(request, {**outcome.body, **(add or {})}, status=outcome.status, headers=headers)

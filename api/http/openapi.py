@@ -6,13 +6,17 @@ from typing import Any
 
 from api.http.errors import ERROR_CODES
 from api.http.schemas import (
+    HELD_TEMPLATE,
     HEX,
+    HOLDER_KEY,
     NONCE_EXAMPLE,
     REQUEST_ID,
     ErrorAnswer,
     TemplateRequest,
     VerifyRequest,
 )
+from templates.keys.holder_key import PATTERN as HOLDER_KEY_PATTERN
+from verify import MAX_FRAMES, MAX_PROBE_PHOTOS
 
 DESCRIPTION = """\
 Face authentication that never stores a face embedding. Every error has one shape; the codes are
@@ -79,6 +83,16 @@ FACE = _text(
     "2·distance², in pixels, the distance from the middle of the picture.",
     enum=["single", "largest"],
 )
+STORAGE = _text(
+    "Who keeps the sealed template: the service (`service`, the default), or whoever gets the "
+    "answer (`holder`).",
+    enum=["service", "holder"],
+)
+HOLDER_KEY_FIELD = _text(
+    "The holder's key: 32 random bytes, base64url.",
+    pattern=HOLDER_KEY_PATTERN,
+    examples=[HOLDER_KEY],
+)
 FILE = {"type": "string", "format": "binary"}
 SIGNATURE_EXAMPLE = {"nonce": NONCE_EXAMPLE, "timestamp": 1767225600, "hmac": HEX}
 
@@ -101,6 +115,8 @@ ENROLLMENT_BODY = _body(
                 examples=['{"gender": "Female", "race": "Indian"}'],
             ),
             "face": FACE,
+            "storage": STORAGE,
+            "holder_key": HOLDER_KEY_FIELD,
         },
     },
     {
@@ -108,17 +124,50 @@ ENROLLMENT_BODY = _body(
         "examples": {"template": {"value": {"template": "kAAAAAAAAAB7Li4u"}}},
     },
 )
+PROBE_PHOTOS = {"type": "array", "items": FILE, "minItems": 1, "maxItems": MAX_PROBE_PHOTOS}
+CHALLENGE_ID = _text(
+    "`challenge_id` of POST /v1/challenges: the images are then the 5 to 12 frames that answer it.",
+    maxLength=1024,
+)
+FRAMES = {**PROBE_PHOTOS, "maxItems": MAX_FRAMES}
+CHALLENGE_BODY = _body(
+    None,
+    {
+        "schema": {
+            "type": "object",
+            "properties": {
+                "subject_id": {
+                    "anyOf": [{"type": "string"}, {"type": "null"}],
+                    "description": "The only subject that it may be answered for; left out: any.",
+                    "examples": ["alice"],
+                }
+            },
+        },
+        "examples": {"subject": {"value": {"subject_id": "alice"}}},
+    },
+)
 VERIFY_BODY = _body(
     {
         "type": "object",
-        "required": ["image"],
-        "properties": {"image": FILE, "level": LEVEL, "face": FACE},
+        "oneOf": [{"required": ["image"]}, {"required": ["images"]}],
+        "properties": {
+            "image": PROBE_PHOTOS,
+            "images": FRAMES,
+            "challenge_id": CHALLENGE_ID,
+            "level": LEVEL,
+            "face": FACE,
+            "held_template": _text(HELD_TEMPLATE),
+            "holder_key": HOLDER_KEY_FIELD,
+        },
     },
     {
         "schema": VerifyRequest.model_json_schema(),
         "examples": {
             "embedding": {
                 "value": {"embedding": [0.6, -0.8], "level": "fmr-1e-3", **SIGNATURE_EXAMPLE}
+            },
+            "embeddings": {
+                "value": {"embeddings": [[0.6, -0.8], [0.8, -0.6]], **SIGNATURE_EXAMPLE}
             },
             "template": {"value": {"template": "kAAAAAAAAAB7Li4u", **SIGNATURE_EXAMPLE}},
         },

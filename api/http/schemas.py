@@ -7,9 +7,19 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from templates.keys.holder_key import PATTERN as HOLDER_KEY_PATTERN
+from verify import MAX_PROBE_PHOTOS
+
 HEX = "9f86d081884c7d659a2feaa0c55ad015a3bf4f1b2b0b822cd15d6c15b0f00a08"
 REQUEST_ID = "4b1f0d5c8f1e4c54a52b3c9f7e2d6a10"
 NONCE_EXAMPLE = "kT3v0m9Qe2-cB7xYwZ1a"
+HOLDER_KEY = "AAECAwQFBgcICQoLDA0ODxAREhMUFRYXGBkaGxwdHh8"
+
+
+HELD_TEMPLATE = (
+    "`held_template` of the enrollment, where the subject's holder keeps the template; else it "
+    "changes nothing."
+)
 
 
 class _Shape(BaseModel):
@@ -50,22 +60,50 @@ class EnrollmentAnswer(_Answer):
     template_id: str = Field(description="Changes with every enrollment.")
     contract_id: str = Field(examples=[HEX])
     replaced: bool = Field(description="An earlier enrollment was replaced.")
+    holder_key: bool = Field(description="It accepts nobody without the holder's key.")
     images: list[Photo] = Field(description="One for each photo; empty for a template.")
+    held_template: str | None = Field(
+        None,
+        description="Only with `storage=holder`: base64 of the sealed template, which the service "
+        "does not keep.",
+    )
 
 
 class TemplateRequest(_Shape):
     """A private template that a client lifted."""
 
     template: str = Field(description="Base64 of the wire bytes.")
+    storage: Literal["service", "holder"] = Field(
+        "service", description="Who keeps the sealed template."
+    )
+    holder_key: str | None = Field(
+        None,
+        pattern=HOLDER_KEY_PATTERN,
+        description="The holder's key: 32 random bytes, base64url.",
+        examples=[HOLDER_KEY],
+    )
 
 
 class VerifyRequest(_Shape):
-    """A probe that is not a photo, signed: exactly one of embedding and template."""
+    """A probe that is not a photo, signed: exactly one of embedding, embeddings and template."""
 
     embedding: list[float] | None = Field(None, description="Unit-norm, of the contract's n.")
+    embeddings: list[list[float]] | None = Field(
+        None,
+        min_length=1,
+        max_length=MAX_PROBE_PHOTOS,
+        description="Such embeddings of one person, which are averaged.",
+    )
     template: str | None = Field(None, description="Base64 of a lifted probe's wire bytes.")
     level: str | None = Field(
         None, description="Security level; default from the contract, or the lowest allowed."
+    )
+    held_template: str | None = Field(None, description=HELD_TEMPLATE)
+    holder_key: str | None = Field(
+        None,
+        pattern=HOLDER_KEY_PATTERN,
+        description="The holder's key, where the enrollment needs one.",
+        examples=[HOLDER_KEY],
     )
     nonce: str = Field(
         pattern="^[A-Za-z0-9_-]{16,64}$",
@@ -86,12 +124,42 @@ class VerifyAnswer(_Answer):
     """The decision."""
 
     decision: Literal["accept", "reject"]
-    reason: Literal["match", "no_match"]
+    reason: Literal["match", "no_match", "liveness"]
+    liveness: Literal["passed", "failed", "not_checked"] = Field(
+        description="Whether a living person made the probe."
+    )
     level: str = Field(examples=["fmr-1e-3"])
     fmr: float = Field(description="False match rate of the level.", examples=[0.001])
     contract_id: str = Field(examples=[HEX])
     calibration_id: str = Field(examples=[HEX])
     distance: float | None = Field(None, description="Only for keys with the right `scores`.")
+    liveness_failure: (
+        Literal[
+            "not_frontal",
+            "jump",
+            "no_turn",
+            "missing_movement",
+            "wrong_order",
+            "another_person",
+            "passive",
+        ]
+        | None
+    ) = Field(None, description="Why liveness failed: only for keys with `scores`.")
+
+
+class ChallengeAnswer(_Answer):
+    """Movements to make, and the id that their frames are sent with."""
+
+    challenge_id: str
+    movements: list[Literal["turn_left", "turn_right", "look_up", "look_down", "come_closer"]] = (
+        Field(
+            description="In this order, as the person sees them who makes them.",
+            examples=[["turn_left", "look_up", "come_closer"]],
+        )
+    )
+    min_frames: int = Field(examples=[5])
+    max_frames: int = Field(examples=[12])
+    expires_at: str = Field(examples=["2026-01-31T12:01:00Z"])
 
 
 class Subject(_Shape):
@@ -100,9 +168,11 @@ class Subject(_Shape):
     subject_id: str = Field(examples=["alice"])
     template_id: str
     contract_id: str = Field(examples=[HEX])
-    current: bool = Field(description="Of the contract in force; otherwise enroll again.")
+    current: bool = Field(description="Served by the contract in force; otherwise enroll again.")
     enrolled_by: Literal["photos", "template"]
     photos: int = Field(description="Photos that were averaged; 0 for a template.")
+    storage: Literal["service", "holder"] = Field(description="Who keeps the sealed template.")
+    holder_key: bool = Field(description="It accepts nobody without the holder's key.")
     created_at: str = Field(examples=["2026-01-31T12:00:00Z"])
     updated_at: str = Field(examples=["2026-01-31T12:00:00Z"])
 
@@ -158,7 +228,7 @@ class ReceiptClaims(BaseModel):
     tenant: str
     subject: str = Field(description="Pseudonym: HMAC of the subject id under a secret key.")
     erased_at: str = Field(examples=["2026-01-31T12:00:00.000000+00:00"])
-    held: bool = Field(description="False: no template was stored.")
+    held: bool = Field(description="False: nobody was enrolled.")
     contract_id: str | None = Field(description="Of the template; null: none was held.")
     erased: list[ErasedItem] = Field(description="Every kind of record, with what was removed.")
     signing_key: str = Field(description="`receipt_key.key_id` of GET /v1/contract.")
@@ -179,12 +249,6 @@ class ExportAnswer(_Answer):
     key_id: str = Field(description="Names the export key.")
 
 
-class ImportRequest(_Shape):
-    """What an export call returned."""
-
-    export: str
-
-
 class ImportAnswer(_Answer):
     """The subject is enrolled."""
 
@@ -192,18 +256,28 @@ class ImportAnswer(_Answer):
     template_id: str
     contract_id: str = Field(examples=[HEX])
     replaced: bool
+    holder_key: bool = Field(description="It accepts nobody without the holder's key.")
+
+
+class RetiredReceiptKey(_Shape):
+    """A key that receipts were signed with until it was retired."""
+
+    key_id: str
+    public_key: str = Field(description="32 bytes, base64.")
+    retired_at: str = Field(examples=["2026-01-31T12:00:00.000000+00:00"])
 
 
 class ReceiptKey(_Shape):
-    """The key that receipts are verified with."""
+    """The key that receipts are verified with, and those before it, the latest first."""
 
     algorithm: Literal["Ed25519"]
     key_id: str
     public_key: str = Field(description="32 bytes, base64.")
+    retired: list[RetiredReceiptKey]
 
 
 class ContractAnswer(_Answer):
-    """The contract in force: everything but its cohort."""
+    """The contract in force: everything but what is sealed."""
 
     contract_id: str = Field(examples=[HEX])
     binding: dict[str, Any]
@@ -211,10 +285,23 @@ class ContractAnswer(_Answer):
     calibrations: list[dict[str, Any]]
     default_level: str
     photo_consistency: float
+    probe_consistency: float
     template_stranger_score: float
     template_foot_point_norm: list[float]
-    cohort_size: int
-    cohort_id: str
+    nobody_id: str = Field(
+        description="Of what scores are computed from: it changes with every calibration.",
+        examples=[HEX],
+    )
+    verdict: dict[str, Any] | None = Field(
+        description="How private and how accurate the calibration found it, and, where people were "
+        "labelled, the `groups` with their worst; each with a status, `PASS` or `FAIL`; null: not "
+        "measured."
+    )
+    liveness: dict[str, Any] | None = Field(
+        default=None,
+        description="The liveness threshold with its graphs and error rates, and the policy where "
+        "the contract has one (docs/liveness.md); absent where there is none.",
+    )
     photos: bool = Field(description="The service runs with a model pack.")
     generator: bool = Field(description="GET /v1/contract/generator has a generator to give.")
     template_enrollment: bool = Field(
@@ -233,6 +320,10 @@ class KeyAnswer(_Answer):
         description="Security levels that it may ask for; not those below the lowest that the "
         "deployment or the key allows.",
         examples=[["fmr-1e-3", "fmr-1e-4"]],
+    )
+    liveness: dict[str, Literal["off", "passive", "active", "both"]] = Field(
+        description="What a verification at each of these levels must pass (docs/liveness.md).",
+        examples=[{"fmr-1e-3": "off", "fmr-1e-4": "active"}],
     )
     expires_at: str | None = Field(examples=["2026-01-31T12:00:00Z"])
     demo: bool = Field(description="The service runs with the demo model.")
@@ -259,7 +350,7 @@ class StoredAnswer(_Answer):
     subject_id: str = Field(examples=["alice"])
     template_id: str
     contract_id: str = Field(examples=[HEX])
-    current: bool = Field(description="Of the contract in force; otherwise enroll again.")
+    current: bool = Field(description="Served by the contract in force; otherwise enroll again.")
     strategy: str | None = Field(description="How it was lifted; null: by another contract.")
     decoys: int | None = Field(description="Decoys among its m directions.")
     n: int = Field(description="Numbers in an embedding.")
@@ -284,6 +375,7 @@ class AuditCell(_Shape):
     """The strongest attack on one property by one kind of attacker."""
 
     property: str
+    leaked: str = Field(description="What was stolen: `database`, `master key` or `holder keys`.")
     knowledge: str
     attack: str
     variant: str | None
@@ -300,6 +392,7 @@ class AuditCell(_Shape):
     limit: str | None = Field(description="Name of the limit.")
     most: float = Field(description="The limit; 1 limits nothing.")
     status: str | None
+    reason: str | None = Field(description="Why no limit is set; null where there is one.")
 
 
 class AuditLimit(_Shape):

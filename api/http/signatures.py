@@ -33,7 +33,7 @@ def checked_nonce(
     body
         The request, with the fields ``nonce``, ``timestamp`` and ``hmac``.
     probe
-        Wire bytes, or the numbers of an embedding, (n,) float64.
+        Wire bytes, or the numbers of an embedding, (n,) float64, or of several, (k, n).
     key, key_prefix
         The probe key of the API key that the request came with, and that key's prefix.
     window_s

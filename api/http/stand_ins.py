@@ -1,7 +1,10 @@
 """Stand-ins of unknown subjects: what opening a real template costs, and what is told of them."""
 
+import contextlib
 import hashlib
 import hmac
+import secrets
+from collections.abc import Callable
 
 from enroll.enroller import WIRE_DTYPE
 from templates.contract import wire
@@ -11,8 +14,6 @@ from templates.keys.sealing import MasterKeyring, encode_parts
 from templates.space.subspace import AffineSubspace
 from templates.store.envelope import Envelope, Owner, close_envelope, open_envelope
 from verify import StandIn, lift_stand_in
-
-STAND_IN_SECRET = "stand-ins"  # noqa: S105 - a name, not a secret
 
 
 class StandIns:
@@ -25,11 +26,13 @@ class StandIns:
     keyring
         What seals the template that is opened for all of them, as the store keeps real ones.
     key
-        32 secret bytes, the same in all processes: without them nobody can tell which template an
-        unknown subject gets.
+        Tells 32 secret bytes, the same in all processes: without them nobody can tell which
+        template an unknown subject gets. Asked each time, as a renewal changes them.
     """
 
-    def __init__(self, contract: Contract, keyring: MasterKeyring, *, key: bytes) -> None:
+    def __init__(
+        self, contract: Contract, keyring: MasterKeyring, *, key: Callable[[], bytes]
+    ) -> None:
         self._contract = contract
         self._keyring = keyring
         self._key = key
@@ -38,7 +41,7 @@ class StandIns:
 
     def lift(self, tenant: str, subject: str) -> AffineSubspace:
         """Lift the template that an unknown subject's distances are told of."""
-        digest = hmac.digest(self._key, encode_parts(tenant, subject), hashlib.sha256)
+        digest = hmac.digest(self._key(), encode_parts(tenant, subject), hashlib.sha256)
         return lift_stand_in(self._contract, digest)
 
     def open(self, lifted: AffineSubspace | None) -> StandIn:
@@ -51,10 +54,15 @@ class StandIns:
             plain = open_envelope(self._sealed, self._nobody, self._keyring)
         return StandIn(plain, lifted)
 
+    def open_in_vain(self, held_template: bytes) -> None:
+        """Try a held template that no enrollment waits for: the work that another one costs."""
+        foreign = Envelope(self._sealed.wrapped_key, held_template)
+        with contextlib.suppress(SealError):
+            open_envelope(foreign, self._nobody, self._keyring)
+
     def _seal(self) -> Envelope:
-        data = wire.encode(
-            self._contract.cohort[0], contract_id=self._contract.contract_id, dtype=WIRE_DTYPE
-        )
+        lifted = lift_stand_in(self._contract, secrets.token_bytes(32))
+        data = wire.encode(lifted, contract_id=self._contract.contract_id, dtype=WIRE_DTYPE)
         return close_envelope(data, self._nobody, self._keyring)
 
     def __repr__(self) -> str:

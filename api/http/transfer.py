@@ -13,10 +13,12 @@ It holds::
 The header tells when the export was made (:class:`templates.store.transfers.Stamp`), so that an old
 one does not undo an erasure or another enrollment; in exports of earlier versions it does not.
 
-The template inside is un-rotated, float32: another tenant's rotation can be put on it, and no
-second rounding to half precision takes place.
+The template inside is without the tenant's rotation, float32: it gets one of the importing
+tenant's, and no second rounding to half precision takes place. A holder's rotation stays, and the
+header names its salt: the enrollment needs the same key after the import.
 """
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -25,17 +27,19 @@ from pathlib import Path
 from api.http.errors import StartError
 from templates.contract.canonical import Fields, Json, canonical_json, parse_object
 from templates.errors import ContractError, ContractMismatch, InvalidTemplate, SealError
-from templates.keys.sealing import MasterKeyring
+from templates.keys.sealing import MasterKeyring, sealed_key_id
 from templates.store.audit_chain import Anchor
 from templates.store.identifiers import InvalidIdentifier
+from templates.store.secret import Secret
 from templates.store.subject_rows import Source
-from templates.store.transfers import Stamp
+from templates.store.transfers import ExportSuperseded, Stamp
 
 MAGIC = b"VEILEXP1"
 CONTRACT_ID_BYTES = 32
 LENGTH_BYTES = 4
 MAX_HEADER_BYTES = 4096
 PURPOSE = "export"
+HOLDER_SALT = re.compile(r"[0-9a-f]{32}")
 
 
 @dataclass(frozen=True)
@@ -48,10 +52,13 @@ class ExportKey:
         Seals with its first key, opens with all of them.
     tenant_bound
         True for the deployment's own key: one tenant's export does not open for another.
+    retired
+        Ids of the keys of the keyring that somebody may have stolen.
     """
 
     keyring: MasterKeyring
     tenant_bound: bool
+    retired: frozenset[str] = frozenset()
 
     @classmethod
     def from_file(cls, path: Path) -> "ExportKey":
@@ -68,9 +75,11 @@ class ExportKey:
             raise StartError(f"the export key cannot be used: {error}") from error
 
     @classmethod
-    def from_secret(cls, secret: bytes) -> "ExportKey":
-        """Make the key from a 32-byte secret of the deployment."""
-        return cls(MasterKeyring([secret], source="the deployment's export key"), tenant_bound=True)
+    def from_secret(cls, secret: Secret) -> "ExportKey":
+        """Make the key from a secret of the deployment."""
+        keys = [secret.value, *(before.value for before in secret.retired)]
+        keyring = MasterKeyring(keys, source="the deployment's export key")
+        return cls(keyring, tenant_bound=True, retired=frozenset(keyring.key_ids[1:]))
 
     @property
     def key_id(self) -> str:
@@ -83,9 +92,9 @@ class ExportKey:
 
 @dataclass(frozen=True)
 class Exported:
-    """One subject as it travels: ``wire`` is an un-rotated template.
+    """One subject as it travels: ``wire`` is a template without the tenant's rotation.
 
-    ``stamp`` is None in an export of an earlier version.
+    ``stamp`` is None in an export of an earlier version, ``holder_salt`` where no key is needed.
     """
 
     subject_id: str
@@ -94,6 +103,7 @@ class Exported:
     photos: int
     wire: bytes = field(repr=False)
     stamp: Stamp | None = None
+    holder_salt: str | None = None
 
 
 def seal_export(exported: Exported, *, key: ExportKey, tenant: str) -> bytes:
@@ -109,6 +119,8 @@ def seal_export(exported: Exported, *, key: ExportKey, tenant: str) -> bytes:
             "exported_at": exported.stamp.at.isoformat(),
             "audit_line": str(exported.stamp.line),
         }
+    if exported.holder_salt is not None:
+        fields["holder_salt"] = exported.holder_salt
     header = canonical_json(fields)
     plain = len(header).to_bytes(LENGTH_BYTES, "big") + header + exported.wire
     sealed = key.keyring.seal(
@@ -117,24 +129,30 @@ def seal_export(exported: Exported, *, key: ExportKey, tenant: str) -> bytes:
     return MAGIC + bytes.fromhex(exported.contract_id) + sealed
 
 
-def open_export(data: bytes, *, key: ExportKey, tenant: str, contract_id: str) -> Exported:
+def open_export(
+    data: bytes, *, key: ExportKey, tenant: str, contract_ids: Sequence[str], restore: bool = False
+) -> Exported:
     """Decrypt an export that a client sent.
+
+    `restore` opens one that was sealed with a retired key, too.
 
     Raises
     ------
     InvalidTemplate
         If it is no export, was altered, or was sealed with another key or for another tenant.
     ContractMismatch
-        If it belongs to another contract than ``contract_id``.
+        If it belongs to none of ``contract_ids``, of which the first is the service's.
+    ExportSuperseded
+        If its key was retired.
     """
     start = len(MAGIC) + CONTRACT_ID_BYTES
     if len(data) < start or not data.startswith(MAGIC):
         raise InvalidTemplate("this is not an export of Veilface")
-    export_contract_id = data[len(MAGIC) : start].hex()
-    if export_contract_id != contract_id:
+    contract_id = data[len(MAGIC) : start].hex()
+    if contract_id not in contract_ids:
         raise ContractMismatch(
-            f"the export belongs to contract {export_contract_id[:16]}, the service to "
-            f"{contract_id[:16]}; the subject must enroll again"
+            f"the export belongs to contract {contract_id[:16]}, the service to "
+            f"{contract_ids[0][:16]}; the subject must enroll again"
         )
     try:
         plain = key.keyring.open(
@@ -145,6 +163,12 @@ def open_export(data: bytes, *, key: ExportKey, tenant: str, contract_id: str) -
             "the export does not open: it was altered, or sealed with another export key or for "
             "another tenant"
         ) from None
+    if not restore and sealed_key_id(data[start:]) in key.retired:
+        raise ExportSuperseded(
+            "the key that this export was sealed with was retired, because it may have been "
+            "stolen: whoever has it could have made the export; export the subject again where it "
+            "is enrolled, or enroll it; an operator may restore an old export knowingly"
+        )
     return _parse(plain, contract_id)
 
 
@@ -163,12 +187,15 @@ def _parse(plain: bytes, contract_id: str) -> Exported:
             photos=fields.integer("photos"),
             wire=plain[LENGTH_BYTES + length :],
             stamp=_stamp(fields) if "exported_at" in parsed else None,
+            holder_salt=fields.text("holder_salt") if "holder_salt" in parsed else None,
         )
         fields.done()
     except (ContractError, InvalidIdentifier) as error:
         raise InvalidTemplate(f"the export's header is broken: {error}") from None
     if exported.contract_id != contract_id:
         raise InvalidTemplate("the export names one contract outside and another one inside")
+    if exported.holder_salt is not None and not HOLDER_SALT.fullmatch(exported.holder_salt):
+        raise InvalidTemplate("the export's header names no salt of a holder's rotation")
     if exported.source not in list(Source) or not 0 <= exported.photos <= 10:
         raise InvalidTemplate("the export's header is not one of a subject")
     return exported

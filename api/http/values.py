@@ -7,10 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from api.http.bodies import text_field
+from api.http.bodies import base64_field, text_field
 from api.http.errors import ApiError
 from models.pack import FacePolicy
 from templates.errors import InvalidEmbedding
+from templates.store.subject_rows import Storage
+from verify import MAX_PROBE_PHOTOS
 
 MAX_EMBEDDING = 4096
 
@@ -54,6 +56,38 @@ def face_policy(value: str | None) -> FacePolicy:
     return FacePolicy(value)
 
 
+def storage_of(fields: Mapping[str, Any]) -> Storage:
+    """Return who is to keep a template: the service, unless the field ``storage`` says otherwise.
+
+    Raises
+    ------
+    ApiError
+        ``validation_failed``.
+    """
+    value = text_field(fields.get("storage"), "storage")
+    if value is None:
+        return Storage.SERVICE
+    if value not in list(Storage):
+        raise ApiError(
+            "validation_failed", "storage must be service or holder", {"field": "storage"}
+        )
+    return Storage(value)
+
+
+def held_template_of(fields: Mapping[str, Any]) -> bytes | None:
+    """Return the sealed template that a holder sent in the field ``held_template``, if any did.
+
+    Raises
+    ------
+    ApiError
+        ``validation_failed`` if it is no string, ``invalid_template`` if it is no base64. What it
+        holds is looked at with the subject only.
+    """
+    if "held_template" not in fields:
+        return None
+    return base64_field(fields["held_template"], "held_template", code="invalid_template")
+
+
 def embedding_of(value: Any) -> NDArray[np.float64]:
     """Return a list of JSON numbers as an array, (k,); the verifier checks length and norm.
 
@@ -70,3 +104,19 @@ def embedding_of(value: Any) -> NDArray[np.float64]:
         return np.array(value, dtype=np.float64)
     except OverflowError:
         raise InvalidEmbedding("an embedding holds a number that is not finite") from None
+
+
+def embeddings_of(value: Any) -> NDArray[np.float64]:
+    """Return 1 to 5 lists of JSON numbers as an array, (k, n).
+
+    Raises
+    ------
+    InvalidEmbedding
+        As :func:`embedding_of`, or if there are more, or they differ in length.
+    """
+    if not isinstance(value, list) or not 0 < len(value) <= MAX_PROBE_PHOTOS:
+        raise InvalidEmbedding(f"embeddings are a list of 1 to {MAX_PROBE_PHOTOS} lists of numbers")
+    rows = [embedding_of(row) for row in value]
+    if len({len(row) for row in rows}) > 1:
+        raise InvalidEmbedding("the embeddings differ in length")
+    return np.stack(rows)

@@ -25,6 +25,7 @@ FIELDS = frozenset(
         "key_id",
         "subject",
         "decision",
+        "liveness",
         "security_level",
         "error_type",
         "receipt_id",

@@ -67,7 +67,7 @@ ERRORS = Counter("veilface_errors", "Errors that were answered.", ("code",), reg
 DECISIONS = Counter(
     "veilface_decisions",
     "Verifications that were decided.",
-    ("decision", "level", "probe"),
+    ("decision", "reason", "level", "probe"),
     registry=REGISTRY,
 )
 STEP_SECONDS = Histogram(
@@ -93,6 +93,12 @@ RATE_STORAGE_FAILURES = Counter(
 )
 PURGE_FAILURES = Counter(
     "veilface_purge_failures", "Rounds of housekeeping that failed.", registry=REGISTRY
+)
+WEBHOOKS = Counter(
+    "veilface_webhooks",
+    "Webhooks that were sent: `taken` by the endpoint, or `failed` for now.",
+    ("outcome",),
+    registry=REGISTRY,
 )
 IN_FLIGHT = Gauge(
     "veilface_requests_in_flight",
@@ -150,17 +156,18 @@ def step(name: str) -> AbstractContextManager[object]:
     return STEP_SECONDS.labels(name).time()
 
 
-def count_decision(*, accepted: bool, level: str, probe: str) -> None:
+def count_decision(*, accepted: bool, reason: str, level: str, probe: str) -> None:
     """Count one verification that was decided.
 
     Parameters
     ----------
-    accepted, level
-        The decision, and the security level of the contract that it was made at.
+    accepted, reason, level
+        The decision, ``match``, ``no_match`` or ``liveness``, and the security level of the
+        contract that it was made at.
     probe
-        ``photo``, ``embedding`` or ``template``.
+        ``photo``, ``frames``, ``embedding`` or ``template``.
     """
-    DECISIONS.labels("accept" if accepted else "reject", level, probe).inc()
+    DECISIONS.labels("accept" if accepted else "reject", reason, level, probe).inc()
 
 
 def count_request(*, route: str | None, method: str, status: int, seconds: float) -> None:

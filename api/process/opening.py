@@ -15,6 +15,7 @@ from sqlalchemy import inspect, select
 from sqlalchemy.engine import Connection, make_url
 
 from api.http.errors import DatabaseAway, StartError
+from api.http.liveness import deployment_policy
 from api.settings import Settings
 from models.errors import ModelError
 from models.pack import ModelPack
@@ -22,11 +23,16 @@ from templates.contract.document import Contract
 from templates.decoys import DecoyGenerator, DecoyPool, load_source
 from templates.errors import ContractMismatch, SealError, StoreUnavailable, VeilfaceError
 from templates.keys.sealing import KeyringSealer, MasterKeyring
+from templates.keys.webhook_secret import read_webhook_secrets
 from templates.store import TemplateStore
 from templates.store.database import Database
 from templates.store.lockout import LockoutPolicy
 from templates.store.retention import Retention
 from templates.store.schema import MasterKeyCheckRow
+
+LOCKED_AFTER, LOCKED_AFTER_RESISTED = 5, 10
+"""Failures in a row that lock a subject unless the settings say otherwise; the second where the
+passive check is in force and known to resist attacks (NIST SP 800-63B)."""
 
 
 def database_in_use(url: str) -> bool:
@@ -131,19 +137,35 @@ def _create_or_load(path: Path) -> MasterKeyring:
         return MasterKeyring.load(path)
 
 
-def open_store(settings: Settings, keyring: MasterKeyring) -> TemplateStore:
+def open_store(
+    settings: Settings, keyring: MasterKeyring, contract: Contract | None = None
+) -> TemplateStore:
     """Open the store; :func:`prepare_database` must have run once before.
+
+    Parameters
+    ----------
+    contract
+        What verifications are decided by; it may allow more failures before a lock.
 
     Raises
     ------
     StartError
-        If the URL is wrong or the SQLite file cannot be made.
+        If the URL is wrong, or the SQLite file cannot be made, or the webhook's secrets be read.
     """
+    try:
+        secret_file = settings.webhook_secret_file
+        if secret_file is not None:
+            read_webhook_secrets(secret_file)
+    except SealError as error:
+        raise StartError(str(error)) from None
     try:
         if settings.database_url is None:
             settings.data_dir.mkdir(parents=True, exist_ok=True)
         return TemplateStore(
-            settings.resolved_database_url, keyring, lockout=lockout_policy(settings)
+            settings.resolved_database_url,
+            keyring,
+            lockout=lockout_policy(settings, contract),
+            tells_events=secret_file is not None,
         )
     except (OSError, VeilfaceError) as error:
         raise StartError(f"the database cannot be opened: {error}") from None
@@ -169,14 +191,26 @@ def retention_of(settings: Settings) -> Retention:
     return Retention(days(settings.retention_days), days(settings.retention_disuse_days))
 
 
-def lockout_policy(settings: Settings) -> LockoutPolicy:
-    """Return what the settings say of failed attempts."""
+def lockout_policy(settings: Settings, contract: Contract | None) -> LockoutPolicy:
+    """Return what settings and contract say of failed attempts (docs/liveness.md "Policy")."""
+    after = settings.lockout_after
+    if after is None:
+        resisted = contract is not None and _resists_attacks(settings, contract)
+        after = min(
+            LOCKED_AFTER_RESISTED if resisted else LOCKED_AFTER, settings.lockout_disable_at
+        )
     return LockoutPolicy(
-        after=settings.lockout_after,
+        after=after,
         first_s=settings.lockout_first_s,
         longest_s=settings.lockout_longest_s,
         disable_at=settings.lockout_disable_at,
     )
+
+
+def _resists_attacks(settings: Settings, contract: Contract) -> bool:
+    """Whether every verification must look live, by a check that is known to resist attacks."""
+    checked = deployment_policy(settings.liveness, contract).passive
+    return checked and contract.liveness is not None and contract.liveness.resists_attacks
 
 
 def prepare_database(store: TemplateStore) -> None:
@@ -203,7 +237,8 @@ def open_contract(settings: Settings, keyring: MasterKeyring) -> Contract:
     Raises
     ------
     StartError
-        If the file is absent, broken, or sealed with another master key.
+        If the file is absent, broken, sealed with another master key, or of an earlier rotation
+        version.
     """
     path = settings.resolved_contract_file
     if not path.is_file():
@@ -212,9 +247,45 @@ def open_contract(settings: Settings, keyring: MasterKeyring) -> Contract:
             "(setting contract_file)"
         )
     try:
-        return Contract.load(path, file_sealer(keyring))
+        contract = Contract.load(path, file_sealer(keyring))
+        contract.binding.require_rotation_version()
     except (OSError, VeilfaceError) as error:
         raise StartError(f"the contract file {path} cannot be used: {error}") from error
+    return contract
+
+
+def weak_privacy(contract: Contract) -> str | None:
+    """Say in one sentence why a contract's templates are not to be trusted, or None."""
+    if contract.verdict is None:
+        return "nobody measured what a thief of a template gets out of it"
+    privacy = contract.verdict.privacy
+    if privacy.status == "PASS":
+        return None
+    if privacy.rate.value <= privacy.limit:
+        return str(privacy.shortfall)
+    return (
+        f"a thief of a template gets a match for the face from {100 * privacy.rate.value:.3g} % of "
+        f"them ({privacy.rate.errors} of {privacy.rate.trials}), and {100 * privacy.limit:.3g} % "
+        "is the most that passes"
+    )
+
+
+def require_privacy(contract: Contract, settings: Settings) -> str | None:
+    """Refuse a contract that is not private, or return what to warn of where that is accepted.
+
+    Raises
+    ------
+    StartError
+        Its privacy failed or was not measured, and ``accept_weak_privacy`` is not set.
+    """
+    why = weak_privacy(contract)
+    if why is not None and not settings.accept_weak_privacy:
+        raise StartError(
+            f"the contract fails on privacy: {why}. Build decoys that are like your people "
+            "(`veilface decoys build --like`) and calibrate again; or serve it knowingly with "
+            "--accept-weak-privacy"
+        )
+    return why
 
 
 def open_decoys(

@@ -3,25 +3,49 @@
 The commands ``decoys build`` and ``calibrate`` and the demo are callers of these functions.
 """
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from attacks.more_faces import more_faces
+from attacks.operating_point import (
+    DIMS,
+    OperatingPoint,
+    judge_accuracy,
+    judge_groups,
+    judge_privacy,
+    smallest_private,
+)
+from attacks.privacy import AttackSetup, privacy_of
 from models.extraction import Extraction
 from models.pack import ModelPack
 from templates.contract.binding import embedding_id
 from templates.contract.canonical import Json
-from templates.contract.document import Binding
-from templates.decoys import Attributes, DecoyGenerator, DecoyPool, DecoySource
+from templates.contract.document import Binding, Contract
+from templates.contract.verdict import Verdict
+from templates.decoys import NOISE_ENERGY, Attributes, DecoyGenerator, DecoyPool, DecoySource
 from templates.errors import ContractMismatch, VeilfaceError
 from templates.keys.rotation import ROTATION_VERSION
-from templates.space.lifting import Strategy
-from verify import Calibrated, CalibrationOptions, LabelledFolder, calibrate, read_lfw_pairs
-from verify.own_decoys import require_others
+from templates.space.lifting import Strategy, plain_strategy
+from verify import (
+    CalibrationOptions,
+    CalibrationReport,
+    LabelledFolder,
+    calibrate,
+    read_lfw_pairs,
+)
+from verify.consistency import match_cosine
+from verify.evaluation.attributes import resembling_rows
+from verify.group_rates import PhotoLabels
+from verify.own_decoys import SAME_PHOTO, require_others
 from verify.trials import chosen_photos
 
 DEFAULT_DIM = 64
-"""Dimension of stored templates: the operating point that docs/privacy.md arrives at."""
+"""Dimension of stored templates where a search finds none that is private, and of an audit."""
 
 
 DEFAULT_PROBE_DIM = 4
@@ -51,9 +75,9 @@ def acquired_json(extraction: Extraction) -> dict[str, Json]:
     }
 
 
-def default_probe_dims(m: int) -> tuple[int, ...]:
+def default_probe_dims(m: int | None) -> tuple[int, ...]:
     """Dimensions of lifted probes where none are asked for: no larger than the templates'."""
-    return (min(DEFAULT_PROBE_DIM, m),)
+    return (DEFAULT_PROBE_DIM if m is None else min(DEFAULT_PROBE_DIM, m),)
 
 
 def made_with(pack: ModelPack) -> str:
@@ -84,9 +108,36 @@ def require_made_with(source: DecoySource, pack: ModelPack) -> None:
         )
 
 
-def make_generator(extraction: Extraction, pack: ModelPack) -> DecoyGenerator:
-    """Fit the generator of decoys that belong to nobody to descriptors of the pack."""
-    return DecoyGenerator.fit(extraction.descriptors, made_with=made_with(pack))
+@dataclass(frozen=True, eq=False)
+class LikeSample:
+    """Descriptors of a few faces of the kind that will be enrolled, and K names of the people."""
+
+    extraction: Extraction
+    people: Sequence[str]
+
+
+def make_generator(
+    extraction: Extraction, pack: ModelPack, *, like: LikeSample | None = None
+) -> DecoyGenerator:
+    """Fit the generator of decoys that belong to nobody to descriptors of the pack.
+
+    Raises
+    ------
+    PreparationError
+        Photos of ``like`` are also among those that are adapted to it.
+    """
+    rows, made, noise = extraction.descriptors, made_with(pack), NOISE_ENERGY / pack.info.n
+    if like is None:
+        return DecoyGenerator.fit(rows, made_with=made, noise=noise)
+    sample = like.extraction.descriptors
+    twice = len(resembling_rows(sample, rows, cosine=SAME_PHOTO))
+    if twice:
+        raise PreparationError(
+            f"{twice} of the {len(sample)} photos to adapt to are among the others too: the fit "
+            "would take them for people whom it has not seen. Give folders that share no people, "
+            "or leave them out"
+        )
+    return DecoyGenerator.adapt(rows, sample, like.people, made_with=made, noise=noise)
 
 
 def make_pool(
@@ -101,8 +152,12 @@ def make_pool(
     """
     if labels is None:
         return DecoyPool(extraction.descriptors, made_with=made_with(pack))
-    found = [labels.get(path.resolve()) for path in extraction.paths]
-    missing = [path.name for path, label in zip(extraction.paths, found, strict=True) if not label]
+    labels_of_photos = [labels.get(path.resolve()) for path in extraction.paths]
+    missing = [
+        path.name
+        for path, label in zip(extraction.paths, labels_of_photos, strict=True)
+        if not label
+    ]
     if missing:
         raise PreparationError(
             f"{len(missing)} photos have no label, the first is {missing[0]}; give the label file "
@@ -110,7 +165,7 @@ def make_pool(
         )
     return DecoyPool(
         extraction.descriptors,
-        labels=[label for label in found if label],
+        labels=[label for label in labels_of_photos if label],
         made_with=made_with(pack),
     )
 
@@ -137,6 +192,15 @@ def binding_for(pack: ModelPack, source: DecoySource, *, strategy: Strategy, m: 
     return binding
 
 
+@dataclass(frozen=True)
+class CalibratedFolder:
+    """A contract with its verdict, the report of its calibration, and why it has its dimension."""
+
+    contract: Contract
+    report: CalibrationReport
+    point: OperatingPoint
+
+
 def calibrate_folder(
     folder: LabelledFolder,
     extraction: Extraction,
@@ -144,21 +208,36 @@ def calibrate_folder(
     pack: ModelPack,
     source: DecoySource,
     strategy: Strategy,
-    m: int,
+    m: int | None,
     options: CalibrationOptions,
     exclude: Collection[str] = (),
     aliases: Mapping[str, str] | None = None,
+    labels: PhotoLabels | None = None,
     progress: Callable[[str, float], None] | None = None,
-) -> Calibrated:
-    """Calibrate on the descriptors of a labelled folder.
+) -> CalibratedFolder:
+    """Calibrate on the descriptors of a labelled folder; judge privacy, accuracy and groups.
 
     LFW's own pairs are used for the ten-fold protocol where ``pairs.txt`` lies in the folder.
+
+    Parameters
+    ----------
+    m
+        Dimension of the templates; None for the smallest at which they are private.
+    labels
+        Of the photos of ``extraction``, for rates by group of people.
 
     Raises
     ------
     ContractError
         The decoys were made of these people, or the data are too few for a single level.
+    PreparationError
+        The strategy has no decoys.
     """
+    if not strategy.needs_decoys:
+        raise PreparationError(
+            f"templates of strategy {strategy} conceal nothing; `veilface evaluate` measures it, "
+            "and no contract is made for it"
+        )
     name_of = dict(zip(folder.paths, folder.identities, strict=True))
     pairs_file = folder.root / "pairs.txt"
     pairs = None
@@ -170,19 +249,69 @@ def calibrate_folder(
     kept, staying = chosen_photos(names, exclude=exclude, aliases=aliases or {})
     if len(kept):
         require_others(source, extraction.descriptors[kept], staying)
-    return calibrate(
+    point = _operating_point(
+        extraction.descriptors[kept], staying, source, strategy=strategy, m=m, options=options
+    )
+    done = calibrate(
         extraction.descriptors,
         names,
-        binding=binding_for(pack, source, strategy=strategy, m=m),
+        binding=binding_for(pack, source, strategy=strategy, m=point.dim),
         source=source,
-        options=options,
+        options=replace(
+            options, probe_dims=tuple(dim for dim in options.probe_dims if dim <= point.dim)
+        ),
         exclude=exclude,
         aliases=aliases,
+        labels=labels,
         pairs=pairs,
         recorded=recorded_of(pack),
         dataset=folder.root.resolve().name,
         **more,
     )
+    verdict = Verdict(
+        privacy=point.tried[point.dim],
+        accuracy=judge_accuracy(
+            done.contract, photos=extraction.attempts, not_acquired=len(extraction.failures)
+        ),
+        groups=judge_groups(done.contract),
+    )
+    return CalibratedFolder(replace(done.contract, verdict=verdict), done.report, point)
+
+
+def _operating_point(
+    descriptors: NDArray[np.float32],
+    names: Sequence[str],
+    source: DecoySource,
+    *,
+    strategy: Strategy,
+    m: int | None,
+    options: CalibrationOptions,
+) -> OperatingPoint:
+    """Measure privacy: of one dimension, or of those on the way to the smallest that passes."""
+    setup = AttackSetup.of_people(
+        descriptors,
+        names,
+        source,
+        match_cosine=match_cosine(descriptors, names, seed=options.seed),
+        photos=options.photos_per_enrollment,
+        seed=options.seed,
+    )
+    plain = plain_strategy(strategy)
+    uncovered = None
+    if isinstance(source, DecoyPool):
+        uncovered = "who has the pool finds the decoys, and no attack of a calibration has it"
+    elif plain is not strategy:
+        uncovered = f"the attacks are on {plain} lifting, not on what {strategy} chooses by"
+    # With decoys in most of the dimensions little is left of a face for anybody.
+    dims = [dim for dim in DIMS if dim <= 3 * source.n // 4] if m is None else []
+    point = smallest_private(
+        lambda dim: judge_privacy(privacy_of(setup, strategy=strategy, m=dim), uncovered=uncovered),
+        dims,
+        otherwise=min(DEFAULT_DIM, source.n // 2) if m is None else m,
+    )
+    judgement = point.tried[point.dim]
+    basis = {**judgement.basis, **more_faces(setup, judgement, strategy=strategy, m=point.dim)}
+    return OperatingPoint(point.dim, {**point.tried, point.dim: replace(judgement, basis=basis)})
 
 
 def recorded_of(pack: ModelPack) -> dict[str, Json]:

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from api.http.errors import ApiError
 from api.http.levels import Levels
-from api.http.stand_ins import STAND_IN_SECRET, StandIns
+from api.http.liveness import LivenessRules
+from api.http.stand_ins import StandIns
 from api.http.transfer import Exported, ExportKey, seal_export
 from api.process.opening import (
     file_sealer,
@@ -41,12 +42,13 @@ from templates.contract.document import Contract
 from templates.decoys import Attributes, DecoyGenerator, DecoyPool
 from templates.errors import DecoyError, StoreBusy
 from templates.keys.randomness import Keystream
-from templates.keys.rotation import tenant_rotation
+from templates.keys.rotation import HAAR_VERSION, TenantRotation
 from templates.keys.sealing import MasterKeyring
 from templates.store import TemplateStore
 from templates.store.audit_log import By
-from templates.store.subject_rows import Source, SubjectTemplate
-from templates.store.subjects import Guard, StoredTemplate
+from templates.store.secret import SecretName
+from templates.store.subject_rows import Source, Storage, SubjectTemplate
+from templates.store.subjects import Guard, Precondition, StoredTemplate
 from templates.store.tenants import RetiredRotation
 from verify import Verifier
 
@@ -64,7 +66,7 @@ __all__ = [
 ]
 
 READS = 3
-"""Looks at a template whose rotation may be dropped between the looks at the two."""
+"""Looks at a template whose rotation key may be dropped between the looks at the two."""
 
 SUPERSEDED_CALIBRATIONS = (
     "the calibrations of the contract file are older ones: others of the same contract were served "
@@ -72,7 +74,8 @@ SUPERSEDED_CALIBRATIONS = (
 )
 
 TENANTS_KEPT = 64
-"""Tenants whose rotations a process keeps: 2 MB each where n = 512."""
+"""Tenants and epochs whose rotations a process keeps: 2 MB each where n = 512, for the matrix of
+version 1."""
 
 
 def _lacking(what: str) -> ApiError:
@@ -91,6 +94,7 @@ class NoDecoys:
         self.source_id = contract.binding.decoy_source_id
         self.n = contract.binding.n
         self.made_with: str | None = None
+        self.noise = 0.0
 
     def draw(
         self,
@@ -107,9 +111,9 @@ class NoDecoys:
 
 @dataclass(frozen=True, eq=False)
 class InRotation:
-    """What works with one epoch of one tenant's rotation, (n, n)."""
+    """What works with the rotations of one tenant in one epoch."""
 
-    rotation: NDArray[np.float64] = field(repr=False)
+    rotation: TenantRotation
     enroller: Enroller
     verifier: Verifier
 
@@ -124,7 +128,7 @@ class Runtime:
     contract: Contract
     source: DecoyPool | DecoyGenerator | None
     pack: ModelPack | None
-    export_key: ExportKey
+    operators_export_key: ExportKey | None
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
     _tenants: OrderedDict[tuple[str, int], InRotation] = field(
         default_factory=OrderedDict, repr=False
@@ -132,9 +136,13 @@ class Runtime:
 
     def __post_init__(self) -> None:
         self.levels = Levels(self.contract, lowest=self.settings.lowest_level)
-        self.stand_ins = StandIns(
-            self.contract, self.keyring, key=self.store.secrets.get(STAND_IN_SECRET)
+        self.liveness = LivenessRules(
+            self.contract,
+            self.pack,
+            deployment=self.settings.liveness,
+            levels=self.settings.liveness_of_levels,
         )
+        self.stand_ins = StandIns(self.contract, self.keyring, key=self._stand_in_key)
 
     @classmethod
     def open(cls, settings: Settings) -> "Runtime":
@@ -151,16 +159,24 @@ class Runtime:
         pack = open_pack(settings, contract)
         if pack is not None:
             try_inference(pack)
-        store = open_store(settings, keyring)
+        store = open_store(settings, keyring, contract)
         prepare_database(store)
         # Obtained now, so that no request waits for it, nor fails on it.
-        store.signer.pseudonym(settings.default_tenant, "-")
-        store.signer.public_key()
-        if settings.export_key_file is not None:
-            export_key = ExportKey.from_file(settings.export_key_file)
-        else:
-            export_key = ExportKey.from_secret(store.secrets.get("export"))
+        for name in set(SecretName) - {SecretName.CHAIN}:
+            store.secrets.get(name)
+        file = settings.export_key_file
+        export_key = None if file is None else ExportKey.from_file(file)
         return cls(settings, keyring, store, contract, source, pack, export_key)
+
+    @property
+    def export_key(self) -> ExportKey:
+        """The operator's key of exports, or else the deployment's own, as it is in force now."""
+        return self.operators_export_key or ExportKey.from_secret(
+            self.store.secrets.get(SecretName.EXPORT)
+        )
+
+    def _stand_in_key(self) -> bytes:
+        return self.store.secrets.get(SecretName.STAND_INS).value
 
     def superseded_calibrations(self) -> str | None:
         """Return what to tell the operator of a contract file that is older than one served."""
@@ -175,50 +191,60 @@ class Runtime:
     @property
     def _calibrations(self) -> tuple[str, list[str]]:
         contract = self.contract
-        return contract.contract_id, [each.calibration_id for each in contract.calibrations]
+        return contract.contract_id, [
+            calibration.calibration_id for calibration in contract.calibrations
+        ]
 
     def epoch(self, tenant: str) -> int:
-        """Return the epoch of the rotation that the tenant's new templates are in."""
+        """Return the epoch that the tenant's new templates are in."""
         return self.store.tenants.get(tenant).rotation_epoch
 
     def enroller(self, tenant: str, epoch: int) -> Enroller:
-        """Return the tenant's enroller for one epoch of its rotation."""
+        """Return the tenant's enroller for one epoch."""
         return self._of(tenant, epoch).enroller
 
     def verifier(self, tenant: str, epoch: int) -> Verifier:
-        """Return the tenant's verifier for one epoch of its rotation."""
+        """Return the tenant's verifier for one epoch."""
         return self._of(tenant, epoch).verifier
 
     def read(
-        self, tenant: str, subject: str, *, contract_id: str | None = None
+        self, tenant: str, subject: str, *, held_template: bytes | None = None
     ) -> tuple[SubjectTemplate, InRotation] | None:
         """Return a subject's template and what works with its rotation; None if there is none.
 
-        ``contract_id`` as for ``Subjects.get``.
+        Raises
+        ------
+        TemplateNotStored
+            If its holder keeps the template, and `held_template` is not it.
         """
         for _ in range(READS):
-            found = self.store.subjects.get(tenant, subject, contract_id=contract_id)
-            if found is None:
+            template = self.store.subjects.get(tenant, subject, held_template=held_template)
+            if template is None:
                 return None
             with contextlib.suppress(RetiredRotation):
-                return found, self._of(tenant, found.record.rotation_epoch)
-            # Between the two looks it was turned into a newer rotation.
+                return template, self._of(tenant, template.record.rotation_epoch)
+            # Between the two looks it was moved into a newer epoch.
         raise StoreBusy("the tenant's rotation is being renewed; send it again")
 
     def _of(self, tenant: str, epoch: int) -> InRotation:
         named = (tenant, epoch)
         with self._lock:
-            found = self._tenants.get(named)
-            if found is not None:
+            kept = self._tenants.get(named)
+            if kept is not None:
                 self._tenants.move_to_end(named)
-                return found
+                return kept
         # Outside of the lock: it takes a query and a QR decomposition.
         key = self.store.tenants.rotation_key(tenant, epoch=epoch).key
-        rotation = tenant_rotation(key, self.contract.binding.n)
+        rotation = TenantRotation(key, self.contract.binding.n)
+        # Made at its first use, the matrix of version 1 would tell that somebody is enrolled.
+        rotation.of("", HAAR_VERSION)
         made = InRotation(
             rotation=rotation,
             enroller=Enroller(
-                self.contract, self.source or NoDecoys(self.contract), rotation=rotation
+                self.contract,
+                self.source or NoDecoys(self.contract),
+                rotation=rotation,
+                lift_secret=self.store.secrets.get(SecretName.LIFTS).value,
             ),
             verifier=Verifier(self.contract, rotation=rotation),
         )
@@ -285,10 +311,15 @@ class Runtime:
         *,
         source: Source,
         photos: int,
+        storage: Storage = Storage.SERVICE,
+        precondition: Precondition | None = None,
         by: By,
         guard: Guard | None = None,
     ) -> StoredTemplate:
-        """Store an enrollment in place of an earlier one; `guard` as for ``Subjects.put``."""
+        """Store an enrollment in place of an earlier one.
+
+        `storage`, `precondition` and `guard` are those of ``Subjects.put``.
+        """
         binding = self.contract.binding
         return self.store.subjects.put(
             tenant,
@@ -301,13 +332,18 @@ class Runtime:
             source=source,
             photos=photos,
             template_id=enrollment.template_id,
+            holder_salt=enrollment.holder_salt,
             rotation_epoch=epoch,
+            storage=storage,
+            precondition=precondition,
             guard=guard,
             by=by,
         )
 
     def export(self, tenant: str, subject: str, *, by: By) -> bytes | None:
-        """Return one subject, un-rotated and encrypted; None if there is none.
+        """Return one subject, encrypted, without the tenant's rotation; None if there is none.
+
+        It stays turned by the holder's, whose key is not here.
 
         Its line stands in the audit log before it is returned.
 
@@ -315,24 +351,27 @@ class Runtime:
         ------
         ContractMismatch
             If the stored template belongs to another contract: its dimension may not even fit.
+        TemplateNotStored
+            If its holder keeps the template.
         """
         read = self.read(tenant, subject)
         if read is None:
             return None
-        found, room = read
+        template, in_rotation = read
         binding = self.contract.binding
-        binding.require_contract(found.record.contract_id, what="the stored template")
-        stored = wire.decode(found.wire, max_n=binding.n, max_m=binding.m)
-        # A rotation's inverse is its transpose.
-        plain = stored.subspace.rotated(room.rotation.T)
+        version = binding.require_contract(template.record.contract_id, what="the stored template")
+        stored = wire.decode(template.wire, max_n=binding.n, max_m=binding.m)
+        rotation = in_rotation.rotation.of(template.template_id, version)
+        plain = stored.subspace.turned_by(rotation.turned_back)
         exported = Exported(
             subject_id=subject,
             contract_id=self.contract.contract_id,
-            source=str(found.record.source),
-            photos=found.record.photos,
+            source=str(template.record.source),
+            photos=template.record.photos,
             wire=wire.encode(plain, contract_id=self.contract.contract_id, dtype="float32"),
+            holder_salt=template.holder_salt,
             stamp=self.store.transfers.stamp(
-                tenant, subject, template_id=found.record.template_id, by=by
+                tenant, subject, template_id=template.record.template_id, by=by
             ),
         )
         return seal_export(exported, key=self.export_key, tenant=tenant)

@@ -1,6 +1,6 @@
 // The camera, with live guidance: about one small frame a second is asked about, and slower where
-// the service says so. The photo that counts is taken at full size, when the visitor says so, and
-// asked about itself before it is handed on.
+// the service says so. The photos that count are taken at full size, a burst of three when the
+// visitor says so, and each is asked about itself before it is handed on.
 
 import { h, s } from "./dom.js";
 import { Problem, call, crops, form } from "./service.js";
@@ -10,6 +10,10 @@ const EVERY_MS = 1000;
 const FRAME = 480;
 const PHOTO = 1280;
 const QUALITY = 0.92;
+// Apart enough for another moment of the face, and over before anybody moves.
+const BURST = 3;
+const APART_MS = 300;
+const TAKE = `Take ${BURST} photos`;
 const OFF = "The camera is off.";
 
 // A picture of at most `side` pixels as JPEG, its middle square where that is asked for.
@@ -44,11 +48,13 @@ function whyNot(error) {
   return "The camera cannot be used: another program may have it. Upload photos instead.";
 }
 
-const release = (stream) => stream?.getTracks().forEach((each) => each.stop());
+export const after = (ms) => new Promise((done) => setTimeout(done, ms));
 
-// `onphoto(blob, name, seen)` is called for each photo that would do, with what the service saw, or
-// null where it could not be asked; `face()` says which face counts.
-export function camera({ onphoto, face, capture = "Take photo" }) {
+export const release = (stream) => stream?.getTracks().forEach((each) => each.stop());
+
+// `onburst(photos)` is called with the photos of a burst that would do, as {blob, name, seen}: `seen`
+// is what the service saw, or null where it could not be asked; `face()` says which face counts.
+export function camera({ onburst, face }) {
   const video = h("video", { playsinline: true, muted: true, "aria-label": "Your camera" });
   video.muted = true;
   const frame = s("rect", { class: "found", rx: "6" });
@@ -56,7 +62,7 @@ export function camera({ onphoto, face, capture = "Take photo" }) {
   const viewfinder = h("div", { class: "viewfinder", hidden: true }, video, overlay);
   const said = h("p", { class: "guidance", role: "status", "data-state": "idle" }, OFF);
   const start = h("button", { type: "button", class: "secondary", onclick: begin }, "Start camera");
-  const take = h("button", { type: "button", hidden: true, onclick: photo }, capture);
+  const take = h("button", { type: "button", hidden: true, onclick: burst }, TAKE);
   const refused = h("p", { class: "refused", role: "status" });
   let stream = null;
   let running = new AbortController();
@@ -134,7 +140,7 @@ export function camera({ onphoto, face, capture = "Take photo" }) {
           );
         }
       }
-      await new Promise((done) => setTimeout(done, Math.max(250, pause - (Date.now() - begun))));
+      await after(Math.max(250, pause - (Date.now() - begun)));
     }
   }
 
@@ -152,30 +158,55 @@ export function camera({ onphoto, face, capture = "Take photo" }) {
   const snap = (side, quality) =>
     picture(video, video.videoWidth, video.videoHeight, { side, quality, square: crops() });
 
-  async function photo() {
+  async function shots(signal) {
+    const taken = [];
+    while (taken.length < BURST) {
+      if (taken.length) await after(APART_MS);
+      if (over(signal)) break;
+      taken.push((await snap(PHOTO, QUALITY)).blob);
+    }
+    return taken;
+  }
+
+  // Why a photo would not do, or null.
+  async function judge(photo, signal) {
+    try {
+      photo.seen = await check(photo.blob, face(), signal);
+      return photo.seen.usable ? null : guidance(photo.seen);
+    } catch (error) {
+      if (!(error instanceof Problem)) throw error;
+      return unasked(error) ? null : sentence(error.message);
+    }
+  }
+
+  async function burst() {
     const { signal } = running;
     take.disabled = true;
+    take.textContent = "Hold still…";
     refused.textContent = "";
-    let taken = null;
-    let seen = null;
+    const good = [];
     let why = null;
     try {
-      taken = await snap(PHOTO, QUALITY);
-      if (over(signal)) return;
-      seen = await check(taken.blob, face(), signal);
+      for (const blob of await shots(signal)) {
+        if (over(signal)) return;
+        const photo = { blob, name: "camera", seen: null };
+        const not = await judge(photo, signal);
+        if (not) why ??= not;
+        else good.push(photo);
+      }
     } catch (error) {
       if (over(signal)) return;
       if (!(error instanceof Problem)) throw error;
-      if (!unasked(error)) why = sentence(error.message);
+      why = sentence(error.message);
     } finally {
       take.disabled = false;
+      take.textContent = TAKE;
     }
     if (over(signal)) return;
     // Unless the visitor went on meanwhile; a button that is switched off loses the focus.
     if (document.activeElement === document.body) take.focus();
-    if (seen && !seen.usable) why = guidance(seen);
-    if (why) refused.textContent = `Not taken. ${why}`;
-    else onphoto(taken.blob, "camera", seen);
+    if (why) refused.textContent = `${good.length || "None"} of ${BURST} photos taken. ${why}`;
+    if (good.length) onburst(good);
   }
 
   function lost() {

@@ -66,6 +66,22 @@ export function table(caption, head, rows) {
   );
 }
 
+// A modal dialog with the focus in its first control; it goes when it is closed.
+export function openDialog(title, text, ...rest) {
+  const id = newId("dialog");
+  const dialog = h(
+    "dialog",
+    { "aria-labelledby": `${id}-title`, "aria-describedby": `${id}-text` },
+    h("h2", { id: `${id}-title` }, title),
+    h("p", { id: `${id}-text` }, text),
+    ...rest,
+  );
+  dialog.addEventListener("close", () => dialog.remove());
+  document.body.append(dialog);
+  dialog.showModal();
+  return dialog;
+}
+
 export const percent = (rate) =>
   rate === null || rate === undefined ? "unknown" : `${Number((100 * rate).toPrecision(3))} %`;
 
@@ -83,8 +99,8 @@ export function when(text) {
 
 export const bytes = (count) => `${count.toLocaleString("en")} bytes`;
 
-export function download(name, text) {
-  const url = URL.createObjectURL(new Blob([text], { type: "application/json" }));
+export function download(name, text, type = "application/json") {
+  const url = URL.createObjectURL(new Blob([text], { type }));
   h("a", { href: url, download: name }).click();
   setTimeout(() => URL.revokeObjectURL(url), 10000);
 }

@@ -1,4 +1,5 @@
-import { facts, field, h } from "./dom.js";
+import { facts, field, h, openDialog } from "./dom.js";
+import { newHolderKey } from "./holder.js";
 import { photoPicker } from "./photos.js";
 import { call, form, may, nonce, session, subjectPath } from "./service.js";
 import { lacking, problemBox } from "./words.js";
@@ -32,6 +33,8 @@ export function enrollView(id) {
   const why = whyOff("enroll");
   const [subject, subjectPart] = subjectField(id);
   const result = h("div", { class: "result" });
+  let dialog = null;
+  const holder = newHolderKey(subject, () => result.replaceChildren());
   const send = h("button", { type: "submit", disabled: true }, "Enroll");
   const picker = why
     ? null
@@ -43,26 +46,60 @@ export function enrollView(id) {
         },
       });
 
+  // The service says whom it would replace, and replaces nobody else: so nothing is replaced unasked.
+  async function put(name, body) {
+    const send = (condition) =>
+      call("PUT", `${subjectPath(name)}/enrollment`, {
+        body,
+        headers: { "Idempotency-Key": nonce(), ...condition },
+      });
+    try {
+      return await send({ "If-None-Match": "*" });
+    } catch (error) {
+      const known = error.code === "enrollment_conflict" && error.details.template_id;
+      if (!known) throw error;
+      return (await mayReplace(name)) ? await send({ "If-Match": `"${known}"` }) : null;
+    }
+  }
+
+  function mayReplace(name) {
+    const close = (value) => () => dialog.close(value);
+    dialog = openDialog(
+      `Replace ${name}’s enrollment?`,
+      "This person is enrolled already. Enrolling again replaces their template and its lock.",
+      h(
+        "p",
+        { class: "row" },
+        h("button", { type: "button", class: "secondary", onclick: close("keep") }, "Keep"),
+        h("button", { type: "button", class: "danger", onclick: close("replace") }, "Replace"),
+      ),
+    );
+    const opened = dialog;
+    return new Promise((resolve) => {
+      opened.addEventListener("close", () => resolve(opened.returnValue === "replace"));
+    });
+  }
+
   async function submit(event) {
     event.preventDefault();
     if (fields.disabled) return;
     // The answer is about this person and these photos, whatever else is chosen when it comes.
     const name = subject.value;
     const sent = picker.chosen();
-    const body = form("images", picker.blobs(), { face: picker.face() });
+    const [photos, face] = [picker.blobs(), picker.face()];
     fields.disabled = true;
     send.textContent = "Enrolling…";
     result.replaceChildren();
     try {
-      const answer = await call("PUT", `${subjectPath(name)}/enrollment`, {
-        body,
-        headers: { "Idempotency-Key": nonce() },
-      });
+      const body = form("images", photos, { face, holder_key: await holder.key(name) });
+      const answer = await put(name, body);
       fields.disabled = false;
-      picker.drop(sent);
-      const shown = enrolled(name, answer);
-      result.replaceChildren(shown);
-      shown.focus();
+      if (answer) {
+        picker.drop(sent);
+        const shown = enrolled(name, answer);
+        result.replaceChildren(shown);
+        shown.focus();
+      }
     } catch (error) {
       fields.disabled = false;
       if (error.details) picker.blame(error, sent);
@@ -78,6 +115,7 @@ export function enrollView(id) {
     { class: "plain", disabled: why !== null },
     subjectPart,
     picker?.root ?? null,
+    holder.parts,
     send,
   );
 
@@ -89,13 +127,20 @@ export function enrollView(id) {
       "p",
       { class: "lead" },
       "Your photos become one private template, which is encrypted; the photos are not kept. ",
-      "Enrolling a person again replaces their template.",
+      "Whoever is enrolled already is replaced only if you confirm it.",
     ),
     offNote(why),
     h("form", { class: "card", onsubmit: submit }, fields),
     result,
   );
-  return { root, stop: () => picker?.stop() };
+  return {
+    root,
+    stop() {
+      dialog?.close();
+      holder.stop();
+      picker?.stop();
+    },
+  };
 }
 
 function enrolled(id, answer) {
@@ -107,6 +152,7 @@ function enrolled(id, answer) {
       ["Person", id],
       ["Photos used", String(answer.images.length)],
       ["Earlier enrollment", answer.replaced ? "replaced" : "none"],
+      ["Holder key", answer.holder_key ? "needed at every verification" : null],
       ["Template", h("code", {}, answer.template_id)],
     ]),
     h(

@@ -1,5 +1,6 @@
 import { download, facts, h, oneIn, percent, table, when } from "./dom.js";
 import { call, session } from "./service.js";
+import { judged } from "./verdict.js";
 import { problemBox } from "./words.js";
 
 const RIGHTS = {
@@ -71,6 +72,9 @@ export function serviceView() {
         ["Lifting", `${contract.binding.strategy}, m = ${contract.binding.m}, n = ${contract.binding.n}`],
         ["Decoys", h("code", {}, contract.binding.decoy_source_id)],
         ["Default level", contract.default_level],
+        ["Privacy: templates that a thief can open", judged(contract.verdict?.privacy)],
+        ["Accuracy: people turned away wrongly", judged(contract.verdict?.accuracy)],
+        ["Groups: strangers let in, in the worst group of people", judged(contract.verdict?.groups)],
         ["Receipt key", h("code", {}, contract.receipt_key.public_key)],
       ]),
       h(
@@ -89,7 +93,9 @@ export function serviceView() {
       contract.calibrations.map((each) =>
         table(
           each.mode === "p2s"
-            ? "Levels for photos"
+            ? each.probe_photos === 1
+              ? "Levels for one photo"
+              : `Levels for ${each.probe_photos} photos of a probe`
             : `Levels for lifted probes, m = ${each.probe_m}`,
           ["Level", "Target FMR", "Measured FMR", "Measured FNMR"],
           each.levels.map((level) => [

@@ -1,4 +1,4 @@
-import { download, facts, h, when } from "./dom.js";
+import { download, facts, h, openDialog, when } from "./dom.js";
 import { offNote } from "./enroll.js";
 import { call, may, subjectPath } from "./service.js";
 import { lacking, problemBox } from "./words.js";
@@ -70,6 +70,7 @@ export function peopleView() {
         person.enrolled_by === "photos" ? `${person.photos} photos, ` : "lifted by a client, ",
         "enrolled ",
         when(person.updated_at),
+        person.holder_key ? ", locked to a holder key" : "",
         person.current ? "" : ". Enrolled under an earlier contract: enroll again",
       ),
       h(
@@ -140,28 +141,17 @@ function confirmErasure(id, work, failed) {
   );
   // What has the focus afterwards; nothing outside can take it while the dialog is open.
   let then = before;
-  const dialog = h(
-    "dialog",
-    { "aria-labelledby": "erase-title", "aria-describedby": "erase-text" },
-    h("h2", { id: "erase-title" }, `Erase ${id}?`),
-    h(
-      "p",
-      { id: "erase-text" },
-      "This removes the template, its key and everything else that is kept about this person. It cannot ",
+  const dialog = openDialog(
+    `Erase ${id}?`,
+    "This removes the template, its key and everything else that is kept about this person. It cannot " +
       "be undone. You get a signed receipt.",
-    ),
     problem,
     h("p", { class: "row" }, keep, erase),
   );
   dialog.addEventListener("cancel", (event) => {
     if (erase.disabled) event.preventDefault();
   });
-  dialog.addEventListener("close", () => {
-    dialog.remove();
-    then?.focus();
-  });
-  document.body.append(dialog);
-  dialog.showModal();
+  dialog.addEventListener("close", () => then?.focus());
   keep.focus();
   return dialog;
 }

@@ -32,10 +32,11 @@ async function smaller(blob) {
   }
 }
 
-export function photoPicker({ most, capture, onchange }) {
+// `replaces`: what is chosen takes the place of what was chosen before.
+export function photoPicker({ most, replaces = false, onchange }) {
   const demo = document.documentElement.dataset.demo === "yes";
   const photos = [];
-  const tray = h("ul", { class: "tray", "aria-label": most > 1 ? "Chosen photos" : "Chosen photo" });
+  const tray = h("ul", { class: "tray", "aria-label": "Chosen photos" });
   const told = h("p", { class: "hint", role: "status" });
   const panel = h("div", { class: "source" });
   const largest = h("input", { type: "checkbox", id: newId("largest") });
@@ -45,17 +46,22 @@ export function photoPicker({ most, capture, onchange }) {
   const decoding = inTurn();
   const asking = inTurn();
 
-  // `seen` is what the service saw already in this very photo.
-  function add(blob, name, seen = null) {
-    if (photos.length >= most) {
-      if (most > 1) {
-        told.textContent = `No more than ${most} photos: remove one first.`;
-        return;
-      }
-      remove(photos[0]);
+  // A burst, some files or a cartoon: what is chosen at one time.
+  function take(together) {
+    if (replaces) [...photos].forEach(remove);
+    const room = most - photos.length;
+    together.slice(0, room).forEach(add);
+    if (together.length > room) {
+      told.textContent = replaces
+        ? `No more than ${most} photos: these are the first.`
+        : `No more than ${most} photos: remove one first.`;
     }
+  }
+
+  // `seen` is what the service saw already in this very photo, or null.
+  function add({ blob, name, seen }) {
     const photo = { blob: null, name, url: URL.createObjectURL(blob) };
-    photo.number = h("span", { class: "number", hidden: most === 1 });
+    photo.number = h("span", { class: "number" });
     photo.said = h("span", { class: "seen", "data-state": "idle" }, "Checking…");
     photo.item = h(
       "li",
@@ -100,7 +106,7 @@ export function photoPicker({ most, capture, onchange }) {
   function changed() {
     // The numbers that the service's messages use.
     photos.forEach((photo, index) => (photo.number.textContent = `Photo ${index + 1}`));
-    told.textContent = most > 1 ? `${photos.length} of ${most} photos chosen.` : "";
+    told.textContent = `${photos.length} of ${most} photos chosen.`;
     onchange(ready());
   }
 
@@ -130,7 +136,7 @@ export function photoPicker({ most, capture, onchange }) {
 
   const builders = {
     camera() {
-      live = camera({ onphoto: add, face, capture });
+      live = camera({ onburst: take, face });
       return live.root;
     },
     files() {
@@ -138,13 +144,13 @@ export function photoPicker({ most, capture, onchange }) {
         type: "file",
         id: newId("files"),
         accept: "image/jpeg,image/png,image/webp",
-        multiple: most > 1,
+        multiple: true,
         onchange: () => {
-          for (const file of input.files) add(file, file.name);
+          take([...input.files].map((file) => ({ blob: file, name: file.name, seen: null })));
           input.value = "";
         },
       });
-      const many = most > 1 ? `Photos: JPEG, PNG or WebP, up to ${most}` : "Photo: JPEG, PNG or WebP";
+      const many = `Photos: JPEG, PNG or WebP, up to ${most}`;
       return h("div", { class: "field" }, h("label", { for: input.id }, many), input);
     },
     drawn() {
@@ -162,7 +168,9 @@ export function photoPicker({ most, capture, onchange }) {
                 "aria-label": `Choose photo ${index + 1} of ${who.value}`,
                 onclick: async () => {
                   const drawn = await fetch(url);
-                  if (drawn.ok) add(await drawn.blob(), `${who.value}, photo ${index + 1}`);
+                  if (!drawn.ok) return;
+                  const name = `${who.value}, photo ${index + 1}`;
+                  take([{ blob: await drawn.blob(), name, seen: null }]);
                 },
               },
               h("img", { src: url, alt: "", width: "84", height: "84" }),
@@ -199,10 +207,10 @@ export function photoPicker({ most, capture, onchange }) {
   const name = newId("source");
   const sources = Object.keys(SOURCES).filter((each) => demo || each !== "drawn");
   const first = demo ? "drawn" : "camera";
-  const choice = h(
+  const sourceChoice = h(
     "fieldset",
     { class: "choice" },
-    h("legend", {}, most > 1 ? `1 to ${most} photos of one person` : "Photo"),
+    h("legend", {}, `1 to ${most} photos of one person`),
     sources.map((each) => {
       const radio = h("input", {
         type: "radio",
@@ -220,7 +228,7 @@ export function photoPicker({ most, capture, onchange }) {
   const root = h(
     "div",
     { class: "picker" },
-    choice,
+    sourceChoice,
     demo
       ? h("p", { class: "hint" }, "The demo model sees only cartoon faces, not real ones.")
       : null,
@@ -240,7 +248,7 @@ export function photoPicker({ most, capture, onchange }) {
     ready,
     blobs: () => photos.map((each) => each.blob),
     chosen: () => [...photos],
-    // What the service said of single photos of an enrollment, by their places among those `sent`.
+    // What the service said of single photos, by their places among those `sent`.
     blame(problem, sent) {
       const { image, photos: unlike } = problem.details;
       if (Number.isInteger(image) && sent[image]) {
@@ -250,6 +258,8 @@ export function photoPicker({ most, capture, onchange }) {
         if (sent[index]) mark(sent[index], "Does not look like the person in the other photos.", "bad");
       }
     },
+    // Let go of the camera, which somebody else is to use.
+    pause: () => choose(sourceChoice.querySelector(":checked").value),
     drop: (sent) => sent.filter((each) => photos.includes(each)).forEach(remove),
     stop: () => {
       live?.stop();

@@ -71,8 +71,8 @@ export async function call(method, path, { body, headers, signal } = {}) {
     requestId: told?.request_id ?? answer.headers.get("X-Request-ID"),
     wait: Number(answer.headers.get("Retry-After")) || null,
   });
-  // The probe's own 401 codes do not occur here: the key itself was refused, if it is still in use.
-  if (answer.status === 401 && session.own && used === key) session.onrefused(problem);
+  // `replayed` is about a challenge; else the key itself was refused, if it is still in use.
+  if (problem.code === "unauthorized" && session.own && used === key) session.onrefused(problem);
   throw problem;
 }
 
@@ -101,8 +101,11 @@ export async function learn() {
 // Levels that a photo can be verified at with this key.
 export const levels = () =>
   session.contract.calibrations
-    .filter((each) => each.mode === "p2s")
+    .filter((each) => each.mode === "p2s" && each.probe_photos === 1)
     .flatMap((each) => each.levels)
     .filter((each) => session.own.levels.includes(each.name));
+
+// Whether a verification at this level must answer a challenge of head movements.
+export const moves = (level) => ["active", "both"].includes(session.own.liveness[level]);
 
 export const crops = () => !session.contract.recorded.detector;

@@ -1,7 +1,8 @@
 import { bytes, facts, h, percent, table, when } from "./dom.js";
 import { offNote, subjectField } from "./enroll.js";
 import { picture } from "./picture.js";
-import { call, may, subjectPath } from "./service.js";
+import { call, may, session, subjectPath } from "./service.js";
+import { thiefCard } from "./verdict.js";
 import { lacking, problemBox } from "./words.js";
 
 export function storedView(id) {
@@ -35,6 +36,7 @@ export function storedView(id) {
     {},
     h("h1", { tabindex: "-1" }, "What is stored"),
     h("p", { class: "lead" }, "No photo and no embedding, only an encrypted set of points that hides the face."),
+    thiefCard(session.contract),
     offNote(why),
     h(
       "form",
@@ -143,10 +145,11 @@ function audited(told) {
     told.cells.length
       ? table(
           "Strongest attacks, and the operator's limits",
-          ["Attack", "Breaks", "Attacker has", "Result", "By chance", "Against the limit", "Limit", "Verdict"],
+          ["Attack", "Breaks", "Leaked", "Attacker has", "Result", "By chance", "Against the limit", "Limit", "Verdict"],
           told.cells.map((each) => [
             named(each),
             each.property,
+            each.leaked,
             each.knowledge,
             ranged(each, each.value, each.ci_low, each.ci_high),
             amount(each, each.chance),

@@ -1,12 +1,22 @@
+import { headMovements } from "./challenge.js";
 import { facts, field, h, oneIn, percent } from "./dom.js";
 import { offNote, subjectField, whyOff } from "./enroll.js";
+import { holderKey } from "./holder.js";
 import { photoPicker } from "./photos.js";
-import { call, form, levels, session, subjectPath } from "./service.js";
-import { problemBox } from "./words.js";
+import { call, form, levels, moves, session, subjectPath } from "./service.js";
+import { livenessWords, problemBox } from "./words.js";
 
 const REASONS = {
-  match: "The photo matches the enrolled person.",
-  no_match: "The photo does not match: a different person, a poor photo, or an id that nobody is enrolled under.",
+  match: "The face matches the enrolled person.",
+  no_match: "No match: a different person, poor photos, an id that nobody is enrolled under, or a holder key that is wrong " +
+    "or missing. If a holder key is lost, enroll the person again.",
+};
+
+// What to do differently depends on what was asked for.
+const NOT_LIVE = "Nothing shows that a living person is before the camera. ";
+const LIVENESS = {
+  movements: NOT_LIVE + "Follow each movement as it is asked for, in good light.",
+  photos: NOT_LIVE + "Take new photos with the camera, of the face itself and in good light.",
 };
 
 export function verifyView(id) {
@@ -36,14 +46,29 @@ export function verifyView(id) {
   const picker = why
     ? null
     : photoPicker({
-        most: 1,
+        most: 5,
+        replaces: true,
         onchange: (ready) => {
-          send.disabled = !ready;
+          send.disabled = !(ready || moving());
           clear();
         },
       });
+  const movements = headMovements();
+  const moving = () => why === null && moves(level.value);
+  const instead = h("p", { class: "hint" }, "If you cannot turn your head, ask the operator for another way.");
+
+  function showWhatIsAsked() {
+    clear();
+    if (!picker) return;
+    picker.root.hidden = moving();
+    if (moving()) picker.pause();
+    movements.root.hidden = instead.hidden = !moving();
+    send.textContent = moving() ? "Start head movements" : "Verify";
+    send.disabled = !(picker.ready() || moving());
+  }
+  const holder = holderKey(subject, clear);
   subject.addEventListener("input", clear);
-  level.addEventListener("change", clear);
+  level.addEventListener("change", showWhatIsAsked);
 
   async function submit(event) {
     event.preventDefault();
@@ -51,21 +76,30 @@ export function verifyView(id) {
     clear();
     const asking = asked;
     const name = subject.value;
-    const body = form("image", picker.blobs(), { level: level.value, face: picker.face() });
+    const sent = picker.chosen();
     fields.disabled = true;
-    send.textContent = "Comparing…";
     try {
+      const holder_key = await holder.key(name);
+      const asksToMove = moving();
+      const { photos, ...shown } = asksToMove
+        ? await movements.frames(name)
+        : { photos: picker.blobs(), face: picker.face() };
+      send.textContent = "Comparing…";
+      const body = form("images", photos, { level: level.value, ...shown, holder_key });
       const answer = await call("POST", `${subjectPath(name)}/verify`, { body });
       if (asking === asked) {
-        result.replaceChildren(decision(name, answer));
+        result.replaceChildren(decision(name, answer, asksToMove ? "movements" : "photos"));
         result.scrollIntoView({ block: "nearest" });
       }
     } catch (error) {
-      if (asking === asked) problem.replaceChildren(problemBox(error));
+      if (asking === asked) {
+        if (error.details && !moving()) picker.blame(error, sent);
+        problem.replaceChildren(problemBox(error));
+      }
     }
     fields.disabled = false;
-    send.textContent = "Verify";
-    send.disabled = !picker.ready();
+    send.textContent = moving() ? "Start head movements" : "Verify";
+    send.disabled = !(picker.ready() || moving());
     // A button that is switched off loses the focus.
     if (document.activeElement === document.body) send.focus();
   }
@@ -81,6 +115,9 @@ export function verifyView(id) {
         "more often.",
     ),
     picker?.root ?? null,
+    why ? null : movements.root,
+    instead,
+    holder.parts,
     send,
   );
 
@@ -88,33 +125,37 @@ export function verifyView(id) {
     "section",
     {},
     h("h1", { tabindex: "-1" }, "Verify"),
-    h("p", { class: "lead" }, "Check whether a photo shows the person enrolled under an id."),
+    h("p", { class: "lead" }, "Check whether photos show the person enrolled under an id. Several are averaged."),
     offNote(why),
     h("form", { class: "card", onsubmit: submit }, fields),
     problem,
     result,
   );
+  showWhatIsAsked();
   return {
     root,
     stop() {
       asked += 1;
+      movements.stop();
+      holder.stop();
       picker?.stop();
     },
   };
 }
 
-function decision(id, answer) {
+function decision(id, answer, sent) {
   const accepted = answer.decision === "accept";
   return h(
     "div",
     { class: `verdict ${accepted ? "accept" : "reject"}` },
     h("p", { class: "verdict-word" }, accepted ? "✓ Accepted" : "✕ Rejected"),
-    h("p", {}, REASONS[answer.reason]),
+    h("p", {}, REASONS[answer.reason] ?? LIVENESS[sent]),
     facts([
       ["Person", id],
       ["Reason", h("code", {}, answer.reason)],
       ["Level", answer.level],
       ["False match rate", `${percent(answer.fmr)} (${oneIn(answer.fmr)})`],
+      ["Liveness", livenessWords(answer)],
       ["Distance", answer.distance === undefined ? null : answer.distance.toFixed(4)],
       ["Request", h("code", {}, answer.request_id)],
     ]),

@@ -13,7 +13,7 @@ const REMEDIES = {
   unsupported_image: "Send a JPEG, PNG or WebP photo.",
   image_too_large: "Send a smaller photo.",
   request_too_large: "Send fewer or smaller photos.",
-  too_many_images: "Send no more than ten photos.",
+  too_many_images: "Send fewer photos.",
   no_face: "Take a photo that shows the face upright and uncovered.",
   multiple_faces: "Take a photo of one person, or tick the box that allows others in the picture.",
   face_too_small: "Move closer, or send a larger photo.",
@@ -27,10 +27,53 @@ const REMEDIES = {
   store_unavailable: "Try again in a moment. If it keeps happening, tell the operator.",
   model_unavailable: "This service cannot take photos. Ask the operator.",
   idempotency_conflict: "Wait a moment and try again.",
+  enrollment_conflict: "This person was enrolled or erased meanwhile. Look them up, and enroll them again if need be.",
   export_superseded: "Export the person again from where they are enrolled.",
+  passkey_refused: "Try again, or use the device that has the passkey. If it is lost, enroll the person again.",
+  passkey_unsupported: "Use another device or browser, or a key file. If a passkey was made just now, delete it.",
+  passkey_of_another: "Choose the passkey that is named after the id. If it is lost, enroll the person again.",
+  replayed: "Start again: the frames must arrive within a minute, and count once.",
+  camera: "Allow this page to use a camera that no other program uses, and try again.",
+  key_file: "Choose the file that was made for this person. If it is lost, enroll the person again.",
   internal_error: "Report the request id to the operator.",
   unreachable: "Check your connection and that the service is running, then try again.",
 };
+
+// What a movement is called, and where its arrow points: in the picture, which is a mirror.
+export const FRONT = "front";
+export const MOVE_BACK = "move_back";
+export const MOVEMENTS = {
+  [FRONT]: ["Look straight ahead", "●"],
+  [MOVE_BACK]: ["Move back and look straight ahead", "●"],
+  turn_left: ["Turn your head to the left", "←"],
+  turn_right: ["Turn your head to the right", "→"],
+  look_up: ["Look up", "↑"],
+  look_down: ["Look down", "↓"],
+  come_closer: ["Come closer", "⤢"],
+};
+
+const FAILURES = {
+  not_frontal: "the first frame did not look straight ahead",
+  jump: "the head jumped between two frames",
+  no_turn: "the head did not turn, as a photo does not",
+  missing_movement: "a movement was not seen",
+  wrong_order: "the movements came in another order, or there was one too many",
+  another_person: "the frames do not show one person",
+  passive: "the photos look like a picture of a picture",
+};
+
+// For a list of facts; why it failed is told to some keys only.
+export function livenessWords({ liveness, liveness_failure: why }) {
+  if (liveness === "not_checked") return null;
+  return why ? `failed: ${FAILURES[why] ?? why}` : liveness;
+}
+
+export function cameraTrouble(error) {
+  if (!navigator.mediaDevices) return "browsers allow the camera only over HTTPS or on localhost";
+  if (error?.name === "NotAllowedError") return "camera access was denied";
+  if (error?.name === "NotFoundError") return "no camera was found";
+  return "the camera cannot be used: another program may have it";
+}
 
 // The service writes for programs, the page for people.
 const TITLES = {

@@ -12,7 +12,7 @@ from attacks.attributes.experiment import run_scheme, work_of
 from attacks.attributes.faces import LabelledFaces, Split, near_duplicates, split
 from attacks.attributes.plan import AttributePlan, prepare
 from attacks.attributes.rows import AttributeRow, strongest
-from attacks.outcomes import AttackOutcome, Knowledge, Property, Scheme
+from attacks.outcomes import AttackOutcome, Knowledge, Leaked, Property, Scheme
 from attacks.population import LEAST_FITTED
 from models.extraction import Extraction
 from verify.fairface_labels import CLASSES, Label
@@ -193,6 +193,7 @@ def attribute_outcomes(rows: Sequence[AttributeRow], *, audited: Scheme) -> list
             attack=ATTACK,
             variant=f"{attribute} by {row.attacker}",
             breaks=Property.CONFIDENTIALITY,
+            leaked=Leaked.HOLDER_KEYS,
             knowledge=knowledge,
             assumption=f"{_HAS[knowledge]}; success is the right {attribute}.",
             scheme=scheme,

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from attacks.attributes.faces import LabelledFaces
 from attacks.attributes.neighbours import Attacked, votes
 from templates.distances import Metric, Neighbours
+from templates.space.embedding import normalised
 from templates.space.subspace import SubspaceBatch
 
 Array32 = NDArray[np.float32]
@@ -68,7 +69,10 @@ class Axes:
             directions = np.linalg.solve(covariance, (means - mean).T).T
             discriminants.append(directions[1:] if len(names) == 2 else directions)
             prototypes.append(means)
-        return cls(_unit(np.vstack(discriminants)), _unit(np.vstack(prototypes)))
+        return cls(
+            normalised(np.vstack(discriminants)).astype(np.float32),
+            normalised(np.vstack(prototypes)).astype(np.float32),
+        )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -159,8 +163,3 @@ def features_of(
 def _inside(templates: SubspaceBatch, rows: Array32) -> Array32:
     """D x for all rows x, shape (P, m, rows)."""
     return np.asarray(templates.bases @ rows.T)
-
-
-def _unit(rows: NDArray[np.float64]) -> Array32:
-    norms = np.linalg.norm(rows, axis=1, keepdims=True)
-    return np.asarray(rows / np.maximum(norms, 1e-12), dtype=np.float32)

@@ -7,6 +7,7 @@ that waits. Every tile is worked on by one core.
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextvars import copy_context
 from dataclasses import dataclass
 from functools import partial
 
@@ -170,11 +171,14 @@ def _observe(
 
 
 def _in_order(work: Iterable[Callable[[], Observations]], threads: int) -> Iterator[Observations]:
-    """Do the work on so many cores; one piece more than there are cores is made ahead."""
+    """Do the work on so many cores; one piece more than there are cores is made ahead.
+
+    A piece runs in a copy of this context, which says where distances are computed.
+    """
     waiting: deque[Future[Observations]] = deque()
     with single_threaded(), ThreadPoolExecutor(threads) as pool:
         for piece in work:
-            waiting.append(pool.submit(piece))
+            waiting.append(pool.submit(copy_context().run, piece))
             if len(waiting) > threads:
                 yield waiting.popleft().result()
         while waiting:

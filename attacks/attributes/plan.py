@@ -14,7 +14,7 @@ from attacks.attributes.likely_points import Form, contrast, decoy_precision
 from attacks.errors import AuditError
 from attacks.outcomes import GENERATED, POOLED, RAW_SCHEME, Scheme
 from attacks.population import LEAST_FITTED
-from templates.decoys import DecoyGenerator, DecoyPool
+from templates.decoys import NOISE_ENERGY, DecoyGenerator, DecoyPool
 from templates.decoys.source import DecoySource
 from templates.space.lifting import Strategy
 
@@ -230,7 +230,8 @@ def prepare(
         The attacker has too few faces for the plan.
     """
     if generator is None and len(parts.lifting) >= LEAST_FITTED:
-        generator = DecoyGenerator.fit(parts.lifting.descriptors)
+        rows = parts.lifting.descriptors
+        generator = DecoyGenerator.fit(rows, noise=NOISE_ENERGY / rows.shape[1])
     against = None if generator is None else decoy_precision(generator, seed=seed)
     side_of = partial(Side.of, nearby=plan.gallery_most, against=against)
     rng = np.random.default_rng([seed, 1])

@@ -1,14 +1,9 @@
 """Attacks on stored templates: what a thief of templates learns, and which probes open them."""
 
-from collections.abc import Sequence
-
-import numpy as np
-from numpy.typing import NDArray
-
 from attacks.outcomes import AttackOutcome
 from attacks.stored.foot_point import foot_point_attack
 from attacks.stored.impersonation import impersonation_attack
-from attacks.stored.intersection import different_photos, same_descriptor
+from attacks.stored.intersection import same_descriptor
 from attacks.stored.known_database import known_database_attack
 from attacks.stored.nearest_neighbour import nearest_neighbour_attack
 from attacks.stored.oracle import oracle_attack
@@ -23,24 +18,14 @@ FEW = 60
 __all__ = ["foot_point_attack", "nearest_neighbour_attack", "template_attacks"]
 
 
-def template_attacks(
-    system: System, *, photos: Sequence[NDArray[np.float32]] = ()
-) -> list[AttackOutcome]:
-    """Run all attacks on stored templates, in order.
-
-    Parameters
-    ----------
-    photos
-        Of each of some people, victims or others, (k_i, n) descriptors of their photos, for the
-        intersection of different photos.
-    """
+def template_attacks(system: System) -> list[AttackOutcome]:
+    """Run all attacks on stored templates, in order."""
     return [
         *foot_point_attack(system),
         *known_database_attack(system),
         *nearest_neighbour_attack(system),
         *oracle_attack(system.first(SOME)),
         *same_descriptor(system.first(FEW)),
-        *different_photos(system, photos),
         *impersonation_attack(system),
         *presentation_attack(system),
     ]

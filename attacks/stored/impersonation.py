@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attacks.decisions import Scores, score
-from attacks.outcomes import POOLED, AttackOutcome, Knowledge, Property
+from attacks.outcomes import POOLED, AttackOutcome, Knowledge, Leaked, Property
 from attacks.recovery import fmr_of
 from attacks.stored.recording import decoy_count, recorded_lift
 from attacks.system import System
@@ -58,7 +58,7 @@ def _pooled(system: System, pool: DecoyPool) -> AttackOutcome:
         chance=fmr_of(system.level),
         assumption=(
             f"The owner of a decoy comes with {same} to a template that holds their decoy; "
-            "success is acceptance by threshold and cohort test."
+            "success is acceptance."
         ),
         details={"with_the_photo_of_the_pool": _rate(system, entries, lift.templates, pairs)},
     )
@@ -72,7 +72,7 @@ def _generated(system: System, faces: NDArray[np.float32]) -> AttackOutcome:
         system, system.victims.enrolled, "decoys of a fitted generator", source=generator
     )
     scores = score(strangers, lift.templates, system.contract, system.points)
-    accepted = scores.at(system.level).accepted
+    accepted = scores.at(system.level)
     control = rate(int(np.count_nonzero(accepted)), accepted.size)
     pairs = np.argwhere(np.ones((len(fitted), len(lift.templates)), dtype=np.bool_))
     return _outcome(
@@ -84,8 +84,8 @@ def _generated(system: System, faces: NDArray[np.float32]) -> AttackOutcome:
         chance=control.value,
         assumption=(
             "A generator is fitted to half of some people, who come with the very photos "
-            "of the fit to every template that was lifted with it; success is acceptance by "
-            "threshold and cohort test, and chance is how often the other half is accepted there: "
+            "of the fit to every template that was lifted with it; success is acceptance, and "
+            "chance is how often the other half is accepted there: "
             "the contract was calibrated with the scheme's own generator."
         ),
         details={"strangers": control.to_json(), "fitted_to": half},
@@ -106,16 +106,15 @@ def _outcome(
     by_level: dict[str, Json] = {}
     scores = _scored(system, photos, templates, pairs)
     for level in system.levels:
-        near, accepted = scores.at(level)
-        by_level[level.name] = {
-            "threshold_alone": _counted(near, pairs, len(photos), len(templates)).to_json(),
-            "with_cohort_test": _counted(accepted, pairs, len(photos), len(templates)).to_json(),
-        }
-    accepted = scores.at(system.level).accepted
+        by_level[level.name] = _counted(
+            scores.at(level), pairs, len(photos), len(templates)
+        ).to_json()
+    accepted = scores.at(system.level)
     return AttackOutcome(
         attack="impersonation",
         variant=variant,
         breaks=Property.IMPERSONATION,
+        leaked=Leaked.DATABASE,
         knowledge=Knowledge.ALGORITHM,
         assumption=assumption,
         scheme=system.scheme,
@@ -129,7 +128,7 @@ def _outcome(
 def _rate(
     system: System, photos: NDArray[np.float32], templates: SubspaceBatch, pairs: Pairs
 ) -> dict[str, Json]:
-    accepted = _scored(system, photos, templates, pairs).at(system.level).accepted
+    accepted = _scored(system, photos, templates, pairs).at(system.level)
     return rate(int(np.count_nonzero(accepted)), len(accepted)).to_json()
 
 
@@ -139,7 +138,7 @@ def _scored(
     """Scores of the pairs, (P,)."""
     every = score(photos, templates, system.contract, system.points)
     row, column = pairs.T
-    return Scores(every.similarities[row, column], every.cohort_scores[row, column])
+    return Scores(every.similarities[row, column], every.scores[row, column])
 
 
 def _counted(accepted: NDArray[np.bool_], pairs: Pairs, owners: int, victims: int) -> Rate:

@@ -1,16 +1,16 @@
-"""Intersection: several templates of one descriptor meet in it (docs/method.md §4.6).
+"""Intersection: lifts of one descriptor with different decoys meet in it (docs/method.md §4.6).
 
-Templates of different photos of one person do not meet, but come near each other in the person.
+Templates of different photos of one person do not meet, but come near each other in the person:
+``attacks.several_templates``.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from attacks.outcomes import AttackOutcome, Knowledge
-from attacks.population import Subjects
 from attacks.recovery import recovery_outcome
 from attacks.system import System
 from templates.decoys import Attributes
@@ -20,14 +20,12 @@ from templates.space.subspace import SubspaceBatch
 
 Array = NDArray[np.float64]
 
-LIFTS = (2, 3, 5, 10, 20)
+LIFTS = (2, 5)
 _SHARED = 1e-3
 """A direction that all of T templates have is one in which Σ dist² rises by less than this · T:
 the rounding of the wire format makes it 10⁻⁶, and two directions of different decoys make it 0.2
 and more."""
 _ROUNDS = 100
-JUDGED_PEOPLE = 20
-"""Of fewer people a share says too little to judge by."""
 
 
 class Meeting(NamedTuple):
@@ -51,19 +49,25 @@ def meeting_point(feet: Array, bases: Array) -> Meeting:
 
     Notes
     -----
-    The normal equations are (T I - BᵀB) x = Σ p_t with the bases stacked in B, of Tm rows. With
-    BBᵀ = U Σ² Uᵀ their solution is (b + BᵀU (T - Σ²)⁻¹ UᵀB b) / T, which takes a factorisation of
-    Tm rows and columns instead of n. Where T - Σ² is 0, the component along Bᵀu is removed.
+    The normal equations are (T I - BᵀB) x = Σ p_t with the bases stacked in B, of Tm rows; where
+    T - σ² is 0 for an eigenvalue σ² of BᵀB, the component along its eigenvector is removed. BBᵀ has
+    the same eigenvalues, and is factorised where it is the smaller one: with BBᵀ = U Σ² Uᵀ the
+    solution is (b + BᵀU (T - Σ²)⁻¹ UᵀB b) / T.
     """
     count = len(feet)
     total = feet.sum(axis=0)
     rows = bases.reshape(-1, bases.shape[2])
-    squares, vectors = np.linalg.eigh(rows @ rows.T)
+    small = len(rows) < rows.shape[1]
+    squares, vectors = np.linalg.eigh(rows @ rows.T if small else rows.T @ rows)
     curvature = count - squares
     free = curvature < _SHARED * count
-    weights = np.where(free, -1.0 / count, 1.0 / np.where(free, 1.0, curvature))
-    along = vectors.T @ (rows @ total)
-    return Meeting((total + rows.T @ (vectors @ (weights * along))) / count, int(free.sum()))
+    inverse = 1.0 / np.where(free, 1.0, curvature)
+    if small:
+        weights = np.where(free, -1.0 / count, inverse)
+        point = (total + rows.T @ (vectors @ (weights * (vectors.T @ (rows @ total))))) / count
+    else:
+        point = vectors @ (np.where(free, 0.0, inverse) * (vectors.T @ total))
+    return Meeting(point, int(free.sum()))
 
 
 def nearest_common_point(feet: Array, bases: Array, starts: Array) -> Array:
@@ -118,7 +122,7 @@ def same_descriptor(system: System, *, lifts: Sequence[int] = LIFTS) -> list[Att
         batches = [
             system.lift(system.victims.enrolled, f"lift {number} of one descriptor")
             if stored
-            else _in_memory(system, f"lift {number} of one descriptor")
+            else in_memory(system, f"lift {number} of one descriptor")
             for number in range(max(lifts))
         ]
         for count in lifts:
@@ -137,7 +141,8 @@ def same_descriptor(system: System, *, lifts: Sequence[int] = LIFTS) -> list[Att
                     assumption=(
                         f"The attacker has {count} templates of one embedding ({form}) and takes "
                         "the point where they meet; success is a match with a fresh photo of the "
-                        "victim. Not judged: the service lifts an embedding once."
+                        "victim. Not judged: the service draws the same decoys for the same "
+                        "photos, and clients may not."
                     ),
                     judged=False,
                     details={
@@ -150,68 +155,7 @@ def same_descriptor(system: System, *, lifts: Sequence[int] = LIFTS) -> list[Att
     return outcomes
 
 
-def different_photos(
-    system: System, photos: Sequence[NDArray[np.float32]], *, lifts: Sequence[int] = LIFTS
-) -> list[AttackOutcome]:
-    """Intersect templates of different photos of one person.
-
-    Parameters
-    ----------
-    photos
-        Of every person (k_i, n) unit rows. The last is the fresh photo; of the others, T are
-        lifted, one template each. People with fewer are left out, and T that nobody reaches; T
-        that fewer than 20 people reach is reported, and not judged.
-    """
-    outcomes = []
-    for count in lifts:
-        enough = [album for album in photos if len(album) > count]
-        if not enough:
-            continue
-        batches = [
-            system.lift(np.stack([album[number] for album in enough]), f"photo {number} of {count}")
-            for number in range(count)
-        ]
-        means = np.stack([album[:count].mean(axis=0, dtype=np.float64) for album in enough])
-        people = Subjects(
-            enrolled=_normalised(means).astype(np.float32),
-            fresh=np.stack([album[-1] for album in enough]),
-            photos=np.full(len(enough), count),
-            shown=np.full(len(enough), -1),  # of no folder
-        )
-        plain = np.stack([meeting.point for meeting in _meetings(batches)])
-        guesses = nearest_common_points(batches)
-        outcomes.append(
-            recovery_outcome(
-                system,
-                guesses,
-                attack="intersection",
-                variant=f"{count} photos of one person",
-                knowledge=Knowledge.TEMPLATES,
-                assumption=(
-                    f"The attacker has {count} templates of one person, each of another photo and "
-                    "without its rotation, and takes the point that is nearest to all; success is "
-                    "a match with a further photo. The truth is the mean of the lifted photos."
-                    + (
-                        ""
-                        if len(enough) >= JUDGED_PEOPLE
-                        else f" Not judged: fewer than {JUDGED_PEOPLE} people have the photos."
-                    )
-                ),
-                judged=len(enough) >= JUDGED_PEOPLE,
-                people=people,
-                details={
-                    "photos": count,
-                    "people": len(enough),
-                    "cosine_of_plain_least_squares_mean": float(
-                        np.einsum("ij,ij->i", _normalised(plain), people.enrolled).mean()
-                    ),
-                },
-            )
-        )
-    return outcomes
-
-
-def _in_memory(system: System, purpose: str) -> SubspaceBatch:
+def in_memory(system: System, purpose: str) -> SubspaceBatch:
     """Lift the victims without the rounding of the wire format."""
     strategy = system.lifter.strategy
     named = [Attributes()] * len(system.victims) if strategy is Strategy.HYBRID_PLUS else None
@@ -226,15 +170,13 @@ def _in_memory(system: System, purpose: str) -> SubspaceBatch:
         )
 
 
-def _stacked(batches: Sequence[SubspaceBatch]) -> list[tuple[Array, Array]]:
-    """Foot points (T, n) and bases (T, m, n) of every row's T templates."""
-    return [
-        (
+def _stacked(batches: Sequence[SubspaceBatch]) -> Iterator[tuple[Array, Array]]:
+    """Yield foot points (T, n) and bases (T, m, n) of every row's T templates."""
+    for row in range(len(batches[0])):
+        yield (
             np.stack([batch.feet[row] for batch in batches]).astype(np.float64),
             np.stack([batch.bases[row] for batch in batches]).astype(np.float64),
         )
-        for row in range(len(batches[0]))
-    ]
 
 
 def _meetings(batches: Sequence[SubspaceBatch]) -> list[Meeting]:

@@ -7,7 +7,7 @@ neighbour, or the point of the template nearest to it, is a guess of the hidden 
 import numpy as np
 from numpy.typing import NDArray
 
-from attacks.outcomes import POOLED, AttackOutcome, Knowledge, Property
+from attacks.outcomes import POOLED, AttackOutcome, Knowledge, Leaked, Property
 from attacks.recovery import recovery_outcome
 from attacks.stored.known_database import find_decoys
 from attacks.stored.recording import decoy_count
@@ -95,6 +95,7 @@ def _identify(system: System, others: NDArray[np.float32]) -> AttackOutcome:
         attack="nearest-neighbour",
         variant=_variant(system, others, "in"),
         breaks=Property.UNLINKABILITY,
+        leaked=Leaked.HOLDER_KEYS,
         knowledge=Knowledge.ALGORITHM,
         assumption=(
             "The attacker has the template without its rotation and a gallery with another photo "

@@ -7,7 +7,7 @@ No attacker has it. It bounds from above what a search among K neighbours could 
 import numpy as np
 from numpy.typing import NDArray
 
-from attacks.outcomes import AttackOutcome, Knowledge, Property
+from attacks.outcomes import AttackOutcome, Knowledge, Leaked, Property
 from attacks.recovery import fmr_of, score_guesses
 from attacks.stored.nearest_neighbour import nearest_entries, nearest_points
 from attacks.system import System
@@ -65,6 +65,7 @@ def oracle_attack(
                 attack="oracle",
                 variant="projected" if projected else "neighbour",
                 breaks=Property.IRREVERSIBILITY,
+                leaked=Leaked.HOLDER_KEYS,
                 knowledge=Knowledge.ALGORITHM,
                 assumption=(
                     f"An oracle, which no attacker has, names the best of the {counts[-1]} "

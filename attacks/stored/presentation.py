@@ -7,14 +7,14 @@ service's cohort are met once, at the end.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from attacks.decisions import Scores, score
-from attacks.linkage import secret_rotation
-from attacks.outcomes import POOLED, AttackOutcome, Knowledge, Property
+from attacks.linkage import rotations_of, turned, turned_points
+from attacks.outcomes import POOLED, AttackOutcome, Knowledge, Leaked, Property
 from attacks.recovery import fmr_of
 from attacks.stored.honest_probes import (
     honest_embedding,
@@ -22,18 +22,20 @@ from attacks.stored.honest_probes import (
     honest_lift,
     points_inside,
 )
-from attacks.stored.wolf_ascent import Ground, ascend_points, ascend_subspaces
+from attacks.stored.wolf_ascent import Ground, ascend_subspaces
 from attacks.stored.wolves import ALONG_MEAN, CENTRAL, axis_wolves, canonical
 from attacks.system import System
 from templates.contract.canonical import Json
 from templates.contract.document import Calibration, Contract, Level, Rate
+from templates.contract.nobody import COHORT_SIZE
 from templates.decoys import DecoyGenerator
 from templates.keys.randomness import Keystream
-from templates.keys.rotation import rotate
+from templates.space.lifting import lift, plain_strategy
 from templates.space.subspace import SubspaceBatch
-from verify.cohort import COHORT_SIZE, Probes, make_cohort, people_like
+from verify.cohort import Probes, people_like
 from verify.comparisons import through_wire
 from verify.metrics import rate
+from verify.point_ascent import ascend_points
 
 TARGETS = 150
 """Templates that the attacker lifts to climb on; as many again to choose among the ends."""
@@ -52,16 +54,16 @@ class OwnTemplates:
     targets, held_out
         Templates of the attacker's faces: to climb on, and to choose with.
     cohort
-        A cohort made as the service makes one.
+        Made as the service makes one, which lifted probes are held against.
     """
 
     targets: SubspaceBatch
     held_out: SubspaceBatch
     cohort: SubspaceBatch
 
-    def ground(self, rule: Level) -> Ground:
-        """Return what the attacker climbs on, by the rule of a level."""
-        return Ground.of(self.targets, self.cohort[:COHORT_CLIMBED], rule)
+    def ground(self, level: Level) -> Ground:
+        """Return what the attacker climbs on with lifted probes, for a level."""
+        return Ground.of(self.targets, self.cohort[:COHORT_CLIMBED], level)
 
 
 def lift_own_templates(system: System) -> OwnTemplates:
@@ -75,13 +77,12 @@ def lift_own_templates(system: System) -> OwnTemplates:
     known = source if isinstance(source, DecoyGenerator) else DecoyGenerator.fit(system.attacker)
     half = len(faces) // 2
     with Keystream.seeded("audit", system.seed, str(system.scheme), "attacker's cohort") as stream:
-        cohort = make_cohort(
-            known,
-            strategy=system.lifter.strategy,
+        cohort = lift(
+            people_like(known, system.attacker).draw(COHORT_SIZE, 1, stream=stream)[:, 0],
+            strategy=plain_strategy(system.lifter.strategy),
             m=system.scheme.dim,
+            source=known,
             stream=stream,
-            size=COHORT_SIZE,
-            hidden=people_like(known, system.attacker),
         )
     return OwnTemplates(
         targets=system.lift(faces[:half], "attacker's targets"),
@@ -98,8 +99,7 @@ def wolf_knowledge(system: System) -> Knowledge:
 def presentation_attack(system: System) -> list[AttackOutcome]:
     """All probes, raw and, where the contract takes them, lifted.
 
-    Of each the decision with input checks and cohort test is judged; the threshold alone, without
-    input checks, stands beside it.
+    Each is judged by the decision, after the input checks.
     """
     own = lift_own_templates(system)
     outcomes = _raw(system, own)
@@ -120,40 +120,40 @@ class Trial:
         What the attacker does with it, to complete "The attacker …".
     probes
         One for each victim, or one for all.
-    alone
-        Those that are tried against the threshold alone.
-    knowledge
+    knowledge, leaked
         What it takes.
     """
 
     variant: str
     does: str
     probes: Probes
-    alone: Probes
     knowledge: Knowledge = Knowledge.ALGORITHM
+    leaked: Leaked = Leaked.DATABASE
 
 
 def _raw(system: System, own: OwnTemplates) -> list[AttackOutcome]:
     calibration, n = system.points, system.templates.n
+    level = calibration.level(system.contract.default_level)
     zero = np.zeros((1, n), dtype=np.float32)
     plain = _plain_wolves(system.attacker)
     starts = np.concatenate([plain, system.attacker[:STARTS]])
     inside = points_inside(system.templates, seed=system.seed)
-    turned = rotate(inside, secret_rotation(system, "replay")).astype(np.float32)
+    rotations = rotations_of(system, "replay", "template", len(inside))
+    as_stored = turned_points(inside, rotations).astype(np.float32)
 
     def wolf(variant: str, does: str, made: Callable[[Level], NDArray[np.float32]]) -> Trial:
-        best = []
-        for rule in _rules(system, calibration):
-            candidates = made(rule)
-            shares = accepted_shares(candidates, own, system.contract, calibration, rule)
-            best.append(candidates[[int(np.argmax(shares))]])
-        return Trial(variant, does, best[0], best[1], wolf_knowledge(system))
+        candidates = made(level)
+        shares = accepted_shares(candidates, own, system.contract, calibration, level)
+        best = candidates[[int(np.argmax(shares))]]
+        return Trial(variant, does, best, wolf_knowledge(system))
 
-    def climbed(rule: Level) -> NDArray[np.float32]:
-        return ascend_points(starts, own.ground(rule))
+    def climbed(level: Level) -> NDArray[np.float32]:
+        return ascend_points(
+            starts, own.targets, system.contract.expectation, threshold=level.threshold
+        )
 
     trials = [
-        Trial("zero embedding", "sends the zero vector", zero, zero),
+        Trial("zero embedding", "sends the zero vector", zero),
         wolf(
             "wolf embedding, axes of faces",
             "sends the best of the mean face and the principal axes of their faces",
@@ -166,18 +166,17 @@ def _raw(system: System, own: OwnTemplates) -> list[AttackOutcome]:
         ),
         Trial(
             "replay as embedding, with the key",
-            "has stolen the template and the tenant's rotation, may send embeddings, and sends a "
+            "has stolen the template and the tenant's key, may send embeddings, and sends a "
             "unit vector of the template",
             inside,
-            inside,
-            Knowledge.KEY,
+            leaked=Leaked.HOLDER_KEYS,
         ),
         Trial(
             "replay as embedding, without the key",
             "has stolen the template in its rotation, may send embeddings, and sends a unit vector "
-            "of it, which the service rotates once more",
-            turned,
-            turned,
+            "of it, which the service turns once more",
+            as_stored,
+            leaked=Leaked.MASTER_KEY,
         ),
     ]
     return [outcome for trial in trials for outcome in _outcomes(system, calibration, trial)]
@@ -185,6 +184,7 @@ def _raw(system: System, own: OwnTemplates) -> list[AttackOutcome]:
 
 def _lifted(system: System, calibration: Calibration, own: OwnTemplates) -> list[AttackOutcome]:
     m, n = calibration.probe_m, system.templates.n
+    level = calibration.level(system.contract.default_level)
     low, high = calibration.foot_point_norm or (0.0, 1.0)
     rng = np.random.default_rng(system.seed)
     wolves = axis_wolves(system.attacker, m, foot_norm=(low + high) / 2, seed=system.seed)
@@ -192,36 +192,32 @@ def _lifted(system: System, calibration: Calibration, own: OwnTemplates) -> list
         [canonical(np.zeros(n), rng.standard_normal((m, n))) for _ in range(len(system.templates))]
     )
     inside = honest_flats(system.templates, calibration)
-    turned = inside.rotated(secret_rotation(system, "replay"))
+    as_stored = turned(inside, rotations_of(system, "replay", "template", len(inside)))
 
-    def shares(probes: SubspaceBatch, rule: Level) -> NDArray[np.float64]:
-        return accepted_shares(probes, own, system.contract, calibration, rule)
+    def shares(probes: SubspaceBatch, level: Level) -> NDArray[np.float64]:
+        return accepted_shares(probes, own, system.contract, calibration, level)
 
     def wolf(variant: str, does: str, made: Callable[[Level], SubspaceBatch]) -> Trial:
-        best = []
-        for rule in _rules(system, calibration):
-            received = through_wire(made(rule), contract_id=system.contract.contract_id)
-            honest = honest_lift(received, calibration)
-            # Without the cohort test there are no input checks either: see `_outcomes`.
-            if np.isfinite(rule.cohort_threshold) and honest.any():
-                received = received[honest]
-            best.append(received[np.array([np.argmax(shares(received, rule))])])
-        return Trial(variant, does, best[0], best[1], wolf_knowledge(system))
+        received = through_wire(made(level), contract_id=system.contract.contract_id)
+        honest = honest_lift(received, calibration)
+        if honest.any():
+            received = received[honest]
+        best = received[np.array([np.argmax(shares(received, level))])]
+        return Trial(variant, does, best, wolf_knowledge(system))
 
     def family(name: str) -> SubspaceBatch:
         return SubspaceBatch.of([axis.subspace for axis in wolves if axis.family == name])
 
-    def climbed(rule: Level) -> SubspaceBatch:
+    def climbed(level: Level) -> SubspaceBatch:
         starts = SubspaceBatch.of([axis.subspace for axis in wolves])
         starts = starts[honest_lift(starts, calibration)]
-        leading = starts[np.argsort(-shares(starts, rule))[:STARTS]]
-        return ascend_subspaces(leading, own.ground(rule))
+        leading = starts[np.argsort(-shares(starts, level))[:STARTS]]
+        return ascend_subspaces(leading, own.ground(level))
 
     trials = [
         Trial(
             "random central subspaces",
             "sends random subspaces through the coordinate origin",
-            central,
             central,
         ),
         wolf(
@@ -241,18 +237,17 @@ def _lifted(system: System, calibration: Calibration, own: OwnTemplates) -> list
         ),
         Trial(
             "replay as lifted probe, with the key",
-            "has stolen the template and the tenant's rotation, may send lifted probes, and sends "
+            "has stolen the template and the tenant's key, may send lifted probes, and sends "
             "a part of the template",
             inside,
-            inside,
-            Knowledge.KEY,
+            leaked=Leaked.HOLDER_KEYS,
         ),
         Trial(
             "replay as lifted probe, without the key",
             "has stolen the template in its rotation, may send lifted probes, and sends a part of "
             "it, which the service rotates once more",
-            turned,
-            turned,
+            as_stored,
+            leaked=Leaked.MASTER_KEY,
         ),
     ]
     return [outcome for trial in trials for outcome in _outcomes(system, calibration, trial)]
@@ -267,77 +262,56 @@ def _plain_wolves(faces: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(rows / np.linalg.norm(rows, axis=1, keepdims=True), dtype=np.float32)
 
 
-def _rules(system: System, calibration: Calibration) -> tuple[Level, Level]:
-    """Return the service's default level, and the same without the cohort test."""
-    level = calibration.level(system.contract.default_level)
-    return level, replace(level, cohort_threshold=-np.inf)
-
-
 def accepted_shares(
     probes: Probes, own: OwnTemplates, contract: Contract, calibration: Calibration, level: Level
 ) -> NDArray[np.float64]:
-    """Share of the attacker's held-out templates that accept each probe, by their own cohort.
+    """Share of the attacker's held-out templates that accept each probe.
 
-    Ties, such as where none accepts, are broken by the mean similarity.
+    Lifted probes are held against the attacker's own cohort, for the service's is secret. Ties,
+    such as where none accepts, are broken by the mean similarity.
     """
     scores = score(probes, own.held_out, contract, calibration, cohort=own.cohort)
     # Similarities lie in [-1, 1]: their mean, scaled, never outweighs one acceptance.
     tie = scores.similarities.mean(axis=1) / (4 * len(own.held_out))
-    return np.asarray(scores.at(level).accepted.mean(axis=1) + tie, dtype=np.float64)
+    return np.asarray(scores.at(level).mean(axis=1) + tie, dtype=np.float64)
 
 
 def _outcomes(system: System, calibration: Calibration, trial: Trial) -> list[AttackOutcome]:
-    """Judge the service's decision, and report that of the threshold alone."""
+    """Judge the service's decision."""
     default = system.contract.default_level
     passed = _passed(trial.probes, calibration)
-    judged, alone = {}, {}
+    judged: dict[str, NDArray[np.bool_]] = {}
     by_level: dict[str, Json] = {}
-    alone_by_level: dict[str, Json] = {}
     scores = _scored(system, trial.probes, calibration)
-    bare = scores if trial.alone is trial.probes else _scored(system, trial.alone, calibration)
     for level in calibration.levels:
-        accepted = scores.at(level).accepted
+        accepted = scores.at(level)
         judged[level.name] = accepted & passed
-        alone[level.name] = bare.at(level).near
         by_level[level.name] = {
             "without_input_checks": _counted(accepted),
             "with_input_checks": _counted(judged[level.name]),
         }
-        alone_by_level[level.name] = _counted(alone[level.name])
-    judged_outcome = AttackOutcome(
-        attack="presentation",
-        breaks=Property.IMPERSONATION,
-        knowledge=trial.knowledge,
-        scheme=system.scheme,
-        level=default,
-        chance=fmr_of(calibration.level(default)),
-        variant=trial.variant,
-        assumption=(
-            f"The attacker {trial.does}; success is acceptance by a victim's template, after "
-            "the input checks, by threshold and cohort test."
-        ),
-        measured=_rate(judged[default]),
-        details={
-            "mode": calibration.mode,
-            "probes": len(trial.probes),
-            "refused_by_the_input_checks": int(np.count_nonzero(~passed)),
-            "by_level": by_level,
-        },
-    )
     return [
-        judged_outcome,
-        replace(
-            judged_outcome,
-            variant=f"{trial.variant}; threshold alone",
+        AttackOutcome(
+            attack="presentation",
+            breaks=Property.IMPERSONATION,
+            leaked=trial.leaked,
+            knowledge=trial.knowledge,
+            scheme=system.scheme,
+            level=default,
+            chance=fmr_of(calibration.level(default)),
+            variant=trial.variant,
             assumption=(
-                f"The attacker {trial.does}; success is acceptance by a victim's template by the "
-                "similarity threshold alone, without input checks and cohort test, which no "
-                "service leaves out (not judged)."
+                f"The attacker {trial.does}; success is acceptance by a victim's template, after "
+                "the input checks."
             ),
-            measured=_rate(alone[default]),
-            judged=False,
-            details={"mode": calibration.mode, "by_level": alone_by_level},
-        ),
+            measured=_rate(judged[default]),
+            details={
+                "mode": calibration.mode,
+                "probes": len(trial.probes),
+                "refused_by_the_input_checks": int(np.count_nonzero(~passed)),
+                "by_level": by_level,
+            },
+        )
     ]
 
 
@@ -352,7 +326,7 @@ def _scored(system: System, probes: Probes, calibration: Calibration) -> Scores:
     if len(probes) > 1:
         return score(probes, system.templates, system.contract, calibration, paired=True)
     every = score(probes, system.templates, system.contract, calibration)
-    return Scores(every.similarities[0], every.cohort_scores[0])
+    return Scores(every.similarities[0], every.scores[0])
 
 
 def _rate(accepted: NDArray[np.bool_]) -> Rate:

@@ -30,6 +30,7 @@ class RecordingSource:
         self.source_id: str = inner.source_id
         self.n: int = inner.n
         self.made_with: str | None = inner.made_with
+        self.noise = inner.noise
         self._inner = inner
         self._noise = noise
         self.last: NDArray[np.float32] = np.empty((0, 0, inner.n), dtype=np.float32)

@@ -1,10 +1,8 @@
-"""Wolves by gradient ascent on the decision itself, against templates that the attacker lifts.
+"""Lifted wolves by gradient ascent on the decision, against templates that the attacker lifts.
 
-The attacker knows the algorithm and the thresholds, and lifts faces of their own (targets) and
-descriptors of nobody (a cohort like the service's). A probe climbs the mean over the targets of
-σ(a) σ(b), where a is how far the similarity exceeds its threshold, in standard deviations of the
-cohort's similarities, and b how far the cohort score exceeds its own: a smooth form of the share
-of templates that accept.
+The attacker knows the algorithm and the thresholds, and lifts faces of their own (targets). Raw
+probes climb as ``verify.point_ascent`` says, as what is expected of a point is known to everybody;
+for lifted ones the attacker lifts descriptors of nobody (a cohort like the service's).
 """
 
 from dataclasses import dataclass
@@ -13,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from templates.contract.document import Level
+from templates.space.embedding import normalised
 from templates.space.subspace import SubspaceBatch
+from verify.point_ascent import ROUNDS, accepted_share, step_lengths
 
 Array32 = NDArray[np.float32]
+Array64 = NDArray[np.float64]
 
-ROUNDS = 60
-_FIRST_STEP, _LAST_STEP = 0.3, 0.01
-"""Length of a step, in radians for a point; directions of steps are normalised."""
 _ALTERNATIONS = 12
 _ALTERNATIONS_ON = 4
 _SEARCH_EVERY = 10
@@ -37,7 +35,7 @@ class Ground:
     radii : (K,) float32
     targets
         How many of the K are targets.
-    similarity_threshold, cohort_threshold
+    threshold
         Of the level that the wolf is made for.
     """
 
@@ -45,8 +43,7 @@ class Ground:
     rows: Array32
     radii: Array32
     targets: int
-    similarity_threshold: float
-    cohort_threshold: float
+    threshold: float
 
     @classmethod
     def of(cls, targets: SubspaceBatch, cohort: SubspaceBatch, level: Level) -> "Ground":
@@ -57,57 +54,32 @@ class Ground:
             rows=bases.reshape(-1, targets.n),
             radii=np.concatenate([targets.radii, cohort.radii]).astype(np.float32),
             targets=len(targets),
-            similarity_threshold=level.similarity_threshold,
-            cohort_threshold=level.cohort_threshold,
+            threshold=level.threshold,
         )
 
-    def slopes(self, similarities: Array32) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def slopes(self, similarities: Array32) -> tuple[Array64, Array64]:
         """Objective, shape (S,), and its slope by every similarity, shape (S, K).
 
         Parameters
         ----------
         similarities : (S, K)
-            Of S probes to the K subspaces.
+            Of S lifted probes to the K subspaces.
         """
         values = similarities.astype(np.float64)
         of_targets, cohort = values[:, : self.targets], values[:, self.targets :]
         mean = cohort.mean(axis=1, keepdims=True)
         spread = np.maximum(cohort.std(axis=1, ddof=1, keepdims=True), 1e-6)
         score = (of_targets - mean) / spread
-        near = _logistic((of_targets - self.similarity_threshold) / spread)
-        singular = _logistic(score - self.cohort_threshold)
-        product = near * singular / self.targets
-        # The cohort's spread is a mere unit of length in `near`, and constant there.
-        by_similarity = product * (1 - near) / spread
-        by_score = product * (1 - singular)
+        objective, by_score = accepted_share(score, self.threshold)
         slopes = np.empty_like(values)
-        slopes[:, : self.targets] = by_similarity + by_score / spread
+        slopes[:, : self.targets] = by_score / spread
         by_mean = -by_score.sum(axis=1, keepdims=True) / spread
         by_spread = -(by_score * score).sum(axis=1, keepdims=True) / spread
         count = cohort.shape[1]
         slopes[:, self.targets :] = by_mean / count + by_spread * (cohort - mean) / (
             (count - 1) * spread
         )
-        return product.sum(axis=1), slopes
-
-
-def ascend_points(starts: Array32, ground: Ground, *, rounds: int = ROUNDS) -> Array32:
-    """Climb with raw probes: unit rows (S, n) to unit rows (S, n)."""
-    points = _unit(starts.astype(np.float32))
-    best, best_value = points, np.full(len(points), -np.inf)
-    for step in _steps(rounds):
-        inside = (points @ ground.rows.T).reshape(len(points), len(ground.feet), -1)
-        lengths = np.maximum(np.linalg.norm(inside, axis=2), 1e-6)
-        similarities = points @ ground.feet.T + ground.radii * lengths
-        value, slopes = ground.slopes(similarities)
-        best = np.where((value > best_value)[:, None], points, best)
-        best_value = np.maximum(value, best_value)
-        weights = slopes.astype(np.float32)
-        inside *= (weights * ground.radii / lengths)[:, :, None]
-        gradient = weights @ ground.feet + inside.reshape(len(points), -1) @ ground.rows
-        gradient -= np.einsum("si,si->s", gradient, points)[:, None] * points
-        points = _unit(points + step * _unit(gradient))
-    return np.ascontiguousarray(best, dtype=np.float32)
+        return objective, slopes
 
 
 def ascend_subspaces(
@@ -125,7 +97,7 @@ def _ascend(foot: Array32, basis: Array32, ground: Ground, rounds: int) -> tuple
     radius = np.float32(np.sqrt(max(0.0, 1 - norm**2)))
     best_foot, best_basis, best_value = foot, basis, -np.inf
     v: Array32 | None = None
-    for number, step in enumerate(_steps(rounds)):
+    for number, step in enumerate(step_lengths(rounds)):
         # The best v moves little in a step: it is searched for anew now and then only.
         again = None if number % _SEARCH_EVERY == 0 else v
         similarities, v, nearest = _closest(foot, basis, radius, ground, again)
@@ -168,8 +140,8 @@ def _closest(
     best_u, best_v = np.zeros_like(g), np.zeros_like(h)
     for v in starts:
         for _ in range(alternations):
-            u = _unit(g + (v[:, None, :] @ transposed)[:, 0, :])
-            v = _unit(h + (u[:, None, :] @ b)[:, 0, :])
+            u = normalised(g + (v[:, None, :] @ transposed)[:, 0, :])
+            v = normalised(h + (u[:, None, :] @ b)[:, 0, :])
         value = np.einsum("ki,ki->k", u, g + (v[:, None, :] @ transposed)[:, 0, :])
         value += np.einsum("ki,ki->k", v, h)
         better = value > best_value
@@ -187,17 +159,4 @@ def _leading(square: Array32) -> Array32:
         power = power / np.maximum(np.einsum("kii->k", power), 1e-12)[:, None, None]
         power = power @ power
     largest = np.argmax(np.einsum("kii->ki", power), axis=1)
-    return _unit(power[np.arange(len(power)), :, largest])
-
-
-def _steps(rounds: int) -> list[float]:
-    return [float(step) for step in np.geomspace(_FIRST_STEP, _LAST_STEP, rounds)]
-
-
-def _logistic(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(1 / (1 + np.exp(-np.clip(x, -60, 60))))
-
-
-def _unit(rows: NDArray[np.floating]) -> Array32:
-    lengths = np.linalg.norm(rows, axis=-1, keepdims=True)
-    return np.asarray(rows / np.maximum(lengths, 1e-12), dtype=np.float32)
+    return normalised(power[np.arange(len(power)), :, largest])

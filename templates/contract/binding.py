@@ -1,16 +1,17 @@
 """What makes two templates comparable: the part of a contract that its id hashes."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 from templates.contract.canonical import Fields, Json, digest, free_object
 from templates.contract.levels import SHA256_HEX
 from templates.errors import ContractError, ContractMismatch
+from templates.keys.rotation import HAAR_VERSION, ROTATION_VERSION
 from templates.space.lifting import Strategy
 
 MAX_N = 4096
-MAX_M = 128
+MAX_M = 192
 
 
 def embedding_id(*, embedder_sha256: str, preprocessing: Mapping[str, object]) -> str:
@@ -57,7 +58,7 @@ class Binding:
     decoy_source_id
         SHA-256 of the decoy source's canonical content.
     rotation_version
-        Version of the tenant-rotation derivation.
+        Version of the derivation that turns stored templates.
     """
 
     embedder_sha256: str
@@ -87,6 +88,21 @@ class Binding:
     def contract_id(self) -> str:
         """SHA-256 of the canonical JSON, 64 hexadecimal digits; computed once."""
         return digest(self.to_json())
+
+    @cached_property
+    def rotation_versions(self) -> dict[str, str]:
+        """Rotation version by the ids of contracts whose stored templates this one serves.
+
+        This contract's own comes first, then that of the one which differs from it in the earlier
+        rotation version only. A rotation changes no distance, so the calibrations hold for both.
+        """
+        earlier = replace(self, rotation_version=HAAR_VERSION)
+        return {self.contract_id: self.rotation_version, earlier.contract_id: HAAR_VERSION}
+
+    @property
+    def contract_ids(self) -> tuple[str, ...]:
+        """The keys of :attr:`rotation_versions`."""
+        return tuple(self.rotation_versions)
 
     @property
     def embedding_id(self) -> str:
@@ -168,18 +184,38 @@ class Binding:
                 f"is {source_id[:16]}…; use the file that the contract was calibrated with"
             )
 
-    def require_contract(self, contract_id: str, *, what: str) -> None:
-        """Refuse a template of another contract.
+    def require_contract(self, contract_id: str, *, what: str) -> str:
+        """Refuse a template of another contract; return its rotation version.
 
         Raises
         ------
         ContractMismatch
             Naming both sides.
         """
-        if contract_id != self.contract_id:
+        version = self.rotation_versions.get(contract_id)
+        if version is None:
             raise ContractMismatch(
                 f"{what} belongs to the contract {contract_id[:16]}…, the service runs "
                 f"{self.contract_id[:16]}…; enroll or lift again under the service's contract"
+            )
+        return version
+
+    def require_rotation_version(self) -> None:
+        """Refuse a contract that was made before templates had rotations of their own.
+
+        It is not converted: its calibrations carry its id, and the seal of its file covers both.
+
+        Raises
+        ------
+        ContractMismatch
+            Naming both versions.
+        """
+        if self.rotation_version != ROTATION_VERSION:
+            raise ContractMismatch(
+                f"the contract turns templates by {self.rotation_version!r}, this program by "
+                f"{ROTATION_VERSION!r}: run `veilface calibrate --strategy {self.strategy} "
+                f"--dim {self.m}` with the same pack, decoys and --flip; stored templates stay "
+                "valid then, and `veilface keys rotate-tenant` turns them"
             )
 
     @classmethod

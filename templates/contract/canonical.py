@@ -150,6 +150,13 @@ class Fields:
             raise ContractError(f"{self._what}: {key!r} is not a short text")
         return value
 
+    def boolean(self, key: str) -> bool:
+        """Hand out ``true`` or ``false``."""
+        value = self.take(key)
+        if not isinstance(value, bool):
+            raise ContractError(f"{self._what}: {key!r} is not true or false")
+        return value
+
     def integer(self, key: str) -> int:
         """Hand out an integer within ±2^53; ``true`` and ``1.0`` are not integers."""
         value = self.take(key)
@@ -168,6 +175,13 @@ class Fields:
             raise ContractError(f"{self._what}: {key!r} is not finite")
         return float(value)
 
+    def take_null(self, key: str) -> bool:
+        """Hand out an entry that is null; returns whether it was, and leaves any other."""
+        if key not in self._entries or self._entries[key] is not None:
+            return False
+        del self._entries[key]
+        return True
+
     def numbers(self, key: str, count: int) -> tuple[float, ...]:
         """Hand out a list of exactly ``count`` finite numbers."""
         value = self.take(key)
@@ -175,6 +189,10 @@ class Fields:
             raise ContractError(f"{self._what}: {key!r} is not a list of {count} numbers")
         entries = Fields(dict(zip(map(str, range(count)), value, strict=True)), what=self._what)
         return tuple(entries.number(str(i)) for i in range(count))
+
+    def lacks(self, key: str) -> bool:
+        """Whether an optional entry is not there, or was handed out."""
+        return key not in self._entries
 
     def items(self, key: str, *, most: int) -> list[object]:
         """Hand out a list of 1 to ``most`` values."""

@@ -2,11 +2,12 @@
 
 ``contract_id`` is the SHA-256 of the canonical JSON of the binding. Every stored template carries
 it, and a template of another contract is refused (docs/contract.md). Recalibrating changes the
-calibrations, their ids and perhaps the cohort, never the ``contract_id``.
+calibrations, their ids and perhaps the strangers, never the ``contract_id``.
 
-The file is JSON. The cohort is a secret: who has it can search for a probe that passes the cohort
-test; and so are the strangers whom templates of clients are held against. Both are sealed inside
-the file, and the seal's context holds the digest of everything else in the file, so that an edited
+The file is JSON. The strangers whom templates of clients are held against, and the seed of the
+cohort that lifted probes are held against, are secrets: who has them can search for what passes
+those tests. They are sealed inside the file with what a point's expected similarity is computed
+from, and the seal's context holds the digest of everything else in the file, so that an edited
 threshold is refused as well.
 """
 
@@ -23,9 +24,11 @@ from pathlib import Path
 import numpy as np
 import safetensors
 import safetensors.numpy
+from numpy.typing import NDArray
 
 from templates.contract.binding import Binding
 from templates.contract.canonical import Fields, Json, digest, free_object, parse_object
+from templates.contract.expectation import EXPECTATION_TENSORS, PointExpectation
 from templates.contract.levels import (
     LEVEL_NAME,
     Calibration,
@@ -35,28 +38,43 @@ from templates.contract.levels import (
     check_norm_range,
     norm_range,
 )
-from templates.contract.nobody import Nobody
+from templates.contract.liveness import LivenessCalibration
+from templates.contract.nobody import NOBODY_TENSORS, Nobody
+from templates.contract.verdict import Verdict
 from templates.distances import Metric
 from templates.errors import ContractError, DecoyError, SealError, Uncalibrated
 from templates.keys.bounded_file import read_at_most
 from templates.keys.private_file import replace_private
 from templates.keys.sealing import Sealer
+from templates.space.lifting import plain_strategy
 from templates.space.subspace import SubspaceBatch
 
-__all__ = ["Binding", "Calibration", "Contract", "Level", "Mode", "Rate"]
+__all__ = [
+    "Binding",
+    "Calibration",
+    "Contract",
+    "Level",
+    "LivenessCalibration",
+    "Mode",
+    "Rate",
+]
 
 FORMAT = "veilface-contract"
 VERSION = 2
-MAX_FILE_BYTES = 256 * 2**20
+MAX_FILE_BYTES = 128 * 2**20
 MAX_CALIBRATIONS = 64
-COHORT_SIZES = (2, 4096)
-BASIS_TOLERANCE = 1e-4
-SEALED = frozenset({"feet", "bases", "people", "means", "spreads", "generator"})
+_EXPECTATION, _NOBODY = "expectation.", "nobody."
+SEALED = frozenset(
+    {
+        *(_EXPECTATION + name for name in EXPECTATION_TENSORS),
+        *(_NOBODY + name for name in NOBODY_TENSORS),
+    }
+)
 
 
 @dataclass(frozen=True, eq=False)
 class Contract:
-    """A binding with its calibrations, its cohort and its enrollment limits.
+    """A binding with its calibrations and limits, and what scores are computed from.
 
     Parameters
     ----------
@@ -65,20 +83,25 @@ class Contract:
     recorded
         Facts that are recorded but not bound: pack name, detector and its input size, dates.
     calibrations
-        One per (mode, metric, probe m); ids are computed here where they are empty, and checked
-        where they are not.
+        One per (mode, metric, probe m, probe photos); ids are computed here where they are empty,
+        and checked where they are not.
     default_level
         Level of a request that names none.
-    photo_consistency
-        Least raw cosine between any two photos of one enrollment.
+    photo_consistency, probe_consistency
+        Least agreement of the photos of one enrollment, and of one probe
+        (``templates.space.agreement``).
     template_foot_point_norm
         Range of ‖p‖ that an honest template of this contract has.
     template_stranger_score
         Largest ``Nobody.score`` that an honest template of this contract has.
-    cohort
-        Templates that belong to nobody, un-rotated; (C, n) feet and (C, m, n) bases. Secret.
+    expectation
+        What a point's similarity to a template of nobody is expected to be.
     nobody
         Strangers who do not exist. Secret.
+    verdict
+        How private and how accurate the calibration found it; None where that was not measured.
+    liveness
+        The threshold of passive presentation attack detection; None where there is none.
 
     Raises
     ------
@@ -91,57 +114,49 @@ class Contract:
     calibrations: tuple[Calibration, ...]
     default_level: str
     photo_consistency: float
+    probe_consistency: float
     template_foot_point_norm: tuple[float, float]
     template_stranger_score: float
-    cohort: SubspaceBatch = field(repr=False)
+    expectation: PointExpectation = field(repr=False)
     nobody: Nobody = field(repr=False)
+    verdict: Verdict | None = None
+    liveness: LivenessCalibration | None = None
 
     def __post_init__(self) -> None:
         recorded = free_object(self.recorded, what="the record")
         object.__setattr__(self, "recorded", recorded)
-        if not -1.0 <= self.photo_consistency <= 1.0:
-            raise ContractError("photo_consistency is a cosine and must lie in [-1, 1]")
+        for name in ("photo_consistency", "probe_consistency"):
+            if not -1.0 <= getattr(self, name) <= 1.0:
+                raise ContractError(f"{name} is a cosine and must lie in [-1, 1]")
         if not LEVEL_NAME.fullmatch(self.default_level):
             raise ContractError("the default level's name must match " + LEVEL_NAME.pattern)
         check_norm_range(self.template_foot_point_norm)
         if not math.isfinite(self.template_stranger_score):
             raise ContractError("template_stranger_score is not a finite number")
-        self._check_cohort()
+        self.expectation.check(self.binding.n)
         self.nobody.check(self.binding.n)
         self._check_calibrations()
-
-    def _check_cohort(self) -> None:
-        feet, bases = self.cohort.feet, self.cohort.bases
-        least, most = COHORT_SIZES
-        if not least <= len(self.cohort) <= most:
-            raise ContractError(f"the cohort must have {least} to {most} templates")
-        if (self.cohort.n, self.cohort.m) != (self.binding.n, self.binding.m):
-            raise ContractError("the cohort's dimensions differ from the binding's")
-        if not (np.isfinite(feet).all() and np.isfinite(bases).all()):
-            raise ContractError("the cohort holds a number that is not finite")
-        # No entry of a unit row is larger, and the products below must not overflow: infinity less
-        # infinity is no number, which no tolerance refuses.
-        if max(np.abs(feet).max(), np.abs(bases).max()) > 1 + BASIS_TOLERANCE:
-            raise ContractError("a cohort template holds a number larger than 1")
-        gram = np.matmul(bases, bases.transpose(0, 2, 1)) - np.eye(self.binding.m, dtype=np.float32)
-        dots = np.matmul(bases, feet[:, :, None])
-        if max(np.abs(gram).max(), np.abs(dots).max()) > BASIS_TOLERANCE:
-            raise ContractError("a cohort template is not in canonical, orthonormal form")
 
     def _check_calibrations(self) -> None:
         if not 1 <= len(self.calibrations) <= MAX_CALIBRATIONS:
             raise ContractError(f"a contract needs 1 to {MAX_CALIBRATIONS} calibrations")
-        keys = {(entry.mode, entry.metric, entry.probe_m) for entry in self.calibrations}
+        keys = {
+            (entry.mode, entry.metric, entry.probe_m, entry.probe_photos)
+            for entry in self.calibrations
+        }
         if len(keys) != len(self.calibrations):
-            raise ContractError("two calibrations share mode, metric and probe m")
+            raise ContractError("two calibrations share mode, metric, probe m and probe photos")
+        points = {entry.metric for entry in self.calibrations if entry.mode == "p2s"}
+        if not points <= {self.expectation.metric}:
+            raise ContractError("the expectation is not of the metric that points are decided by")
         if any(entry.probe_m >= self.binding.n for entry in self.calibrations):
             raise ContractError("a calibration's probe m is not below the embedding dimension")
         names = {level.name for entry in self.calibrations for level in entry.levels}
         if self.default_level not in names:
             raise ContractError("no calibration has the default level")
-        contract_id, cohort_id = self.contract_id, self.cohort_id
+        contract_id, nobody_id = self.contract_id, self.nobody_id
         identified = tuple(
-            entry.identified(contract_id=contract_id, cohort_id=cohort_id)
+            entry.identified(contract_id=contract_id, nobody_id=nobody_id)
             for entry in self.calibrations
         )
         for given, computed in zip(self.calibrations, identified, strict=True):
@@ -155,60 +170,93 @@ class Contract:
         return self.binding.contract_id
 
     @cached_property
-    def cohort_id(self) -> str:
-        """SHA-256 over the cohort's float32 numbers, feet then bases, little-endian."""
-        digester = hashlib.sha256(str(self.cohort.bases.shape).encode())
-        digester.update(self.cohort.feet.astype("<f4", copy=False).tobytes())
-        digester.update(self.cohort.bases.astype("<f4", copy=False).tobytes())
-        return digester.hexdigest()
+    def nobody_id(self) -> str:
+        """SHA-256 over all that scores are computed from: the expectation and the strangers."""
+        return hashlib.sha256(self.expectation.digest + self.nobody.digest).hexdigest()
+
+    @cached_property
+    def cohort(self) -> SubspaceBatch:
+        """Templates of nobody that lifted probes are normalised by; lifted at the first use."""
+        strategy = plain_strategy(self.binding.strategy)
+        return self.nobody.cohort(strategy=strategy, m=self.binding.m)
 
     def calibration(
-        self, mode: Mode, metric: Metric | None = None, probe_m: int = 0
+        self,
+        mode: Mode,
+        metric: Metric | None = None,
+        probe_m: int = 0,
+        probe_photos: int = 1,
+        *,
+        level: str | None = None,
     ) -> Calibration:
-        """Find the calibration of one mode, metric and probe dimension.
+        """Find the calibration of one mode, metric, probe dimension and number of photos.
 
-        ``metric`` None takes the first that the contract lists for the mode and dimension.
+        Parameters
+        ----------
+        metric
+            None takes the first that the contract lists for the mode and dimension.
+        probe_photos
+            Photos that the probe is the mean of. The calibration of the most photos that are not
+            more serves: a mean of more photos is rejected less often.
+        level
+            Of those that have this level only, where one has it.
 
         Raises
         ------
         Uncalibrated
             Where there is none; the message names those there are.
         """
-        for entry in self.calibrations:
-            if (entry.mode, entry.probe_m) == (mode, probe_m) and metric in (None, entry.metric):
-                return entry
-        have = [f"{entry.mode} {entry.metric} m={entry.probe_m}" for entry in self.calibrations]
+        fitting = [
+            entry
+            for entry in self.calibrations
+            if (entry.mode, entry.probe_m) == (mode, probe_m)
+            and metric in (None, entry.metric)
+            and entry.probe_photos <= probe_photos
+        ]
+        fitting = [entry for entry in fitting if entry.metric == fitting[0].metric]
+        having = [entry for entry in fitting if level in {one.name for one in entry.levels}]
+        if fitting:
+            return max(having or fitting, key=lambda entry: entry.probe_photos)
+        have = [
+            f"{entry.mode} {entry.metric} m={entry.probe_m}"
+            for entry in self.calibrations
+            if entry.probe_photos == 1
+        ]
         wanted = f"{mode} {metric or 'any metric'} with probe m = {probe_m}"
         raise Uncalibrated(f"no calibration for {wanted}; calibrated are: {', '.join(have)}")
 
     def public(self) -> dict[str, Json]:
-        """Everything but the cohort and the strangers, as JSON values."""
-        return {
+        """Everything but the expectation and the strangers, as JSON values."""
+        facts: dict[str, Json] = {
             "contract_id": self.contract_id,
             "binding": self.binding.to_json(),
             "recorded": dict(self.recorded),
             "calibrations": [entry.to_json() for entry in self.calibrations],
             "default_level": self.default_level,
             "photo_consistency": self.photo_consistency,
+            "probe_consistency": self.probe_consistency,
             "template_foot_point_norm": list(self.template_foot_point_norm),
             "template_stranger_score": self.template_stranger_score,
-            "cohort_size": len(self.cohort),
-            "cohort_id": self.cohort_id,
+            "nobody_id": self.nobody_id,
+            "verdict": None if self.verdict is None else self.verdict.to_json(),
         }
+        # Absent where there is none, as in files that were written before it existed.
+        if self.liveness is not None:
+            facts["liveness"] = self.liveness.to_json()
+        return facts
 
     def save(self, path: Path | str, sealer: Sealer) -> None:
         """Write the contract file atomically, readable by its owner only (mode 0600).
 
-        ``public()`` returns the same facts for readers who may not know the cohort.
+        ``public()`` returns the same facts for readers who may not know the strangers.
         """
         document: dict[str, Json] = {"format": FORMAT, "version": VERSION, **self.public()}
         tensors = {
-            "feet": np.ascontiguousarray(self.cohort.feet, dtype=np.float32),
-            "bases": np.ascontiguousarray(self.cohort.bases, dtype=np.float32),
-            **self.nobody.tensors(),
+            **{_EXPECTATION + name: part for name, part in self.expectation.tensors().items()},
+            **{_NOBODY + name: part for name, part in self.nobody.tensors().items()},
         }
         sealed = sealer.seal(safetensors.numpy.save(tensors), context=_seal_context(document))
-        document["cohort"] = base64.b64encode(sealed).decode("ascii")
+        document["sealed"] = base64.b64encode(sealed).decode("ascii")
         replace_private(Path(path), _render(document))
 
     @classmethod
@@ -220,16 +268,22 @@ class Contract:
         ContractError
             Where the file is absent, too large, of another version, or breaks any rule.
         SealError
-            Where the cohort does not open: another master key, or an edited file.
+            Where the sealed part does not open: another master key, or an edited file.
         """
         fields = Fields(
             parse_object(_read_bounded(Path(path)), what="the contract file"), what="it"
         )
-        if fields.text("format") != FORMAT or fields.integer("version") != VERSION:
-            raise ContractError(f"the file is not a {FORMAT} of version {VERSION}; recalibrate")
-        cohort_text = fields.take("cohort")
-        if not isinstance(cohort_text, str):
-            raise ContractError("the contract file's cohort is not base64 text")
+        if fields.text("format") != FORMAT:
+            raise ContractError(f"the file is not a {FORMAT}")
+        earlier = fields.lacks("probe_consistency") or "cohort" in fields.remaining()
+        if fields.integer("version") != VERSION or earlier:
+            raise ContractError(
+                "the contract file was written by an earlier version of this program, or by a "
+                "later one: run `veilface calibrate` again; templates stay valid"
+            )
+        text = fields.take("sealed")
+        if not isinstance(text, str):
+            raise ContractError("the contract file's sealed part is not base64 text")
         document = {"format": FORMAT, "version": VERSION, **fields.remaining()}
         binding = Binding.from_json(fields.take("binding"))
         if fields.text("contract_id") != binding.contract_id:
@@ -239,64 +293,71 @@ class Contract:
         )
         if not all(entry.calibration_id for entry in calibrations):
             raise ContractError("a calibration has no calibration_id")
-        cohort, nobody = _open_cohort(cohort_text, sealer, document, binding)
+        verdict = fields.take("verdict")
+        liveness = None if fields.lacks("liveness") else fields.take("liveness")
+        expectation, nobody = _open_sealed(text, sealer, document)
         contract = cls(
             binding=binding,
             recorded=fields.free("recorded"),
             calibrations=calibrations,
             default_level=fields.text("default_level"),
             photo_consistency=fields.number("photo_consistency"),
+            probe_consistency=fields.number("probe_consistency"),
             template_foot_point_norm=norm_range(fields.take("template_foot_point_norm")),
             template_stranger_score=fields.number("template_stranger_score"),
-            cohort=cohort,
+            expectation=expectation,
             nobody=nobody,
+            verdict=None if verdict is None else Verdict.from_json(verdict),
+            liveness=None if liveness is None else LivenessCalibration.from_json(liveness),
         )
-        if fields.integer("cohort_size") != len(cohort):
-            raise ContractError("cohort_size is not the size of the cohort")
-        if fields.text("cohort_id") != contract.cohort_id:
-            raise ContractError("the cohort_id is not the hash of the cohort")
+        if fields.text("nobody_id") != contract.nobody_id:
+            raise ContractError("the nobody_id is not the hash of what scores are computed from")
         fields.done()
         return contract
 
 
 def _seal_context(document: Mapping[str, object]) -> str:
-    """Context of the cohort's seal: the contract id and the digest of all that is not sealed."""
-    return f"contract-cohort:{document['contract_id']}:{digest(document)}"
+    """Context of the seal: the contract id and the digest of all that is not sealed."""
+    return f"contract-nobody:{document['contract_id']}:{digest(document)}"
 
 
-def _open_cohort(
-    text: str, sealer: Sealer, document: Mapping[str, object], binding: Binding
-) -> tuple[SubspaceBatch, Nobody]:
+def _open_sealed(
+    text: str, sealer: Sealer, document: Mapping[str, object]
+) -> tuple[PointExpectation, Nobody]:
     try:
         sealed = base64.b64decode(text, validate=True)
     except (binascii.Error, ValueError):
-        raise ContractError("the contract file's cohort is not base64 text") from None
+        raise ContractError("the contract file's sealed part is not base64 text") from None
     try:
         plain = sealer.open(sealed, context=_seal_context(document))
     except SealError as error:
         raise SealError(
-            "the contract's cohort does not open: the master key is not the one that sealed it, "
-            "or the file was edited; use the right key file, or run the calibration again"
+            "the contract does not open: the master key is not the one that sealed it, or the file "
+            "was edited; use the right key file, or run the calibration again"
         ) from error
     try:
         tensors = safetensors.numpy.load(plain)
     except (safetensors.SafetensorError, ValueError, KeyError):
-        raise ContractError("the contract's cohort is not a safetensors container") from None
+        raise ContractError("the contract's sealed part is not a safetensors container") from None
     if set(tensors) != SEALED:
-        raise ContractError(
-            "the contract's cohort does not hold exactly " + ", ".join(sorted(SEALED))
-        )
-    feet, bases = tensors["feet"], tensors["bases"]
-    count = len(feet) if feet.ndim else 0
-    if feet.shape != (count, binding.n) or bases.shape != (count, binding.m, binding.n):
-        raise ContractError("the contract's cohort has shapes other than the binding's")
-    if feet.dtype != np.float32 or bases.dtype != np.float32:
-        raise ContractError("the contract's cohort is not float32")
+        raise ContractError("the contract's sealed part holds other arrays than it must")
     try:
-        nobody = Nobody.from_tensors(tensors)
+        return (
+            PointExpectation.from_tensors(_part(tensors, _EXPECTATION)),
+            Nobody.from_tensors(_part(tensors, _NOBODY)),
+        )
     except DecoyError:
         raise ContractError("the contract's generator of decoys of nobody is broken") from None
-    return SubspaceBatch(np.ascontiguousarray(feet), np.ascontiguousarray(bases)), nobody
+
+
+def _part(
+    tensors: Mapping[str, NDArray[np.generic]], prefix: str
+) -> dict[str, NDArray[np.generic]]:
+    return {
+        name.removeprefix(prefix): array
+        for name, array in tensors.items()
+        if name.startswith(prefix)
+    }
 
 
 def _read_bounded(path: Path) -> bytes:

@@ -1,7 +1,8 @@
 """What a calibration found: rates with their counts, levels, and the calibration itself."""
 
+import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias, cast, get_args
 
@@ -12,8 +13,13 @@ from templates.errors import ContractError, Uncalibrated
 Mode: TypeAlias = Literal["p2s", "s2s"]
 Interval: TypeAlias = Literal["wilson", "subject-bootstrap"]
 
-MAX_LEVELS = 16
+MAX_LEVELS = 8
+MAX_PHOTOS = 10
+MAX_PROBE_PHOTOS = 5
 MAX_STEPS = 10_000
+MAX_GROUPS = 64
+"""Groups of people in a level, over all attributes."""
+MAX_GROUP_NAME = 100
 LEVEL_NAME = re.compile(r"[a-z0-9][a-z0-9.+-]{0,31}")
 SHA256_HEX = re.compile(r"[0-9a-f]{64}")
 
@@ -78,74 +84,170 @@ class Rate:
 
 
 @dataclass(frozen=True)
-class Level:
-    """A security level: both thresholds, and the errors seen on the calibration data.
+class GroupRates:
+    """Error rates within one group of people, at a level's threshold (ISO/IEC 19795-10).
 
-    A probe is accepted where its similarity reaches ``similarity_threshold`` *and* its cohort
-    score reaches ``cohort_threshold`` (docs/method.md §6). The rates are those of this joint
-    decision.
+    Parameters
+    ----------
+    attribute, group
+        Such as ``gender`` and ``Female``: printable, at most ``MAX_GROUP_NAME`` characters.
+    fmr
+        Of impostor trials in which both people are in the group.
+    frr
+        Of the genuine probes of its people, those that are refused because their photos do not
+        agree among the errors.
+    fmr_judged, frr_judged
+        Whether there were trials enough to judge the rate by.
+    """
+
+    attribute: str
+    group: str
+    fmr: Rate
+    frr: Rate
+    fmr_judged: bool
+    frr_judged: bool
+
+    def __post_init__(self) -> None:
+        check_group_names((self.attribute, self.group))
+
+    def to_json(self) -> dict[str, Json]:
+        """JSON form."""
+        return {
+            "attribute": self.attribute,
+            "group": self.group,
+            "fmr": self.fmr.to_json(),
+            "frr": self.frr.to_json(),
+            "fmr_judged": self.fmr_judged,
+            "frr_judged": self.frr_judged,
+        }
+
+    @classmethod
+    def from_json(cls, value: object) -> "GroupRates":
+        """Parse hostile JSON."""
+        fields = Fields(value, what="the rates of a group")
+        rates = cls(
+            attribute=fields.text("attribute"),
+            group=fields.text("group"),
+            fmr=Rate.from_json(fields.take("fmr")),
+            frr=Rate.from_json(fields.take("frr")),
+            fmr_judged=fields.boolean("fmr_judged"),
+            frr_judged=fields.boolean("frr_judged"),
+        )
+        fields.done()
+        return rates
+
+
+def check_group_names(names: Iterable[str]) -> None:
+    """Refuse a name of an attribute or a group that a terminal or a page could not show."""
+    for name in names:
+        if not 1 <= len(name) <= MAX_GROUP_NAME or not name.isprintable():
+            raise ContractError(
+                f"an attribute or a group needs a printable name of 1 to {MAX_GROUP_NAME} "
+                "characters"
+            )
+
+
+@dataclass(frozen=True)
+class Level:
+    """A security level: its threshold, and the errors seen on the calibration data.
+
+    A probe is accepted where its score reaches ``threshold``: the similarity less what is expected
+    of this probe against templates of nobody, in units of its spread (docs/method.md §6).
 
     Parameters
     ----------
     name
         For example ``fmr-1e-3`` or ``accuracy``.
     target_fmr
-        The false match rate that the thresholds were chosen for; None for ``accuracy``, whose
-        similarity threshold is the ten-fold protocol's.
-    similarity_threshold
-        On the scale of ``templates.distances.similarity``.
-    cohort_threshold
-        In standard deviations of the probe's similarities to the cohort.
+        The false match rate that the threshold was chosen for; None for ``accuracy``, whose
+        threshold is the ten-fold protocol's.
+    threshold
+        Least score that is accepted.
     fmr, fnmr
-        Joint rates on the calibration data.
+        Rates on the calibration data.
+    fnmr_by_photos
+        The FNMR of templates of one photo, of two …: of those that were tried.
+    frr_by_photos
+        As ``fnmr_by_photos``, of all genuine probes: those of several photos that are refused,
+        because they do not agree, are rejected too. Empty where none was refused.
+    groups
+        Rates by group of people; empty where nobody was labelled.
     """
 
     name: str
     target_fmr: float | None
-    similarity_threshold: float
-    cohort_threshold: float
+    threshold: float
     fmr: Rate
     fnmr: Rate
+    fnmr_by_photos: Mapping[int, Rate] = field(default_factory=dict)
+    frr_by_photos: Mapping[int, Rate] = field(default_factory=dict)
+    groups: tuple[GroupRates, ...] = ()
 
     def __post_init__(self) -> None:
         if not LEVEL_NAME.fullmatch(self.name):
             raise ContractError("a level's name must match " + LEVEL_NAME.pattern)
         if self.target_fmr is not None and not 0.0 < self.target_fmr <= 0.5:
             raise ContractError("a level's target FMR must lie in (0, 0.5]")
+        if not math.isfinite(self.threshold):
+            raise ContractError("a level's threshold is not a finite number")
+        enrolled = {*self.fnmr_by_photos, *self.frr_by_photos}
+        if not all(1 <= photos <= MAX_PHOTOS for photos in enrolled):
+            raise ContractError(f"a template is made of 1 to {MAX_PHOTOS} photos")
+        named = {(entry.attribute, entry.group) for entry in self.groups}
+        if len(self.groups) > MAX_GROUPS or len(named) != len(self.groups):
+            raise ContractError(f"a level has at most {MAX_GROUPS} groups, each of them once")
 
     def to_json(self) -> dict[str, Json]:
-        """JSON form."""
-        return {
+        """JSON form; without ``frr_by_photos`` and ``groups`` where they are empty."""
+        value: dict[str, Json] = {
             "name": self.name,
             "target_fmr": self.target_fmr,
-            "similarity_threshold": self.similarity_threshold,
-            "cohort_threshold": self.cohort_threshold,
+            "score_threshold": self.threshold,
             "fmr": self.fmr.to_json(),
             "fnmr": self.fnmr.to_json(),
+            "fnmr_by_photos": _json_by_photos(self.fnmr_by_photos),
         }
+        if self.frr_by_photos:
+            value["frr_by_photos"] = _json_by_photos(self.frr_by_photos)
+        if self.groups:
+            value["groups"] = [entry.to_json() for entry in self.groups]
+        return value
 
     @classmethod
     def from_json(cls, value: object) -> "Level":
         """Parse hostile JSON."""
         fields = Fields(value, what="a level")
-        target = fields.take("target_fmr")
+        groups = [] if fields.lacks("groups") else fields.items("groups", most=MAX_GROUPS)
         level = cls(
             name=fields.text("name"),
-            target_fmr=None
-            if target is None
-            else Fields({"t": target}, what="a level").number("t"),
-            similarity_threshold=fields.number("similarity_threshold"),
-            cohort_threshold=fields.number("cohort_threshold"),
+            target_fmr=None if fields.take_null("target_fmr") else fields.number("target_fmr"),
+            threshold=fields.number("score_threshold"),
             fmr=Rate.from_json(fields.take("fmr")),
             fnmr=Rate.from_json(fields.take("fnmr")),
+            fnmr_by_photos=_rates_by_photos(fields, "fnmr_by_photos"),
+            frr_by_photos={}
+            if fields.lacks("frr_by_photos")
+            else _rates_by_photos(fields, "frr_by_photos"),
+            groups=tuple(map(GroupRates.from_json, groups)),
         )
         fields.done()
         return level
 
 
+def _json_by_photos(rates: Mapping[int, Rate]) -> dict[str, Json]:
+    return {str(photos): rate.to_json() for photos, rate in rates.items()}
+
+
+def _rates_by_photos(fields: Fields, key: str) -> dict[int, Rate]:
+    value = fields.take(key)
+    if not isinstance(value, dict) or not all(re.fullmatch("[1-9]|10", name) for name in value):
+        raise ContractError(f"{key} is not an object whose keys are numbers of photos")
+    return {int(photos): Rate.from_json(rate) for photos, rate in value.items()}
+
+
 @dataclass(frozen=True)
 class Calibration:
-    """Thresholds of one (mode, metric, probe m) of a contract.
+    """Thresholds of one (mode, metric, probe m, probe photos) of a contract.
 
     Parameters
     ----------
@@ -155,6 +257,8 @@ class Calibration:
         The distance that decides.
     probe_m
         Dimension of the lifted probe; 0 in ``p2s``.
+    probe_photos
+        Photos of one person that a probe is the mean of; 1 in ``s2s``.
     steps
         Steps of the spherical s-to-s iteration: calibration and service must see equal numbers.
     levels
@@ -162,9 +266,10 @@ class Calibration:
     foot_point_norm
         Range of ‖p‖ that an honest lifted probe has; None in ``p2s``.
     calibrated_on
-        What was measured: data, people, counts, protocol, seed.
+        What was measured: data, people, counts, protocol, seed; how the levels were set.
     calibration_id
-        SHA-256 of all of the above, the contract id and the cohort id; empty until ``identified``.
+        SHA-256 of all of the above, the contract id and the contract's ``nobody_id``; empty until
+        ``identified``.
     """
 
     mode: Mode
@@ -174,6 +279,7 @@ class Calibration:
     levels: tuple[Level, ...]
     foot_point_norm: tuple[float, float] | None
     calibrated_on: Mapping[str, Json] = field(default_factory=dict)
+    probe_photos: int = 1
     calibration_id: str = ""
 
     def __post_init__(self) -> None:
@@ -181,6 +287,10 @@ class Calibration:
             raise ContractError("a calibration's mode must be p2s or s2s")
         if (self.mode == "p2s") != (self.probe_m == 0) or not 0 <= self.probe_m <= 4096:
             raise ContractError("a calibration's probe m must be 0 in p2s and 1 or more in s2s")
+        if not 1 <= self.probe_photos <= (MAX_PROBE_PHOTOS if self.mode == "p2s" else 1):
+            raise ContractError(
+                f"a probe is of 1 to {MAX_PROBE_PHOTOS} photos in p2s, and of 1 in s2s"
+            )
         if (self.mode == "p2s") != (self.foot_point_norm is None):
             raise ContractError("a calibration has a range of foot-point norms exactly in s2s")
         if self.foot_point_norm is not None:
@@ -190,6 +300,11 @@ class Calibration:
         names = [level.name for level in self.levels]
         if not names or len(names) > MAX_LEVELS or len(set(names)) != len(names):
             raise ContractError(f"a calibration needs 1 to {MAX_LEVELS} levels of distinct names")
+        # At most five calibrations are of raw probes, which bounds the values in a contract.
+        if self.mode == "s2s" and any(level.groups for level in self.levels):
+            raise ContractError("rates by group are of raw probes")
+        if self.probe_photos == 1 and any(level.frr_by_photos for level in self.levels):
+            raise ContractError("one photo cannot disagree: its FRR is its FNMR")
         facts = free_object(self.calibrated_on, what="what a calibration was calibrated on")
         object.__setattr__(self, "calibrated_on", facts)
         object.__setattr__(self, "metric", Metric(self.metric))
@@ -207,14 +322,15 @@ class Calibration:
                 return level
         raise Uncalibrated(
             f"no level of the requested name for {self.mode} {self.metric} with probe m = "
-            f"{self.probe_m}; calibrated are: {', '.join(level.name for level in self.levels)}"
+            f"{self.probe_m} and {self.probe_photos} photo(s); calibrated are: "
+            + ", ".join(level.name for level in self.levels)
         )
 
-    def identified(self, *, contract_id: str, cohort_id: str) -> "Calibration":
-        """Compute the id for one contract and one cohort."""
+    def identified(self, *, contract_id: str, nobody_id: str) -> "Calibration":
+        """Compute the id for one contract."""
         body: dict[str, Json] = self.to_json()
         del body["calibration_id"]
-        bound = {"calibration": body, "contract_id": contract_id, "cohort_id": cohort_id}
+        bound = {"calibration": body, "contract_id": contract_id, "nobody_id": nobody_id}
         return replace(self, calibration_id=digest(bound))
 
     def to_json(self) -> dict[str, Json]:
@@ -223,6 +339,7 @@ class Calibration:
             "mode": self.mode,
             "metric": str(self.metric),
             "probe_m": self.probe_m,
+            "probe_photos": self.probe_photos,
             "steps": self.steps,
             "levels": [level.to_json() for level in self.levels],
             "foot_point_norm": list(self.foot_point_norm) if self.foot_point_norm else None,
@@ -242,6 +359,7 @@ class Calibration:
             mode=cast(Mode, fields.text("mode")),
             metric=Metric(metric),
             probe_m=fields.integer("probe_m"),
+            probe_photos=fields.integer("probe_photos"),
             steps=fields.integer("steps"),
             levels=tuple(map(Level.from_json, fields.items("levels", most=MAX_LEVELS))),
             foot_point_norm=None if norms is None else norm_range(norms),

@@ -87,7 +87,7 @@ def size_limit(max_n: int, max_m: int) -> int:
 
 
 def decode(
-    data: bytes | bytearray | memoryview, *, max_n: int = 4096, max_m: int = 128
+    data: bytes | bytearray | memoryview, *, max_n: int = 4096, max_m: int = 192
 ) -> WireTemplate:
     """Read the bytes of a template from anybody.
 

@@ -6,6 +6,13 @@ A source is either a secret pool of real descriptors or a generator of descripto
 from templates.decoys.generator import DecoyGenerator
 from templates.decoys.loading import load_source
 from templates.decoys.pool import DecoyPool
-from templates.decoys.source import Attributes, DecoySource
+from templates.decoys.source import NOISE_ENERGY, Attributes, DecoySource
 
-__all__ = ["Attributes", "DecoyGenerator", "DecoyPool", "DecoySource", "load_source"]
+__all__ = [
+    "NOISE_ENERGY",
+    "Attributes",
+    "DecoyGenerator",
+    "DecoyPool",
+    "DecoySource",
+    "load_source",
+]

@@ -1,10 +1,9 @@
 """Fitting the decoy generator's statistics to real descriptors."""
 
-import warnings
-
 import numpy as np
 from numpy.typing import NDArray
 
+from templates.decoys.mixture import fit_mixture
 from templates.decoys.statistics import DescriptorStatistics, band_edges, leading_axes
 from templates.errors import DecoyError
 
@@ -15,8 +14,6 @@ _COMPONENTS = 4
 _PER_COMPONENT = 500
 """A component describes at least hundreds of people on average: it is a crowd, not a person."""
 _UNIT_TOLERANCE = 1e-3
-_REGULARISATION = 1e-5
-"""Added to variances: the log energies vary by about 0.1, and it must be far below its square."""
 
 
 def fit_statistics(descriptors: NDArray[np.floating]) -> DescriptorStatistics:
@@ -49,8 +46,7 @@ def fit_statistics(descriptors: NDArray[np.floating]) -> DescriptorStatistics:
     ----------
     .. [1] D. Bartz, "Cross-validation based nonlinear shrinkage", 2016.
     """
-    x = _checked(descriptors)
-    n = x.shape[1]
+    x = checked_descriptors(descriptors)
     mean = x.mean(axis=0)
     axes = principal_axes(x)
     coordinates = cross_fitted(x, axes)
@@ -58,18 +54,29 @@ def fit_statistics(descriptors: NDArray[np.floating]) -> DescriptorStatistics:
     if deviations[0] <= 1e-6:
         raise DecoyError("the embeddings to fit hardly differ from each other")
     # An axis on which nothing varies stays an axis on which nothing varies.
-    whitened = coordinates / np.maximum(deviations, 1e-12)
-    weights, centres, covariances = _mixture(mixture_features(whitened))
+    return principal_statistics(mean, axes, deviations, coordinates / np.maximum(deviations, 1e-12))
+
+
+def principal_statistics(
+    mean: NDArray[np.float64],
+    axes: NDArray[np.float64],
+    deviations: NDArray[np.float64],
+    whitened: NDArray[np.float64],
+) -> DescriptorStatistics:
+    """Put the statistics together; the clusters and sizes are those of (N, n) whitened rows."""
+    components = int(np.clip(len(whitened) // _PER_COMPONENT, 1, _COMPONENTS))
+    weights, centres, covariances = fit_mixture(mixture_features(whitened), components)
     return DescriptorStatistics(
         mean=mean.astype(np.float32),
-        axes=(axes[:n] * deviations[:, None]).astype(np.float32),
+        axes=(axes * deviations[:, None]).astype(np.float32),
         weights=weights.astype(np.float32),
         centres=centres.astype(np.float32),
         spreads=np.linalg.cholesky(covariances).astype(np.float32),
     )
 
 
-def _checked(descriptors: NDArray[np.floating]) -> NDArray[np.float64]:
+def checked_descriptors(descriptors: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return descriptors that a fit can take, as float64; otherwise raise `DecoyError`."""
     x = np.asarray(descriptors)
     if x.ndim != 2 or not MIN_DESCRIPTORS <= x.shape[0] <= MAX_DESCRIPTORS or x.shape[1] < 2:
         raise DecoyError(
@@ -115,24 +122,3 @@ def mixture_features(whitened: NDArray[np.float64]) -> NDArray[np.float64]:
     squares = np.add.reduceat(whitened**2, edges[:-1], axis=1) / np.diff(edges)
     log_energies = 0.5 * np.log(np.maximum(squares, 1e-8))
     return np.hstack([whitened[:, : leading_axes(n)], log_energies])
-
-
-def _mixture(features: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-    """Weights (c,), centres (c, q) and covariances (c, q, q) of Gaussian components."""
-    components = int(np.clip(len(features) // _PER_COMPONENT, 1, _COMPONENTS))
-    if components == 1:  # known in closed form, so that the demo needs no scikit-learn
-        covariance = np.cov(features, rowvar=False, bias=True)
-        regular = covariance + _REGULARISATION * np.eye(len(covariance))
-        return np.ones(1), features.mean(axis=0)[None], regular[None]
-    from sklearn.exceptions import ConvergenceWarning
-    from sklearn.mixture import GaussianMixture
-
-    # The seed fixes the start of the expectation-maximisation only.
-    mixture = GaussianMixture(
-        components, reg_covar=_REGULARISATION, max_iter=300, n_init=3, random_state=0
-    )
-    with warnings.catch_warnings():
-        # A mixture a step short of its optimum is as good a generator.
-        warnings.simplefilter("ignore", ConvergenceWarning)
-        mixture.fit(features)
-    return mixture.weights_, mixture.means_, mixture.covariances_

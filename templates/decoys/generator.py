@@ -16,9 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from templates.decoys import container
+from templates.decoys.adaptation import adapted_statistics
 from templates.decoys.files import read_bounded, write_private
 from templates.decoys.fitting import fit_statistics
-from templates.decoys.source import MAX_DIMENSION, Attributes, checked_made_with, take_made_with
+from templates.decoys.source import (
+    MAX_DIMENSION,
+    Attributes,
+    checked_made_with,
+    checked_noise,
+    take_made_with,
+)
 from templates.decoys.statistics import (
     MAX_COMPONENTS,
     DescriptorStatistics,
@@ -52,17 +59,20 @@ class DecoyGenerator:
         As `fit` finds them.
     made_with
         `templates.contract.binding.embedding_id` of the pack that gave the descriptors of the fit.
+    noise
+        Variance of the noise that every number of a decoy gets, and of a lifted descriptor.
 
     Raises
     ------
     DecoyError
-        `made_with` is not 64 lower-case hexadecimal digits.
+        `made_with` is not 64 lower-case hexadecimal digits, or `noise` is out of range.
 
     Notes
     -----
-    A decoy is x / ‖x‖ with x = mean + z · axes. A component of the Gaussian mixture is chosen,
-    and gives the leading coordinates of z and the log energy of each band; inside a band z has
-    a uniform direction and that energy. See `templates.decoys.statistics` for why.
+    A decoy is x / ‖x‖ with x = mean + z · axes + e, and e the noise. A component of the Gaussian
+    mixture is chosen, and gives the leading coordinates of z and the log energy of each band;
+    inside a band z has a uniform direction and that energy. See `templates.decoys.statistics` for
+    why.
 
     References
     ----------
@@ -72,8 +82,15 @@ class DecoyGenerator:
     mixtures", PAMI 2009.
     """
 
-    def __init__(self, statistics: DescriptorStatistics, *, made_with: str | None = None) -> None:
+    def __init__(
+        self,
+        statistics: DescriptorStatistics,
+        *,
+        made_with: str | None = None,
+        noise: float = 0.0,
+    ) -> None:
         self._statistics = statistics
+        self.noise: float = checked_noise(repr(float(noise)))
         self.made_with: str | None = None if made_with is None else checked_made_with(made_with)
         self.n: int = statistics.n
         self.source_id: str = hashlib.sha256(self.to_bytes()).hexdigest()
@@ -83,13 +100,23 @@ class DecoyGenerator:
     def __repr__(self) -> str:
         return f"DecoyGenerator(n={self.n}, id {self.source_id[:12]})"
 
+    def without_noise(self) -> "DecoyGenerator":
+        """Return what draws faces as they are before lifting, not decoys."""
+        return DecoyGenerator(self._statistics, made_with=self.made_with)
+
     @property
     def statistics(self) -> DescriptorStatistics:
         """The fitted statistics."""
         return self._statistics
 
     @classmethod
-    def fit(cls, descriptors: NDArray[np.floating], *, made_with: str | None = None) -> Self:
+    def fit(
+        cls,
+        descriptors: NDArray[np.floating],
+        *,
+        made_with: str | None = None,
+        noise: float = 0.0,
+    ) -> Self:
         """Fit to real descriptors.
 
         Parameters
@@ -98,6 +125,8 @@ class DecoyGenerator:
             float32, shape (N, n), unit rows, N ≥ 100; several thousand give good decoys.
         made_with
             `templates.contract.binding.embedding_id` of the pack that gave them.
+        noise
+            As for the class.
 
         Raises
         ------
@@ -105,7 +134,42 @@ class DecoyGenerator:
             Too few descriptors, or descriptors that are not finite unit vectors or lie in a small
             subspace.
         """
-        return cls(fit_statistics(descriptors), made_with=made_with)
+        return cls(fit_statistics(descriptors), made_with=made_with, noise=noise)
+
+    @classmethod
+    def adapt(
+        cls,
+        descriptors: NDArray[np.floating],
+        like: NDArray[np.floating],
+        people: Sequence[str],
+        *,
+        made_with: str | None = None,
+        noise: float = 0.0,
+    ) -> Self:
+        """Fit to many descriptors of any kind, adapted to few of the kind that is enrolled.
+
+        Parameters
+        ----------
+        descriptors
+            float32, shape (N, n), unit rows, N ≥ 100; tens of thousands give good decoys.
+        like
+            float32, shape (K, n), unit rows, K ≥ 100, of people who are not in ``descriptors`` and
+            will not be enrolled.
+        people
+            K names of those people.
+        made_with
+            `templates.contract.binding.embedding_id` of the pack that gave all of them.
+        noise
+            As for the class.
+
+        Raises
+        ------
+        DecoyError
+            Too few of either, or descriptors that are not finite unit vectors or lie in a small
+            subspace.
+        """
+        statistics = adapted_statistics(descriptors, like, people)
+        return cls(statistics, made_with=made_with, noise=noise)
 
     def draw(
         self,
@@ -151,8 +215,8 @@ class DecoyGenerator:
         noise = stream.normal((count, feature_count(self.n)))
         features = statistics.centres[chosen].astype(np.float64)
         for component in range(len(self._cumulative)):
-            mine = chosen == component
-            features[mine] += noise[mine] @ self._spreads[component]
+            drawn = chosen == component
+            features[drawn] += noise[drawn] @ self._spreads[component]
         z = np.empty((count, self.n), dtype=np.float32)
         z[:, :lead] = features[:, :lead]
         directions = stream.normal((count, self.n - lead))
@@ -162,6 +226,8 @@ class DecoyGenerator:
         sizes = np.exp(np.clip(features[:, lead:], -20.0, 20.0)) / np.sqrt(squares)
         z[:, lead:] = directions * np.repeat(sizes, widths, axis=1)
         x = statistics.mean + z @ statistics.axes
+        if self.noise:
+            x = x + np.sqrt(self.noise) * stream.normal((count, self.n))
         norms = np.linalg.norm(x.astype(np.float64), axis=1, keepdims=True)
         if not (norms > _SMALLEST_NORM).all() or not np.isfinite(norms).all():
             raise DecoyError("the decoy generator makes vectors without a direction; fit it anew")
@@ -175,6 +241,8 @@ class DecoyGenerator:
         }
         if self.made_with is not None:
             fields["made_with"] = self.made_with
+        if self.noise:
+            fields["noise"] = repr(self.noise)
         return container.encode(fields, {name: getattr(self._statistics, name) for name in _PARTS})
 
     @classmethod
@@ -190,12 +258,13 @@ class DecoyGenerator:
             data, what="decoy generator", max_bytes=MAX_GENERATOR_BYTES
         )
         made_with = take_made_with(fields)
+        noise = checked_noise(fields.pop("noise", "0.0"))
         if fields != {"format": GENERATOR_FORMAT, "version": GENERATOR_VERSION}:
             raise DecoyError(f"this is not a decoy generator of version {GENERATOR_VERSION}")
         if set(arrays) != set(_PARTS) or any(a.dtype != np.float32 for a in arrays.values()):
             raise DecoyError("the decoy generator has missing or unknown parts")
         parts = {name: array.astype(np.float32) for name, array in arrays.items()}
-        return cls(DescriptorStatistics(**parts), made_with=made_with)
+        return cls(DescriptorStatistics(**parts), made_with=made_with, noise=noise)
 
     def save(self, path: Path) -> None:
         """Write the generator as a plain file, which clients may have.

@@ -8,6 +8,7 @@ fault; the pool exists for the paper's strategies, hybrid+ and sub-databases amo
 import hashlib
 from collections import defaultdict
 from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Self
 
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from templates.decoys import container
 from templates.decoys.files import read_bounded, write_private
+from templates.decoys.generator import DecoyGenerator
 from templates.decoys.source import MAX_DIMENSION, Attributes, checked_made_with, take_made_with
 from templates.errors import DecoyError
 from templates.keys.randomness import Keystream
@@ -83,6 +85,7 @@ class DecoyPool:
         self._labels = None if labels is None else tuple(labels)
         self.n: int = array.shape[1]
         self.made_with: str | None = None if made_with is None else checked_made_with(made_with)
+        self.noise = 0.0
         self.source_id: str = hashlib.sha256(self._encode()).hexdigest()
 
     def __len__(self) -> int:
@@ -91,6 +94,11 @@ class DecoyPool:
     def __repr__(self) -> str:
         labelled = "unlabelled" if self._labels is None else "labelled"
         return f"DecoyPool({len(self)} {labelled} entries, n={self.n}, id {self.source_id[:12]})"
+
+    @cached_property
+    def fitted(self) -> DecoyGenerator:
+        """A generator fitted to the entries, always the same for the same pool."""
+        return DecoyGenerator.fit(self._descriptors[np.lexsort(self._descriptors.T)])
 
     @property
     def labelled(self) -> bool:
@@ -194,9 +202,9 @@ class DecoyPool:
         part_of_row = stream.choose(sub_databases, rows, 1).reshape(rows)
         chosen = np.empty((rows, k), dtype=np.int64)
         for number, part in enumerate(parts):
-            mine = np.flatnonzero(part_of_row == number)
-            if len(mine):
-                chosen[mine] = part[stream.choose(len(part), len(mine), k)]
+            inside = np.flatnonzero(part_of_row == number)
+            if len(inside):
+                chosen[inside] = part[stream.choose(len(part), len(inside), k)]
         return chosen
 
     def _choose_unlike(
@@ -213,13 +221,13 @@ class DecoyPool:
         for row, attributes in enumerate(unlike):
             rows_of[attributes].append(row)
         chosen = np.empty((rows, k), dtype=np.int64)
-        for attributes, mine in rows_of.items():
+        for attributes, alike in rows_of.items():
             allowed = np.array(
                 [i for i, label in enumerate(self._labels) if _differs(label, attributes)],
                 dtype=np.int64,
             )
             self._require(len(allowed), k, "of another gender and race in the pool")
-            chosen[mine] = allowed[stream.choose(len(allowed), len(mine), k)]
+            chosen[alike] = allowed[stream.choose(len(allowed), len(alike), k)]
         return chosen
 
     @staticmethod
@@ -294,7 +302,7 @@ class DecoyPool:
 def _differs(label: Attributes, subject: Attributes) -> bool:
     """Whether an entry is surely of another gender and race; an unlabelled entry is not."""
     pairs = ((label.gender, subject.gender), (label.race, subject.race))
-    return all(theirs is None or (mine is not None and mine != theirs) for mine, theirs in pairs)
+    return all(other is None or (own is not None and own != other) for own, other in pairs)
 
 
 def _coded(values: list[str | None]) -> tuple[list[str], NDArray[np.uint8]]:

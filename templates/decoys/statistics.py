@@ -102,6 +102,15 @@ class DescriptorStatistics:
         return int(self.mean.shape[0])
 
     @property
+    def second_moment(self) -> NDArray[np.float64]:
+        """Second moment about the origin of what is drawn, (n, n), before it is scaled to length 1.
+
+        As if coordinates were uncorrelated and of unit variance, as they are of the faces of a fit.
+        """
+        axes, mean = self.axes.astype(np.float64), self.mean.astype(np.float64)
+        return np.asarray(axes.T @ axes + np.outer(mean, mean))
+
+    @property
     def participation(self) -> float:
         """Participation ratio (Σσ)² / Σσ² of the deviations of decoys along the axes: 1 to n."""
         lead, widths = leading_axes(self.n), np.diff(band_edges(self.n))

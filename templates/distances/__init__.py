@@ -2,11 +2,14 @@
 
 A probe is a raw descriptor (point to subspace) or itself lifted (subspace to subspace). Probes
 and templates may have different subspace dimensions. Float32 runs on compiled kernels (``tiles``)
-or, on a device, on ``torch``; float64 on the plain NumPy of ``exact``, which is their
+or, under ``on_device``, on ``torch``; float64 on the plain NumPy of ``exact``, which is their
 specification. The kernels' compiler and torch take long to load, so the two are imported where they
 are first used.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from types import ModuleType
 from typing import Any
 
@@ -33,13 +36,52 @@ __all__ = [
     "Neighbours",
     "count_within",
     "nearest",
+    "on_device",
     "paired_distances",
     "pairwise_distances",
+    "require_device",
     "similarity",
     "warm_up",
 ]
 
 Probes = NDArray[np.float32] | NDArray[np.float64] | SubspaceBatch
+_DEVICE: ContextVar[str | None] = ContextVar("device", default=None)
+
+
+@contextmanager
+def on_device(device: str | None) -> Iterator[None]:
+    """Compute the float32 distances of a block on a device of torch, and copy the results back.
+
+    Float64 and pairs of a point and a template (`paired_distances`) stay on the processor. A thread
+    that the block starts is outside it, unless it runs in a copy of the context.
+
+    Parameters
+    ----------
+    device : str, optional
+        As torch names it, such as "cuda"; None for the processor without torch. One that torch
+        cannot use is a TemplateError of the first call that needs it.
+
+    Examples
+    --------
+    >>> with on_device("cuda"):  # doctest: +SKIP
+    ...     pairwise_distances(probes, templates, metric="spherical")
+    """
+    before = _DEVICE.set(device)
+    try:
+        yield
+    finally:
+        _DEVICE.reset(before)
+
+
+def require_device(device: str) -> None:
+    """Refuse a device that torch cannot use.
+
+    Raises
+    ------
+    TemplateError
+        There is no torch, or no such device; the message names the remedy.
+    """
+    _torch().usable(device)
 
 
 def pairwise_distances(
@@ -50,7 +92,6 @@ def pairwise_distances(
     steps: int = DEFAULT_STEPS,
     dtype: DTypeLike = np.float32,
     threads: int | None = None,
-    device: str | None = None,
 ) -> Floats:
     """Distances of every probe to every template.
 
@@ -69,8 +110,6 @@ def pairwise_distances(
     threads : int, optional
         At most; by default as many as the matrix library would use. Their number does not change
         the result. Float64 uses the library's.
-    device : str, optional
-        Of torch, such as "cuda": the float32 work is done there, and the result copied back.
 
     Returns
     -------
@@ -82,7 +121,7 @@ def pairwise_distances(
     InvalidEmbedding, InvalidTemplate
         Probes or templates of wrong shape, or with a number that is not finite.
     TemplateError
-        A parameter out of range, or a device that torch cannot use.
+        A parameter out of range, or a device (`on_device`) that torch cannot use.
 
     References
     ----------
@@ -90,16 +129,16 @@ def pairwise_distances(
     """
     options = _options(metric, steps, threads)
     probes = _checked(probes, templates, dtype)
-    found: Floats
-    if device is not None:
-        if np.dtype(dtype) != np.float32:
-            raise TemplateError(f"a device computes in float32, not in {np.dtype(dtype)}")
-        found = _torch().pairwise(probes, templates, device=device, **options).cpu().numpy()
-    elif np.dtype(dtype) == np.float64:
-        found = exact.pairwise(probes, templates, **options)
+    distances: Floats
+    device = _DEVICE.get()
+    if np.dtype(dtype) == np.float64:
+        distances = exact.pairwise(probes, templates, **options)
+    elif device is not None:
+        torch, *sides = _placed(probes, templates, device)
+        distances = torch.pairwise(*sides, **options).cpu().numpy()
     else:
-        found = _tiles().pairwise(probes, templates, threads=threads, **options)
-    return found
+        distances = _tiles().pairwise(probes, templates, threads=threads, **options)
+    return distances
 
 
 def nearest(
@@ -112,14 +151,13 @@ def nearest(
     of_templates: bool = False,
     labels: Labels | None = None,
     threads: int | None = None,
-    device: str | None = None,
     progress: Progress | None = None,
 ) -> Neighbours:
     """Find the K nearest templates of every probe, without the matrix of all distances.
 
     Parameters
     ----------
-    probes, templates, metric, steps, threads, device
+    probes, templates, metric, steps, threads
         As of `pairwise_distances`, in float32.
     k : int
         At least 1.
@@ -128,7 +166,7 @@ def nearest(
     labels : pair of ndarray of int64, shapes (P,) and (T,), optional
         Pairs with equal labels are passed over.
     progress
-        Called with numbers of pairs that are done; not called on a device.
+        Called with numbers of pairs that are done; on a device once, with all of them.
 
     Returns
     -------
@@ -146,9 +184,12 @@ def nearest(
         raise TemplateError(f"{k} neighbours cannot be found; k is at least 1")
     options |= {"of_templates": of_templates, "labels": _labels(labels, probes, templates)}
     probes = _checked(probes, templates, np.float32)
+    device = _DEVICE.get()
     if device is not None:
-        found = _torch().nearest(probes, templates, k, device=device, **options)
-        return Neighbours(*(part.cpu().numpy() for part in found))
+        torch, *sides = _placed(probes, templates, device)
+        neighbours = torch.nearest(*sides, k, **options)
+        _report_all(progress, probes, templates)
+        return Neighbours(*(part.cpu().numpy() for part in neighbours))
     options |= {"threads": threads, "progress": progress}
     return Neighbours(*_tiles().nearest(probes, templates, k, **options))
 
@@ -162,7 +203,6 @@ def count_within(
     steps: int = DEFAULT_STEPS,
     labels: Labels | None = None,
     threads: int | None = None,
-    device: str | None = None,
     progress: Progress | None = None,
 ) -> NDArray[np.int64]:
     """Count the pairs up to every threshold, without the matrix of all distances.
@@ -172,7 +212,7 @@ def count_within(
 
     Parameters
     ----------
-    probes, templates, metric, steps, labels, threads, device, progress
+    probes, templates, metric, steps, labels, threads, progress
         As of `nearest`.
     thresholds : array_like of float, shape (S,)
         In any order.
@@ -195,9 +235,11 @@ def count_within(
     order = np.argsort(limits)
     counts = np.empty(len(limits), dtype=np.int64)
     probes = _checked(probes, templates, np.float32)
+    device = _DEVICE.get()
     if device is not None:
-        found = _torch().counts_within(probes, templates, limits[order], device=device, **options)
-        counts[order] = found.cpu().numpy()
+        torch, *sides = _placed(probes, templates, device)
+        counts[order] = torch.counts_within(*sides, limits[order], **options).cpu().numpy()
+        _report_all(progress, probes, templates)
     else:
         options |= {"threads": threads, "progress": progress}
         counts[order] = _tiles().counts_within(probes, templates, limits[order], **options)
@@ -223,8 +265,14 @@ def paired_distances(
     if len(probes) != len(templates):
         raise TemplateError(f"{len(probes)} probes do not pair with {len(templates)} templates")
     if isinstance(probes, SubspaceBatch) and np.dtype(dtype) == np.float32:
-        found: Floats = _tiles().paired(probes, templates, **options)
-        return found
+        distances: Floats
+        device = _DEVICE.get()
+        if device is not None:
+            torch, *sides = _placed(probes, templates, device)
+            distances = torch.paired(*sides, **options).cpu().numpy()
+        else:
+            distances = _tiles().paired(probes, templates, **options)
+        return distances
     every = np.arange(len(probes))
     return exact.pairs(probes, templates, every, every, **options).astype(dtype)
 
@@ -232,6 +280,11 @@ def paired_distances(
 def warm_up() -> None:
     """Compile the kernels, or load them from their cache, so that no request has to wait."""
     _tiles().warm_up()
+
+
+def _report_all(progress: Progress | None, probes: Probes, templates: SubspaceBatch) -> None:
+    if progress is not None:
+        progress(len(probes) * len(templates))
 
 
 def _tiles() -> ModuleType:
@@ -245,9 +298,16 @@ def _torch() -> ModuleType:
         from templates.distances import torch
     except ImportError as error:
         raise TemplateError(
-            f"a device needs the extra 'torch' of veilface ({error.name} is not installed)"
+            f'{error.name} is not installed, and a device needs it: pip install "veilface[torch]"'
         ) from None
     return torch
+
+
+def _placed(probes: Probes, templates: SubspaceBatch, device: str) -> tuple[Any, Any, Any]:
+    """Load what computes on a device, and copy both sides there."""
+    torch = _torch()
+    there = torch.usable(device)
+    return torch, torch.placed(probes, there), torch.placed(templates, there)
 
 
 def _options(metric: Metric | str, steps: int, threads: int | None = None) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from templates.distances import exact
 from templates.distances.blas import single_threaded
-from templates.distances.kernels.arguments import Options, Result, Tile
+from templates.distances.kernels.arguments import Array32, Options, Result, Tile
 from templates.distances.kernels.euclidean import scratch_size as euclidean_scratch
 from templates.distances.kernels.lanes import LANES
 from templates.distances.kernels.selection import count_within, keep_nearest
@@ -34,11 +34,9 @@ from templates.distances.metric import (
     Progress,
     parts,
 )
-from templates.distances.rounded import RoundedSubspaces
 from templates.distances.threads import share
 from templates.space.subspace import SubspaceBatch
 
-Array32 = NDArray[np.float32]
 Probes = Array32 | SubspaceBatch
 
 # Rows of the product of a tile; the probes have half: 2 MiB.
@@ -155,7 +153,6 @@ def warm_up() -> None:
     paired(batch, batch, **options)
     nearest(batch, batch, 1, of_templates=False, labels=None, threads=1, **options)
     counts_within(batch, batch, np.ones(1), labels=None, threads=1, **options)
-    RoundedSubspaces.of(batch).similarities(batch.feet[0], metric=Metric.SPHERICAL)
 
 
 # --- what is kept --------------------------------------------------------------------------------
@@ -328,8 +325,8 @@ class _Solver:
     @property
     def multiplications(self) -> int:
         """Of the product of all rows."""
-        each = (self._m + 1) * (self._templates.m + 1) * self._templates.n
-        return len(self._probes) * len(self._templates) * each
+        of_a_pair = (self._m + 1) * (self._templates.m + 1) * self._templates.n
+        return len(self._probes) * len(self._templates) * of_a_pair
 
     @property
     def tiles(self) -> int:

@@ -5,6 +5,7 @@ import this file: torch is an optional extra of the project.
 """
 
 import math
+from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,11 +17,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from templates.distances import exact
-from templates.distances.metric import ACCURACY, LONGEST, NEAR, STILL, Labels, Metric
+from templates.distances.metric import ACCURACY, LONGEST, NEAR, STILL, Labels, Metric, parts
 from templates.errors import TemplateError
 from templates.space.subspace import SubspaceBatch
 
-TILE_BYTES = {"cpu": 8 << 20, "cuda": 128 << 20}
+TILE_BYTES = defaultdict(lambda: 128 << 20, cpu=8 << 20)
 """Size of the products that are made at a time; the whole computation holds a few times that."""
 
 _EPS, _TINY = torch.finfo(torch.float32).eps, torch.finfo(torch.float32).tiny
@@ -65,15 +66,8 @@ class SubspaceTensors:
 Side = Tensor | SubspaceTensors
 
 
-def pairwise(
-    probes: Any, templates: Any, *, metric: Metric, steps: int, device: str | None = None
-) -> Tensor:
-    """Distances of every probe to every template, float32, (P, T), on the device.
-
-    Points are an array or a tensor (P, n), subspaces a batch or ``SubspaceTensors``. Arrays and
-    batches go to ``device``; tensors stay where they are.
-    """
-    probes, templates = _placed(probes, templates, device)
+def pairwise(probes: Side, templates: SubspaceTensors, *, metric: Metric, steps: int) -> Tensor:
+    """Distances of every probe, points (P, n) or subspaces, to every template, (P, T)."""
     out = torch.empty(len(probes), len(templates), device=templates.device)
     with ieee_products(templates.device):
         for rows, columns, distances in _tiles(probes, templates, metric, steps):
@@ -81,18 +75,29 @@ def pairwise(
     return out
 
 
+def paired(
+    probes: SubspaceTensors, templates: SubspaceTensors, *, metric: Metric, steps: int
+) -> Tensor:
+    """Distances of subspace i to subspace i, (P,)."""
+    out = torch.empty(len(templates), device=templates.device)
+    numbers = (probes.m + templates.m + 2) * probes.n + (probes.m + 1) * (templates.m + 1)
+    step = max(1, TILE_BYTES[templates.device.type] // 4 // numbers)
+    with ieee_products(templates.device):
+        for part in parts(len(templates), step):
+            out[part] = _distances(probes[part], templates[part], metric, steps, paired=True)
+    return out
+
+
 def nearest(
-    probes: Any,
-    templates: Any,
+    probes: Side,
+    templates: SubspaceTensors,
     k: int,
     *,
     of_templates: bool = False,
     labels: Labels | None = None,
-    device: str | None = None,
     **options: Any,
 ) -> tuple[Tensor, Tensor]:
     """Indices and distances of the k nearest, as ``templates.distances.nearest`` finds them."""
-    probes, templates = _placed(probes, templates, device)
     there = templates.device
     best = torch.full((len(templates if of_templates else probes), k), _NOTHING, device=there)
     with ieee_products(there):
@@ -106,22 +111,19 @@ def nearest(
             keys = torch.cat([best[rows], keys], dim=1)
             best[rows] = torch.topk(keys, k, dim=1, largest=False).values
     nothing = best == _NOTHING
-    found = (best >> 32).int().view(torch.float32)
-    indices = (best & 0xFFFFFFFF).masked_fill_(nothing, -1)
-    return indices, found.masked_fill(nothing, torch.inf)
+    distances = (best >> 32).int().view(torch.float32).masked_fill(nothing, torch.inf)
+    return (best & 0xFFFFFFFF).masked_fill_(nothing, -1), distances
 
 
 def counts_within(
-    probes: Any,
-    templates: Any,
+    probes: Side,
+    templates: SubspaceTensors,
     thresholds: NDArray[np.float64],
     *,
     labels: Labels | None = None,
-    device: str | None = None,
     **options: Any,
 ) -> Tensor:
     """Numbers of pairs up to each threshold, int64; thresholds ascend."""
-    probes, templates = _placed(probes, templates, device)
     bounds = torch.tensor(thresholds, dtype=torch.float64, device=templates.device)
     counts = torch.zeros(len(bounds) + 1, dtype=torch.int64, device=templates.device)
     with ieee_products(templates.device):
@@ -176,20 +178,11 @@ def usable(device: str) -> torch.device:
     return torch.device(device)
 
 
-def _placed(probes: Any, templates: Any, device: str | None) -> tuple[Side, SubspaceTensors]:
-    """Bring probes and templates to one device."""
-    there = templates.device if device is None else usable(device)
-    sides = []
-    for side in (probes, templates):
-        if isinstance(side, SubspaceBatch):
-            side = SubspaceTensors.of(side, there)
-        elif isinstance(side, np.ndarray):
-            side = torch.tensor(side, dtype=torch.float32, device=there)
-        sides.append(side)
-    left, right = sides
-    if left.device != right.device:
-        raise TemplateError(f"the probes are on {left.device}, the templates on {right.device}")
-    return left, right
+def placed(side: NDArray[Any] | SubspaceBatch, device: torch.device) -> Side:
+    """Copy points or subspaces to a device."""
+    if isinstance(side, SubspaceBatch):
+        return SubspaceTensors.of(side, device)
+    return torch.tensor(side, dtype=torch.float32, device=device)
 
 
 def _drop(table: Tensor, labels: Labels | None, rows: slice, columns: slice, value: int) -> None:
@@ -206,41 +199,48 @@ def _tiles(
     probes: Side, templates: SubspaceTensors, metric: Metric, steps: int
 ) -> Iterator[tuple[slice, slice, Tensor]]:
     """Yield rows, columns and their distances, the columns of one row of tiles in order."""
-    rows, columns = len(probes), len(templates)
-    budget = TILE_BYTES.get(templates.device.type, TILE_BYTES["cuda"]) // 4
+    rows, columns, budget = len(probes), len(templates), TILE_BYTES[templates.device.type] // 4
     deep, wide = 1 if isinstance(probes, Tensor) else probes.m + 1, templates.m + 1
     pairs = max(1, budget // (deep * wide))
     # The stacked rows count too: few probes and many templates must not make a long tile.
     height = max(1, min(rows, math.isqrt(pairs), budget // (deep * templates.n)))
     width = max(1, min(columns, pairs // height, budget // (wide * templates.n)))
-    for row in range(0, rows, height):
-        for column in range(0, columns, width):
-            part = slice(row, min(row + height, rows)), slice(column, min(column + width, columns))
-            yield *part, _distances(probes[part[0]], templates[part[1]], metric, steps)
+    for row in parts(rows, height):
+        for column in parts(columns, width):
+            yield row, column, _distances(probes[row], templates[column], metric, steps)
 
 
-def _distances(probes: Side, templates: SubspaceTensors, metric: Metric, steps: int) -> Tensor:
-    """Distances of one tile, shape (P, T)."""
+def _distances(
+    probes: Side, templates: SubspaceTensors, metric: Metric, steps: int, *, paired: bool = False
+) -> Tensor:
+    """Distances of one tile, shape (P, T), or of probe i to template i, shape (P,)."""
     spherical = metric is Metric.SPHERICAL
     left, right = (_on_sphere(side) if spherical else side for side in (probes, templates))
-    shape = -1, len(probes), templates.m + 1, len(templates)
-    gram = (stacked(left) @ stacked(right).T).view(shape)
-    # Products of every pair: (P · T, m_D + 1, m_E + 1), m_D = 0 for points.
-    block = gram.permute(1, 3, 0, 2).flatten(0, 1).contiguous()
+    # Products of every pair: (pairs, m_D + 1, m_E + 1), m_D = 0 for points.
+    rows, columns = stacked(left), stacked(right)
+    if paired:
+        rows, columns = (part.view(-1, len(probes), templates.n) for part in (rows, columns))
+        block = rows.transpose(0, 1) @ columns.permute(1, 2, 0)
+    else:
+        gram = (rows @ columns.T).view(-1, len(probes), templates.m + 1, len(templates))
+        block = gram.permute(1, 3, 0, 2).flatten(0, 1).contiguous()
     if spherical:
         gains = block[:, 0, 1:].norm(dim=1) if isinstance(left, Tensor) else _gains(block, steps)
         squared = 2 - 2 * (block[:, 0, 0] + gains)
     else:
-        gaps = (_squares(left)[:, None] + _squares(right)).flatten() - 2 * block[:, 0, 0]
+        squares = _squares(left) if paired else _squares(left)[:, None]
+        gaps = (squares + _squares(right)).flatten() - 2 * block[:, 0, 0]
         lifted = not isinstance(left, Tensor)
         squared = _schur(block, gaps) if lifted else gaps - block[:, 0, 1:].square().sum(dim=1)
-    distances = squared.clamp(min=0).sqrt().view(shape[1], shape[3])
+    distances = squared.clamp(min=0).sqrt()
+    if not paired:
+        distances = distances.view(len(probes), len(templates))
     near = torch.nonzero(~((distances >= NEAR) & (distances < torch.inf)), as_tuple=True)
     if len(near[0]):
-        pairs = (index.cpu().numpy() for index in near)
+        i, j = (index.cpu().numpy() for index in (near[0], near[-1]))
         sides = _on_processor(probes), _on_processor(templates)
-        found = exact.pairs(*sides, *pairs, metric=metric, steps=steps)
-        distances[near] = torch.tensor(found, dtype=torch.float32, device=distances.device)
+        corrected = exact.pairs(*sides, i, j, metric=metric, steps=steps)
+        distances[near] = torch.tensor(corrected, dtype=torch.float32, device=distances.device)
     return distances
 
 

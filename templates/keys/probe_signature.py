@@ -1,12 +1,12 @@
 """Signatures of probes, so that a probe that was captured cannot be sent again.
 
-A client that sends an embedding or a lifted template adds three fields: ``nonce``, ``timestamp``
-and ``hmac``. The text that is signed has seven lines, without a line break at the end::
+A client that sends embeddings or a lifted template adds three fields: ``nonce``, ``timestamp`` and
+``hmac``. The text that is signed has seven lines, without a line break at the end::
 
     veilface-probe-1
     <subject id>
     <level, or nothing>
-    <"embedding" or "template">
+    <"embedding", "embeddings" or "template">
     <SHA-256 of the probe's bytes, 64 hexadecimal digits>
     <nonce>
     <timestamp>
@@ -14,7 +14,8 @@ and ``hmac``. The text that is signed has seven lines, without a line break at t
 ``hmac`` is its HMAC-SHA256 (RFC 2104), 64 hexadecimal digits, under the probe key: HKDF of the
 secret part of the API key (``templates.keys.api_token.probe_key``). The bytes of a template are its
 wire bytes; those of an embedding are its numbers as little-endian float64, with 0 for -0, because
-JSON writers do not agree on the latter.
+JSON writers do not agree on the latter. Those of several embeddings are the SHA-256 of each, 32
+bytes, one after the other: so it is signed where each of them ends.
 """
 
 import base64
@@ -75,8 +76,9 @@ def sign_probe(
     ----------
     token
         The API key that the request is sent with.
-    probe : bytes, or (n,) floating
-        Wire bytes of a lifted probe, or an embedding with exactly the numbers that are sent.
+    probe : bytes, (n,) or (k, n) floating
+        Wire bytes of a lifted probe; an embedding, or several of one person, with exactly the
+        numbers that are sent.
     level
         As the request names it; None where it names none.
     nonce, timestamp
@@ -107,11 +109,12 @@ def signed_probe(
     Parameters as in :func:`sign_probe`.
     """
     signature = sign_probe(token, subject_id, probe, level=level)
-    sent: dict[str, Any] = (
-        {"template": base64.b64encode(probe).decode("ascii")}
+    kind = _kind(probe)
+    sent: dict[str, Any] = {
+        kind: base64.b64encode(probe).decode("ascii")
         if isinstance(probe, bytes)
-        else {"embedding": [float(number) for number in probe]}
-    )
+        else probe.astype(np.float64).tolist()
+    }
     if level is not None:
         sent["level"] = level
     return {**sent, **signature.fields()}
@@ -128,17 +131,30 @@ def probe_mac(
 ) -> str:
     """HMAC-SHA256 of a probe under a probe key, 64 hexadecimal digits."""
     if isinstance(probe, bytes):
-        kind, body = "template", probe
+        body = probe
+    elif probe.ndim == 2:
+        body = b"".join(hashlib.sha256(_number_bytes(row)).digest() for row in probe)
     else:
-        # Adding 0 turns -0 into 0 and changes nothing else.
-        kind, body = "embedding", (probe.astype(np.float64) + 0.0).astype("<f8").tobytes()
+        body = _number_bytes(probe)
     lines = (
         _VERSION,
         subject_id,
         level or "",
-        kind,
+        _kind(probe),
         hashlib.sha256(body).hexdigest(),
         nonce,
         str(timestamp),
     )
     return hmac.new(key, "\n".join(lines).encode(), hashlib.sha256).hexdigest()
+
+
+def _kind(probe: bytes | NDArray[np.floating]) -> str:
+    """Name the field that holds the probe."""
+    if isinstance(probe, bytes):
+        return "template"
+    return "embeddings" if probe.ndim == 2 else "embedding"
+
+
+def _number_bytes(embedding: NDArray[np.floating]) -> bytes:
+    # Adding 0 turns -0 into 0 and changes nothing else.
+    return (embedding.astype(np.float64) + 0.0).astype("<f8").tobytes()

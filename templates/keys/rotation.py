@@ -1,52 +1,181 @@
-"""The secret rotation of a tenant: templates of two tenants cannot be linked (docs/method.md §4.9).
+"""The secret rotations of templates: without the tenant's key, no two of them can be linked.
 
-The rotation maps a descriptor x to R x, before lifting or, which is the same, after it
-(``AffineSubspace.rotated``). Distances inside a tenant do not change.
+Each template has a rotation of its own (docs/method.md §4.9). It maps a descriptor x to R x, before
+lifting or, which is the same, after it (``AffineSubspace.turned_by``). A probe is turned as the
+template that it is compared with, so no distance changes.
+
+Where the person keeps a key, the holder's rotation comes first and the tenant's last: the tenant's
+can be renewed, or undone for an export, without the holder's key.
 """
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.kdf.hkdf import HKDF
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
+from scipy.fft import dct, idct
 
 from templates.keys.randomness import KEY_BYTES, Keystream
+from templates.keys.sealing import encode_parts
 
-ROTATION_VERSION = "haar-1"
-"""Names how a key becomes a matrix; part of the contract."""
+ROTATION_VERSION = "signs-cosine-2"
+"""Names how a key and a template's id become a rotation; part of the contract."""
+HOLDER_VERSION = "signs-cosine-2"
+"""Names how a holder's key and the salt of an enrollment become a rotation."""
+HAAR_VERSION = "haar-1"
+"""Of templates from before: one matrix for all that a tenant has in one epoch."""
+
+TRANSFORMS = 4
+"""Cosine transforms of one rotation. After k of them the variance of any entry of R x over the keys
+is 1/n for every unit vector x, to a relative n^(1 − k/2): with four, 1/n (docs/method.md §4.9)."""
+
+Array64 = NDArray[np.float64]
+HolderKey = bytes | bytearray
+"""The 32 secret bytes that the holder of an enrollment keeps, and the service does not."""
 
 
-def tenant_rotation(key: bytes, n: int) -> NDArray[np.float64]:
-    """Return the rotation that belongs to a tenant's key.
+class Rotation(Protocol):
+    """An orthogonal map R of descriptors."""
+
+    def turned(self, points: NDArray[np.floating]) -> Array64:
+        """Return R x for every row x of ``points``, shape (k, n), in float64."""
+        ...
+
+    def turned_back(self, points: NDArray[np.floating]) -> Array64:
+        """Return Rᵀ x for every row x of ``points``, shape (k, n), in float64."""
+        ...
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class SignedCosineRotation:
+    """Random signs and orthonormal cosine transforms in turn, with signs at both ends.
+
+    Parameters
+    ----------
+    signs : (TRANSFORMS + 1, n) float64
+        Each 1 or −1.
+    """
+
+    signs: Array64
+
+    def turned(self, points: NDArray[np.floating]) -> Array64:
+        """Return R x for every row."""
+        turned = points * self.signs[0]
+        for signs in self.signs[1:]:
+            turned = dct(turned, norm="ortho", overwrite_x=True)
+            turned *= signs
+        return np.asarray(turned)
+
+    def turned_back(self, points: NDArray[np.floating]) -> Array64:
+        """Return Rᵀ x for every row."""
+        turned = points * self.signs[-1]
+        for signs in self.signs[-2::-1]:
+            turned = idct(turned, norm="ortho", overwrite_x=True)
+            turned *= signs
+        return np.asarray(turned)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class MatrixRotation:
+    """An orthogonal (n, n) matrix."""
+
+    matrix: Array64
+
+    def turned(self, points: NDArray[np.floating]) -> Array64:
+        """Return R x for every row."""
+        return np.asarray(points.astype(np.float64) @ self.matrix.T)
+
+    def turned_back(self, points: NDArray[np.floating]) -> Array64:
+        """Return Rᵀ x for every row."""
+        return np.asarray(points.astype(np.float64) @ self.matrix)
+
+
+class TenantRotation:
+    """Gives each template that a tenant has in one epoch its rotation.
 
     Parameters
     ----------
     key : bytes
-        32 secret bytes.
+        The 32 secret bytes of the tenant and epoch.
     n : int
         Descriptor dimension.
+    """
 
-    Returns
-    -------
-    ndarray of float64, shape (n, n)
-        Orthogonal; distributed by the Haar measure over the keys. Equal on every machine to
-        rounding (10⁻¹³).
+    def __init__(self, key: bytes, n: int) -> None:
+        if len(key) != KEY_BYTES:
+            raise ValueError(f"a tenant's rotation key has {KEY_BYTES} bytes, not {len(key)}")
+        if n < 1:
+            raise ValueError(f"a rotation needs a dimension of 1 or more, not {n}")
+        self._key = key
+        self.n = n
 
-    Notes
-    -----
-    HKDF-SHA-256 turns key and n into a ChaCha20 key, whose stream fills a Gaussian matrix. Its Q
-    factor is Haar-distributed when R has a positive diagonal (Mezzadri, Notices AMS 2007).
+    def __repr__(self) -> str:
+        return f"TenantRotation(n={self.n})"
+
+    def of(self, template_id: str, version: str = ROTATION_VERSION) -> Rotation:
+        """Return the rotation of one template. Equal on every machine to rounding.
+
+        Parameters
+        ----------
+        template_id
+            Random, and another one for each enrollment: two templates never share a rotation.
+        version
+            Of the contract that the template belongs to.
+
+        Notes
+        -----
+        HKDF-SHA-256 turns the key, n and the id into the bits of all signs. The derived bits are
+        the whole secret of this rotation, so who finds the rotation of their own template out has
+        nothing of another's.
+        """
+        if version == HAAR_VERSION:
+            return self._haar
+        if version != ROTATION_VERSION:
+            raise ValueError(f"this program does not know the rotation version {version!r}")
+        info = encode_parts("template rotation", version, self.n, template_id)
+        return _derived(self._key, info, self.n)
+
+    @cached_property
+    def _haar(self) -> MatrixRotation:
+        """The one matrix of version 1, by a QR decomposition; made when it is first asked for.
+
+        HKDF-SHA-256 turns key and n into a ChaCha20 key, whose stream fills a Gaussian matrix. Its
+        Q factor is Haar-distributed when R has a positive diagonal (Mezzadri, Notices AMS 2007).
+        """
+        info = f"veilface tenant rotation {HAAR_VERSION} n={self.n}".encode()
+        derived = HKDF(algorithm=SHA256(), length=KEY_BYTES, salt=None, info=info).derive(self._key)
+        with Keystream(derived) as stream:
+            q, r = np.linalg.qr(stream.normal((self.n, self.n)))
+        return MatrixRotation(np.ascontiguousarray(q * np.where(np.diagonal(r) < 0, -1.0, 1.0)))
+
+
+def holder_rotation(key: HolderKey, salt: str, n: int) -> SignedCosineRotation:
+    """Return the rotation of one enrollment under its holder's key.
+
+    Parameters
+    ----------
+    salt
+        Random, and another one for each enrollment. It stays where the template gets another id:
+        the holder's key is not there when a template is imported.
+    n
+        Descriptor dimension.
+
+    Raises
+    ------
+    ValueError
+        Where the key has another length.
     """
     if len(key) != KEY_BYTES:
-        raise ValueError(f"a tenant's rotation key has {KEY_BYTES} bytes, not {len(key)}")
-    if n < 1:
-        raise ValueError(f"a rotation needs a dimension of 1 or more, not {n}")
-    info = f"veilface tenant rotation {ROTATION_VERSION} n={n}".encode()
-    derived = HKDF(algorithm=SHA256(), length=KEY_BYTES, salt=None, info=info).derive(key)
-    with Keystream(derived) as stream:
-        q, r = np.linalg.qr(stream.normal((n, n)))
-    return np.ascontiguousarray(q * np.where(np.diagonal(r) < 0, -1.0, 1.0))
+        raise ValueError(f"a holder key has {KEY_BYTES} bytes, not {len(key)}")
+    return _derived(key, encode_parts("holder rotation", HOLDER_VERSION, n, salt), n)
 
 
-def rotate(points: ArrayLike, rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return R x for every row x of ``points``, shape (k, n) or (n,), in float64."""
-    return np.asarray(np.asarray(points, dtype=np.float64) @ rotation.T)
+def _derived(key: HolderKey, info: bytes, n: int) -> SignedCosineRotation:
+    count = (TRANSFORMS + 1) * n
+    derived = HKDF(algorithm=SHA256(), length=-(-count // 8), salt=None, info=info).derive(key)
+    bits = np.unpackbits(np.frombuffer(derived, dtype=np.uint8), count=count)
+    signs = 1 - 2 * bits.astype(np.float64)
+    return SignedCosineRotation(signs.reshape(-1, n))

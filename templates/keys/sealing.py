@@ -380,7 +380,7 @@ class MasterKeyring:
 
 
 class KeyringSealer:
-    """A :class:`Sealer` under a master keyring, for files: decoy pools, cohorts, caches.
+    """A :class:`Sealer` under a master keyring, for files: decoy pools, contracts, caches.
 
     Parameters
     ----------

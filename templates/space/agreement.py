@@ -1,11 +1,77 @@
-"""How well several photos agree that they show one person, from their raw embeddings."""
+"""Several photos of one person: how well they agree that they are, and the one mean of them."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from templates.errors import VeilfaceError
+
 _LEAST_NORM = 1e-12
+_LEAST_MEAN = 1e-6
+
+
+class InconsistentImages(VeilfaceError):
+    """The photos of one enrollment or probe do not all show the same person.
+
+    Parameters
+    ----------
+    apart, others
+        Positions from 0, ascending: the photos that differ from the others. Where both are as
+        many, either may be the stranger's.
+    """
+
+    def __init__(self, apart: Sequence[int], others: Sequence[int]) -> None:
+        self.apart = tuple(apart)
+        self.others = tuple(others)
+        super().__init__(self.sentence())
+
+    @property
+    def photos(self) -> tuple[int, ...]:
+        """The photos that differ, ascending: all of them where either half may."""
+        if len(self.apart) < len(self.others):
+            return self.apart
+        return tuple(sorted(self.apart + self.others))
+
+    def sentence(self, names: Sequence[str] | None = None) -> str:
+        """Say which photos differ: by their names, else by numbers from 1."""
+        if len(self.apart) == len(self.others) == 1:
+            differing = f"{_listed(self.photos, names)} do not look like the same person"
+        else:
+            verb = "does" if len(self.apart) == 1 else "do"
+            differing = (
+                f"{_listed(self.apart, names)} {verb} not look like the person on "
+                f"{_listed(self.others, names)}"
+            )
+        return f"{differing}; send photos of one person only, or clearer ones"
+
+
+def _listed(positions: Sequence[int], names: Sequence[str] | None) -> str:
+    if names is not None:
+        shown = [names[position] for position in positions]
+    else:
+        shown = [str(position + 1) for position in positions]
+        shown[0] = f"{'photos' if len(shown) > 1 else 'photo'} {shown[0]}"
+    return " and ".join([", ".join(shown[:-1]), shown[-1]] if len(shown) > 1 else shown)
+
+
+def mean_embedding(rows: NDArray[np.float32], *, consistency: float) -> NDArray[np.float32]:
+    """Average the unit rows of one person and normalise, (k, n) to (n,).
+
+    Raises
+    ------
+    InconsistentImages
+        Where the rows part into two groups that agree less than ``consistency``
+        (:func:`weakest_split`), or cancel.
+    """
+    mean = rows.astype(np.float64).mean(axis=0)
+    norm = float(np.linalg.norm(mean))
+    if len(rows) > 1:
+        split = weakest_split(rows)
+        if split.agreement < consistency or norm < _LEAST_MEAN:
+            raise InconsistentImages(split.apart, split.others)
+    return np.asarray(mean / norm, dtype=np.float32)
 
 
 class WeakestSplit(NamedTuple):

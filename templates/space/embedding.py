@@ -1,4 +1,6 @@
-"""The check that every raw embedding passes before anything is computed from it."""
+"""Unit vectors: the check that every raw embedding passes before anything is computed from it."""
+
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -6,6 +8,14 @@ from numpy.typing import ArrayLike, NDArray
 from templates.errors import InvalidEmbedding
 
 UNIT_TOLERANCE = 1e-3
+_LEAST_NORM = 1e-12
+FloatT = TypeVar("FloatT", bound=np.floating)
+
+
+def normalised(rows: NDArray[FloatT]) -> NDArray[FloatT]:
+    """Scale vectors along the last axis to norm 1, in their dtype; unchecked, and zeros stay."""
+    norms = np.linalg.norm(rows, axis=-1, keepdims=True)
+    return np.asarray(rows / np.maximum(norms, _LEAST_NORM))
 
 
 def unit_descriptors(descriptors: ArrayLike) -> NDArray[np.float64]:

@@ -1,5 +1,7 @@
 """From descriptors to private templates: the strategies of paper §3.2, §4.2 and §4.3."""
 
+import hashlib
+import hmac
 from collections.abc import Sequence
 from enum import StrEnum
 from typing import assert_never
@@ -10,8 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from templates.decoys.source import Attributes, DecoySource
 from templates.errors import LiftingError
 from templates.keys.randomness import Keystream
+from templates.keys.sealing import encode_parts
 from templates.space.embedding import unit_descriptors
-from templates.space.subspace import SubspaceBatch
+from templates.space.subspace import SubspaceBatch, span_basis
 
 SUB_DATABASES = 16
 """Parts that the sub-strategies split the database into (paper §4.2)."""
@@ -57,6 +60,41 @@ class Strategy(StrEnum):
         return SUB_DATABASES if split else None
 
 
+# A pool may own a real person whom templates of nobody must not hold, so these are lifted from
+# generated descriptors with generated decoys; such strategies are then their plain forms.
+_PLAIN = {
+    Strategy.HYBRID_PLUS: Strategy.HYBRID,
+    Strategy.SUB_HYBRID: Strategy.HYBRID,
+    Strategy.SUB_ADVERSARIAL: Strategy.ADVERSARIAL,
+}
+
+
+def plain_strategy(strategy: Strategy) -> Strategy:
+    """Return the form of a strategy that needs no labels and no sub-databases."""
+    return _PLAIN.get(strategy, strategy)
+
+
+def lift_stream(secret: bytes, *, contract_id: str, photos: Sequence[bytes]) -> Keystream:
+    """Return the stream that one set of photos is lifted from: the same whenever they come again.
+
+    Two lifts of one descriptor with different decoys meet in it (docs/method.md §4.6). From this
+    stream they are one set, which tells no more than either; other photos give other decoys.
+
+    Parameters
+    ----------
+    secret : bytes
+        32 random bytes of the deployment. Who has them and these very photos has the decoys.
+    contract_id : str
+        Of the contract that the template will carry.
+    photos : sequence of bytes
+        What was sent, in any order: the files, or the bytes of the embeddings. Not what a model
+        made of the files, which another processor rounds in another way.
+    """
+    digests = sorted(hashlib.sha256(photo).digest() for photo in photos)
+    parts = encode_parts("lift", contract_id, *digests)
+    return Keystream(hmac.digest(secret, parts, hashlib.sha256))
+
+
 def lift(
     descriptors: ArrayLike,
     *,
@@ -79,14 +117,15 @@ def lift(
     source : DecoySource, optional
         Required by every strategy but random.
     stream : Keystream, optional
-        For experiments. By default every template gets a fresh key, dropped afterwards.
+        Of :func:`lift_stream` for what is stored; a seeded one in experiments. By default every
+        template gets a fresh key, dropped afterwards.
     attributes : sequence of Attributes, optional
         One per descriptor; required by hybrid+ and refused by the others.
 
     Returns
     -------
     SubspaceBatch
-        Functions of the sets and of fresh randomness only (see ``SubspaceBatch.through``).
+        Functions of the sets and of the stream only (see ``SubspaceBatch.through``).
 
     Raises
     ------
@@ -112,6 +151,48 @@ def lift(
     return SubspaceBatch(feet, bases)
 
 
+def lift_of_nobody(
+    descriptors: ArrayLike,
+    *,
+    strategy: Strategy,
+    m: int,
+    source: DecoySource,
+    stream: Keystream,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Lift, but leave the bases as they come: the first rows of one tell which points made it.
+
+    Faster than :func:`lift`, in one piece of (N, m, n) float64, and only for descriptors that are
+    nobody's. Parameters and errors are those of :func:`lift`; there is no hybrid+ here.
+
+    Returns
+    -------
+    feet, bases : ndarray of float64, shapes (N, n) and (N, m, n)
+    """
+    points = with_noise(unit_descriptors(descriptors), strategy, source, stream)
+    bases = span_basis(
+        draw_directions(points, strategy=strategy, m=m, source=source, stream=stream)
+    )
+    inside = np.einsum("tmi,ti->tm", bases, points)
+    return points - np.einsum("tm,tmi->ti", inside, bases), bases
+
+
+def with_noise(
+    points: NDArray[np.float64],
+    strategy: Strategy,
+    source: DecoySource | None,
+    stream: Keystream,
+) -> NDArray[np.float64]:
+    """Give unit descriptors (N, n) the noise that the source's decoys have; unit rows again.
+
+    Embedders leave axes along which faces hardly differ. Decoys cannot be fitted there well enough
+    to hide a descriptor: noise on both does (docs/decoys.md "Noise").
+    """
+    if not strategy.needs_decoys or source is None or not source.noise:
+        return points
+    moved = points + np.sqrt(source.noise) * stream.normal(points.shape)
+    return np.asarray(moved / np.linalg.norm(moved, axis=1, keepdims=True))
+
+
 def draw_directions(
     descriptors: ArrayLike,
     *,
@@ -123,8 +204,8 @@ def draw_directions(
 ) -> NDArray[np.float64]:
     """Draw the directions that span the subspaces, before they are orthonormalised.
 
-    For the evaluation's paper-faithful mode; see :func:`lift` for the parameters and errors.
-    Whoever holds the directions knows the descriptor: they do not leave memory.
+    See :func:`lift` for the parameters and errors; noise is not added here. Whoever holds the
+    directions knows the descriptor: they do not leave memory.
 
     Returns
     -------
@@ -181,8 +262,9 @@ def _lift(
     for first in range(0, count, step):
         tile = slice(first, min(first + step, count))
         chosen = None if attributes is None else attributes[tile]
-        directions = _directions(points[tile], strategy, m, source, stream, chosen)
-        batch = SubspaceBatch.through(points[tile], directions, stream=stream)
+        hidden = with_noise(points[tile], strategy, source, stream)
+        directions = _directions(hidden, strategy, m, source, stream, chosen)
+        batch = SubspaceBatch.through(hidden, directions, stream=stream)
         feet[tile], bases[tile] = batch.feet, batch.bases
     return SubspaceBatch(feet, bases)
 

@@ -6,7 +6,7 @@ point is a function of 𝒟, and the basis a uniformly random one of span(D), so
 descriptor that was lifted nor on the decoys one by one.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Self, overload
@@ -23,6 +23,9 @@ FLOAT32_TOLERANCE = 1e-5
 # of float32 inputs rather than directions.
 _LEAST_PIVOT = 1e-5
 _TILE_BYTES = 16 << 20
+
+Turn = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+"""An orthogonal map of rows, shape (k, n)."""
 
 
 def _stored(array: ArrayLike, ndim: int, name: str) -> NDArray[np.float32]:
@@ -188,9 +191,9 @@ class AffineSubspace:
         """Return the same set as the intersection of n − m hyperplanes (supplement A)."""
         return DualSubspace.of_primal(self.foot, self.basis)
 
-    def rotated(self, rotation: NDArray[np.float64]) -> Self:
-        """Return the image of the set under the orthogonal (n, n) matrix: every x becomes R x."""
-        batch = SubspaceBatch.of([self]).rotated(rotation)
+    def turned_by(self, turn: Turn) -> Self:
+        """Return the image of the set, as :meth:`SubspaceBatch.turned_by`."""
+        batch = SubspaceBatch.of([self]).turned_by(turn)
         return type(self)(batch.feet[0], batch.bases[0])
 
 
@@ -341,18 +344,21 @@ class SubspaceBatch:
         return np.sqrt(np.maximum(0.0, 1.0 - self.foot_norms**2))
 
     def rotated(self, rotation: NDArray[np.float64]) -> Self:
-        """Return the images of the sets under the orthogonal (n, n) matrix: every x becomes R x.
-
-        Computed in float64, so that R and Rᵀ undo each other to float32 rounding.
-        """
+        """Return the images of the sets under the orthogonal (n, n) matrix: every x becomes R x."""
         if rotation.shape != (self.n, self.n):
             raise InvalidTemplate(
                 f"a rotation of shape {rotation.shape} does not fit embeddings of {self.n} numbers"
             )
-        feet = self.feet.astype(np.float64) @ rotation.T
+        return self.turned_by(lambda points: points @ rotation.T)
+
+    def turned_by(self, turn: Turn) -> Self:
+        """Return the images of the sets under an orthogonal map of rows, shape (k, n).
+
+        Computed in float64, so that a map and its inverse undo each other to float32 rounding.
+        """
         bases = np.empty_like(self.bases)
         step = max(1, _TILE_BYTES // (8 * self.m * self.n))
         for first in range(0, len(self), step):
-            tile = slice(first, first + step)
-            bases[tile] = self.bases[tile].astype(np.float64) @ rotation.T
-        return type(self)(feet.astype(np.float32), bases)
+            tile = self.bases[first : first + step].astype(np.float64)
+            bases[first : first + step] = turn(tile.reshape(-1, self.n)).reshape(tile.shape)
+        return type(self)(turn(self.feet.astype(np.float64)).astype(np.float32), bases)

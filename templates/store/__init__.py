@@ -15,7 +15,13 @@ from templates.store.receipts import Receipt, verify_receipt
 from templates.store.repository import TemplateStore
 from templates.store.retention import Retention
 from templates.store.standing import AttemptsStatus
-from templates.store.subject_rows import Source, SubjectRecord, SubjectTemplate
+from templates.store.subject_rows import (
+    Source,
+    Storage,
+    SubjectRecord,
+    SubjectTemplate,
+    TemplateNotStored,
+)
 from templates.store.subjects import StoredTemplate, SubjectPage
 from templates.store.tenant_erasure import TenantErasure
 from templates.store.tenants import RetiredRotation, RotationKey, Tenant
@@ -47,11 +53,13 @@ __all__ = [
     "Right",
     "RotationKey",
     "Source",
+    "Storage",
     "StoredTemplate",
     "SubjectPage",
     "SubjectRecord",
     "SubjectTemplate",
     "Superseded",
+    "TemplateNotStored",
     "TemplateStore",
     "Tenant",
     "TenantErasure",

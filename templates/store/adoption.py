@@ -14,7 +14,7 @@ from typing import Any, cast
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
-from templates.store.audit_chain import Line, is_true_line
+from templates.store.audit_chain import Line, LineKeys, is_true_line
 from templates.store.audit_log import PROGRAM, AuditLog, Entry
 from templates.store.authenticity import (
     LAST_KEY_LINE,
@@ -66,13 +66,13 @@ def adopt(context: StoreContext) -> Adoption:
     audit_log = context.audit_log
     if context.read(audit_log.authenticates_rows):
         return Adoption()
-    return context.database.write_alone(lambda connection: _adopt(connection, audit_log))
+    return context.write_alone(lambda connection: _adopt(connection, audit_log))
 
 
 def _adopt(connection: Connection, audit_log: AuditLog) -> Adoption:
     if not audit_log.begin_authentication(connection):
         return Adoption()
-    refused = tuple(_contradicted(connection, audit_log.line_key()))
+    refused = tuple(contradicted_keys(connection, audit_log.line_keys()))
     for prefix in refused:
         warn("an API key that the audit log contradicts was not authenticated", key_id=prefix)
     rows = sum(
@@ -117,7 +117,7 @@ def _authenticate(
     return len(before)
 
 
-def _contradicted(connection: Connection, line_key: bytes) -> Iterator[str]:
+def contradicted_keys(connection: Connection, line_keys: LineKeys) -> Iterator[str]:
     """Prefixes of the keys that the audit log does not know, or knows otherwise."""
     keys = sa.select(ApiKeyRow.prefix, ApiKeyRow.revoked_at, TenantRow.name.label("tenant"))
     query = keys.outerjoin(TenantRow, TenantRow.id == ApiKeyRow.tenant_id)
@@ -125,7 +125,7 @@ def _contradicted(connection: Connection, line_key: bytes) -> Iterator[str]:
         lines = [
             line
             for row in connection.execute(_LINES_OF_KEY, {"prefix": key.prefix})
-            if is_true_line(line_key, line := Line(**row._mapping))
+            if is_true_line(line_keys, line := Line(**row._mapping))
         ]
         created = any((line.action, line.tenant) == ("key-create", key.tenant) for line in lines)
         revoked = any((line.action, line.outcome) == ("key-revoke", "revoked") for line in lines)

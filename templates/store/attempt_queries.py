@@ -1,8 +1,12 @@
 """What a verification asks of the database: one query before its decision, one in its record.
 
-The statements are made once: building one costs more than running it.
+The statements are made once: building one costs more than running it. After a renewal of secrets,
+older lines of the audit log name a subject by earlier pseudonyms, so what asks the log is made for
+a number of them.
 """
 
+import functools
+from collections.abc import Sequence
 from typing import Any, cast
 
 import sqlalchemy as sa
@@ -40,23 +44,49 @@ COUNTS = tuple(
 )
 """What is counted of a subject; NULL where nothing is."""
 
-# A line beyond the head is none: nobody is kept from inserting one.
-_OF_SUBJECT = (
-    AuditRow.pseudonym == sa.bindparam("pseudonym"),
+_ATTEMPTS = (
+    # A line beyond the head is none: nobody is kept from inserting one.
     AuditRow.sequence <= sa.select(AuditHeadRow.sequence).scalar_subquery(),
     ATTEMPT_LINES,
 )
-_LAST = last_line(*_OF_SUBJECT).add_columns(AuditRow.outcome).subquery("last_attempt")
-LAST_LINE = (_LAST.c.sequence.label("last_sequence"), _LAST.c.outcome.label("last_outcome"))
-"""Last line of the audit log that tells of an attempt on the subject, or of their end."""
 
 LINES_OF_ATTEMPTS: Any = (
     sa.select(*(getattr(AuditRow, name) for name in Line.__dataclass_fields__))
-    .where(*_OF_SUBJECT)
+    .where(AuditRow.pseudonym.in_(sa.bindparam("pseudonyms", expanding=True)), *_ATTEMPTS)
     .order_by(AuditRow.sequence.desc())
     .limit(sa.bindparam("most"))
 )
-"""Of `pseudonym`: the latest `most` of these lines, the last one first."""
+"""Of `pseudonyms`: the latest `most` of these lines, the last one first."""
+
+
+def named(pseudonyms: Sequence[str]) -> dict[str, str]:
+    """Parameters that :func:`before` and :func:`standing` take a subject's pseudonyms by."""
+    return dict(zip(_names(len(pseudonyms)), pseudonyms, strict=True))
+
+
+def _names(count: int) -> list[str]:
+    return ["pseudonym", *(f"pseudonym_{number}" for number in range(1, count))]
+
+
+def _last_attempt(count: int) -> sa.Subquery:
+    """Last line of the audit log that tells of an attempt on the subject, or of their end."""
+    # One for each pseudonym, each read from the end of its index; together, all would be sorted.
+    last: list[Any] = [
+        last_line(AuditRow.pseudonym == sa.bindparam(name), *_ATTEMPTS).add_columns(
+            AuditRow.outcome
+        )
+        for name in _names(count)
+    ]
+    if count > 1:
+        either = sa.union_all(*(sa.select(line.subquery()) for line in last)).subquery()
+        last = [sa.select(either).order_by(either.c.sequence.desc()).limit(1)]
+    subquery: sa.Subquery = last[0].subquery("last_attempt")
+    return subquery
+
+
+def _last_line(last: sa.Subquery) -> tuple[Any, Any]:
+    return last.c.sequence.label("last_sequence"), last.c.outcome.label("last_outcome")
+
 
 TENANT_ERASED: Any = last_line(
     AuditRow.tenant == sa.bindparam("tenant"), AuditRow.outcome == "erased", TENANT_LINES
@@ -74,55 +104,71 @@ _USED_NONCE = (
 
 _LOGGED_NONCE = sa.select(AuditRow.sequence).where(AuditRow.nonce == sa.bindparam("nonce_digest"))
 
-BEFORE: Any = (
-    sa.select(
-        *TEMPLATE_COLUMNS,
-        TenantRow.rotation_epoch.label("current_epoch"),
-        sa.or_(sa.exists(_USED_NONCE), sa.exists(_LOGGED_NONCE)).label("used"),
-        *COUNTS,
-        *LAST_LINE,
-    )
-    .select_from(TenantRow)
-    .outerjoin(FailedAttemptsRow, _FAILURES)
-    .outerjoin(_LAST, sa.true())
-    .outerjoin(SubjectRow, _SUBJECT)
-    .outerjoin(
-        TemplateRow,
-        sa.and_(_TEMPLATE, TemplateRow.contract_id == sa.bindparam("contract_id")),
-    )
-    .where(_TENANT)
-)
-"""All that is looked at before a decision; one row where there is the tenant.
 
-Of `tenant`, `pseudonym`, `subject_id`, `contract_id`, `key_prefix`, `nonce_hash` and
-`nonce_digest`. The columns of the template are NULL where the subject has none of the contract.
-"""
+@functools.cache
+def before(count: int) -> Any:
+    """All that is looked at before a decision; one row where there is the tenant.
 
-STANDING: Any = (
-    sa.select(
-        TenantRow.id.label("tenant_id"),
-        *COUNTS,
-        *LAST_LINE,
-        sa.exists(_LOGGED_NONCE).label("used"),
-        SubjectRow.id.label("subject_pk"),
-        TemplateRow.template_id,
-        TemplateRow.contract_id,
-        sa.select(ApiKeyRow.id)
-        .where(ApiKeyRow.prefix == sa.bindparam("key_prefix"))
-        .scalar_subquery()
-        .label("api_key_id"),
+    Of `tenant`, :func:`named` for so many pseudonyms, `subject_id`, `contract_id`,
+    `earlier_contract_id`, `key_prefix`, `nonce_hash` and `nonce_digest`. The columns of the
+    template are NULL where the subject has none of either contract.
+    """
+    last = _last_attempt(count)
+    return (
+        sa.select(
+            *TEMPLATE_COLUMNS,
+            TenantRow.rotation_epoch.label("current_epoch"),
+            sa.or_(sa.exists(_USED_NONCE), sa.exists(_LOGGED_NONCE)).label("used"),
+            *COUNTS,
+            *_last_line(last),
+        )
+        .select_from(TenantRow)
+        .outerjoin(FailedAttemptsRow, _FAILURES)
+        .outerjoin(last, sa.true())
+        .outerjoin(SubjectRow, _SUBJECT)
+        .outerjoin(
+            TemplateRow,
+            sa.and_(
+                _TEMPLATE,
+                TemplateRow.contract_id.in_(
+                    [sa.bindparam("contract_id"), sa.bindparam("earlier_contract_id")]
+                ),
+            ),
+        )
+        .where(_TENANT)
     )
-    .select_from(TenantRow)
-    .outerjoin(FailedAttemptsRow, _FAILURES)
-    .outerjoin(_LAST, sa.true())
-    .outerjoin(SubjectRow, _SUBJECT)
-    .outerjoin(TemplateRow, _TEMPLATE)
-    .where(_TENANT)
-)
-"""What a decision is recorded against; one row where there is the tenant.
 
-Of `tenant`, `pseudonym`, `subject_id`, `key_prefix` and `nonce_digest`.
-"""
+
+@functools.cache
+def standing(count: int) -> Any:
+    """What a decision is recorded against; one row where there is the tenant.
+
+    Of `tenant`, :func:`named` for so many pseudonyms, `subject_id`, `key_prefix` and
+    `nonce_digest`.
+    """
+    last = _last_attempt(count)
+    return (
+        sa.select(
+            TenantRow.id.label("tenant_id"),
+            *COUNTS,
+            *_last_line(last),
+            sa.exists(_LOGGED_NONCE).label("used"),
+            SubjectRow.id.label("subject_pk"),
+            TemplateRow.template_id,
+            TemplateRow.contract_id,
+            sa.select(ApiKeyRow.id)
+            .where(ApiKeyRow.prefix == sa.bindparam("key_prefix"))
+            .scalar_subquery()
+            .label("api_key_id"),
+        )
+        .select_from(TenantRow)
+        .outerjoin(FailedAttemptsRow, _FAILURES)
+        .outerjoin(last, sa.true())
+        .outerjoin(SubjectRow, _SUBJECT)
+        .outerjoin(TemplateRow, _TEMPLATE)
+        .where(_TENANT)
+    )
+
 
 _failures = cast(sa.Table, FailedAttemptsRow.__table__)
 _subjects = cast(sa.Table, SubjectRow.__table__)

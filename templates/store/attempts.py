@@ -7,10 +7,11 @@ is held against the audit log (``templates.store.standing``), and so is a nonce:
 from its table changes nothing.
 """
 
+import contextlib
 import hashlib
 import hmac
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from datetime import timedelta
 from functools import partial
 from typing import Any, Protocol, TypeVar
@@ -20,15 +21,21 @@ from sqlalchemy.engine import Connection
 
 from templates.errors import StoreError
 from templates.keys.sealing import encode_parts
-from templates.store.attempt_queries import BEFORE, NOTE_USE, STANDING
+from templates.store.attempt_queries import NOTE_USE, before, named, standing
 from templates.store.audit_log import By, Entry
 from templates.store.context import StoreContext
 from templates.store.deployment import insert_once
 from templates.store.identifiers import UnknownTenant, checked_subject_id
 from templates.store.lockout import LockedOut, LockoutPolicy, Nonce, Replayed, Superseded
+from templates.store.outbox import EventType
 from templates.store.schema import FailedAttemptsRow, UsedNonceRow
 from templates.store.standing import UNKNOWN_RETENTION, AttemptsStatus, Standing
-from templates.store.subject_rows import SubjectTemplate, opened_template, subject_lock
+from templates.store.subject_rows import (
+    SubjectTemplate,
+    TemplateNotStored,
+    opened_template,
+    subject_lock,
+)
 
 NONCE_GRACE = timedelta(minutes=5)
 BATCH = 500
@@ -42,17 +49,18 @@ class Attempt:
     ----------
     rotation_epoch
         The tenant's current one.
+    template_id
+        Id of the subject's template; None where there is none of the contract.
     template
-        The subject's; None where there is none of the contract.
+        That template; None also where its holder keeps it, and sent none, or another one.
+    untried
+        A held template that was sent for a subject who has none: nothing tried to open it yet.
     """
 
     rotation_epoch: int
+    template_id: str | None
     template: SubjectTemplate | None
-
-    @property
-    def template_id(self) -> str | None:
-        """Id of the template."""
-        return None if self.template is None else self.template.record.template_id
+    untried: bytes | None = field(default=None, repr=False)
 
 
 class Decided(Protocol):
@@ -80,7 +88,13 @@ class Attempts:
         self._standing = Standing(context, policy)
 
     def begin(
-        self, tenant: str, subject_id: str, *, contract_id: str, nonce: Nonce | None = None
+        self,
+        tenant: str,
+        subject_id: str,
+        *,
+        contract_ids: Sequence[str],
+        nonce: Nonce | None = None,
+        held_template: bytes | None = None,
     ) -> Attempt:
         """Read all that a decision needs, and refuse early what :meth:`conclude` would refuse.
 
@@ -91,11 +105,14 @@ class Attempts:
         ----------
         tenant, subject_id
             Whom the probe is to be compared with.
-        contract_id
-            A template of another contract is as good as none: nothing of it is read or decrypted,
-            so that it costs what a subject costs that does not exist.
+        contract_ids
+            One or two. A template of another contract is as good as none: nothing of it is read or
+            decrypted, so that it costs what a subject costs that does not exist.
         nonce
             Of a signed probe; None for a photo.
+        held_template
+            The sealed template that the subject's holder sent, if any did. It counts where the
+            store keeps none of the subject; whose it is turns out here.
 
         Raises
         ------
@@ -103,8 +120,9 @@ class Attempts:
         SealError
             If the row was altered or moved, or its master key is missing.
         """
-        asked = self._asked(tenant, subject_id, nonce, contract_id)
-        return self._opened(self._context.read(partial(self._before, asked=asked)))
+        asked = partial(self._asked, tenant, subject_id, nonce, contract_ids)
+        row = self._context.read(lambda connection: self._before(connection, asked()))
+        return self._opened(row, held_template)
 
     def conclude(
         self,
@@ -113,7 +131,7 @@ class Attempts:
         *,
         accepted: bool,
         template_id: str | None,
-        contract_id: str | None = None,
+        contract_ids: Sequence[str] | None = None,
         level: str,
         nonce: Nonce | None,
         by: By,
@@ -134,8 +152,9 @@ class Attempts:
         accepted
             The decision; who is not enrolled is never accepted.
         template_id
-            Id of the template that was decided on; None for a subject that was not enrolled.
-        contract_id
+            Id of the template that was decided on, or that its holder did not send; None for a
+            subject that was not enrolled.
+        contract_ids
             As of :meth:`begin`; None where any template counts.
         level
             Security level of the decision, for the audit log.
@@ -154,9 +173,9 @@ class Attempts:
             If the subject's template is another one now. Nothing is written.
         UnknownTenant, StoreError, StoreUnavailable
         """
-        asked = self._asked(tenant, subject_id, nonce, contract_id)
 
         def work(connection: Connection) -> LockedOut | Replayed | None:
+            asked = self._asked(tenant, subject_id, nonce, contract_ids)
             return self._record(connection, asked, accepted, template_id, nonce, level, by)
 
         refusal = self._context.write(work, lock=subject_lock(tenant, subject_id))
@@ -169,8 +188,9 @@ class Attempts:
         subject_id: str,
         decide: Callable[[Attempt], D],
         *,
-        contract_id: str,
+        contract_ids: Sequence[str],
         nonce: Nonce | None,
+        held_template: bytes | None = None,
         by: By,
     ) -> D:
         """:meth:`begin`, a decision and :meth:`conclude` while nobody replaces the template.
@@ -184,10 +204,10 @@ class Attempts:
         ------
         LockedOut, Replayed, UnknownTenant, SealError, StoreError, StoreUnavailable
         """
-        asked = self._asked(tenant, subject_id, nonce, contract_id)
 
         def work(connection: Connection) -> D | LockedOut | Replayed:
-            attempt = self._opened(self._before(connection, asked))
+            asked = self._asked(tenant, subject_id, nonce, contract_ids)
+            attempt = self._opened(self._before(connection, asked), held_template)
             decided = decide(attempt)
             refusal = self._record(
                 connection, asked, decided.accepted, attempt.template_id, nonce, decided.level, by
@@ -207,28 +227,28 @@ class Attempts:
         bool
             False if there was none of these. The total stays.
         """
-        asked = self._asked(tenant, subject_id)
 
         def work(connection: Connection) -> bool:
-            row = _one(connection, STANDING, asked)
+            asked = self._asked(tenant, subject_id)
+            row = _one(connection, standing, asked)
             status = self._status(connection, row, asked)
-            held = status is not None and status.holds_something
-            outcome = "reset" if held else "nothing_held"
+            to_clear = status is not None and status.holds_something
+            outcome = "reset" if to_clear else "nothing_held"
             entry = Entry("lockout-reset", outcome, by, tenant, asked["pseudonym"])
             line = self._context.audit_log.append(connection, entry)
-            if status is not None and held:
+            if status is not None and to_clear:
                 cleared = status.cleared()
                 self._standing.write(connection, row, asked["pseudonym"], cleared, line)
-            return held
+            return to_clear
 
         return self._context.write(work, lock=subject_lock(tenant, subject_id))
 
     def status(self, tenant: str, subject_id: str) -> AttemptsStatus | None:
         """What is counted of a subject; None if no attempt on it ever failed."""
-        asked = self._asked(tenant, subject_id)
 
         def work(connection: Connection) -> AttemptsStatus | None:
-            row = connection.execute(STANDING, asked).one_or_none()
+            asked = self._asked(tenant, subject_id)
+            row = connection.execute(standing(len(asked["pseudonyms"])), asked).one_or_none()
             return None if row is None else self._status(connection, row, asked)
 
         return self._context.read(work)
@@ -261,14 +281,20 @@ class Attempts:
         tenant: str,
         subject_id: str,
         nonce: Nonce | None = None,
-        contract_id: str | None = None,
+        contract_ids: Sequence[str] | None = None,
     ) -> dict[str, Any]:
-        """Parameters of :data:`BEFORE` and :data:`STANDING`."""
+        """Parameters of :func:`before` and :func:`standing`, and ``pseudonyms``.
+
+        Made in the transaction that asks: a renewal of the secrets changes them.
+        """
+        pseudonyms = self._context.signer.pseudonyms(tenant, checked_subject_id(subject_id))
         return {
             "tenant": tenant,
             "subject_id": subject_id,
-            "pseudonym": self._context.signer.pseudonym(tenant, checked_subject_id(subject_id)),
-            "contract_id": contract_id,
+            "pseudonyms": pseudonyms,
+            **named(pseudonyms),
+            "contract_id": None if contract_ids is None else contract_ids[0],
+            "earlier_contract_id": None if contract_ids is None else contract_ids[-1],
             "key_prefix": None if nonce is None else nonce.key_prefix,
             "nonce_hash": None if nonce is None else nonce.hash,
             "nonce_digest": None if nonce is None else self._digest(nonce),
@@ -281,23 +307,31 @@ class Attempts:
         return hmac.new(row_key, message, hashlib.sha256).hexdigest()
 
     def _before(self, connection: Connection, asked: dict[str, Any]) -> Any:
-        """Row of :data:`BEFORE`, where nothing refuses the attempt."""
-        row = _one(connection, BEFORE, asked)
+        """Row of :func:`before`, where nothing refuses the attempt."""
+        row = _one(connection, before, asked)
         if row.used:
             raise Replayed
         self._standing.refuse_locked(self._status(connection, row, asked))
         return row
 
-    def _opened(self, row: Any) -> Attempt:
-        enrolled = row.template_id is not None
-        template = opened_template(row, self._context.keyring) if enrolled else None
-        return Attempt(rotation_epoch=row.current_epoch, template=template)
+    def _opened(self, row: Any, held_template: bytes | None) -> Attempt:
+        template = None
+        if row.template_id is not None:
+            with contextlib.suppress(TemplateNotStored):
+                template = opened_template(row, self._context.keyring, held_template)
+        is_held = row.template_id is not None and row.ciphertext is None
+        return Attempt(
+            rotation_epoch=row.current_epoch,
+            template_id=row.template_id,
+            template=template,
+            untried=None if is_held else held_template,
+        )
 
     def _status(
         self, connection: Connection, row: Any, asked: dict[str, Any]
     ) -> AttemptsStatus | None:
-        tenant, pseudonym = asked["tenant"], asked["pseudonym"]
-        return self._standing.of(connection, row, tenant=tenant, pseudonym=pseudonym)
+        tenant, pseudonyms = asked["tenant"], asked["pseudonyms"]
+        return self._standing.of(connection, row, tenant=tenant, pseudonyms=pseudonyms)
 
     def _record(
         self,
@@ -309,9 +343,9 @@ class Attempts:
         level: str,
         by: By,
     ) -> LockedOut | Replayed | None:
-        row = _one(connection, STANDING, asked)
+        row = _one(connection, standing, asked)
         status = self._status(connection, row, asked)
-        contract_id = asked["contract_id"]
+        contract_ids = asked["contract_id"], asked["earlier_contract_id"]
         if accepted and template_id is None:
             raise ValueError("a subject that is not enrolled cannot be accepted")
         outcome = "accept" if accepted else "reject"
@@ -320,7 +354,7 @@ class Attempts:
         try:
             _use(connection, nonce, row)
             self._standing.refuse_locked(status)
-            of_contract = contract_id in (None, row.contract_id)
+            of_contract = contract_ids[0] is None or row.contract_id in contract_ids
             if (row.template_id if of_contract else None) != template_id:
                 raise Superseded
             if accepted:
@@ -345,12 +379,25 @@ class Attempts:
         line = self._context.audit_log.append(connection, entry)
         if new_status is not None:
             self._standing.write(connection, row, asked["pseudonym"], new_status, line)
+            until = new_status.locked_until
+            if until is not None or new_status.disabled_at is not None:
+                # Of an unknown subject too: whether it is told must not show who is enrolled.
+                self._context.outbox.add(
+                    connection,
+                    EventType.LOCKED_OUT,
+                    tenant_id=row.tenant_id,
+                    tenant=asked["tenant"],
+                    pseudonym=asked["pseudonym"],
+                    subject_id=asked["subject_id"],
+                    until=None if until is None else until.isoformat(),
+                    disabled=new_status.disabled_at is not None,
+                )
         return refusal
 
 
-def _one(connection: Connection, query: Any, asked: dict[str, Any]) -> Any:
+def _one(connection: Connection, query: Callable[[int], Any], asked: dict[str, Any]) -> Any:
     try:
-        row = connection.execute(query, asked).one_or_none()
+        row = connection.execute(query(len(asked["pseudonyms"])), asked).one_or_none()
     except (ValueError, TypeError):
         # SQLite keeps any value in any column.
         raise StoreError(

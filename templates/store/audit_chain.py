@@ -6,6 +6,9 @@ Who can write the database but has no master key can therefore neither write a l
 off unseen. Two things only an :class:`Anchor` that was kept elsewhere shows: an older state of the
 whole log, its head included, put back, which is a true one; and a log whose lines, MAC and key were
 all removed, which the next upgrade of the schema takes for one that never began.
+
+A renewal of the key ends the lines of the old one and begins those of the new one
+(:class:`LineKeys`); the head is always under the new one.
 """
 
 import hashlib
@@ -161,9 +164,35 @@ def line_hash(key: bytes, values: Mapping[str, str | int | bytes | datetime | No
     return hmac.digest(key, encode_parts("line", *parts), hashlib.sha256)
 
 
-def is_true_line(key: bytes, line: Line) -> bool:
+@dataclass(frozen=True)
+class LineKeys:
+    """The keys of a chain: a line is good under the key of its own time only.
+
+    Whoever took a key that was retired since cannot add to the lines of its time, because the
+    first line under the next key holds the hash of the last of them.
+
+    Attributes
+    ----------
+    current
+        Key of the head, and of the lines that come.
+    retired
+        Each with the number of the last line of its time, the oldest first.
+    """
+
+    current: bytes = field(repr=False)
+    retired: tuple[tuple[int, bytes], ...] = field(default=(), repr=False)
+
+    def of(self, sequence: int) -> bytes:
+        """Key of the line of this number."""
+        for through, key in self.retired:
+            if sequence <= through:
+                return key
+        return self.current
+
+
+def is_true_line(keys: LineKeys, line: Line) -> bool:
     """Whether a line is as it was written."""
-    return hmac.compare_digest(line_hash(key, vars(line)), line.hash)
+    return hmac.compare_digest(line_hash(keys.of(line.sequence), vars(line)), line.hash)
 
 
 def head_mac(key: bytes, head: Anchor) -> bytes:
@@ -192,8 +221,8 @@ def is_head(key: bytes, head: Anchor, mac: bytes) -> bool:
 class Chain:
     """A walk along the chain, from before its first line; keeps a bounded number of problems."""
 
-    def __init__(self, key: bytes, *, anchor: Anchor | None = None) -> None:
-        self._key = key
+    def __init__(self, keys: LineKeys, *, anchor: Anchor | None = None) -> None:
+        self._keys = keys
         self._anchor = anchor
         self._last = START
         self._trusted = True  # whether the hash of the last line is its true one
@@ -224,7 +253,7 @@ class Chain:
             line = Line.read(values)
         except ValueError:
             return None
-        return line if is_true_line(self._key, line) else None
+        return line if is_true_line(self._keys, line) else None
 
     def _follows(self, line: Line) -> bool:
         # Beside a gap or an altered line, which are reported, there is nothing to compare with.
@@ -244,7 +273,7 @@ class Chain:
         last = self._last
         if held != self._lines:
             self._report(Problem(last.sequence, TWICE))
-        if head is None or not is_head(self._key, head, mac):
+        if head is None or not is_head(self._keys.current, head, mac):
             self._report(Problem(last.sequence, HEAD_MISMATCH))
         elif head.sequence > last.sequence:
             self._report(Problem(last.sequence + 1, MISSING, through=head.sequence))

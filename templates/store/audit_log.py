@@ -22,6 +22,7 @@ from templates.store.audit_chain import (
     Anchor,
     Chain,
     Line,
+    LineKeys,
     Verification,
     head_mac,
     is_head,
@@ -39,14 +40,15 @@ from templates.store.identifiers import (
     checked_tenant_name,
 )
 from templates.store.schema import AuditHeadRow, AuditRow
+from templates.store.secret import Secret, SecretName
 
-CHAIN_SECRET = "audit-chain"  # noqa: S105 - a name, not a secret
 BATCH = 1000
 MAX_ACTOR = 64
 MAX_REQUEST_ID = 64
 MAX_DETAIL = 64
 
 TENANT_ERASE = "tenant-erase"
+RENEWAL = "secrets-renew"
 
 _BEGIN_LOCK = "veilface audit chain"
 _DIGEST = re.compile(r"[0-9a-f]{64}")
@@ -57,6 +59,11 @@ _MOVE_HEAD = sa.update(AuditHeadRow.__table__)  # type: ignore[arg-type]
 
 class BrokenAuditLog(StoreError):
     """The head of the audit log, or its key, is missing or forged, so no line can be added."""
+
+
+def is_digest(text: str) -> bool:
+    """Whether a text is 64 hexadecimal digits, as a pseudonym is."""
+    return _DIGEST.fullmatch(text) is not None
 
 
 def _checked_text(text: str | None, longest: int, what: str) -> None:
@@ -124,10 +131,10 @@ class Entry:
         checked_opaque_id(self.outcome, what="audit outcome")
         if self.tenant is not None:
             checked_tenant_name(self.tenant)
-        if self.pseudonym is not None and _DIGEST.fullmatch(self.pseudonym) is None:
+        if self.pseudonym is not None and not is_digest(self.pseudonym):
             raise InvalidIdentifier("the audit log names a subject by its pseudonym only")
         _checked_text(self.detail, MAX_DETAIL, "detail")
-        if self.nonce is not None and _DIGEST.fullmatch(self.nonce) is None:
+        if self.nonce is not None and not is_digest(self.nonce):
             raise InvalidIdentifier("the audit log keeps the digest of a nonce only")
 
 
@@ -144,8 +151,7 @@ class AuditLog:
         self._database = database
         self._secrets = secrets
         self._clock = clock
-        self._key: bytes | None = None
-        self._row_key: bytes | None = None
+        self._row_keys: dict[bytes, bytes] = {}
 
     def begin(self) -> None:
         """Make the key of a chain that never began, and the MAC of its head; else do nothing.
@@ -163,14 +169,14 @@ class AuditLog:
         self._database.write(self._begin, lock=_BEGIN_LOCK)
 
     def _begin(self, connection: Connection) -> None:
-        key = self._secrets.make(connection, CHAIN_SECRET)
-        if key is None:
+        secret = self._secrets.make(connection, SecretName.CHAIN)
+        if secret is None:
             return
         head, mac = read_head(connection)
         written = connection.execute(sa.select(sa.exists(AuditRow.sequence))).scalar_one()
         if written or head != START or mac:
             raise _without_key()  # which takes back the key that was made
-        connection.execute(sa.update(AuditHeadRow).values(mac=head_mac(key, START)))
+        connection.execute(sa.update(AuditHeadRow).values(mac=head_mac(secret.value, START)))
 
     def authenticates_rows(self, connection: Connection) -> bool:
         """Whether the head says that the rows of this database are authenticated.
@@ -178,12 +184,12 @@ class AuditLog:
         One that is missing or forged does too: who reads it is told, and no row is vouched for.
         """
         head, mac = read_head(connection)
-        return head is None or not is_head_before_authentication(self._opened_key(), head, mac)
+        return head is None or not is_head_before_authentication(self._key(), head, mac)
 
     def begin_authentication(self, connection: Connection) -> bool:
         """Let the head say that rows are authenticated from now on; False if it said so before."""
         head, mac = read_head(connection, for_update=True)
-        key = self._opened_key()
+        key = self._key()
         if head is None or not is_head_before_authentication(key, head, mac):
             return False
         connection.execute(sa.update(AuditHeadRow).values(mac=head_mac(key, head)))
@@ -201,15 +207,16 @@ class AuditLog:
         """
         self.row_key()
 
-    def line_key(self) -> bytes:
-        """Key of the chain.
+    def line_keys(self) -> LineKeys:
+        """Keys of the chain.
 
         Raises
         ------
         BrokenAuditLog
-            If it is gone.
+            If they are gone.
         """
-        return self._opened_key()
+        chain = self._chain()
+        return LineKeys(chain.value, tuple((key.line, key.value) for key in chain.retired))
 
     def row_key(self) -> bytes:
         """Key of the MACs of rows, derived from the chain's: they are lost together.
@@ -219,9 +226,13 @@ class AuditLog:
         BrokenAuditLog
             If the key of the chain is gone.
         """
-        if self._row_key is None:
-            self._row_key = derive_key(self._opened_key(), "rows")
-        return self._row_key
+        return self.row_key_of(self._key())
+
+    def row_key_of(self, chain_key: bytes) -> bytes:
+        """:meth:`row_key` of another key of the chain than the one in force."""
+        if chain_key not in self._row_keys:
+            self._row_keys[chain_key] = derive_key(chain_key, "rows")
+        return self._row_keys[chain_key]
 
     def append(self, connection: Connection, entry: Entry) -> int:
         """Add a line inside a transaction that is open already; returns its number.
@@ -239,9 +250,29 @@ class AuditLog:
             If :meth:`prepare` was not called before the transaction: opening the key is a
             transaction of its own, which on SQLite would wait for this one.
         """
-        key = self._key
-        if key is None:
+        chain = self._secrets.opened(SecretName.CHAIN)
+        if chain is None:
             raise RuntimeError("call AuditLog.prepare before the transaction")
+        return self._append(connection, entry, chain.value).sequence
+
+    def hand_over(self, connection: Connection, by: By) -> tuple[Secret, Anchor]:
+        """Renew the key of the chain in a transaction of :meth:`Secrets.write_alone`.
+
+        A line under the old key ends its time, and one under the new key begins the next, with the
+        hash of the other in it. Returns the secret, and the new head.
+        """
+        old = self._key()
+        end = self._append(connection, Entry(RENEWAL, "retired", by), old)
+        fresh = self._secrets.renew(
+            connection, SecretName.CHAIN, at=self._clock(), line=end.sequence
+        )
+        assert fresh is not None, "its value was read just now"  # noqa: S101
+        moved = head_mac(fresh.value, end)
+        connection.execute(_MOVE_HEAD, {"sequence": end.sequence, "hash": end.hash, "mac": moved})
+        begun = self._append(connection, Entry(RENEWAL, "renewed", by), fresh.value)
+        return fresh, begun
+
+    def _append(self, connection: Connection, entry: Entry, key: bytes) -> Anchor:
         last = self._head(connection, key, for_update=True)
         values: dict[str, str | int | bytes | datetime | None] = {
             "sequence": last.sequence + 1,
@@ -260,12 +291,12 @@ class AuditLog:
         connection.execute(_ADD_LINE, {**values, "hash": new.hash})
         moved = {"sequence": new.sequence, "hash": new.hash, "mac": head_mac(key, new)}
         connection.execute(_MOVE_HEAD, moved)
-        return new.sequence
+        return new
 
     def record(self, entry: Entry) -> None:
         """Add a line in a transaction of its own."""
         self.prepare()
-        self._database.write(lambda connection: self.append(connection, entry))
+        self._secrets.write(lambda connection: self.append(connection, entry))
 
     def head(self) -> Anchor:
         """Number and hash of the last line; keep them elsewhere, to verify the log against.
@@ -275,8 +306,8 @@ class AuditLog:
         BrokenAuditLog
             If the head row is missing or forged.
         """
-        key = self._opened_key()
-        return self._database.read(lambda connection: self._head(connection, key))
+        self.prepare()
+        return self._secrets.read(lambda connection: self._head(connection, self._key()))
 
     def lines(self, *, after: int = 0, batch: int = BATCH) -> Iterator[Line]:
         """Read the log from the line after `after` on, a batch in memory at a time.
@@ -315,7 +346,22 @@ class AuditLog:
         SealError
             If the master key is not the one that the log was written with.
         """
-        chain = Chain(self._opened_key(), anchor=anchor)
+        keys = self.line_keys()
+        while True:
+            verification = self._walk(keys, anchor, progress, batch)
+            # Renewed during the walk, the lines after it are under a key that was not known.
+            self._secrets.read(self._secrets.follow)
+            if keys == (keys := self.line_keys()):
+                return verification
+
+    def _walk(
+        self,
+        keys: LineKeys,
+        anchor: Anchor | None,
+        progress: Callable[[int], None] | None,
+        batch: int,
+    ) -> Verification:
+        chain = Chain(keys, anchor=anchor)
         after: int | None = None
         while True:
             while rows := self._database.read(partial(read_lines, after=after, batch=batch)):
@@ -328,12 +374,14 @@ class AuditLog:
             if not end.more:
                 return chain.end(end.head, end.mac, held=end.held)
 
-    def _opened_key(self) -> bytes:
-        if self._key is None:
-            self._key = self._secrets.existing(CHAIN_SECRET)
-        if self._key is None:
+    def _chain(self) -> Secret:
+        chain = self._secrets.existing(SecretName.CHAIN)
+        if chain is None:
             raise _without_key()
-        return self._key
+        return chain
+
+    def _key(self) -> bytes:
+        return self._chain().value
 
     def _head(self, connection: Connection, key: bytes, *, for_update: bool = False) -> Anchor:
         head, mac = read_head(connection, for_update=for_update)

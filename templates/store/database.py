@@ -23,7 +23,8 @@ from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 
 from templates.errors import StoreBusy, StoreError, StoreUnavailable
-from templates.store.engine import checked_url, make_engine
+from templates.store.engine import checked_url, make_engine, sqlite_file
+from templates.store.turn import next_in_line
 
 T = TypeVar("T")
 
@@ -165,7 +166,7 @@ class Database:
             return True
         process = self._process()
         try:
-            with process.writing, process.engine.connect() as connection:
+            with process.writing, self._turn(wait), process.engine.connect() as connection:
                 # On the driver's connection: SQLAlchemy would begin a transaction around it.
                 driver = _driver(connection)
                 try:
@@ -208,7 +209,7 @@ class Database:
         process = self._process()
         try:
             autocommit = process.engine.execution_options(isolation_level="AUTOCOMMIT")
-            with process.writing, autocommit.connect() as connection:
+            with process.writing, self._turn(None), autocommit.connect() as connection:
                 if self.is_sqlite:
                     _driver(connection).execute("VACUUM")
                 for table in () if self.is_sqlite else tables:
@@ -242,6 +243,12 @@ class Database:
             If one takes longer than the timeout.
         """
         self.write_alone(lambda _: None)
+
+    def _turn(self, wait: float | None) -> contextlib.AbstractContextManager[None]:
+        """The turn to wait for SQLite's lock; nothing on PostgreSQL."""
+        if not self.is_sqlite:
+            return contextlib.nullcontext()
+        return next_in_line(sqlite_file(self.url), self._timeout if wait is None else wait)
 
     def _lock_limit(self, wait: float | None) -> str:
         return str(round(1000 * (self._timeout if wait is None else wait)))

@@ -1,9 +1,18 @@
-"""Secrets of the whole deployment, made once, and the check of the master key."""
+"""Secrets of the whole deployment, made once and renewed after a theft; the master key's check.
+
+What a process has opened is good only while the database holds the same: so whatever needs a secret
+runs through :meth:`Secrets.read` or :meth:`Secrets.write`, which ask the database in the same
+transaction. A renewal (``templates.store.renewal``) is taken up by all workers with it, at the
+moment of its commit.
+"""
 
 import functools
 import os
 import threading
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from datetime import datetime
+from typing import Any, TypeVar
 
 import sqlalchemy as sa
 from sqlalchemy.dialects.postgresql import insert as postgresql_insert
@@ -13,12 +22,24 @@ from sqlalchemy.engine import Connection
 from templates.errors import SealError, StoreError
 from templates.keys.sealing import MasterKeyring, sealed_key_id
 from templates.store.database import Database
-from templates.store.identifiers import Clock, checked_opaque_id
+from templates.store.identifiers import Clock
 from templates.store.schema import Base, MasterKeyCheckRow, SecretRow
+from templates.store.secret import SECRET_BYTES, Secret, SecretName
 
 SECRET_PURPOSE = "store-secret"  # noqa: S105 - a label, not a secret
 CHECK_PURPOSE = "master-key-check"
+PROOF_PURPOSE = "store-secret-renewal"
 _CHECK_TEXT = b"veilface"
+
+T = TypeVar("T")
+
+
+@dataclass
+class _Opened:
+    """The secrets as the database held them at one moment, opened as far as they were needed."""
+
+    sealed: dict[str, bytes] = field(default_factory=dict, repr=False)
+    secrets: dict[str, Secret] = field(default_factory=dict, repr=False)
 
 
 class Secrets:
@@ -34,30 +55,26 @@ class Secrets:
         self._database = database
         self._keyring = keyring
         self._clock = clock
-        self._opened: dict[str, bytes] = {}
+        self._opened = _Opened()
         self._lock = threading.Lock()
 
-    def get(self, name: str) -> bytes:
-        """Return 32 random bytes of this name; the first call of any process makes them.
+    def get(self, name: SecretName) -> Secret:
+        """Return the secret of this name; the first call of any process makes it.
 
         Raises
         ------
         SealError
             If the master key that wrapped it is missing.
         """
-        checked_opaque_id(name, what="secret's name")
-        # Without the lock: a transaction that needs a known secret must not wait for a thread
-        # that obtains another one, and so waits for that transaction.
-        if (secret := self._opened.get(name)) is not None:
+        if (secret := self.opened(name)) is not None:
             return secret
-        with self._lock:
-            if name not in self._opened:
-                self._opened[name] = self._database.write(
-                    lambda connection: self._obtain(connection, name)
-                )
-            return self._opened[name]
+        if name is not SecretName.CHAIN:
+            # First: a renewal between the two is told by the one that was read before.
+            self.existing(SecretName.CHAIN)
+        self._keep(name, self._database.write(lambda connection: self._obtain(connection, name)))
+        return self._required(name)
 
-    def existing(self, name: str) -> bytes | None:
+    def existing(self, name: SecretName) -> Secret | None:
         """Return what :meth:`get` returns where it was made before, and None where it was not.
 
         Raises
@@ -65,46 +82,170 @@ class Secrets:
         SealError
             If the master key that wrapped it is missing.
         """
-        if (secret := self._opened.get(name)) is not None:
+        if (secret := self.opened(name)) is not None:
             return secret
-        secret = self._database.read(lambda connection: self._read(connection, name))
-        if secret is not None:
-            with self._lock:
-                self._opened[name] = secret
+        sealed = self._database.read(lambda connection: _sealed(connection, name))
+        if sealed is None:
+            return None
+        self._keep(name, sealed)
+        return self._required(name)
+
+    def opened(self, name: SecretName) -> Secret | None:
+        """Return a secret that this process knows already, without asking the database."""
+        opened = self._opened
+        secret = opened.secrets.get(name)
+        if secret is None and (sealed := opened.sealed.get(name)) is not None:
+            secret = opened.secrets[name] = self._open(name, sealed)
         return secret
 
-    def make(self, connection: Connection, name: str) -> bytes | None:
+    def read(self, work: Callable[[Connection], T]) -> T:
+        """:meth:`Database.read` under the secrets of the database that is read.
+
+        Where they were renewed meanwhile, `work` runs again.
+        """
+
+        def attempt(connection: Connection) -> tuple[bool, T | StoreError]:
+            before = self._opened
+            outcome: T | StoreError
+            try:
+                outcome = work(connection)
+            except StoreError as error:
+                outcome = error
+            # Afterwards: if nothing has changed by now, nothing had while `work` read.
+            self.follow(connection)
+            return self._opened is before, outcome
+
+        while True:
+            settled, outcome = self._database.read(attempt)
+            if settled and isinstance(outcome, StoreError):
+                raise outcome
+            if settled:
+                return outcome  # type: ignore[return-value]  # no error
+
+    def write(self, work: Callable[[Connection], T], *, lock: str | None = None) -> T:
+        """:meth:`Database.write` under the secrets of the database that is written."""
+        return self._database.write(self._following(work), lock=lock)
+
+    def write_alone(self, work: Callable[[Connection], T]) -> T:
+        """:meth:`Database.write_alone` under the secrets of the database that is written."""
+        return self._database.write_alone(self._following(work))
+
+    def _following(self, work: Callable[[Connection], T]) -> Callable[[Connection], T]:
+        def following(connection: Connection) -> T:
+            # A renewal waits for this write, or this one for it: nothing changes from here on.
+            self.follow(connection)
+            return work(connection)
+
+        return following
+
+    def follow(self, connection: Connection) -> None:
+        """Take up what another process changed: a renewal, or another master key.
+
+        All secrets are renewed in one transaction, so the audit chain's tells of all.
+
+        Raises
+        ------
+        StoreError
+            If that one is gone.
+        """
+        known = self._opened.sealed.get(SecretName.CHAIN)
+        if known is None or known == (now := _sealed(connection, SecretName.CHAIN)):
+            return
+        if now is None:
+            raise StoreError(
+                "the key of the audit log is missing: restore the database from a backup"
+            )
+        # All in one statement: between two of them, PostgreSQL may show another renewal.
+        rows = connection.execute(sa.select(SecretRow.name, SecretRow.wrapped_value))
+        newer = _Opened({row.name: row.wrapped_value for row in rows})
+        chain = self._open(SecretName.CHAIN, newer.sealed[SecretName.CHAIN])
+        newer.secrets[SecretName.CHAIN] = chain
+        with self._lock:
+            before = self.opened(SecretName.CHAIN)
+            # Never back: a reader may still see the database as it was before a renewal.
+            if before is None or len(chain.retired) >= len(before.retired):
+                self._opened = newer
+
+    def make(self, connection: Connection, name: SecretName) -> Secret | None:
         """Make a secret inside a transaction that is open already; None if there is one."""
-        checked_opaque_id(name, what="secret's name")
-        return self._read(connection, name) if self._insert(connection, name) else None
-
-    def _obtain(self, connection: Connection, name: str) -> bytes:
-        self._insert(connection, name)
-        value = self._read(connection, name)
-        assert value is not None, "it was there, or was inserted"  # noqa: S101
-        return value
-
-    def _insert(self, connection: Connection, name: str) -> bool:
-        fresh = self._keyring.seal(os.urandom(32), purpose=SECRET_PURPOSE, bound_to=[name])
-        return insert_once(
-            connection,
-            SecretRow,
-            name=name,
-            wrapped_value=fresh,
-            wrapping_key=sealed_key_id(fresh),
-            created_at=self._clock(),
-        )
-
-    def _read(self, connection: Connection, name: str) -> bytes | None:
-        wrapped = connection.execute(
-            sa.select(SecretRow.wrapped_value).where(SecretRow.name == name)
-        ).scalar_one_or_none()
-        if wrapped is None:
+        if not self._insert(connection, name):
             return None
-        return self._keyring.open(wrapped, purpose=SECRET_PURPOSE, bound_to=[name])
+        return self._open(name, self._obtain(connection, name))
+
+    def renew(
+        self, connection: Connection, name: SecretName, *, at: datetime, line: int
+    ) -> Secret | None:
+        """Draw a secret anew inside a transaction of :meth:`write_alone`; None if there is none.
+
+        Processes, this one too, take it up when that is committed.
+        """
+        sealed = _sealed(connection, name)
+        if sealed is None:
+            return None
+        before = self._open(name, sealed)
+        fresh = before.renewed(
+            at=at,
+            line=line,
+            prove=lambda value: self._keyring.seal(
+                b"", purpose=PROOF_PURPOSE, bound_to=[name, value]
+            ),
+        )
+        connection.execute(
+            sa.update(SecretRow)
+            .where(SecretRow.name == name)
+            .values(**self._wrapped(name, fresh), created_at=at)
+        )
+        return fresh
+
+    def was_drawn_now(self, name: SecretName, secret: Secret) -> bool:
+        """Whether a secret was drawn under the master key in force: only who has that shows it."""
+        proof = secret.proof
+        if proof is None or sealed_key_id(proof) != self._keyring.current:
+            return False
+        try:
+            self._keyring.open(proof, purpose=PROOF_PURPOSE, bound_to=[name, secret.value])
+        except SealError:
+            return False
+        return True
+
+    def _obtain(self, connection: Connection, name: SecretName) -> bytes:
+        self._insert(connection, name)
+        sealed = _sealed(connection, name)
+        assert sealed is not None, "it was there, or was inserted"  # noqa: S101
+        return sealed
+
+    def _insert(self, connection: Connection, name: SecretName) -> bool:
+        fresh = Secret(os.urandom(SECRET_BYTES))
+        created = {"name": name, "created_at": self._clock()}
+        return insert_once(connection, SecretRow, **self._wrapped(name, fresh), **created)
+
+    def _wrapped(self, name: SecretName, secret: Secret) -> dict[str, Any]:
+        sealed = self._keyring.seal(secret.to_bytes(), purpose=SECRET_PURPOSE, bound_to=[name])
+        return {"wrapped_value": sealed, "wrapping_key": sealed_key_id(sealed)}
+
+    def _open(self, name: SecretName, sealed: bytes) -> Secret:
+        plain = self._keyring.open(sealed, purpose=SECRET_PURPOSE, bound_to=[name])
+        return Secret.from_bytes(plain)
+
+    def _keep(self, name: SecretName, sealed: bytes) -> None:
+        with self._lock:
+            self._opened.sealed.setdefault(name, sealed)
+
+    def _required(self, name: SecretName) -> Secret:
+        secret = self.opened(name)
+        assert secret is not None, "it was kept"  # noqa: S101
+        return secret
 
     def __repr__(self) -> str:
         return "Secrets()"
+
+
+_SEALED = sa.select(SecretRow.wrapped_value).where(SecretRow.name == sa.bindparam("name"))
+
+
+def _sealed(connection: Connection, name: SecretName) -> bytes | None:
+    sealed: bytes | None = connection.execute(_SEALED, {"name": name}).scalar_one_or_none()
+    return sealed
 
 
 def insert_once(connection: Connection, table: type[Base], **values: object) -> bool:

@@ -1,5 +1,7 @@
 """What a connection to SQLite or PostgreSQL is made with: the URL, the pool, SQLite's settings."""
 
+import errno
+import functools
 import os
 import time
 from pathlib import Path
@@ -11,6 +13,7 @@ from sqlalchemy.engine import URL, Connection, Engine, make_url
 from sqlalchemy.exc import ArgumentError
 
 from templates.errors import StoreError
+from templates.store.turn import next_in_line
 
 
 def checked_url(text: str) -> URL:
@@ -75,7 +78,8 @@ def make_engine(url: URL, *, timeout: float, pool_size: int, max_overflow: int) 
             },
             **pool,
         )
-    _create_private_file(Path(str(url.database)))
+    path = sqlite_file(url)
+    _create_private_file(path)
     engine = sa.create_engine(
         url,
         poolclass=sa.pool.QueuePool,
@@ -83,13 +87,23 @@ def make_engine(url: URL, *, timeout: float, pool_size: int, max_overflow: int) 
         **pool,
     )
     event.listen(engine, "connect", _prepare_sqlite)
-    event.listen(engine, "begin", _begin_sqlite)
+    event.listen(engine, "begin", functools.partial(_begin_sqlite, path, timeout))
     return engine
 
 
+def sqlite_file(url: URL) -> Path:
+    """Return the file of an SQLite database; a link to it has been followed."""
+    return Path(str(url.database)).resolve()
+
+
 def _create_private_file(path: Path) -> None:
+    # A file that is there is not opened: closing it would drop the locks that SQLite holds on it.
     try:
-        os.close(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
+        if path.exists():
+            if not os.access(path, os.R_OK | os.W_OK):
+                raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+        else:
+            os.close(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
     except OSError as error:
         raise StoreError(f"the database file {path} cannot be used: {error.strerror}") from None
 
@@ -126,6 +140,9 @@ def _set_wal(cursor: Any) -> None:
         return
 
 
-def _begin_sqlite(connection: Connection) -> None:
-    writing = connection.get_execution_options().get("veilface_write", False)
-    connection.exec_driver_sql("BEGIN IMMEDIATE" if writing else "BEGIN")
+def _begin_sqlite(path: Path, timeout: float, connection: Connection) -> None:
+    if connection.get_execution_options().get("veilface_write", False):
+        with next_in_line(path, timeout):
+            connection.exec_driver_sql("BEGIN IMMEDIATE")
+    else:
+        connection.exec_driver_sql("BEGIN")

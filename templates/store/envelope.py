@@ -3,8 +3,11 @@
 A subject's data key, 32 random bytes, is made anew with every enrollment and encrypts exactly one
 template, so that a nonce cannot repeat under it. It is stored wrapped by the master key, bound to
 the tenant and to the random row id of the subject. The template's ciphertext is bound to tenant,
-row id, subject id, contract id, template id and rotation epoch: a row that is moved or relabelled
-does not open.
+row id, subject id, contract id, template id, rotation epoch and, where it needs a holder's key, the
+salt of the holder's rotation: a row that is moved or relabelled does not open.
+
+A held template is that ciphertext, given to the subject's holder and kept nowhere: the data key
+stays in the store, so that the template opens here only, for this subject and this enrollment.
 """
 
 import os
@@ -20,6 +23,10 @@ _VERSION = b"\x01"
 DATA_KEY_PURPOSE = "subject-data-key"
 
 
+class ForeignTemplate(SealError):
+    """A ciphertext that is not the template it is taken for: altered, or of another owner."""
+
+
 @dataclass(frozen=True)
 class Owner:
     """What a template's ciphertext belongs to."""
@@ -30,6 +37,7 @@ class Owner:
     contract_id: str
     template_id: str
     rotation_epoch: int
+    holder_salt: str | None = None
 
     @property
     def bound_to(self) -> bytes:
@@ -42,12 +50,13 @@ class Owner:
             self.contract_id,
             self.template_id,
             self.rotation_epoch,
+            *(() if self.holder_salt is None else (self.holder_salt,)),
         )
 
 
 @dataclass(frozen=True)
 class Envelope:
-    """A template as it is stored."""
+    """A template as it is kept: the key by the store, the ciphertext by it or by the holder."""
 
     wrapped_key: bytes = field(repr=False)
     ciphertext: bytes = field(repr=False)
@@ -72,22 +81,26 @@ def open_envelope(envelope: Envelope, owner: Owner, keyring: MasterKeyring) -> b
 
     Raises
     ------
+    ForeignTemplate
+        If the ciphertext was altered, or belongs to another owner or another enrollment.
     SealError
-        If the row was altered, belongs to another owner, or its master key is missing.
+        If the wrapped key was altered or belongs to another owner, or its master key is missing.
     """
     data_key = keyring.open(
         envelope.wrapped_key,
         purpose=DATA_KEY_PURPOSE,
         bound_to=[owner.tenant_id, owner.subject_pk],
     )
-    stored = envelope.ciphertext
-    if len(stored) < 1 + NONCE_BYTES + TAG_BYTES or stored[:1] != _VERSION:
-        raise SealError("a stored template is cut short, or of a version this program cannot read")
+    sealed = envelope.ciphertext
+    if len(sealed) < 1 + NONCE_BYTES + TAG_BYTES or sealed[:1] != _VERSION:
+        raise ForeignTemplate(
+            "a sealed template is cut short, or of a version this program cannot read"
+        )
     try:
         return AESGCM(data_key).decrypt(
-            stored[1 : 1 + NONCE_BYTES], stored[1 + NONCE_BYTES :], owner.bound_to
+            sealed[1 : 1 + NONCE_BYTES], sealed[1 + NONCE_BYTES :], owner.bound_to
         )
     except InvalidTag:
-        raise SealError(
-            "a stored template does not open: its row was altered, or belongs to another subject"
+        raise ForeignTemplate(
+            "a sealed template does not open: it was altered, or belongs to another subject"
         ) from None

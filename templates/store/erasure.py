@@ -9,6 +9,7 @@ from sqlalchemy.engine import Connection
 from templates.store.audit_log import PROGRAM, By, Entry
 from templates.store.context import StoreContext
 from templates.store.identifiers import checked_subject_id
+from templates.store.outbox import EventType
 from templates.store.receipts import Erased, Receipt, keep_receipt, latest_receipt
 from templates.store.schema import (
     FailedAttemptsRow,
@@ -29,7 +30,7 @@ class Erasure:
     receipt
         The signed receipt.
     erased
-        Whether this call removed a template; False when there was none (any more).
+        Whether this call removed an enrollment; False when there was none (any more).
     log_purged
         False if SQLite could not empty its write-ahead log just now, as beside a long reader; the
         next erasure or ``purge_log`` does it.
@@ -55,9 +56,10 @@ class Erasures:
         own call removed.
 
         What stays is the receipt, and the lines of the audit log, which name the subject by its
-        pseudonym. The nonces of signed probes stay for their few minutes: they belong to an API key
-        and name no subject. As the failed attempts go, an erasure ends a lock: whoever may erase
-        and enroll a subject may also start its count anew.
+        pseudonym; where events are told, also those of the subject that the endpoint has not taken
+        yet, sealed, for a week at most. The nonces of signed probes stay for their few minutes:
+        they belong to an API key and name no subject. As the failed attempts go, an erasure ends a
+        lock: whoever may erase and enroll a subject may also start its count anew.
         """
         work = self._work(tenant, subject_id, by)
         receipt, erased = self._context.write(work, lock=subject_lock(tenant, subject_id))
@@ -93,17 +95,26 @@ class Erasures:
     def _work(
         self, tenant: str, subject_id: str, by: By
     ) -> Callable[[Connection], tuple[Receipt, bool]]:
-        """The transaction of an erasure: what was signed, and whether there was a template."""
+        """The transaction of an erasure: what was signed, and whether anybody was enrolled."""
         signer, audit_log = self._context.signer, self._context.audit_log
-        pseudonym = signer.pseudonym(tenant, checked_subject_id(subject_id))
-        signer.public_key()  # obtains the signing key before the transaction needs it
+        checked_subject_id(subject_id)
 
         def work(connection: Connection) -> tuple[Receipt, bool]:
-            receipt, outcome = remove(connection)
+            pseudonym = signer.pseudonym(tenant, subject_id)
+            receipt, outcome = remove(connection, pseudonym)
             audit_log.append(connection, Entry("erase", outcome, by, tenant, pseudonym))
+            if outcome == "erased":
+                self._context.outbox.add(
+                    connection,
+                    EventType.ERASED,
+                    tenant_id=tenant_id_of(connection, tenant),
+                    tenant=tenant,
+                    pseudonym=pseudonym,
+                    subject_id=subject_id,
+                )
             return receipt, outcome == "erased"
 
-        def remove(connection: Connection) -> tuple[Receipt, str]:
+        def remove(connection: Connection, pseudonym: str) -> tuple[Receipt, str]:
             tenant_id = tenant_id_of(connection, tenant)
 
             def removed(table: type[FailedAttemptsRow | IdempotencyRow]) -> int:
@@ -124,8 +135,11 @@ class Erasures:
                 contract_id = connection.execute(
                     sa.select(TemplateRow.contract_id).where(TemplateRow.subject_pk == subject_pk)
                 ).scalar_one()
+                # One that its holder keeps was not here; the rest of its row goes with the subject.
                 templates = connection.execute(
-                    sa.delete(TemplateRow).where(TemplateRow.subject_pk == subject_pk)
+                    sa.delete(TemplateRow).where(
+                        TemplateRow.subject_pk == subject_pk, TemplateRow.ciphertext.is_not(None)
+                    )
                 ).rowcount
                 subjects = connection.execute(
                     sa.delete(SubjectRow).where(SubjectRow.id == subject_pk)
@@ -151,5 +165,8 @@ class Erasures:
 
     def receipt(self, tenant: str, subject_id: str) -> Receipt | None:
         """Return the latest erasure receipt of a subject, or None."""
-        pseudonym = self._context.signer.pseudonym(tenant, checked_subject_id(subject_id))
-        return self._context.database.read(lambda connection: latest_receipt(connection, pseudonym))
+        signer = self._context.signer
+        checked_subject_id(subject_id)
+        return self._context.read(
+            lambda connection: latest_receipt(connection, signer.pseudonym(tenant, subject_id))
+        )

@@ -7,7 +7,6 @@ photo was sent to somebody who holds the photo. Answers must hold no biometric d
 carries a MAC: one that somebody else wrote is not given, and the write runs.
 """
 
-import hashlib
 import hmac
 import uuid
 from dataclasses import dataclass, field
@@ -23,6 +22,7 @@ from templates.store.authenticity import columns_of, is_authentic, row_mac, warn
 from templates.store.context import StoreContext
 from templates.store.deployment import insert_once
 from templates.store.schema import IdempotencyRow
+from templates.store.secret import SecretName
 from templates.store.subject_rows import tenant_id_of
 
 RETENTION = timedelta(hours=24)
@@ -30,8 +30,6 @@ CLAIM = timedelta(minutes=1)
 BATCH = 500
 MAX_KEY = 255
 MAX_BODY_BYTES = 64 * 1024
-
-_SECRET = "idempotency"  # noqa: S105 - a name, not a secret
 
 
 class IdempotencyConflict(StoreError):
@@ -88,12 +86,14 @@ class Idempotency:
         if not 1 <= len(key) <= MAX_KEY:
             raise StoreError(f"an idempotency key has 1 to {MAX_KEY} characters")
         context = self._context
-        secret = context.secrets.get(_SECRET)
-        key_hash = hmac.digest(secret, encode_parts("key", key), hashlib.sha256)
-        request_hash = hmac.digest(secret, encode_parts("request", request), hashlib.sha256)
-        pseudonym = None if subject_id is None else context.signer.pseudonym(tenant, subject_id)
+        # Obtained before the transaction needs it.
+        lock = context.secrets.get(SecretName.IDEMPOTENCY).digest(encode_parts("key", key)).hex()
 
         def work(connection: Connection) -> Claim | Answer:
+            secret = context.secrets.get(SecretName.IDEMPOTENCY)
+            key_hash = secret.digest(encode_parts("key", key))
+            request_hash = secret.digest(encode_parts("request", request))
+            pseudonym = None if subject_id is None else context.signer.pseudonym(tenant, subject_id)
             tenant_id = tenant_id_of(connection, tenant)
             now = context.clock()
             claim = Claim(
@@ -118,7 +118,7 @@ class Idempotency:
                 raise IdempotencyConflict("the first request with this key is still running")
             return Answer(row.status, row.body)
 
-        return context.write(work, lock=f"idempotency {tenant} {actor} {key_hash.hex()}")
+        return context.write(work, lock=f"idempotency {tenant} {actor} {lock}")
 
     def _insert(
         self, connection: Connection, claim: Claim, pseudonym: str | None, now: datetime
@@ -145,15 +145,17 @@ class Idempotency:
         if len(body) > MAX_BODY_BYTES:
             raise StoreError(f"an answer of more than {MAX_BODY_BYTES} bytes is not kept")
         row = {**vars(claim), "claim": claim.token, "status": status, "body": body}
-        mac = row_mac(self._context.audit_log.row_key(), IdempotencyRow, row)
-        statement = (
-            sa.update(IdempotencyRow)
-            .where(*_is(claim), IdempotencyRow.claim == claim.token)
-            .values(status=status, body=body, mac=mac)
-        )
-        return self._context.database.write(
-            lambda connection: connection.execute(statement).rowcount == 1
-        )
+
+        def work(connection: Connection) -> bool:
+            mac = row_mac(self._context.audit_log.row_key(), IdempotencyRow, row)
+            statement = (
+                sa.update(IdempotencyRow)
+                .where(*_is(claim), IdempotencyRow.claim == claim.token)
+                .values(status=status, body=body, mac=mac)
+            )
+            return connection.execute(statement).rowcount == 1
+
+        return self._context.write(work)
 
     def release(self, claim: Claim) -> None:
         """Give the key back, because the write failed and may be tried again."""

@@ -97,7 +97,7 @@ class LockedOut(StoreError):
 
 
 class Replayed(StoreError):
-    """A signed probe that was seen before.
+    """A signed probe, or an answer to a challenge, that was seen before.
 
     Attributes
     ----------
@@ -109,7 +109,10 @@ class Replayed(StoreError):
 
     def __init__(
         self,
-        message: str = "this signed probe was seen before: sign each probe with a nonce of its own",
+        message: str = (
+            "this probe was seen before: sign each probe with a nonce of its own, or ask for "
+            "another challenge"
+        ),
         *,
         recorded: bool = False,
     ) -> None:
@@ -119,7 +122,10 @@ class Replayed(StoreError):
 
 @dataclass(frozen=True)
 class Nonce:
-    """The nonce of a signed probe; kept until the probe's time stamp alone would refuse it."""
+    """The nonce of a signed probe or a challenge; kept until its time alone would refuse it.
+
+    `key_prefix` is of the key that the probe is signed with, or that asked for the challenge.
+    """
 
     key_prefix: str
     value: str = field(repr=False)

@@ -5,14 +5,18 @@ A receipt is a canonical JSON text (``templates.contract.canonical``) and its Ed
 the deployment: whoever holds the subject id and asks the deployment can find the receipt, nobody
 else learns whom it is about. The receipt of a whole tenant is of another kind, and names the
 tenant.
+
+Both keys can be renewed. A receipt under a retired key is good if it is dated before the key was
+retired; as whoever took that key can date receipts back, the renewal signs every receipt that the
+deployment keeps again.
 """
 
 import base64
 import binascii
 import hashlib
-import hmac
 import json
 import uuid
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from datetime import datetime
 from typing import Any
@@ -27,9 +31,7 @@ from templates.errors import StoreError
 from templates.keys.sealing import encode_parts
 from templates.store.deployment import Secrets
 from templates.store.schema import ReceiptRow
-
-PSEUDONYM_SECRET = "pseudonym"  # noqa: S105 - a name, not a secret
-RECEIPT_SECRET = "receipt-signing"  # noqa: S105
+from templates.store.secret import SecretName
 
 SUBJECT_KIND = "veilface-erasure-receipt"
 TENANT_KIND = "veilface-tenant-erasure-receipt"
@@ -45,7 +47,8 @@ class Erased:
     contract_id
         Contract of the template; None where there was none.
     template, data_key, metadata
-        1 or 0: they come and go together.
+        1 or 0: they come and go together, but for a template that its holder keeps (0), which
+        opens no more without the data key.
     failed_attempts, idempotency_records
         Records that named the subject by its pseudonym.
     """
@@ -144,20 +147,56 @@ class Receipt:
             raise StoreError("the signature of a receipt is base64") from None
 
 
+@dataclass(frozen=True)
+class ReceiptKey:
+    """What receipts are verified with.
+
+    Attributes
+    ----------
+    public_key
+        32 bytes, Ed25519.
+    retired_at
+        When it was replaced; None while it is in force, or where nobody says.
+    """
+
+    public_key: bytes = field(repr=False)
+    retired_at: datetime | None = None
+
+    @property
+    def key_id(self) -> str:
+        """:func:`key_fingerprint` of it."""
+        return key_fingerprint(self.public_key)
+
+
 class ReceiptSigner:
     """Makes pseudonyms and receipts with the deployment's keys."""
 
     def __init__(self, secrets: Secrets) -> None:
         self._secrets = secrets
 
+    def prepare(self) -> None:
+        """Obtain the keys; to be called before a transaction that needs them."""
+        self._secrets.get(SecretName.PSEUDONYM)
+        self._secrets.get(SecretName.RECEIPT)
+
     def pseudonym(self, tenant: str, subject_id: str) -> str:
         """Keyed pseudonym, 64 hexadecimal digits, of one subject of one tenant."""
-        key = self._secrets.get(PSEUDONYM_SECRET)
-        return hmac.new(key, encode_parts(tenant, subject_id), hashlib.sha256).hexdigest()
+        return self.pseudonyms(tenant, subject_id)[0]
+
+    def pseudonyms(self, tenant: str, subject_id: str) -> tuple[str, ...]:
+        """:meth:`pseudonym`, and behind it those that older lines of the audit log name."""
+        digests = self._secrets.get(SecretName.PSEUDONYM).digests(encode_parts(tenant, subject_id))
+        return tuple(digest.hex() for digest in digests)
+
+    def keys(self) -> tuple[ReceiptKey, ...]:
+        """Keys that verify this deployment's receipts: the one in force, then the retired ones."""
+        secret = self._secrets.get(SecretName.RECEIPT)
+        retired = (ReceiptKey(public_key_of(key.value), key.at) for key in reversed(secret.retired))
+        return ReceiptKey(public_key_of(secret.value)), *retired
 
     def public_key(self) -> bytes:
-        """The 32 bytes that verify this deployment's receipts."""
-        return self._private().public_key().public_bytes_raw()
+        """The 32 bytes that verify the receipts that are signed now."""
+        return public_key_of(self._secrets.get(SecretName.RECEIPT).value)
 
     def sign(self, *, tenant: str, pseudonym: str, erased: Erased, erased_at: datetime) -> Receipt:
         """Write and sign the receipt of a subject, with a random id of its own."""
@@ -185,21 +224,26 @@ class ReceiptSigner:
         )
 
     def _signed(self, kind: str, erased_at: datetime, **claims: Any) -> Receipt:
-        private = self._private()
-        body = canonical_json(
-            {
-                "kind": kind,
-                "version": _VERSION,
-                "receipt_id": uuid.uuid4().hex,
-                "erased_at": erased_at.isoformat(),
-                "signing_key": key_fingerprint(private.public_key().public_bytes_raw()),
-                **claims,
-            }
-        )
-        return Receipt(body.decode(), private.sign(body))
+        head = {
+            "kind": kind,
+            "version": _VERSION,
+            "receipt_id": uuid.uuid4().hex,
+            "erased_at": erased_at.isoformat(),
+        }
+        return sign_claims({**head, **claims}, self._secrets.get(SecretName.RECEIPT).value)
 
-    def _private(self) -> Ed25519PrivateKey:
-        return Ed25519PrivateKey.from_private_bytes(self._secrets.get(RECEIPT_SECRET))
+
+def sign_claims(claims: dict[str, Any], private_key: bytes) -> Receipt:
+    """Write the text of a receipt, which names its key, and sign it."""
+    private = Ed25519PrivateKey.from_private_bytes(private_key)
+    public_key = private.public_key().public_bytes_raw()
+    body = canonical_json({**claims, "signing_key": key_fingerprint(public_key)})
+    return Receipt(body.decode(), private.sign(body))
+
+
+def public_key_of(private_key: bytes) -> bytes:
+    """The 32 bytes that verify what a private key signs."""
+    return Ed25519PrivateKey.from_private_bytes(private_key).public_key().public_bytes_raw()
 
 
 def key_fingerprint(public_key: bytes) -> str:
@@ -265,3 +309,34 @@ def verify_receipt(receipt: Receipt, public_key: bytes) -> dict[str, Any]:
     ):
         raise StoreError("the signed text is not an erasure receipt of version 1")
     return claims
+
+
+def verify_under(receipt: Receipt, keys: Sequence[ReceiptKey]) -> tuple[dict[str, Any], ReceiptKey]:
+    """:func:`verify_receipt` under one of several keys; returns the key too.
+
+    Raises
+    ------
+    StoreError
+        As there, and if the key was retired before the time that the receipt names.
+    """
+    error = StoreError("a receipt is verified with at least one key")
+    for key in keys:
+        try:
+            claims = verify_receipt(receipt, key.public_key)
+        except StoreError as refusal:
+            error = refusal
+            continue
+        if key.retired_at is not None and not _is_before(claims, key.retired_at):
+            raise StoreError(
+                f"the receipt is dated after its key {key.key_id} was retired: somebody signed it "
+                "who took that key"
+            )
+        return claims, key
+    raise error
+
+
+def _is_before(claims: dict[str, Any], time: datetime) -> bool:
+    try:
+        return datetime.fromisoformat(claims["erased_at"]) <= time
+    except (KeyError, TypeError, ValueError):
+        return False

@@ -35,6 +35,7 @@ from templates.store.schema import (
     FailedAttemptsRow,
     TenantRow,
 )
+from templates.store.secret import Secret, SecretName, digest_again
 from templates.store.standing import UNKNOWN_RETENTION
 
 TENANT_ALTERED = "row of a tenant was altered, or put back to an earlier state"
@@ -77,15 +78,18 @@ def check_records(context: StoreContext) -> tuple[RecordProblem, ...]:
     tuple of RecordProblem
         The first thousand.
     """
-    key, now = context.audit_log.row_key(), context.clock()
+    now = context.clock()
 
     def work(connection: Connection) -> tuple[RecordProblem, ...]:
-        return tuple(itertools.islice(_problems(connection, key, now), MAX_PROBLEMS))
+        return tuple(itertools.islice(_problems(connection, context, now), MAX_PROBLEMS))
 
-    return context.database.read(work)
+    return context.read(work)
 
 
-def _problems(connection: Connection, key: bytes, now: datetime) -> Iterator[RecordProblem]:
+def _problems(
+    connection: Connection, context: StoreContext, now: datetime
+) -> Iterator[RecordProblem]:
+    key = context.audit_log.row_key()
     for row in _rows(connection, TenantRow, LAST_TENANT_LINE):
         if not is_current(key, TenantRow, row):
             yield RecordProblem(TENANT_ALTERED, str(row["name"]))
@@ -100,10 +104,31 @@ def _problems(connection: Connection, key: bytes, now: datetime) -> Iterator[Rec
         if not is_authentic(key, FailedAttemptsRow, row):
             yield RecordProblem(COUNT_ALTERED, row["pseudonym"])
     since = {"since": now - UNKNOWN_RETENTION}
-    for (pseudonym,) in connection.execute(_VANISHED, since):
-        yield RecordProblem(COUNT_VANISHED, pseudonym)
+    pseudonyms = context.secrets.get(SecretName.PSEUDONYM)
+    for pseudonym, line in connection.execute(_VANISHED, since).all():
+        if not _is_carried_on(connection, pseudonyms, pseudonym, line):
+            yield RecordProblem(COUNT_VANISHED, pseudonym)
     for (sequence,) in connection.execute(_NONCES_TWICE):
         yield RecordProblem(NONCE_TWICE, f"line {sequence}")
+
+
+def _is_carried_on(connection: Connection, pseudonyms: Secret, pseudonym: str, line: int) -> bool:
+    """Whether a count is kept, or the log goes on, under a later pseudonym of the subject.
+
+    `line` is the last one that tells of an attempt under this pseudonym.
+    """
+    later: list[str] = []
+    digest = bytes.fromhex(pseudonym)
+    for value in pseudonyms.since(line):
+        digest = digest_again(value, digest)
+        later.append(digest.hex())
+    if not later:
+        return False
+    log_goes_on = sa.exists(AuditRow.sequence).where(AuditRow.pseudonym.in_(later), ATTEMPT_LINES)
+    is_counted = sa.exists(FailedAttemptsRow.line).where(
+        FailedAttemptsRow.pseudonym == later[-1], FailedAttemptsRow.line >= line
+    )
+    return bool(connection.execute(sa.select(sa.or_(log_goes_on, is_counted))).scalar_one())
 
 
 def _rows(
@@ -115,15 +140,16 @@ def _rows(
         query = query.add_columns(last_line.label("last_line"))
     if table is ApiKeyRow:
         query = query.add_columns(TENANT_OF_KEY.label("tenant"))
-    rows = _read(connection, query, table)
+    rows = read_rows(connection, query, table)
     while rows:
         yield from (row._asdict() for row in rows)
         place = [rows[-1]._mapping[str(column.key)] for column in primary_key]
         later = sa.tuple_(*primary_key) > sa.tuple_(*map(sa.literal, place))
-        rows = _read(connection, query.where(later), table)
+        rows = read_rows(connection, query.where(later), table)
 
 
-def _read(connection: Connection, query: Any, table: type[Base]) -> Sequence[Any]:
+def read_rows(connection: Connection, query: Any, table: type[Base]) -> Sequence[Any]:
+    """Read rows of a table, or raise :class:`StoreError` where one holds what is never written."""
     try:
         return connection.execute(query).all()
     except (ValueError, TypeError):
@@ -161,7 +187,7 @@ _last = (
 )
 _erasure = sa.orm.aliased(AuditRow)
 _VANISHED: Any = (
-    sa.select(_last.c.pseudonym)
+    sa.select(_last.c.pseudonym, _last.c.line)
     .join(AuditRow, AuditRow.sequence == _last.c.line)
     .outerjoin(FailedAttemptsRow, FailedAttemptsRow.pseudonym == _last.c.pseudonym)
     .where(

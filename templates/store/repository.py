@@ -18,6 +18,7 @@ from templates.store.identifiers import Clock, utc_now
 from templates.store.known_calibrations import KnownCalibrations
 from templates.store.lockout import LockoutPolicy
 from templates.store.record_check import RecordProblem, check_records
+from templates.store.renewal import Renewal
 from templates.store.rerotation import Rerotation
 from templates.store.retention import RetentionJob
 from templates.store.rewrap import WrappedKeys
@@ -26,6 +27,7 @@ from templates.store.schema import (
     FailedAttemptsRow,
     IdempotencyRow,
     MasterKeyCheckRow,
+    OutboxRow,
     RotationKeyRow,
     SubjectRow,
     TemplateRow,
@@ -57,13 +59,17 @@ class TemplateStore:
         timeout: float = 10.0,
         clock: Clock = utc_now,
         lockout: LockoutPolicy = _LOCKOUT,
+        tells_events: bool = False,
     ) -> None:
         database = Database(url, pool_size=pool_size, max_overflow=max_overflow, timeout=timeout)
-        self._context = context = StoreContext.of(database, keyring, clock)
+        self._context = context = StoreContext.of(
+            database, keyring, clock, tells_events=tells_events
+        )
         self.database = database
         self.secrets = context.secrets
         self.signer = context.signer
         self.audit_log = context.audit_log
+        self.outbox = context.outbox
         self.tenants = Tenants(context)
         self.api_keys = ApiKeys(context, self.tenants)
         self.subjects = Subjects(context)
@@ -76,6 +82,7 @@ class TemplateStore:
         self.rerotation = Rerotation(context, self.tenants)
         self.tenant_erasures = TenantErasures(context, self.tenants, self.api_keys)
         self.wrapped_keys = WrappedKeys(context)
+        self.renewal = Renewal(context, self.tenants)
 
     def upgrade(self) -> Adoption:
         """Bring the schema to this program's version; safe when several workers start at once.
@@ -145,6 +152,7 @@ class TemplateStore:
         """
         self.idempotency.expire()
         self.attempts.expire()
+        self.outbox.expire()
         return self.database.purge_log(wait=wait)
 
     def compact(self) -> None:
@@ -162,6 +170,7 @@ _HOLD_SUBJECT_DATA = (
     TemplateRow,
     FailedAttemptsRow,
     IdempotencyRow,
+    OutboxRow,
     RotationKeyRow,
     ApiKeyRow,
     UsedNonceRow,

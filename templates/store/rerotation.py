@@ -1,4 +1,4 @@
-"""Renewing a tenant's rotation: a new epoch, templates moved into it, and the old keys dropped.
+"""Renewing a tenant's rotations: a new epoch, templates moved into it, and the old keys dropped.
 
 ::
 
@@ -7,14 +7,19 @@
     retire   the keys of the older epochs go, when nothing needs them
 
 A template of the old rotation R is turned by R' Rᵀ, which is R' x for every x that was R x, so
-nobody has to enroll again. It protects what is stored from now on. A copy of the database that was
-taken before, with its rotation key and master key, keeps what it had.
+nobody has to enroll again. Its id stays, and with the new key gives another rotation. A template of
+the earlier rotation version becomes one of the contract's own. It protects what is stored from now
+on. A copy of the database that was taken before, with its rotation key and master key, keeps what
+it had.
 
 Each move rounds to the stored precision once more. In half precision at n = 512 and m = 16 the
 distance of a probe to the template then differs from the one before by 1.3·10⁻⁵ in the root mean
 square, and by 8·10⁻⁵ at most over 400,000 pairs: as much as the first rounding costs
 (``tests/templates/store/test_rerotation.py``). They add up like independent errors: after three
 moves the distance is 2.6·10⁻⁵ from that to the template before any rounding.
+
+A template that its holder keeps is not here to be turned: it stays in its epoch, whose key is kept
+until the subject is enrolled again or erased.
 """
 
 import time
@@ -23,18 +28,17 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
-import numpy as np
 import sqlalchemy as sa
-from numpy.typing import NDArray
 from sqlalchemy.engine import Connection
 
 from templates.contract import wire
-from templates.errors import SealError, StoreError, TemplateError
-from templates.keys.rotation import tenant_rotation
+from templates.contract.binding import Binding
+from templates.errors import InvalidTemplate, SealError, StoreError, TemplateError
+from templates.keys.rotation import TenantRotation
 from templates.keys.sealing import sealed_key_id
 from templates.store.audit_log import PROGRAM, By, Entry
 from templates.store.context import StoreContext
-from templates.store.envelope import close_envelope, open_envelope
+from templates.store.envelope import Owner, close_envelope, open_envelope
 from templates.store.schema import RotationKeyRow, SubjectRow, TemplateRow, TenantRow
 from templates.store.subject_rows import TEMPLATE_COLUMNS, envelope_of, owner_of
 from templates.store.tenants import RetiredRotation, Tenants
@@ -44,29 +48,27 @@ BATCH = 50
 PURGE_WAIT_S = 0.25
 _PAUSE_S = 0.05
 
-Rotation = NDArray[np.float64]
-
 
 @dataclass(frozen=True)
 class _Rotated:
     """A template in the new epoch, and the row that it replaces, with ``TEMPLATE_COLUMNS``."""
 
     row: Any = field(repr=False)
-    epoch: int
+    owner: Owner
     wire: bytes = field(repr=False)
 
 
 class Rerotation:
-    """Renews the rotations of tenants."""
+    """Renews the rotations of tenants' templates."""
 
     def __init__(self, context: StoreContext, tenants: Tenants) -> None:
         self._context = context
         self._tenants = tenants
 
     def begin(self, tenant: str, *, by: By = PROGRAM) -> int:
-        """Make a new rotation, in which templates are enrolled from now on; returns its epoch.
+        """Make a new key, under which templates are enrolled from now on; returns its epoch.
 
-        Stored templates stay in theirs until :meth:`move` has seen them.
+        Stored templates stay under theirs until :meth:`move` has seen them.
 
         Raises
         ------
@@ -86,6 +88,7 @@ class Rerotation:
     def move(
         self,
         tenant: str,
+        binding: Binding,
         *,
         batch: int = BATCH,
         progress: Callable[[int], None] | None = None,
@@ -93,14 +96,18 @@ class Rerotation:
     ) -> int:
         """Bring stored templates of older epochs into the current one; returns how many.
 
-        Template id, contract, metadata and times stay; the data key is a new one. A subject that
-        is enrolled or erased meanwhile is left as it is. It may be interrupted, run again, and run
-        by several processes at once.
+        Template id, metadata and times stay; the data key is a new one. A subject that is enrolled
+        or erased meanwhile is left as it is. It may be interrupted, run again, and run by several
+        processes at once.
 
         Parameters
         ----------
         tenant
             Whose templates.
+        binding
+            Of the contract that they will belong to: those of it, and of the one that differs from
+            it in the earlier rotation version only, are moved. Which rotation a template of any
+            other has is not known here, and it is left to be enrolled again.
         batch
             Templates in one transaction, and in memory.
         progress
@@ -120,12 +127,14 @@ class Rerotation:
         owner, database = self._tenants.get(tenant), self._context.database
         # An enrollment that read the epoch before the renewal may commit into the old one still.
         database.await_writers()
-        rotations = _Rotations(self._tenants, tenant)
+        rotations = _Rotations(self._tenants, tenant, binding)
         total, broken = 0, set[str]()
         while True:
             moved, left, after = 0, 0, ""
             broken_before, broken = broken, set()
-            while rows := database.read(partial(_old_templates, owner.id, after, batch)):
+            while rows := database.read(
+                partial(_old_templates, owner.id, binding.contract_ids, after, batch)
+            ):
                 after = rows[-1].subject_pk
                 rotated = self._rotate_all(rotations, rows, broken)
                 changed = database.write(partial(self._replace_all, rotated=rotated))
@@ -151,12 +160,12 @@ class Rerotation:
         return total
 
     def remaining(self, tenant: str) -> int:
-        """Number of the tenant's templates that are not in its current rotation."""
+        """Number of the tenant's templates that are not in its current epoch."""
         owner = self._tenants.get(tenant)
         return self._context.database.read(lambda connection: _count(connection, _is_old(owner.id)))
 
     def subjects_of_old_epochs(self, tenant: str, *, batch: int = 1000) -> Iterator[str]:
-        """Ids, in order, of the subjects whose templates are not in the current rotation."""
+        """Ids, in order, of the subjects whose templates are not in the current epoch."""
         owner, after = self._tenants.get(tenant), ""
         database = self._context.database
         while names := database.read(partial(_old_subjects, owner.id, after, batch)):
@@ -186,7 +195,7 @@ class Rerotation:
             if left := _count(connection, older):
                 raise StoreError(
                     f"{left} templates of tenant {tenant!r} are still in an older rotation: "
-                    "move them first"
+                    "move them first, and enroll again the subjects whose holders keep theirs"
                 )
             dropped = connection.execute(
                 sa.delete(RotationKeyRow).where(
@@ -210,9 +219,7 @@ class Rerotation:
         for row in rows:
             try:
                 stored = open_envelope(envelope_of(row), owner_of(row), self._context.keyring)
-                rotated.append(
-                    _Rotated(row, epoch, rotations.rotated(stored, row.rotation_epoch, epoch))
-                )
+                rotated.append(rotations.rotated(row, stored, epoch))
             except (SealError, TemplateError, RetiredRotation):
                 broken.add(row.subject_pk)
         return rotated
@@ -237,8 +244,7 @@ class Rerotation:
         ).one_or_none()
         if unchanged is None:
             return False
-        owner = replace(owner_of(row), rotation_epoch=rotated.epoch)
-        new = close_envelope(rotated.wire, owner, self._context.keyring)
+        new = close_envelope(rotated.wire, rotated.owner, self._context.keyring)
         connection.execute(
             sa.update(SubjectRow)
             .where(SubjectRow.id == row.subject_pk)
@@ -247,7 +253,11 @@ class Rerotation:
         connection.execute(
             sa.update(TemplateRow)
             .where(TemplateRow.subject_pk == row.subject_pk)
-            .values(rotation_epoch=rotated.epoch, ciphertext=new.ciphertext)
+            .values(
+                contract_id=rotated.owner.contract_id,
+                rotation_epoch=rotated.owner.rotation_epoch,
+                ciphertext=new.ciphertext,
+            )
         )
         return True
 
@@ -257,37 +267,37 @@ def _entry(outcome: str, tenant: str, epoch: int, by: By) -> Entry:
 
 
 class _Rotations:
-    """The rotations of one tenant, and the matrices that lead from one epoch to another."""
+    """Brings templates of one tenant from one epoch, and rotation version, into another."""
 
-    def __init__(self, tenants: Tenants, tenant: str) -> None:
+    def __init__(self, tenants: Tenants, tenant: str, binding: Binding) -> None:
         self._tenants = tenants
         self._tenant = tenant
-        self._of_epochs: dict[tuple[int, int], Rotation] = {}
-        self._between_epochs: dict[tuple[int, int, int], Rotation] = {}
+        self._binding = binding
+        self._of_epochs: dict[int, TenantRotation] = {}
 
     def current_epoch(self) -> int:
         return self._tenants.get(self._tenant).rotation_epoch
 
-    def rotated(self, stored: bytes, old: int, new: int) -> bytes:
-        """Bring the wire bytes of a template from one epoch into another."""
-        template = wire.decode(stored)
-        rotation = self._between(old, new, template.subspace.n)
-        return wire.encode(
-            template.subspace.rotated(rotation),
-            contract_id=template.contract_id,
-            dtype=template.dtype,
+    def rotated(self, row: Any, stored: bytes, epoch: int) -> _Rotated:
+        """Turn the wire bytes of a row's template as the contract's templates of an epoch are."""
+        binding, template = self._binding, wire.decode(stored)
+        shape = template.subspace.n, template.subspace.m
+        if template.contract_id != row.contract_id or shape != (binding.n, binding.m):
+            raise InvalidTemplate("a stored template is not of the contract that its row names")
+        old = self._of(row.rotation_epoch).of(
+            row.template_id, binding.rotation_versions[row.contract_id]
         )
+        new = self._of(epoch).of(row.template_id, binding.rotation_version)
+        turned = template.subspace.turned_by(lambda points: new.turned(old.turned_back(points)))
+        owner = replace(owner_of(row), contract_id=binding.contract_id, rotation_epoch=epoch)
+        data = wire.encode(turned, contract_id=binding.contract_id, dtype=template.dtype)
+        return _Rotated(row, owner, data)
 
-    def _between(self, old: int, new: int, n: int) -> Rotation:
-        if (old, new, n) not in self._between_epochs:
-            self._between_epochs[old, new, n] = self._of(new, n) @ self._of(old, n).T
-        return self._between_epochs[old, new, n]
-
-    def _of(self, epoch: int, n: int) -> Rotation:
-        if (epoch, n) not in self._of_epochs:
+    def _of(self, epoch: int) -> TenantRotation:
+        if epoch not in self._of_epochs:
             key = self._tenants.rotation_key(self._tenant, epoch=epoch).key
-            self._of_epochs[epoch, n] = tenant_rotation(key, n)
-        return self._of_epochs[epoch, n]
+            self._of_epochs[epoch] = TenantRotation(key, self._binding.n)
+        return self._of_epochs[epoch]
 
 
 def _current_epoch(tenant_id: str) -> sa.ScalarSelect[int]:
@@ -321,11 +331,18 @@ def _old_subjects(tenant_id: str, after: str, batch: int, connection: Connection
     return connection.execute(query).scalars().all()
 
 
-def _old_templates(tenant_id: str, after: str, batch: int, connection: Connection) -> Sequence[Any]:
+def _old_templates(
+    tenant_id: str, contract_ids: Sequence[str], after: str, batch: int, connection: Connection
+) -> Sequence[Any]:
     query = (
         sa.select(*TEMPLATE_COLUMNS)
         .join(TemplateRow, TemplateRow.subject_pk == SubjectRow.id)
-        .where(_is_old(tenant_id), SubjectRow.id > after)
+        .where(
+            _is_old(tenant_id),
+            TemplateRow.ciphertext.is_not(None),
+            TemplateRow.contract_id.in_(contract_ids),
+            SubjectRow.id > after,
+        )
         .order_by(SubjectRow.id)
         .limit(batch)
     )

@@ -162,6 +162,7 @@ class ApiKeyRow(Base):
     revoked_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
     last_used_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
     lowest_level: Mapped[str | None] = mapped_column(String(64))
+    liveness: Mapped[str | None] = mapped_column(String(16))
     line: Mapped[int] = mapped_column(SERIAL, server_default="0")
     mac: Mapped[bytes | None] = mapped_column(MAC)
 
@@ -187,7 +188,11 @@ class SubjectRow(Base):
 
 
 class TemplateRow(Base):
-    """The one template of a subject, encrypted under the subject's data key."""
+    """The one template of a subject, encrypted under the subject's data key.
+
+    Where the subject's holder keeps the ciphertext, it is NULL here. `holder_salt` is NULL where
+    the template needs no holder's key.
+    """
 
     __tablename__ = "templates"
 
@@ -197,12 +202,13 @@ class TemplateRow(Base):
     template_id: Mapped[str] = mapped_column(String(64))
     contract_id: Mapped[str] = mapped_column(String(64), index=True)
     rotation_epoch: Mapped[int] = mapped_column(Integer)
-    ciphertext: Mapped[bytes] = mapped_column(LargeBinary)
+    ciphertext: Mapped[bytes | None] = mapped_column(LargeBinary)
     n: Mapped[int] = mapped_column(Integer)
     m: Mapped[int] = mapped_column(Integer)
     dtype: Mapped[str] = mapped_column(String(16))
     source: Mapped[str] = mapped_column(String(16))
     photos: Mapped[int] = mapped_column(Integer)
+    holder_salt: Mapped[str | None] = mapped_column(UUID_HEX)
     created_at: Mapped[datetime] = mapped_column(UtcDateTime)
 
 
@@ -271,6 +277,24 @@ class IdempotencyRow(Base):
     body: Mapped[bytes | None] = mapped_column(LargeBinary)
     created_at: Mapped[datetime] = mapped_column(UtcDateTime)
     expires_at: Mapped[datetime] = mapped_column(UtcDateTime, index=True)
+    mac: Mapped[bytes | None] = mapped_column(MAC)
+
+
+class OutboxRow(Base):
+    """An event that the operator's endpoint is to be told, until it has taken it."""
+
+    __tablename__ = "outbox"
+    __table_args__ = (Index("ix_outbox_tenant_id_pseudonym", "tenant_id", "pseudonym"),)
+
+    sequence: Mapped[int] = mapped_column(SERIAL, primary_key=True, autoincrement=True)
+    event_id: Mapped[str] = mapped_column(UUID_HEX)
+    tenant_id: Mapped[str] = mapped_column(UUID_HEX, ForeignKey("tenants.id", ondelete="CASCADE"))
+    pseudonym: Mapped[str] = mapped_column(PSEUDONYM)
+    wrapped_body: Mapped[bytes] = mapped_column(LargeBinary)
+    wrapping_key: Mapped[str] = mapped_column(KEY_ID)
+    attempts: Mapped[int] = mapped_column(Integer)
+    created_at: Mapped[datetime] = mapped_column(UtcDateTime)
+    due_at: Mapped[datetime] = mapped_column(UtcDateTime, index=True)
     mac: Mapped[bytes | None] = mapped_column(MAC)
 
 

@@ -6,7 +6,7 @@ are counted, back to the last accept, reset or erasure: so a row that was remove
 back from a copy neither lifts a lock nor makes one.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Any
@@ -61,7 +61,7 @@ class Standing:
         self._policy = policy
 
     def of(
-        self, connection: Connection, row: Any, *, tenant: str, pseudonym: str
+        self, connection: Connection, row: Any, *, tenant: str, pseudonyms: Sequence[str]
     ) -> AttemptsStatus | None:
         """Return what counts of a subject; None where nothing ever failed.
 
@@ -70,9 +70,9 @@ class Standing:
         connection
             Asked for further lines where the row is not good.
         row
-            Of ``BEFORE`` or ``STANDING``: with ``COUNTS``, ``LAST_LINE`` and ``subject_pk``.
-        tenant, pseudonym
-            Whose row it is.
+            Of ``before`` or ``standing``: with ``COUNTS``, the last line and ``subject_pk``.
+        tenant, pseudonyms
+            Whose row it is: it has the first of the pseudonyms.
         """
         row_key = self._context.audit_log.row_key()
         counts = _counts_of(row)
@@ -82,7 +82,7 @@ class Standing:
             return _status(counts)
         if row.last_outcome != "reject":
             return None if counts is None or not counts["total"] else _status(counts).cleared()
-        status = self._counted_in_log(connection, tenant, pseudonym)
+        status = self._counted_in_log(connection, tenant, pseudonyms)
         if status is None or (
             # An old count of somebody unknown was removed in its time: see Attempts.expire.
             row.subject_pk is None
@@ -94,7 +94,7 @@ class Standing:
             "the count of failed attempts on a subject was removed or altered in the database; "
             "it was taken from the audit log",
             tenant=tenant,
-            subject=pseudonym[:16],
+            subject=pseudonyms[0][:16],
         )
         return status
 
@@ -141,16 +141,16 @@ class Standing:
             connection.execute(NEXT_COUNTS, {**of, **values})
 
     def _counted_in_log(
-        self, connection: Connection, tenant: str, pseudonym: str
+        self, connection: Connection, tenant: str, pseudonyms: Sequence[str]
     ) -> AttemptsStatus | None:
         policy = self._policy
         most = max(policy.disable_at, 1) if policy.after else _MOST_COUNTED
         rows = connection.execute(
-            LINES_OF_ATTEMPTS, {"pseudonym": pseudonym, "most": min(most, _MOST_COUNTED)}
+            LINES_OF_ATTEMPTS, {"pseudonyms": pseudonyms, "most": min(most, _MOST_COUNTED)}
         )
         # An erased tenant's subjects went without lines of their own.
         erased = connection.execute(TENANT_ERASED, {"tenant": tenant}).scalar() or 0
-        line_key = self._context.audit_log.line_key()
+        line_keys = self._context.audit_log.line_keys()
         failed_at: datetime | None = None
         consecutive = 0
         for row in rows:
@@ -160,7 +160,7 @@ class Standing:
             if (line.actor or "").startswith("operator") and line.action == "verify":
                 continue  # an earlier version's name for what an operator tried: nothing counts it
             # A line that is not true may have been any: it counts as a failure.
-            if is_true_line(line_key, line) and line.outcome != "reject":
+            if is_true_line(line_keys, line) and line.outcome != "reject":
                 break
             failed_at = failed_at or line.at
             consecutive += 1

@@ -8,8 +8,9 @@ from typing import Any
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
+from templates.errors import StoreError
 from templates.keys.sealing import MasterKeyring
-from templates.store.envelope import Envelope, Owner, open_envelope
+from templates.store.envelope import Envelope, ForeignTemplate, Owner, open_envelope
 from templates.store.identifiers import UnknownTenant
 from templates.store.schema import SubjectRow, TemplateRow, TenantRow
 
@@ -21,9 +22,29 @@ class Source(StrEnum):
     TEMPLATE = "template"
 
 
+class Storage(StrEnum):
+    """Who keeps a subject's sealed template; its data key is always in the store."""
+
+    SERVICE = "service"
+    HOLDER = "holder"
+
+
+class TemplateNotStored(StoreError):
+    """The subject's holder keeps its template, and none was sent, or none that opens."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            "the holder of this subject keeps its template, and the service has none: it can be "
+            "verified with that template, and not exported or shown"
+        )
+
+
 @dataclass(frozen=True)
 class SubjectRecord:
-    """What is known of a subject without opening its template."""
+    """What is known of a subject without opening its template.
+
+    `holder_salt` is None where the template needs no holder's key.
+    """
 
     subject_id: str
     template_id: str
@@ -34,6 +55,8 @@ class SubjectRecord:
     dtype: str
     source: Source
     photos: int
+    storage: Storage
+    holder_salt: str | None
     created_at: datetime
     updated_at: datetime
 
@@ -44,6 +67,16 @@ class SubjectTemplate:
 
     record: SubjectRecord
     wire: bytes = field(repr=False)
+
+    @property
+    def template_id(self) -> str:
+        """Id of the template, which its rotation is derived from."""
+        return self.record.template_id
+
+    @property
+    def holder_salt(self) -> str | None:
+        """What its holder's rotation is derived from, with their key; None if it needs no key."""
+        return self.record.holder_salt
 
 
 RECORD_COLUMNS = (
@@ -56,6 +89,10 @@ RECORD_COLUMNS = (
     TemplateRow.dtype,
     TemplateRow.source,
     TemplateRow.photos,
+    sa.case(
+        (TemplateRow.ciphertext.is_(None), Storage.HOLDER.value), else_=Storage.SERVICE.value
+    ).label("storage"),
+    TemplateRow.holder_salt,
     SubjectRow.created_at,
     SubjectRow.updated_at,
 )
@@ -83,7 +120,8 @@ def of_tenant(columns: tuple[Any, ...], tenant: str) -> Any:
 def read_record(row: Any) -> SubjectRecord:
     """Read a row that has :data:`RECORD_COLUMNS`."""
     values = {name: row._mapping[name] for name in SubjectRecord.__dataclass_fields__}
-    return SubjectRecord(**{**values, "source": Source(row.source)})
+    values |= {"source": Source(row.source), "storage": Storage(row.storage)}
+    return SubjectRecord(**values)
 
 
 def owner_of(row: Any) -> Owner:
@@ -92,19 +130,33 @@ def owner_of(row: Any) -> Owner:
 
 
 def envelope_of(row: Any) -> Envelope:
-    """The template of a row."""
+    """The stored template of a row."""
     return Envelope(row.wrapped_key, row.ciphertext)
 
 
-def opened_template(row: Any, keyring: MasterKeyring) -> SubjectTemplate:
-    """Decrypt the template of a row.
+def opened_template(
+    row: Any, keyring: MasterKeyring, held_template: bytes | None = None
+) -> SubjectTemplate:
+    """Decrypt the template of a row, or the one that its holder sent; a stored one is preferred.
 
     Raises
     ------
+    TemplateNotStored
+        If the holder keeps it, and sent none, or another one.
     SealError
         If the row was altered or moved, or its master key is missing.
     """
-    wire = open_envelope(envelope_of(row), owner_of(row), keyring)
+    envelope = envelope_of(row)
+    if row.ciphertext is None:
+        if held_template is None:
+            raise TemplateNotStored
+        envelope = Envelope(row.wrapped_key, held_template)
+    try:
+        wire = open_envelope(envelope, owner_of(row), keyring)
+    except ForeignTemplate:
+        if row.ciphertext is None:
+            raise TemplateNotStored from None
+        raise
     return SubjectTemplate(record=read_record(row), wire=wire)
 
 

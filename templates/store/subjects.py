@@ -3,7 +3,7 @@
 import base64
 import binascii
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any
@@ -15,18 +15,20 @@ from templates.errors import SealError, StoreBusy, StoreError
 from templates.keys.sealing import sealed_key_id
 from templates.store.audit_log import PROGRAM, By, Entry
 from templates.store.context import StoreContext
-from templates.store.envelope import Envelope, Owner, close_envelope
+from templates.store.envelope import Owner, close_envelope
 from templates.store.identifiers import (
     InvalidIdentifier,
     UnknownTenant,
     checked_opaque_id,
     checked_subject_id,
 )
+from templates.store.outbox import EventType
 from templates.store.schema import FailedAttemptsRow, SubjectRow, TemplateRow, TenantRow
 from templates.store.subject_rows import (
     RECORD_COLUMNS,
     TEMPLATE_COLUMNS,
     Source,
+    Storage,
     SubjectRecord,
     SubjectTemplate,
     of_tenant,
@@ -36,20 +38,53 @@ from templates.store.subject_rows import (
     subject_pk_of,
 )
 
-MAX_WIRE_BYTES = 4 * 1024 * 1024  # a float32 template of n = 4096, m = 128 has 2.1 MB
+MAX_WIRE_BYTES = 4 * 1024 * 1024  # a float32 template of n = 4096, m = 192 has 3.2 MB
 MAX_PAGE = 1000
 
 _CURSOR_PURPOSE = "list-cursor"
 
-Guard = Callable[[Connection, str], Entry | None]
+Guard = Callable[[Connection, Sequence[str]], Entry | None]
+
+
+class EnrollmentConflict(StoreError):
+    """The subject has another template than a write may replace; it is left as it was.
+
+    Attributes
+    ----------
+    template_id
+        The template that the subject has; None if it is not enrolled.
+    """
+
+    template_id: str | None = None
+
+    def __init__(self, template_id: str | None) -> None:
+        super().__init__(
+            "the subject is not enrolled, and there is nothing to replace: enroll it without "
+            "naming a template"
+            if template_id is None
+            else "the subject is enrolled, with another template than the request may replace: "
+            "name that one, or choose another subject id"
+        )
+        self.template_id = template_id
+
+
+@dataclass(frozen=True)
+class Precondition:
+    """What a subject must have before a write: this template, or, where it is None, none."""
+
+    template_id: str | None
 
 
 @dataclass(frozen=True)
 class StoredTemplate:
-    """What :meth:`Subjects.put` did."""
+    """What :meth:`Subjects.put` did.
+
+    `held_template` is what the holder is to keep, where the store does not.
+    """
 
     template_id: str
     created: bool
+    held_template: bytes | None = field(default=None, repr=False)
 
 
 @dataclass(frozen=True)
@@ -97,8 +132,11 @@ class Subjects:
         dtype: str,
         source: Source,
         photos: int,
-        template_id: str | None = None,
+        template_id: str,
+        holder_salt: str | None = None,
         rotation_epoch: int | None = None,
+        storage: Storage = Storage.SERVICE,
+        precondition: Precondition | None = None,
         guard: Guard | None = None,
         by: By = PROGRAM,
     ) -> StoredTemplate:
@@ -113,12 +151,18 @@ class Subjects:
         contract_id, n, m, dtype, source, photos
             Metadata that stays readable without a key.
         template_id
-            Made here when not given.
+            Random, and another one for each enrollment: the template's rotation is derived from it.
+        holder_salt
+            What the holder's rotation is derived from; None where the template needs no key.
         rotation_epoch
-            Epoch of the tenant's rotation that the template is in; the current one by default.
+            Epoch of the tenant's key that the template is turned by; the current one by default.
             Another one is refused: its key is, or will be, dropped.
+        storage
+            Who keeps the sealed template. A holder's is returned, and all but it is stored.
+        precondition
+            What may be replaced; whatever there is by default.
         guard
-            Called in the transaction with its connection and the subject's pseudonym, before
+            Called in the transaction with its connection and the subject's pseudonyms, before
             anything is written. What it raises takes the enrollment back; what it returns goes
             into the audit log before the enrollment's own line.
         by
@@ -127,22 +171,27 @@ class Subjects:
         Raises
         ------
         InvalidIdentifier, UnknownTenant, StoreError, StoreUnavailable
+        EnrollmentConflict
+            If the subject does not meet the precondition.
 
         Notes
         -----
         A replacement gets a fresh data key, and the old key and ciphertext are removed with it:
-        an old backup of one of the two rows does not help to read the other.
+        an old backup of one of the two rows does not help to read the other, and a template that a
+        holder kept opens no more.
         """
         checked_subject_id(subject_id)
         checked_opaque_id(contract_id, what="contract id")
-        template_id = checked_opaque_id(template_id or uuid.uuid4().hex, what="template id")
+        template_id = checked_opaque_id(template_id, what="template id")
         if not 0 < len(wire) <= MAX_WIRE_BYTES:
             raise StoreError(
                 f"a template has 1 to {MAX_WIRE_BYTES} wire bytes, this has {len(wire)}"
             )
-        context, pseudonym = self._context, self._context.signer.pseudonym(tenant, subject_id)
+        context = self._context
 
-        def work(connection: Connection) -> bool:
+        def work(connection: Connection) -> StoredTemplate:
+            pseudonyms = context.signer.pseudonyms(tenant, subject_id)
+            pseudonym = pseudonyms[0]
             owner_row = connection.execute(_TENANT.where(TenantRow.name == tenant)).one_or_none()
             if owner_row is None:
                 raise UnknownTenant.named(tenant)
@@ -150,19 +199,28 @@ class Subjects:
             epoch = current_epoch if rotation_epoch is None else rotation_epoch
             if epoch != current_epoch:
                 raise StoreBusy("the tenant's rotation was renewed meanwhile; send it again")
-            guard_entry = None if guard is None else guard(connection, pseudonym)
-            now = context.clock()
             enrolled_pk = subject_pk_of(connection, tenant_id, subject_id)
+            if precondition is not None:
+                enrolled = connection.execute(_TEMPLATE_ID, {"pk": enrolled_pk}).scalar()
+                if enrolled != precondition.template_id:
+                    raise EnrollmentConflict(enrolled)
+            guard_entry = None if guard is None else guard(connection, pseudonyms)
+            now = context.clock()
             is_new, subject_pk = enrolled_pk is None, enrolled_pk or uuid.uuid4().hex
-            owner = Owner(tenant_id, subject_pk, subject_id, contract_id, template_id, epoch)
-            _write_rows(
-                connection,
-                owner,
-                close_envelope(wire, owner, context.keyring),
-                {"n": n, "m": m, "dtype": dtype, "source": Source(source).value, "photos": photos},
-                is_new=is_new,
-                now=now,
+            owner = Owner(
+                tenant_id, subject_pk, subject_id, contract_id, template_id, epoch, holder_salt
             )
+            envelope = close_envelope(wire, owner, context.keyring)
+            is_held = storage is Storage.HOLDER
+            metadata = {
+                "n": n,
+                "m": m,
+                "dtype": dtype,
+                "source": Source(source).value,
+                "photos": photos,
+                "ciphertext": None if is_held else envelope.ciphertext,
+            }
+            _write_rows(connection, owner, envelope.wrapped_key, metadata, is_new=is_new, now=now)
             if is_new:
                 # A count of failures from before goes when the subject goes, and not earlier.
                 connection.execute(
@@ -176,35 +234,40 @@ class Subjects:
             if guard_entry is not None:
                 context.audit_log.append(connection, guard_entry)
             outcome = "created" if is_new else "replaced"
-            context.audit_log.append(connection, Entry("enroll", outcome, by, tenant, pseudonym))
-            return is_new
+            detail = storage.value if is_held else None
+            entry = Entry("enroll", outcome, by, tenant, pseudonym, detail=detail)
+            context.audit_log.append(connection, entry)
+            context.outbox.add(
+                connection,
+                EventType.ENROLLED,
+                tenant_id=tenant_id,
+                tenant=tenant,
+                pseudonym=pseudonym,
+                subject_id=subject_id,
+                template_id=template_id,
+                replaced=not is_new,
+            )
+            return StoredTemplate(template_id, is_new, envelope.ciphertext if is_held else None)
 
-        created = context.write(work, lock=subject_lock(tenant, subject_id))
-        if not created:
+        stored = context.write(work, lock=subject_lock(tenant, subject_id))
+        if not stored.created:
             context.database.try_purge_log()
-        return StoredTemplate(template_id=template_id, created=created)
+        return stored
 
     def get(
-        self, tenant: str, subject_id: str, *, contract_id: str | None = None
+        self, tenant: str, subject_id: str, *, held_template: bytes | None = None
     ) -> SubjectTemplate | None:
         """Return a subject with its decrypted template, or None.
 
-        Parameters
-        ----------
-        tenant, subject_id
-            Whose it is.
-        contract_id
-            If given, a template of another contract is as good as none: nothing of it is read or
-            decrypted, so that it costs what a subject costs that does not exist.
-
         Raises
         ------
+        TemplateNotStored
+            If its holder keeps the template, and `held_template` is not it.
         SealError
             If the row was altered or moved, or its master key is missing.
         """
-        conditions = () if contract_id is None else (TemplateRow.contract_id == contract_id,)
-        row = self._row(TEMPLATE_COLUMNS, tenant, subject_id, *conditions)
-        return None if row is None else opened_template(row, self._context.keyring)
+        row = self._row(TEMPLATE_COLUMNS, tenant, subject_id)
+        return None if row is None else opened_template(row, self._context.keyring, held_template)
 
     def describe(self, tenant: str, subject_id: str) -> SubjectRecord | None:
         """Return a subject's metadata, or None; nothing is decrypted."""
@@ -216,6 +279,8 @@ class Subjects:
 
         Raises
         ------
+        TemplateNotStored
+            If its holder keeps the template.
         SealError
             If the row was altered or moved, or its master key is missing.
         """
@@ -225,15 +290,9 @@ class Subjects:
         template = opened_template(row, self._context.keyring)
         return StoredForm(template, bytes(row.ciphertext), row.last_used_at)
 
-    def _row(
-        self,
-        columns: tuple[Any, ...],
-        tenant: str,
-        subject_id: str,
-        *conditions: sa.ColumnElement[bool],
-    ) -> Any:
+    def _row(self, columns: tuple[Any, ...], tenant: str, subject_id: str) -> Any:
         subject = SubjectRow.subject_id == checked_subject_id(subject_id)
-        query = of_tenant(columns, tenant).where(subject, *conditions)
+        query = of_tenant(columns, tenant).where(subject)
         return self._context.database.read(
             lambda connection: connection.execute(query).one_or_none()
         )
@@ -292,12 +351,15 @@ class Subjects:
 
 
 _TENANT = sa.select(TenantRow.id, TenantRow.rotation_epoch)
+_TEMPLATE_ID = sa.select(TemplateRow.template_id).where(
+    TemplateRow.subject_pk == sa.bindparam("pk")
+)
 
 
 def _write_rows(
     connection: Connection,
     owner: Owner,
-    envelope: Envelope,
+    wrapped_key: bytes,
     metadata: dict[str, Any],
     *,
     is_new: bool,
@@ -305,8 +367,8 @@ def _write_rows(
 ) -> None:
     """Insert a subject and its template, or replace the template and the data key there are."""
     key_columns = {
-        "wrapped_key": envelope.wrapped_key,
-        "wrapping_key": sealed_key_id(envelope.wrapped_key),
+        "wrapped_key": wrapped_key,
+        "wrapping_key": sealed_key_id(wrapped_key),
         "updated_at": now,
     }
     if is_new:
@@ -327,7 +389,7 @@ def _write_rows(
             template_id=owner.template_id,
             contract_id=owner.contract_id,
             rotation_epoch=owner.rotation_epoch,
-            ciphertext=envelope.ciphertext,
+            holder_salt=owner.holder_salt,
             created_at=now,
             **metadata,
         )

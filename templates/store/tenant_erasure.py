@@ -152,7 +152,6 @@ class TenantErasures:
         """
         checked_tenant_name(tenant)
         context = self._context
-        context.signer.public_key()  # obtains the signing key before a transaction needs it
         begun = context.write(lambda connection: self._begin(connection, tenant, by))
         if isinstance(begun, Receipt):
             receipt, erased = begun, False
@@ -162,7 +161,7 @@ class TenantErasures:
                 while removed := self._remove_batch(tenant_id, tenant, records, batch):
                     if progress is not None:
                         progress(removed)
-            receipt, erased = context.database.write_alone(
+            receipt, erased = context.write_alone(
                 lambda connection: self._finish(connection, tenant_id, tenant, by)
             )
         return TenantErasure(receipt, erased, log_purged=context.database.try_purge_log())
@@ -319,7 +318,8 @@ def _remove(connection: Connection, records: _Records, rows: Sequence[Any]) -> C
         some = rows[start : start + BATCH]
         if records.table is SubjectRow:
             templates = sa.delete(TemplateRow).where(
-                TemplateRow.subject_pk.in_([row.id for row in some])
+                TemplateRow.subject_pk.in_([row.id for row in some]),
+                TemplateRow.ciphertext.is_not(None),
             )
             _count(counts, ["templates"], connection.execute(templates).rowcount)
         keys = [tuple(row._mapping[column.key] for column in records.key) for row in some]
@@ -344,6 +344,6 @@ def _count(counts: Counts, items: Sequence[str], count: int) -> None:
 
 
 def _template_of(tenant_id: str) -> sa.ColumnElement[bool]:
-    return TemplateRow.subject_pk.in_(
-        sa.select(SubjectRow.id).where(SubjectRow.tenant_id == tenant_id)
-    )
+    subjects = sa.select(SubjectRow.id).where(SubjectRow.tenant_id == tenant_id)
+    # What holders keep is not here.
+    return sa.and_(TemplateRow.subject_pk.in_(subjects), TemplateRow.ciphertext.is_not(None))

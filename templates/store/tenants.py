@@ -1,7 +1,7 @@
-"""Tenants, and the key of each one's rotation.
+"""Tenants, and the key of each one's rotations.
 
-A tenant's name and an epoch name one rotation for ever: the epochs of a tenant that is made anew,
-after one of its name was erased, go on where those ended. So a process that keeps rotations in
+A tenant's name and an epoch name one key for ever: the epochs of a tenant that is made anew,
+after one of its name was erased, go on where those ended. So a process that keeps keys in
 memory, and an enrollment that was under way, cannot mistake one for the other.
 """
 
@@ -40,7 +40,7 @@ class Tenant:
     Attributes
     ----------
     rotation_epoch
-        Epoch whose key new templates are rotated with.
+        Epoch whose key new templates are turned by.
     template_enrollment
         Whether clients may enroll templates that they made themselves.
     """
@@ -54,7 +54,10 @@ class Tenant:
 
 @dataclass(frozen=True)
 class RotationKey:
-    """The secret that a tenant's rotation is drawn from (``templates.keys.rotation``)."""
+    """The secret that the rotations of a tenant's templates derive from.
+
+    See ``templates.keys.rotation``.
+    """
 
     epoch: int
     key: bytes = field(repr=False)
@@ -71,7 +74,7 @@ class AlteredTenant(UnknownTenant):
 
 
 class RetiredRotation(UnknownTenant):
-    """No rotation of this epoch any more: what was read in it was moved on since, read it again."""
+    """No key of this epoch any more: what was read in it was moved on since, read it again."""
 
 
 class Tenants:
@@ -183,7 +186,7 @@ class Tenants:
             lambda connection: connection.execute(query).scalar_one_or_none()
         )
         if wrapped is None:
-            raise RetiredRotation(f"tenant {name!r} has no rotation of epoch {epoch}")
+            raise RetiredRotation(f"tenant {name!r} has no rotation key of epoch {epoch}")
         key = self._context.keyring.open(
             wrapped, purpose=ROTATION_PURPOSE, bound_to=[tenant.id, epoch]
         )

@@ -5,6 +5,7 @@ it, the audit log tells exactly what happened after it, whatever the clocks of h
 names the line of the export by its number and hash. In another deployment the times are compared.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
@@ -25,14 +26,17 @@ from templates.store.subjects import Guard
 
 
 class ExportSuperseded(StoreError):
-    """The subject was erased or enrolled again after the export was made."""
+    """The subject was erased or enrolled again after the export was made, or its key was retired.
 
-    def __init__(self) -> None:
-        super().__init__(
-            "the subject was erased or enrolled after this export was made, and importing it would "
-            "undo that: export the subject again where it is enrolled, or enroll it; an operator "
-            "may restore an old export knowingly"
-        )
+    Importing it would undo that, or trust whoever has the key.
+    """
+
+
+_SUPERSEDED = (
+    "the subject was erased or enrolled after this export was made, and importing it would "
+    "undo that: export the subject again where it is enrolled, or enroll it; an operator "
+    "may restore an old export knowingly"
+)
 
 
 @dataclass(frozen=True)
@@ -66,12 +70,13 @@ class Transfers:
             If the subject was enrolled again, or erased, since the template was read.
         """
         context = self._context
-        pseudonym = context.signer.pseudonym(tenant, checked_subject_id(subject_id))
+        checked_subject_id(subject_id)
 
         def work(connection: Connection) -> Stamp:
             subject = {"tenant": tenant, "subject_id": subject_id}
             if connection.execute(_TEMPLATE_ID, subject).scalar_one_or_none() != template_id:
                 raise StoreBusy("the subject was enrolled again or erased meanwhile: send it again")
+            pseudonym = context.signer.pseudonym(tenant, subject_id)
             entry = Entry("export", "exported", by, tenant, pseudonym)
             line = context.audit_log.append(connection, entry)
             own_hash = connection.execute(_HASH, {"line": line}).scalar_one()
@@ -92,32 +97,35 @@ class Transfers:
             Who imports, for that line.
         """
 
-        def check(connection: Connection, pseudonym: str) -> Entry | None:
-            if not is_superseded(connection, tenant, pseudonym, stamp):
+        def check(connection: Connection, pseudonyms: Sequence[str]) -> Entry | None:
+            if not is_superseded(connection, tenant, pseudonyms, stamp):
                 return None
             if not restore:
-                raise ExportSuperseded
-            return Entry("import", "restored", by, tenant, pseudonym)
+                raise ExportSuperseded(_SUPERSEDED)
+            return Entry("import", "restored", by, tenant, pseudonyms[0])
 
         return check
 
 
-def is_superseded(connection: Connection, tenant: str, pseudonym: str, stamp: Stamp | None) -> bool:
+def is_superseded(
+    connection: Connection, tenant: str, pseudonyms: Sequence[str], stamp: Stamp | None
+) -> bool:
     """Whether the subject was enrolled or erased here after an export of it was made.
 
     Parameters
     ----------
     connection
         Of the transaction that would import it, under the lock of the subject.
-    tenant, pseudonym
+    tenant, pseudonyms
         Whom it would be imported for.
     stamp
         Of the export; None for one from before exports had any, which anything supersedes.
     """
-    last = max(
-        connection.execute(_LAST_LINE, {"pseudonym": pseudonym}).scalar() or 0,
-        connection.execute(TENANT_ERASED, {"tenant": tenant}).scalar() or 0,
+    about_subject = (
+        connection.execute(_LAST_LINE, {"pseudonym": pseudonym}).scalar() or 0
+        for pseudonym in pseudonyms
     )
+    last = max(connection.execute(TENANT_ERASED, {"tenant": tenant}).scalar() or 0, *about_subject)
     if not last or stamp is None:
         return bool(last)
     own_hash = connection.execute(_HASH, {"line": stamp.line.sequence}).scalar_one_or_none()
@@ -136,6 +144,11 @@ _TEMPLATE_ID: Any = (
         SubjectRow.subject_id == sa.bindparam("subject_id"),
     )
 )
-_LAST_LINE = last_line(AuditRow.pseudonym == sa.bindparam("pseudonym"), ENROLLMENT_LINES)
+# A reset of a lock that was not there also leaves a line with the outcome `nothing_held`.
+_LAST_LINE = last_line(
+    AuditRow.pseudonym == sa.bindparam("pseudonym"),
+    ENROLLMENT_LINES,
+    AuditRow.action != sa.literal_column("'lockout-reset'"),
+)
 _HASH: Any = sa.select(AuditRow.hash).where(AuditRow.sequence == sa.bindparam("line"))
 _TIME: Any = sa.select(AuditRow.at).where(AuditRow.sequence == sa.bindparam("line"))

@@ -23,8 +23,9 @@ from typing import Any
 import httpx
 
 from tests.api.deployment import Deployment, bearer, deploy, images, photo
-from tests.api.process.test_server import Server, free_port
+from tests.api.process.test_server import Server
 from tests.patience import PATIENCE_S
+from tests.ports import free_port
 
 CONFIG = """\
 [checks]

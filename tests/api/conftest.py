@@ -2,13 +2,26 @@
 
 from collections.abc import Iterator
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 
 from api.http.app import create_app
-from tests.api.client import Client
+from tests.api.client import NO_COLLECTION, Client
 from tests.api.deployment import Deployment, bearer, deploy
-from tests.databases import database_url, postgres_database, postgres_url  # noqa: F401
+from tests.databases import (  # noqa: F401
+    database_url,
+    migrate_ahead,
+    postgres_database,
+    postgres_url,
+)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def no_collection() -> Iterator[None]:
+    """What tests imported stays out of the collector's sight, whoever starts a service."""
+    with patch("api.http.app.gc", NO_COLLECTION):
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -31,6 +44,7 @@ def client(deployment: Deployment) -> Iterator[Client]:
 @pytest.fixture
 def both(tmp_path: Path, database_url: str) -> Iterator[tuple[Client, Deployment]]:  # noqa: F811
     """A fresh deployment on each database, with a client that has all rights."""
+    migrate_ahead(database_url)
     deployment = deploy(tmp_path, database_url=database_url)
     with Client(create_app(deployment.settings)) as running:
         running.headers.update(bearer(deployment.token))

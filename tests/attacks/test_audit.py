@@ -6,6 +6,7 @@ import pytest
 
 from attacks import audit
 from attacks.audit import AuditPlan, run_audit
+from attacks.further_faces import FurtherFaces
 from models.extraction import Extraction
 from models.pack import ModelPack
 from tests.attacks.stored.systems import OWNERS, VICTIMS, M, generator, system_of
@@ -24,7 +25,13 @@ def test_an_audit_of_two_schemes_reports_its_progress(monkeypatch: pytest.Monkey
         return system_of("generator")
 
     monkeypatch.setattr(audit, "enroll_victims", enroll)
-    monkeypatch.setattr(audit, "_attacks", lambda *_: [list, list, list])
+    given: list[int] = []
+
+    def attacks(*arguments: Any) -> list[Any]:
+        given.append(len(arguments[4]))
+        return [list, list, list]
+
+    monkeypatch.setattr(audit, "_attacks", attacks)
     shares: list[float] = []
     result = run_audit(
         AuditPlan(dims=(M,), victims=VICTIMS, owners=OWNERS),
@@ -34,6 +41,7 @@ def test_an_audit_of_two_schemes_reports_its_progress(monkeypatch: pytest.Monkey
         decoys=generator(),
         aligned=True,
         start_service=None,
+        further=[FurtherFaces("more", faces.descriptors[:7], people.names[:7])],
         progress=shares.append,
     )
     assert shares == sorted(shares)
@@ -42,3 +50,6 @@ def test_an_audit_of_two_schemes_reports_its_progress(monkeypatch: pytest.Monkey
     assert len(schemes) == len(result.schemes) == 2
     assert result.settings["victims"] == VICTIMS
     assert not result.settings["service"]
+    (more,) = result.settings["further_attacker_faces"]
+    assert more["faces"] + more["left_out"] == 7
+    assert given == [OWNERS + more["faces"], more["faces"]]

@@ -11,7 +11,7 @@ from attacks.chosen_enrollment import (
     polar_factor,
 )
 from attacks.errors import AuditError
-from attacks.outcomes import Knowledge, Property
+from attacks.outcomes import Knowledge, Leaked, Property
 from attacks.system import System
 from templates.keys.randomness import Keystream
 from templates.space.subspace import SubspaceBatch
@@ -80,17 +80,22 @@ def test_best_known_points_lie_in_their_templates_and_in_the_span(system: System
         assert np.linalg.norm(drawn @ span, axis=1).max() <= reached[index] + 1e-4
 
 
-def test_victims_are_opened_with_enough_accounts_and_not_with_one(system: System) -> None:
-    one, enough = chosen_enrollment(system, accounts=(1, 20, 10_000))
-    assert [each.details["accounts"] for each in (one, enough)] == [1, 20]
-    assert float(str(enough.details["alignment"])) > 0.999
-    assert enough.measured.value == 1.0
-    assert abs(float(str(one.details["alignment"]))) < 0.15
-    assert one.measured.value <= 2 / 40  # chance is 1 in 100 or less
-    assert enough.judged
-    assert enough.knowledge is Knowledge.TEMPLATES
-    assert enough.breaks is Property.IMPERSONATION
-    assert [one, enough] == chosen_enrollment(system, accounts=(1, 20))
+def test_no_number_of_accounts_opens_victims_with_rotations_of_their_own(system: System) -> None:
+    one, enough, common, opened = chosen_enrollment(system, accounts=(1, 20, 10_000))
+    assert [each.details["accounts"] for each in (one, enough, common)] == [1, 20, 20]
+    for row in (one, enough):
+        assert row.judged
+        assert (row.leaked, row.knowledge) == (Leaked.MASTER_KEY, Knowledge.TEMPLATES)
+        assert row.breaks is Property.IMPERSONATION
+        assert abs(float(str(row.details["alignment"]))) < 0.15
+        assert row.measured.value <= 2 / 40  # chance is 1 in 100 or less
+    # The controls: the attack is one where all have one rotation, and the key gives all of them.
+    assert float(str(common.details["alignment"])) > 0.999
+    assert common.measured.value == opened.measured.value == 1.0
+    assert opened.leaked is Leaked.HOLDER_KEYS
+    assert not common.judged
+    assert not opened.judged
+    assert [one, enough] == chosen_enrollment(system, accounts=(1, 20))[:2]
 
 
 def test_an_attacker_without_faces_is_refused(system: System) -> None:

@@ -23,14 +23,14 @@ def first_accepted(system: System, most: int) -> list[float]:
     for number in range(len(system.templates)):
         reached.append(np.inf)
         for attempt, face in enumerate(faces, start=1):
-            answer = decide(
+            accepted = decide(
                 face[None].astype(np.float32),
                 system.templates[number : number + 1],
                 system.contract,
                 system.points,
                 system.level,
             )
-            if answer.accepted[0, 0]:
+            if accepted[0, 0]:
                 reached[-1] = attempt
                 break
     return reached
@@ -81,7 +81,7 @@ def test_templates_of_noise_are_opened_as_often_as_by_any_face(system: System) -
     noise = SubspaceBatch(length * axes[:, 0], np.ascontiguousarray(axes[:, 1:]))
     closed = replace(system, templates=noise)
     faces = attacker_prior(system).faces.astype(np.float32)
-    one = decide(faces, noise, system.contract, system.points, system.level).accepted.mean()
+    one = decide(faces, noise, system.contract, system.points, system.level).mean()
     assert one > 0
     for limit, outcome in by_limit(dictionary_outcomes(closed)).items():
         assert outcome.measured.value <= 2 * (1 - (1 - one) ** limit)

@@ -9,10 +9,10 @@ from attacks.hill_climbing import (
     Climber,
     climb,
     climbing_outcomes,
-    in_process,
 )
 from attacks.prior import Prior, attacker_prior, learn_prior
 from attacks.system import System
+from tests.attacks.own_decisions import in_process
 from tests.verify.synthetic import unit
 
 SCORED = (Climber.GRADIENT, Climber.REGRESSION)

@@ -5,11 +5,11 @@ import pytest
 
 from attacks.errors import AuditError
 from attacks.likelihood import (
-    face_precision,
     find_least_decoy_like,
     likeliest_guesses,
     likeliest_points,
     precision,
+    simulate_unlimited,
 )
 from attacks.outcomes import GENERATED, Scheme
 from attacks.population import Population
@@ -85,39 +85,67 @@ def test_a_generator_of_another_kind_than_the_victims_is_seen_through(
     narrow = np.where(np.arange(n) < n // 2, 1.0, 0.02)
     other = DecoyGenerator.fit(unit(rng.normal(size=(600, n)) * narrow))
     system = small_system(small_population, Scheme("adversarial", GENERATED, 6), other)
-    for row in find_least_decoy_like(system, draws=2000):
+    *rows, control = find_least_decoy_like(system, draws=2000, kind="a test")
+    for row in rows:
         assert row.measured.value > 0.9, row.variant
         assert float(str(row.details["cosine_to_truth_mean"])) > 0.8
         assert row.judged
-
-
-def test_few_faces_have_a_precision_too() -> None:
-    few = np.random.default_rng(0).normal(size=(20, N)) * np.linspace(0.2, 1, N)
-    values = np.linalg.eigvalsh(face_precision(few))
-    assert values.min() > 0
-    assert values.max() / values.min() < 1e3  # the plain covariance is singular
-    many = np.random.default_rng(0).normal(size=(200, N))
-    np.testing.assert_array_equal(face_precision(many), precision(many))
+        assert row.details["faces_from"] == "a test"
+    assert control.variant == "photos of other people"
+    assert control.measured.value <= 0.1
+    assert not control.judged
 
 
 def test_guesses_are_what_the_outcomes_report(system: System) -> None:
     guesses = likeliest_guesses(system, draws=1000)
-    for row in find_least_decoy_like(system, draws=1000):
-        mine = cosines(guesses[row.variant], system.victims.enrolled).mean()
-        assert float(str(row.details["cosine_to_truth_mean"])) == pytest.approx(mine, abs=1e-6)
+    for row in find_least_decoy_like(system, draws=1000)[:-1]:
+        mean = cosines(guesses[row.variant], system.victims.enrolled).mean()
+        assert float(str(row.details["cosine_to_truth_mean"])) == pytest.approx(mean, abs=1e-6)
 
 
-def test_outcomes_with_and_without_faces(system: System, strangers: np.ndarray) -> None:
-    outcomes = find_least_decoy_like(system, draws=1000)
-    assert [each.variant for each in outcomes] == ["generator", "generator and faces"]
+def test_further_faces_are_counted(system: System, strangers: np.ndarray) -> None:
+    count = len(system.attacker)
+    outcomes = find_least_decoy_like(system, strangers, draws=1000)
+    assert [row.variant for row in outcomes] == [
+        "generator",
+        f"{count + len(strangers)} faces",
+        "photos of other people",
+    ]
+    assert outcomes[1].details["faces"] == count + len(strangers)
+
+
+def test_templates_of_strangers_give_nothing(system: System, strangers: np.ndarray) -> None:
     noise = replace(system, templates=system.lift(strangers, "noise"))
     for row in find_least_decoy_like(noise, draws=1000):
         assert row.measured.value <= 0.1
 
 
-def test_random_lifting_has_no_decoys_to_be_unlike(weak_system: System) -> None:
-    assert find_least_decoy_like(weak_system) == []
-    assert likeliest_guesses(weak_system) == {}
+def test_random_lifting_gives_the_descriptor_to_who_knows_faces(weak_system: System) -> None:
+    (with_faces, control) = find_least_decoy_like(weak_system)
+    assert with_faces.variant == f"{len(weak_system.attacker)} faces"
+    # These synthetic faces vary along all axes, from which random directions hardly stand out.
+    assert with_faces.measured.value > 0.4
+    assert control.measured.value <= 0.1
+
+
+def test_the_attacker_without_limit_is_simulated(system: System, weak_system: System) -> None:
+    measured = find_least_decoy_like(system, draws=1000)
+    few, many = (
+        simulate_unlimited(system, fitted_to=count, kind="a test", measured=measured)[0]
+        for count in (100, 4000)
+    )
+    assert few.measured.value > many.measured.value
+    assert few.judged
+    assert few.details["faces"] == "unlimited"
+    assert few.details["generator_fitted_to"] == 100
+    assert few.details["extrapolated_from_finite"] is None  # one number of faces only
+    assert simulate_unlimited(weak_system, fitted_to=100) == []
+    (estimate,) = simulate_unlimited(system, fitted_to=None, measured=measured)
+    assert not estimate.judged
+    assert estimate.details["generator_fitted_to"] is None
+    assert "the decoy generator as it is" in estimate.assumption
+    # These decoys are of the people's kind, and were fitted to thousands of such faces.
+    assert estimate.measured.value < few.measured.value
 
 
 def test_a_covariance_needs_more_draws_than_dimensions(system: System) -> None:

@@ -1,7 +1,7 @@
 import json
 from typing import Any
 
-from attacks.outcomes import AttackOutcome, Estimate, Knowledge, Property, Scheme
+from attacks.outcomes import AttackOutcome, Estimate, Knowledge, Leaked, Property, Scheme
 from attacks.report import document
 from attacks.report_tables import markdown
 from verify.metrics import rate
@@ -15,6 +15,7 @@ def outcomes(scheme: Scheme, hits: int) -> list[AttackOutcome]:
         AttackOutcome(
             attack="foot-point",
             breaks=Property.IRREVERSIBILITY,
+            leaked=Leaked.HOLDER_KEYS,
             knowledge=Knowledge.TEMPLATE,
             assumption="One template; guesses its foot point.",
             scheme=scheme,
@@ -27,6 +28,7 @@ def outcomes(scheme: Scheme, hits: int) -> list[AttackOutcome]:
             attack="linkage",
             variant="secret rotations, nearest points",
             breaks=Property.UNLINKABILITY,
+            leaked=Leaked.MASTER_KEY,
             knowledge=Knowledge.ALGORITHM,
             assumption="Two rotated templates | of two tenants.",
             scheme=scheme,

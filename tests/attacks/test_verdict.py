@@ -2,8 +2,8 @@ import math
 
 import pytest
 
-from attacks.outcomes import AttackOutcome, Estimate, Knowledge, Measured, Property, Scheme
-from attacks.verdict import LIMITS, Status, headlines, judge
+from attacks.outcomes import AttackOutcome, Estimate, Knowledge, Leaked, Measured, Property, Scheme
+from attacks.verdict import LIMITS, Cell, Status, headlines, judge
 from verify.metrics import rate, wilson
 
 SCHEME = Scheme("adversarial", "generator", 16)
@@ -13,6 +13,7 @@ def outcome(
     breaks: Property,
     measured: Measured,
     *,
+    leaked: Leaked = Leaked.HOLDER_KEYS,
     knowledge: Knowledge = Knowledge.ALGORITHM,
     chance: float = 0.001,
     attack: str = "some attack",
@@ -22,6 +23,7 @@ def outcome(
     return AttackOutcome(
         attack=attack,
         breaks=breaks,
+        leaked=leaked,
         knowledge=knowledge,
         assumption="Has what it has.",
         scheme=scheme,
@@ -31,7 +33,7 @@ def outcome(
     )
 
 
-def only_cell(*outcomes: AttackOutcome, limits: dict[str, float] | None = None):
+def only_cell(*outcomes: AttackOutcome, limits: dict[str, float] | None = None) -> Cell:
     (verdict,) = judge(outcomes, limits=limits)
     (cell,) = verdict.cells
     return cell
@@ -87,14 +89,17 @@ def test_an_interval_that_holds_chance_starts_at_nothing() -> None:
 
 def test_linkability_is_compared_above_its_null() -> None:
     linked = Estimate(0.95, 0.9, 0.98, 400, "bootstrap")
-    cell = only_cell(outcome(Property.UNLINKABILITY, linked, chance=0.085))
+    stolen = Leaked.MASTER_KEY
+    cell = only_cell(outcome(Property.UNLINKABILITY, linked, leaked=stolen, chance=0.085))
     assert cell.excess == pytest.approx(0.865)
+    assert cell.limit == "linkability"
     assert cell.status is Status.FAIL
 
 
 def test_a_d_sys_below_its_null_tells_nothing() -> None:
     below = Estimate(0.01, 0.0, 0.05, 400, "bootstrap")
-    cell = only_cell(outcome(Property.UNLINKABILITY, below, chance=0.2))
+    stolen = Leaked.MASTER_KEY
+    cell = only_cell(outcome(Property.UNLINKABILITY, below, leaked=stolen, chance=0.2))
     assert (cell.excess, cell.low, cell.high) == (0.0, 0.0, 0.0)
     assert cell.status is Status.PASS
 
@@ -109,22 +114,59 @@ def test_a_doubt_is_not_hidden_behind_a_small_success() -> None:
     assert not any("no attack" in line for line in headlines(judge([known, doubtful])))
 
 
-def test_who_has_the_key_is_unlimited_unless_the_operator_limits_it() -> None:
-    replay = outcome(Property.IMPERSONATION, rate(100, 100), knowledge=Knowledge.KEY)
-    assert only_cell(replay).status is Status.UNLIMITED
-    assert only_cell(replay, limits={"success-with-key": 0.5}).status is Status.FAIL
+@pytest.mark.parametrize(
+    ("breaks", "leaked", "knowledge"),
+    [
+        (Property.IRREVERSIBILITY, Leaked.HOLDER_KEYS, Knowledge.TEMPLATES),
+        (Property.IRREVERSIBILITY, Leaked.DATABASE, Knowledge.RIGHT),
+        (Property.UNLINKABILITY, Leaked.HOLDER_KEYS, Knowledge.ALGORITHM),
+        (Property.RENEWABILITY, Leaked.HOLDER_KEYS, Knowledge.ALGORITHM),
+        (Property.IMPERSONATION, Leaked.HOLDER_KEYS, Knowledge.ALGORITHM),
+    ],
+)
+def test_what_no_template_withstands_is_without_a_limit_and_says_why(
+    breaks: Property, leaked: Leaked, knowledge: Knowledge
+) -> None:
+    broken = outcome(breaks, rate(100, 100), leaked=leaked, knowledge=knowledge)
+    cell = only_cell(broken)
+    assert (cell.limit, cell.status) == ("success-with-key", Status.UNLIMITED)
+    assert cell.reason
+    line, _no_limit_exceeded = headlines(judge([broken]))
+    assert f"leaked {leaked}" in line
+    assert line.endswith(f"By design: {cell.reason}.")
+    limited = only_cell(broken, limits={"success-with-key": 0.5})
+    assert (limited.status, limited.reason) == (Status.FAIL, None)
 
 
-def test_who_has_several_templates_has_a_limit_of_its_own() -> None:
-    meets = outcome(
-        Property.IRREVERSIBILITY, rate(90, 100), knowledge=Knowledge.TEMPLATES, attack="meets"
+@pytest.mark.parametrize("knowledge", [Knowledge.ALGORITHM, Knowledge.TEMPLATES])
+@pytest.mark.parametrize("breaks", [Property.IRREVERSIBILITY, Property.IMPERSONATION])
+def test_a_secret_rotation_leaves_next_to_nothing(breaks: Property, knowledge: Knowledge) -> None:
+    def cell(hits: int) -> Cell:
+        stolen = Leaked.MASTER_KEY
+        return only_cell(outcome(breaks, rate(hits, 1000), leaked=stolen, knowledge=knowledge))
+
+    assert (cell(1).limit, cell(1).status) == ("success-without-key", Status.PASS)
+    assert cell(30).status is Status.FAIL
+
+
+def test_a_limit_that_the_operator_lifted_has_no_reason() -> None:
+    cell = only_cell(
+        outcome(Property.IRREVERSIBILITY, rate(90, 100)), limits={"recovery-success": 1.0}
     )
-    assert only_cell(meets).limit == "success-with-templates"
-    assert only_cell(meets).status is Status.FAIL
-    assert only_cell(meets, limits={"success-with-templates": 1.0}).status is Status.UNLIMITED
-    linked = Estimate(0.3, 0.2, 0.4, 400, "bootstrap")
-    cell = only_cell(outcome(Property.UNLINKABILITY, linked, knowledge=Knowledge.TEMPLATES))
-    assert cell.limit == "linkability"
+    assert (cell.status, cell.reason) == (Status.UNLIMITED, None)
+
+
+def test_what_leaked_parts_the_cells() -> None:
+    (verdict,) = judge(
+        [
+            outcome(Property.IRREVERSIBILITY, rate(5, 1000)),
+            outcome(Property.IRREVERSIBILITY, rate(0, 1000), leaked=Leaked.MASTER_KEY),
+        ]
+    )
+    assert [(cell.outcome.leaked, cell.excess) for cell in verdict.cells] == [
+        (Leaked.MASTER_KEY, 0.0),
+        (Leaked.HOLDER_KEYS, 0.005),
+    ]
 
 
 def test_schemes_are_judged_apart() -> None:
@@ -141,7 +183,7 @@ def test_schemes_are_judged_apart() -> None:
 def test_what_fails_is_said_first() -> None:
     verdicts = judge(
         [
-            outcome(Property.IMPERSONATION, rate(100, 100), knowledge=Knowledge.KEY, attack="key"),
+            outcome(Property.IMPERSONATION, rate(100, 100), attack="key"),
             outcome(Property.IRREVERSIBILITY, rate(50, 100), attack="recovers"),
         ]
     )

@@ -13,6 +13,7 @@ import pytest
 from api.http.app import environment_of
 from benchmarks.deployment import service as serve
 from tests.api.deployment import Deployment, deploy
+from tests.ports import free_port
 
 VEILFACE = Path(sys.executable).with_name("veilface")
 
@@ -40,7 +41,7 @@ def started(deployment: Deployment, folder: Path) -> Iterator[Running]:
     """``veilface serve`` as a process of its own."""
     ours = {name: value for name, value in os.environ.items() if not name.startswith("VEILFACE_")}
     env = ours | environment_of(deployment.settings) | {"OMP_NUM_THREADS": "1"}
-    with serve(env, workers=1, log=folder / "serve.log") as url:
+    with serve(env, workers=1, log=folder / "serve.log", port=free_port()) as url:
         yield Running(url, deployment)
 
 

@@ -4,6 +4,7 @@ import asyncio
 import inspect
 import io
 import socket
+import stat
 from pathlib import Path
 
 import httpx
@@ -18,7 +19,9 @@ from veilface_client import (
     Client,
     Conflict,
     ConnectionFailed,
+    EnrollmentConflict,
     Forbidden,
+    InvalidRequest,
     LockedOut,
     NotEnrolled,
     NotFound,
@@ -28,6 +31,7 @@ from veilface_client import (
     Unauthorized,
     Unavailable,
     UnexpectedAnswer,
+    new_holder_key,
 )
 
 
@@ -46,6 +50,11 @@ def test_a_person_from_enrollment_to_receipt(service: Running, token: str, tmp_p
         assert (accepted.decision, accepted.level, accepted.fmr) == ("accept", "fmr-1e-2", 0.01)
         assert accepted.distance is not None, "the key has the right scores"
         assert client.verify("anna", str(path)).accepted
+        assert client.verify("anna", [photo(1, 3), io.BytesIO(photo(1, 4)), path])
+        with pytest.raises(PhotoRefused, match="photo 2 does not look like the person on photos"):
+            client.verify("anna", [photo(1, 3), photo(2, 0), photo(1, 4)])
+        with pytest.raises(InvalidRequest, match="at most 5 photos"):
+            client.verify("anna", [photo(1, shot) for shot in range(6)])
         rejected = client.verify("anna", photo(2, 0))
         assert not rejected
         assert rejected.reason == "no_match"
@@ -72,6 +81,92 @@ def test_a_person_from_enrollment_to_receipt(service: Running, token: str, tmp_p
     assert forged != receipt.raw
     (tmp_path / "receipt.json").write_bytes(forged)
     assert run("keys", "verify-receipt", *saved).status != 0
+
+
+def test_a_person_who_keeps_their_template(service: Running, token: str, tmp_path: Path) -> None:
+    photos, now, file = [photo(1, 0), photo(1, 1)], photo(1, 9), tmp_path / "hana.template"
+    with Client(service.url, token) as client:
+        enrolled = client.enroll("hana", photos, storage="holder")
+        held = enrolled.held_template
+        assert held is not None
+        assert "held_template" not in repr(enrolled)
+        enrolled.save_held_template(file)
+        assert stat.S_IMODE(file.stat().st_mode) == 0o600
+        with pytest.raises(FileExistsError):
+            enrolled.save_held_template(file)
+        assert client.describe("hana").storage == "holder"
+        for template in (held, file, str(file)):
+            assert client.verify("hana", now, held_template=template)
+        assert not client.verify("hana", now)
+        with pytest.raises(Conflict, match="the holder of this subject keeps its template"):
+            client.export("hana")
+        with pytest.raises(ValueError, match="storage='holder'"):
+            client.enroll("hana", photos, storage="service").save_held_template(tmp_path / "none")
+        assert client.verify("hana", now), "the service has a template again"
+        client.erase("hana")
+
+    async def asynchronously() -> list[bool]:
+        async with AsyncClient(service.url, token) as client:
+            enrolled = await client.enroll("hana", photos, storage="holder")
+            kept = (enrolled.held_template, file)
+            decisions = [await client.verify("hana", now, held_template=sent) for sent in kept]
+            await client.erase("hana")
+        return [decision.accepted for decision in decisions]
+
+    assert asyncio.run(asynchronously()) == [True, False], "the file has an earlier one"
+
+
+def test_an_enrollment_replaces_what_it_may(service: Running, token: str) -> None:
+    with Client(service.url, token) as client:
+        with pytest.raises(EnrollmentConflict, match="nothing to replace"):
+            client.enroll("ida", photo(1), replace="0" * 32)
+        first = client.enroll("ida", photo(1), replace=False)
+        with pytest.raises(EnrollmentConflict) as refused:
+            client.enroll("ida", photo(1), replace=False)
+        assert refused.value.details == {"template_id": first.template_id}
+        second = client.enroll("ida", photo(1), replace=first.template_id)
+        for wrong in ("", '"', "*", "a b"):
+            with pytest.raises(ValueError, match="template_id of an enrollment"):
+                client.enroll("ida", photo(1), replace=wrong)
+
+    async def asynchronously() -> str:
+        async with AsyncClient(service.url, token) as client:
+            for replace in (False, first.template_id):
+                with pytest.raises(EnrollmentConflict):
+                    await client.enroll("ida", photo(1), replace=replace)
+            third = await client.enroll("ida", photo(1), replace=second.template_id)
+            await client.erase("ida")
+            return third.template_id
+
+    assert len({first.template_id, second.template_id, asyncio.run(asynchronously())}) == 3
+
+
+def test_an_enrollment_that_needs_its_holders_key(service: Running, token: str) -> None:
+    key, other = new_holder_key(), new_holder_key()
+    with Client(service.url, token) as client:
+        assert client.enroll("kept", photo(7), holder_key=key).holder_key
+        assert client.describe("kept").holder_key
+        assert client.verify("kept", photo(7, 1), holder_key=key)
+        for wrong in (other, None):
+            assert not client.verify("kept", photo(7, 1), holder_key=wrong)
+        assert not client.enroll("kept", photo(7)).holder_key
+        assert client.verify("kept", photo(7, 1), holder_key=other)
+        for no_key in (b"", key[:31], key + b"x", key.hex()):
+            with pytest.raises(ValueError, match="32 bytes") as caught:
+                client.verify("kept", photo(7, 1), holder_key=no_key)  # type: ignore[arg-type]
+            assert key.hex()[:8] not in str(caught.value)
+        client.erase("kept")
+
+    async def asynchronously() -> list[bool]:
+        async with AsyncClient(service.url, token) as client:
+            await client.enroll("kept", photo(7), holder_key=key)
+            decisions = [
+                await client.verify("kept", photo(7, 1), holder_key=sent) for sent in (key, other)
+            ]
+            await client.erase("kept")
+        return [decision.accepted for decision in decisions]
+
+    assert asyncio.run(asynchronously()) == [True, False]
 
 
 def test_export_and_import(service: Running, token: str) -> None:
@@ -133,7 +228,7 @@ def test_every_call_asynchronously(service: Running, token: str, tmp_path: Path)
             enrolled = await client.enroll("emil", [path, photo(7, 1)])
             assert len(enrolled.images) == 2
             answers = await asyncio.gather(
-                client.verify("emil", photo(7, 2)), client.verify("emil", photo(8))
+                client.verify("emil", [photo(7, 2), path]), client.verify("emil", photo(8))
             )
             assert [bool(each) for each in answers] == [True, False]
             assert (await client.describe("emil")).photos == 2

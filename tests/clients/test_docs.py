@@ -33,11 +33,11 @@ PYTHON = [
 
 @pytest.fixture
 def newcomer(service: Running, token: str, tmp_path: Path) -> tuple[Path, dict[str, str]]:
-    """A folder with three photos and a pack, on a service where nobody is enrolled."""
+    """A folder with four photos and a pack, on a service where nobody is enrolled."""
     with Client(service.url, token) as client:
         for subject in list(client.subjects()):
             client.erase(subject.subject_id)
-    for shot in range(3):
+    for shot in range(4):
         (tmp_path / f"anna{shot + 1}.jpg").write_bytes(photo(1, shot))
     (tmp_path / "buffalo_l").symlink_to(service.pack)
     path = f"{VEILFACE.parent}:{os.environ['PATH']}"
@@ -66,7 +66,7 @@ def test_a_snippet_prints_what_it_says(
 
 def test_the_same_from_the_shell(service: Running, newcomer: tuple[Path, dict[str, str]]) -> None:
     folder, env = newcomer
-    install, script = blocks(PAGES[0], "sh")
+    install, _, script = blocks(PAGES[0], "sh")
     assert install == "pip install ./clients/python\n"
     assert (ROOT / "clients" / "python" / "pyproject.toml").exists()
     done = subprocess.run(
@@ -78,6 +78,25 @@ def test_the_same_from_the_shell(service: Running, newcomer: tuple[Path, dict[st
     )
     assert done.returncode == 0, done.stderr
     assert '"decision":"accept"' in done.stdout.replace(": ", ":")
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_the_command_as_the_pages_use_it(
+    page: str, service: Running, newcomer: tuple[Path, dict[str, str]]
+) -> None:
+    folder, env = newcomer
+    (script,) = (block for block in blocks(page, "sh") if block.startswith("veilface-client "))
+    done = subprocess.run(
+        ["bash", "-euo", "pipefail", "-c", script],
+        cwd=folder,
+        env=env | {"VEILFACE_URL": service.url},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    enrolled, verified = done.stdout.splitlines()
+    assert enrolled.startswith("Enrolled anna from 2 photos")
+    assert verified == "accept: anna, level fmr-1e-3"
 
 
 def test_the_table_of_classes_is_that_of_the_code() -> None:

@@ -114,7 +114,7 @@ DECISION = {
 
 
 def test_fields_to_come_are_ignored_and_values_are_frozen() -> None:
-    decision = parse(results.Decision, answer(200, {**DECISION, "liveness": 0.9}))
+    decision = parse(results.Decision, answer(200, {**DECISION, "of_a_later_version": 0.9}))
     assert decision.accepted
     with pytest.raises(ValidationError, match="frozen"):
         decision.decision = "reject"

@@ -92,7 +92,7 @@ def traffic(
         "plain mean": mean,
         "descriptor that was lifted": mean / np.linalg.norm(mean),
     }
-    crops = [pack.crop_photo(each, policy=FacePolicy.SINGLE, quality=None)[0] for each in files]
+    crops = [pack.crop_photo(each, policy=FacePolicy.SINGLE, quality=None).crop for each in files]
     strings = {
         name: content
         for i, (file, crop) in enumerate(zip(files, crops, strict=True))
@@ -146,7 +146,10 @@ NAMES = [*(f"descriptor {i}" for i in range(ENROLLED + 1)), "plain mean"]
 NAMES.append("descriptor that was lifted")
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=pytest.mark.long if name[-1] in "123" else ()) for name in NAMES],
+)
 def test_a_descriptor_is_found_in_every_encoding(traffic: Traffic, name: str) -> None:
     """Planted into the recording itself, in the place of the template's first bytes."""
     values = traffic.descriptors[name]

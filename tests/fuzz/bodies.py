@@ -42,6 +42,7 @@ class Bodies:
     def __init__(self) -> None:
         self.document = {
             "embedding": [0.1] * 16,
+            "embeddings": [[0.1] * 8, [0.2] * 8],
             "template": "AAAA",
             "level": "fmr-1e-3",
             "nonce": "x",

@@ -1,13 +1,10 @@
-"""Hostile contract files: documents that were changed, with a cohort that was sealed anew."""
+"""Hostile contract files: documents that were changed, with a sealed part that was sealed anew."""
 
 import base64
 import json
 import random
 from pathlib import Path
 from typing import Any
-
-import numpy as np
-import safetensors.numpy
 
 from templates.contract.document import Contract, _seal_context
 from templates.errors import ContractError
@@ -33,10 +30,9 @@ class Contracts:
             self.contract.save(file, SEALER)
         self.sound = file.read_bytes()
         self.document: dict[str, Any] = json.loads(self.sound)
-        cohort = self.contract.cohort
-        self.cohort = safetensors.numpy.save(
-            {"feet": np.ascontiguousarray(cohort.feet), "bases": np.ascontiguousarray(cohort.bases)}
-        )
+        sealed = self.document.pop("sealed")
+        self.plain = SEALER.open(base64.b64decode(sealed), context=_seal_context(self.document))
+        self.document["sealed"] = sealed
 
     def make(self, rng: random.Random) -> bytes:
         """One case."""
@@ -52,19 +48,19 @@ class Contracts:
         return self._sealed(rng)
 
     def _sealed(self, rng: random.Random) -> bytes:
-        """A document whose cohort opens, whatever it says: a seal holds the hash of the rest."""
-        document = {key: value for key, value in self.document.items() if key != "cohort"}
+        """A document whose sealed part opens, whatever it says."""
+        document = {key: value for key, value in self.document.items() if key != "sealed"}
         if rng.random() < 0.7:
             changed = twisted(rng, document)
             document = changed if isinstance(changed, dict) else document
-        cohort = self.cohort
+        inside = self.plain
         if rng.random() < 0.7:
-            cohort = hostile_tensors(rng, cohort, [cohort])
+            inside = hostile_tensors(rng, inside, [inside])
         try:
             plain = json.loads(written(rng, document))
             context = _seal_context(plain)
         except (ContractError, ValueError, KeyError, TypeError, RecursionError):
-            return written(rng, {**document, "cohort": self.document["cohort"]})
+            return written(rng, {**document, "sealed": self.document["sealed"]})
         with repeatable(rng):
-            sealed = SEALER.seal(cohort, context=context)
-        return json.dumps({**plain, "cohort": base64.b64encode(sealed).decode()}).encode()
+            sealed = SEALER.seal(inside, context=context)
+        return json.dumps({**plain, "sealed": base64.b64encode(sealed).decode()}).encode()

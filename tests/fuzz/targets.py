@@ -100,17 +100,20 @@ def template(folder: Path) -> Target:
 
 def probe(folder: Path) -> Target:
     """``Verifier.decide_template``: a lifted probe on its way to a decision."""
+    from enroll import Enrollment
     from templates.contract import wire
     from templates.errors import ContractMismatch, InvalidTemplate, Uncalibrated
+    from templates.keys.rotation import TenantRotation
     from tests.fuzz.tensors import Templates, subspace
     from tests.templates.contract.test_contract import M, N, make_contract
     from verify import Verifier
 
     contract = make_contract()
-    rotation = np.linalg.qr(np.random.default_rng(0).normal(size=(N, N)))[0]
+    rotation = TenantRotation(bytes(32), N)
     verifier = Verifier(contract, rotation=rotation)
-    enrolled = subspace(N, M, 5).rotated(rotation)
-    stored = wire.encode(enrolled, contract_id=contract.contract_id)
+    enrolled = subspace(N, M, 5).turned_by(rotation.of("template").turned)
+    data = wire.encode(enrolled, contract_id=contract.contract_id)
+    stored = Enrollment(data, "template", contract.contract_id, ())
     templates = Templates(contract.contract_id)
     right = [one for one in templates.sound if (wire.decode(one).subspace.n) == N]
     templates.sound = right * 3 + templates.sound
@@ -118,7 +121,7 @@ def probe(folder: Path) -> Target:
     def read(data: bytes) -> None:
         decision = verifier.decide_template(data, stored)
         demand(np.isfinite(decision.distance), "a finite distance")
-        demand(np.isfinite(decision.cohort_score), "a finite cohort score")
+        demand(np.isfinite(decision.score), "a finite score")
 
     read(wire.encode(subspace(N, 2), contract_id=contract.contract_id))  # compiles the kernels
     refusals = (InvalidTemplate, ContractMismatch, Uncalibrated)
@@ -133,7 +136,7 @@ def export(folder: Path) -> Target:
     from tests.fuzz.tensors import CONTRACT, KEY, TENANT, Exports
 
     def read(data: bytes) -> None:
-        exported = open_export(data, key=KEY, tenant=TENANT, contract_id=CONTRACT)
+        exported = open_export(data, key=KEY, tenant=TENANT, contract_ids=[CONTRACT])
         demand(exported.contract_id == CONTRACT, "the contract that was asked for")
         wire.decode(exported.wire)
 
@@ -163,7 +166,7 @@ def bin_file(folder: Path) -> Target:
 
 
 def contract(folder: Path) -> Target:
-    """``templates.contract.document``: the contract file, its JSON and its sealed cohort."""
+    """``templates.contract.document``: the contract file, its JSON and its sealed part."""
     from templates.contract.document import Binding, Contract
     from templates.errors import ContractError, SealError
     from tests.fuzz import regressions
@@ -178,8 +181,8 @@ def contract(folder: Path) -> Target:
         public = loaded.public()
         demand(json.loads(json.dumps(public, allow_nan=False)) == public, "plain JSON")
         demand(Binding.from_json(public["binding"]) == loaded.binding, "a binding as it was read")
-        score = loaded.cohort.foot_norms
-        demand(bool(np.isfinite(score).all()), "a finite cohort")
+        expected = loaded.expectation.statistics(loaded.nobody.people)
+        demand(bool(np.isfinite(expected).all()), "finite expectations")
 
     made = Contracts(folder)
     return Target(read, (ContractError, SealError), made.make, 64, regressions.contracts(folder))

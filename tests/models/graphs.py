@@ -102,6 +102,80 @@ def yunet_shapes() -> bytes:
     return shaped([("input", [1, 3, 640, 640])], outputs)
 
 
+def mean_liveness(weights: np.ndarray, *, size: Dim = 80, softmax: bool = False) -> bytes:
+    """A liveness graph: logits are the means of the crop's channels times ``weights``, (3, k)."""
+    classes = weights.shape[1]
+    nodes = [
+        helper.make_node("GlobalAveragePool", ["input"], ["pooled"]),
+        helper.make_node("Flatten", ["pooled"], ["means"]),
+        helper.make_node("MatMul", ["means", "weights"], ["logits" if softmax else "output"]),
+    ]
+    if softmax:
+        nodes.append(helper.make_node("Softmax", ["logits"], ["output"], axis=1))
+    graph = helper.make_graph(
+        nodes,
+        "liveness",
+        [_value("input", ["N", 3, size, size])],
+        [_value("output", ["N", classes])],
+        [helper.make_tensor("weights", TensorProto.FLOAT, [3, classes], weights.ravel())],
+    )
+    return _save(graph)
+
+
+def fixed_face_detector(box: Sequence[float], keypoints: np.ndarray, *, canvas: int = 128) -> bytes:
+    """A YuNet that sees one face at one place, of every canvas that is not all black."""
+    x1, y1, x2, y2 = box
+    constants, nodes = [], []
+    for stride in (8, 16, 32):
+        cells = (canvas // stride) ** 2
+        parts = {
+            "cls": np.zeros((1, cells, 1)),
+            "seen": np.zeros((1, cells, 1)),
+            "bbox": np.zeros((1, cells, 4)),
+            "kps": np.zeros((1, cells, 10)),
+        }
+        if stride == 32:
+            # Of the first cell, whose corner is the origin.
+            parts["cls"][0, 0] = parts["seen"][0, 0] = 1
+            centre = [(x1 + x2) / 2 / stride, (y1 + y2) / 2 / stride]
+            sides = [np.log((x2 - x1) / stride), np.log((y2 - y1) / stride)]
+            parts["bbox"][0, 0] = [*centre, *sides]
+            parts["kps"][0, 0] = (keypoints / stride).ravel()
+        for name, values in parts.items():
+            made = "seen" if name == "seen" else f"{name}_made"
+            constants.append(
+                helper.make_tensor(
+                    f"{made}_{stride}", TensorProto.FLOAT, values.shape, values.ravel()
+                )
+            )
+            if name == "seen":
+                nodes.append(
+                    helper.make_node("Mul", [f"seen_{stride}", "light"], [f"obj_{stride}"])
+                )
+            else:
+                nodes.append(
+                    helper.make_node("Identity", [f"{made}_{stride}"], [f"{name}_{stride}"])
+                )
+    constants.append(helper.make_tensor("gain", TensorProto.FLOAT, [], [1.0]))
+    light = [
+        helper.make_node("ReduceMax", ["input"], ["brightest"], keepdims=0),
+        helper.make_node("Min", ["brightest", "gain"], ["light"]),
+    ]
+    widths = {"cls": 1, "obj": 1, "bbox": 4, "kps": 10}
+    graph = helper.make_graph(
+        [*light, *nodes],
+        "fixed-face",
+        [_value("input", [1, 3, canvas, canvas])],
+        [
+            _value(f"{name}_{stride}", [1, (canvas // stride) ** 2, width])
+            for name, width in widths.items()
+            for stride in (8, 16, 32)
+        ],
+        constants,
+    )
+    return _save(graph)
+
+
 def write_pack(folder: Path, **files: bytes) -> Path:
     """A pack folder with ``name=bytes`` written to ``name.onnx``."""
     folder.mkdir(parents=True, exist_ok=True)

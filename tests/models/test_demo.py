@@ -23,7 +23,7 @@ from models.errors import NoFace
 from models.pack import ModelPack
 from models.synthetic import draw_face, draw_people, encode_photo
 
-PEOPLE, PHOTOS = 200, 4
+PEOPLE, PHOTOS = 100, 4
 
 
 def normalised(faces: np.ndarray) -> np.ndarray:
@@ -37,8 +37,12 @@ def session() -> ort.InferenceSession:
 
 
 @pytest.fixture(scope="module")
-def descriptors(session) -> np.ndarray:
-    faces = draw_people(range(PEOPLE), range(PHOTOS))
+def faces() -> np.ndarray:
+    return draw_people(range(PEOPLE), range(PHOTOS))
+
+
+@pytest.fixture(scope="module")
+def descriptors(session, faces) -> np.ndarray:
     raw = session.run(None, {"image": normalised(faces)})[0]
     return (raw / np.linalg.norm(raw, axis=1, keepdims=True)).reshape(PEOPLE, PHOTOS, -1)
 
@@ -88,8 +92,8 @@ def other_pictures() -> Iterator[np.ndarray]:
         yield from (face[::-1].copy(), np.roll(face, 20, axis=0), np.roll(face, 25, axis=1))
 
 
-def test_drawn_faces_and_nothing_else_are_taken_for_faces():
-    for face in draw_people(range(PEOPLE), range(2)):
+def test_drawn_faces_and_nothing_else_are_taken_for_faces(faces):
+    for face in faces:
         require_face(face)
     for picture in other_pictures():
         with pytest.raises(NoFace, match="no cartoon face was found"):
@@ -169,7 +173,7 @@ def test_raw_descriptors_separate_synthetic_people(descriptors):
 def test_adversarially_lifted_descriptors_still_separate(descriptors):
     """Spherical point to subspace (docs/method.md §3.4), m = 8, decoys from other people."""
     m = 8
-    decoys, people = descriptors[:100, 0], descriptors[100:]
+    decoys, people = descriptors[:50, 0], descriptors[50:]
     rng = np.random.default_rng(5)
     genuine, impostor = [], []
     for i, person in enumerate(people):

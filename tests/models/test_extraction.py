@@ -1,4 +1,6 @@
 import io
+import itertools
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -135,6 +137,17 @@ def test_the_cache_file_is_written_even_when_inference_breaks(pack, files, monke
     assert flushed == [True]
 
 
+def test_the_cache_file_is_written_now_and_then(pack, files, monkeypatch):
+    """By a clock that ticks when it is read: 15 ticks apart, or 20 times what writing takes."""
+    monkeypatch.setattr(extraction, "CHUNK", 1)
+    clock = itertools.count()
+    monkeypatch.setattr(extraction, "time", SimpleNamespace(monotonic=lambda: next(clock)))
+    cache, told, flushed = EmbeddingCache(), [], []
+    monkeypatch.setattr(cache, "flush", lambda: flushed.append(sum(told)))
+    Extractor(pack, cache=cache).extract((files * 6)[:40], progress=told.append)
+    assert flushed == [15, 35, 40]
+
+
 def test_a_function_is_told_how_many_are_done(pack, files, monkeypatch):
     monkeypatch.setattr(extraction, "CHUNK", 3)
     told = []
@@ -153,6 +166,7 @@ def test_the_bar_appears_only_when_asked_and_late(pack, files, monkeypatch, caps
     out, err = capsys.readouterr()
     assert out == ""
     assert "7/7" in err
+    assert "photos/s" in err
 
 
 def test_repr_shows_no_numbers(pack, files):

@@ -15,7 +15,8 @@ from models.errors import (
     PackError,
     ProviderUnavailable,
 )
-from models.pack import FacePolicy, ModelPack, inspect
+from models.pack import FacePolicy, ModelPack
+from models.pack_graphs import inspect
 from models.quality import QualityLimits
 from models.signature import Role
 from tests.models import graphs
@@ -262,7 +263,7 @@ def test_own_alignment_agrees_with_the_public_crops(real, lfw_photos, lfw_aligne
 
 
 def test_lfw_pairs_are_told_apart(mbf_pack_dir, lfw_aligned):
-    """A slice of view 2 at the threshold of FMR 1e-4 that data/README.md states."""
+    """A slice of view 2 at the cosine that all of LFW has at FMR 1e-4."""
     pack = ModelPack.load(mbf_pack_dir, threads=1)
     lines = (lfw_aligned / "pairs.txt").read_text().splitlines()[1:]
     genuine = [line.split("\t") for line in lines[:25]]

@@ -1,7 +1,7 @@
 import pytest
 
 from models.errors import PackError
-from models.pack_file import PackFile, read_pack_file
+from models.pack_file import LivenessStatement, PackFile, read_pack_file
 
 
 def read(folder, text):
@@ -35,6 +35,39 @@ def test_all_keys(tmp_path):
     )
 
 
+def test_liveness_graphs_by_their_file(tmp_path):
+    stated = read(
+        tmp_path,
+        """
+        [[liveness]]
+        file = "first.onnx"
+        [[liveness]]
+        file = "second.onnx"
+        crop_scale = 1.5
+        crop = "square"
+        input_size = 128
+        channel_order = "rgb"
+        input_range = [0, 1]
+        live_class = 0
+        score = "difference"
+        """,
+    )
+    assert stated == PackFile(
+        liveness={
+            "first.onnx": LivenessStatement(),
+            "second.onnx": LivenessStatement(
+                crop_scale=1.5,
+                crop="square",
+                input_size=128,
+                channel_order="rgb",
+                input_range=(0.0, 1.0),
+                live_class=0,
+                score="difference",
+            ),
+        }
+    )
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -55,6 +88,20 @@ def test_all_keys(tmp_path):
         ("[embedder]\ninput_size = 112.0", "multiple of 16"),
         ("[detector]\ninput_size = 100", "multiple of 32"),
         ("[detector]\ninput_size = 65536", "to 2048"),
+        ("[liveness]\nfile = 'a'", r"must be a table, written \[\[liveness\]\]"),
+        ("liveness = 3", r"must be a table, written \[\[liveness\]\]"),
+        ("[[liveness]]\nfile = 'a'\nscale = 2", "unknown key 'scale'.*crop_scale"),
+        ("[[liveness]]\ncrop_scale = 2", "needs 'file'"),
+        ("[[liveness]]\nfile = 'a'\n[[liveness]]\nfile = 'a'", "states a twice"),
+        ("[[liveness]]\nfile = 'a'\ncrop_scale = 0.1", "number from 0.5 to 8"),
+        ("[[liveness]]\nfile = 'a'\ncrop_scale = nan", "number from 0.5 to 8"),
+        ("[[liveness]]\nfile = 'a'\ncrop = 'round'", '"box" or "square"'),
+        ("[[liveness]]\nfile = 'a'\ninput_range = [1, 0]", "two numbers that ascend"),
+        ("[[liveness]]\nfile = 'a'\ninput_range = 1", "two numbers that ascend"),
+        ("[[liveness]]\nfile = 'a'\nlive_class = -1", "whole number from 0"),
+        ("[[liveness]]\nfile = 'a'\nlive_class = true", "whole number from 0"),
+        ("[[liveness]]\nfile = 'a'\nscore = 'argmax'", '"softmax" or "difference"'),
+        ("[[liveness]]\nfile = 'a'\ninput_size = 8", "from 16"),
         ("# " + "x" * 70_000, "not a pack.toml"),
     ],
 )

@@ -38,7 +38,11 @@ def net(size, outputs, channels=3):
         (net((120, 120), [("a", [1, 512])]), Role.UNKNOWN),
         (net((96, 96), [("a", [1, 512])]), Role.UNKNOWN),
         (net((112, 112), [("a", [1, 512])], channels=1), Role.UNKNOWN),
-        (net((80, 80), [("output", ["N", 3])]), Role.UNKNOWN),
+        (net((80, 80), [("output", ["N", 3])]), Role.LIVENESS),
+        (net((80, 80), [("output", ["N", 2])]), Role.UNKNOWN),
+        # Two or three numbers are no embedding, whatever the size.
+        (net((128, 128), [("output", ["N", 2])]), Role.UNKNOWN),
+        (net((112, 112), [("output", ["N", 3])]), Role.UNKNOWN),
         (graphs.shaped([("a", [1, 4]), ("b", [1, 4])], [("o", [1, 4])]), Role.UNKNOWN),
     ],
 )
@@ -147,7 +151,8 @@ def as_onnx_reads_it(model: bytes) -> Signature:
         )
 
     kinds = tuple(node.op_type for node in graph.node[:FIRST_NODES])
-    return Signature(tensors(graph.input), tensors(graph.output), kinds)
+    maker = next((n.op_type for n in graph.node if graph.output[0].name in n.output), "")
+    return Signature(tensors(graph.input), tensors(graph.output), kinds, maker)
 
 
 MADE = [
@@ -186,6 +191,6 @@ def test_real_packs(mbf_pack_dir, yunet_pack_dir, shared_data):
         "w600k_mbf.onnx": (Role.EMBEDDER, False),
         "yunet_n_dynamic.onnx": (Role.YUNET, False),
         "mobilefacenet_y1_128d_fp32.onnx": (Role.EMBEDDER, True),
-        "minifasnet_v2_2.7_80x80.onnx": (Role.UNKNOWN, False),
-        "minifasnet_v1se_4.0_80x80.onnx": (Role.UNKNOWN, False),
+        "minifasnet_v2_2.7_80x80.onnx": (Role.LIVENESS, False),
+        "minifasnet_v1se_4.0_80x80.onnx": (Role.LIVENESS, False),
     }

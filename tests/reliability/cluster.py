@@ -11,7 +11,7 @@ from pathlib import Path
 import psycopg
 
 from tests.patience import PATIENCE_S
-from tests.reliability.service import free_port
+from tests.ports import free_port
 
 ACCOUNT = "postgres"
 

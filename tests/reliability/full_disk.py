@@ -17,11 +17,12 @@ import httpx
 
 from tests.api.deployment import deploy
 from tests.patience import PATIENCE_S
+from tests.ports import free_port
 from tests.reliability.evidence import examine, unexpected
 from tests.reliability.kill import QUIET
 from tests.reliability.load import Load, look_at_all, make_subjects, people_of
 from tests.reliability.operations import Clients, Operation, People
-from tests.reliability.service import Service, free_port
+from tests.reliability.service import Service
 
 MOUNT_BYTES = 4 * 1024 * 1024
 FILE_LIMIT_BYTES = 12 * 1024

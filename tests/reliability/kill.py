@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from tests.api.deployment import deploy
+from tests.ports import free_port
 from tests.reliability.evidence import examine, unexpected
 from tests.reliability.load import Load, look_at_all, make_subjects, people_of
 from tests.reliability.operations import LOST, NOT_SENT, Clients, Operation, People
-from tests.reliability.service import Service, free_port
+from tests.reliability.service import Service
 
 WORKERS = 2
 WRITERS = 5
@@ -31,7 +32,7 @@ QUIET: dict[str, Any] = {
     "probe_window_s": 3600,
     "queue_limit": 256,
 }
-"""Settings under which nothing but the faults of a scenario makes the service refuse."""
+"""Settings at which nothing but the faults of a scenario refuses."""
 
 
 @dataclass

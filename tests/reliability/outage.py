@@ -12,12 +12,13 @@ import httpx
 
 from tests.api.deployment import deploy
 from tests.patience import PATIENCE_S, wait_until
+from tests.ports import free_port
 from tests.reliability.cluster import Cluster
 from tests.reliability.evidence import examine, unexpected
 from tests.reliability.kill import QUIET
 from tests.reliability.load import Load, look_at_all, make_subjects, people_of
 from tests.reliability.operations import Clients, Operation, People
-from tests.reliability.service import Service, free_port
+from tests.reliability.service import Service
 
 WRITERS = 5
 READERS = 3

@@ -13,11 +13,12 @@ from typing import Any
 import psutil
 
 from tests.api.deployment import deploy
+from tests.ports import free_port
 from tests.reliability.evidence import examine, unexpected
 from tests.reliability.kill import QUIET
 from tests.reliability.load import look_at_all, make_subjects, people_of
 from tests.reliability.operations import Clients, Operation, People
-from tests.reliability.service import Service, free_port
+from tests.reliability.service import Service
 
 CLIENTS = 32
 SUBJECTS = 5

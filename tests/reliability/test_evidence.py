@@ -143,7 +143,7 @@ def keeps_what_was_erased(stopped: StoppedDeployment) -> None:
     with stopped.store() as store:
         other = store.subjects.get("default", "subject-0")
         assert other is not None
-        columns = ("contract_id", "n", "m", "dtype", "source", "photos")
+        columns = ("contract_id", "n", "m", "dtype", "source", "photos", "template_id")
         known = {name: getattr(other.record, name) for name in columns}
         store.subjects.put("default", "subject-1", other.wire, **known)
 

@@ -12,10 +12,11 @@ import pytest
 from api.http.app import IMPORT_S
 from tests.api.deployment import deploy
 from tests.patience import wait_until
+from tests.ports import free_port
 from tests.reliability.cluster import Cluster
 from tests.reliability.kill import QUIET
 from tests.reliability.operations import Clients, People
-from tests.reliability.service import START_S, Service, free_port
+from tests.reliability.service import START_S, Service
 
 pytestmark = pytest.mark.long
 

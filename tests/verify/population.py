@@ -7,13 +7,12 @@ from numpy.typing import NDArray
 
 from templates.contract.document import Binding, Contract
 from templates.decoys import DecoyGenerator
-from templates.distances import DEFAULT_STEPS, Metric
 from templates.keys.randomness import Keystream
 from templates.keys.rotation import ROTATION_VERSION
 from templates.space.lifting import Strategy, lift
 from templates.space.subspace import SubspaceBatch
 from verify import CalibrationOptions, calibrate
-from verify.cohort import make_cohort, people_like
+from verify.cohort import people_like
 from verify.strangers import make_nobody
 
 N, M = 64, 8
@@ -56,17 +55,7 @@ def contract() -> Contract:
     """A contract, calibrated as `veilface calibrate` does; its secrets are drawn of a seed."""
     hidden = people_like(decoys(), enrolled(PEOPLE, seed=2))
     with Keystream.seeded("population", "secrets") as stream:
-        cohort = make_cohort(
-            decoys(), strategy=Strategy.ADVERSARIAL, m=M, stream=stream, hidden=hidden
-        )
-        nobody = make_nobody(
-            decoys(),
-            strangers=(hidden,),
-            cohort=cohort,
-            metric=Metric.SPHERICAL,
-            steps=DEFAULT_STEPS,
-            stream=stream,
-        )
+        nobody = make_nobody(decoys(), strangers=(hidden,), stream=stream)
     return calibrate(
         photos_of(PEOPLE, PHOTOS + 1, seed=2).reshape(-1, N),
         [f"p{i}" for i in range(PEOPLE) for _ in range(PHOTOS + 1)],
@@ -80,7 +69,6 @@ def contract() -> Contract:
             rotation_version=ROTATION_VERSION,
         ),
         source=decoys(),
-        cohort=cohort,
         nobody=nobody,
         options=CalibrationOptions(targets=(1e-2, 1e-3), most_cells=100_000),
     ).contract

@@ -1,19 +1,19 @@
 """Synthetic people: descriptors that cluster by person, and contracts calibrated on them."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from templates.contract.document import Binding
 from templates.decoys import DecoyGenerator, DecoyPool
-from templates.keys.rotation import ROTATION_VERSION
+from templates.keys.rotation import ROTATION_VERSION, TenantRotation
 from templates.space.lifting import Strategy
-from templates.space.subspace import AffineSubspace
 from verify import Calibrated, CalibrationOptions, calibrate
 
 N = 64
 M = 6
+LIFT_SECRET = bytes(range(32))
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,12 +26,6 @@ class People:
 
 def unit(rows: NDArray[np.floating]) -> NDArray[np.float32]:
     return np.asarray(rows / np.linalg.norm(rows, axis=-1, keepdims=True), dtype=np.float32)
-
-
-def rounded(template: AffineSubspace) -> AffineSubspace:
-    """The template as the cohort test sees it: rows in multiples of 1/127 of their largest."""
-    steps = np.abs(template.basis).max(axis=1, keepdims=True) / np.float32(127)
-    return replace(template, basis=np.rint(template.basis / steps) * steps)
 
 
 def draw_people(
@@ -86,9 +80,18 @@ def calibrate_people(
         source=source,
         options=options
         or CalibrationOptions(
-            probe_dims=(0, 2), lifted_probes=300, lifted_impostor_pairs=30_000, steps=20
+            probe_dims=(0, 2),
+            probe_photos=(1,),
+            lifted_probes=300,
+            lifted_impostor_pairs=30_000,
+            steps=20,
         ),
     )
+
+
+def tenant_rotation(n: int = N, seed: int = 5) -> TenantRotation:
+    """Gives the templates of one tenant their rotations."""
+    return TenantRotation(seed.to_bytes(32), n)
 
 
 def random_rotation(n: int = N, seed: int = 5) -> NDArray[np.float64]:

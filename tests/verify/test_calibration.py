@@ -9,26 +9,30 @@ from numpy.typing import NDArray
 from enroll import Enroller
 from templates.contract import wire
 from templates.contract.document import Contract
+from templates.distances import Metric
 from templates.errors import ContractError, ContractMismatch, InvalidEmbedding
 from templates.keys.randomness import Keystream
+from templates.space.lifting import lift
 from templates.space.subspace import SubspaceBatch
 from tests.verify.synthetic import (
+    LIFT_SECRET,
     People,
     calibrate_people,
     draw_people,
     make_binding,
     make_generator,
     make_pool,
-    random_rotation,
-    rounded,
+    tenant_rotation,
+    unit,
 )
 from verify import Calibrated, CalibrationOptions, Verifier, calibrate
 from verify.calibration import _default_level, _protocol_pairs
 from verify.calibration_mode import ACCURACY_LEVEL
-from verify.cohort import client_source, make_cohort
+from verify.cohort import client_source
 from verify.comparisons import Lifter, honest_norms, point_trials, through_wire
+from verify.expectation import fit_expectation
 from verify.tenfold import Pair
-from verify.trials import enrolled_means, plan_trials
+from verify.trials import enrolled_means, plan_trials, probe_sets
 
 
 def spherical(
@@ -39,51 +43,132 @@ def spherical(
     return float(e @ p + np.sqrt(1 - p @ p) * np.linalg.norm(d @ e))
 
 
-def test_point_trials_agree_with_brute_force() -> None:
+@pytest.mark.parametrize("most_templates", [None, 9])
+def test_point_trials_agree_with_brute_force(most_templates: int | None) -> None:
     people = draw_people(12)
     source = make_generator()
     rng = np.random.default_rng(0)
-    plan = plan_trials(people.names, photos_per_enrollment=3, rng=rng)
+    plan = plan_trials(
+        people.names, photos_per_enrollment=3, rng=rng, most_templates=most_templates
+    )
+    compared = plan.compared.tolist()
     lifter = Lifter(make_binding(source.source_id).strategy, source, "0" * 64)
     with Keystream.seeded("test") as stream:
-        templates = lifter.lift(enrolled_means(people.descriptors, plan), m=6, stream=stream)
-        cohort = make_cohort(source, strategy=lifter.strategy, m=6, stream=stream, size=10)
-    options = CalibrationOptions()
+        means = enrolled_means(people.descriptors, plan)[compared]
+        templates = lifter.lift(means, m=6, stream=stream)
+        expectation = fit_expectation(
+            source,
+            source,
+            strategy=lifter.strategy,
+            m=6,
+            metric=Metric.SPHERICAL,
+            stream=stream,
+            templates=200,
+        )
     impostors, genuine = point_trials(
         people.descriptors,
         plan,
         templates,
-        cohort,
-        metric=options.metric,
-        steps=options.steps,
-        most_cells=10**6,
-        rng=rng,
+        expectation,
+        probe_sets(plan, 1, most=10**6, rng=rng),
+        consistency=1.0,
         progress=lambda _what, _share: None,
     )
-    expected, expected_z, seen = [], [], []
-    for photo, descriptor in enumerate(people.descriptors):
-        crowd = [spherical(descriptor, t.foot, rounded(t).basis) for t in cohort]
-        for person, template in enumerate(templates):
-            score = spherical(descriptor, template.foot, template.basis)
-            if person != plan.person_of[photo]:
-                expected.append(score)
-                expected_z.append((score - np.mean(crowd)) / np.std(crowd, ddof=1))
-                seen.append((plan.person_of[photo], person))
-    cells = np.flatnonzero(np.isfinite(impostors.similarities))
-    assert impostors.trials == len(cells) == len(expected)
-    np.testing.assert_allclose(impostors.similarities[cells], expected, atol=2e-6)
-    np.testing.assert_allclose(impostors.cohort_scores[cells], expected_z, atol=2e-4)
-    np.testing.assert_array_equal(impostors.people_of(cells), seen)
-    assert impostors.person_pairs == 12 * 11 // 2
+    means, spreads = expectation.statistics(people.descriptors)
+
+    def score(photo: int, person: int) -> float:
+        template = templates[compared.index(person)]
+        close = spherical(people.descriptors[photo], template.foot, template.basis)
+        return float((close - means[photo]) / spreads[photo])
+
+    photos = np.concatenate(
+        [plan.genuine, np.setdiff1d(np.arange(len(people.names)), plan.genuine)]
+    )
+    trials = {
+        (photo, person): score(photo, person)
+        for photo in photos
+        for person in compared
+        if person != plan.person_of[photo]
+    }
+    seen = [(plan.person_of[photo], person) for photo, person in trials]
+    cells = np.flatnonzero(np.isfinite(impostors.scores))
+    assert impostors.trials == len(cells) == len(trials)
+    np.testing.assert_allclose(
+        np.sort(impostors.scores[cells]), np.sort(list(trials.values())), atol=2e-4
+    )
+    assert sorted(map(tuple, impostors.people_of(cells))) == sorted(seen)
+    for cell in cells[::7]:
+        owner, person = impostors.people_of(cell[None])[0]
+        own = [trials[photo, person] for photo in photos if plan.person_of[photo] == owner]
+        assert np.abs(np.array(own) - impostors.scores[cell]).min() < 2e-4
+    assert impostors.person_pairs == len({frozenset(map(int, pair)) for pair in seen})
     weights = rng.integers(0, 4, 12).astype(float)
     total = sum(weights[a] * weights[b] for a, b in seen)
     assert impostors.weighted_trials(weights) == pytest.approx(total)
-    own = [
-        spherical(people.descriptors[photo], templates[person].foot, templates[person].basis)
-        for photo, person in zip(plan.genuine, plan.person_of[plan.genuine], strict=True)
-    ]
-    np.testing.assert_allclose(genuine.similarities, own, atol=2e-6)
-    np.testing.assert_array_equal(genuine.people, plan.person_of[plan.genuine])
+    order = np.argsort(genuine.people, kind="stable")
+    owners = plan.person_of[plan.genuine]
+    np.testing.assert_array_equal(genuine.people[order], np.sort(owners))
+    for person in np.unique(owners):
+        own = [score(photo, person) for photo in plan.genuine[owners == person]]
+        np.testing.assert_allclose(
+            np.sort(genuine.scores[genuine.people == person]), np.sort(own), atol=2e-4
+        )
+    np.testing.assert_array_equal(
+        genuine.enrolled_photos, [len(plan.enrolled[person]) for person in genuine.people]
+    )
+
+
+def test_probes_of_several_photos_are_calibrated_where_the_people_allow() -> None:
+    people = draw_people(80, photos=(6, 3, 5))
+    options = CalibrationOptions(targets=(1e-1, 1e-2), least_people=50)
+    calibrations = calibrate_people(people, options=options).contract.calibrations
+    # 54 people have two photos left over after the enrollment of three, 27 have three.
+    assert [entry.probe_photos for entry in calibrations] == [1, 2]
+    single, double = calibrations
+    assert double.calibrated_on["genuine_trials"] == 27 * 3 + 26
+    assert double.calibrated_on["impostor_sample"] == "means of 2 photos of one person"
+    for entry in calibrations:
+        level = entry.level("fmr-1e-2")
+        trials = {k: rate.trials for k, rate in level.fnmr_by_photos.items()}
+        assert sum(trials.values()) == level.fnmr.trials == entry.calibrated_on["genuine_trials"]
+    assert set(single.level("fmr-1e-2").fnmr_by_photos) == {2, 3}
+    assert set(double.level("fmr-1e-2").fnmr_by_photos) == {3}
+    # Averaging takes off noise of the photos, and nothing else of impostors.
+    assert double.level("fmr-1e-2").fnmr.value <= single.level("fmr-1e-2").fnmr.value
+    assert double.level("fmr-1e-2").threshold == pytest.approx(
+        single.level("fmr-1e-2").threshold, abs=0.3
+    )
+    none = calibrate_people(people, options=CalibrationOptions(targets=(1e-1,))).contract
+    assert [entry.probe_photos for entry in none.calibrations] == [1, 2]
+
+
+def test_decisions_of_means_have_the_error_rate_of_their_calibration() -> None:
+    options = CalibrationOptions(targets=(1e-1, 1e-2))
+    contract = replace(
+        calibrate_people(draw_people(120, photos=(5,)), options=options).contract,
+        photo_consistency=-1.0,
+        probe_consistency=-1.0,
+    )
+    people = draw_people(30, photos=(5,), seed=78)
+    verifier = Verifier(contract, rotation=tenant_rotation())
+    enroller = Enroller(
+        contract, make_generator(), rotation=tenant_rotation(), lift_secret=LIFT_SECRET
+    )
+    photos = people.descriptors.reshape(30, 5, -1)
+    stored = [enroller.from_embeddings(own[:3]) for own in photos]
+    means = unit(photos[:, 3:].sum(axis=1))
+    accepted = np.array(
+        [
+            [
+                verifier.decide_embedding(mean, template, level="fmr-1e-2", photos=2).accepted
+                for template in stored
+            ]
+            for mean in means
+        ]
+    )
+    assert np.diagonal(accepted).all()
+    # 870 attempts at 1e-2: 8.7 expected; 27 is six standard deviations away.
+    assert (accepted.sum() - 30) <= 27
 
 
 def test_bounded_memory_takes_a_subset_of_the_probes() -> None:
@@ -93,7 +178,7 @@ def test_bounded_memory_takes_a_subset_of_the_probes() -> None:
     facts = contract.calibrations[0].calibrated_on
     assert facts["impostor_trials"] == 30 * 19
     total = len(people.names) * 19
-    assert facts["impostor_sample"] == f"random subset of {total} cross-identity pairs"
+    assert facts["impostor_sample"] == f"{facts['impostor_trials']} of {total} cross-identity pairs"
 
 
 def test_levels_fall_to_the_smallest_that_the_data_resolve(calibrated: Calibrated) -> None:
@@ -105,13 +190,16 @@ def test_levels_fall_to_the_smallest_that_the_data_resolve(calibrated: Calibrate
     assert facts["genuine_trials"] == 50 * (4 - 3) + 50 * (3 - 2)
     assert [level.name for level in point.levels] == ["fmr-1e-2", "fmr-1e-3"]
     assert (lifted.mode, lifted.probe_m) == ("s2s", 2)
-    assert any("raw probes: FMR 0.0001 is not resolved" in s for s in calibrated.report.unresolved)
+    assert any(
+        "raw probes of 1 photo(s): FMR 0.0001 is not resolved" in s
+        for s in calibrated.report.unresolved
+    )
     for calibration in (point, lifted):
         for level in calibration.levels:
             assert level.target_fmr is not None
             assert 0.9 * level.target_fmr <= level.fmr.value <= level.target_fmr
             assert level.fmr.ci_low < level.fmr.value < level.fmr.ci_high
-        thresholds = [level.similarity_threshold for level in calibration.levels]
+        thresholds = [level.threshold for level in calibration.levels]
         assert thresholds == sorted(thresholds)
     assert calibrated.contract.default_level == "fmr-1e-3"
 
@@ -120,12 +208,12 @@ def service_outcomes(
     contract: Contract, people: People, *, level: str
 ) -> tuple[list[bool], list[bool]]:
     """Enroll and verify as the service does, with a rotation; accepted genuine and impostors."""
-    rotation = random_rotation()
-    enroller = Enroller(contract, make_generator(), rotation=rotation)
+    rotation = tenant_rotation()
+    enroller = Enroller(contract, make_generator(), rotation=rotation, lift_secret=LIFT_SECRET)
     verifier = Verifier(contract, rotation=rotation)
     names = sorted(set(people.names))
     photos = {n: [i for i, own in enumerate(people.names) if own == n] for n in names}
-    stored = {n: enroller.from_embeddings(people.descriptors[photos[n][:3]]).wire for n in names}
+    stored = {n: enroller.from_embeddings(people.descriptors[photos[n][:3]]) for n in names}
     genuine, impostor = [], []
     for probe_name in names:
         probe = people.descriptors[photos[probe_name][3]]
@@ -145,7 +233,7 @@ def test_thresholds_hold_for_people_that_calibration_has_not_seen(calibrated: Ca
     assert sum(genuine) >= 38
 
 
-def test_recalibration_keeps_the_contract_and_its_cohort(
+def test_recalibration_keeps_the_contract_and_its_strangers(
     people: People, calibrated: Calibrated
 ) -> None:
     source = make_generator()
@@ -154,21 +242,26 @@ def test_recalibration_keeps_the_contract_and_its_cohort(
         people.names,
         binding=calibrated.contract.binding,
         source=source,
-        cohort=calibrated.contract.cohort,
+        expectation=calibrated.contract.expectation,
+        nobody=calibrated.contract.nobody,
         options=CalibrationOptions(seed=1),
     ).contract
     assert again.contract_id == calibrated.contract.contract_id
-    assert again.cohort_id == calibrated.contract.cohort_id
+    assert again.nobody_id == calibrated.contract.nobody_id
     assert (
         again.calibrations[0].calibration_id != calibrated.contract.calibrations[0].calibration_id
     )
 
 
-def test_the_cohort_is_new_every_time_and_the_rest_follows_the_seed() -> None:
+def test_strangers_are_new_every_time_and_the_rest_follows_the_seed() -> None:
     people = draw_people(30)
     options = CalibrationOptions(targets=(1e-1, 1e-2))
     first, second = (calibrate_people(people, options=options).contract for _ in range(2))
-    assert first.cohort_id != second.cohort_id
+    assert first.nobody.seed != second.nobody.seed
+    assert not np.isin(first.nobody.people[:, 0], second.nobody.people[:, 0]).all()
+    np.testing.assert_allclose(first.expectation.mean, second.expectation.mean, rtol=1e-3)
+    thresholds = [entry.calibrations[0].level("fmr-1e-2").threshold for entry in (first, second)]
+    assert thresholds[0] == pytest.approx(thresholds[1], abs=1e-3)
     assert first.template_foot_point_norm == second.template_foot_point_norm
     assert first.photo_consistency == second.photo_consistency
 
@@ -235,15 +328,11 @@ def test_ten_fold_adds_the_accuracy_level(people: People) -> None:
     level = calibration.level(ACCURACY_LEVEL)
     (folds,) = result.report.ten_folds
     assert level.target_fmr is None
-    assert level.similarity_threshold == pytest.approx(np.mean(folds.thresholds))
+    assert level.threshold == pytest.approx(np.mean(folds.thresholds))
     assert calibration.calibrated_on["ten_fold_accuracy"] == pytest.approx(folds.accuracy_mean)
     assert folds.accuracy_mean > 0.95
-    # Same marginal quantile: the cohort test alone accepts as many as the similarity alone would,
-    # so the joint rate is that of neither.
     other = calibration.level("fmr-1e-2")
-    stricter = level.similarity_threshold > other.similarity_threshold
-    assert (level.cohort_threshold > other.cohort_threshold) == stricter
-    assert (level.fmr.value < other.fmr.value) == stricter
+    assert (level.fmr.value < other.fmr.value) == (level.threshold > other.threshold)
 
 
 def ten_pairs(people: People) -> list[Pair]:
@@ -342,15 +431,21 @@ def test_the_wire_changes_scores_by_less_than_a_thousandth() -> None:
     people = draw_people(20, photos=(1,))
     lifter = Lifter(make_binding(source.source_id).strategy, source, "0" * 64)
     with Keystream.seeded("wire") as stream:
-        cohort = make_cohort(source, strategy=lifter.strategy, m=6, stream=stream, size=20)
-    sent = through_wire(cohort, contract_id="0" * 64)
-    for before, after in zip(cohort, sent, strict=True):
+        batch = lift(
+            draw_people(20, photos=(1,), seed=3).descriptors,
+            strategy=lifter.strategy,
+            m=6,
+            source=source,
+            stream=stream,
+        )
+    sent = through_wire(batch, contract_id="0" * 64)
+    for before, after in zip(batch, sent, strict=True):
         for probe in people.descriptors[:5]:
             change = spherical(probe, before.foot, before.basis) - spherical(
                 probe, after.foot, after.basis
             )
             assert abs(change) < 1e-3
-    data = wire.encode(cohort[0], contract_id="0" * 64, dtype="float16")
+    data = wire.encode(batch[0], contract_id="0" * 64, dtype="float16")
     np.testing.assert_array_equal(wire.decode(data).subspace.foot, sent[0].foot)
 
 
@@ -374,8 +469,6 @@ def test_lifted_probes_have_recorded_foot_point_norms(calibrated: Calibrated) ->
     assert lifted.foot_point_norm is not None
     low, high = lifted.foot_point_norm
     source = make_generator()
-    from templates.space.lifting import lift
-
     probes: SubspaceBatch = lift(
         draw_people(200, photos=(1,), seed=31).descriptors,
         strategy=calibrated.contract.binding.strategy,

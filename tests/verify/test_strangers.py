@@ -9,7 +9,6 @@ from scipy.stats import norm, t
 
 from attacks.stored.wolves import canonical
 from templates.decoys import DecoyGenerator
-from templates.distances import Metric
 from templates.space.subspace import AffineSubspace, SubspaceBatch
 from tests.verify.population import M, N, contract, decoys, enrolled, photos_of, templates_of, unit
 from verify.stand_ins import lift_stand_in
@@ -19,7 +18,7 @@ PEOPLE = 600
 
 
 def score(template: AffineSubspace) -> float:
-    return contract().nobody.score(template, metric=Metric.SPHERICAL, steps=50)
+    return contract().nobody.score(template, contract().expectation)
 
 
 def wolf() -> AffineSubspace:
@@ -37,9 +36,8 @@ def accepted_share(template: AffineSubspace) -> float:
     strangers = photos_of(1500, 1, seed=8)[:, 0]
     level = contract().calibration("p2s").level("fmr-1e-3")
     near = similarities(strangers, SubspaceBatch.of([template]))[:, 0]
-    cohort = similarities(strangers, contract().cohort)
-    z = (near - cohort.mean(axis=1)) / cohort.std(axis=1, ddof=1)
-    return float(np.mean((near >= level.similarity_threshold) & (z >= level.cohort_threshold)))
+    means, spreads = contract().expectation.statistics(strangers)
+    return float(np.mean((near - means) / spreads >= level.threshold))
 
 
 def similarities(points: NDArray[np.float32], batch: SubspaceBatch) -> NDArray[np.float64]:
@@ -60,8 +58,7 @@ def test_few_people_set_a_wider_limit() -> None:
     nobody = contract().nobody
     templates = templates_of(enrolled(100, seed=6), seed=6)
     wide, narrow = (
-        honest_score(nobody, templates[:count], halves=False, metric=Metric.SPHERICAL, steps=50)
-        for count in (4, 100)
+        honest_score(nobody, contract().expectation, templates[:count]) for count in (4, 100)
     )
     spread = np.std([score(each) for each in templates], ddof=1)
     assert wide > narrow + 3 * spread
@@ -111,12 +108,14 @@ def test_a_template_is_held_against_strangers_that_its_person_had_no_part_in() -
     templates = templates_of(enrolled(40, seed=6), seed=6)
     scores = np.array(
         [
-            nobody[slice(middle, None) if number % 2 == 0 else slice(middle)].score(
-                template, metric=Metric.SPHERICAL, steps=50
-            )
-            for number, template in enumerate(templates)
+            nobody.scores(
+                templates[number : number + 1],
+                contract().expectation,
+                rows=slice(middle, None) if number % 2 == 0 else slice(middle),
+            )[0]
+            for number in range(len(templates))
         ]
     )
-    limit = honest_score(nobody, templates, halves=True, metric=Metric.SPHERICAL, steps=50)
+    limit = honest_score(nobody, contract().expectation, templates, people=np.arange(40))
     reach = t.isf(norm.sf(6), 39) * np.sqrt(1 + 1 / 40)
     assert limit == pytest.approx(scores.mean() + reach * scores.std(ddof=1), rel=1e-6)

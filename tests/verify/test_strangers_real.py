@@ -68,11 +68,11 @@ def faces(shared_data: Path) -> Thirds:
 
 
 def test_axes_of_faces_are_refused_and_people_are_not(faces: Thirds) -> None:
-    contract, rule = faces.contract, faces.contract.calibrations[0]
+    contract = faces.contract
     limit = contract.template_stranger_score
 
     def score(template: object) -> float:
-        return contract.nobody.score(template, metric=rule.metric, steps=rule.steps)  # type: ignore[arg-type]
+        return contract.nobody.score(template, contract.expectation)  # type: ignore[arg-type]
 
     honest = [score(template) for template in faces.templates(faces.enrolled[:400])]
     assert np.sum(np.array(honest) > limit) <= 1

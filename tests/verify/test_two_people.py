@@ -51,7 +51,7 @@ def sets(
         return Faces(found.descriptors, np.array([name_of[path] for path in found.paths]))
 
     source = DecoyGenerator.fit(faces(single[:DECOY_FACES], 1).descriptors)
-    contract = contract_of(pack, faces(calibrated, 3), source, 64, (0,))
+    contract = contract_of(faces(calibrated, 3), source, 64, (0,))
     return faces(attacking, 3), people, contract, source
 
 

@@ -14,8 +14,8 @@ import pytest
 
 from api.process.runtime import open_keyring, open_store
 from api.settings import Settings
-from tests.api.process.test_server import free_port
 from tests.patience import PATIENCE_S
+from tests.ports import free_port
 
 
 @dataclass

@@ -48,6 +48,57 @@ def test_a_visitor_enrolls_and_verifies_a_drawn_person(open_tab: OpenTab, demo: 
         assert client.delete("/v1/subjects/visitor").is_success
 
 
+def test_an_enrollment_is_replaced_only_where_the_visitor_says_so(
+    open_tab: OpenTab, demo: Served
+) -> None:
+    tab = open_tab(demo)
+    page = tab.page
+    enroll = page.get_by_role("button", name="Enroll", exact=True)
+
+    def template_id() -> str:
+        with demo.client() as client:
+            return client.get("/v1/subjects/visitor").json()["template_id"]
+
+    tab.open("Enroll")
+    page.get_by_label("Person's id").fill("visitor")
+    choose(tab, "person-1", 1)
+    enroll.click()
+    expect(page.locator(".verdict")).to_contain_text("Earlier enrollmentnone")
+    first = template_id()
+
+    choose(tab, "person-1", 2)
+    enroll.click()
+    dialog = page.get_by_role("dialog", name="Replace visitor’s enrollment?")
+    expect(dialog.get_by_role("button", name="Keep")).to_be_focused()
+    page.keyboard.press("Escape")
+    expect(dialog).to_have_count(0)
+    expect(enroll).to_be_focused()
+    expect(page.locator(".tray li")).to_have_count(1)
+    assert template_id() == first
+    enroll.click()
+    dialog.get_by_role("button", name="Keep").click()
+    expect(enroll).to_be_enabled()
+    assert template_id() == first
+
+    # What somebody else enrolled while the question stood is not replaced by the answer.
+    enroll.click()
+    expect(dialog).to_be_visible()
+    photo = demo.settings.data_dir / "people" / "person-1" / "3.png"
+    with demo.client() as client:
+        sent = {"images": ("3.png", photo.read_bytes())}
+        meanwhile = client.put("/v1/subjects/visitor/enrollment", files=sent).json()["template_id"]
+    dialog.get_by_role("button", name="Replace").click()
+    expect(page.get_by_role("alert")).to_contain_text("enrollment_conflict")
+    assert template_id() == meanwhile
+
+    enroll.click()
+    dialog.get_by_role("button", name="Replace").click()
+    expect(page.locator(".verdict")).to_contain_text("Earlier enrollmentreplaced")
+    assert template_id() != meanwhile
+    with demo.client() as client:
+        assert client.delete("/v1/subjects/visitor").is_success
+
+
 def test_every_screen_is_marked(open_tab: OpenTab, demo: Served) -> None:
     tab = open_tab(demo, sign_in=None)
     tab.page.goto(tab.url)
@@ -136,8 +187,10 @@ def test_the_test_picture_of_a_fake_camera_is_no_face(
     page.get_by_label("Camera", exact=True).check()
     page.get_by_role("button", name="Start camera").click()
     tab.guided("No cartoon face found")
-    page.get_by_role("button", name="Take photo").click()
-    expect(page.locator(".refused")).to_contain_text("Not taken. No cartoon face found")
+    page.get_by_role("button", name="Take 3 photos").click()
+    expect(page.locator(".refused")).to_contain_text(
+        "None of 3 photos taken. No cartoon face found"
+    )
     expect(page.locator(".tray li")).to_have_count(0)
     drawn = demo.settings.data_dir / "people" / "person-2" / "0.png"
     page.get_by_label("Files", exact=True).check()

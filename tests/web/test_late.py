@@ -1,11 +1,13 @@
 """What comes late: answers after the visitor went on, and a key that was changed meanwhile."""
 
 import contextlib
+import time
 from typing import Any
 
 import pytest
 from playwright.sync_api import Error, Page, Route, expect
 
+from tests.patience import PATIENCE_S
 from tests.web.conftest import OpenTab
 from tests.web.served import Served
 from tests.web.test_demo import choose
@@ -33,11 +35,11 @@ class PendingRequests:
 
     def wait(self) -> Route:
         """Wait for the first one."""
-        for _ in range(200):
-            if self.routes:
-                return self.routes[0]
+        end = time.monotonic() + PATIENCE_S
+        while not self.routes:  # it comes only while the page's own loop runs
+            assert time.monotonic() < end, "no such request came"
             self.page.wait_for_timeout(25)
-        raise AssertionError("no such request came")
+        return self.routes[0]
 
 
 def refusal(code: str, message: str, **details: Any) -> dict[str, Any]:

@@ -102,7 +102,7 @@ def test_guidance_waits_as_long_as_it_is_told(open_tab: OpenTab, demo: Served) -
     tab.guided("Guidance is paused: too many requests.")
     tab.page.wait_for_timeout(2500)
     assert asked == ["check"]
-    expect(tab.page.get_by_role("button", name="Take photo")).to_be_enabled()
+    expect(tab.page.get_by_role("button", name="Take 3 photos")).to_be_enabled()
 
 
 def test_a_request_elsewhere_would_be_seen(open_tab: OpenTab, demo: Served) -> None:

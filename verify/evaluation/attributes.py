@@ -12,17 +12,17 @@ from verify.evaluation.acquisition import EmbeddedSet
 from verify.evaluation.labels_file import Labels
 from verify.evaluation.plan import EvaluationError
 
+NEIGHBOURS = 10
 _ROWS = 1024
 
 
 def predict_attributes(
-    descriptors: NDArray[np.float32], pool: DecoyPool, *, k: int = 10
+    descriptors: NDArray[np.float32], pool: DecoyPool, *, k: int = NEIGHBOURS
 ) -> list[Attributes]:
     """Predict gender and race by the vote of the k nearest entries of a labelled pool.
 
     hybrid+ needs the attributes of the faces it lifts; the paper predicts those of unlabelled
-    faces. The vote is taken for each attribute by itself, among the entries that have a label of
-    it; equal votes go to the label that comes first in the alphabet.
+    faces. The vote is taken for each attribute by itself (:func:`voted`).
 
     Parameters
     ----------
@@ -48,8 +48,8 @@ def predict_attributes(
             "attributes are predicted from a labelled decoy pool, and this one has no labels; "
             "build the pool from a folder with FairFace labels"
         )
-    genders = _voted(descriptors, entries, [label.gender for label in labels], k)
-    races = _voted(descriptors, entries, [label.race for label in labels], k)
+    genders = voted(descriptors, entries, [label.gender for label in labels], k=k)
+    races = voted(descriptors, entries, [label.race for label in labels], k=k)
     return [Attributes(gender, race) for gender, race in zip(genders, races, strict=True)]
 
 
@@ -94,22 +94,44 @@ def known_attributes(
     return attributes, predicted
 
 
-def _voted(
+def voted(
     descriptors: NDArray[np.float32],
     entries: NDArray[np.float32],
     labels: Sequence[str | None],
-    k: int,
+    *,
+    k: int = NEIGHBOURS,
 ) -> list[str | None]:
-    # Imported here, because scikit-learn takes a second to load, and most commands need none.
-    from sklearn.neighbors import KNeighborsClassifier
+    """Give each face the label that most of its k nearest labelled entries have.
 
+    Equal votes go to the label that comes first in the alphabet.
+
+    Parameters
+    ----------
+    descriptors, entries : (N, n) and (K, n) float32
+        Unit rows.
+    labels
+        One per entry; None where it has none.
+    k
+        Number of neighbours; all entries where fewer have a label.
+
+    Returns
+    -------
+    list
+        One label per face; None where no entry has one.
+    """
     known = [i for i, label in enumerate(labels) if label is not None]
     if not known or not len(descriptors):
         return [None] * len(descriptors)
-    # Of unit rows, the nearest by Euclidean distance are the nearest by angle.
-    vote = KNeighborsClassifier(n_neighbors=min(k, len(known)), algorithm="brute")
-    vote.fit(entries[known], [labels[i] for i in known])
-    return [str(label) for label in vote.predict(descriptors)]
+    names, number_of = np.unique([str(labels[i]) for i in known], return_inverse=True)
+    nearest_of, k = entries[known].T, min(k, len(known))
+    chosen: list[str | None] = []
+    for start in range(0, len(descriptors), _ROWS):
+        # Of unit rows, the nearest by Euclidean distance are the nearest by angle.
+        cosines = descriptors[start : start + _ROWS] @ nearest_of
+        nearest = np.argpartition(-cosines, k - 1, axis=1)[:, :k]
+        votes = (number_of[nearest][:, :, None] == np.arange(len(names))).sum(axis=1)
+        chosen += [str(name) for name in names[votes.argmax(axis=1)]]
+    return chosen
 
 
 def resembling(

@@ -170,12 +170,12 @@ class _Ends:
             if (end, piece) not in self._number:
                 break
             end = self._number[end, piece]
-            found = self._whole.get(end, [])
+            rows = self._whole.get(end, [])
             if shared == len(wanted):
-                found = found or self._with[end]
+                rows = rows or self._with[end]
             elif telling is not None and shared >= telling:
-                found = self._with[end]
-            best = found or best
+                rows = self._with[end]
+            best = rows or best
         return best
 
 

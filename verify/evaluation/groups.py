@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from verify.metrics import wilson
+from verify.metrics import resolvable, wilson
 
 MIN_GENUINE = 100
 """Genuine trials below which a group is listed and not judged: one error is more than 1 %."""
@@ -68,7 +68,7 @@ class Group:
         Of impostor trials within the group, and of its genuine trials.
     fmr_judged, fnmr_judged
         Whether there are trials enough to compare the rate with other groups': for the FMR
-        1 / target, as in fewer a single error exceeds the target; for the FNMR ``MIN_GENUINE``.
+        :func:`fmr_judged`, for the FNMR ``MIN_GENUINE``.
     """
 
     name: str
@@ -239,18 +239,17 @@ def by_group(
         count = int(np.count_nonzero(trials))
         return MeanRate(errors, count, *wilson(errors, count))
 
-    names = sorted({*first_labels, *second_labels} - {None}, key=_in_order)
+    names = sorted({*first_labels, *second_labels} - {None}, key=in_order)
     number = {name: place for place, name in enumerate(names)}
     first = np.array([number.get(label, -1) for label in first_labels], dtype=np.int64)
     second = np.array([number.get(label, -1) for label in second_labels], dtype=np.int64)
     labelled = (first >= 0) & (second >= 0)
     together = labelled & (first == second)
-    needed = math.ceil((1 - 1e-9) / target_fmr)
     groups = []
     for place, name in enumerate(names):
         fmr = counted(~same & together & (first == place))
         fnmr = counted(same & together & (first == place))
-        enough = fmr.trials >= needed, fnmr.trials >= MIN_GENUINE
+        enough = fmr_judged(fmr.trials, target_fmr), fnmr.trials >= MIN_GENUINE
         groups.append(Group(str(name), fmr, fnmr, *enough))
     pooled_fmr, pooled_fnmr = counted(~same & together), counted(same & together)
     judged_fmr = [(group.name, group.fmr) for group in groups if group.fmr_judged]
@@ -276,7 +275,13 @@ def by_group(
     )
 
 
-def _in_order(name: str | None) -> tuple[float, str]:
+def fmr_judged(trials: int, target: float) -> bool:
+    """Whether a group has 1 / target impostor trials: in fewer, one error exceeds the target."""
+    return resolvable(target, trials, expected_errors=1)
+
+
+def in_order(name: str | None) -> tuple[float, str]:
+    """Sort key of labels: ages in the order of years, others by the alphabet."""
     years = re.match(r"\d+", str(name))
     return (float(years.group()) if years else math.inf, str(name))
 

@@ -47,6 +47,8 @@ class EvaluationPlan:
         FMR targets.
     steps
         Of the spherical iteration.
+    device
+        Of torch, for subspace-to-subspace distances; None for the processor.
 
     Raises
     ------
@@ -63,6 +65,7 @@ class EvaluationPlan:
     seed: int = 0
     targets: tuple[float, ...] = TARGETS
     steps: int = DEFAULT_STEPS
+    device: str | None = None
 
     def __post_init__(self) -> None:
         unknown = [name for name in self.strategies if name not in STRATEGIES]
@@ -131,6 +134,7 @@ def units_of(plan: EvaluationPlan, sources: Sequence[Source], *, n: int) -> list
                     modes=plan.modes,
                     metrics=plan.metrics,
                     steps=plan.steps,
+                    device=plan.device,
                     seed=seed,
                 )
                 for source in _fitting(strategy, sources, plan)

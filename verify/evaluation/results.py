@@ -33,7 +33,7 @@ from verify.tenfold import FOLDS
 
 FORMAT = "veilface evaluation"
 VERSION = 1
-_LIBRARIES = ("numpy", "scipy", "scikit-learn", "onnxruntime", "opencv-python-headless")
+_LIBRARIES = ("numpy", "scipy", "onnxruntime", "opencv-python-headless")
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ class SetResult:
             "failed_genuine": facts.failed_genuine,
             "failed_impostor": facts.failed_impostor,
             "fta": facts.fta,
-            "decoys": [{**each.json(), "left_out": each.left_out} for each in self.sources],
+            "decoys": [{**source.json(), "left_out": source.left_out} for source in self.sources],
             "notes": notes(pairs),
         }
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from templates.decoys import Attributes, DecoyPool, DecoySource
-from templates.distances import Metric, paired_distances, similarity
+from templates.distances import Metric, on_device, paired_distances, similarity
 from templates.keys.randomness import Keystream
 from templates.space.lifting import Strategy, lift
 from templates.space.subspace import SubspaceBatch
@@ -159,9 +159,10 @@ def _lifted(
                         probes, templates = points[0], batches[1]
                     case _:
                         probes, templates = batches[0], batches[1]
-                distances = paired_distances(
-                    probes, templates, metric=cell.metric, steps=unit.steps
-                )
+                with on_device(unit.device):
+                    distances = paired_distances(
+                        probes, templates, metric=cell.metric, steps=unit.steps
+                    )
                 column[rows] = similarity(distances.astype(np.float64))
     return columns
 

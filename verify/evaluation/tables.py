@@ -51,7 +51,15 @@ def write_csv(results: Mapping[str, Any], path: Path | str) -> None:
     formula has an apostrophe before it.
     """
     timings = timings_by_key(results)
-    lines = [_flat(row) | _flat_timing(timings.get(timing_key(row), {})) for row in results["rows"]]
+    write_lines(
+        [_flat(row) | _flat_timing(timings.get(timing_key(row), {})) for row in results["rows"]],
+        path,
+    )
+
+
+def write_lines(rows: Sequence[Mapping[str, Any]], path: Path | str) -> None:
+    """Write rows, flattened, as :func:`write_csv` does."""
+    lines = [_flat(row) for row in rows]
     columns = list(dict.fromkeys(name for line in lines for name in line))
     file = io.StringIO(newline="")
     writer = csv.DictWriter(file, columns, restval="", lineterminator="\r\n")

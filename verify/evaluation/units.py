@@ -82,6 +82,8 @@ class LiftUnit:
         Whether both sides draw from the whole pool, instead of each from its own half.
     modes, metrics, steps
         What is compared, and the steps of the spherical iteration.
+    device
+        Of torch, for subspace-to-subspace distances; None for the processor.
     seed
         Of all that is random.
     """
@@ -94,6 +96,7 @@ class LiftUnit:
     metrics: tuple[Metric, ...]
     steps: int
     seed: int
+    device: str | None = None
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,5 @@
 """The contract in force, and the decoy generator for clients that lift."""
 
-import base64
-
 from fastapi import APIRouter, Depends, Request
 from starlette.responses import Response
 
@@ -10,7 +8,7 @@ from api.http.auth import CallerDep, holding
 from api.http.deps import GateDep, RuntimeDep
 from api.http.errors import ApiError
 from api.http.openapi import EVERY_CALL, error_responses
-from api.http.receipts import key_fingerprint
+from api.http.receipts import receipt_keys_json
 from api.http.schemas import ContractAnswer
 from templates.decoys import DecoyGenerator
 
@@ -26,8 +24,8 @@ router = APIRouter(prefix="/v1/contract", tags=["contract"])
 async def get_contract(
     request: Request, caller: CallerDep, runtime: RuntimeDep, gate: GateDep
 ) -> Response:
-    """Any valid key may read it. The cohort is a secret and is not part of it."""
-    public_key = await gate.query(runtime.store.signer.public_key)
+    """Any valid key may read it. What the contract seals is not part of it."""
+    keys = await gate.query(runtime.store.signer.keys)
     tenant = await gate.query(lambda: runtime.store.tenants.get(caller.tenant))
     return answer(
         request,
@@ -36,11 +34,7 @@ async def get_contract(
             "photos": runtime.pack is not None,
             "generator": isinstance(runtime.source, DecoyGenerator),
             "template_enrollment": tenant.template_enrollment,
-            "receipt_key": {
-                "algorithm": "Ed25519",
-                "key_id": key_fingerprint(public_key),
-                "public_key": base64.b64encode(public_key).decode("ascii"),
-            },
+            "receipt_key": receipt_keys_json(keys),
         },
     )
 

@@ -1,5 +1,6 @@
 """Enrollment: photos, or a client's template."""
 
+import base64
 from functools import partial
 from typing import Any
 
@@ -26,16 +27,20 @@ from api.http.deps import (
     query_of,
 )
 from api.http.errors import ApiError
+from api.http.holder_keys import FIELD, HolderKeyHeaderDep, digest, holder_key_of
 from api.http.idempotency import Outcome, once
 from api.http.openapi import BODY, ENROLLMENT_BODY, EVERY_CALL, IDEMPOTENT, PHOTO, error_responses
+from api.http.preconditions import PreconditionDep, asked
 from api.http.schemas import EnrollmentAnswer
-from api.http.values import face_policy, one_of
+from api.http.values import face_policy, one_of, storage_of
 from api.process.runtime import Runtime
 from enroll import Enrollment
 from models.quality import Quality
 from templates.decoys import Attributes
+from templates.keys.holder_key import wipe
 from templates.store.audit_log import By
-from templates.store.subject_rows import Source
+from templates.store.subject_rows import Source, Storage
+from templates.store.subjects import Precondition
 
 router = APIRouter(prefix="/v1/subjects", tags=["subjects"])
 
@@ -48,6 +53,7 @@ CODES = (
     "forbidden",
     "invalid_template",
     "contract_mismatch",
+    "enrollment_conflict",
     "inconsistent_images",
 )
 
@@ -70,6 +76,8 @@ async def enroll(
     runtime: RuntimeDep,
     gate: GateDep,
     idempotency_key: IdempotencyDep,
+    holder_key_header: HolderKeyHeaderDep,
+    precondition: PreconditionDep,
 ) -> Response:
     """Rights: `enroll`, and `embeddings` for a template, which the tenant must allow.
 
@@ -77,6 +85,16 @@ async def enroll(
     client lifted: nothing in it tells whether it holds one person, so it is refused unless the
     operator allowed it (`template_enrollment` of `GET /v1/contract`). All or nothing: a rejected
     set leaves the old enrollment untouched.
+
+    With `holder_key` the template accepts nobody without this key, which the service does not
+    keep: a verification must send it too. Who loses it enrolls again.
+
+    With `storage=holder` the answer has the sealed template (`held_template`), and the service
+    keeps only what it is opened with: every verification must bring it.
+
+    An earlier enrollment is replaced, unless a header says otherwise: `If-None-Match: *` never
+    replaces, `If-Match: "template id"` replaces only that template. Otherwise the answer is
+    `enrollment_conflict`, with the `template_id` that is enrolled, or null.
     """
     settings = runtime.settings
     query = query_of(request, ("face",))
@@ -85,18 +103,42 @@ async def enroll(
             runtime.required_pack()
             runtime.require_decoys()
             form = await sent_form(request, settings, max_images=settings.max_images)
-            return await _enroll_photos(request, caller, subject, form, query, idempotency_key)
+            return await _enroll_photos(
+                request,
+                caller,
+                subject,
+                form,
+                query,
+                idempotency_key,
+                holder_key_header,
+                precondition,
+            )
         caller.require("embeddings")
         body = await sent_json(request, settings)
         await gate.query(lambda: runtime.require_template_enrollment(caller.tenant))
-        reject_unknown([*body, *query], ("template",))
+        reject_unknown([*body, *query], ("template", "storage", FIELD))
         template = base64_field(body.get("template"), "template", code="invalid_template")
+        storage = storage_of(body)
+        holder_key = holder_key_of(holder_key_header, body)
 
         def work() -> Outcome:
             epoch = runtime.epoch(caller.tenant)
-            enrollment = runtime.enroller(caller.tenant, epoch).from_template(template)
+            try:
+                enrollment = runtime.enroller(caller.tenant, epoch).from_template(
+                    template, holder_key=holder_key
+                )
+            finally:
+                wipe(holder_key)
             return _stored(
-                runtime, caller.tenant, subject, epoch, enrollment, Source.TEMPLATE, by(request)
+                runtime,
+                caller.tenant,
+                subject,
+                epoch,
+                enrollment,
+                Source.TEMPLATE,
+                storage,
+                precondition,
+                by(request),
             )
 
         return await once(
@@ -104,7 +146,13 @@ async def enroll(
             caller,
             idempotency_key,
             operation="enroll-template",
-            asked=[subject, template],
+            asked=[
+                subject,
+                template,
+                *_named(storage),
+                *asked(precondition),
+                *digest(holder_key),
+            ],
             subject=subject,
             work=work,
             run=partial(gate.compute, key=caller.prefix),
@@ -118,20 +166,40 @@ async def _enroll_photos(
     form: Form,
     query: dict[str, str],
     idempotency_key: str | None,
+    holder_key_header: str | None,
+    precondition: Precondition | None,
 ) -> Response:
     runtime: Runtime = request.app.state.runtime
     pack, photos = runtime.required_pack(), form.images("images")
-    reject_unknown(form.fields, ("attributes", "face"))
+    reject_unknown(form.fields, ("attributes", "face", "storage", FIELD))
+    storage = storage_of(form.fields)
     policy = face_policy(one_of(form.fields, query, "face"))
     attributes = parse_attributes(form.fields.get("attributes"))
+    holder_key = holder_key_of(holder_key_header, form.fields)
 
     def work() -> Outcome:
         epoch = runtime.epoch(caller.tenant)
-        enrollment = runtime.enroller(caller.tenant, epoch).from_photos(
-            pack, photos, attributes=attributes, policy=policy, limits=runtime.image_limits
-        )
+        try:
+            enrollment = runtime.enroller(caller.tenant, epoch).from_photos(
+                pack,
+                photos,
+                attributes=attributes,
+                holder_key=holder_key,
+                policy=policy,
+                limits=runtime.image_limits,
+            )
+        finally:
+            wipe(holder_key)
         return _stored(
-            runtime, caller.tenant, subject, epoch, enrollment, Source.PHOTOS, by(request)
+            runtime,
+            caller.tenant,
+            subject,
+            epoch,
+            enrollment,
+            Source.PHOTOS,
+            storage,
+            precondition,
+            by(request),
         )
 
     return await once(
@@ -144,7 +212,10 @@ async def _enroll_photos(
             str(policy),
             attributes.gender or "",
             attributes.race or "",
+            *_named(storage),
+            *asked(precondition),
             *photos,
+            *digest(holder_key),
         ],
         subject=subject,
         work=work,
@@ -182,6 +253,11 @@ def parse_attributes(text: str | None) -> Attributes:
     return Attributes(gender=value.get("gender"), race=value.get("race"))
 
 
+def _named(storage: Storage) -> list[str]:
+    """What a request asks for beside the default: records of earlier versions name nothing."""
+    return [] if storage is Storage.SERVICE else [storage.value]
+
+
 def _quality(quality: object) -> dict[str, Any]:
     return quality.as_dict() if isinstance(quality, Quality) else {}
 
@@ -193,6 +269,8 @@ def _stored(
     epoch: int,
     enrollment: Enrollment,
     source: Source,
+    storage: Storage,
+    precondition: Precondition | None,
     who: By,
 ) -> Outcome:
     stored = runtime.put(
@@ -202,12 +280,15 @@ def _stored(
         enrollment,
         source=source,
         photos=len(enrollment.per_photo),
+        storage=storage,
+        precondition=precondition,
         by=who,
     )
     body: dict[str, Any] = {
         "template_id": stored.template_id,
         "contract_id": enrollment.contract_id,
         "replaced": not stored.created,
+        "holder_key": enrollment.holder_salt is not None,
         "images": [
             {
                 "index": result.index,
@@ -217,4 +298,6 @@ def _stored(
             for result in enrollment.per_photo
         ],
     }
-    return Outcome(201 if stored.created else 200, body)
+    if stored.held_template is not None:
+        body["held_template"] = base64.b64encode(stored.held_template).decode("ascii")
+    return Outcome(201 if stored.created else 200, body, kept=stored.held_template is None)

@@ -25,13 +25,18 @@ async def get_own_key(
 ) -> Response:
     """Any valid key may ask, for itself only: never the secret, nor its label."""
     key = await gate.query(lambda: runtime.store.api_keys.get(caller.prefix))
+    levels = runtime.levels.allowed(lowest_of_key=caller.lowest_level)
     return answer(
         request,
         {
             "prefix": caller.prefix,
             "tenant": caller.tenant,
             "rights": [str(right) for right in Right if str(right) in caller.rights],
-            "levels": runtime.levels.allowed(lowest_of_key=caller.lowest_level),
+            "levels": levels,
+            "liveness": {
+                level: str(runtime.liveness.policy(level, of_key=caller.liveness))
+                for level in levels
+            },
             "expires_at": None if key is None else iso_time(key.expires_at),
             "demo": runtime.settings.demo,
         },

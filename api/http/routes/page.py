@@ -91,16 +91,18 @@ def page_routes(*, demo: bool) -> list[BaseRoute]:
             raise ApiError("not_found", "there is no such path")
         return file.answer(request)
 
-    routes: list[BaseRoute] = [_route("/", page), _route("/assets/{name}", asset)]
+    routes: list[BaseRoute] = [route_of("/", page), route_of("/assets/{name}", asset)]
     if demo:
         routes += [
-            _route("/demo/people", demo_people),
-            _route("/demo/people/{person}/{shot}", demo_photo),
+            route_of("/demo/people", demo_people),
+            route_of("/demo/people/{person}/{shot}", demo_photo),
         ]
     return routes
 
 
-def _route(path: str, endpoint: Endpoint) -> Route:
+def route_of(path: str, endpoint: Endpoint) -> Route:
+    """Route a path that is not in the document of the API."""
+
     async def named(request: Request) -> Response:
         # What log lines and metrics call it, as FastAPI does for its own routes.
         request.scope["route"] = route

@@ -70,9 +70,7 @@ async def check_photo(
         def work() -> dict[str, Any]:
             try:
                 with step("check"):
-                    _, quality, face = pack.crop_photo(
-                        photo, policy=policy, limits=runtime.image_limits
-                    )
+                    taken = pack.crop_photo(photo, policy=policy, limits=runtime.image_limits)
             except FaceError as refusal:
                 return {
                     "usable": False,
@@ -87,12 +85,12 @@ async def check_photo(
                 "code": None,
                 "message": (
                     "one face, large and clear enough"
-                    if face is not None
+                    if taken.face is not None
                     else "an aligned crop of a face, clear enough"
                 ),
                 "details": {},
-                "box": None if face is None else [round(float(side), 1) for side in face.box],
-                "quality": quality.as_dict(),
+                "box": None if taken.box is None else [round(side, 1) for side in taken.box],
+                "quality": taken.quality.as_dict(),
             }
 
         return answer(request, await gate.compute(work, key=caller.prefix))

@@ -25,7 +25,9 @@ EXCERPT_BYTES = 64
 @router.get(
     "/subjects/{subject_id}/stored",
     response_model=StoredAnswer,
-    responses=error_responses(*EVERY_CALL, "forbidden", "not_enrolled", "validation_failed"),
+    responses=error_responses(
+        *EVERY_CALL, "forbidden", "not_enrolled", "validation_failed", "template_not_stored"
+    ),
     summary="What is stored of a subject",
 )
 async def get_stored(
@@ -34,7 +36,8 @@ async def get_stored(
     """Right: `enroll`. Sizes, an excerpt of the ciphertext, and how far the foot point lies out.
 
     No byte and no direction of the template: the length of its foot point, to three digits, is
-    the one number that is read from it. A line in the audit log says who looked.
+    the one number that is read from it. A line in the audit log says who looked. Where the
+    subject's holder keeps the template, there is none to show: `template_not_stored`.
     """
 
     def work() -> tuple[StoredForm, float] | None:
@@ -61,8 +64,8 @@ async def get_stored(
         raise ApiError("not_enrolled", "nobody is enrolled under this id")
     form, norm = read
     record = form.template.record
-    strategy = runtime.contract.binding.strategy
-    current = record.contract_id == runtime.contract.contract_id
+    binding = runtime.contract.binding
+    strategy, current = binding.strategy, record.contract_id in binding.contract_ids
     return answer(
         request,
         {

@@ -10,9 +10,11 @@ from api.http.audit import by
 from api.http.deps import Enrolls, Erases, GateDep, IdempotencyDep, RuntimeDep, SubjectDep
 from api.http.errors import ApiError
 from api.http.openapi import EVERY_CALL, error_responses
+from api.http.preconditions import NoPreconditionDep, etag
 from api.http.receipts import receipt_json
 from api.http.schemas import ReceiptAnswer, SubjectAnswer, SubjectsAnswer
 from api.http.values import iso_time
+from templates.contract.document import Binding
 from templates.store.subject_rows import SubjectRecord
 
 router = APIRouter(prefix="/v1/subjects", tags=["subjects"])
@@ -39,9 +41,7 @@ async def list_subjects(
     return answer(
         request,
         {
-            "subjects": [
-                _described(record, runtime.contract.contract_id) for record in page.records
-            ],
+            "subjects": [_described(record, runtime.contract.binding) for record in page.records],
             "next_cursor": page.next_cursor,
         },
     )
@@ -60,7 +60,11 @@ async def get_subject(
     record = await gate.query(lambda: runtime.store.subjects.describe(caller.tenant, subject))
     if record is None:
         raise ApiError("not_enrolled", "nobody is enrolled under this id")
-    return answer(request, _described(record, runtime.contract.contract_id))
+    return answer(
+        request,
+        _described(record, runtime.contract.binding),
+        headers={"ETag": etag(record.template_id)},
+    )
 
 
 @router.delete(
@@ -76,12 +80,14 @@ async def erase_subject(
     runtime: RuntimeDep,
     gate: GateDep,
     _idempotency_key: IdempotencyDep,
+    _precondition: NoPreconditionDep,
 ) -> Response:
     """Right: `erase`. Erases template, metadata and data key; answers with a signed receipt.
 
     Erasing again returns the same receipt, and after another enrollment it erases that one: an
-    `Idempotency-Key` is accepted and changes nothing. A key that also has `enroll` or `admin` is
-    told of a subject that never was there; another one gets a receipt that says nothing was held.
+    `Idempotency-Key` is accepted and changes nothing. `If-Match` and `If-None-Match` are refused.
+    A key that also has `enroll` or `admin` is told of a subject that never was there; another one
+    gets a receipt that says nothing was held.
     """
 
     def work() -> dict[str, Any]:
@@ -98,14 +104,16 @@ async def erase_subject(
     return answer(request, await gate.query(work))
 
 
-def _described(record: SubjectRecord, contract_id: str) -> dict[str, Any]:
+def _described(record: SubjectRecord, binding: Binding) -> dict[str, Any]:
     return {
         "subject_id": record.subject_id,
         "template_id": record.template_id,
         "contract_id": record.contract_id,
-        "current": record.contract_id == contract_id,
+        "current": record.contract_id in binding.contract_ids,
         "enrolled_by": str(record.source),
         "photos": record.photos,
+        "storage": str(record.storage),
+        "holder_key": record.holder_salt is not None,
         "created_at": iso_time(record.created_at),
         "updated_at": iso_time(record.updated_at),
     }

@@ -13,6 +13,7 @@ from api.http.deps import Exports, GateDep, IdempotencyDep, RuntimeDep, SubjectD
 from api.http.errors import ApiError
 from api.http.idempotency import Outcome, once
 from api.http.openapi import BODY, EVERY_CALL, IDEMPOTENT, IMPORT_BODY, error_responses
+from api.http.preconditions import PreconditionDep, asked
 from api.http.schemas import ExportAnswer, ImportAnswer
 from api.http.transfer import open_export
 from templates.store.identifiers import checked_subject_id
@@ -31,15 +32,17 @@ router = APIRouter(prefix="/v1/subjects", tags=["transfer"])
         "not_found",
         "validation_failed",
         "contract_mismatch",
+        "template_not_stored",
     ),
     summary="Export a subject, encrypted",
 )
 async def export_subject(
     request: Request, caller: Exports, subject: SubjectDep, runtime: RuntimeDep, gate: GateDep
 ) -> Response:
-    """Right: `export`. The template is un-rotated inside the encryption.
+    """Right: `export`. The template is un-rotated inside the encryption; a holder's rotation stays.
 
-    Only keys with `enroll` or `admin` are told `not_enrolled`; others get `not_found`.
+    Only keys with `enroll` or `admin` are told `not_enrolled`; others get `not_found`. Where the
+    subject's holder keeps the template, there is none to export: `template_not_stored`.
     """
     async with gate.admitted(caller.prefix):
         exported = await gate.compute(
@@ -73,6 +76,7 @@ async def export_subject(
             "invalid_template",
             "contract_mismatch",
             "export_superseded",
+            "enrollment_conflict",
         ),
     },
     openapi_extra=IMPORT_BODY,
@@ -84,11 +88,15 @@ async def import_subject(
     runtime: RuntimeDep,
     gate: GateDep,
     idempotency_key: IdempotencyDep,
+    precondition: PreconditionDep,
 ) -> Response:
-    """Right: `export`. The tenant's own rotation is put on the template.
+    """Right: `export`. The template gets a new id, and a rotation of the importing tenant's.
+
+    It needs a holder's key where it did before, and the same one.
 
     An export that is older than the subject's last enrollment or erasure is refused
     (`export_superseded`), unless the body says `"restore": true` and the key has `admin` too.
+    `If-None-Match` and `If-Match` say what may be replaced, as of an enrollment.
     """
     settings = runtime.settings
     async with gate.admitted(caller.prefix):
@@ -107,7 +115,8 @@ async def import_subject(
                 data,
                 key=runtime.export_key,
                 tenant=caller.tenant,
-                contract_id=runtime.contract.contract_id,
+                contract_ids=runtime.contract.binding.contract_ids,
+                restore=restore,
             )
         )
         subject = checked_subject_id(exported.subject_id)
@@ -120,10 +129,13 @@ async def import_subject(
         def work() -> Outcome:
             epoch = runtime.epoch(caller.tenant)
             enroller = runtime.enroller(caller.tenant, epoch)
-            # A template that the service made of photos is no client's.
-            from_photos = exported.source == Source.PHOTOS
-            make = enroller.from_export if from_photos else enroller.from_template
-            enrollment = make(exported.wire)
+            salt = exported.holder_salt
+            # A template that the service made of photos is no client's. One that is in a holder's
+            # rotation cannot be held against strangers: it was when it was enrolled.
+            if exported.source == Source.PHOTOS or salt is not None:
+                enrollment = enroller.from_export(exported.wire, holder_salt=salt)
+            else:
+                enrollment = enroller.from_template(exported.wire)
             stored = runtime.put(
                 caller.tenant,
                 exported.subject_id,
@@ -131,6 +143,7 @@ async def import_subject(
                 enrollment,
                 source=Source(exported.source),
                 photos=exported.photos,
+                precondition=precondition,
                 by=by(request),
                 guard=guard,
             )
@@ -140,6 +153,7 @@ async def import_subject(
                     "template_id": stored.template_id,
                     "contract_id": enrollment.contract_id,
                     "replaced": not stored.created,
+                    "holder_key": salt is not None,
                 },
             )
 
@@ -148,7 +162,7 @@ async def import_subject(
             caller,
             idempotency_key,
             operation="import",
-            asked=[data, "restore"] if restore else [data],
+            asked=[data, *(["restore"] if restore else []), *asked(precondition)],
             subject=exported.subject_id,
             work=work,
             run=partial(gate.compute, key=caller.prefix),

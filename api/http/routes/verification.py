@@ -1,4 +1,4 @@
-"""Verification: a photo, an embedding or a lifted probe against one subject.
+"""Verification: photos, embeddings or a lifted probe against one subject.
 
 The order of a verification, which is what bounds an attacker::
 
@@ -11,9 +11,9 @@ no more are answered than of requests that come one after the other.
 
 import contextlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from fastapi import APIRouter, Request
@@ -23,22 +23,49 @@ from starlette.responses import Response
 from api.http.answers import answer
 from api.http.audit import by
 from api.http.auth import Caller
-from api.http.bodies import base64_field, content_type, reject_unknown, sent_form, sent_json
+from api.http.bodies import (
+    base64_field,
+    content_type,
+    reject_unknown,
+    sent_form,
+    sent_json,
+    text_field,
+)
+from api.http.challenges import FIELD as CHALLENGE
+from api.http.challenges import MAX_ID, opened_challenge
 from api.http.deps import GateDep, RuntimeDep, SubjectDep, Verifies, query_of
 from api.http.errors import ApiError
+from api.http.holder_keys import FIELD, HolderKeyHeaderDep, holder_key_of
 from api.http.openapi import BODY, EVERY_CALL, PHOTO, VERIFY_BODY, error_responses
 from api.http.schemas import VerifyAnswer
 from api.http.signatures import FIELDS as SIGNATURE_FIELDS
 from api.http.signatures import checked_nonce
-from api.http.values import embedding_of, face_policy, one_of
+from api.http.values import (
+    embedding_of,
+    embeddings_of,
+    face_policy,
+    held_template_of,
+    one_of,
+)
 from api.process.metrics import count_decision, step
 from api.process.runtime import Runtime
+from api.settings import Settings
 from templates.errors import ContractMismatch
+from templates.keys.holder_key import wipe
 from templates.store.attempts import Attempt
 from templates.store.audit_log import By
 from templates.store.lockout import Nonce, Superseded
 from templates.store.tenants import RetiredRotation
-from verify import Decision, StandIn, Verifier
+from verify import (
+    MAX_FRAMES,
+    MAX_PROBE_PHOTOS,
+    MIN_FRAMES,
+    Decision,
+    OpenedTemplate,
+    PhotoProbe,
+    StandIn,
+    Verifier,
+)
 
 router = APIRouter(prefix="/v1/subjects", tags=["subjects"])
 
@@ -47,13 +74,19 @@ DECISIONS = 3
 must wait for it."""
 
 
+PROBES = ("embedding", "embeddings", "template")
+"""Fields that hold a probe that is not a photo."""
+
+
 @dataclass(frozen=True)
 class Probe:
-    """What is compared, how, and what keeps it from a second use."""
+    """What is compared, how, with whose template, and what keeps it from a second use."""
 
-    kind: str
-    compare: Callable[[Verifier, bytes | StandIn], Decision]
+    kind: Literal["photo", "frames", "embedding", "template"]
+    compare: Callable[[Verifier, OpenedTemplate], Decision]
+    held_template: bytes | None = field(repr=False)
     nonce: Nonce | None
+    holder_key: bytearray | None = field(repr=False)
 
 
 CODES = (
@@ -64,6 +97,7 @@ CODES = (
     "not_enrolled",
     "invalid_template",
     "invalid_embedding",
+    "inconsistent_images",
     "contract_mismatch",
     "uncalibrated",
     "replayed",
@@ -80,34 +114,65 @@ CODES = (
     summary="Is this the subject?",
 )
 async def verify(
-    request: Request, caller: Verifies, subject: SubjectDep, runtime: RuntimeDep, gate: GateDep
+    request: Request,
+    caller: Verifies,
+    subject: SubjectDep,
+    runtime: RuntimeDep,
+    gate: GateDep,
+    holder_key_header: HolderKeyHeaderDep,
 ) -> Response:
     """Rights: `verify`, and `embeddings` for a probe that is not a photo.
 
+    The probe is 1 to 5 photos, or embeddings, which must show one and the same person and are
+    averaged: one comparison, and one attempt. Or it is a private template that the client lifted.
+
+    An enrollment that was made with a holder's key rejects everybody who does not send the same
+    `holder_key`, in the same words and time as a wrong face; one that was made without ignores it.
+
     A level below the lowest that the deployment or the key allows is `forbidden`.
+
+    With a `challenge_id`, the photos are the 5 to 12 frames of a person who makes the movements of
+    the challenge. Where the deployment, the level or the key asks for liveness, a probe that does
+    not show it is a rejection with the reason `liveness`; one that cannot show it is `forbidden`.
 
     A subject that does not exist is answered as one that does not match, in the same shape and
     with the same work, and so is one that was enrolled under another contract; only keys with
     `enroll` or `admin` are told `not_enrolled` or `contract_mismatch`. The distance is returned
-    only to keys with `scores`.
+    only to keys with `scores`, of a rejection where a holder's key is needed only to those that
+    have `enroll` or `admin` too: others are told the one that an unknown subject would have.
+
+    Where the subject's holder keeps the template, it comes with the probe as `held_template`. One
+    that is missing, altered, replaced or another subject's is a rejection; where the service
+    stores the template, it changes nothing.
     """
     query = query_of(request, ("level", "face"))
     async with gate.admitted(caller.prefix):
         with step("body"):
             if content_type(request) == "multipart/form-data":
-                probe = await _photo_probe(request, runtime, caller, query)
+                probe = await _photo_probe(
+                    request, runtime, caller, subject, query, holder_key_header
+                )
             else:
-                probe = await _sent_probe(request, runtime, caller, subject, query)
+                probe = await _sent_probe(
+                    request, runtime, caller, subject, query, holder_key_header
+                )
         decision = await gate.compute(
-            partial(_decide_and_record, runtime, caller, subject, probe, by(request)),
+            partial(_decide_and_wipe, runtime, caller, subject, probe, by(request)),
             key=caller.prefix,
         )
     request.state.log["security_level"] = decision.level
     request.state.log["decision"] = "accept" if decision.accepted else "reject"
-    count_decision(accepted=decision.accepted, level=decision.level, probe=probe.kind)
+    request.state.log["liveness"] = decision.liveness
+    count_decision(
+        accepted=decision.accepted,
+        reason=decision.reason,
+        level=decision.level,
+        probe=probe.kind,
+    )
     body: dict[str, Any] = {
         "decision": "accept" if decision.accepted else "reject",
         "reason": decision.reason,
+        "liveness": decision.liveness,
         "level": decision.level,
         "fmr": decision.fmr,
         "contract_id": decision.contract_id,
@@ -115,53 +180,119 @@ async def verify(
     }
     if "scores" in caller.rights:
         body["distance"] = decision.distance
+        if decision.liveness_failure is not None:
+            body["liveness_failure"] = str(decision.liveness_failure)
     return answer(request, body)
 
 
 async def _photo_probe(
-    request: Request, runtime: Runtime, caller: Caller, query: dict[str, str]
+    request: Request,
+    runtime: Runtime,
+    caller: Caller,
+    subject: str,
+    query: dict[str, str],
+    holder_key_header: str | None,
 ) -> Probe:
     pack = runtime.required_pack()
     settings = runtime.settings
-    form = await sent_form(request, settings, max_images=1)
-    photo = form.images("image")[0]
-    reject_unknown(form.fields, ("level", "face"))
+    form = await sent_form(request, settings, max_images=MAX_FRAMES)
+    photos = form.images("image", "images")
+    reject_unknown(form.fields, ("level", "face", "held_template", CHALLENGE, FIELD))
+    challenge_id = text_field(form.fields.get(CHALLENGE), CHALLENGE, max_length=MAX_ID)
+    _check_count(len(photos), settings, is_challenge=challenge_id is not None)
+    held_template = held_template_of(form.fields)
     level = _level(runtime, caller, one_of(form.fields, query, "level"))
     policy = face_policy(one_of(form.fields, query, "face"))
+    holder_key = holder_key_of(holder_key_header, form.fields)
 
-    embedded: list[NDArray[np.float32]] = []
+    liveness = runtime.liveness.require(
+        level, of_key=caller.liveness, photos=True, challenge=challenge_id is not None
+    )
+    challenge = None
+    if challenge_id is not None:
+        challenge = opened_challenge(
+            runtime.keyring, challenge_id, tenant=caller.tenant, subject=subject
+        )
+    embed: Callable[[Verifier], PhotoProbe]
+    if challenge is None:
 
-    def compare(verifier: Verifier, stored: bytes | StandIn) -> Decision:
-        if not embedded:  # a probe may be decided more than once
+        def embed(verifier: Verifier) -> PhotoProbe:
+            return verifier.photo_probe(
+                pack, photos, passive=liveness.passive, policy=policy, limits=runtime.image_limits
+            )
+    else:
+
+        def embed(verifier: Verifier) -> PhotoProbe:
+            return verifier.frames_probe(
+                pack,
+                photos,
+                challenge.movements,
+                passive=liveness.passive,
+                policy=policy,
+                limits=runtime.image_limits,
+            )
+
+    probes: list[PhotoProbe] = []
+
+    def compare(verifier: Verifier, stored: OpenedTemplate) -> Decision:
+        if not probes:  # a probe may be decided more than once
             with step("photo"):
-                embedded.append(
-                    verifier.embed_photo(pack, photo, policy=policy, limits=runtime.image_limits)
-                )
+                probes.append(embed(verifier))
+        (probe,) = probes
         with step("decide"):
-            return verifier.decide_embedding(embedded[0], stored, level=level)
+            decision = verifier.decide_embedding(
+                probe.embedding, stored, holder_key=holder_key, level=level, photos=probe.photos
+            )
+        if challenge is None and not liveness.passive:
+            return decision
+        return decision.with_liveness(probe.failure)
 
-    return Probe("photo", compare, nonce=None)
+    if challenge is None:
+        return Probe("photo", compare, held_template, nonce=None, holder_key=holder_key)
+    return Probe("frames", compare, held_template, challenge.nonce, holder_key)
+
+
+def _check_count(count: int, settings: Settings, *, is_challenge: bool) -> None:
+    """Refuse more photos than a probe has, or fewer frames than show movements."""
+    most = MAX_FRAMES if is_challenge else min(MAX_PROBE_PHOTOS, settings.max_images)
+    if count > most:
+        raise ApiError("too_many_images", f"at most {most} photos in one request", {"limit": most})
+    if is_challenge and count < MIN_FRAMES:
+        raise ApiError(
+            "validation_failed",
+            f"a challenge is answered by {MIN_FRAMES} to {MAX_FRAMES} frames",
+            {"field": "images"},
+        )
 
 
 async def _sent_probe(
-    request: Request, runtime: Runtime, caller: Caller, subject: str, query: dict[str, str]
+    request: Request,
+    runtime: Runtime,
+    caller: Caller,
+    subject: str,
+    query: dict[str, str],
+    holder_key_header: str | None,
 ) -> Probe:
     caller.require("embeddings")
     settings = runtime.settings
     body = await sent_json(request, settings)
-    reject_unknown(body, ("embedding", "template", "level", *SIGNATURE_FIELDS))
-    if ("embedding" in body) == ("template" in body):
+    reject_unknown(body, (*PROBES, "level", "held_template", FIELD, *SIGNATURE_FIELDS))
+    named = [kind for kind in PROBES if kind in body]
+    if len(named) != 1:
         raise ApiError(
-            "validation_failed", "send exactly one of embedding and template, or a photo"
+            "validation_failed",
+            "send exactly one of embedding, embeddings and template, or photos",
         )
     if "face" in query:
         raise ApiError("validation_failed", "face applies to photos only", {"field": "face"})
     asked = one_of(body, query, "level")
+    held_template = held_template_of(body)
+    kind, value = named[0], body[named[0]]
     sent: bytes | NDArray[np.float64]
-    if "embedding" in body:
-        kind, sent = "embedding", embedding_of(body["embedding"])
+    if kind == "template":
+        sent = base64_field(value, "template", code="invalid_template")
     else:
-        kind, sent = "template", base64_field(body["template"], "template", code="invalid_template")
+        sent = embedding_of(value) if kind == "embedding" else embeddings_of(value)
     nonce = checked_nonce(
         body,
         sent,
@@ -172,71 +303,127 @@ async def _sent_probe(
         window_s=settings.probe_window_s,
     )
     level = _level(runtime, caller, asked)
+    runtime.liveness.require(level, of_key=caller.liveness, photos=False, challenge=False)
+    holder_key = holder_key_of(holder_key_header, body)
 
-    def compare(verifier: Verifier, stored: bytes | StandIn) -> Decision:
+    def compare(verifier: Verifier, stored: OpenedTemplate) -> Decision:
         with step("decide"):
             if isinstance(sent, bytes):
-                return verifier.decide_template(sent, stored, level=level)
-            return verifier.decide_embedding(sent, stored, level=level)
+                return verifier.decide_template(sent, stored, holder_key=holder_key, level=level)
+            rows = np.atleast_2d(sent)
+            mean = verifier.average(rows)
+            return verifier.decide_embedding(
+                mean, stored, holder_key=holder_key, level=level, photos=len(rows)
+            )
 
-    return Probe(kind, compare, nonce)
+    return Probe(
+        "template" if kind == "template" else "embedding", compare, held_template, nonce, holder_key
+    )
 
 
 def _level(runtime: Runtime, caller: Caller, asked: str | None) -> str:
     return runtime.levels.in_force(asked, lowest_of_key=caller.lowest_level)
 
 
+def _decide_and_wipe(
+    runtime: Runtime, caller: Caller, subject: str, probe: Probe, who: By
+) -> Decision:
+    """Decide, and forget the holder's key: here, because nobody waits for a cancelled thread."""
+    try:
+        return _decide_and_record(runtime, caller, subject, probe, who)
+    finally:
+        wipe(probe.holder_key)
+
+
 def _decide_and_record(
     runtime: Runtime, caller: Caller, subject: str, probe: Probe, who: By
 ) -> Decision:
     """Decide and record; a template that was replaced or erased meanwhile accepts nobody."""
-    attempts, contract_id = runtime.store.attempts, runtime.contract.contract_id
+    attempts, contract_ids = runtime.store.attempts, runtime.contract.binding.contract_ids
 
     def compare(attempt: Attempt) -> Decision:
-        return probe.compare(*_verifier_and_template(runtime, caller, subject, attempt))
+        return _decided(probe, _opened(runtime, caller, subject, attempt))
 
     for _ in range(DECISIONS):
-        # A retired rotation: the template was turned into a newer one between the two looks.
+        # A retired rotation: the template was moved into a newer epoch between the two looks.
         with contextlib.suppress(Superseded, RetiredRotation):
             # In one step, which metrics show: it must not tell who is enrolled.
             with step("store"):
                 attempt = attempts.begin(
-                    caller.tenant, subject, contract_id=contract_id, nonce=probe.nonce
+                    caller.tenant,
+                    subject,
+                    contract_ids=contract_ids,
+                    nonce=probe.nonce,
+                    held_template=probe.held_template,
                 )
-                verifier, stored = _verifier_and_template(runtime, caller, subject, attempt)
-            decision = probe.compare(verifier, stored)
+                opened = _opened(runtime, caller, subject, attempt)
+            decision = _decided(probe, opened)
             with step("record"):
                 attempts.conclude(
                     caller.tenant,
                     subject,
                     accepted=decision.accepted,
                     template_id=attempt.template_id,
-                    contract_id=contract_id,
+                    contract_ids=contract_ids,
                     level=decision.level,
                     nonce=probe.nonce,
                     by=who,
                 )
             return decision
     return attempts.decide_alone(
-        caller.tenant, subject, compare, contract_id=contract_id, nonce=probe.nonce, by=who
+        caller.tenant,
+        subject,
+        compare,
+        contract_ids=contract_ids,
+        nonce=probe.nonce,
+        held_template=probe.held_template,
+        by=who,
     )
 
 
-def _verifier_and_template(
-    runtime: Runtime, caller: Caller, subject: str, attempt: Attempt
-) -> tuple[Verifier, bytes | StandIn]:
-    """Return what compares with the subject's template, and that template, or one of nobody."""
+@dataclass(frozen=True)
+class _Opened:
+    """What compares, and with what.
+
+    `nobody` is the subject's stand-in where the caller is told distances and not who is enrolled.
+    """
+
+    verifier: Verifier
+    stored: OpenedTemplate
+    nobody: StandIn | None
+
+
+def _decided(probe: Probe, opened: _Opened) -> Decision:
+    decision = probe.compare(opened.verifier, opened.stored)
+    if opened.nobody is None:
+        return decision
+    # A wrong holder's key turns the probe away from all faces: the distance would tell that a key
+    # is needed, and so that somebody is enrolled. Compared for every subject: the time tells.
+    unknown = probe.compare(opened.verifier, opened.nobody)
+    if decision.accepted or opened.stored.holder_salt is None:
+        return decision
+    return replace(decision, distance=unknown.distance)
+
+
+def _opened(runtime: Runtime, caller: Caller, subject: str, attempt: Attempt) -> _Opened:
+    """Open the subject's template, or one of nobody."""
     template, tenant = attempt.template, caller.tenant
     lifted = None
     if "scores" in caller.rights and not caller.sees_enrollment:
         # The distance will be told. Lifted for every subject, enrolled or not: the time tells.
         lifted = runtime.stand_ins.lift(tenant, subject)
+    if attempt.untried is not None:
+        # Opened for every subject, as one whose holder keeps a template: the time tells.
+        runtime.stand_ins.open_in_vain(attempt.untried)
+    stored: OpenedTemplate
     if template is not None:
-        return runtime.verifier(tenant, template.record.rotation_epoch), template.wire
-    if caller.sees_enrollment:
+        stored, epoch = template, template.record.rotation_epoch
+    elif caller.sees_enrollment and attempt.template_id is None:
         raise _why_not(runtime, tenant, subject)
-    verifier = runtime.verifier(tenant, attempt.rotation_epoch)
-    return verifier, runtime.stand_ins.open(lifted)
+    else:
+        stored, epoch = runtime.stand_ins.open(lifted), attempt.rotation_epoch
+    nobody = None if lifted is None else StandIn(stored.wire, lifted)
+    return _Opened(runtime.verifier(tenant, epoch), stored, nobody)
 
 
 def _why_not(runtime: Runtime, tenant: str, subject: str) -> Exception:

@@ -10,6 +10,7 @@ from veilface_client.errors import (
     Conflict,
     ConnectionFailed,
     ContractMismatch,
+    EnrollmentConflict,
     Forbidden,
     IdempotencyConflict,
     InvalidRequest,
@@ -28,9 +29,11 @@ from veilface_client.errors import (
     UnexpectedAnswer,
     VeilfaceError,
 )
+from veilface_client.holder_keys import new_holder_key
 from veilface_client.lifts import Enrollable, Probe
 from veilface_client.photos import Photo
 from veilface_client.results import (
+    Challenge,
     Contract,
     Decision,
     Enrollment,
@@ -49,6 +52,7 @@ from veilface_client.retries import Retries
 __all__ = [
     "AsyncClient",
     "AsyncPrivateClient",
+    "Challenge",
     "Client",
     "Conflict",
     "ConnectionFailed",
@@ -57,6 +61,7 @@ __all__ = [
     "Decision",
     "Enrollable",
     "Enrollment",
+    "EnrollmentConflict",
     "Export",
     "Forbidden",
     "Generator",
@@ -87,4 +92,17 @@ __all__ = [
     "UnexpectedAnswer",
     "Unlocked",
     "VeilfaceError",
+    "__version__",
+    "new_holder_key",
 ]
+
+__version__: str
+
+
+def __getattr__(name: str) -> str:
+    # Read when it is asked for: the modules also work where no distribution is installed.
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("veilface-client")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -11,10 +11,11 @@ from typing import Self, TypeVar
 import httpx
 
 from veilface_client import calls, flows, private_flows, results
-from veilface_client.calls import Call, Face
+from veilface_client.calls import Call, Face, Storage
 from veilface_client.connection import DEFAULT_TIMEOUT, options, signing_token
 from veilface_client.errors import UnexpectedAnswer
 from veilface_client.flows import Flow, Send, Wait, Work
+from veilface_client.held_templates import HeldTemplate
 from veilface_client.lifting import Lifter
 from veilface_client.lifts import Enrollable, Probe
 from veilface_client.photos import Photo
@@ -162,6 +163,9 @@ class AsyncClient(AsyncSession):
         *,
         attributes: Mapping[str, str] | None = None,
         face: Face | None = None,
+        storage: Storage | None = None,
+        holder_key: bytes | None = None,
+        replace: bool | str = True,
         idempotency_key: str | None = None,
     ) -> results.Enrollment:
         """Enroll a subject, or replace its enrollment."""
@@ -172,15 +176,41 @@ class AsyncClient(AsyncSession):
                 self._retries,
                 attributes=attributes,
                 face=face,
+                storage=storage,
+                holder_key=holder_key,
+                replace=replace,
                 key=idempotency_key,
             )
         )
 
+    async def challenge(self, subject: str | None = None) -> results.Challenge:
+        """Ask for a challenge of head movements, for one verification."""
+        return await self._send(calls.challenge(subject))
+
     async def verify(
-        self, subject: str, photo: Photo, *, level: str | None = None, face: Face | None = None
+        self,
+        subject: str,
+        photos: Photo | Iterable[Photo],
+        *,
+        level: str | None = None,
+        face: Face | None = None,
+        challenge: results.Challenge | None = None,
+        held_template: HeldTemplate | None = None,
+        holder_key: bytes | None = None,
     ) -> results.Decision:
-        """Check whether a photo shows the subject."""
-        return await self._run(flows.verify(subject, photo, self._retries, level=level, face=face))
+        """Check whether photos of one person show the subject."""
+        return await self._run(
+            flows.verify(
+                subject,
+                photos,
+                self._retries,
+                level=level,
+                face=face,
+                challenge=challenge,
+                held_template=held_template,
+                holder_key=holder_key,
+            )
+        )
 
 
 class AsyncPrivateClient(AsyncSession):
@@ -229,10 +259,22 @@ class AsyncPrivateClient(AsyncSession):
         photos: Photo | Iterable[Photo] | Enrollable,
         *,
         face: Face | None = None,
+        storage: Storage | None = None,
+        holder_key: bytes | None = None,
+        replace: bool | str = True,
     ) -> results.Enrollment:
         """Lift photos here (or take a lift of :meth:`lift_enrollment`), and enroll by it alone."""
         return await self._run(
-            private_flows.enroll(subject, photos, self._lifter, self._retries, face=face)
+            private_flows.enroll(
+                subject,
+                photos,
+                self._lifter,
+                self._retries,
+                face=face,
+                storage=storage,
+                holder_key=holder_key,
+                replace=replace,
+            )
         )
 
     async def lift_enrollment(
@@ -243,29 +285,33 @@ class AsyncPrivateClient(AsyncSession):
             private_flows.lift_enrollment(photos, self._lifter, self._retries, face=face)
         )
 
-    async def lift(self, photo: Photo, *, face: Face | None = None) -> Probe:
-        """Lift a probe here; it may be verified against several subjects."""
+    async def lift(self, photos: Photo | Iterable[Photo], *, face: Face | None = None) -> Probe:
+        """Lift a probe here, of photos of one person; several subjects may be verified by it."""
         return await self._run(
-            private_flows.lift_probe(photo, self._lifter, self._retries, face=face)
+            private_flows.lift_probe(photos, self._lifter, self._retries, face=face)
         )
 
     async def verify(
         self,
         subject: str,
-        photo: Photo | Probe,
+        photos: Photo | Iterable[Photo] | Probe,
         *,
         level: str | None = None,
         face: Face | None = None,
+        held_template: HeldTemplate | None = None,
+        holder_key: bytes | None = None,
     ) -> results.Decision:
-        """Lift a photo here (or take a probe of :meth:`lift`), and verify by it."""
+        """Lift photos of one person here (or take a probe of :meth:`lift`), and verify by it."""
         return await self._run(
             private_flows.verify(
                 subject,
-                photo,
+                photos,
                 self._token,
                 self._lifter,
                 self._retries,
                 level=level,
                 face=face,
+                held_template=held_template,
+                holder_key=holder_key,
             )
         )

@@ -16,14 +16,17 @@ import httpx
 
 from veilface_client import results
 from veilface_client.errors import UnexpectedAnswer
+from veilface_client.holder_keys import holder_key_field
 from veilface_client.results import parse
 from veilface_client.signature import signed_probe
 
 T = TypeVar("T")
 Face = Literal["single", "largest"]
+Storage = Literal["service", "holder"]
 
 _SUBJECT = re.compile(r"[A-Za-z0-9._@:-]{1,128}")
 _KEY = re.compile(r"[\x21-\x7e]{1,255}")
+_TEMPLATE_ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
 
 class Resend(Enum):
@@ -69,20 +72,38 @@ def idempotency(key: str | None) -> dict[str, str]:
     return {"Idempotency-Key": key}
 
 
+def precondition(replace: bool | str) -> dict[str, str]:
+    """Return the header that says what an enrollment may replace; none where it is anything."""
+    if replace is True:
+        return {}
+    if replace is False:
+        return {"If-None-Match": "*"}
+    if not _TEMPLATE_ID.fullmatch(replace):
+        raise ValueError("replace is True, False, or the template_id of an enrollment")
+    return {"If-Match": f'"{replace}"'}
+
+
 def enroll_photos(
     subject: str,
     photos: Sequence[bytes],
     *,
     attributes: Mapping[str, str] | None,
     face: Face | None,
+    storage: Storage | None,
+    holder_key: bytes | None,
+    replace: bool | str,
     key: str | None,
 ) -> Call[results.Enrollment]:
     """Enroll by photos."""
     fields = _fields(attributes=None if attributes is None else json.dumps(dict(attributes)))
     content = {
         "files": [("images", _file(photo)) for photo in photos],
-        "data": {**fields, **_fields(face=face)},
-        "headers": idempotency(key),
+        "data": {
+            **fields,
+            **_fields(face=face, storage=storage),
+            **holder_key_field(holder_key),
+        },
+        "headers": {**idempotency(key), **precondition(replace)},
     }
     return Call(
         "PUT",
@@ -92,11 +113,20 @@ def enroll_photos(
     )
 
 
-def enroll_template(subject: str, template: bytes, *, key: str) -> Call[results.Enrollment]:
+def enroll_template(
+    subject: str,
+    template: bytes,
+    *,
+    storage: Storage | None,
+    holder_key: bytes | None,
+    replace: bool | str,
+    key: str,
+) -> Call[results.Enrollment]:
     """Enroll by a private template."""
+    body = {"template": base64.b64encode(template).decode("ascii")}
     content = {
-        "json": {"template": base64.b64encode(template).decode("ascii")},
-        "headers": idempotency(key),
+        "json": {**body, **_fields(storage=storage), **holder_key_field(holder_key)},
+        "headers": {**idempotency(key), **precondition(replace)},
     }
     return Call(
         "PUT",
@@ -106,11 +136,26 @@ def enroll_template(subject: str, template: bytes, *, key: str) -> Call[results.
     )
 
 
-def verify_photo(
-    subject: str, photo: bytes, *, level: str | None, face: Face | None
+def verify_photos(
+    subject: str,
+    photos: Sequence[bytes],
+    *,
+    level: str | None,
+    face: Face | None,
+    challenge_id: str | None,
+    held_template: str | None,
+    holder_key: bytes | None,
 ) -> Call[results.Decision]:
-    """Verify a photo."""
-    content = {"files": {"image": _file(photo)}, "data": _fields(level=level, face=face)}
+    """Verify photos of one person, or the frames that answer a challenge."""
+    content = {
+        "files": [("image", _file(photo)) for photo in photos],
+        "data": {
+            **_fields(
+                level=level, face=face, challenge_id=challenge_id, held_template=held_template
+            ),
+            **holder_key_field(holder_key),
+        },
+    }
     return Call(
         "POST",
         subject_path(subject, "/verify"),
@@ -121,15 +166,33 @@ def verify_photo(
 
 
 def verify_template(
-    token: str, subject: str, template: bytes, *, level: str | None
+    token: str,
+    subject: str,
+    template: bytes,
+    *,
+    level: str | None,
+    held_template: str | None,
+    holder_key: bytes | None,
 ) -> Call[results.Decision]:
     """Verify a lifted probe, signed anew for each sending."""
+    more = {**_fields(held_template=held_template), **holder_key_field(holder_key)}
     return Call(
         "POST",
         subject_path(subject, "/verify"),
         lambda answer: parse(results.Decision, answer),
-        lambda: {"json": signed_probe(token, subject, template, level=level)},
+        lambda: {"json": {**signed_probe(token, subject, template, level=level), **more}},
         Resend.WHEN_NOT_DONE,
+    )
+
+
+def challenge(subject: str | None) -> Call[results.Challenge]:
+    """Ask for a challenge; one that is lost harms nobody."""
+    body = _fields(subject_id=subject)
+    return Call(
+        "POST",
+        "/v1/challenges",
+        lambda answer: parse(results.Challenge, answer),
+        lambda: {"json": body},
     )
 
 

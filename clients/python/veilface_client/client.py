@@ -11,10 +11,11 @@ from typing import Self, TypeVar
 import httpx
 
 from veilface_client import calls, flows, private_flows, results
-from veilface_client.calls import Call, Face
+from veilface_client.calls import Call, Face, Storage
 from veilface_client.connection import DEFAULT_TIMEOUT, options, signing_token
 from veilface_client.errors import UnexpectedAnswer
 from veilface_client.flows import Flow, Send, Wait, Work
+from veilface_client.held_templates import HeldTemplate
 from veilface_client.lifting import Lifter
 from veilface_client.lifts import Enrollable, Probe
 from veilface_client.photos import Photo
@@ -188,6 +189,9 @@ class Client(Session):
         *,
         attributes: Mapping[str, str] | None = None,
         face: Face | None = None,
+        storage: Storage | None = None,
+        holder_key: bytes | None = None,
+        replace: bool | str = True,
         idempotency_key: str | None = None,
     ) -> results.Enrollment:
         """Enroll a subject, or replace its enrollment. Right: ``enroll``.
@@ -201,8 +205,19 @@ class Client(Session):
         face
             ``single`` (the service's default) refuses a photo with several faces; ``largest``
             takes one that is large and central.
+        storage
+            ``holder`` answers with the sealed template (``held_template``), which the service then
+            does not keep: save it, for every verification needs it.
+        holder_key
+            32 bytes (:func:`new_holder_key`) without which the enrollment accepts nobody, and which
+            the service does not keep. Who loses it enrolls again.
+        replace
+            What may be replaced: whatever there is, nothing (False), or the enrollment of this
+            ``template_id`` only; otherwise :class:`EnrollmentConflict`. With ``False`` and
+            ``storage="holder"`` a lost answer cannot be had again: the next sending conflicts.
         idempotency_key
-            Of this one logical write; made anew for each call where it is not given.
+            Of this one logical write; made anew for each call where it is not given. With
+            ``storage="holder"`` each sending enrolls again, and the last answer counts.
         """
         return self._run(
             flows.enroll(
@@ -211,19 +226,57 @@ class Client(Session):
                 self._retries,
                 attributes=attributes,
                 face=face,
+                storage=storage,
+                holder_key=holder_key,
+                replace=replace,
                 key=idempotency_key,
             )
         )
 
-    def verify(
-        self, subject: str, photo: Photo, *, level: str | None = None, face: Face | None = None
-    ) -> results.Decision:
-        """Check whether a photo shows the subject. Right: ``verify``.
+    def challenge(self, subject: str | None = None) -> results.Challenge:
+        """Ask for a challenge of head movements, for one verification. Right: ``verify``.
 
-        A rejection is no error: the decision is false. Each rejection counts on the subject's
-        lockout.
+        With a subject, it can be answered for that one only.
         """
-        return self._run(flows.verify(subject, photo, self._retries, level=level, face=face))
+        return self._send(calls.challenge(subject))
+
+    def verify(
+        self,
+        subject: str,
+        photos: Photo | Iterable[Photo],
+        *,
+        level: str | None = None,
+        face: Face | None = None,
+        challenge: results.Challenge | None = None,
+        held_template: HeldTemplate | None = None,
+        holder_key: bytes | None = None,
+    ) -> results.Decision:
+        """Check whether 1 to 5 photos of one person show the subject. Right: ``verify``.
+
+        A rejection is no error: the decision is false. Each rejection counts once on the subject's
+        lockout, however many photos there were. An enrollment that was made with a
+        ``holder_key`` rejects whoever sends another one, or none; any other ignores it.
+
+        Parameters
+        ----------
+        challenge
+            One of :meth:`challenge`: the photos are then the frames that answer it, in their
+            order, as the camera gives them, not mirrored.
+        held_template
+            Of a subject whose holder keeps it: the bytes, or the path of the file.
+        """
+        return self._run(
+            flows.verify(
+                subject,
+                photos,
+                self._retries,
+                level=level,
+                face=face,
+                challenge=challenge,
+                held_template=held_template,
+                holder_key=holder_key,
+            )
+        )
 
 
 class PrivateClient(Session):
@@ -288,6 +341,9 @@ class PrivateClient(Session):
         photos: Photo | Iterable[Photo] | Enrollable,
         *,
         face: Face | None = None,
+        storage: Storage | None = None,
+        holder_key: bytes | None = None,
+        replace: bool | str = True,
     ) -> results.Enrollment:
         """Lift photos here (or take a lift of :meth:`lift_enrollment`), and enroll by it alone.
 
@@ -295,7 +351,16 @@ class PrivateClient(Session):
         give the embedding away. After an error repeat with its ``lift``.
         """
         return self._run(
-            private_flows.enroll(subject, photos, self._lifter, self._retries, face=face)
+            private_flows.enroll(
+                subject,
+                photos,
+                self._lifter,
+                self._retries,
+                face=face,
+                storage=storage,
+                holder_key=holder_key,
+                replace=replace,
+            )
         )
 
     def lift_enrollment(
@@ -309,31 +374,35 @@ class PrivateClient(Session):
             private_flows.lift_enrollment(photos, self._lifter, self._retries, face=face)
         )
 
-    def lift(self, photo: Photo, *, face: Face | None = None) -> Probe:
-        """Lift a probe here; it may be verified against several subjects, and again."""
-        return self._run(private_flows.lift_probe(photo, self._lifter, self._retries, face=face))
+    def lift(self, photos: Photo | Iterable[Photo], *, face: Face | None = None) -> Probe:
+        """Lift a probe here, of photos of one person; several subjects may be verified by it."""
+        return self._run(private_flows.lift_probe(photos, self._lifter, self._retries, face=face))
 
     def verify(
         self,
         subject: str,
-        photo: Photo | Probe,
+        photos: Photo | Iterable[Photo] | Probe,
         *,
         level: str | None = None,
         face: Face | None = None,
+        held_template: HeldTemplate | None = None,
+        holder_key: bytes | None = None,
     ) -> results.Decision:
-        """Lift a photo here (or take a probe of :meth:`lift`), and verify by it.
+        """Lift photos of one person here (or take a probe of :meth:`lift`), and verify by it.
 
         Rights: ``verify``, ``embeddings``. Each sending is signed anew. After an error repeat
-        with its ``lift``, never with the photo.
+        with its ``lift``, never with the photos.
         """
         return self._run(
             private_flows.verify(
                 subject,
-                photo,
+                photos,
                 self._token,
                 self._lifter,
                 self._retries,
                 level=level,
                 face=face,
+                held_template=held_template,
+                holder_key=holder_key,
             )
         )

@@ -12,6 +12,7 @@
     │   │   └── NotEnrolled
     │   ├── Conflict
     │   │   ├── ContractMismatch
+    │   │   ├── EnrollmentConflict
     │   │   └── IdempotencyConflict
     │   ├── LockedOut           wait .retry_after, and offer another factor
     │   ├── RateLimited
@@ -121,6 +122,10 @@ class ContractMismatch(Conflict):
     """A template of another contract."""
 
 
+class EnrollmentConflict(Conflict):
+    """The subject has another template than may be replaced; ``details["template_id"]`` is it."""
+
+
 class IdempotencyConflict(Conflict):
     """The idempotency key was used for another request, or that one still runs."""
 
@@ -198,7 +203,9 @@ FAMILIES: dict[str, type[ServiceError]] = {
     "method_not_allowed": InvalidRequest,
     "contract_mismatch": ContractMismatch,
     "idempotency_conflict": IdempotencyConflict,
+    "enrollment_conflict": EnrollmentConflict,
     "export_superseded": Conflict,
+    "template_not_stored": Conflict,
     "image_too_large": PhotoRefused,
     "request_too_large": InvalidRequest,
     "too_many_images": InvalidRequest,

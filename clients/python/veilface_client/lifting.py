@@ -137,16 +137,21 @@ class Lifter:
         )
 
     def probe(
-        self, inputs: LiftInputs, photo: bytes, *, face: Face | None, canceller: Canceller
+        self,
+        inputs: LiftInputs,
+        photos: Sequence[bytes],
+        *,
+        face: Face | None,
+        canceller: Canceller,
     ) -> Probe:
-        """Return a probe of one photo."""
+        """Return a probe of these photos."""
         dim = [] if self._dim is None else ["--dim", str(self._dim)]
         # A probe on stdout is always signed. It gets a key that is nobody's: the client's own
         # never leaves this process, and the client signs anew for each sending.
         nobodys = f"vf_{secrets.token_hex(6)}_{secrets.token_hex(32)}"
         template = self._lift(
             inputs,
-            [photo],
+            photos,
             "--probe", "--subject", "unsigned", *dim,
             face=face,
             canceller=canceller,

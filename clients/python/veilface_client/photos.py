@@ -43,9 +43,9 @@ def read_photos(photos: Photo | Iterable[Photo]) -> list[bytes]:
     """Return the bytes of one photo, or of several."""
     if isinstance(photos, bytes | bytearray | memoryview | str | os.PathLike):
         return [read_photo(photos)]
-    if hasattr(photos, "read"):
+    if hasattr(photos, "read") or not isinstance(photos, Iterable):
         return [read_photo(cast("BinaryIO", photos))]
     contents = [read_photo(photo) for photo in photos]
     if not contents:
-        raise ValueError("an enrollment takes at least one photo")
+        raise ValueError("there is no photo: at least one is needed")
     return contents

@@ -5,13 +5,14 @@ from functools import partial
 from typing import TypeVar
 
 from veilface_client import calls, results
-from veilface_client.calls import Call, Face
+from veilface_client.calls import Call, Face, Storage
 from veilface_client.child import Canceller
 from veilface_client.errors import ContractMismatch, UnexpectedAnswer, VeilfaceError
-from veilface_client.flows import Flow, Work, send
+from veilface_client.flows import Flow, Work, read_held_template, send
+from veilface_client.held_templates import HeldTemplate
 from veilface_client.lifting import Lifter, LiftInputs
 from veilface_client.lifts import Enrollable, Probe
-from veilface_client.photos import Photo, read_photo, read_photos
+from veilface_client.photos import Photo, read_photos
 from veilface_client.retries import Retries
 
 T = TypeVar("T")
@@ -34,11 +35,13 @@ def inputs_of(lifter: Lifter, retries: Retries, *, fresh: bool = False) -> Flow[
     raise UnexpectedAnswer("the generator of the service is not that of its contract")
 
 
-def lift_probe(photo: Photo, lifter: Lifter, retries: Retries, *, face: Face | None) -> Flow[Probe]:
+def lift_probe(
+    photos: Photo | Iterable[Photo], lifter: Lifter, retries: Retries, *, face: Face | None
+) -> Flow[Probe]:
     """Lift a probe; nothing is sent of it."""
-    picture: bytes = yield Work(lambda: read_photo(photo))
+    pictures: list[bytes] = yield Work(lambda: read_photos(photos))
     inputs = yield from inputs_of(lifter, retries)
-    return (yield from _probe(picture, lifter, inputs, face))
+    return (yield from _probe(pictures, lifter, inputs, face))
 
 
 def lift_enrollment(
@@ -57,53 +60,61 @@ def enroll(
     retries: Retries,
     *,
     face: Face | None,
+    storage: Storage | None,
+    holder_key: bytes | None,
+    replace: bool | str,
 ) -> Flow[results.Enrollment]:
     """Enroll by photos that are lifted here, or by a template that was lifted before."""
     calls.subject_path(subject)
     if isinstance(photos, Enrollable):
-        return (yield from _enroll(subject, photos, retries))
+        return (yield from _enroll(subject, photos, retries, storage, holder_key, replace))
     pictures: list[bytes] = yield Work(lambda: read_photos(photos))
     lift = yield from lift_enrollment(pictures, lifter, retries, face=face)
     try:
-        return (yield from _enroll(subject, lift, retries))
+        return (yield from _enroll(subject, lift, retries, storage, holder_key, replace))
     except ContractMismatch:
         renewed = yield from inputs_of(lifter, retries, fresh=True)
         if renewed.contract_id == lift.contract_id:
             raise
     lift = yield from _enrollable(pictures, lifter, renewed, face)
-    return (yield from _enroll(subject, lift, retries))
+    return (yield from _enroll(subject, lift, retries, storage, holder_key, replace))
 
 
 def verify(
     subject: str,
-    photo: Photo | Probe,
+    photos: Photo | Iterable[Photo] | Probe,
     token: str,
     lifter: Lifter,
     retries: Retries,
     *,
     level: str | None,
     face: Face | None,
+    held_template: HeldTemplate | None,
+    holder_key: bytes | None,
 ) -> Flow[results.Decision]:
-    """Verify a photo that is lifted here, or a probe that was lifted before."""
+    """Verify photos that are lifted here, or a probe that was lifted before."""
     calls.subject_path(subject)
-    if isinstance(photo, Probe):
-        return (yield from _verify(subject, photo, token, retries, level))
-    picture: bytes = yield Work(lambda: read_photo(photo))
-    probe = yield from lift_probe(picture, lifter, retries, face=face)
+    held = yield from read_held_template(held_template)
+    if isinstance(photos, Probe):
+        return (yield from _verify(subject, photos, token, retries, level, held, holder_key))
+    pictures: list[bytes] = yield Work(lambda: read_photos(photos))
+    probe = yield from lift_probe(pictures, lifter, retries, face=face)
     try:
-        return (yield from _verify(subject, probe, token, retries, level))
+        return (yield from _verify(subject, probe, token, retries, level, held, holder_key))
     except ContractMismatch:
         renewed = yield from inputs_of(lifter, retries, fresh=True)
         if renewed.contract_id == probe.contract_id:
             # It is the subject's stored template that is of another contract.
             raise
-    probe = yield from _probe(picture, lifter, renewed, face)
-    return (yield from _verify(subject, probe, token, retries, level))
+    probe = yield from _probe(pictures, lifter, renewed, face)
+    return (yield from _verify(subject, probe, token, retries, level, held, holder_key))
 
 
-def _probe(picture: bytes, lifter: Lifter, inputs: LiftInputs, face: Face | None) -> Flow[Probe]:
+def _probe(
+    pictures: list[bytes], lifter: Lifter, inputs: LiftInputs, face: Face | None
+) -> Flow[Probe]:
     canceller = Canceller()
-    lift = partial(lifter.probe, inputs, picture, face=face, canceller=canceller)
+    lift = partial(lifter.probe, inputs, pictures, face=face, canceller=canceller)
     probe: Probe = yield Work(lift, canceller.cancel)
     return probe
 
@@ -117,15 +128,43 @@ def _enrollable(
     return enrollable
 
 
-def _enroll(subject: str, lift: Enrollable, retries: Retries) -> Flow[results.Enrollment]:
-    call = calls.enroll_template(subject, lift.template, key=lift.key_for(subject))
+def _enroll(
+    subject: str,
+    lift: Enrollable,
+    retries: Retries,
+    storage: Storage | None,
+    holder_key: bytes | None,
+    replace: bool | str,
+) -> Flow[results.Enrollment]:
+    key = lift.key_for(subject)
+    call = calls.enroll_template(
+        subject,
+        lift.template,
+        storage=storage,
+        holder_key=holder_key,
+        replace=replace,
+        key=key,
+    )
     return (yield from _send(call, lift, retries))
 
 
 def _verify(
-    subject: str, lift: Probe, token: str, retries: Retries, level: str | None
+    subject: str,
+    lift: Probe,
+    token: str,
+    retries: Retries,
+    level: str | None,
+    held_template: str | None,
+    holder_key: bytes | None,
 ) -> Flow[results.Decision]:
-    call = calls.verify_template(token, subject, lift.template, level=level)
+    call = calls.verify_template(
+        token,
+        subject,
+        lift.template,
+        level=level,
+        held_template=held_template,
+        holder_key=holder_key,
+    )
     return (yield from _send(call, lift, retries))
 
 

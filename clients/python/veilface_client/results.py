@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import httpx
-from pydantic import Field, StringConstraints, ValidationError
+from pydantic import AwareDatetime, Base64Bytes, Field, StringConstraints, ValidationError
 
 from veilface_client.errors import UnexpectedAnswer
+from veilface_client.held_templates import save_held_template
 from veilface_client.lifts import Value
 
 Hex = Annotated[str, StringConstraints(pattern=r"\A[0-9a-f]{64}\z")]
@@ -32,12 +33,32 @@ class PhotoUsed(Value):
 
 
 class Enrollment(Answer):
-    """The subject is enrolled; ``images`` is empty for a template."""
+    """The subject is enrolled; ``images`` is empty for a template.
+
+    ``held_template`` is there where it was enrolled with ``storage="holder"``: the one copy of its
+    sealed template, which every verification needs.
+    """
 
     template_id: str
     contract_id: str
     replaced: bool
+    holder_key: bool = False
     images: tuple[PhotoUsed, ...]
+    held_template: Base64Bytes | None = Field(default=None, repr=False)
+
+    def save_held_template(self, path: str | os.PathLike[str]) -> None:
+        """Write the held template to a new file that only this user can read.
+
+        Raises
+        ------
+        ValueError
+            The service keeps the template.
+        FileExistsError
+            There is a file already: it may be the only copy of another template.
+        """
+        if self.held_template is None:
+            raise ValueError("the service keeps the template: enroll with storage='holder'")
+        save_held_template(self.held_template, path)
 
 
 class Decision(Answer):
@@ -50,6 +71,8 @@ class Decision(Answer):
     contract_id: str
     calibration_id: str
     distance: float | None = None
+    liveness: str = "not_checked"  # as a service that checks none would say
+    liveness_failure: str | None = None
 
     @property
     def accepted(self) -> bool:
@@ -61,6 +84,20 @@ class Decision(Answer):
         return self.accepted
 
 
+class Challenge(Answer):
+    """Movements to make, in their order, as the person sees them who makes them.
+
+    ``min_frames`` to ``max_frames`` frames of the movements must reach the service before
+    ``expires_at``, in one verification.
+    """
+
+    challenge_id: str
+    movements: tuple[str, ...]
+    min_frames: int
+    max_frames: int
+    expires_at: str
+
+
 class Subject(Value):
     """A subject, without its template."""
 
@@ -70,8 +107,10 @@ class Subject(Value):
     current: bool
     enrolled_by: str
     photos: int
-    created_at: str
-    updated_at: str
+    storage: str = "service"  # a service that does not say keeps all
+    holder_key: bool = False
+    created_at: AwareDatetime
+    updated_at: AwareDatetime
 
 
 class SubjectAnswer(Subject, Answer):
@@ -89,9 +128,9 @@ class Lockout(Answer):
     """Failed verifications of a subject."""
 
     consecutive_failures: int
-    last_failed_at: str | None
-    locked_until: str | None
-    disabled_at: str | None
+    last_failed_at: AwareDatetime | None
+    locked_until: AwareDatetime | None
+    disabled_at: AwareDatetime | None
 
 
 class Unlocked(Answer):
@@ -126,7 +165,7 @@ class Receipt(_Verbatim):
 
     @property
     def held(self) -> bool:
-        """Whether a template was stored."""
+        """Whether the subject was enrolled."""
         return self.claims.get("held") is True
 
 
@@ -173,6 +212,7 @@ class Imported(Answer):
     template_id: str
     contract_id: str
     replaced: bool
+    holder_key: bool = False
 
 
 class Health(Answer):

@@ -65,7 +65,7 @@ def euclidean_subspaces(tile: Tile, options: Options, work: Array32, out: Result
     zero, one = every(np.float32(0)), every(np.float32(1))
     smallest = every(np.float32(100) * _EPS)
     limit = every(options.least * options.least)
-    found = 0
+    inexact = 0
     for i in range(len(tile.probe_terms)):
         for j in range(0, columns, LANES):
             origin = i * (m_d + 1) * (m_e + 1) * columns + j
@@ -116,7 +116,7 @@ def euclidean_subspaces(tile: Tile, options: Options, work: Array32, out: Result
                 size = size + beta * (beta + beta)
             sound &= less(limit, squared) & less(squared, every(OVERFLOW))
             sound &= less(every(np.float32(4) * _EPS) * size, every(options.accuracy) * squared)
-            found += sound != ALL
+            inexact += sound != ALL
             distance = blend(sound, root(squared), every(np.float32(-1)))
             put(out.distances, i * out.stride + j, out.width - j, distance)
-    return found
+    return inexact

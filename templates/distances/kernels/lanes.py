@@ -85,25 +85,9 @@ def load(typing: Any, array: Any, index: Any) -> Any:
     """Numbers ``index`` to ``index + 15`` of a flat, contiguous float32 array."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        found = builder.load(_address(context, builder, signature.args[0], *arguments))
-        found.align = _ALIGNMENT
-        return found
-
-    return _LANES(array, types.intp), generate
-
-
-@_primitive
-def load_bytes(typing: Any, array: Any, index: Any) -> Any:
-    """Numbers ``index`` to ``index + 15`` of a flat, contiguous int8 array, as float32."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
-        kind = ir.VectorType(ir.IntType(8), LANES)
-        place = builder.bitcast(builder.gep(data, [arguments[1]]), kind.as_pointer())
-        found = builder.load(place)
-        found.align = 1
-        wide = builder.sext(found, ir.VectorType(ir.IntType(32), LANES))
-        return builder.sitofp(wide, _FLOATS)
+        numbers = builder.load(_address(context, builder, signature.args[0], *arguments))
+        numbers.align = _ALIGNMENT
+        return numbers
 
     return _LANES(array, types.intp), generate
 
@@ -156,8 +140,8 @@ def _called(name: str, count: int) -> Any:
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         kind = ir.FunctionType(_FLOATS, [_FLOATS] * count)
         title = f"llvm.{name}.v{LANES}f32"
-        found: Any = cgutils.get_or_insert_function  # untyped
-        return builder.call(found(builder.module, kind, title), arguments)
+        function: Any = cgutils.get_or_insert_function  # untyped
+        return builder.call(function(builder.module, kind, title), arguments)
 
     return {1: one, 2: two, 3: three}[count]
 
@@ -239,8 +223,8 @@ def put(typing: Any, array: Any, index: Any, count: Any, value: Any) -> Any:
         kind = ir.FunctionType(
             ir.VoidType(), [_FLOATS, _FLOATS.as_pointer(), ir.IntType(32), _FLAGS]
         )
-        found: Any = cgutils.get_or_insert_function  # untyped
-        write = found(builder.module, kind, f"llvm.masked.store.v{LANES}f32.p0")
+        function: Any = cgutils.get_or_insert_function  # untyped
+        write = function(builder.module, kind, f"llvm.masked.store.v{LANES}f32.p0")
         alignment = ir.Constant(ir.IntType(32), _ALIGNMENT)
         builder.call(write, [arguments[3], place, alignment, wanted])
         return context.get_dummy_value()

@@ -29,7 +29,7 @@ def points(tile: Tile, options: Options, out: Result) -> int:
     product, columns, m = tile.product, len(tile.template_squares), tile.m_e
     zero, two, minus_two = every(np.float32(0)), every(np.float32(2)), every(np.float32(-2))
     limit, unknown = every(options.least * options.least), every(np.float32(-1))
-    found = 0
+    inexact = 0
     for i in range(len(tile.probe_terms)):
         own = every(tile.probe_terms[i])
         for j in range(0, columns, LANES):
@@ -44,7 +44,7 @@ def points(tile: Tile, options: Options, out: Result) -> int:
             else:
                 squared = fma(minus_two, dots, own + load(tile.template_squares, j)) - inside
             known = less(limit, squared) & less(squared, every(OVERFLOW))
-            found += known != ALL
+            inexact += known != ALL
             distance = blend(known, root(squared), unknown)
             put(out.distances, i * out.stride + j, out.width - j, distance)
-    return found
+    return inexact

@@ -1,12 +1,9 @@
 """What is kept of a tile of distances where the whole matrix is not: the nearest, and counts."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from templates.distances.kernels.arguments import Array32, Integers
 from templates.distances.kernels.lanes import ALL, LANES, compiled, every, inlined, less, load
-
-Array32 = NDArray[np.float32]
-Integers = NDArray[np.int64]
 
 
 @inlined

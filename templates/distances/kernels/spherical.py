@@ -432,14 +432,14 @@ def _finish(
     value, _, _ = _ascend(work, waiting, other + size, other, m, options.steps, True)
     gain = larger(gain, value)
     store(work, best, _distance(load(work, dots) + gain))
-    found = 0
+    inexact = 0
     for lane in range(count):
         distance = work[best + lane]
         if not distance > options.least:
             distance = np.float32(-1)
-            found += 1
+            inexact += 1
         out[places[lane]] = distance
-    return found
+    return inexact
 
 
 @inlined
@@ -478,7 +478,7 @@ def spherical_subspaces(tile: Tile, options: Options, work: Array32, out: Result
     if swapped:
         across, down = down, across
     places = np.zeros(LANES, dtype=np.int64)
-    held = found = 0
+    filled = inexact = 0
     zero = every(np.float32(0))
     for i in range(len(tile.probe_terms)):
         for j in range(0, columns, LANES):
@@ -513,7 +513,7 @@ def spherical_subspaces(tile: Tile, options: Options, work: Array32, out: Result
             place = i * out.stride + j
             distance = blend(known, distance, every(np.float32(-1)))
             put(out.distances, place, out.width - j, distance)
-            found += known != ALL
+            inexact += known != ALL
             if proven == ALL:
                 continue
             store(work, free, gain)
@@ -522,18 +522,20 @@ def spherical_subspaces(tile: Tile, options: Options, work: Array32, out: Result
                 if proven >> lane & 1 or j + lane >= out.width:
                     continue
                 for k in range(0, size, LANES):
-                    work[waiting + k + held] = work[problem + k + lane]
-                work[best + held] = work[free + lane]
-                work[dots + held] = work[free + LANES + lane]
-                places[held] = place + lane
-                held += 1
-                if held == LANES:
-                    found += _finish(
-                        work, waiting, best, dots, free, low, options, places, held, out.distances
+                    work[waiting + k + filled] = work[problem + k + lane]
+                work[best + filled] = work[free + lane]
+                work[dots + filled] = work[free + LANES + lane]
+                places[filled] = place + lane
+                filled += 1
+                if filled == LANES:
+                    inexact += _finish(
+                        work, waiting, best, dots, free, low, options, places, filled, out.distances
                     )
-                    held = 0
+                    filled = 0
                     store(work, free, gain)
                     store(work, free + LANES, dot)
-    if held:
-        found += _finish(work, waiting, best, dots, free, low, options, places, held, out.distances)
-    return found
+    if filled:
+        inexact += _finish(
+            work, waiting, best, dots, free, low, options, places, filled, out.distances
+        )
+    return inexact

@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 from api.cli import app
 from models.demo import build_demo_pack
 from models.synthetic import draw_face, encode_photo
+from tests.once import made_once
 
 DIM = 8
 PROBE_DIM = 4
@@ -54,7 +55,6 @@ def draw(folder: Path, seeds: range, photos: range) -> Path:
 class World:
     """Folders that the commands read and wrote."""
 
-    root: Path
     pack: Path
     decoy_faces: Path
     labelled: Path
@@ -67,13 +67,11 @@ class World:
         return [self.people / f"person-{seed}" / f"{number}.png" for number in numbers]
 
 
-@pytest.fixture(scope="session")
-def world(tmp_path_factory: pytest.TempPathFactory) -> World:
-    root = tmp_path_factory.mktemp("world")
+def make_world(root: Path) -> None:
     pack = build_demo_pack(root / "pack")
     decoy_faces = draw(root / "decoy-faces", range(5000, 5150), range(1))
     labelled = draw(root / "labelled", range(6000, 6050), range(4))
-    people = draw(root / "people", range(1, 5), range(5))
+    draw(root / "people", range(1, 5), range(5))
     data = root / "data"
     built = run("decoys", "build", decoy_faces, "--pack", pack, "--data-dir", data, "--json")
     assert built.status == 0, built.stderr
@@ -81,7 +79,15 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> World:
         *("calibrate", labelled, "--pack", pack, "--data-dir", data, "--dim", str(DIM), "--json"),
     )
     assert calibrated.status == 0, calibrated.stderr
-    return World(root, pack, decoy_faces, labelled, people, data, built.json, calibrated.json)
+    (root / "said.json").write_text(json.dumps([built.json, calibrated.json]))
+
+
+@pytest.fixture(scope="session")
+def world(tmp_path_factory: pytest.TempPathFactory) -> World:
+    """Commands of tests read it; what one writes into is a copy, :func:`data`."""
+    root = made_once(tmp_path_factory, "world", make_world)
+    folders = (root / name for name in ("pack", "decoy-faces", "labelled", "people", "data"))
+    return World(*folders, *json.loads((root / "said.json").read_text()))
 
 
 def key_file(data: Path) -> Path:
@@ -89,11 +95,16 @@ def key_file(data: Path) -> Path:
     return data.parent / f"{data.name}-keys" / "master.key"
 
 
+def copied(data: Path, folder: Path) -> Path:
+    """Copy a data folder and its master key to ``folder``."""
+    shutil.copytree(key_file(data).parent, key_file(folder / "data").parent)
+    return Path(shutil.copytree(data, folder / "data"))
+
+
 @pytest.fixture
 def data(world: World, tmp_path: Path) -> Path:
     """A data folder of this test alone, and its master key: contract, decoys, no database yet."""
-    shutil.copytree(key_file(world.data).parent, key_file(tmp_path / "data").parent)
-    return Path(shutil.copytree(world.data, tmp_path / "data"))
+    return copied(world.data, tmp_path)
 
 
 @pytest.fixture

@@ -15,7 +15,6 @@ import pytest
 
 from api.cli.attacked_service import Ask, attacked_service, leaves_on_sigterm
 from api.http.errors import StartError
-from attacks.hill_climbing import in_process
 from attacks.outcomes import GENERATED, Scheme
 from attacks.population import draw_population
 from attacks.system import System
@@ -23,6 +22,7 @@ from templates.contract import wire
 from templates.keys.sealing import MasterKeyring
 from templates.store import TemplateStore
 from tests.attacks.conftest import small_system
+from tests.attacks.own_decisions import in_process
 from tests.leaks import LeakSearch
 from tests.verify.synthetic import draw_people, make_generator, unit
 

@@ -50,6 +50,9 @@ class FaceAudit:
         return self.root / "out"
 
 
+FEW = ("--attack", "100", "--attacked", "50", "--attackers", "knn", "--attributes", "gender")
+
+
 def evaluated(strategy: str, decoys: str | None, dim: int, accuracy: float) -> dict[str, Any]:
     raw = strategy == "raw"
     return {
@@ -120,7 +123,7 @@ def test_the_report_of_faces_is_the_one_that_is_documented(face_report: Any) -> 
     missing = members.keys() - face_report.keys()
     assert missing <= {name for name in members if "`templates`" in members[name]}
     assert face_report.keys() <= members.keys()
-    assert (face_report["format"], face_report["version"]) == ("veilface audit", 1)
+    assert (face_report["format"], face_report["version"]) == ("veilface audit", 2)
     assert face_report["kind"] == "fairface"
     scheme = {"strategy", "decoys", "dim"}
     row_names = named_in("A row of attribute inference has")
@@ -227,8 +230,7 @@ def test_only_the_photos_that_the_limits_ask_for_are_embedded(
         yield shares.append
 
     monkeypatch.setattr(audit_report, "share_done", recorded)
-    few = ("--attack", "100", "--attacked", "50", "--attackers", "knn", "--attributes", "gender")
-    ran = run(*faces.asked, *few, "--out", faces.root / "few", "--json")
+    ran = run(*faces.asked, *FEW, "--out", faces.root / "few", "--json")
     assert ran.status in (0, 1), ran.stderr
     acquired, settings = ran.json["failure_to_acquire"], ran.json["settings"]
     assert (acquired["train"]["photos"], acquired["val"]["photos"]) == (200, 50)
@@ -241,11 +243,12 @@ def test_only_the_photos_that_the_limits_ask_for_are_embedded(
     assert shares[-1] == pytest.approx(1.0)
 
 
-def test_the_verdict_is_a_table_on_the_terminal(faces: FaceAudit, face_report: Any) -> None:
+def test_the_verdict_is_a_table_on_the_terminal(faces: FaceAudit) -> None:
     """Rows as in the report: the property, who the attacker was, what it reached, the limit."""
-    limit = face_report["verdicts"][0]["cells"][0]["compared"] / 2
+    limit = 0.0125
     ran = run(
-        *faces.asked, "--max-attribute-leakage", f"{limit:.6f}", "--out", faces.root / "table"
+        *(*faces.asked, *FEW, "--max-attribute-leakage", str(limit)),
+        *("--out", faces.root / "table"),
     )
     lines = ran.stdout.splitlines()
     assert "Verdict on adversarial, m = 4, generated decoys" in lines[0]
@@ -253,9 +256,9 @@ def test_the_verdict_is_a_table_on_the_terminal(faces: FaceAudit, face_report: A
     (cell,) = verdict["cells"]
     (row,) = [line for line in lines if "confidentiality" in line and "│" in line]
     shown = [part.strip() for part in row.strip("│").split("│")]
-    assert shown[:2] == ["confidentiality", cell["knowledge"]]
-    assert shown[2].startswith(cell["attack"])
-    assert shown[3].startswith(f"{cell['value']:.3g} (")
+    assert shown[:3] == ["confidentiality", cell["leaked"], cell["knowledge"]]
+    assert shown[3].startswith(cell["attack"])
+    assert shown[4].startswith(f"{cell['value']:.3g} (")
     assert shown[-2:] == [f"attribute-leakage {limit:.3g}", "fail"]
 
 

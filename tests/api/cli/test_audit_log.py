@@ -3,17 +3,29 @@ import sqlite3
 
 import pytest
 
-from tests.api.cli.conftest import run
+from tests.api.cli.conftest import copied, run
+
+
+@pytest.fixture(scope="module")
+def logged(world, tmp_path_factory):
+    """A data folder with a few lines in its log: keys, an enrollment, two verifications."""
+    data = copied(world.data, tmp_path_factory.mktemp("logged"))
+    options = ("--pack", world.pack, "--data-dir", data)
+    assert run("keys", "create", "--right", "verify", "--data-dir", data).status == 0
+    assert run("enroll", "ann", *world.photos(1, range(3)), *options).status == 0
+    assert run("verify", "ann", *world.photos(1, range(3, 4)), *options).status == 0
+    assert run("verify", "ann", *world.photos(2, range(1)), *options).status == 1
+    return data
 
 
 @pytest.fixture
-def log(world, veilface):
-    """A log with a few lines: keys, an enrollment, two verifications."""
-    pack = ("--pack", world.pack)
-    assert veilface("keys", "create", "--right", "verify").status == 0
-    assert veilface("enroll", "ann", *world.photos(1, range(3)), *pack).status == 0
-    assert veilface("verify", "ann", *world.photos(1, range(3, 4)), *pack).status == 0
-    assert veilface("verify", "ann", *world.photos(2, range(1)), *pack).status == 1
+def data(logged, tmp_path):
+    return copied(logged, tmp_path)
+
+
+@pytest.fixture
+def log(veilface):
+    """Commands on a log of this test alone."""
     return veilface
 
 

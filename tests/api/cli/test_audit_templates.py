@@ -15,15 +15,21 @@ import pytest
 import attacks.audit
 import attacks.population
 import attacks.system
+from api.cli import audit_templates
+from attacks.audit import AuditPlan, AuditResult
 from attacks.databases import link_databases
 from attacks.outcomes import Knowledge, Property
 from attacks.population import Population
 from attacks.stored import presentation
+from attacks.stored.foot_point import foot_point_attack
+from attacks.stored.known_database import known_database_attack
 from attacks.system import System
 from attacks.verdict import LIMITS, Status
 from models.demo import DEMO_NOTICE
+from models.extraction import Extraction
 from tests.api.cli.audit_bench import are_pictures, both, documented, draw_people, named_in
 from tests.api.cli.conftest import Ran, World, run
+from tests.attacks.stored.systems import system_of
 from tests.leaks import LeakSearch
 from verify import calibrate
 
@@ -121,31 +127,67 @@ def test_an_audit_of_templates_writes_report_and_figures(
     assert people.left == []
 
 
-def test_the_report_of_templates_is_the_one_that_is_documented(people_report: Any) -> None:
+def is_as_documented(report: Any) -> None:
     members = documented()
-    missing = members.keys() - people_report.keys()
+    missing = members.keys() - report.keys()
     assert missing <= {
         name for name in members if re.match("`fairface`|with `--evaluation`", members[name])
     }
-    assert people_report.keys() <= members.keys()
-    assert (people_report["kind"], people_report["rows"]) == ("templates", [])
-    assert people_report["limits"].keys() == {limit.name for limit in LIMITS}
+    assert report.keys() <= members.keys()
+    assert (report["kind"], report["rows"]) == ("templates", [])
+    assert report["limits"].keys() == {limit.name for limit in LIMITS}
     scheme = {"strategy", "decoys", "dim"}
     outcome_names = named_in("An outcome has") - {"errors"}
-    for outcome in people_report["outcomes"]:
+    for outcome in report["outcomes"]:
         assert outcome_names <= outcome.keys() | outcome["measured"].keys()
         assert outcome.keys() <= outcome_names | scheme
         assert outcome["measured"]["ci_low"] <= outcome["measured"]["value"]
         assert outcome["measured"]["value"] <= outcome["measured"]["ci_high"]
     values = {*map(str, Property), *map(str, Knowledge), *map(str, Status)}
     cell_names = named_in("A cell of a verdict is") - values
-    for verdict in people_report["verdicts"]:
+    for verdict in report["verdicts"]:
         assert verdict.keys() == scheme | {"passed", "comparison", "cells"}
         for cell in verdict["cells"]:
             assert cell.keys() >= cell_names
             assert cell["status"] in set(map(str, Status))
 
 
+@pytest.mark.long
+def test_the_report_of_templates_is_the_one_that_is_documented(people_report: Any) -> None:
+    is_as_documented(people_report)
+
+
+def test_what_two_attacks_found_becomes_report_verdict_and_status(
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The command around a small system with decoys of real people, which one attack opens."""
+    system = system_of("pool")
+
+    def two_attacks(plan: AuditPlan, faces: Extraction, *_: Any, **__: Any) -> AuditResult:
+        assert (plan.victims, len(faces.descriptors)) == (20, 20)
+        outcomes = [*foot_point_attack(system), *known_database_attack(system)]
+        return AuditResult(outcomes, [], [], {"victims": plan.victims})
+
+    monkeypatch.setattr(audit_templates, "run_audit", two_attacks)
+    asked = (
+        *("audit", "templates", world.people, "--pack", world.pack, "--data-dir", world.data),
+        *("--aligned", "--no-learned", "--victims", "20"),
+    )
+    failed = run(*asked, "--out", tmp_path / "failed", "--json")
+    assert failed.status == 1, failed.stderr
+    report = json.loads((tmp_path / "failed" / "report.json").read_text(encoding="utf-8"))
+    is_as_documented(report)
+    assert [row["attack"] for row in report["outcomes"]].count("foot-point") > 0
+    (verdict,) = report["verdicts"]
+    cells = {cell["limit"]: cell["status"] for cell in verdict["cells"]}
+    assert cells["recovery-success"] == "fail"
+    most = [f"--max-{limit.name}=1" for limit in LIMITS if limit.name != "attribute-leakage"]
+    kept = run(*asked, *most, "--out", tmp_path / "kept")
+    assert kept.status == 0, kept.stderr
+    assert kept.stdout.strip().endswith("PASSED")
+
+
+@pytest.mark.long
 def test_every_property_is_attacked_and_the_service_was_climbed(people_report: Any) -> None:
     mine = [row for row in people_report["outcomes"] if row["decoys"] == "generator"]
     properties = {row["property"] for row in mine}
@@ -158,6 +200,7 @@ def test_every_property_is_attacked_and_the_service_was_climbed(people_report: A
     assert not any(row["judged"] for row in over_rest if row["variant"].startswith("dictionary"))
 
 
+@pytest.mark.long
 def test_an_attack_that_exceeds_its_limit_is_status_1(
     people: TemplateAudit, people_report: Any
 ) -> None:
@@ -196,6 +239,7 @@ def test_the_seed_gives_the_outcomes_and_kept_limits_are_status_0(
     assert len(found) < len(people_report["outcomes"])
 
 
+@pytest.mark.long
 def test_pools_are_compared_with_and_do_not_decide(compared: Ran, compared_report: Any) -> None:
     audited, other = compared_report["verdicts"]
     assert (audited["decoys"], audited["comparison"]) == ("generator", False)
@@ -209,6 +253,7 @@ def test_pools_are_compared_with_and_do_not_decide(compared: Ran, compared_repor
     assert "For comparison: " in compared.stdout
 
 
+@pytest.mark.long
 def test_the_service_of_the_contract_is_audited(people_report: Any, world: World) -> None:
     settings, known = people_report["settings"], world.calibrated["contract"]
     assert settings["contract_id"] == known["contract_id"]
@@ -220,6 +265,7 @@ def test_the_service_of_the_contract_is_audited(people_report: Any, world: World
     assert {row["level"] for row in people_report["outcomes"]} - {None} <= levels
 
 
+@pytest.mark.long
 def test_nothing_of_people_and_templates_stands_in_the_report(people: TemplateAudit) -> None:
     (population,) = people.populations
     rows = np.concatenate(

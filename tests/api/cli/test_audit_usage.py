@@ -4,23 +4,29 @@ import importlib
 import json
 import shutil
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from api.cli import audit_templates
+from api.process.opening import file_sealer
 from attacks.learned import extra
 from attacks.population import LEAST_FITTED
 from models.pack import ModelPack
+from templates.contract.document import Contract
 from templates.decoys import DecoyGenerator
 from templates.decoys.fitting import MIN_DESCRIPTORS
 from templates.keys.randomness import Keystream
+from templates.keys.rotation import HAAR_VERSION
+from templates.keys.sealing import MasterKeyring
 from tests.api.cli.audit_bench import draw_fairface
-from tests.api.cli.conftest import Ran, World, run
+from tests.api.cli.conftest import Ran, World, key_file, run
 
 SMALL = ("--lifting", "100", "--strategy", "raw", "--generated-dim", "4", "--service-dim", "4")
 FAIRFACE_USAGE: list[tuple[list[str], str]] = [
+    (["--device", "nowhere"], "; leave out --device to use the processor"),
     (["--attributes", "gender,height"], "--attributes takes of gender, race, age, not"),
     (["--attributes", ","], "--attributes takes of gender, race, age, and is empty"),
     (["--strategy", "raw,homomorphic"], "--strategy takes of raw, random, adversarial, hybrid"),
@@ -38,6 +44,7 @@ FAIRFACE_USAGE: list[tuple[list[str], str]] = [
     ),
 ]
 TEMPLATES_USAGE: list[tuple[list[str], str]] = [
+    (["--device", "nowhere"], "; leave out --device to use the processor"),
     (["--dim", "many"], "--dim takes whole numbers such as 16,32, not 'many'"),
     (["--dim", "16,256"], "--dim takes dimensions from 1 to 255, not 256"),
     (["--dim", "0"], "--dim takes dimensions from 1 to 255, not 0"),
@@ -271,6 +278,22 @@ def test_people_without_folders_are_refused(world: World, tmp_path: Path) -> Non
     assert (ran.status, ran.stdout) == (1, "")
     assert "defect" not in ran.stderr
     assert "error: " in ran.stderr
+
+
+@pytest.mark.usefixtures("before_any_face")
+def test_a_contract_of_the_earlier_rotation_version_is_refused(
+    world: World, tmp_path: Path
+) -> None:
+    sealer = file_sealer(MasterKeyring.load(key_file(world.data)))
+    contract = Contract.load(world.data / "contract.json", sealer)
+    earlier = replace(
+        contract,
+        binding=replace(contract.binding, rotation_version=HAAR_VERSION),
+        calibrations=tuple(replace(each, calibration_id="") for each in contract.calibrations),
+    )
+    earlier.save(tmp_path / "earlier.json", sealer)
+    ran = templates(world, world.labelled, "--contract", tmp_path / "earlier.json")
+    refused(ran, "run `veilface calibrate --strategy adversarial --dim ", 1)
 
 
 @pytest.mark.usefixtures("before_any_face")

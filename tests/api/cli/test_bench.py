@@ -103,9 +103,11 @@ def test_a_device_that_is_not_there_is_refused(device: str):
 
 def test_a_device_without_torch_names_the_extra(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "torch", None)
+    monkeypatch.delitem(sys.modules, "templates.distances.torch", raising=False)
+    monkeypatch.delattr("templates.distances.torch", raising=False)
     shown = run(*TINY, "--device", "cuda")
     assert shown.status == 2
-    assert "extra 'torch'" in shown.stderr
+    assert 'pip install "veilface[torch]"' in shown.stderr
 
 
 def test_a_device_is_measured_with_torch():

@@ -8,7 +8,7 @@ from models.demo import DEMO_NOTICE
 from templates.contract.document import Binding
 from templates.decoys import DecoyGenerator, DecoyPool, load_source
 from templates.keys.sealing import MasterKeyring
-from tests.api.cli.conftest import key_file, run
+from tests.api.cli.conftest import draw, key_file, run
 
 RACES = ("White", "Black", "Indian")
 
@@ -114,3 +114,52 @@ def test_a_pack_must_be_named(world, tmp_path):
     ran = run("decoys", "build", world.decoy_faces, "--data-dir", tmp_path)
     assert ran.status == 2
     assert "--pack" in ran.stderr
+
+
+@pytest.fixture(scope="module")
+def volunteers(tmp_path_factory):
+    """Fifty people with two photos, in folders of their own."""
+    return draw(tmp_path_factory.mktemp("volunteers"), range(9000, 9050), range(2))
+
+
+def test_a_generator_is_adapted_to_a_sample(world, veilface, volunteers, tmp_path):
+    """Of two folders; the file is an ordinary one."""
+    out = tmp_path / "decoys.veil"
+    ran = veilface(
+        *("decoys", "build", world.decoy_faces, world.labelled, "--like", volunteers),
+        *("--pack", world.pack, "--out", out, "--json"),
+    )
+    assert ran.status == 0, ran.stderr
+    assert (ran.json["descriptors"], ran.json["like"]) == (350, 100)
+    adapted = DecoyGenerator.load(out)
+    assert adapted.source_id == ran.json["source_id"]
+    assert adapted.made_with == world.built["made_with"]
+
+
+def test_a_sample_that_is_among_the_sources_is_refused(world, veilface, volunteers, tmp_path):
+    ran = veilface(
+        *("decoys", "build", world.decoy_faces, volunteers, "--like", volunteers),
+        *("--pack", world.pack, "--out", tmp_path / "decoys.veil"),
+    )
+    assert ran.status == 1
+    assert "100 of the 100 photos to adapt to are among the others too" in ran.stderr
+    assert "Give folders that share no people" in ran.stderr
+    assert not (tmp_path / "decoys.veil").exists()
+
+
+def test_a_sample_of_too_few_photos_is_refused(world, veilface, tmp_path):
+    ran = veilface(
+        *("decoys", "build", world.decoy_faces, "--like", world.people),
+        *("--pack", world.pack, "--out", tmp_path / "decoys.veil"),
+    )
+    assert ran.status == 1
+    assert "100 or more embeddings of the kind that will be enrolled, and 20 are" in ran.stderr
+
+
+def test_a_pool_is_not_adapted(world, veilface, volunteers):
+    ran = veilface(
+        *("decoys", "build", world.decoy_faces, "--like", volunteers, "--kind", "pool"),
+        *("--pack", world.pack),
+    )
+    assert ran.status == 2
+    assert "--like adapts a generator" in ran.stderr

@@ -94,8 +94,6 @@ def test_every_extra_brings_what_its_commands_need():
         (("evaluate", "lfw.bin"), "joblib", "evaluate"),
         (("audit", "templates", "people"), "sklearn", "audit"),
         (("audit", "fairface", "faces"), "matplotlib", "audit"),
-        (("decoys", "build", "faces"), "sklearn", "decoys"),
-        (("demo", "--pack", "pack", "--faces", "faces"), "sklearn", "decoys"),
     ],
 )
 def test_a_missing_extra_is_named_before_any_work(monkeypatch, words, package, extra):

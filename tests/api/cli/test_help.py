@@ -11,11 +11,20 @@ from tests.api.cli.conftest import run
 
 DOCS = Path(__file__).resolve().parents[3] / "docs" / "cli.md"
 PROMISED = {
-    *("demo", "serve", "enroll", "verify", "lift", "calibrate", "evaluate"),
+    *("demo", "setup", "serve", "enroll", "verify", "lift", "calibrate", "evaluate"),
+    "evaluate liveness",
     *("audit fairface", "audit templates"),
-    *("decoys build", "models inspect", "db upgrade", "db check", "db compact", "db current"),
+    *(
+        "decoys build",
+        "models inspect",
+        "models fetch",
+        "db upgrade",
+        "db check",
+        "db compact",
+        "db current",
+    ),
     *("keys create", "keys list", "keys revoke", "keys master", "keys rotate", "keys rewrap"),
-    *("keys verify-receipt", "keys replace", "keys rotate-tenant"),
+    *("keys verify-receipt", "keys replace", "keys rotate-tenant", "keys renew"),
     *("db unlock", "db purge", "db erase-tenant", "db template-enrollment"),
     *("audit-log verify", "audit-log head", "audit-log show"),
     "bench distances",
@@ -85,3 +94,25 @@ def test_no_command_shows_the_help_and_is_wrong_usage():
 @pytest.mark.parametrize("arguments", [["unknown"], ["verify"], ["serve", "--port", "x"]])
 def test_wrong_usage_is_status_2(arguments):
     assert run(*arguments).status == 2
+
+
+@pytest.mark.parametrize(
+    ("path", "arguments", "option"),
+    [
+        (("evaluate",), ["lfw.bin"], "repeats"),
+        (("audit", "fairface"), ["fairface"], "attacked"),
+        (("audit", "templates"), ["people"], "victims"),
+    ],
+)
+def test_quick_is_what_the_page_says_where_nothing_else_is_given(path, arguments, option):
+    command = ALL[path]
+    shown = next(each.help for each in command.params if "--quick" in each.opts)
+    flags = shown.split("`")[1]
+    section = DOCS.read_text().split(f"## `veilface {' '.join(path)}`", 1)[1].split("\n## ", 1)[0]
+    assert f"`{flags}`" in section
+    quick = command.make_context("it", [*arguments, "--quick"]).params
+    written = command.make_context("it", [*arguments, *flags.split()]).params
+    assert {**quick, "_quick": False} == written
+    chosen = command.make_context("it", [*arguments, "--quick", f"--{option}", "150"]).params
+    assert chosen == {**quick, option: 150}
+    assert command.make_context("it", arguments).params != written

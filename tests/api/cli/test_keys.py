@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from api.cli import keys
+from api.cli import master_keys
 from api.http.receipts import receipt_json
 from api.process.opening import file_sealer
 from templates.contract.document import Contract
@@ -47,6 +47,18 @@ def test_a_key_is_made_listed_and_revoked(veilface, store):
     assert again.status == 1
     assert again.json == {"prefix": prefix, "revoked": False}
     assert "revoked" in veilface("keys", "list").stdout
+
+
+def test_liveness_is_shown_and_kept_by_a_replacement(veilface, store):
+    made = veilface("keys", "create", "--right", "verify", "--liveness", "active", "--json")
+    replaced = veilface("keys", "replace", made.json["prefix"], "--json")
+    assert made.json["liveness"] == replaced.json["liveness"] == "active"
+    assert store.api_keys.verify(replaced.json["token"]).liveness == "active"
+    free = veilface("keys", "create", "--right", "verify", "--json")
+    listed = {key["prefix"]: key["liveness"] for key in veilface("keys", "list", "--json").json}
+    assert listed[made.json["prefix"]] == "active"
+    assert listed[free.json["prefix"]] == "off"
+    assert veilface("keys", "create", "--right", "verify", "--liveness", "perhaps").status == 2
 
 
 def test_a_lowest_level_is_shown_and_kept_by_a_replacement(veilface, store):
@@ -124,7 +136,7 @@ def test_a_rotation_without_retiring_keeps_both_keys(veilface, data):
 def test_a_key_that_came_first_during_a_rotation_keeps_the_others_in_the_file(
     veilface, data, store, monkeypatch
 ):
-    file, seal_again = key_file(data), keys._seal_files_again
+    file, seal_again = key_file(data), master_keys._seal_files_again
 
     def rotate_meanwhile(*arguments):
         """Another program, which knows nothing of our lock, between the check and the drop."""
@@ -133,7 +145,7 @@ def test_a_key_that_came_first_during_a_rotation_keeps_the_others_in_the_file(
         return done
 
     with monkeypatch.context() as patch:
-        patch.setattr("api.cli.keys._seal_files_again", rotate_meanwhile)
+        patch.setattr("api.cli.master_keys._seal_files_again", rotate_meanwhile)
         ran = veilface("keys", "rotate", "--retire")
     assert ran.status == 1
     assert "no key was dropped: run `veilface keys rewrap --retire`" in " ".join(ran.stderr.split())
@@ -160,7 +172,7 @@ def test_one_rotation_runs_at_a_time(veilface, data, monkeypatch, command):
         other.append(caught.value)
         return []
 
-    monkeypatch.setattr("api.cli.keys._seal_files_again", start_another)
+    monkeypatch.setattr("api.cli.master_keys._seal_files_again", start_another)
     assert veilface("keys", command).status == 0
     assert len(other) == 1  # the lock was held over the whole command
     with ThreadPoolExecutor(1) as thread:

@@ -12,7 +12,8 @@ from models.demo import DEMO_NOTICE
 from models.pack import ModelPack
 from templates.contract import wire
 from templates.contract.document import Binding, Contract
-from templates.decoys import DecoyGenerator
+from templates.decoys import NOISE_ENERGY, DecoyGenerator
+from templates.keys.holder_key import encode_holder_key, write_holder_key
 from templates.keys.probe_signature import sign_probe
 from templates.keys.sealing import MasterKeyring
 from tests.api.cli.conftest import DIM, PROBE_DIM, key_file, run
@@ -42,7 +43,7 @@ def lift(world, public):
     return call
 
 
-def test_an_enrollment_holds_the_descriptor_of_the_photos(world, lift, tmp_path):
+def test_an_enrollment_holds_the_descriptor_of_the_photos_with_noise(world, lift, tmp_path):
     out = tmp_path / "me.veil"
     photos = world.photos(1, range(3))
     ran = lift(*photos, "--out", out, "--json")
@@ -60,7 +61,9 @@ def test_an_enrollment_holds_the_descriptor_of_the_photos(world, lift, tmp_path)
     foot = received.subspace.foot.astype(np.float64)
     basis = received.subspace.basis.astype(np.float64)
     residual = (mean - foot) - basis.T @ (basis @ (mean - foot))
-    assert np.linalg.norm(residual) < 5e-3  # float16
+    # What the noise moved it by, but for the little of that along the template's directions.
+    expected = np.sqrt(NOISE_ENERGY / (1 + NOISE_ENERGY))
+    assert np.linalg.norm(residual) == pytest.approx(expected, rel=0.3)
     assert ran.json["kind"] == "enrollment"
 
 
@@ -90,16 +93,25 @@ def test_two_lifts_share_nothing_but_the_descriptor(world, lift, tmp_path):
     assert overlap.max() < 0.999
 
 
-def test_a_probe_has_a_calibrated_dimension_and_goes_to_stdout_signed(world, lift, monkeypatch):
+def test_a_probe_has_a_calibrated_dimension_and_goes_to_stdout_signed(
+    world, lift, monkeypatch, tmp_path
+):
     (photo,) = world.photos(1, range(1))
+    key = tmp_path / "me.key"
+    write_holder_key(key, bytes(range(32)))
     token = f"vf_{'a' * 12}_{'b' * 64}"
     monkeypatch.setenv("VEILFACE_API_KEY", token)
-    ran = lift(photo, "--probe", "--out", "-", "--subject", "me", "--level", "fmr-1e-2")
+    begun = time.time()
+    ran = lift(
+        *(photo, "--probe", "--out", "-", "--subject", "me", "--level", "fmr-1e-2"),
+        *("--holder-key-file", key),
+    )
     assert ran.status == 0
+    assert ran.json["holder_key"] == encode_holder_key(bytes(range(32)))
+    assert int(begun) <= ran.json["timestamp"] <= time.time()
     assert token not in ran.stderr
     sent = base64.b64decode(ran.json["template"])
     assert wire.decode(sent).subspace.m == PROBE_DIM
-    assert abs(ran.json["timestamp"] - time.time()) < 60
     again = sign_probe(
         token,
         "me",
@@ -128,6 +140,7 @@ def test_a_probe_on_stdout_needs_a_subject_and_a_key(world, lift, monkeypatch):
     ("arguments", "status", "said"),
     [
         (("--dim", "5"), 2, "add --probe"),
+        (("--holder-key-file", "none"), 2, "--holder-key-file goes with --out -"),
         (("--probe", "--dim", "5"), 2, f"of dimension {PROBE_DIM}, not 5"),
     ],
 )

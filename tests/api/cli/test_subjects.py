@@ -1,3 +1,5 @@
+import stat
+
 from models.demo import DEMO_NOTICE
 
 STORED = ("--tenant", "default")
@@ -6,6 +8,7 @@ STORED = ("--tenant", "default")
 def test_enroll_then_accept_and_reject(world, veilface):
     enrolled = veilface("enroll", "ann", *world.photos(1, range(3)), "--pack", world.pack, "--json")
     assert enrolled.status == 0, enrolled.stderr
+    assert "warning: weak privacy: a thief of a template" in enrolled.stderr
     assert enrolled.json["replaced"] is False
     assert enrolled.json["photos"] == 3
     assert DEMO_NOTICE in enrolled.stderr
@@ -19,12 +22,30 @@ def test_enroll_then_accept_and_reject(world, veilface):
     assert own.json["notice"] == enrolled.json["notice"] == DEMO_NOTICE
     assert DEMO_NOTICE in own.stderr
 
+    burst = veilface("verify", "ann", *world.photos(1, range(5)), "--pack", world.pack)
+    assert burst.status == 0, burst.stderr
+
     other = veilface("verify", "ann", *world.photos(2, range(1)), "--pack", world.pack)
     assert other.status == 1
     assert other.stdout.startswith("reject: ann")
 
     again = veilface("enroll", "ann", *world.photos(1, range(1)), "--pack", world.pack, "--json")
     assert again.json["replaced"] is True
+
+
+def test_what_an_enrollment_may_replace(world, veilface):
+    ann = ("enroll", "ann", *world.photos(1, range(1)), "--pack", world.pack, "--json")
+    assert veilface(*ann, "--replace", "0" * 32).status == 1
+    first = veilface(*ann, "--no-replace")
+    assert (first.status, first.json["replaced"]) == (0, False)
+    refused = veilface(*ann, "--no-replace")
+    assert (refused.status, refused.stdout) == (1, "")
+    assert "the subject is enrolled, with another template" in refused.stderr
+    replaced = veilface(*ann, "--replace", first.json["template_id"])
+    assert (replaced.status, replaced.json["replaced"]) == (0, True)
+    assert veilface(*ann, "--replace", first.json["template_id"]).status == 1
+    both = veilface(*ann, "--no-replace", "--replace", replaced.json["template_id"])
+    assert both.status == 2
 
 
 def test_what_stands_in_the_way_is_named(world, veilface, tmp_path):
@@ -60,6 +81,9 @@ def test_a_verification_without_a_decision_is_no_rejection(world, veilface, tmp_
         ((*ann, *pack, "--unknown-option"), 2, "No such option"),
         (("verify", "nobody", *world.photos(1, range(1)), *pack), 3, "nobody is enrolled as"),
         (("verify", "ann", broken, *pack), 3, "broken.png"),
+        ((*ann, broken, *pack), 3, "broken.png"),
+        ((*ann, *world.photos(2, range(1)), *pack), 3, "3.png and 0.png do not look like the same"),
+        ((*ann, *world.photos(1, range(5)), *pack), 2, "1 to 5 photos"),
         (("verify", "ann", tmp_path, *pack), 3, "Is a directory"),
         ((*ann, "--pack", absent), 3, "does not exist"),
         ((*ann, *pack, "--contract-file", absent), 3, "there is no contract file"),
@@ -82,3 +106,58 @@ def test_an_unknown_level_names_those_there_are(world, veilface):
     )
     assert ran.status == 3
     assert "fmr-1e-2" in ran.stderr
+
+
+def test_a_held_template_is_written_once_and_read_back(world, veilface, tmp_path):
+    pack, file = ("--pack", world.pack), tmp_path / "hal.template"
+    enroll = ("enroll", "hal", *world.photos(3, range(3)), *pack, "--held-template", file)
+    enrolled = veilface(*enroll, "--json")
+    assert (enrolled.status, enrolled.json["storage"]) == (0, "holder")
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
+    again = veilface(*enroll)
+    assert (again.status, "name a new file" in again.stderr) == (2, True)
+
+    # A renewal of the rotations cannot turn what is not there: it says so, and keeps the old key.
+    renewed = veilface("keys", "rotate-tenant", "--json").json
+    assert (renewed["moved"], renewed["enroll_again"]) == (0, ["hal"])
+    assert renewed["rotations_dropped"] == 0
+
+    verify = ("verify", "hal", *world.photos(3, range(3, 4)), *pack)
+    own = veilface(*verify, "--held-template", file)
+    assert (own.status, own.stdout[:6]) == (0, "accept")
+    without = veilface(*verify)
+    assert (without.status, without.stdout) == (3, "")
+    assert "--held-template" in without.stderr
+    file.write_bytes(b"no base64!")
+    broken = veilface(*verify, "--held-template", file)
+    assert (broken.status, "is not a held template" in broken.stderr) == (3, True)
+    file.write_bytes(b"AAAA")
+    other = veilface(*verify, "--held-template", file)
+    assert (other.status, other.stdout[:6]) == (1, "reject")
+
+
+def test_a_holders_key_in_a_file(world, veilface, tmp_path):
+    pack, key, other = ("--pack", world.pack), tmp_path / "ann.key", tmp_path / "other.key"
+    photos, probe = world.photos(1, range(3)), world.photos(1, range(3, 4))
+    made = veilface("enroll", "ann", *photos, *pack, "--new-holder-key-file", key, "--json")
+    assert made.status == 0, made.stderr
+    assert made.json["holder_key"] is True
+    assert key.stat().st_mode & 0o777 == 0o600
+    right = veilface("verify", "ann", *probe, *pack, "--holder-key-file", key)
+    assert (right.status, right.stdout[:6]) == (0, "accept"), right.stderr
+    without = veilface("verify", "ann", *probe, *pack)
+    assert (without.status, without.stdout[:6]) == (1, "reject")
+
+    again = veilface("enroll", "ann", *photos, *pack, "--new-holder-key-file", key)
+    assert (again.status, "exists already" in again.stderr) == (1, True)
+    assert veilface("verify", "ann", *probe, *pack, "--holder-key-file", key).status == 0
+    both = ("--holder-key-file", key, "--new-holder-key-file", other)
+    assert veilface("enroll", "ann", *photos, *pack, *both).status == 2
+    plain = veilface("enroll", "ann", *photos, *pack, "--json")
+    assert plain.json["holder_key"] is False
+    key.chmod(0o644)
+    readable = veilface("verify", "ann", *probe, *pack, "--holder-key-file", key)
+    assert (readable.status, "read by others" in readable.stderr) == (3, True)
+    said = key.read_text().strip()
+    for ran in (made, right, without, again, plain, readable):
+        assert said not in ran.stdout + ran.stderr

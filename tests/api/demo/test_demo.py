@@ -11,7 +11,7 @@ from api.demo.people import Scale
 from api.demo.run import LevelCount, Person, _faults, at_least, run_demo
 from api.http.errors import StartError
 from models.demo import DEMO_NOTICE
-from models.pack import inspect
+from models.pack_graphs import inspect
 from models.signature import Role
 from tests.api.cli.conftest import run
 
@@ -105,8 +105,10 @@ def test_it_fails_when_it_should():
     rejected = Person("b", 0, 2, 0, 50)
     assert _faults([good], [LevelCount("fmr-1e-2", 0.01, 2, 2, 3, 100)]) == []
     assert "b was rejected" in _faults([good, rejected], [])[0]
-    lax = LevelCount("fmr-1e-3", 0.001, 2, 2, 4, 160)
-    assert "accepted 4 of 160 impostors" in _faults([good], [lax])[0]
+    lax = LevelCount("fmr-1e-3", 0.001, 2, 2, 5, 160)
+    assert "accepted 5 of 160 impostors" in _faults([good], [lax])[0]
+    unlucky = LevelCount("fmr-1e-3", 0.001, 2, 2, 4, 160)
+    assert _faults([good], [unlucky]) == []
 
 
 @pytest.mark.parametrize(("errors", "trials", "rate"), [(0, 10, 0.1), (3, 160, 0.01), (1, 5, 0.5)])
@@ -115,6 +117,7 @@ def test_the_binomial_tail(errors, trials, rate):
     assert isclose(at_least(errors, trials, rate), expected, rel_tol=1e-9)
 
 
+@pytest.mark.long
 def test_real_faces_and_weights(mbf_pack_dir, lfw_aligned, tmp_path):
     """The embedder alone, on aligned crops: detection is tested elsewhere, and takes long."""
     embedder = next(graph.file for graph in inspect(mbf_pack_dir) if graph.role is Role.EMBEDDER)

@@ -14,15 +14,15 @@ from tests.api.deployment import Deployment, N, bearer, deploy, make_contract, u
 from tests.api.shapes import assert_answer, assert_error
 
 
-def test_the_contract_without_its_cohort(client: Client, deployment: Deployment) -> None:
+def test_the_contract_without_what_is_sealed(client: Client, deployment: Deployment) -> None:
     answer = client.get("/v1/contract")
     body = assert_answer(answer, 200, ContractAnswer)
     assert body["contract_id"] == deployment.contract.contract_id
     assert body["photos"] is True
     assert body["generator"] is True
-    assert "cohort" not in body
-    # A cohort of 40 templates would fill some hundred kilobytes.
-    assert len(answer.content) < 20_000
+    assert "sealed" not in body
+    # A hundred strangers alone would fill some ten kilobytes.
+    assert len(answer.content) < 10_000
     levels = [level["name"] for level in body["calibrations"][0]["levels"]]
     assert levels == ["fmr-1e-2", "fmr-1e-3", "accuracy"]
 

@@ -68,7 +68,7 @@ def test_documents_name_no_code_that_does_not_exist() -> None:
     words = set(re.findall(r"`([a-z]+_[a-z_]+)`", (DOCS / "errors.md").read_text()))
     known = set(ERROR_CODES) | {
         "request_id", "limit_bytes", "low_quality", "field", "known", "problems", "lowest_level",
-        "tenant_setting", "template_enrollment",
+        "tenant_setting", "template_enrollment", "template_id",
     }  # fmt: skip
     assert words <= known
 

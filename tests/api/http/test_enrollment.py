@@ -58,6 +58,26 @@ def test_photos_enroll_on_both_databases(both: tuple[Client, Deployment]) -> Non
         assert assert_answer(answer, 200, VerifyAnswer)["decision"] == decision
 
 
+def test_the_same_photos_are_lifted_to_the_same_set(client: Client) -> None:
+    """Two sets with the embedding in common and other decoys would meet in it."""
+    for subject, shots in (("once", (0, 1)), ("again", (1, 0)), ("other", (0, 2))):
+        sent = images(*(photo(6, shot) for shot in shots))
+        assert client.put(path(subject), files=sent).status_code == 201
+    spans = {}
+    for subject in ("once", "again", "other"):
+        template, in_rotation = client.app.state.runtime.read("default", subject)
+        rotation = in_rotation.rotation.of(template.template_id)
+        set_ = wire.decode(template.wire).subspace.turned_by(rotation.turned_back)
+        rows = np.vstack([set_.foot, set_.basis]).astype(np.float64)
+        spans[subject] = np.linalg.qr(rows.T)[0]
+    cosines = {
+        subject: np.linalg.svd(spans["once"].T @ spans[subject], compute_uv=False).min()
+        for subject in ("again", "other")
+    }
+    assert cosines["again"] > 0.999  # half precision
+    assert cosines["other"] < 0.9
+
+
 def test_a_rejected_set_leaves_the_old_enrollment(client: Client) -> None:
     old = client.put(path("bob"), files=images(photo(1))).json()["template_id"]
     broken = client.put(path("bob"), files=images(photo(1), b"no picture"))

@@ -2,9 +2,9 @@ import pytest
 
 from api.http import errors
 from api.http.errors import ERROR_CODES, ApiError, api_error
-from enroll.errors import InconsistentImages, PhotoRejected
 from models import errors as model_errors
 from templates import errors as template_errors
+from templates.space.agreement import InconsistentImages
 from templates.store.identifiers import InvalidIdentifier
 from tests.api.client import Client
 from tests.api.deployment import bearer
@@ -16,7 +16,13 @@ PRODUCT_CODES = {
     403: {"forbidden"},
     404: {"not_enrolled", "not_found"},
     405: {"method_not_allowed"},
-    409: {"contract_mismatch", "idempotency_conflict", "export_superseded"},
+    409: {
+        "contract_mismatch",
+        "idempotency_conflict",
+        "enrollment_conflict",
+        "export_superseded",
+        "template_not_stored",
+    },
     413: {"image_too_large", "request_too_large", "too_many_images"},
     422: {
         "no_face",
@@ -50,7 +56,7 @@ def test_the_codes_are_those_of_the_contract() -> None:
         (model_errors.FaceTooSmall("x"), "face_too_small"),
         (model_errors.LowQuality("x"), "low_quality"),
         (model_errors.PackError("x"), "model_unavailable"),
-        (PhotoRejected(3, model_errors.NoFace("x"), count=5), "no_face"),
+        (model_errors.PhotoRejected(3, model_errors.NoFace("x"), count=5), "no_face"),
         (InconsistentImages((1,), (0,)), "inconsistent_images"),
         (template_errors.InvalidTemplate("x"), "invalid_template"),
         (template_errors.InvalidEmbedding("x"), "invalid_embedding"),
@@ -85,7 +91,7 @@ def test_every_exception_of_the_packages_has_a_code() -> None:
             Exception.__init__(instance, "x")
             instance.__dict__.update(
                 index=0,
-                place="photo 1 of 1",
+                _place="",
                 cause=model_errors.NoFace("x"),
                 apart=(1,),
                 others=(0,),
@@ -97,10 +103,13 @@ def test_every_exception_of_the_packages_has_a_code() -> None:
 
 def test_a_photo_is_named_by_its_position() -> None:
     dark = model_errors.LowQuality("dark", details={"darkness": 1})
-    known = api_error(PhotoRejected(3, dark, count=5))
+    known = api_error(model_errors.PhotoRejected(3, dark, count=5))
     assert known is not None
     assert known.details == {"image": 3, "darkness": 1}
     assert known.message == "photo 4 of 5: dark"  # programs count from 0, people from 1
+    alone = api_error(model_errors.PhotoRejected(0, dark, count=1))
+    assert alone is not None
+    assert (alone.details, alone.message) == ({"image": 0, "darkness": 1}, "dark")
 
 
 def test_a_failure_of_the_service_does_not_tell_where() -> None:
@@ -128,7 +137,7 @@ def test_details_become_json() -> None:
         ("GET", "/nothing", 404, "not_found"),
         ("GET", "/v1", 404, "not_found"),
         ("GET", "/v1/subjects/", 404, "not_found"),
-        ("GET", "/docs", 404, "not_found"),
+        ("GET", "/redoc", 404, "not_found"),
         ("POST", "/v1/contract", 405, "method_not_allowed"),
         ("GET", "/v1/subjects/a/verify", 405, "method_not_allowed"),
         ("PATCH", "/v1/subjects/a", 405, "method_not_allowed"),

@@ -36,12 +36,12 @@ def test_a_photo_waits_for_at_most_two_turns_of_a_busy_key(
     client, deployment = service
     busy, other = deployment.key("verify", tenant="busy"), deployment.key("verify", tenant="other")
     go_on, turns = threading.Event(), []
-    embed_photo = Verifier.embed_photo
+    photo_probe = Verifier.photo_probe
 
-    def counted(self: Verifier, pack: Any, data: bytes, **options: Any) -> Any:
-        turns.append("other" if data == single else "busy")
+    def counted(self: Verifier, pack: Any, data: list[bytes], **options: Any) -> Any:
+        turns.append("other" if data == [single] else "busy")
         go_on.wait()
-        return embed_photo(self, pack, data, **options)
+        return photo_probe(self, pack, data, **options)
 
     def verify(token: str, data: bytes) -> int:
         return client.post(
@@ -55,7 +55,7 @@ def test_a_photo_waits_for_at_most_two_turns_of_a_busy_key(
             time.sleep(0.01)
 
     single = photo(2)
-    monkeypatch.setattr(Verifier, "embed_photo", counted)
+    monkeypatch.setattr(Verifier, "photo_probe", counted)
     with ThreadPoolExecutor(SENT + 1) as pool:
         try:
             flood = [pool.submit(verify, busy, photo(1, shot)) for shot in range(SENT)]

@@ -31,11 +31,13 @@ SCALARS: list[Any] = [None, True, 0, -1, 1e308, 10**300, float("nan"), float("in
 
 def some_json(rng: random.Random, template: str) -> Any:
     value: Any = rng.choice(SCALARS)
-    keys = ["embedding", "template", "level", "export", "attributes", "face", "\ud800", ""]
+    keys = ["embedding", "embeddings", "template", "level", "export", "attributes", "face"]
+    keys += ["\ud800", ""]
+    numbers = [rng.choice(SCALARS) for _ in range(64)]
     if rng.random() < 0.8:
         value = {
             rng.choice(keys): rng.choice(
-                [*SCALARS, template, template[:-4], [rng.choice(SCALARS) for _ in range(64)]]
+                [*SCALARS, template, template[:-4], numbers, [numbers, [0.125] * 64]]
             )
             for _ in range(rng.randint(0, 3))
         }

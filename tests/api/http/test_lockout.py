@@ -3,6 +3,7 @@
 import json
 import re
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,20 @@ from templates.keys.probe_signature import signed_probe
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, deploy, images, photo
 from tests.api.shapes import assert_answer, assert_error
+from tests.databases import migrate_ahead
 
 AFTER = 5
+FIRST_S = 3600
+
+
+@pytest.fixture
+def both(tmp_path: Path, database_url: str) -> Iterator[tuple[Client, Deployment]]:
+    """As elsewhere, with locks that outlast every test, however long a busy machine takes."""
+    migrate_ahead(database_url)
+    deployment = deploy(tmp_path, database_url=database_url, lockout_first_s=FIRST_S)
+    with Client(create_app(deployment.settings)) as running:
+        running.headers.update(bearer(deployment.token))
+        yield running, deployment
 
 
 def enroll(client: Client, subject: str = "alice", person: int = 1) -> None:
@@ -48,7 +61,7 @@ def test_a_subject_locks_and_the_right_face_waits_too(both: tuple[Client, Deploy
     for person in (1, 2):
         answer = attempt(client, token, person)
         assert assert_error(answer, 423, "locked_out") == {"disabled": False}
-        assert 1 <= int(answer.headers["retry-after"]) <= 30
+        assert FIRST_S // 2 < int(answer.headers["retry-after"]) <= FIRST_S
 
 
 def test_an_unknown_subject_locks_in_the_same_words(both: tuple[Client, Deployment]) -> None:
@@ -149,7 +162,7 @@ def test_the_lock_outlives_a_restart_and_an_operator_lifts_it(
 
 
 def test_a_disabled_subject_waits_for_an_operator(tmp_path: Path) -> None:
-    own = deploy(tmp_path, lockout_after=3, lockout_first_s=0.001, lockout_longest_s=0.001,
+    own = deploy(tmp_path, lockout_after=3, lockout_first_s=1e-6, lockout_longest_s=1e-6,
                  lockout_disable_at=6)  # fmt: skip
     with Client(create_app(own.settings), headers=bearer(own.token)) as client:
         enroll(client)

@@ -20,7 +20,8 @@ from api.http.protocol import (
     Protocol,
 )
 from tests.api.deployment import bearer, deploy, images, photo
-from tests.api.process.test_server import Server, free_port
+from tests.api.process.test_server import Server
+from tests.ports import free_port
 
 PATIENCE_S = 60
 """Of a socket, so that a server that says nothing fails a test instead of stopping it."""

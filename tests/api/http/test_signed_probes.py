@@ -102,7 +102,7 @@ def test_old_and_future_probes_are_refused(service: tuple[Client, Deployment, st
     client, deployment, token = service
     numbers = descriptor(client, 1)
     window = deployment.settings.probe_window_s
-    for away, status in ((-window - 5, 401), (window + 5, 401), (-window + 10, 200)):
+    for away, status in ((-window - 5, 401), (window + 5, 401), (-window / 2, 200)):
         signature = sign_probe(token, "alice", numbers, timestamp=int(time.time() + away))
         body = {"embedding": [float(x) for x in numbers], **signature.fields()}
         answer = send(client, token, body)

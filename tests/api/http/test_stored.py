@@ -48,20 +48,20 @@ def test_the_numbers_are_those_of_the_database(client: Client, deployment: Deplo
     assert deployment.settings.pack is not None
     pack = ModelPack.load(deployment.settings.pack, threads=1)
     mean = sum(pack.embed_photo(photo(1, shot)).embedding for shot in (0, 1))
-    verifier = _rotated(deployment, mean / np.linalg.norm(mean))
-    cosine = float(subspace.foot @ verifier) / float(np.linalg.norm(subspace.foot))
+    turned = _turned(deployment, found.template_id, mean / np.linalg.norm(mean))
+    cosine = float(subspace.foot @ turned) / float(np.linalg.norm(subspace.foot))
     assert body["foot_point_similarity"] == pytest.approx(cosine, abs=2e-3)
 
 
-def _rotated(deployment: Deployment, descriptor: Any) -> Any:
-    from templates.keys.rotation import tenant_rotation
+def _turned(deployment: Deployment, template_id: str, descriptor: Any) -> Any:
+    from templates.keys.rotation import TenantRotation
 
     store = open_store(deployment.settings, open_keyring(deployment.settings))
     try:
         key = store.tenants.rotation_key("default").key
     finally:
         store.close()
-    return tenant_rotation(key, N) @ descriptor
+    return TenantRotation(key, N).of(template_id).turned(descriptor[None])[0]
 
 
 def test_no_byte_of_the_template_is_told(client: Client, deployment: Deployment) -> None:
@@ -153,10 +153,10 @@ def test_what_cannot_be_written_down_is_not_shown(
 
 def cell(**changes: Any) -> dict[str, Any]:
     return {
-        "property": "irreversibility", "knowledge": "algorithm", "attack": "likelihood",
-        "variant": "", "value": 0.2, "ci_low": 0.1, "ci_high": 0.3, "chance": 0.001,
-        "compared": 0.2, "compared_low": 0.1, "compared_high": 0.3,
-        "limit": "recovery-success", "most": 0.1, "status": "fail", **changes,
+        "property": "irreversibility", "leaked": "holder keys", "knowledge": "algorithm",
+        "attack": "likelihood", "variant": "", "value": 0.2, "ci_low": 0.1, "ci_high": 0.3,
+        "chance": 0.001, "compared": 0.2, "compared_low": 0.1, "compared_high": 0.3,
+        "limit": "recovery-success", "most": 0.1, "status": "fail", "reason": None, **changes,
     }  # fmt: skip
 
 
@@ -180,7 +180,7 @@ def report(dim: int = M, **changes: Any) -> dict[str, Any]:
         "cells": [
             cell(attack="foot-point", knowledge="template", value=0.05, compared=0.05),
             cell(),
-            cell(knowledge="key", value=1.0, compared=1.0),
+            cell(knowledge="right", value=1.0, compared=1.0, limit="success-with-key"),
             cell(property="impersonation", value=0.9, compared=0.9),
             LINKABILITY,
             GENDER,
@@ -188,7 +188,7 @@ def report(dim: int = M, **changes: Any) -> dict[str, Any]:
     }  # fmt: skip
     compared = {**verdict, "decoys": "pool", "comparison": True, "cells": [cell(value=0.99)]}
     return {
-        "format": "veilface audit", "version": 1, "kind": "templates", "passed": False,
+        "format": "veilface audit", "version": 2, "kind": "templates", "passed": False,
         "headlines": [f"adversarial, m = {dim}, generated decoys: irreversibility fails."],
         "comparison_headlines": [],
         "limits": {"recovery-success": 0.1}, "verdicts": [compared, verdict],

@@ -15,6 +15,7 @@ from api.process.runtime import Runtime
 from templates.contract import wire
 from templates.errors import ContractMismatch, InvalidTemplate
 from templates.keys.sealing import MasterKeyring
+from templates.store.secret import Secret
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, deploy, images, photo
 from tests.api.shapes import assert_answer, assert_error
@@ -83,6 +84,13 @@ def test_the_export_of_what_is_enrolled_now_comes_back(both: tuple[Client, Deplo
     assert verdict(client, "anna", 1) == "accept"
 
 
+def test_a_lock_that_was_not_there_supersedes_no_export(both: tuple[Client, Deployment]) -> None:
+    client, _ = both
+    data = exported(client, "anna", person=1)
+    assert client.delete("/v1/subjects/anna/lockout").status_code == 200
+    assert send(client, data).status_code == 200
+
+
 def test_an_erased_tenant_is_not_brought_back(both: tuple[Client, Deployment]) -> None:
     client, deployment = both
     token = deployment.key("enroll", "export", tenant="other")
@@ -135,7 +143,7 @@ def test_an_export_without_a_time_is_older_than_anything(client: Client) -> None
         base64.b64decode(exported(client, "old")),
         key=runtime.export_key,
         tenant="default",
-        contract_id=runtime.contract.contract_id,
+        contract_ids=runtime.contract.binding.contract_ids,
     )
     for subject, status in (("old", 409), ("new", 201)):
         timeless = replace(inside, subject_id=subject, stamp=None)
@@ -149,7 +157,10 @@ def test_what_travels_is_not_rotated_and_not_what_is_stored(
     runtime: Runtime = client.app.state.runtime
     data = base64.b64decode(exported(client, "plain"))
     inside = open_export(
-        data, key=runtime.export_key, tenant="default", contract_id=deployment.contract.contract_id
+        data,
+        key=runtime.export_key,
+        tenant="default",
+        contract_ids=[deployment.contract.contract_id],
     )
     plain = wire.decode(inside.wire).subspace
     pack = runtime.pack
@@ -242,18 +253,18 @@ def test_what_the_key_holder_sealed_is_still_checked(
 
 
 def test_export_key_binds_contract_and_tenant() -> None:
-    key = ExportKey.from_secret(os.urandom(32))
+    key = ExportKey.from_secret(Secret(os.urandom(32)))
     blob = seal_export(Exported("s", CONTRACT, "photos", 1, b"wire"), key=key, tenant="t")
-    opened = open_export(blob, key=key, tenant="t", contract_id=CONTRACT)
+    opened = open_export(blob, key=key, tenant="t", contract_ids=[CONTRACT])
     assert opened == Exported("s", CONTRACT, "photos", 1, b"wire")
     assert "wire" not in repr(opened).replace("Exported", "").split("photos")[-1]
     with pytest.raises(InvalidTemplate):
-        open_export(blob, key=key, tenant="u", contract_id=CONTRACT)
+        open_export(blob, key=key, tenant="u", contract_ids=[CONTRACT])
     with pytest.raises(ContractMismatch):
-        open_export(blob, key=key, tenant="t", contract_id="cd" * 32)
+        open_export(blob, key=key, tenant="t", contract_ids=["cd" * 32])
     moved = MAGIC + bytes.fromhex("cd" * 32) + blob[len(MAGIC) + 32 :]
     with pytest.raises(InvalidTemplate):
-        open_export(moved, key=key, tenant="t", contract_id="cd" * 32)
+        open_export(moved, key=key, tenant="t", contract_ids=["cd" * 32])
 
 
 def test_a_bad_export_key_file_stops_the_start(tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ from tests.api.shapes import assert_answer, assert_error
 PRODUCT_KEYS = {
     "decision",
     "reason",
+    "liveness",
     "level",
     "fmr",
     "contract_id",
@@ -111,8 +112,8 @@ def test_who_is_not_enrolled_costs_the_same_steps(
         event.listen(engine, "before_cursor_execute", record)
         with monkeypatch.context() as patch:
             # AESGCM is final in some releases: wrap by composition there.
-            patch.setattr(envelope, "AESGCM", _counting(steps))
-            patch.setattr(sealing, "AESGCM", _counting(steps))
+            patch.setattr(envelope, "AESGCM", counting_cipher(steps))
+            patch.setattr(sealing, "AESGCM", counting_cipher(steps))
             ask(client, token, subject, files=images(photo(2), name="image"))
         event.remove(engine, "before_cursor_execute", record)
         seen[subject] = steps
@@ -120,7 +121,7 @@ def test_who_is_not_enrolled_costs_the_same_steps(
     assert any(step.startswith("decrypt") for step in seen["alice"])
 
 
-def _counting(steps: list[str]) -> type:
+def counting_cipher(steps: list[str]) -> type:
     from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
     class Counting:
@@ -163,7 +164,8 @@ def test_distances_do_not_tell_who_is_unknown(client: Client, deployment: Deploy
     assert distances[0] == distance("unknown-0")
     # Other tenants and other deployments give the same name another stand-in.
     assert distance("unknown-0", tenant="elsewhere") != distances[0]
-    other = StandIns(deployment.contract, client.app.state.runtime.keyring, key=os.urandom(32))
+    keyring, foreign = client.app.state.runtime.keyring, os.urandom(32)
+    other = StandIns(deployment.contract, keyring, key=lambda: foreign)
     own = client.app.state.runtime.stand_ins
     told, elsewhere = (each.lift("default", "unknown-0") for each in (own, other))
     assert (told.foot != elsewhere.foot).any()
@@ -289,7 +291,7 @@ def test_fields_are_checked(client: Client, sender: str) -> None:
         {"json": {"embedding": descriptor}, "params": {"levle": "x"}},
         {"json": {"embedding": descriptor, "level": "a"}, "params": {"level": "b"}},
         {"json": {"template": 5}},
-        {"files": images(photo(1), name="images")},
+        {"files": images(photo(1), name="photo")},
         {"files": images(photo(1), name="image"), "data": {"attributes": "{}"}},
         {"files": images(photo(1), name="image"), "data": {"face": "all"}},
         {"files": images(photo(1), name="image"), "params": "level=a&level=b"},

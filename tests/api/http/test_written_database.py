@@ -15,6 +15,7 @@ import pytest
 import sqlalchemy as sa
 
 from api.process.opening import open_keyring, open_store
+from templates.contract.liveness_policy import LivenessPolicy
 from templates.errors import StoreError
 from templates.keys.probe_signature import signed_probe
 from templates.keys.sealing import MasterKeyring
@@ -185,6 +186,8 @@ def test_a_key_whose_hash_was_put_in_place_of_anothers_is_none(attacked: Attacke
         "rights = 'admin,enroll,erase,export,verify'",
         "expires_at = NULL",
         "lowest_level = NULL",
+        "liveness = NULL",
+        "liveness = 'off'",
         "tenant_id = (SELECT id FROM tenants WHERE name = 'other')",
         "mac = NULL",
     ],
@@ -196,6 +199,7 @@ def test_a_key_with_a_changed_column_is_none(attacked: Attacked, change: str) ->
         ["verify"],
         expires_at=datetime.now(UTC) + timedelta(hours=1),
         lowest_level="fmr-1e-3",
+        liveness=LivenessPolicy.PASSIVE,
     )
     assert attacked.accepts(new.token)
     attacked.attacker.run(f"UPDATE api_keys SET {change} WHERE prefix = '{new.key.prefix}'")
@@ -484,7 +488,7 @@ def test_all_still_works_after_the_master_key_is_rotated(attacked: Attacked) -> 
         assert fresh.api_keys.verify(token) is not None
         assert fresh.tenants.get("default").rotation_epoch == 1
         fresh.rerotation.begin("default")
-        assert fresh.rerotation.move("default") == 1
+        assert fresh.rerotation.move("default", attacked.deployment.contract.binding) == 1
         fresh.rerotation.retire("default")
         assert fresh.check_records() == ()
     finally:

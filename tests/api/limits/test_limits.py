@@ -15,7 +15,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.types import Message, Receive, Scope, Send
 
-from api.http.bodies import MAX_FIELD_BYTES, read_json
+from api.http.bodies import MAX_FIELD_BYTES, MAX_JSON_PARTS, read_json
 from api.http.context import RequestContext
 from api.http.errors import ApiError
 from api.limits.admission import MAX_JSON_BYTES, Gate
@@ -91,8 +91,6 @@ def test_an_image_may_be_as_large_as_the_limit_and_no_larger(
 def test_eleven_images_are_too_many(client: Client) -> None:
     answer = client.put(ENROLL, files=images(*[photo(1)] * 11))
     assert assert_error(answer, 413, "too_many_images") == {"limit": 10}
-    answer = client.post(VERIFY, files=images(photo(1), photo(1), name="image"))
-    assert assert_error(answer, 413, "too_many_images") == {"limit": 1}
     assert client.put(ENROLL, files=images(*[photo(1, i) for i in range(10)])).status_code == 200
 
 
@@ -306,12 +304,14 @@ def test_no_more_compute_at_once_than_there_are_slots() -> None:
     import time
 
     running, most, lock = 0, 0, threading.Lock()
+    two_at_once = threading.Barrier(2, timeout=PATIENCE_S)
 
     def work() -> None:
         nonlocal running, most
         with lock:
             running += 1
             most = max(most, running)
+        two_at_once.wait()
         time.sleep(0.02)
         with lock:
             running -= 1
@@ -347,4 +347,4 @@ def test_a_body_of_more_values_than_any_request_has_is_not_parsed(
         patch.setattr("api.http.bodies.parse_json", None)
         answer = client.post(VERIFY, content=body, headers={"Content-Type": "application/json"})
     assert_error(answer, 400, "malformed_request")
-    assert "more than 16384 values" in answer.json()["error"]["message"]
+    assert f"more than {MAX_JSON_PARTS} values" in answer.json()["error"]["message"]

@@ -7,6 +7,8 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,8 +27,8 @@ from api.process.metrics import exposition, shared_directory, step
 from templates.store.lockout import LockedOut
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, deploy, images, photo
-from tests.api.process.test_server import free_port
-from tests.patience import PATIENCE_S
+from tests.patience import PATIENCE_S, wait_until
+from tests.ports import free_port
 
 Labels = dict[str, str]
 Samples = dict[tuple[str, frozenset[tuple[str, str]]], float]
@@ -87,8 +89,8 @@ def test_a_decision_is_counted_with_its_level_and_kind_of_probe(client: Client) 
         answer = client.post(f"{path}/verify", files=images(photo(person, 2), name="image"))
         assert answer.status_code == 200
     level = answer.json()["level"]
-    for decision, times in (("accept", 2), ("reject", 1)):
-        labels = {"decision": decision, "level": level, "probe": "photo"}
+    for decision, reason, times in (("accept", "match", 2), ("reject", "no_match", 1)):
+        labels = {"decision": decision, "reason": reason, "level": level, "probe": "photo"}
         assert rise("veilface_decisions_total", **labels) == times
     for name in ("body", "photo", "store", "decide"):
         assert rise("veilface_step_seconds_count", step=name) >= 3, name
@@ -152,11 +154,16 @@ def test_a_failed_purge_is_counted() -> None:
     before = value(samples(exposition().decode()), "veilface_purge_failures_total")
 
     async def scenario() -> None:
-        with anyio.move_on_after(0.2):
+        with anyio.CancelScope() as purging:
+
+            def failed(error: Exception) -> None:
+                failures.append(error)
+                purging.cancel()
+
             await purge_regularly(
                 Broken(),  # type: ignore[arg-type]
                 every_s=60,
-                on_failure=failures.append,
+                on_failure=failed,
             )
 
     anyio.run(scenario)
@@ -172,11 +179,13 @@ def test_a_step_is_measured_even_if_it_fails() -> None:
         time.sleep(0.02)
         raise KeyError
 
+    begun = time.perf_counter()
     with pytest.raises(KeyError), step(name):
         fail()
+    took = time.perf_counter() - begun
     found = samples(exposition().decode())
     assert value(found, "veilface_step_seconds_count", step=name) == 1
-    assert 0.02 <= value(found, "veilface_step_seconds_sum", step=name) < 0.5
+    assert 0.02 <= value(found, "veilface_step_seconds_sum", step=name) <= took
     assert value(found, "veilface_step_seconds_bucket", step=name, le="0.01") == 0
     assert value(found, "veilface_step_seconds_bucket", step=name, le="+Inf") == 1
 
@@ -259,7 +268,7 @@ print(exposition().decode())
 def test_what_dead_workers_counted_stays_in_one_file() -> None:
     with shared_directory() as folder:
         assert folder.stat().st_mode & 0o077 == 0
-        for number in range(1, 6):
+        for number in range(1, 4):
             ran = subprocess.run(
                 [sys.executable, "-c", COUNTS, str(number)],
                 capture_output=True,
@@ -285,6 +294,7 @@ def test_what_dead_workers_counted_stays_in_one_file() -> None:
     assert "PROMETHEUS_MULTIPROC_DIR" not in os.environ
 
 
+@pytest.mark.long
 def test_any_worker_answers_for_all_and_nothing_falls_when_one_dies(tmp_path: Path) -> None:
     deployment = deploy(tmp_path, workers=2, port=free_port(), compute_slots=1)
     url = f"http://127.0.0.1:{deployment.settings.port}"
@@ -307,15 +317,14 @@ def test_any_worker_answers_for_all_and_nothing_falls_when_one_dies(tmp_path: Pa
             dict(labels)["pid"] for name, labels in found if name == "process_resident_memory_bytes"
         }
 
-    def until(condition: Any) -> None:
-        for _ in range(600):
-            try:
-                if condition():
-                    return
-            except httpx.TransportError:
-                pass
-            time.sleep(0.1)
-        pytest.fail((tmp_path / "log").read_text())
+    def until(condition: Callable[[], bool]) -> None:
+        def holds() -> bool:
+            assert process.poll() is None, (tmp_path / "log").read_text()
+            with suppress(httpx.TransportError):
+                return condition()
+            return False
+
+        wait_until(holds)
 
     try:
         until(lambda: len(workers(scraped())) == 2)

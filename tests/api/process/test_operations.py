@@ -12,7 +12,7 @@ import subprocess
 import sys
 import time
 from collections.abc import AsyncIterator, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -25,19 +25,20 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 
 from api.http.app import create_app, environment_of
-from api.http.context import RequestContext
+from api.http.context import RequestContext, _Body
 from api.http.errors import StartError
 from api.process import healthcheck
-from api.process.metrics import MODEL_UP, STORE_UP
+from api.process.metrics import IN_FLIGHT, MODEL_UP, STORE_UP
 from api.process.operations import OPERATIONS_PATHS, operations_server, tls_options
 from api.settings import Settings, load_settings
 from models.errors import ModelError
 from templates.store import TemplateStore
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, deploy, images, photo
-from tests.api.process.test_server import free_port
+from tests.api.process.test_server import in_flight
 from tests.api.shapes import assert_error
 from tests.patience import PATIENCE_S, wait_until
+from tests.ports import free_port
 
 READY = "/health/ready"
 
@@ -223,7 +224,8 @@ def test_a_request_too_many_is_refused_before_anything_of_it_is_read(tmp_path: P
             async with anyio.create_task_group() as tasks:
                 for _ in range(2):
                     tasks.start_soon(post, slow())
-                await anyio.sleep(0.5)
+                while IN_FLIGHT._value.get() < 2:
+                    await anyio.sleep(0.01)
                 refused = await post(counted())
                 assert_error(refused, 503, "overloaded")
                 assert read == 0
@@ -240,17 +242,26 @@ def test_a_request_too_many_is_refused_before_anything_of_it_is_read(tmp_path: P
     anyio.run(scenario)
 
 
-@pytest.mark.parametrize(("most", "lingers"), [(40, True), (4, False)])
+@pytest.mark.parametrize(("most", "leave"), [(40, 0), (4, 2)])
 def test_who_has_no_key_does_not_hold_a_crowded_room(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int, lingers: bool
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int, leave: int
 ) -> None:
-    monkeypatch.setattr("api.http.context.LINGER_S", 1.0)
+    """Two of four leave at once where four is all there is room for; elsewhere each has time."""
+    monkeypatch.setattr("api.http.context.LINGER_S", PATIENCE_S)
     deployment = deploy(tmp_path, max_in_flight=most)
-    took: list[float] = []
+    linger = _Body.linger
+    left, lingering = 0, 0
+
+    async def counted(body: _Body) -> None:
+        nonlocal lingering
+        lingering += 1
+        await linger(body)
+
+    monkeypatch.setattr(_Body, "linger", counted)
 
     async def endless() -> AsyncIterator[bytes]:
         yield b"{"
-        await anyio.sleep(30)
+        await anyio.sleep_forever()
 
     async def scenario() -> None:
         app = create_app(deployment.settings)
@@ -260,18 +271,24 @@ def test_who_has_no_key_does_not_hold_a_crowded_room(
         ):
 
             async def post() -> None:
-                started = time.monotonic()
+                nonlocal left
                 answer = await client.post("/v1/subjects/import", content=endless())
                 assert_error(answer, 401, "unauthorized")
-                took.append(time.monotonic() - started)
+                left += 1
 
             async with anyio.create_task_group() as tasks:
                 for _ in range(4):
                     tasks.start_soon(post)
+                while left + lingering < 4:
+                    await anyio.sleep(0.01)
+                assert (left, lingering) == (leave, 4 - leave)
+                tasks.cancel_scope.cancel()
+            # The time that each has ends.
+            monkeypatch.setattr("api.http.context.LINGER_S", 0.05)
+            await post()
+            assert (left, lingering) == (leave + 1, 5 - leave)
 
     anyio.run(scenario)
-    # Two of four leave at once where four are all there is room for; elsewhere each gets its time.
-    assert sum(seconds >= 1.0 for seconds in took) == (4 if lingers else 2)
 
 
 def test_health_has_a_bound_of_its_own() -> None:
@@ -357,21 +374,21 @@ def serving(
             stderr=log,
         )
     try:
-        for _ in range(1200):
-            if process.poll() is not None:
-                break
-            try:
-                if httpx.get(url, **options, timeout=PATIENCE_S).status_code == 200:
-                    yield process
-                    return
-            except httpx.TransportError:
-                time.sleep(0.05)
-        pytest.fail((folder / "log").read_text())
+
+        def ready() -> bool:
+            assert process.poll() is None, (folder / "log").read_text()
+            with suppress(httpx.TransportError):
+                return httpx.get(url, **options, timeout=PATIENCE_S).status_code == 200
+            return False
+
+        wait_until(ready, what="a service that is ready")
+        yield process
     finally:
         process.kill()
         process.wait()
 
 
+@pytest.mark.long
 def test_workers_share_the_port_and_say_that_they_stop(tmp_path: Path) -> None:
     port, beside = free_port(), free_port()
     deployment = deploy(tmp_path, workers=2, port=port, operations_port=beside, compute_slots=1)
@@ -393,19 +410,19 @@ def test_workers_share_the_port_and_say_that_they_stop(tmp_path: Path) -> None:
                 + b"Content-Type: application/json\r\nContent-Length: 100\r\n\r\n{"
             )
             held.append(raw)
-        time.sleep(1)
+        wait_until(lambda: in_flight(f"http://127.0.0.1:{beside}") == 8, what="all eight")
         process.send_signal(signal.SIGTERM)
-        seen = set()
-        for _ in range(40):
-            time.sleep(0.1)
-            try:
+
+        def stopping() -> bool:
+            assert process.poll() is None
+            with suppress(httpx.TransportError):
                 answer = httpx.get(ready, timeout=PATIENCE_S)
-            except httpx.TransportError:
-                continue
-            if answer.status_code == 503:
-                seen.add(assert_error(answer, 503, "overloaded")["stopping"])
-                break
-        assert seen == {True}
+                return answer.status_code == 503 and assert_error(answer, 503, "overloaded") == {
+                    "stopping": True
+                }
+            return False
+
+        wait_until(stopping, what="a worker that says that it stops")
         for raw in held:
             raw.close()
         assert process.wait(timeout=PATIENCE_S) == 0

@@ -28,14 +28,16 @@ from api.process.opening import (
 from api.process.runtime import Runtime
 from api.settings import Settings
 from models.pack import ModelPack
+from templates.contract.document import Rate
+from templates.contract.verdict import Verdict
 from templates.decoys import DecoyGenerator
 from templates.keys.sealing import MasterKeyring
-from templates.space.subspace import SubspaceBatch
 from templates.store.database import Database
 from tests.api.cli.conftest import run
 from tests.api.client import Client
 from tests.api.deployment import (
     Deployment,
+    M,
     N,
     bearer,
     deploy,
@@ -131,7 +133,9 @@ def test_a_broken_contract(fresh: Deployment) -> None:
 
 def test_an_edited_contract(fresh: Deployment) -> None:
     path = fresh.settings.resolved_contract_file
-    path.write_text(path.read_text().replace("0.75", "0.05"))
+    edited = path.read_text().replace('"score_threshold": 2.5', '"score_threshold": 0.5')
+    assert edited != path.read_text()
+    path.write_text(edited)
     assert "contract file" in refused(fresh.settings)
 
 
@@ -349,16 +353,6 @@ def test_serving_keeps_no_second_copy_of_the_models(
     assert alive == [False]
 
 
-def test_the_cohort_is_rounded_before_the_service_is_ready(
-    fresh: Deployment, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    rounded: list[SubspaceBatch] = []
-    monkeypatch.setattr("api.http.app.rounded_cohort", rounded.append)
-    app = create_app(fresh.settings)
-    with Client(app):
-        assert rounded == [app.state.runtime.contract.cohort]
-
-
 def test_recalibration_keeps_the_templates(fresh: Deployment) -> None:
     with Client(create_app(fresh.settings), headers=bearer(fresh.token)) as client:
         client.put("/v1/subjects/a/enrollment", files=images(photo(1)))
@@ -375,9 +369,7 @@ def test_a_template_of_an_older_contract_is_refused(fresh: Deployment) -> None:
     with Client(create_app(fresh.settings), headers=bearer(fresh.token)) as client:
         client.put("/v1/subjects/a/enrollment", files=images(photo(1)))
     assert fresh.settings.pack is not None
-    other = make_contract(
-        ModelPack.load(fresh.settings.pack, threads=1), fresh.source, rotation_version="other"
-    )
+    other = make_contract(ModelPack.load(fresh.settings.pack, threads=1), fresh.source, m=M - 1)
     other.save(fresh.settings.resolved_contract_file, file_sealer(open_keyring(fresh.settings)))
     with Client(create_app(fresh.settings), headers=bearer(fresh.token)) as client:
         probe = client.post("/v1/subjects/a/verify", files=images(photo(1), name="image"))
@@ -418,7 +410,7 @@ def test_an_older_contract_of_the_same_id_is_told_of_and_served(
     assert check() == (0, False)
     level = fresh.contract.calibrations[0].levels[0]
     p2s, s2s = fresh.contract.calibrations
-    stricter = replace(level, similarity_threshold=level.similarity_threshold + 0.05)
+    stricter = replace(level, threshold=level.threshold + 0.05)
     newer = replace(
         fresh.contract,
         calibrations=(
@@ -437,3 +429,31 @@ def test_an_older_contract_of_the_same_id_is_told_of_and_served(
     with Client(create_app(fresh.settings), headers=bearer(fresh.token)) as client:
         assert client.get("/v1/contract").status_code == 200
     assert "the calibrations of the contract file are older ones" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("measured", [True, False])
+def test_weak_privacy_is_served_only_knowingly(fresh: Deployment, measured: bool) -> None:
+    settings = fresh.settings
+    rate = Rate(errors=90, trials=400, ci_low=0.1, ci_high=0.3)
+    made = fresh.contract.verdict
+    bad = Verdict(replace(made.privacy, rate=rate), replace(made.accuracy, rate=rate))
+    weak = replace(fresh.contract, verdict=bad if measured else None)
+    weak.save(settings.resolved_contract_file, file_sealer(open_keyring(settings)))
+    why = "22.5 % of them (90 of 400), and 5 % is" if measured else "nobody measured"
+    refusing = Client(create_app(settings))
+    with pytest.raises(StartError, match="--accept-weak-privacy") as caught, refusing:
+        pass
+    assert why in str(caught.value)
+    check = ("serve", "--check", "--data-dir", settings.data_dir, "--pack", settings.pack)
+    refusal = run(*check)
+    assert refusal.status == 1
+    assert why in refusal.stderr
+
+    accepted = run(*check, "--accept-weak-privacy")
+    assert accepted.status == 0, accepted.stderr
+    assert f"weak privacy is accepted: {'a thief' if measured else 'nobody'}" in accepted.stderr
+    with Client(create_app(changed(fresh, accept_weak_privacy=True))) as client:
+        answer = client.get("/v1/contract", headers=bearer(fresh.token)).json()
+    assert (answer["verdict"] and answer["verdict"]["privacy"]["status"]) == (
+        "FAIL" if measured else None
+    )

@@ -18,7 +18,7 @@ VICTIMS = faces(30, seed=2, n=256).descriptors
 class Watched:
     """The pool, and what was drawn from it."""
 
-    source_id, made_with, n = POOL.source_id, None, POOL.n
+    source_id, made_with, n, noise = POOL.source_id, None, POOL.n, 0.0
 
     def __init__(self) -> None:
         self.drawn: list[np.ndarray] = []

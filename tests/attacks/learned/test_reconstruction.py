@@ -69,6 +69,8 @@ def test_the_raw_descriptor_is_drawn_and_noise_is_not(
     rows = {each.variant: each for each in outcomes}
     assert list(rows) == ["raw embedding", "foot point", "noise again", "noise"]
     assert rows["raw embedding"].measured.value > 0.5
+    assert all(row.details["control_holds"] for row in outcomes)
+    assert not any("proves nothing" in row.assumption for row in outcomes)
     assert rows["noise"].measured.value <= 0.15
     assert rows["noise again"].measured.value <= 0.15
     quality = [
@@ -77,6 +79,20 @@ def test_the_raw_descriptor_is_drawn_and_noise_is_not(
     assert quality[0] > quality[1] + 1
     assert not rows["noise"].judged
     assert rows["foot point"].judged
+
+
+def test_a_decoder_that_draws_no_raw_embedding_proves_nothing(
+    mirrored: System, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(decoder, "_CHANNELS", (8, 8, 8, 8))
+    faces = mirrored.victims.enrolled
+    blank = np.zeros((len(faces), SIZE, SIZE, 3), dtype=np.uint8)
+    outcomes = reconstruct(
+        mirrored, blank, faces, paint(faces), embed=embed, seconds=1e9, epochs=1, seed=0
+    )
+    for row in outcomes:
+        assert "It proves nothing" in row.assumption
+        assert row.details["control_holds"] is False
 
 
 def test_scores_of_a_perfect_drawing_and_of_a_wrong_one(mirrored: System) -> None:

@@ -27,15 +27,16 @@ from templates.contract.document import (
     Level,
     Rate,
 )
+from templates.contract.expectation import PointExpectation
 from templates.contract.levels import MAX_LEVELS
 from templates.contract.nobody import Nobody
 from templates.decoys import DecoyGenerator
 from templates.distances import Metric
 from templates.errors import ContractError, ContractMismatch, SealError, Uncalibrated
-from templates.keys.randomness import Keystream
+from templates.keys.rotation import HAAR_VERSION, ROTATION_VERSION
 from templates.keys.sealing import KeyringSealer, MasterKeyring
-from templates.space.lifting import Strategy, lift
-from templates.space.subspace import SubspaceBatch
+from templates.space.lifting import Strategy
+from verify.strangers import STRANGERS
 
 N, M = 16, 3
 SEALER = KeyringSealer(MasterKeyring([os.urandom(32)]))
@@ -50,24 +51,32 @@ def make_binding(**changes: Any) -> Binding:
         "strategy": Strategy.RANDOM,
         "m": M,
         "decoy_source_id": "cd" * 32,
-        "rotation_version": "1",
+        "rotation_version": ROTATION_VERSION,
     }
     return Binding(**{**fields, **changes})
 
 
-def make_cohort(seed: int = 0, *, n: int = N, m: int = M) -> SubspaceBatch:
-    with Keystream.seeded("cohort", seed) as stream:
-        rows = stream.normal((5, n))
-        rows /= np.linalg.norm(rows, axis=1, keepdims=True)
-        return lift(rows, strategy=Strategy.RANDOM, m=m, stream=stream)
+@functools.cache
+def make_nobody(n: int = N, *, seed: int = 0) -> Nobody:
+    rows = np.random.default_rng(4).normal(size=(200, n)).astype(np.float32)
+    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+    return Nobody.of(rows[:6], DecoyGenerator.fit(rows), seed=bytes([seed]) * 32)
 
 
 @functools.cache
-def make_nobody(n: int = N) -> Nobody:
-    rows = np.random.default_rng(4).normal(size=(200, n)).astype(np.float32)
-    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
-    numbers = np.linspace(0.1, 0.2, 6, dtype=np.float32)
-    return Nobody(rows[:6], numbers, numbers, DecoyGenerator.fit(rows))
+def make_expectation(n: int = N, m: int = M) -> PointExpectation:
+    """That of templates in all directions alike: √(m/n), with a spread of 0.1."""
+    return PointExpectation(
+        metric=Metric.SPHERICAL,
+        projector=np.eye(n, dtype=np.float32) * np.float32(m / n),
+        foot=np.zeros(n, dtype=np.float32),
+        mean=np.array([1.0, 0, 0, 0, 0, 0]),
+        log_spread=np.array([0, 0, 0, 0, 0, np.log(0.1)]),
+    )
+
+
+def changed(**fields: Any) -> PointExpectation:
+    return dataclasses.replace(make_expectation(), **fields)
 
 
 def make_calibration(**changes: Any) -> Calibration:
@@ -77,8 +86,8 @@ def make_calibration(**changes: Any) -> Calibration:
         "probe_m": 0,
         "steps": 50,
         "levels": (
-            Level("fmr-1e-2", 1e-2, 0.35, 2.0, RATE, RATE),
-            Level("accuracy", None, 0.4, 3.0, RATE, RATE),
+            Level("fmr-1e-2", 1e-2, 2.0, RATE, RATE, {1: RATE, 3: RATE}),
+            Level("accuracy", None, 3.0, RATE, RATE),
         ),
         "foot_point_norm": None,
         "calibrated_on": {"people": 80, "share": 1.0},
@@ -96,9 +105,10 @@ def make_contract(**changes: Any) -> Contract:
         "calibrations": (make_calibration(), make_calibration(**LIFTED)),
         "default_level": "fmr-1e-2",
         "photo_consistency": 0.25,
+        "probe_consistency": 0.2,
         "template_foot_point_norm": (0.1, 0.8),
         "template_stranger_score": 1.5,
-        "cohort": make_cohort(),
+        "expectation": make_expectation(),
         "nobody": make_nobody(),
     }
     return Contract(**{**fields, **changes})
@@ -111,7 +121,7 @@ def test_contract_id_is_the_hash_of_the_canonical_json() -> None:
     written = (
         '{"decoy_source_id":"' + "cd" * 32 + '","embedder_sha256":"' + "ab" * 32 + '","m":3,"n":16,'
         '"preprocessing":{"flip":false,"mean":[127.5,127.5,127.5],"size":112},'
-        '"rotation_version":"1","strategy":"random"}'
+        '"rotation_version":"signs-cosine-2","strategy":"random"}'
     )
     assert make_binding().contract_id == hashlib.sha256(written.encode("utf-8")).hexdigest()
 
@@ -139,14 +149,41 @@ def test_every_part_of_the_binding_changes_the_id(changes: dict[str, Any]) -> No
     assert make_binding(**changes).contract_id != make_binding().contract_id
 
 
+def test_templates_of_the_earlier_rotation_version_are_served_and_no_others() -> None:
+    binding = make_binding()
+    earlier = make_binding(rotation_version=HAAR_VERSION)
+    assert binding.contract_ids == (binding.contract_id, earlier.contract_id)
+    for served in (binding, earlier):
+        version = binding.require_contract(served.contract_id, what="the template")
+        assert version == served.rotation_version
+    for other in ({"m": 4}, {"rotation_version": "2"}, {"m": 4, "rotation_version": HAAR_VERSION}):
+        with pytest.raises(ContractMismatch, match="the template belongs to the contract"):
+            binding.require_contract(make_binding(**other).contract_id, what="the template")
+    # Nothing is served the other way round.
+    assert earlier.contract_ids == (earlier.contract_id,)
+
+
+def test_a_contract_of_the_earlier_rotation_version_is_refused_with_the_remedy() -> None:
+    make_binding().require_rotation_version()
+    with pytest.raises(
+        ContractMismatch, match=r"'haar-1'.* run `veilface calibrate --strategy"
+    ) as no:
+        make_binding(rotation_version=HAAR_VERSION).require_rotation_version()
+    assert f"--strategy {make_binding().strategy} --dim {make_binding().m}`" in str(no.value)
+
+
 def test_recalibrating_keeps_the_contract_id_and_changes_the_calibration_id() -> None:
     first = make_contract()
-    levels = (Level("fmr-1e-2", 1e-2, 0.36, 2.0, RATE, RATE),)
+    levels = (Level("fmr-1e-2", 1e-2, 2.1, RATE, RATE),)
     again = make_contract(calibrations=(make_calibration(levels=levels),))
-    other_cohort = make_contract(cohort=make_cohort(1))
-    ids = {entry.calibrations[0].calibration_id for entry in (first, again, other_cohort)}
-    assert len(ids) == 3
-    assert len({entry.contract_id for entry in (first, again, other_cohort)}) == 1
+    others = [
+        make_contract(nobody=make_nobody(seed=1)),
+        make_contract(expectation=changed(mean=np.array([1.0, 0, 0, 0, 0, 1e-9]))),
+        make_contract(expectation=changed(projector=make_expectation(m=M + 1).projector)),
+    ]
+    ids = {entry.calibrations[0].calibration_id for entry in (first, again, *others)}
+    assert len(ids) == 5
+    assert len({entry.contract_id for entry in (first, again, *others)}) == 1
     assert make_contract().calibrations[0].calibration_id in ids
 
 
@@ -194,8 +231,11 @@ def test_impossible_bindings_are_refused(changes: dict[str, Any]) -> None:
         {**LIFTED, "foot_point_norm": (0.9, 0.2)},
         {"steps": 0},
         {"levels": ()},
-        {"levels": (Level("a", 1e-2, 0, 0, RATE, RATE),) * 2},
+        {"levels": (Level("a", 1e-2, 0, RATE, RATE),) * 2},
         {"mode": "raw"},
+        {"probe_photos": 0},
+        {"probe_photos": 6},
+        {**LIFTED, "probe_photos": 2},
     ],
 )
 def test_impossible_calibrations_are_refused(changes: dict[str, Any]) -> None:
@@ -207,25 +247,26 @@ def test_impossible_calibrations_are_refused(changes: dict[str, Any]) -> None:
     "changes",
     [
         {"photo_consistency": 1.5},
+        {"probe_consistency": -1.5},
         {"template_foot_point_norm": (0.8, 0.1)},
         {"template_stranger_score": float("nan")},
-        {"nobody": dataclasses.replace(make_nobody(), people=make_nobody().people[:1])},
-        {"nobody": dataclasses.replace(make_nobody(), people=2 * make_nobody().people)},
-        {"nobody": dataclasses.replace(make_nobody(), people=np.nan * make_nobody().people)},
-        {"nobody": dataclasses.replace(make_nobody(), means=make_nobody().means[:5])},
-        {"nobody": dataclasses.replace(make_nobody(), means=2 + make_nobody().means)},
-        {"nobody": dataclasses.replace(make_nobody(), spreads=0 * make_nobody().spreads)},
+        {"nobody": dataclasses.replace(make_nobody(), halves=make_nobody().halves[:1])},
+        {"nobody": dataclasses.replace(make_nobody(), halves=2 * make_nobody().halves)},
+        {"nobody": dataclasses.replace(make_nobody(), halves=np.nan * make_nobody().halves)},
+        {"nobody": dataclasses.replace(make_nobody(), seed=b"short")},
         {"nobody": make_nobody(N + 1)},
         {"default_level": "fmr-1e-9"},
         {"calibrations": ()},
         {"calibrations": (make_calibration(), make_calibration(steps=9))},
         {"calibrations": (make_calibration(calibration_id="0" * 64),)},
-        {"cohort": make_cohort(n=17)},
-        {"cohort": make_cohort(m=4)},
-        {"cohort": make_cohort()[0:1]},
-        {"cohort": SubspaceBatch(make_cohort().feet * np.nan, make_cohort().bases)},
-        {"cohort": SubspaceBatch(make_cohort().feet, make_cohort().bases * np.float32(1.01))},
-        {"cohort": SubspaceBatch(make_cohort().feet[::-1], make_cohort().bases)},
+        {"expectation": make_expectation(N + 1)},
+        {"expectation": changed(metric=Metric.EUCLIDEAN)},
+        {"expectation": changed(foot=np.full(N, np.nan, dtype=np.float32))},
+        {"expectation": changed(foot=np.full(N, 1.1, dtype=np.float32))},
+        {"expectation": changed(projector=np.triu(np.full((N, N), 0.1, dtype=np.float32)))},
+        {"expectation": changed(mean=np.full(6, np.inf))},
+        {"expectation": changed(mean=np.full(6, 1e7))},
+        {"expectation": changed(log_spread=np.zeros(5))},
     ],
 )
 def test_contradictions_are_refused(changes: dict[str, Any]) -> None:
@@ -306,6 +347,14 @@ def test_a_file_keeps_everything(tmp_path: Path) -> None:
     assert loaded.public() == contract.public()
     assert loaded.calibrations == contract.calibrations
     assert loaded.binding == contract.binding
+    assert loaded.nobody_id == contract.nobody_id
+    np.testing.assert_array_equal(loaded.nobody.people, contract.nobody.people)
+    np.testing.assert_array_equal(loaded.expectation.projector, contract.expectation.projector)
+    points = contract.nobody.people
+    np.testing.assert_array_equal(
+        loaded.expectation.statistics(points), contract.expectation.statistics(points)
+    )
+    # Lifted from the seed, and not kept in the file.
     np.testing.assert_array_equal(loaded.cohort.feet, contract.cohort.feet)
     np.testing.assert_array_equal(loaded.cohort.bases, contract.cohort.bases)
 
@@ -333,22 +382,24 @@ def test_a_failed_write_leaves_the_old_file(
     assert len(list(tmp_path.iterdir())) == 1
 
 
-def test_the_cohort_is_sealed_and_never_public(tmp_path: Path) -> None:
+def test_strangers_and_seed_are_sealed_and_never_public(tmp_path: Path) -> None:
     contract = make_contract()
     text = saved(tmp_path, contract).read_bytes()
     patterns = [
         array[0].astype(dtype).tobytes()
         for array in (contract.cohort.feet, contract.cohort.bases, contract.nobody.people)
         for dtype in ("<f4", "<f2", "<f8")
-    ]
-    raw = text + base64.b64decode(json.loads(text)["cohort"])
+    ] + [contract.nobody.seed]
+    raw = text + base64.b64decode(json.loads(text)["sealed"])
     assert not any(pattern in raw for pattern in patterns)
     # Positive control: the same search finds a number that was planted.
     assert any(pattern in raw + contract.cohort.feet.tobytes() for pattern in patterns)
     public = json.dumps(contract.public())
-    assert "cohort" not in contract.public()
-    assert repr(float(contract.cohort.feet[0, 0])) not in public
-    assert "cohort=" not in repr(contract)
+    assert "sealed" not in contract.public()
+    assert repr(float(contract.nobody.people[0, 0])) not in public
+    assert contract.nobody.seed.hex() not in public
+    assert "nobody=" not in repr(contract)
+    assert repr(contract.nobody).startswith("<")
 
 
 def test_another_master_key_does_not_open_it(tmp_path: Path) -> None:
@@ -365,12 +416,12 @@ def reloaded(path: Path, document: Any) -> Contract:
 def test_edited_thresholds_do_not_load(tmp_path: Path) -> None:
     path = saved(tmp_path)
     document = json.loads(path.read_text())
-    document["calibrations"][0]["levels"][0]["similarity_threshold"] = -1.0
+    document["calibrations"][0]["levels"][0]["score_threshold"] = -1.0
     with pytest.raises(SealError, match="the file was edited"):
         reloaded(path, document)
     # An attacker can recompute the public ids, but not the seal over them.
     edited = Calibration.from_json(document["calibrations"][0]).identified(
-        contract_id=document["contract_id"], cohort_id=document["cohort_id"]
+        contract_id=document["contract_id"], nobody_id=document["nobody_id"]
     )
     document["calibrations"][0] = edited.to_json()
     with pytest.raises(SealError, match="the file was edited"):
@@ -389,14 +440,14 @@ MUTATIONS: list[tuple[str, Any]] = [
     ("version", 1),
     ("version", True),
     ("contract_id", "0" * 64),
-    ("cohort", "!!!"),
-    ("cohort", 3),
-    ("cohort", ""),
-    ("cohort_size", 6),
-    ("cohort_id", "0" * 64),
+    ("sealed", "!!!"),
+    ("sealed", 3),
+    ("sealed", ""),
+    ("nobody_id", "0" * 64),
     ("photo_consistency", "0.25"),
     ("photo_consistency", 1e400),
     ("photo_consistency", None),
+    ("probe_consistency", None),
     ("template_foot_point_norm", [0.1]),
     ("template_foot_point_norm", [0.1, True]),
     ("template_stranger_score", "1.5"),
@@ -500,39 +551,106 @@ def test_no_edit_of_a_value_is_accepted(tmp_path: Path, data: st.DataObject) -> 
         reloaded(path, document)
 
 
-def test_a_cohort_that_is_no_cohort_is_refused(tmp_path: Path) -> None:
+def test_a_sealed_part_that_is_no_such_part_is_refused(tmp_path: Path) -> None:
     path = saved(tmp_path)
     document = json.loads(path.read_text())
-    sealed = document.pop("cohort")
+    sealed = document.pop("sealed")
     context = contract_module._seal_context(document)
     good = SEALER.open(base64.b64decode(sealed), context=context)
-    feet, bases = np.zeros((5, N), np.float32), np.zeros((5, M, N), np.float32)
-    endless = np.full_like(bases, 3e38)
-    endless[:, :, ::2] *= -1
-    rest = make_nobody().tensors()
     whole = safetensors.numpy.load(good)
+
+    def with_(name: str, array: Any) -> bytes:
+        return safetensors.numpy.save(whole | {name: np.ascontiguousarray(array)})
+
+    triangle, axes = whole["expectation.projector"], whole["nobody.axes"]
     for plain in (
         b"",
-        safetensors.numpy.save(whole | {"people": rest["people"].astype(np.float64)}),
-        safetensors.numpy.save(whole | {"people": rest["people"][0]}),
-        safetensors.numpy.save(whole | {"people": rest["people"][:5]}),
-        safetensors.numpy.save(whole | {"generator": rest["generator"][:-1]}),
-        safetensors.numpy.save(whole | {"generator": rest["generator"].astype(np.float32)}),
-        safetensors.numpy.save(whole | {"spreads": rest["spreads"].astype(np.float16)}),
         good[:-1],
-        safetensors.numpy.save({"feet": feet}),
-        safetensors.numpy.save({"feet": feet, "bases": bases[:4]} | rest),
-        safetensors.numpy.save({"feet": feet.astype(np.float64), "bases": bases} | rest),
-        safetensors.numpy.save({"feet": feet, "bases": bases, "more": feet} | rest),
-        safetensors.numpy.save({"feet": np.array(1, dtype=np.float32), "bases": bases} | rest),
-        safetensors.numpy.save({"feet": feet, "bases": bases} | rest),
-        # Products of these overflow, to infinities whose difference no tolerance refuses.
-        safetensors.numpy.save({"feet": feet, "bases": endless} | rest),
-        safetensors.numpy.save({"feet": feet + np.float32(3e38), "bases": endless} | rest),
+        safetensors.numpy.save({"nobody.people": whole["nobody.people"]}),
+        with_("more", triangle),
+        with_("nobody.people", whole["nobody.people"].astype(np.float32)),
+        with_("nobody.people", whole["nobody.people"][0]),
+        with_("nobody.people", whole["nobody.people"][:5]),
+        with_("nobody.seed", whole["nobody.seed"][:-1]),
+        with_("nobody.seed", whole["nobody.seed"].astype(np.float32)),
+        with_("nobody.axes", axes[:-1]),
+        with_("nobody.axes", np.full_like(axes, np.inf)),
+        with_("expectation.projector", triangle[:-1]),
+        with_("expectation.projector", triangle.astype(np.float16)),
+        with_("expectation.projector", np.full_like(triangle, 3e38)),
+        with_("expectation.foot", np.float32(1)),
+        with_("expectation.mean", whole["expectation.mean"][:-1]),
+        with_("expectation.log_spread", np.full(6, np.nan)),
+        with_("expectation.metric", np.frombuffer(b"cosine", dtype=np.uint8)),
+        with_("expectation.metric", np.frombuffer(b"euclidean", dtype=np.uint8)),
+        # Sound, but not what the rest of the document names.
+        with_("expectation.foot", whole["expectation.foot"] + np.float32(1e-3)),
+        with_("nobody.seed", whole["nobody.seed"] + np.uint8(1)),
     ):
         text = base64.b64encode(SEALER.seal(plain, context=context)).decode()
         with pytest.raises(ContractError):
-            reloaded(path, document | {"cohort": text})
+            reloaded(path, document | {"sealed": text})
+    text = base64.b64encode(SEALER.seal(good, context=context)).decode()
+    assert reloaded(path, document | {"sealed": text}).nobody_id == document["nobody_id"]
+
+
+def test_the_layout_of_an_earlier_version_is_refused_with_the_remedy(tmp_path: Path) -> None:
+    path = saved(tmp_path)
+    document = json.loads(path.read_text())
+    level = document["calibrations"][0]["levels"][0]
+    level |= {"similarity_threshold": 0.35, "cohort_threshold": level.pop("score_threshold")}
+    earlier = document | {"cohort": document["sealed"], "cohort_size": 400, "cohort_id": "0" * 64}
+    del earlier["sealed"], earlier["nobody_id"]
+    for old in (earlier, document | {"version": 1}):
+        with pytest.raises(ContractError, match="run `veilface calibrate` again"):
+            reloaded(path, old)
+
+
+def test_the_calibration_of_the_most_photos_that_are_not_more_serves() -> None:
+    lax, strict = make_calibration().levels[0], Level("fmr-1e-4", 1e-4, 4.0, RATE, RATE)
+    contract = make_contract(
+        calibrations=(
+            make_calibration(levels=(lax, strict)),
+            make_calibration(levels=(lax, strict), probe_photos=2),
+            make_calibration(levels=(lax,), probe_photos=5),
+            make_calibration(**LIFTED),
+        )
+    )
+    chosen = [
+        contract.calibration("p2s", probe_photos=photos).probe_photos for photos in range(1, 9)
+    ]
+    assert chosen == [1, 2, 2, 2, 5, 5, 5, 5]
+    # A level that more photos do not resolve is taken from fewer.
+    assert contract.calibration("p2s", probe_photos=5, level="fmr-1e-4").probe_photos == 2
+    assert contract.calibration("p2s", probe_photos=5, level="fmr-1e-2").probe_photos == 5
+    assert contract.calibration("p2s", probe_photos=5, level="none").probe_photos == 5
+    assert contract.calibration("s2s", None, 2, 3).probe_photos == 1
+    with pytest.raises(Uncalibrated):
+        contract.calibration("p2s", probe_photos=0)
+
+
+def test_a_contract_of_faces_takes_less_than_three_megabytes(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    n, m = 512, 64
+    rows = rng.normal(size=(600, n)).astype(np.float32)
+    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+    people = np.concatenate([rows, -rows[:400]])
+    levels = tuple(
+        Level(f"fmr-1e-{k}", 10.0**-k, 3.0, RATE, RATE, {1: RATE, 2: RATE, 3: RATE})
+        for k in range(2, 7)
+    )
+    square = rng.normal(size=(n, n)).astype(np.float32) / 100
+    contract = make_contract(
+        binding=make_binding(n=n, m=m),
+        calibrations=(
+            *(make_calibration(levels=levels, probe_photos=photos) for photos in (1, 2, 3, 5)),
+            *(make_calibration(**LIFTED | {"probe_m": k}, levels=levels) for k in (2, 4, 8, 16)),
+        ),
+        expectation=dataclasses.replace(make_expectation(n, m), projector=square + square.T),
+        nobody=Nobody.of(people, DecoyGenerator.fit(rows), seed=bytes(32)),
+    )
+    assert len(people) == STRANGERS
+    assert saved(tmp_path, contract).stat().st_size < 3_000_000
 
 
 def test_frozen() -> None:
@@ -555,7 +673,10 @@ def test_a_file_of_more_values_than_any_contract_has_is_not_parsed(
 
 
 def test_the_largest_contract_has_fewer_values_than_are_read() -> None:
-    levels = tuple(Level(f"level-{i}", 1e-2, 0.3, 2.0, RATE, RATE) for i in range(MAX_LEVELS))
+    levels = tuple(
+        Level(f"level-{i}", 1e-2, 2.0, RATE, RATE, dict.fromkeys(range(1, 11), RATE))
+        for i in range(MAX_LEVELS)
+    )
     entries = tuple(
         make_calibration(mode="s2s", probe_m=m, foot_point_norm=(0.2, 0.9), levels=levels)
         for m in range(1, MAX_CALIBRATIONS + 1)
@@ -564,7 +685,7 @@ def test_the_largest_contract_has_fewer_values_than_are_read() -> None:
     largest = make_contract(
         binding=binding,
         calibrations=entries,
-        cohort=make_cohort(n=binding.n),
+        expectation=make_expectation(binding.n),
         nobody=make_nobody(binding.n),
         default_level="level-0",
         recorded={str(i): i for i in range(MAX_ITEMS)},

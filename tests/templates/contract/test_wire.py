@@ -251,7 +251,7 @@ def test_malformed_containers_are_refused():
 
 def test_size_is_refused_before_anything_is_read():
     with pytest.raises(InvalidTemplate, match="more than"):
-        decode(bytes(size_limit(4096, 128) + 1))
+        decode(bytes(size_limit(4096, 192) + 1))
     good = encode(template(24, 5), contract_id=CONTRACT)
     assert decode(good, max_n=24, max_m=5).subspace.n == 24
     for limits in ({"max_n": 23, "max_m": 5}, {"max_n": 24, "max_m": 4}):

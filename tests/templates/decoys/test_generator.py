@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from scipy.stats import ks_2samp
+from scipy.stats import ks_2samp, multivariate_normal
 from sklearn.mixture import GaussianMixture
 
 from templates.decoys import (
@@ -17,10 +17,10 @@ from templates.decoys import (
     DecoyGenerator,
     DecoySource,
     container,
-    fitting,
     load_source,
 )
 from templates.decoys.generator import GENERATOR_FORMAT, MAX_GENERATOR_BYTES
+from templates.decoys.mixture import fit_mixture
 from templates.decoys.statistics import (
     DescriptorStatistics,
     band_edges,
@@ -211,11 +211,31 @@ def test_one_component_is_what_scikit_learn_fits() -> None:
     """Fewer than 1,000 descriptors are one component, in closed form."""
     features = np.random.default_rng(3).normal(size=(999, 7)) * np.linspace(0.1, 3, 7) + 0.5
     expected = GaussianMixture(1, reg_covar=1e-5).fit(features)
-    weights, centres, covariances = fitting._mixture(features)
+    weights, centres, covariances = fit_mixture(features, 1)
     assert weights.tolist() == [1.0]
     np.testing.assert_allclose(centres, expected.means_)
     np.testing.assert_allclose(covariances, expected.covariances_, rtol=1e-9, atol=1e-12)
-    assert len(fitting._mixture(np.repeat(features, 2, axis=0))[0]) == 3
+
+
+def test_several_components_are_as_likely_as_those_of_scikit_learn() -> None:
+    """Three crowds that overlap: the likelihood of rows that had no part in the fit."""
+    rng = np.random.default_rng(4)
+    centres = np.array([[0.0] * 5, [3.0, 0, 0, 0, 0], [0, 2.5, 0, 0, 0]])
+    spreads = np.array([[1.0, 1, 1, 0.1, 0.1], [0.5, 2, 1, 0.1, 0.3], [1, 1, 0.2, 0.2, 0.1]])
+    crowd = rng.choice(3, size=6000, p=[0.5, 0.3, 0.2])
+    rows = centres[crowd] + spreads[crowd] * rng.normal(size=(6000, 5))
+    fitted = fit_mixture(rows[:3000], 3)
+    weights, means, covariances = fitted
+    assert weights.sum() == pytest.approx(1.0)
+    densities = [
+        weight * multivariate_normal(mean, covariance).pdf(rows[3000:])
+        for weight, mean, covariance in zip(weights, means, covariances, strict=True)
+    ]
+    ours = float(np.log(np.sum(densities, axis=0)).mean())
+    theirs = GaussianMixture(3, reg_covar=1e-5, n_init=3, random_state=0).fit(rows[:3000])
+    assert ours == pytest.approx(theirs.score(rows[3000:]), abs=0.01)
+    again = fit_mixture(rows[:3000], 3)
+    assert all(np.array_equal(one, other) for one, other in zip(fitted, again, strict=True))
 
 
 def test_every_single_byte_flip_is_refused_or_gives_a_working_generator() -> None:

@@ -9,9 +9,8 @@ FOLDER = Path(__file__).parents[3] / "templates" / "distances"
 PREFIX = "templates.distances"
 MAY = {
     "__init__": {"exact", "metric", "tiles", "torch"},
-    "tiles": {"blas", "exact", "kernels", "metric", "rounded", "threads"},
+    "tiles": {"blas", "exact", "kernels", "metric", "threads"},
     "torch": {"exact", "metric"},
-    "rounded": {"exact", "kernels", "metric"},
     "exact": {"metric"},
     "kernels": {"metric"},
     "metric": set(),

@@ -145,12 +145,17 @@ def pairs() -> dict[str, tuple[AffineSubspace, AffineSubspace]]:
 MEETING = {"shared decoy", "two shared decoys", "contained", "identical"}
 
 
+@functools.cache
+def brute_force(name: str, metric: str) -> float:
+    return BRUTE[metric](*pairs()[name])
+
+
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("metric", METRICS)
 @pytest.mark.parametrize("name", pairs())
 def test_subspace_pairs_agree_with_brute_force(name: str, metric: str, dtype: str):
     a, b = pairs()[name]
-    expected = BRUTE[metric](a, b)
+    expected = brute_force(name, metric)
     for one, two in ((a, b), (b, a)):
         seen = pairwise_distances(
             SubspaceBatch.of([one]), SubspaceBatch.of([two]), metric=metric, dtype=dtype
@@ -316,7 +321,10 @@ def test_distances_obey_the_order_of_the_sets(m: int, k: int, seed: int, metric:
     short = 1e-4 if metric == "spherical" else 1e-6
     assert np.isfinite(subspaces).all()
     assert (subspaces <= points + short).all()
-    assert (points <= raw + 1e-6).all()
+    # Subspaces are float32, whose rounding moves where one meets the sphere by as much over the
+    # radius of what they share: 2e-4 is met once in a thousand random subspaces of one dimension.
+    radii = np.sqrt(np.maximum(1 - b.foot_norms**2, 1e-12))
+    assert (points <= raw + 1e-6 + np.finfo(np.float32).eps / 2 / radii).all()
     np.testing.assert_allclose(pairwise_distances(b, a, **options), subspaces.T, atol=short)
     euclidean = pairwise_distances(a, b, metric="euclidean", dtype=np.float64)
     assert (euclidean <= subspaces + 1e-6).all()
@@ -339,8 +347,15 @@ def test_paired_is_the_diagonal_of_pairwise(metric: str, dtype: str):
         np.testing.assert_allclose(paired, expected, atol=2e-6)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("metric", METRICS)
+@pytest.mark.parametrize(
+    ("metric", "dtype"),
+    [
+        ("euclidean", "float32"),
+        ("euclidean", "float64"),
+        ("spherical", "float32"),
+        pytest.param("spherical", "float64", marks=pytest.mark.long),
+    ],
+)
 def test_tiles_bound_the_memory_and_do_not_show(
     metric: str, dtype: str, monkeypatch: pytest.MonkeyPatch
 ):

@@ -88,5 +88,8 @@ with blas.single_threaded():
     libraries = ThreadpoolController().select(user_api="blas").lib_controllers
     assert any("scipy" in each.filepath for each in libraries)
     assert all(each.num_threads == 1 for each in libraries)
+libraries = ThreadpoolController().select(user_api="blas").lib_controllers
+assert all(each.num_threads == 2 for each in libraries)
 """
-    subprocess.run([sys.executable, "-c", code], check=True)
+    two = os.environ | {"OPENBLAS_NUM_THREADS": "2"}
+    subprocess.run([sys.executable, "-c", code], check=True, env=two)

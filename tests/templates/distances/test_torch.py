@@ -22,6 +22,7 @@ from templates.distances.torch import (  # noqa: E402
     SubspaceTensors,
     counts_within,
     nearest,
+    paired,
     pairwise,
 )
 
@@ -315,49 +316,95 @@ def test_a_device_gives_what_the_processor_gives(metric: Metric) -> None:
     a = lift(rows[:30], strategy="random", m=3, stream=stream)
     b = lift(rows[30:], strategy="random", m=5, stream=stream)
     labels = np.arange(30) % 4, np.arange(40) % 3
+    calls = [
+        lambda probes: pairwise_distances(probes, b, metric=metric),
+        lambda probes: entrance.paired_distances(probes, b[:30], metric=metric),
+        lambda probes: entrance.nearest(probes, b, k=4, metric=metric, labels=labels),
+        lambda probes: entrance.nearest(probes, b, k=4, metric=metric, of_templates=True),
+        lambda probes: entrance.count_within(probes, b, [1.3, 0.2, 0.8], metric=metric),
+        lambda probes: entrance.count_within(probes, b, 0.9, metric=metric, labels=labels),
+    ]
     for probes in (a, rows[:30]):
-        options = {"metric": metric}
-        there = entrance.pairwise_distances(probes, b, device="cpu", **options)
-        here = entrance.pairwise_distances(probes, b, **options)
-        assert isinstance(there, np.ndarray)
-        np.testing.assert_allclose(there, here, atol=2e-5)
-        for of_templates in (False, True):
-            options = {"metric": metric, "k": 4, "of_templates": of_templates, "labels": labels}
-            there = entrance.nearest(probes, b, device="cpu", **options)
-            here = entrance.nearest(probes, b, **options)
-            np.testing.assert_array_equal(there.indices, here.indices)
-            np.testing.assert_allclose(there.distances, here.distances, atol=2e-5)
-        limits = [1.3, 0.2, 0.8]
-        np.testing.assert_array_equal(
-            entrance.count_within(probes, b, limits, metric=metric, labels=labels, device="cpu"),
-            entrance.count_within(probes, b, limits, metric=metric, labels=labels),
+        for call in calls:
+            here = call(probes)
+            with entrance.on_device("cpu"):
+                there = call(probes)
+            assert type(there) is type(here)
+            for left, right in zip(there, here, strict=True):
+                np.testing.assert_allclose(left, right, atol=2e-5)
+
+
+def test_a_device_holds_for_the_block_alone_and_not_for_float64(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    used = []
+
+    def spied(name: str):
+        make = getattr(on_device, name)
+
+        def spy(*sides, **options):
+            used.append(name)
+            return make(*sides, **options)
+
+        return spy
+
+    for name in ("pairwise", "paired"):
+        monkeypatch.setattr(on_device, name, spied(name))
+    templates = faces(4, 3, seed=14)
+    options = {"metric": Metric.EUCLIDEAN}
+    with entrance.on_device("cpu"):
+        pairwise_distances(templates, templates, **options)
+        pairwise_distances(templates, templates, dtype=np.float64, **options)
+        entrance.paired_distances(templates, templates, **options)
+        with entrance.on_device(None):
+            pairwise_distances(templates, templates, **options)
+    pairwise_distances(templates, templates, **options)
+    assert used == ["pairwise", "paired"]
+
+
+@pytest.mark.parametrize("metric", list(Metric))
+def test_paired_tiles_do_not_show(metric: Metric, monkeypatch: pytest.MonkeyPatch) -> None:
+    a, b = faces(20, 4, seed=15), faces(20, 4, seed=16)
+    b = SubspaceBatch(
+        np.concatenate([a.feet[:1], b.feet[1:]]), np.concatenate([a.bases[:1], b.bases[1:]])
+    )
+    whole = paired(tensors(a), tensors(b), metric=metric, steps=50).numpy()
+    monkeypatch.setitem(on_device.TILE_BYTES, "cpu", 1 << 14)
+    tiled = paired(tensors(a), tensors(b), metric=metric, steps=50).numpy()
+    expected = np.diagonal(reference(a, b, metric=metric))
+    np.testing.assert_allclose(tiled, whole, atol=5e-6)
+    np.testing.assert_allclose(similarity(whole), similarity(expected), atol=3e-6)
+    assert whole[0] < 1e-5
+
+
+def test_a_search_on_a_device_reports_every_pair() -> None:
+    done: list[int] = []
+    templates = faces(4, 3, seed=17)
+    with entrance.on_device("cpu"):
+        entrance.nearest(templates.feet, templates, k=1, metric="euclidean", progress=done.append)
+        entrance.count_within(
+            templates.feet, templates, 1.0, metric="euclidean", progress=done.append
         )
+    assert done == [16, 16]
 
 
 def test_what_a_device_cannot_do_is_said() -> None:
     rows = np.eye(24)[:4]
     templates = lift(rows, strategy="random", m=2)
-    with pytest.raises(TemplateError, match="cannot use the device nowhere"):
-        entrance.pairwise_distances(rows, templates, metric="euclidean", device="nowhere")
+    refused = pytest.raises(TemplateError, match="cannot use the device nowhere")
+    with refused, entrance.on_device("nowhere"):
+        pairwise_distances(rows, templates, metric="euclidean")
     if not torch.cuda.is_available():
-        with pytest.raises(TemplateError, match="cannot use the device cuda"):
-            entrance.nearest(rows, templates, k=1, metric="euclidean", device="cuda")
-    elsewhere = tensors(templates), torch.empty(4, 24, device="meta")
-    with pytest.raises(TemplateError, match="are on meta, the templates on cpu"):
-        pairwise(elsewhere[1], elsewhere[0], metric=Metric.EUCLIDEAN, steps=1)
-    with pytest.raises(TemplateError, match="an array or a batch"):
-        entrance.pairwise_distances(torch.tensor(rows), templates, metric="euclidean")
-    with pytest.raises(InvalidEmbedding, match="not finite"):
-        entrance.pairwise_distances(
-            np.full((1, 24), np.nan), templates, metric="euclidean", device="cpu"
-        )
-    with pytest.raises(InvalidEmbedding, match="shape"):
-        entrance.nearest(rows[:, :5], templates, k=1, metric="euclidean", device="cpu")
-    with pytest.raises(InvalidTemplate, match="does not fit"):
-        entrance.count_within(
-            lift(np.eye(25)[:4], strategy="random", m=2),
-            templates,
-            [1.0],
-            metric="euclidean",
-            device="cpu",
-        )
+        refused = pytest.raises(TemplateError, match="cannot use the device cuda")
+        with refused, entrance.on_device("cuda"):
+            entrance.nearest(rows, templates, k=1, metric="euclidean")
+    with entrance.on_device("cpu"):
+        with pytest.raises(TemplateError, match="an array or a batch"):
+            pairwise_distances(torch.tensor(rows), templates, metric="euclidean")
+        with pytest.raises(InvalidEmbedding, match="not finite"):
+            pairwise_distances(np.full((1, 24), np.nan), templates, metric="euclidean")
+        with pytest.raises(InvalidEmbedding, match="shape"):
+            entrance.nearest(rows[:, :5], templates, k=1, metric="euclidean")
+        other = lift(np.eye(25)[:4], strategy="random", m=2)
+        with pytest.raises(InvalidTemplate, match="does not fit"):
+            entrance.count_within(other, templates, [1.0], metric="euclidean")

@@ -60,4 +60,4 @@ def test_a_pipe_which_has_no_size_is_read_as_well(size: int, most: int) -> None:
     thread.start()
     with os.fdopen(reading, "rb") as file:
         assert read_at_most(file, most) == content[: most + 1]
-    thread.join(10)
+    thread.join()

@@ -53,6 +53,24 @@ def test_an_embedding_is_signed_as_the_doubles_that_json_carries(dtype: str) -> 
     )
 
 
+def test_several_embeddings_are_signed_by_the_digest_of_each() -> None:
+    rows = np.random.default_rng(0).normal(size=(3, 64)).astype(np.float32)
+    made = signed_probe(TOKEN, "bob", rows)
+    received = json.loads(json.dumps(made))["embeddings"]
+    digests = [hashlib.sha256(np.array(row, dtype="<f8").tobytes()).digest() for row in received]
+    assert made["hmac"] == by_the_document(
+        "bob", "embeddings", b"".join(digests), made["nonce"], made["timestamp"], ""
+    )
+
+
+def test_where_an_embedding_ends_is_signed() -> None:
+    fixed = {"nonce": "n" * 16, "timestamp": 1000}
+    numbers = np.arange(12.0)
+    shapes = ((12,), (1, 12), (2, 6), (3, 4), (12, 1))
+    made = {sign_probe(TOKEN, "bob", numbers.reshape(shape), **fixed).hmac for shape in shapes}
+    assert len(made) == len(shapes)
+
+
 def test_every_part_changes_the_signature() -> None:
     fixed = {"nonce": "n" * 16, "timestamp": 1000}
     base = sign_probe(TOKEN, "alice", b"probe", level="a", **fixed).hmac

@@ -1,15 +1,30 @@
 import hashlib
 import hmac
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 import scipy.linalg
+from numpy.typing import NDArray
 from scipy import stats
+from scipy.fft import dct
 
 from templates.distances import Metric, pairwise_distances
 from templates.keys.randomness import Keystream
-from templates.keys.rotation import ROTATION_VERSION, rotate, tenant_rotation
+from templates.keys.rotation import (
+    HAAR_VERSION,
+    ROTATION_VERSION,
+    TRANSFORMS,
+    Rotation,
+    SignedCosineRotation,
+    TenantRotation,
+    holder_rotation,
+)
+from templates.keys.sealing import encode_parts
 from templates.space.lifting import lift
+
+KNOWN = [0.29210510032827836, 0.14434577434, 5.805401994660683, -3.454763042292888, -3.04232787677]
+VERSIONS = [HAAR_VERSION, ROTATION_VERSION]
 
 
 def units(stream: Keystream, count: int, n: int) -> np.ndarray:
@@ -17,65 +32,219 @@ def units(stream: Keystream, count: int, n: int) -> np.ndarray:
     return rows / np.linalg.norm(rows, axis=1, keepdims=True)
 
 
-def test_matrix_follows_from_the_key_as_documented():
-    key, n = b"k" * 32, 24
-    # HKDF (RFC 5869) by hand: extract with a zero salt, expand one block.
+def expanded(key: bytes, info: bytes, length: int) -> bytes:
+    """HKDF-SHA-256 (RFC 5869) by hand, with a zero salt."""
     extracted = hmac.new(bytes(32), key, hashlib.sha256).digest()
-    info = f"veilface tenant rotation {ROTATION_VERSION} n={n}".encode()
-    derived = hmac.new(extracted, info + b"\x01", hashlib.sha256).digest()
+    out, block = b"", b""
+    for number in range(1, -(-length // 32) + 1):
+        block = hmac.new(extracted, block + info + bytes([number]), hashlib.sha256).digest()
+        out += block
+    return out[:length]
+
+
+def matrix(rotation: Rotation, n: int) -> NDArray[np.float64]:
+    return rotation.turned(np.eye(n)).T
+
+
+def rotations(count: int, n: int) -> Callable[[str], Rotation]:
+    """The rotation of a template id, under the first of `count` keys."""
+    return TenantRotation(count.to_bytes(32), n).of
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 24, 31, 64])
+def test_rotation_follows_from_key_and_id_as_documented(n: int) -> None:
+    key, template_id = b"k" * 32, "0123456789abcdef" * 2
+    count = (TRANSFORMS + 1) * n
+    info = encode_parts("template rotation", "signs-cosine-2", n, template_id)
+    derived = expanded(key, info, -(-count // 8))
+    bits = [byte >> (7 - place) & 1 for byte in derived for place in range(8)][:count]
+    signs = np.where(np.reshape(bits, (-1, n)), -1.0, 1.0)
+    # The orthonormal DCT-II from its definition.
+    row, column = np.mgrid[:n, :n]
+    cosine = np.sqrt(2 / n) * np.cos(np.pi * row * (2 * column + 1) / (2 * n))
+    cosine[0] = n**-0.5
+    expected = np.diag(signs[0])
+    for each in signs[1:]:
+        expected = np.diag(each) @ cosine @ expected
+    found = matrix(TenantRotation(key, n).of(template_id), n)
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+def test_a_known_answer() -> None:
+    """Computed once: what is stored must still be found by another version of this program."""
+    rotation = TenantRotation(bytes(range(32)), 5).of("00112233445566778899aabbccddeeff")
+    found = rotation.turned(np.array([[1.0, 2.0, 3.0, 4.0, 5.0]]))
+    np.testing.assert_allclose(found[0], KNOWN, atol=1e-9)
+
+
+def test_version_1_follows_from_the_key_as_documented() -> None:
+    key, n = b"k" * 32, 24
+    derived = expanded(key, f"veilface tenant rotation haar-1 n={n}".encode(), 32)
     words = np.frombuffer(Keystream(derived).token(8 * n * n), dtype=np.uint64)
     gaussian = stats.norm.ppf(words / 2.0**64).reshape(n, n)
     q, r = scipy.linalg.qr(gaussian)
     expected = q * np.sign(np.diag(r))
-    np.testing.assert_allclose(tenant_rotation(key, n), expected, atol=1e-9)
+    tenant = TenantRotation(key, n)
+    np.testing.assert_allclose(matrix(tenant.of("a", HAAR_VERSION), n), expected, atol=1e-9)
+    assert tenant.of("b", HAAR_VERSION) is tenant.of("a", HAAR_VERSION)
 
 
-def test_matrix_is_orthogonal_and_belongs_to_key_and_dimension():
-    a = tenant_rotation(b"a" * 32, 64)
-    np.testing.assert_allclose(a @ a.T, np.eye(64), atol=1e-13)
-    np.testing.assert_array_equal(a, tenant_rotation(b"a" * 32, 64))
-    assert np.abs(a - tenant_rotation(b"b" * 32, 64)).max() > 0.1
-    assert np.abs(a[:32, :32] - tenant_rotation(b"a" * 32, 32)).max() > 0.1
+@pytest.mark.parametrize("version", VERSIONS)
+@pytest.mark.parametrize("n", [2, 7, 64, 127, 512])
+def test_rotations_are_orthogonal_and_undone(n: int, version: str) -> None:
+    rotation = TenantRotation(b"a" * 32, n).of("template", version)
+    found = matrix(rotation, n)
+    np.testing.assert_allclose(found @ found.T, np.eye(n), atol=1e-12)
+    np.testing.assert_allclose(rotation.turned_back(np.eye(n)), found, atol=1e-12)
+    points = units(Keystream.seeded("points"), 3, n)
+    kept = points.copy()
+    np.testing.assert_allclose(rotation.turned(points), points @ found.T, atol=1e-12)
+    np.testing.assert_array_equal(points, kept)
+    np.testing.assert_allclose(rotation.turned_back(rotation.turned(points)), points, atol=1e-12)
+    again = TenantRotation(b"a" * 32, n).of("template", version)
+    np.testing.assert_allclose(matrix(again, n), found, atol=1e-12)
 
 
-def test_matrices_are_distributed_by_the_haar_measure():
+def test_another_key_id_or_dimension_gives_an_unrelated_rotation() -> None:
+    """tr(AᵀB) of independent rotations has mean 0 and variance near 1, whatever n."""
+    n = 128
+    base = TenantRotation(b"a" * 32, n)
+    one = matrix(base.of("template"), n)
+    others = [
+        base.of("template2"),
+        base.of(""),
+        TenantRotation(b"b" * 32, n).of("template"),
+        TenantRotation(b"a" * 31 + b"b", n).of("template"),
+        base.of("template", HAAR_VERSION),
+    ]
+    for other in others:
+        assert abs(np.vdot(one, matrix(other, n))) < 8
+    wide = TenantRotation(b"a" * 32, 2 * n).of("template")
+    assert isinstance(wide, type(base.of("template")))
+    assert (wide.signs[0, :n] != base.of("template").signs[0]).any()
+
+
+@pytest.mark.parametrize("n", [64, 97, 512])
+def test_entries_are_those_of_a_haar_rotation(n: int) -> None:
+    """R x of fixed x, over many keys: entries are near N(0, 1/n), the worst x included.
+
+    Bounds are six standard errors of what a Haar rotation gives. A single transform between signs
+    fails them: the control at the end.
+    """
+    keys = 2000
+    stream = Keystream.seeded("entries")
+    axis = np.zeros(n)
+    axis[1] = 1.0
+    fixed = np.stack([axis, np.full(n, n**-0.5), *units(stream, 2, n)])
+    seen = np.stack([rotations(7, n)(str(number)).turned(fixed) for number in range(keys)])
+    moments = seen.transpose(1, 0, 2) * np.sqrt(n)  # (4, keys, n)
+    assert np.abs(moments.mean(axis=1)).max() < 6 / np.sqrt(keys)
+    assert np.abs((moments**2).mean(axis=1) - 1).max() < 6 * np.sqrt(2 / keys) + 2 / n
+    # Kurtosis over all entries: 3 n / (n + 2) of a uniform point of the sphere.
+    fourth = (moments**4).mean(axis=(1, 2))
+    assert np.abs(fourth - 3 * n / (n + 2)).max() < 6 * np.sqrt(96 / (keys * n)) + 3 / n
+    for rows in moments:
+        assert stats.kstest(rows[:, 3], "norm").pvalue > 1e-7
+    # Different entries are not correlated, be they of one point or of two.
+    for one, other in ((2, 2), (0, 2), (0, 0)):
+        products = moments[one][:, :-1] * moments[other][:, 1:]
+        assert abs(products.mean()) < 6 / np.sqrt(products.size)
+    single = np.stack(
+        [SignedCosineRotation(signs).turned(fixed[:1])[0] for signs in _signs(keys, 2, n)]
+    )
+    assert np.abs((single**2 * n).mean(axis=0) - 1).max() > 0.9
+
+
+@pytest.mark.parametrize("n", [2, 5, 64, 97, 512])
+def test_variances_are_even_whatever_the_vector(n: int) -> None:
+    """Over random signs, a transform C maps the variances of entries by the squares of C."""
+    squares = dct(np.eye(n), norm="ortho", axis=0) ** 2
+    variances = np.linalg.matrix_power(squares, TRANSFORMS)
+    assert np.abs(n * variances - 1).max() < (1 + 1e-9) / n
+
+
+def _signs(count: int, rows: int, n: int) -> NDArray[np.float64]:
+    return np.where(Keystream.seeded("signs").uniform((count, rows, n)) < 0.5, -1.0, 1.0)
+
+
+def test_version_1_is_distributed_by_the_haar_measure() -> None:
     n = 6
-    matrices = np.stack([tenant_rotation(i.to_bytes(32), n) for i in range(1500)])
+    found = np.stack(
+        [matrix(TenantRotation(i.to_bytes(32), n).of("", HAAR_VERSION), n) for i in range(1500)]
+    )
     # The square of any entry is Beta(1/2, (n - 1)/2); without the sign fix the diagonal is not.
     for row, column in ((0, 0), (5, 5), (2, 4)):
-        entries = matrices[:, row, column]
+        entries = found[:, row, column]
         assert stats.kstest(entries**2, "beta", (0.5, (n - 1) / 2)).pvalue > 1e-3
         assert stats.binomtest(int((entries > 0).sum()), 1500).pvalue > 1e-3
-    assert stats.binomtest(int((np.linalg.det(matrices) > 0).sum()), 1500).pvalue > 1e-3
+    assert stats.binomtest(int((np.linalg.det(found) > 0).sum()), 1500).pvalue > 1e-3
 
 
+@pytest.mark.parametrize("version", VERSIONS)
 @pytest.mark.parametrize("metric", list(Metric))
-def test_distances_inside_a_tenant_do_not_change(metric: Metric):
+def test_a_probe_that_is_turned_as_the_template_is_as_far_from_it(
+    metric: Metric, version: str
+) -> None:
     stream = Keystream.seeded("tenant")
     points, others = units(stream, 9, 40), units(stream, 7, 40)
     a = lift(points, strategy="random", m=12, stream=stream)
     b = lift(others, strategy="random", m=7, stream=stream)
-    rotation = tenant_rotation(b"r" * 32, 40)
-    for probes, moved in ((points, rotate(points, rotation)), (a, a.rotated(rotation))):
+    turned = TenantRotation(b"r" * 32, 40).of("template", version).turned
+    for probes, moved in ((points, turned(points)), (a, a.turned_by(turned))):
         before = pairwise_distances(probes, b, metric=metric, dtype=np.float64)
-        after = pairwise_distances(moved, b.rotated(rotation), metric=metric, dtype=np.float64)
+        after = pairwise_distances(moved, b.turned_by(turned), metric=metric, dtype=np.float64)
         np.testing.assert_allclose(after, before, atol=1e-6)
 
 
-def test_rotating_before_lifting_is_rotating_after():
+@pytest.mark.parametrize("version", VERSIONS)
+def test_turning_before_lifting_is_turning_after(version: str) -> None:
     stream = Keystream.seeded("order")
     points = units(stream, 5, 30)
-    rotation = tenant_rotation(b"r" * 32, 30)
-    templates = lift(points, strategy="random", m=4, stream=stream).rotated(rotation)
-    for template, point in zip(templates, rotate(points, rotation), strict=True):
+    rotation = TenantRotation(b"r" * 32, 30).of("template", version)
+    templates = lift(points, strategy="random", m=4, stream=stream).turned_by(rotation.turned)
+    for template, point in zip(templates, rotation.turned(points), strict=True):
         template.validate(1e-6)
         assert template.contains(point)
-    back = templates.rotated(rotation.T)
+    back = templates.turned_by(rotation.turned_back)
     assert all(t.contains(p) for t, p in zip(back, points, strict=True))
 
 
-def test_key_and_dimension_are_checked():
+def test_key_dimension_and_version_are_checked_and_the_key_is_not_shown() -> None:
     with pytest.raises(ValueError, match="32 bytes, not 31"):
-        tenant_rotation(bytes(31), 8)
+        TenantRotation(bytes(31), 8)
     with pytest.raises(ValueError, match="dimension"):
-        tenant_rotation(bytes(32), 0)
+        TenantRotation(bytes(32), 0)
+    tenant = TenantRotation(b"secret" * 5 + b"xy", 8)
+    with pytest.raises(ValueError, match="rotation version 'another'"):
+        tenant.of("template", "another")
+    assert repr(tenant) == "TenantRotation(n=8)"
+
+
+@pytest.mark.parametrize("n", [2, 31, 64])
+def test_a_holders_rotation_follows_from_key_and_salt_as_documented(n: int) -> None:
+    """That of a tenant's key and a template's id, but for the words in front."""
+    key, salt = bytes(range(32)), "fedcba9876543210" * 2
+    count = (TRANSFORMS + 1) * n
+    info = encode_parts("holder rotation", "signs-cosine-2", n, salt)
+    derived = expanded(key, info, -(-count // 8))
+    bits = np.unpackbits(np.frombuffer(derived, dtype=np.uint8), count=count)
+    expected = SignedCosineRotation(1.0 - 2.0 * bits.reshape(-1, n))
+    found = matrix(holder_rotation(bytearray(key), salt, n), n)
+    np.testing.assert_array_equal(found, matrix(expected, n))
+    np.testing.assert_allclose(found @ found.T, np.eye(n), atol=1e-12)
+
+
+def test_a_holders_rotation_is_its_own() -> None:
+    """Of one key: not the tenant's, and another one for another salt."""
+    n, key = 128, b"k" * 32
+    one = matrix(holder_rotation(key, "salt", n), n)
+    others = [
+        holder_rotation(key, "salt2", n),
+        holder_rotation(b"j" * 32, "salt", n),
+        TenantRotation(key, n).of("salt"),
+    ]
+    for other in others:
+        assert abs(np.vdot(one, matrix(other, n))) < 8
+    for length in (0, 31, 33):
+        with pytest.raises(ValueError, match="32 bytes"):
+            holder_rotation(bytes(length), "salt", n)

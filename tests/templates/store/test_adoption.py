@@ -10,6 +10,7 @@ import sqlalchemy as sa
 from templates.keys.sealing import MasterKeyring, encode_parts
 from templates.store import By, LockedOut, NewApiKey, Right, TemplateStore
 from templates.store.record_check import ACTOR_NEVER_CREATED, KEY_ALTERED, RecordProblem
+from templates.store.secret import SecretName
 from tests.templates.store.conftest import Clock, put
 from tests.templates.store.test_attempts import attempt
 
@@ -28,7 +29,7 @@ def run(store: TemplateStore, *statements: str, **values: object) -> None:
 
 def as_an_earlier_version_left_it(store: TemplateStore) -> None:
     """No row has a MAC, and the head has the one that it had then."""
-    head, key = store.audit_log.head(), store.secrets.get("audit-chain")
+    head, key = store.audit_log.head(), store.secrets.get(SecretName.CHAIN).value
     mac = hmac.new(key, encode_parts("head", head.sequence, head.hash), hashlib.sha256).digest()
     run(store, *STRIPPED)
     run(store, "UPDATE audit_head SET mac = :mac", mac=mac)
@@ -99,7 +100,7 @@ def test_a_lock_from_before_is_not_lost_and_not_put_back(
     store.upgrade()
     run(store, "DELETE FROM failed_attempts")
     with pytest.raises(LockedOut):
-        store.attempts.begin("default", "ada", contract_id="c" * 64)
+        store.attempts.begin("default", "ada", contract_ids=["c" * 64])
     clock.pass_by(seconds=30)
     assert attempt(store, accepted=True) == "accept"
     assert not store.attempts.reset("default", "ada", by=By())

@@ -3,7 +3,7 @@
 import os
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
 from typing import Any, TextIO
@@ -69,7 +69,7 @@ def conclude(
     decided_on: str | None,
     *,
     accepted: bool = True,
-    contract_id: str | None = None,
+    contract_ids: Sequence[str] | None = None,
     nonce: Nonce | None = None,
     tenant: str = "default",
 ) -> None:
@@ -79,7 +79,7 @@ def conclude(
         "ada",
         accepted=accepted,
         template_id=decided_on,
-        contract_id=contract_id,
+        contract_ids=contract_ids,
         level="high",
         nonce=nonce,
         by=BY,
@@ -88,7 +88,7 @@ def conclude(
 
 def begin(store: TemplateStore, *, tenant: str = "default", nonce: Nonce | None = None) -> Attempt:
     """Begin an attempt on ada."""
-    return store.attempts.begin(tenant, "ada", contract_id=CONTRACT, nonce=nonce)
+    return store.attempts.begin(tenant, "ada", contract_ids=[CONTRACT], nonce=nonce)
 
 
 def status(store: TemplateStore, subject: str = "ada") -> AttemptsStatus:
@@ -373,15 +373,20 @@ def test_a_rejection_of_nobody_who_is_enrolled_meanwhile_is_taken_back(
     assert ada.attempts.status("default", "ada") is None
 
 
-def test_a_template_of_another_contract_is_as_good_as_none(ada: TemplateStore) -> None:
-    conclude(ada, None, accepted=False, contract_id="d" * 64)
+@pytest.mark.parametrize("served", [[CONTRACT], [CONTRACT, "e" * 64], ["e" * 64, CONTRACT]])
+def test_a_template_of_another_contract_is_as_good_as_none(
+    ada: TemplateStore, served: list[str]
+) -> None:
+    conclude(ada, None, accepted=False, contract_ids=["d" * 64])
     assert status(ada).consecutive == 1
     with pytest.raises(Superseded):
-        conclude(ada, None, accepted=False, contract_id=CONTRACT)
+        conclude(ada, None, accepted=False, contract_ids=served)
     with pytest.raises(Superseded):
-        conclude(ada, template_id(ada, "ada"), contract_id="d" * 64)
-    conclude(ada, template_id(ada, "ada"), contract_id=CONTRACT)
+        conclude(ada, template_id(ada, "ada"), contract_ids=["d" * 64, "e" * 64])
+    conclude(ada, template_id(ada, "ada"), contract_ids=served)
     assert status(ada).consecutive == 0
+    found = ada.attempts.begin("default", "ada", contract_ids=served)
+    assert found.template_id == template_id(ada, "ada")
 
 
 def test_a_lock_and_a_replay_come_before_a_decision_that_is_gone(
@@ -418,9 +423,12 @@ def test_an_attempt_has_the_template_and_the_epoch(ada: TemplateStore) -> None:
     assert found.rotation_epoch == ada.tenants.get("default").rotation_epoch
 
 
-def test_an_attempt_on_nobody_and_on_another_contract_has_no_template(ada: TemplateStore) -> None:
+def test_an_attempt_on_nobody_and_on_another_contract_has_no_template(
+    ada: TemplateStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("templates.store.attempts.opened_template", None)  # nothing is decrypted
     for subject, contract in (("nobody", CONTRACT), ("ada", "d" * 64)):
-        found = ada.attempts.begin("default", subject, contract_id=contract)
+        found = ada.attempts.begin("default", subject, contract_ids=[contract, "e" * 64])
         assert found.template is None
         assert found.template_id is None
         assert found.rotation_epoch == 1
@@ -435,7 +443,7 @@ def alone(
     store: TemplateStore, decide: Callable[[Attempt], Says], *, nonce: Nonce | None = None
 ) -> Says:
     return store.attempts.decide_alone(
-        "default", "ada", decide, contract_id=CONTRACT, nonce=nonce, by=BY
+        "default", "ada", decide, contract_ids=[CONTRACT], nonce=nonce, by=BY
     )
 
 

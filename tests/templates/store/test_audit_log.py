@@ -28,9 +28,10 @@ from templates.store import (
     TemplateStore,
     UnknownTenant,
 )
-from templates.store.audit_chain import MAX_PROBLEMS, Chain, head_mac, line_hash
+from templates.store.audit_chain import MAX_PROBLEMS, Chain, LineKeys, head_mac, line_hash
 from templates.store.database import Database
 from templates.store.schema import AuditHeadRow, AuditRow, SubjectRow
+from templates.store.secret import SecretName
 from tests.templates.store.conftest import Clock, put
 from tests.templates.store.test_concurrency import fork
 
@@ -146,7 +147,7 @@ def test_the_hash_is_a_plain_hmac(store: TemplateStore) -> None:
     parts += [part(b"t", b"unknown_key"), part(b"i", b"0"), part(b"i", b"0")]
     parts += [part(b"b", line.previous_hash)]
     message = len(parts).to_bytes(4, "big") + b"".join(parts)
-    key = store.secrets.get("audit-chain")
+    key = store.secrets.get(SecretName.CHAIN).value
     assert line.hash == hmac.new(key, message, hashlib.sha256).digest()
 
 
@@ -750,7 +751,7 @@ def test_a_column_without_a_value_is_named_and_not_stumbled_over(
 
 
 def test_a_last_line_without_a_hash_can_be_told() -> None:
-    chain = Chain(KEY)
+    chain = Chain(LineKeys(KEY))
     chain.step({**next(made_up_lines(1)), "hash": None})
     head = Anchor(1, bytes(32))
     found = chain.end(head, head_mac(KEY, head), held=1)
@@ -827,26 +828,28 @@ def test_processes_append_to_one_chain(store: TemplateStore) -> None:
 def test_verifying_beside_writers_ends_and_is_clean(
     store: TemplateStore, database_url: str, key_file: Path
 ) -> None:
-    stop, errors = threading.Event(), list[BaseException]()
+    errors = list[BaseException]()
     reader = TemplateStore(database_url, MasterKeyring.load(key_file))
 
     def write() -> None:
         try:
-            while not stop.is_set():
+            for _ in range(40):
                 store.audit_log.record(entry(1))
         except BaseException as error:
             errors.append(error)
 
+    found = [reader.audit_log.verify(batch=5)]
     threads = [threading.Thread(target=write) for _ in range(3)]
     for thread in threads:
         thread.start()
-    found = [reader.audit_log.verify(batch=5) for _ in range(10)]
-    stop.set()
+    while any(thread.is_alive() for thread in threads):
+        found.append(reader.audit_log.verify(batch=5))
+    found.append(reader.audit_log.verify(batch=5))
     for thread in threads:
         thread.join()
     assert errors == []
-    assert [each.problems for each in found] == [()] * 10
-    assert found[-1].lines > found[0].lines
+    assert [each.problems for each in found] == [()] * len(found)
+    assert found[-1].lines == found[0].lines + 3 * 40
     reader.close()
 
 
@@ -878,7 +881,7 @@ def test_the_walk_takes_the_same_memory_however_long_the_log() -> None:
     """The store hands the chain a batch at a time, so this is what could grow."""
 
     def peak(count: int) -> tuple[int, Chain]:
-        chain = Chain(KEY)
+        chain = Chain(LineKeys(KEY))
         tracemalloc.start()
         for columns in made_up_lines(count):
             chain.step(columns)
@@ -894,7 +897,7 @@ def test_the_walk_takes_the_same_memory_however_long_the_log() -> None:
 
 
 def test_a_log_that_is_wrong_everywhere_does_not_fill_the_memory() -> None:
-    chain = Chain(bytes(32))  # another key: every line is wrong
+    chain = Chain(LineKeys(bytes(32)))  # another key: every line is wrong
     count = MAX_PROBLEMS + 700
     for columns in made_up_lines(count):
         chain.step(columns)
@@ -935,7 +938,7 @@ def test_any_change_of_any_line_is_found(seed: int) -> None:
     raw = bytearray(value.encode() if isinstance(value, str) else value)
     raw[generator.randrange(len(raw))] ^= 1 << generator.randrange(7)
     lines[at][column] = raw.decode() if isinstance(value, str) else bytes(raw)
-    chain = Chain(KEY)
+    chain = Chain(LineKeys(KEY))
     for columns in lines:
         chain.step(columns)
     assert Problem(at + 1, "altered") in chain.end(None, b"", held=12).problems

@@ -14,10 +14,13 @@ from typing import TextIO
 
 import pytest
 import sqlalchemy as sa
+from sqlalchemy.engine import Connection
 
 from templates.keys.sealing import MasterKeyring
 from templates.store import TemplateStore
+from templates.store.database import Database
 from templates.store.schema import ReceiptRow, SubjectRow, TemplateRow
+from tests.patience import PATIENCE_S
 from tests.templates.store.conftest import put
 
 SUBJECTS = ("ada", "eve", "kim")
@@ -169,3 +172,40 @@ def test_a_killed_writer_leaves_whole_subjects(store: TemplateStore) -> None:
         # The locks of the dead are free.
         store.erasures.erase("default", subject)
         assert store.subjects.get("default", subject) is None
+
+
+def test_a_process_that_writes_without_a_pause_starves_no_other(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path / 'veilface.db'}"
+    busy, other = (Database(url, timeout=PATIENCE_S) for _ in range(2))
+    busy.write(lambda connection: connection.exec_driver_sql("CREATE TABLE written (n)"))
+    done, writes, waited = threading.Event(), 0, []
+
+    def write(connection: Connection) -> None:
+        connection.exec_driver_sql("INSERT INTO written VALUES (1)")
+        time.sleep(0.005)  # as long as a disk may take
+
+    def write_on() -> None:
+        nonlocal writes
+        while not done.is_set():
+            busy.write(write)
+            writes += 1
+
+    threads = [threading.Thread(target=write_on) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    try:
+        for work in (other.write, lambda _: other.purge_log()):
+            work(write)
+            for _ in range(20):
+                time.sleep(0.02)
+                before = writes
+                work(write)
+                waited.append(writes - before)
+    finally:
+        done.set()
+        for thread in threads:
+            thread.join()
+        busy.close()
+        other.close()
+    assert writes > 2 * len(waited)
+    assert max(waited) < 20, waited

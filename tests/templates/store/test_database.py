@@ -215,11 +215,11 @@ def test_all_connections_busy_is_store_unavailable(database_url: str) -> None:
 
     def hold(connection: sa.Connection) -> None:
         entered.set()
-        leave.wait(10)
+        leave.wait(PATIENCE_S)
 
     thread = threading.Thread(target=lambda: database.read(hold))
     thread.start()
-    entered.wait(10)
+    assert entered.wait(PATIENCE_S)
     try:
         with pytest.raises(StoreUnavailable, match="busy"):
             database.read(lambda connection: connection.execute(sa.select(1)))

@@ -11,6 +11,7 @@ from templates.keys.sealing import MasterKeyring
 from templates.store import Retention, TemplateStore, migrate
 from templates.store.database import Database
 from templates.store.schema import Base, SubjectRow, TenantRow
+from templates.store.secret import SecretName
 from tests.templates.store.conftest import put
 
 
@@ -135,7 +136,7 @@ def test_workers_that_start_at_once_agree(database_url: str, keyring: MasterKeyr
             if new := store.api_keys.bootstrap():
                 tokens.append(new.token)
             assert store.audit_log.verify().intact
-            secrets.append(store.secrets.get("pseudonym"))
+            secrets.append(store.secrets.get(SecretName.PSEUDONYM).value)
         except Exception as error:
             errors.append(error)
         finally:
@@ -194,3 +195,18 @@ def test_migrating_leaves_logging_alone(database_url: str) -> None:
     assert (logging.root.level, logging.root.handlers) == (level, handlers)
     assert not logging.getLogger("templates").disabled
     database.close()
+
+
+def test_templates_that_need_a_key_keep_the_schema(store: TemplateStore) -> None:
+    """An earlier version would compare them without the holder's rotation, and never match."""
+    put(store, "ada", b"wire", holder_salt="ab" * 16)
+    with pytest.raises(StoreError, match="1 templates need their holder's key"):
+        migrate.downgrade(store.database, "0004")
+    store.check()
+    put(store, "ada", b"wire")
+    migrate.downgrade(store.database, "0004")
+    store.upgrade()
+    assert store.audit_log.verify().intact
+    template = store.subjects.get("default", "ada")
+    assert template is not None
+    assert (template.wire, template.holder_salt) == (b"wire", None)

@@ -1,7 +1,11 @@
 import itertools
 import math
 import random
+import signal
+import subprocess
+import sys
 import threading
+import uuid
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
@@ -13,25 +17,31 @@ import sqlalchemy as sa
 from numpy.typing import NDArray
 
 from templates.contract import wire
+from templates.contract.binding import Binding
 from templates.distances import Metric, pairwise_distances
 from templates.errors import StoreError, StoreUnavailable
 from templates.keys.randomness import Keystream
-from templates.keys.rotation import rotate, tenant_rotation
+from templates.keys.rotation import HAAR_VERSION, ROTATION_VERSION, Rotation, TenantRotation
 from templates.keys.sealing import MasterKeyring
-from templates.space.lifting import lift
+from templates.space.lifting import Strategy, lift
 from templates.space.subspace import AffineSubspace, SubspaceBatch
 from templates.store import Source, TemplateStore, UnknownTenant
 from templates.store.audit_log import By
 from templates.store.database import Database
 from templates.store.rerotation import _Rotations
 from templates.store.schema import RotationKeyRow, SubjectRow, TemplateRow
+from templates.store.subject_rows import SubjectTemplate
 from templates.store.tenants import RetiredRotation
 from tests.patience import PATIENCE_S
-from tests.templates.store.conftest import CONTRACT, Clock, SlowSealing, template_id
+from tests.templates.store.conftest import Clock, SlowSealing, template_id
 from tests.templates.store.test_erasure import found, pieces
 
 N, M = 48, 4
 OPERATOR = By("operator:kim", "request-1")
+
+
+def binding(n: int = N, m: int = M, version: str = ROTATION_VERSION) -> Binding:
+    return Binding("ab" * 32, {}, n, Strategy.RANDOM, m, "cd" * 32, version)
 
 
 def units(stream: Keystream, count: int, n: int = N) -> NDArray[np.float64]:
@@ -40,9 +50,20 @@ def units(stream: Keystream, count: int, n: int = N) -> NDArray[np.float64]:
 
 
 class People:
-    """Subjects with a template each, enrolled as the service does it: lifted, then rotated."""
+    """Subjects with a template each, enrolled as the service does it: lifted, then turned.
 
-    def __init__(self, store: TemplateStore, count: int, *, n: int = N, m: int = M) -> None:
+    `version` is that of the service that enrolls, whose contract follows from it.
+    """
+
+    def __init__(
+        self,
+        store: TemplateStore,
+        count: int,
+        *,
+        n: int = N,
+        m: int = M,
+        version: str = ROTATION_VERSION,
+    ) -> None:
         self._store = store
         self.names = [f"s{number:03}" for number in range(count)]
         stream = Keystream.seeded("rerotation")
@@ -50,29 +71,49 @@ class People:
         self.templates = lift(self.points, strategy="random", m=m, stream=stream)
         self._stream = stream
         self.n, self.m = n, m
-        self._rotations: dict[bytes, NDArray[np.float64]] = {}
+        self.version = version
+        self._rotations: dict[bytes, TenantRotation] = {}
 
     def enroll(
         self, name: str, *, tenant: str = "default", dtype: wire.WireDtype = "float16"
     ) -> None:
         epoch = self._store.tenants.get(tenant).rotation_epoch
         template = self.templates[self.names.index(name)]
-        self.put(name, self.encoded(template, tenant, epoch, dtype), epoch, tenant, dtype)
+        new_id = uuid.uuid4().hex
+        encoded = self.encoded(template, tenant, epoch, new_id, dtype)
+        self.put(name, encoded, epoch, tenant, new_id, dtype)
 
     def encoded(
-        self, template: AffineSubspace, tenant: str, epoch: int, dtype: wire.WireDtype = "float16"
+        self,
+        template: AffineSubspace,
+        tenant: str,
+        epoch: int,
+        template_id: str,
+        dtype: wire.WireDtype = "float16",
     ) -> bytes:
-        rotated = template.rotated(self.rotation(epoch, tenant))
-        return wire.encode(rotated, contract_id=CONTRACT, dtype=dtype)
+        rotation = self.tenant_rotation(epoch, tenant).of(template_id, self.version)
+        turned = template.turned_by(rotation.turned)
+        return wire.encode(turned, contract_id=self.binding.contract_id, dtype=dtype)
+
+    @property
+    def binding(self) -> Binding:
+        return binding(self.n, self.m, self.version)
 
     def put(
-        self, name: str, encoded: bytes, epoch: int | None, tenant: str, dtype: str = "float16"
+        self,
+        name: str,
+        encoded: bytes,
+        epoch: int | None,
+        tenant: str,
+        template_id: str,
+        dtype: str = "float16",
     ) -> None:
         self._store.subjects.put(
             tenant,
             name,
             encoded,
-            contract_id=CONTRACT,
+            contract_id=self.binding.contract_id,
+            template_id=template_id,
             n=self.n,
             m=self.m,
             dtype=dtype,
@@ -81,11 +122,18 @@ class People:
             rotation_epoch=epoch,
         )
 
-    def rotation(self, epoch: int, tenant: str = "default") -> NDArray[np.float64]:
+    def tenant_rotation(self, epoch: int, tenant: str = "default") -> TenantRotation:
         key = self._store.tenants.rotation_key(tenant, epoch=epoch).key
         if key not in self._rotations:
-            self._rotations[key] = tenant_rotation(key, self.n)
+            self._rotations[key] = TenantRotation(key, self.n)
         return self._rotations[key]
+
+    def rotation(self, stored: SubjectTemplate) -> Rotation:
+        """By the epoch, id and contract of a stored template."""
+        record = stored.record
+        versions = binding(self.n, self.m).rotation_versions
+        of_epoch = self.tenant_rotation(record.rotation_epoch)
+        return of_epoch.of(record.template_id, versions[record.contract_id])
 
     def distances(
         self, probes: NDArray[np.float64], metric: Metric = Metric.EUCLIDEAN
@@ -95,12 +143,11 @@ class People:
         held = [each for each in stored if each is not None]
         assert len(held) == len(stored)
         table = np.empty((len(probes), len(held)))
-        for epoch in {each.record.rotation_epoch for each in held}:
-            of_epoch = [i for i, each in enumerate(held) if each.record.rotation_epoch == epoch]
-            subspaces = SubspaceBatch.of([wire.decode(held[i].wire).subspace for i in of_epoch])
-            rotated = rotate(probes, self.rotation(epoch))
-            table[:, of_epoch] = pairwise_distances(
-                rotated, subspaces, metric=metric, dtype=np.float64
+        for number, each in enumerate(held):
+            subspace = SubspaceBatch.of([wire.decode(each.wire).subspace])
+            turned = self.rotation(each).turned(probes)
+            table[:, [number]] = pairwise_distances(
+                turned, subspace, metric=metric, dtype=np.float64
             )
         return table
 
@@ -167,11 +214,12 @@ def test_a_new_epoch_serves_new_enrollments_and_keeps_the_old(store: TemplateSto
         store.rerotation.begin("nobody")
 
 
+@pytest.mark.parametrize("version", [HAAR_VERSION, ROTATION_VERSION])
 @pytest.mark.parametrize("dtype", ["float16", "float32"])
 def test_moved_templates_are_the_same_sets_in_the_new_rotation(
-    store: TemplateStore, clock: Clock, dtype: wire.WireDtype
+    store: TemplateStore, clock: Clock, dtype: wire.WireDtype, version: str
 ) -> None:
-    people = People(store, 7)
+    people = People(store, 7, version=version)
     for name in people.names:
         people.enroll(name, dtype=dtype)
     people.enroll("s003", tenant="other")
@@ -183,10 +231,10 @@ def test_moved_templates_are_the_same_sets_in_the_new_rotation(
     store.rerotation.begin("default")
     assert store.rerotation.remaining("default") == 7
     progress: list[int] = []
-    assert store.rerotation.move("default", batch=3, progress=progress.append) == 7
+    assert store.rerotation.move("default", binding(), batch=3, progress=progress.append) == 7
     assert progress == [3, 3, 1]
     assert store.rerotation.remaining("default") == 0
-    assert store.rerotation.move("default") == 0
+    assert store.rerotation.move("default", binding()) == 0
 
     assert np.abs(people.distances(probes) - distances_before).max() < 1e-3
     assert people.own_distances().max() < 1e-3
@@ -196,21 +244,27 @@ def test_moved_templates_are_the_same_sets_in_the_new_rotation(
         "templates.ciphertext",
         "templates.rotation_epoch",
     }
+    if version == HAAR_VERSION:
+        changed.add("templates.contract_id")
+    old_rotation = people.tenant_rotation(1)
     for name in people.names:
         different = {key for key in before[name] if before[name][key] != after[name][key]}
         assert different == changed, name
         stored = store.subjects.get("default", name)
         assert stored is not None
         assert wire.decode(stored.wire).dtype == dtype
+        assert wire.decode(stored.wire).contract_id == binding().contract_id
+        assert stored.record.contract_id == binding().contract_id
         # The new numbers are those of the new rotation only.
         subspace = SubspaceBatch.of([wire.decode(stored.wire).subspace])
         own = people.points[[people.names.index(name)]]
-        old = pairwise_distances(rotate(own, people.rotation(1)), subspace, metric="euclidean")
-        assert old.min() > 0.1
+        old = old_rotation.of(stored.record.template_id, version).turned(own)
+        assert pairwise_distances(old, subspace, metric="euclidean").min() > 0.1
     assert store.subjects.get("other", "s003") == theirs
 
 
 @pytest.mark.parametrize("metric", list(Metric))
+@pytest.mark.long
 def test_what_another_rounding_costs(
     tmp_path: Path, keyring: MasterKeyring, metric: Metric
 ) -> None:
@@ -229,7 +283,7 @@ def test_what_another_rounding_costs(
     seen = [people.distances(probes, metric)]
     for _ in range(3):
         store.rerotation.begin("default")
-        assert store.rerotation.move("default") == 40
+        assert store.rerotation.move("default", people.binding) == 40
         seen.append(people.distances(probes, metric))
     errors = [seen[0] - exact, *(after - before for before, after in itertools.pairwise(seen))]
     assert errors[0].size == 8000
@@ -244,11 +298,11 @@ def test_what_another_rounding_costs(
 
 def test_an_enrollment_of_an_older_epoch_is_refused(store: TemplateStore) -> None:
     people = People(store, 1)
-    late = people.encoded(people.templates[0], "default", 1)
+    late = people.encoded(people.templates[0], "default", 1, "late")
     store.rerotation.begin("default")
     for epoch in (1, 3):
         with pytest.raises(StoreUnavailable, match="rotation was renewed meanwhile; send it again"):
-            people.put("s000", late, epoch, "default")
+            people.put("s000", late, epoch, "default", "late")
     assert store.subjects.describe("default", "s000") is None
     people.enroll("s000")
     record = store.subjects.describe("default", "s000")
@@ -266,7 +320,7 @@ def test_retiring_drops_the_old_keys_once_nothing_needs_them(store: TemplateStor
     with pytest.raises(StoreError, match=r"3 templates .* move them first"):
         store.rerotation.retire("default")
     assert epochs(store) == [1, 2, 3]
-    store.rerotation.move("default")
+    store.rerotation.move("default", binding())
     assert store.rerotation.retire("default", by=OPERATOR) == 2
     assert epochs(store) == [3]
     assert store.rerotation.retire("default") == 0
@@ -284,10 +338,10 @@ def test_a_move_has_its_line_and_takes_back_no_decision(store: TemplateStore) ->
         people.enroll(name)
     decided_on = template_id(store, people.names[0])
     store.rerotation.begin("default")
-    assert store.rerotation.move("default", by=OPERATOR) == 3
+    assert store.rerotation.move("default", binding(), by=OPERATOR) == 3
     assert audit(store)[-1] == ("moved", "default", "operator:kim", "request-1", "epoch 2")
     before = store.audit_log.head()
-    assert store.rerotation.move("default", by=OPERATOR) == 0
+    assert store.rerotation.move("default", binding(), by=OPERATOR) == 0
     assert store.audit_log.head() == before
     store.attempts.conclude(
         "default",
@@ -312,15 +366,18 @@ def test_what_is_left_is_named_in_pages(store: TemplateStore) -> None:
     assert list(store.rerotation.subjects_of_old_epochs("default", batch=2)) == left
     assert list(store.rerotation.subjects_of_old_epochs("other")) == []
     assert store.rerotation.remaining("default") == 4
-    for call in (store.rerotation.remaining, store.rerotation.move, store.rerotation.retire):
+    for call in (store.rerotation.remaining, store.rerotation.retire):
         with pytest.raises(UnknownTenant):
             call("nobody")
+    with pytest.raises(UnknownTenant):
+        store.rerotation.move("nobody", binding())
     with pytest.raises(UnknownTenant):
         list(store.rerotation.subjects_of_old_epochs("nobody"))
 
 
-def test_an_interrupted_move_goes_on_where_it_stopped(store: TemplateStore) -> None:
-    people = People(store, 8)
+@pytest.mark.parametrize("version", [HAAR_VERSION, ROTATION_VERSION])
+def test_an_interrupted_move_goes_on_where_it_stopped(store: TemplateStore, version: str) -> None:
+    people = People(store, 8, version=version)
     for name in people.names:
         people.enroll(name)
     store.rerotation.begin("default")
@@ -329,18 +386,115 @@ def test_an_interrupted_move_goes_on_where_it_stopped(store: TemplateStore) -> N
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        store.rerotation.move("default", batch=3, progress=stop)
+        store.rerotation.move("default", binding(), batch=3, progress=stop)
     assert store.rerotation.remaining("default") == 5
     assert people.own_distances().max() < 1e-3  # in both epochs
-    assert store.rerotation.move("default") == 5
+    assert store.rerotation.move("default", binding()) == 5
     assert people.own_distances().max() < 1e-3
+
+
+def test_templates_of_both_versions_are_served_in_one_epoch_and_moved(store: TemplateStore) -> None:
+    """A deployment that was calibrated anew, and enrolls, before its tenant is renewed."""
+    before, after = People(store, 6, version=HAAR_VERSION), People(store, 6)
+    for name in before.names:
+        before.enroll(name)
+    for name in after.names[:2]:
+        after.enroll(name)
+    old, new = before.binding.contract_id, after.binding.contract_id
+    served = after.binding.contract_ids
+    assert served == (new, old)
+    found = [row["templates.contract_id"] for _, row in sorted(rows(store).items())]
+    assert found == [new] * 2 + [old] * 4
+    assert {row["templates.rotation_epoch"] for row in rows(store).values()} == {1}
+    assert after.own_distances().max() < 1e-3
+    begun = store.attempts.begin("default", "s005", contract_ids=served)
+    assert begun.template is not None
+    assert begun.template.record.contract_id == old
+
+    store.rerotation.begin("default")
+    assert store.rerotation.move("default", after.binding) == 6
+    assert store.rerotation.retire("default") == 1
+    assert {row["templates.contract_id"] for row in rows(store).values()} == {new}
+    assert after.own_distances().max() < 1e-3
+    # What was read before the move is still decided on.
+    store.attempts.conclude(
+        "default",
+        "s005",
+        accepted=True,
+        template_id=begun.template_id,
+        contract_ids=served,
+        level="m",
+        nonce=None,
+        by=OPERATOR,
+    )
+
+
+def test_templates_of_another_contract_are_left_and_named(store: TemplateStore) -> None:
+    people, foreign = People(store, 3), People(store, 3, m=M + 1)
+    people.enroll("s000")
+    foreign.enroll("s001")
+    people.enroll("s002")
+    kept = store.subjects.get("default", "s001")
+    store.rerotation.begin("default")
+    assert store.rerotation.move("default", people.binding) == 2
+    assert list(store.rerotation.subjects_of_old_epochs("default")) == ["s001"]
+    assert store.subjects.get("default", "s001") == kept
+    with pytest.raises(StoreError, match="move them first"):
+        store.rerotation.retire("default")
+    people.enroll("s001")
+    assert store.rerotation.retire("default") == 1
+
+
+KILLED = """
+import os, signal, sys
+from templates.keys.sealing import MasterKeyring
+from templates.store import TemplateStore
+from templates.store.rerotation import Rerotation
+from tests.templates.store.test_rerotation import binding
+
+url, key_file, place = sys.argv[1:]
+replace_all = Rerotation._replace_all
+
+def die(*_: object) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+def die_inside(*arguments: object, **named: object) -> int:
+    replace_all(*arguments, **named)
+    die()
+
+if place == "inside":
+    Rerotation._replace_all = die_inside
+store = TemplateStore(url, MasterKeyring.load(key_file))
+store.rerotation.move("default", binding(), batch=2, progress=die)
+"""
+
+
+@pytest.mark.long
+def test_ten_kills_on_the_way_lose_nothing(
+    store: TemplateStore, database_url: str, key_file: Path
+) -> None:
+    people = People(store, 11, version=HAAR_VERSION)
+    for name in people.names:
+        people.enroll(name)
+    store.rerotation.begin("default")
+    for number in range(10):
+        # Inside a transaction, and after it.
+        place = ("inside", "after")[number % 2]
+        command = [sys.executable, "-c", KILLED, database_url, str(key_file), place]
+        assert subprocess.run(command, check=False).returncode == -signal.SIGKILL
+        assert people.own_distances().max() < 1e-3
+        assert store.rerotation.remaining("default") == 11 - 2 * ((number + 1) // 2)
+    assert store.rerotation.move("default", binding()) == 1
+    assert store.rerotation.retire("default") == 1
+    assert people.own_distances().max() < 1e-3
+    assert store.audit_log.verify().intact
 
 
 def meanwhile(monkeypatch: pytest.MonkeyPatch, action: Callable[[], object]) -> None:
     """Do something once, after a template was read and before it is replaced."""
     rotated, done = _Rotations.rotated, threading.Event()
 
-    def rotated_late(*arguments: Any) -> bytes:
+    def rotated_late(*arguments: Any) -> Any:
         template = rotated(*arguments)
         if not done.is_set():
             done.set()
@@ -357,9 +511,9 @@ def test_a_subject_that_is_enrolled_again_meanwhile_is_left_alone(
     people.enroll("s000")
     people.enroll("s001")
     store.rerotation.begin("default")
-    new = people.encoded(people.templates[1], "default", 2)
-    meanwhile(monkeypatch, lambda: people.put("s000", new, 2, "default"))
-    assert store.rerotation.move("default") == 1
+    new = people.encoded(people.templates[1], "default", 2, "new")
+    meanwhile(monkeypatch, lambda: people.put("s000", new, 2, "default", "new"))
+    assert store.rerotation.move("default", binding()) == 1
     stored = store.subjects.get("default", "s000")
     assert stored is not None
     assert stored.wire == new
@@ -374,7 +528,7 @@ def test_a_subject_that_is_erased_meanwhile_stays_erased(
     people.enroll("s001")
     store.rerotation.begin("default")
     meanwhile(monkeypatch, lambda: [store.erasures.erase("default", name) for name in people.names])
-    assert store.rerotation.move("default") == 0
+    assert store.rerotation.move("default", binding()) == 0
     assert rows(store) == {}
 
 
@@ -387,7 +541,7 @@ def test_a_key_that_was_wrapped_again_meanwhile_is_not_put_back(
     store.rerotation.begin("default")
     MasterKeyring.add_current(key_file)
     meanwhile(monkeypatch, store.wrapped_keys.rewrap)
-    assert store.rerotation.move("default") == 3  # looked at again
+    assert store.rerotation.move("default", binding()) == 3  # looked at again
     assert list(store.wrapped_keys.count()) == [MasterKeyring.load(key_file).current]
     assert people.own_distances().max() < 1e-3
 
@@ -396,20 +550,20 @@ def test_a_template_that_does_not_open_is_said_and_the_rest_is_moved(store: Temp
     people = People(store, 5)
     for name in people.names:
         people.enroll(name)
-    people.put("s003", b"no template", 1, "default")
+    people.put("s003", b"no template", 1, "default", "broken")
     pk = rows(store)["s001"]["subjects.id"]
     damage = sa.update(TemplateRow).where(TemplateRow.subject_pk == pk).values(template_id="x")
     store.database.write(lambda each: each.execute(damage))
     store.rerotation.begin("default")
     with pytest.raises(StoreError, match=r"2 templates .* could not be moved") as caught:
-        store.rerotation.move("default", batch=2)
+        store.rerotation.move("default", binding(), batch=2)
     assert "s001" not in str(caught.value)
     assert list(store.rerotation.subjects_of_old_epochs("default")) == ["s001", "s003"]
     with pytest.raises(StoreError, match="move them first"):
         store.rerotation.retire("default")
     store.erasures.erase("default", "s001")
     people.enroll("s003")
-    assert store.rerotation.move("default") == 0
+    assert store.rerotation.move("default", binding()) == 0
     assert store.rerotation.retire("default") == 1
 
 
@@ -430,7 +584,7 @@ def test_an_enrollment_under_way_is_waited_for_before_a_key_goes(
 
         def renew() -> None:
             store.rerotation.begin("default")
-            store.rerotation.move("default")
+            store.rerotation.move("default", binding())
             store.rerotation.retire("default")
 
         renewing = threads.submit(renew)
@@ -447,11 +601,12 @@ def test_an_enrollment_under_way_is_waited_for_before_a_key_goes(
     service.close()
 
 
+@pytest.mark.parametrize("version", [HAAR_VERSION, ROTATION_VERSION])
 def test_a_service_in_use_loses_nothing(
-    store: TemplateStore, database_url: str, key_file: Path
+    store: TemplateStore, database_url: str, key_file: Path, version: str
 ) -> None:
     service = TemplateStore(database_url, MasterKeyring.load(key_file))
-    people, users = People(store, 10), People(service, 10)
+    people, users = People(store, 10, version=version), People(service, 10)
     for name in people.names:
         people.enroll(name)
     errors: list[BaseException] = []
@@ -482,11 +637,11 @@ def test_a_service_in_use_loses_nothing(
                     if stored is None:
                         continue
                     try:
-                        rotation = users.rotation(stored.record.rotation_epoch)
+                        rotation = users.rotation(stored)
                     except RetiredRotation:
                         continue  # moved and retired since it was read: the caller reads it again
                     subspace = SubspaceBatch.of([wire.decode(stored.wire).subspace])
-                    probe = rotate(point[None], rotation)
+                    probe = rotation.turned(point[None])
                     assert pairwise_distances(probe, subspace, metric="euclidean").max() < 1e-2
         except BaseException as error:
             errors.append(error)
@@ -499,7 +654,7 @@ def test_a_service_in_use_loses_nothing(
         for _ in range(3):
             store.rerotation.begin("default")
             with ThreadPoolExecutor(2) as movers:
-                moving = [movers.submit(store.rerotation.move, "default", batch=3)] * 2
+                moving = [movers.submit(store.rerotation.move, "default", binding(), batch=3)] * 2
                 for each in moving:
                     each.result()
             while True:
@@ -508,7 +663,7 @@ def test_a_service_in_use_loses_nothing(
                     break
                 except StoreError as error:
                     left.append(str(error))
-                    store.rerotation.move("default")
+                    store.rerotation.move("default", binding())
     finally:
         stop.set()
         for thread in threads:
@@ -548,7 +703,7 @@ def test_sqlite_files_keep_nothing_of_the_old_rotation(
     assert found(folder, data_key) != {}
     assert found(folder, rotation_key) != {}
     store.rerotation.begin("default")
-    store.rerotation.move("default", batch=5)
+    store.rerotation.move("default", people.binding, batch=5)
     assert found(folder, ciphertext) == {}
     assert found(folder, data_key) == {}
     store.rerotation.retire("default")

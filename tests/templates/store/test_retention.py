@@ -295,9 +295,9 @@ def test_sqlite_files_keep_nothing_of_who_was_erased(
     store.tenants.create("default")
     generator = random.Random(8)
     for number in range(10):
-        put(store, f"subject-{number:04}", generator.randbytes(17_000))
+        put(store, f"subject-{number:04}", generator.randbytes(9_000))
     clock.pass_by(days=10)
-    put(store, "subject-0003", generator.randbytes(17_000))
+    put(store, "subject-0003", generator.randbytes(9_000))
     database = Database(url)
     rows = database.read(
         lambda each: each.execute(

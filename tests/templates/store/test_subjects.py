@@ -1,5 +1,7 @@
 import base64
 import random
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 import sqlalchemy as sa
@@ -7,10 +9,12 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from templates.errors import SealError, StoreError, StoreUnavailable
+from templates.keys.sealing import MasterKeyring
 from templates.store import InvalidIdentifier, Source, TemplateStore, UnknownTenant
 from templates.store.database import Database
 from templates.store.identifiers import checked_subject_id
 from templates.store.schema import SubjectRow, TemplateRow
+from templates.store.subjects import EnrollmentConflict, Precondition
 from tests.templates.store.conftest import CONTRACT, Clock, put
 
 
@@ -228,6 +232,7 @@ def test_a_row_relabelled_in_the_database_does_not_open(
         "f": ("ciphertext", b""),
         "g": ("ciphertext", b"\x02" * 60),
         "h": ("wrapped_key", b""),
+        "i": ("holder_salt", "ab" * 16),
     }
     for subject, (column, value) in changes.items():
         put(store, subject, b"wire", template_id="t-1")
@@ -332,12 +337,46 @@ def test_a_cursor_shows_nothing_and_cannot_be_made(store: TemplateStore) -> None
             store.subjects.list("default", limit=limit)
 
 
-def test_a_template_of_another_contract_is_as_good_as_none(
-    store: TemplateStore, monkeypatch: pytest.MonkeyPatch
+def test_a_precondition_names_what_may_be_replaced(store: TemplateStore) -> None:
+    with pytest.raises(EnrollmentConflict) as refused:
+        put(store, "ann", b"1", precondition=Precondition("x"))
+    assert refused.value.template_id is None
+    put(store, "ann", b"2", template_id="a", precondition=Precondition(None))
+    for named in (None, "x"):
+        with pytest.raises(EnrollmentConflict) as refused:
+            put(store, "ann", b"3", precondition=Precondition(named))
+        assert refused.value.template_id == "a"
+    # Another tenant's subject of the same id is another subject.
+    put(store, "ann", b"4", tenant="other", precondition=Precondition(None))
+    assert store.subjects.get("default", "ann").wire == b"2"
+    assert not put(store, "ann", b"5", precondition=Precondition("a")).created
+    assert store.subjects.get("default", "ann").wire == b"5"
+    outcomes = [line.outcome for line in store.audit_log.lines() if line.action == "enroll"]
+    assert outcomes == ["created", "created", "replaced"]
+
+
+def test_of_processes_that_enroll_at_once_one_does(
+    store: TemplateStore, database_url: str, key_file: Path
 ) -> None:
-    put(store, "ada", b"wire")
-    found = store.subjects.get("default", "ada", contract_id=CONTRACT)
-    assert found is not None
-    assert found.wire == b"wire"
-    monkeypatch.setattr(store._context.keyring, "open", None)  # nothing may be decrypted
-    assert store.subjects.get("default", "ada", contract_id="d" * 64) is None
+    """Each thread has a store of its own, as each worker of a service has."""
+    stores = [store, *(TemplateStore(database_url, MasterKeyring.load(key_file)) for _ in range(3))]
+
+    def enroll(number: int, named: str | None) -> bool:
+        try:
+            put(stores[number % 4], "ann", bytes([number]), precondition=Precondition(named))
+        except EnrollmentConflict:
+            return False
+        return True
+
+    try:
+        named: str | None = None
+        for _ in range(5):
+            with ThreadPoolExecutor(8) as threads:
+                enrolled = list(threads.map(enroll, range(1, 9), [named] * 8))
+            assert sum(enrolled) == 1
+            template = store.subjects.get("default", "ann")
+            assert template.wire == bytes([1 + enrolled.index(True)])
+            named = template.template_id
+    finally:
+        for other in stores[1:]:
+            other.close()

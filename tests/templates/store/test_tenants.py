@@ -1,7 +1,7 @@
 import pytest
 
-from templates.errors import StoreError
 from templates.store import InvalidIdentifier, TemplateStore, UnknownTenant
+from templates.store.secret import SecretName
 
 
 def test_a_tenant_is_made_once(store: TemplateStore) -> None:
@@ -32,12 +32,11 @@ def test_each_tenant_has_a_rotation_key_of_its_own(store: TemplateStore) -> None
 
 
 def test_secrets_are_made_once_and_differ_by_name(store: TemplateStore) -> None:
-    assert len(store.secrets.get("export")) == 32
-    assert store.secrets.get("export") == store.secrets.get("export")
-    assert store.secrets.get("export") != store.secrets.get("pseudonym")
-    assert store.secrets.get("export").hex() not in repr(store.secrets)
-    with pytest.raises(StoreError):
-        store.secrets.get("no spaces")
+    secrets = [store.secrets.get(name) for name in SecretName]
+    assert [len(secret.value) for secret in secrets] == [32] * len(SecretName)
+    assert len({secret.value for secret in secrets}) == len(SecretName)
+    assert secrets == [store.secrets.get(name) for name in SecretName]
+    assert not any(secret.value.hex() in repr((store.secrets, secrets)) for secret in secrets)
 
 
 def test_enrollment_by_template_is_off_until_it_is_allowed(store: TemplateStore) -> None:

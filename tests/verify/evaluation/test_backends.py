@@ -10,6 +10,7 @@ import pytest
 from cryptography.exceptions import InvalidTag
 from distributed import Client, LocalCluster
 
+from tests.patience import wait_until
 from tests.verify.evaluation.materials import material
 from verify.evaluation import backends
 from verify.evaluation.backends import Backend, BackendError, spread
@@ -22,8 +23,11 @@ def add(shared: int, item: int) -> int:
     return shared + item
 
 
-def process(shared: object, item: object) -> int:
-    time.sleep(0.5)  # long enough for the others to begin
+def process(shared: tuple[Path, int], item: object) -> int:
+    """Process of a task, once so many processes have begun one."""
+    folder, processes = shared
+    (folder / str(os.getpid())).touch()
+    wait_until(lambda: len(list(folder.iterdir())) >= processes, what="the other processes")
     return os.getpid()
 
 
@@ -31,7 +35,7 @@ def process(shared: object, item: object) -> int:
 def cluster() -> Iterator[str]:
     """A scheduler and two workers, each a process of its own."""
     with LocalCluster(  # type: ignore[no-untyped-call]
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0"
     ) as running:
         yield running.scheduler_address
 
@@ -51,19 +55,20 @@ def test_what_is_no_address_is_refused(text: str) -> None:
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_local_work_is_done_in_as_many_processes(jobs: int) -> None:
+def test_local_work_is_done_in_as_many_processes(jobs: int, tmp_path: Path) -> None:
     backend = Backend(None, jobs)
     assert sorted(spread(backend, add, 100, range(5))) == [(i, 100 + i) for i in range(5)]
-    processes = {pid for _, pid in spread(backend, process, None, range(4))}
+    processes = {pid for _, pid in spread(backend, process, (tmp_path, jobs), range(4))}
     assert len(processes) == jobs
     assert (os.getpid() in processes) is (jobs == 1)
     assert list(spread(backend, add, 1, [])) == []
 
 
-def test_a_cluster_does_the_same_work(cluster: str) -> None:
+def test_a_cluster_does_the_same_work(cluster: str, tmp_path: Path) -> None:
     backend = Backend.parse(cluster.replace("tcp", "dask"), jobs=1)
     assert sorted(spread(backend, add, 100, range(5))) == [(i, 100 + i) for i in range(5)]
-    assert os.getpid() not in {pid for _, pid in spread(backend, process, None, range(4))}
+    processes = {pid for _, pid in spread(backend, process, (tmp_path, 2), range(4))}
+    assert os.getpid() not in processes
 
 
 def kept_open() -> int:

@@ -104,6 +104,7 @@ def test_rows_are_means_of_their_runs(tmp_path: Path) -> None:
     assert len(results["curves"]) == len(rows) - 1
 
 
+@pytest.mark.long
 def test_results_do_not_depend_on_where_the_work_is_done(tmp_path: Path) -> None:
     here = document_of(run(tmp_path / "one"))
     there = document_of(run(tmp_path / "two", jobs=2))

@@ -5,6 +5,7 @@ import pytest
 
 from templates.decoys import Attributes, DecoyGenerator, DecoyPool
 from templates.distances import Metric, similarity
+from templates.errors import TemplateError
 from templates.keys.randomness import Keystream
 from templates.space.lifting import Strategy, lift
 from tests.verify.evaluation.materials import N, material, pool
@@ -80,6 +81,17 @@ def test_each_side_is_lifted_and_the_other_compared_with_it() -> None:
         assert found[Mode.SUBSPACE, "euclidean", "both"][row] == pytest.approx(
             similarity(residual(second.foot, first.foot, rows)), abs=1e-4
         )
+
+
+def test_a_device_gives_the_similarities_of_the_processor() -> None:
+    pytest.importorskip("torch", reason="torch is an optional extra")
+    known = material(pairs=30)
+    here, there = (score_unit(known, unit(device=device)) for device in (None, "cpu"))
+    assert [scores.cell for scores in here] == [scores.cell for scores in there]
+    for one, other in zip(here, there, strict=True):
+        np.testing.assert_allclose(one.similarities, other.similarities, atol=5e-6)
+    with pytest.raises(TemplateError, match="torch cannot use the device nowhere"):
+        score_unit(known, unit(device="nowhere"))
 
 
 def test_seeds_change_lifts_and_one_seed_repeats_them() -> None:

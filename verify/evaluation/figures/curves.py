@@ -41,7 +41,7 @@ BAND_ALPHA = 0.11
 PANEL_INCHES = (4.6, 4.3)
 SIDE_INCHES = 2.75
 HASH_HUES = dict(zip(HASHES, ("#8c8c8c", "#8c8c8c", "#5e5e5e", "#5e5e5e"), strict=True))
-_EER: dict[str, Any] = {"color": QUIET, "linewidth": 0.9, "label": "FMR = FNMR"}
+EQUAL: dict[str, Any] = {"color": QUIET, "linewidth": 0.9}
 Draw = Callable[[Axes, Array, Array, Array, Array, dict[str, Any]], None]
 
 
@@ -52,7 +52,7 @@ def det_figure(results: Mapping[str, Any]) -> Figure | None:
     dimensions the smallest and the largest that all strategies of the panel have; raw descriptors
     and hashes are in every panel as references. Bands are 95 %.
     """
-    return _figure(results, _draw_det, _dress_det)
+    return _figure(results, draw_det, dress_det)
 
 
 def roc_figure(results: Mapping[str, Any]) -> Figure | None:
@@ -114,7 +114,7 @@ def _figure(results: Row, draw: Draw, dress: Callable[[Axes], None]) -> Figure |
                     draw(axes, fmr, fnmr, low, high, _look(curve, shown, looks))
                 axes.set_title(f"{name}, {_title(mode, shown)}", loc="left")
                 dress(axes)
-        _legend(figure, drawn, looks, diagonal=draw is _draw_det)
+        _legend(figure, drawn, looks, diagonal=draw is draw_det)
     return figure
 
 
@@ -159,9 +159,10 @@ def _markers(look: dict[str, Any], points: int) -> dict[str, Any]:
     return look | {"markevery": (number * step // len(MARKERS), step)}
 
 
-def _draw_det(
+def draw_det(
     axes: Axes, fmr: Array, fnmr: Array, low: Array, high: Array, look: dict[str, Any]
 ) -> None:
+    """Draw one error rate over the other, with the band of the latter."""
     # A rate of 0 has no deviate: the line leaves the panel through its foot.
     clipped = [np.clip(rate, SMALLEST, 1 - SMALLEST) for rate in (fmr, fnmr, low, high)]
     axes.plot(clipped[0], clipped[1], **_markers(look, len(fmr)))
@@ -183,7 +184,8 @@ def _percent(value: float) -> str:
     return f"{100 * value:.4f}".rstrip("0").rstrip(".")
 
 
-def _dress_det(axes: Axes) -> None:
+def dress_det(axes: Axes, x: str = "FMR", y: str = "FNMR") -> None:
+    """Set scales, ticks and labels of a DET panel whose curves are drawn."""
     lines = axes.get_lines()
     fmr = np.concatenate([np.asarray(line.get_xdata(), dtype=np.float64) for line in lines])
     fnmr = np.concatenate([np.asarray(line.get_ydata(), dtype=np.float64) for line in lines])
@@ -200,9 +202,9 @@ def _dress_det(axes: Axes) -> None:
         inside = [rate for rate in RATE_TICKS if limits[0] * 0.999 <= rate <= limits[1]]
         getattr(axes, f"set_{axis}ticks")(inside, [_percent(rate) for rate in inside])
         getattr(axes, f"set_{axis}lim")(limits)
-    axes.plot([SMALLEST, 0.999], [SMALLEST, 0.999], **_EER)
-    axes.set_xlabel("FMR %")
-    axes.set_ylabel("FNMR %")
+    axes.plot([SMALLEST, 0.999], [SMALLEST, 0.999], **(EQUAL | {"label": f"{x} = {y}"}))
+    axes.set_xlabel(f"{x} %")
+    axes.set_ylabel(f"{y} %")
     axes.grid(color=RULE, linewidth=0.8)
 
 
@@ -234,7 +236,9 @@ def _legend(
             by_mode.setdefault(curve["mode"], set()).add(int(curve["dim"]))
     for dash, pick, word in ((DASHES[0], max, "solid"), (DASHES[1], min, "dashed")):
         dims = {
-            mode: pick(found) for mode, found in by_mode.items() if len(found) > 1 or pick is max
+            mode: pick(dims_of_mode)
+            for mode, dims_of_mode in by_mode.items()
+            if len(dims_of_mode) > 1 or pick is max
         }
         if dims:
             same = len(set(dims.values())) == 1
@@ -246,5 +250,5 @@ def _legend(
                 )
             )
     if diagonal:
-        handles.append(Line2D([], [], **_EER))
+        handles.append(Line2D([], [], **EQUAL, label="FMR = FNMR"))
     side_legend(figure, handles, SIDE_INCHES)

@@ -129,7 +129,7 @@ def _person_rule(file: Path, trials: Sequence[Trial]) -> Callable[[str], str]:
 def _files(root: Path, keys: Sequence[str]) -> dict[str, PictureFile]:
     # Archives are often unpacked into a folder of their own name.
     folders = [root / PHOTOS, root / PHOTOS / PHOTOS]
-    listed = next((found for folder in folders if (found := photos_in(folder))), {})
+    listed = next((photos for folder in folders if (photos := photos_in(folder))), {})
     files: dict[str, PictureFile] = {}
     faults: list[str] = []
     for key in keys:

@@ -1,0 +1,118 @@
+"""``veilface calibrate --liveness``: the liveness threshold of a contract that is there."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from api.cli.console import demo_notice, emit, message, say, show, table
+from api.cli.descriptors import bulk_pack
+from api.cli.errors import CommandError, UsageError
+from api.cli.evaluate_liveness import require_liveness, score_with_progress
+from api.cli.verdict import shown_rate
+from api.process.opening import file_sealer, open_keyring
+from api.settings import Settings
+from models.errors import PackError
+from models.pack import ModelPack
+from templates.contract.document import Contract
+from templates.contract.liveness_policy import LivenessPolicy
+from templates.errors import VeilfaceError
+from templates.keys.sealing import Sealer
+from verify.evaluation.liveness.presentations import read_presentations
+from verify.evaluation.liveness.rates import calibrate_liveness
+
+
+def set_liveness_threshold(
+    data: Path,
+    file: Path,
+    settings: Settings,
+    *,
+    bpcer: float,
+    policy: LivenessPolicy | None,
+    as_json: bool,
+) -> None:
+    """Set the threshold at a BPCER on live photos, and store it in a contract file.
+
+    Parameters
+    ----------
+    policy
+        What every verification by the contract must pass; None keeps what the file says.
+
+    Raises
+    ------
+    CommandError
+        There is no contract yet, or the pack has no liveness graph.
+    DatasetError
+        The photos are too few for the rate.
+    """
+    if not 0 < bpcer < 1:
+        raise UsageError("--bpcer takes a rate between 0 and 1")
+    presented = read_presentations(data, attacks=False)
+    if not file.is_file():
+        raise CommandError(
+            f"{file} is not there: calibrate on labelled people first; --liveness adds a threshold "
+            "to that contract"
+        )
+    sealer = file_sealer(open_keyring(settings))
+    contract = Contract.load(file, sealer)
+    flip = bool(contract.binding.preprocessing["flip"])
+    pack = bulk_pack(settings, flip=flip, why="liveness graphs are part of a model pack")
+    liveness = require_liveness(pack)
+    contract.binding.require_embedder(
+        embedder_sha256=pack.info.embedder_sha256,
+        preprocessing=pack.info.preprocessing,
+        n=pack.info.n,
+    )
+    scored = score_with_progress(pack, presented)
+    calibration = calibrate_liveness(scored, liveness.graphs, target=bpcer)
+    if policy is None and contract.liveness is not None:
+        policy = contract.liveness.policy
+    calibration = replace(calibration, policy=policy or LivenessPolicy.OFF)
+    replace(contract, liveness=calibration).save(file, sealer)
+    notice = demo_notice(pack.info.embedder_sha256, n=pack.info.n)
+    if as_json:
+        emit(
+            {
+                **notice,
+                "out": str(file),
+                "contract_id": contract.contract_id,
+                "liveness": calibration.to_json(),
+            }
+        )
+        return
+    listing = table(f"liveness, threshold {calibration.threshold:.4g}", "photos", "error", "seen")
+    listing.add_row("live", "BPCER", shown_rate(calibration.bpcer))
+    for species, rate in calibration.apcer.items():
+        listing.add_row(species, "APCER", shown_rate(rate))
+    show(listing)
+    worst = calibration.worst_species
+    if worst is None:
+        say("No attack photos: what passes at this threshold was not measured.")
+    else:
+        say(
+            f"Worst species: {worst}, of which {shown_rate(calibration.apcer[worst])} pass. Other "
+            "photos give other rates: `veilface evaluate liveness`."
+        )
+    say(f"{file}: contract {contract.contract_id[:16]}, liveness policy {calibration.policy}.")
+
+
+def with_liveness_of(file: Path, contract: Contract, pack: ModelPack, sealer: Sealer) -> Contract:
+    """Keep the liveness threshold of the contract file that a new calibration replaces.
+
+    It belongs to the liveness graphs, not to the templates: kept where the pack still has them.
+    """
+    if not file.is_file():
+        return contract
+    try:
+        liveness = Contract.load(file, sealer).liveness
+        graphs = None if liveness is None else pack.liveness
+    except (VeilfaceError, PackError):
+        # An older format, another master key, or graphs that cannot be used: it is replaced.
+        return contract
+    if liveness is None:
+        return contract
+    if graphs is None or liveness.graphs != graphs.graphs:
+        message(
+            f"The liveness threshold and the liveness policy {liveness.policy} of {file} are "
+            "dropped: the pack has other liveness graphs. Run `veilface calibrate --liveness`."
+        )
+        return contract
+    return replace(contract, liveness=liveness)

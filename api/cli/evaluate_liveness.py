@@ -1,0 +1,261 @@
+"""``veilface evaluate liveness``: what the liveness graphs of a pack detect, and what not."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from api.cli.console import demo_notice, emit, message, progress, say, show, table
+from api.cli.descriptors import BULK, bulk_pack
+from api.cli.errors import CommandError, UsageError, require_extra
+from api.cli.inputs import listed, load_decoys
+from api.cli.options import AsJson, takes_settings
+from api.process.opening import file_sealer, open_keyring
+from api.process.preparation import recorded_of
+from api.settings import Settings
+from attacks.impostor_presentations import verify_presentations
+from models.liveness import PassiveLiveness
+from models.pack import ModelPack
+from templates.contract.document import Contract
+from templates.keys.private_file import make_folder, replace_public
+from verify.datasets import DatasetError
+from verify.evaluation.liveness.document import (
+    CONTRACT_POINT,
+    OperatingPoint,
+    document,
+    markdown,
+)
+from verify.evaluation.liveness.presentations import PresentationSet, read_presentations
+from verify.evaluation.liveness.rates import threshold_at_bpcer
+from verify.evaluation.liveness.scores import ScoredSet, score_set
+from verify.evaluation.liveness.verified import VerifiedSet
+from verify.evaluation.markdown_cells import interval_cell, significant
+from verify.evaluation.results import Model
+from verify.evaluation.rows import Json
+from verify.evaluation.tables import write_lines
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("evaluate liveness")(evaluate_liveness)
+
+
+@takes_settings(*BULK)
+def evaluate_liveness(
+    data: Annotated[
+        Path,
+        typer.Argument(
+            help="Photos: a folder with `live/` and `spoof/SPECIES/`, or a CSV "
+            "`path,presentation[,subject]`, where presentation is `live` or a species.",
+            show_default=False,
+        ),
+    ],
+    *,
+    settings: Settings,
+    contract: Annotated[
+        Path | None,
+        typer.Option(
+            help="A contract file: its liveness threshold is applied, and, with the decoys, "
+            "attacks go through the whole verification.",
+            show_default=False,
+        ),
+    ] = None,
+    decoys: Annotated[
+        Path | None,
+        typer.Option(
+            help="The contract's decoys. Unset: `decoys.veil` in `data_dir`, where it is.",
+            show_default=False,
+        ),
+    ] = None,
+    bpcer: Annotated[
+        str,
+        typer.Option(help="Also set thresholds on these photos, at these BPCER."),
+    ] = "0.01,0.05,0.1",
+    level: Annotated[
+        str | None,
+        typer.Option(
+            help="Level of the whole verification. Unset: the contract's default.",
+            show_default=False,
+        ),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the templates.")] = 0,
+    out: Annotated[Path, typer.Option(help="Folder of the results.")] = Path("liveness"),
+    as_json: AsJson = False,
+) -> None:
+    """Evaluate the pack's liveness graphs on live and attack photos (ISO/IEC 30107-3).
+
+    Reports APCER for each attack species, BPCER, photos without a face and, with a contract, its
+    decoys and subjects, IAPMR through the whole verification. Writes results.json, results.csv,
+    results.md and a DET figure to --out. docs/liveness.md says what such graphs cannot see.
+
+    Example: `veilface evaluate liveness photos --pack buffalo_l --contract contract.json
+    --out liveness-results`
+    """
+    require_extra("evaluate")
+    targets = listed(bpcer, float, "--bpcer", expected="rates such as 0.01,0.05")
+    if not all(0 < target < 1 for target in targets):
+        raise UsageError("--bpcer takes rates between 0 and 1")
+    if contract is None and (decoys is not None or level is not None):
+        raise UsageError("--decoys and --level are of the whole verification: give --contract too")
+    presented = read_presentations(data, attacks=True)
+    pack = bulk_pack(settings, flip=False, why="liveness graphs are part of a model pack")
+    liveness = require_liveness(pack)
+    bound = None
+    if contract is not None:
+        bound = Contract.load(contract, file_sealer(open_keyring(settings)))
+        if bound.binding.preprocessing["flip"]:
+            pack = bulk_pack(settings, flip=True, why="")
+    if bound is not None and bound.liveness is not None:
+        bound.liveness.require_graphs(liveness.graphs)
+    scored = score_with_progress(pack, presented)
+    require_responses(scored)
+    points, refused = _points(scored, bound, targets)
+    verified, unverified = _verified(
+        scored, pack, bound, settings, decoys=decoys, level=level, seed=seed
+    )
+    results = document(
+        scored,
+        Model(pack.info.n, recorded_of(pack), pack.info.embedder_sha256, pack.info.preprocessing),
+        liveness,
+        points,
+        contract=bound,
+        verified=verified,
+        unverified=unverified,
+        refused=refused,
+    )
+    make_folder(out)
+    written = _write(results, out)
+    notice = demo_notice(pack.info.embedder_sha256, n=pack.info.n)
+    if as_json:
+        emit({**notice, "out": str(out), "files": [path.name for path in written], **results})
+        return
+    _show(results)
+    say(f"{out}: {', '.join(path.name for path in written)}.")
+
+
+def require_liveness(pack: ModelPack) -> PassiveLiveness:
+    """Return the liveness graphs of a pack.
+
+    Raises
+    ------
+    CommandError
+        It has none.
+    """
+    if pack.liveness is None:
+        raise CommandError(
+            f"the pack {pack.info.name} has no liveness graph: add one to its folder "
+            "(docs/liveness.md), and look at it with `veilface models inspect`"
+        )
+    return pack.liveness
+
+
+def score_with_progress(pack: ModelPack, presented: PresentationSet) -> ScoredSet:
+    """Score photos under a progress bar; say how many have no face."""
+    with progress("scoring photos", len(presented.presentations)) as advance:
+        scored = score_set(pack, presented, progress=advance)
+    if scored.failures:
+        message(f"note: {len(scored.failures)} photos without a face are counted apart")
+    return scored
+
+
+def require_responses(scored: ScoredSet) -> None:
+    """Refuse a set of which a whole side has no face.
+
+    Raises
+    ------
+    CommandError
+        No live photo, or no attack photo, gave a score.
+    """
+    attacks = [len(scored.scored(name)[0]) for name in scored.presented.species]
+    if not len(scored.scored(None)[0]) or not any(attacks):
+        raise CommandError(
+            "a face was found in no live photo, or in no attack photo: are these whole frames with "
+            "a face in them?"
+        )
+
+
+def _points(
+    scored: ScoredSet, contract: Contract | None, targets: tuple[float, ...]
+) -> tuple[list[OperatingPoint], list[str]]:
+    points, refused = [], []
+    if contract is not None and contract.liveness is not None:
+        points.append(OperatingPoint(CONTRACT_POINT, contract.liveness.threshold))
+    elif contract is not None:
+        refused.append(
+            "the contract has no liveness threshold; `veilface calibrate --liveness` sets one"
+        )
+    for target in sorted(set(targets)):
+        try:
+            threshold = threshold_at_bpcer(scored.scored(None)[0], target)
+        except DatasetError as error:
+            refused.append(str(error))
+        else:
+            points.append(OperatingPoint(f"bpcer-{target:g}", threshold))
+    if not points:
+        raise CommandError(f"no threshold to report at: {'; '.join(refused)}")
+    return points, refused
+
+
+def _verified(
+    scored: ScoredSet,
+    pack: ModelPack,
+    contract: Contract | None,
+    settings: Settings,
+    *,
+    decoys: Path | None,
+    level: str | None,
+    seed: int,
+) -> tuple[VerifiedSet | None, str | None]:
+    """Verify the photos, or say why that was not done."""
+    if contract is None:
+        return None, "it takes a contract (--contract) and its decoys"
+    if not any(one.subject for one in scored.presentations):
+        return None, "nothing says whose faces the photos show; give a CSV with subjects"
+    file = decoys or settings.resolved_decoys_file
+    if decoys is None and not file.is_file():
+        return None, "it takes the contract's decoys (--decoys)"
+    source = load_decoys(file, file_sealer(open_keyring(settings)), pack)
+    verified = verify_presentations(scored, pack.info, contract, source, level=level, seed=seed)
+    if not verified.enrolled:
+        return None, (
+            f"no subject has {verified.enrolled_photos} live photos that agree, to be enrolled by"
+        )
+    return verified, None
+
+
+def _write(results: Json, out: Path) -> list[Path]:
+    # Imported here: drawing loads a library that nothing else needs.
+    from verify.evaluation.figures.liveness import liveness_figure
+    from verify.evaluation.figures.style import write
+
+    files = [out / "results.json", out / "results.csv", out / "results.md"]
+    text = json.dumps(results, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    replace_public(files[0], text.encode())
+    write_lines(results["rows"], files[1])
+    replace_public(files[2], markdown(results).encode())
+    return [*files, *write(liveness_figure(results), out, "det")]
+
+
+def _show(results: Json) -> None:
+    dataset = results["dataset"]
+    listing = table(
+        f"{dataset['name']}: {dataset['live']} live photos, "
+        f"{sum(dataset['attacks'].values())} attacks",
+        *("threshold of", "threshold", "species", "APCER %", "BPCER %", "IAPMR %"),
+    )
+    for row in results["rows"]:
+        listing.add_row(
+            row["operating_point"],
+            significant(row["threshold"]),
+            row["species"] + (" (worst)" if row["worst"] else ""),
+            interval_cell(row["apcer"]),
+            interval_cell(row["bpcer"]),
+            interval_cell(row["iapmr"]),
+        )
+    show(listing)
+    facts = results["verification"]
+    if not facts["measured"]:
+        say(f"IAPMR was not measured: {facts['reason']}.")
+    for sentence in results["refused"]:
+        say(f"Not reported: {sentence}.")

@@ -1,0 +1,99 @@
+"""Challenges: sealed, self-contained ids, so that any worker knows one and nothing is stored of it.
+
+Its nonce is used up by the decision, in the decision's transaction, as that of a signed probe is.
+"""
+
+import base64
+import binascii
+import json
+import secrets
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+
+from api.http.bodies import parse_json
+from api.http.errors import ApiError
+from templates.errors import SealError
+from templates.keys.sealing import MasterKeyring
+from templates.store.lockout import Nonce, Replayed
+from verify import Movement, draw_movements
+
+FIELD = "challenge_id"
+MAX_ID = 1024
+LIFETIME = timedelta(seconds=60)
+_PURPOSE = "challenge"
+
+
+@dataclass(frozen=True)
+class Challenge:
+    """What was asked, and what keeps it from a second use."""
+
+    movements: tuple[Movement, ...]
+    nonce: Nonce
+
+    @property
+    def expires_at(self) -> datetime:
+        """When its frames come too late."""
+        return self.nonce.expires_at
+
+
+def new_challenge(
+    keyring: MasterKeyring, *, tenant: str, key_prefix: str, subject: str | None
+) -> tuple[str, Challenge]:
+    """Draw a challenge; return its id and what it asks.
+
+    Parameters
+    ----------
+    tenant
+        The only one whose keys can answer it.
+    key_prefix
+        Of the key that asks for it, under which its nonce is kept, whichever key answers.
+    subject
+        The only one that it can be answered for; None for any.
+    """
+    expires = datetime.now(UTC).replace(microsecond=0) + LIFETIME
+    nonce = Nonce(key_prefix, secrets.token_urlsafe(18), expires)
+    challenge = Challenge(draw_movements(), nonce)
+    body = {
+        "movements": [str(movement) for movement in challenge.movements],
+        "key": key_prefix,
+        "nonce": nonce.value,
+        "expires": int(expires.timestamp()),
+        "subject": subject,
+    }
+    sealed = keyring.seal(json.dumps(body).encode(), purpose=_PURPOSE, bound_to=[tenant])
+    return base64.urlsafe_b64encode(sealed).rstrip(b"=").decode("ascii"), challenge
+
+
+def opened_challenge(
+    keyring: MasterKeyring, challenge_id: str, *, tenant: str, subject: str
+) -> Challenge:
+    """Open the id of a challenge that frames answer.
+
+    Raises
+    ------
+    ApiError
+        ``validation_failed`` where it is none of this service, tenant and subject.
+    Replayed
+        Where it has expired.
+    """
+    unknown = ApiError(
+        "validation_failed",
+        "the challenge_id is not one that this service gave out for this tenant and subject",
+        {"field": FIELD},
+    )
+    try:
+        padded = challenge_id.encode("ascii") + b"=" * (-len(challenge_id) % 4)
+        sealed = base64.b64decode(padded, altchars=b"-_", validate=True)
+        body = parse_json(keyring.open(sealed, purpose=_PURPOSE, bound_to=[tenant], refresh=False))
+    except (SealError, binascii.Error, ValueError):
+        raise unknown from None
+    if body["subject"] not in (None, subject):
+        raise unknown
+    expires = datetime.fromtimestamp(body["expires"], UTC)
+    if datetime.now(UTC) > expires:
+        raise Replayed(
+            f"the challenge has expired: its frames must arrive within {LIFETIME.seconds} s; ask "
+            "for another one"
+        )
+    movements = tuple(Movement(movement) for movement in body["movements"])
+    return Challenge(movements, Nonce(body["key"], body["nonce"], expires))

@@ -1,0 +1,185 @@
+"""Who is in which role of a deployment's preparation, and what so many people can show.
+
+Nobody may be in two: decoys adapted to the people whom a calibration measures hide those better
+than they will hide a user (docs/decoys.md "Decoys of the people themselves"). People are told
+apart by the names of their folders, which is as far as it is seen to here: somebody who is there
+under two names, with other photos, is not noticed.
+"""
+
+import hashlib
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from attacks.operating_point import LEAST_FACES, LEAST_VICTIMS
+from attacks.privacy import MOST_LIFTED
+from templates.decoys.fitting import MIN_DESCRIPTORS
+from verify.metrics import resolvable
+from verify.thresholds import EXPECTED_ERRORS, TARGETS
+
+SAMPLE_PHOTOS = (600, 300)
+"""Photos to adapt decoys to: what docs/decoys.md measured, the better first."""
+LEAST_PEOPLE = 80
+"""With several photos each: as many resolve a false match rate of 1 in 1,000."""
+FACES_PER_DIMENSION = 4
+"""Below that many fitted faces, membership of the fit shows in the statistics (docs/decoys.md)."""
+
+Albums = Mapping[str, Sequence[Path]]
+
+
+@dataclass(frozen=True)
+class Roles:
+    """Photos by role; the name of a person is in one of the three.
+
+    Parameters
+    ----------
+    faces
+        Photos of anybody, that decoys are fitted to.
+    sample
+        Photos of the kind that will be enrolled, that decoys are adapted to; none where there are
+        too few.
+    calibration
+        Photos by person, that thresholds and the verdict are measured on.
+    left_out
+        Photos of the other roles that are named like people of the calibration or the sample.
+    """
+
+    faces: tuple[Path, ...] = field(repr=False)
+    sample: tuple[Path, ...] = field(repr=False)
+    calibration: Albums = field(repr=False)
+    left_out: int = 0
+
+    @property
+    def photos(self) -> int:
+        """Number of photos of the calibration."""
+        return sum(map(len, self.calibration.values()))
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 (hex) of who is in the fit of the decoys: the same for the same files."""
+        parts = ("\n".join(sorted(map(str, role))) for role in (self.faces, self.sample))
+        return hashlib.sha256("\0".join(parts).encode("utf-8", "surrogateescape")).hexdigest()
+
+
+def split_people(albums: Albums) -> tuple[tuple[Path, ...], Albums]:
+    """Part people into a sample for the decoys and those to calibrate on.
+
+    The sample gets nobody whom the verdict needs, and where nothing else is possible, nobody whom
+    the thresholds need. People with the fewest photos are in it, of equals those whose names hash
+    lowest: the same for the same folder.
+    """
+
+    def place(name: str) -> tuple[int, bytes]:
+        return len(albums[name]), hashlib.sha256(name.encode("utf-8", "surrogateescape")).digest()
+
+    order = sorted(albums, key=place)
+    for wanted in SAMPLE_PHOTOS:
+        names = _first(order, albums, wanted)
+        rest = _without(albums, names)
+        if names and is_telling(rest):
+            return _photos(albums, names), rest
+    names = _first(order, albums, SAMPLE_PHOTOS[-1])
+    rest = _without(albums, names)
+    if names and with_several(rest) >= LEAST_PEOPLE:
+        return _photos(albums, names), rest
+    return (), albums
+
+
+def with_several(albums: Albums) -> int:
+    """Number of people with two photos or more."""
+    return sum(len(photos) > 1 for photos in albums.values())
+
+
+def attacked_and_others(albums: Albums) -> tuple[int, int]:
+    """How many people the privacy of a calibration is measured on, and photos of all the others.
+
+    The second is what is to be expected: who is attacked is drawn.
+    """
+    several = with_several(albums)
+    attacked = min(MOST_LIFTED, (len(albums) + 1) // 2, several)
+    of_several = sum(len(photos) for photos in albums.values() if len(photos) > 1)
+    total = sum(map(len, albums.values()))
+    return attacked, total - (of_several * attacked // several if several else 0)
+
+
+def is_telling(albums: Albums) -> bool:
+    """Whether so many people can show that templates are private."""
+    attacked, others = attacked_and_others(albums)
+    return attacked >= LEAST_VICTIMS and others >= LEAST_FACES
+
+
+def resolved_rates(albums: Albums) -> list[float]:
+    """False match rates that so many people and photos resolve, the largest first."""
+    people, photos = len(albums), sum(map(len, albums.values()))
+    if not with_several(albums):
+        return []
+    return [
+        target
+        for target in sorted(TARGETS, reverse=True)
+        if resolvable(target, photos * (people - 1), expected_errors=EXPECTED_ERRORS)
+        and resolvable(target, people * (people - 1) // 2)
+    ]
+
+
+def promises(roles: Roles, *, n: int) -> tuple[list[str], list[str]]:
+    """Say what can and what cannot be promised with so many photos, in sentences.
+
+    Parameters
+    ----------
+    n
+        Numbers of an embedding.
+    """
+    can, cannot = [], []
+    people = roles.calibration
+    rates = resolved_rates(people)
+    if rates:
+        levels = ", ".join(f"1 in {1 / rate:,.0f}" for rate in rates)
+        can.append(f"thresholds for false match rates of {levels}")
+    else:
+        cannot.append(
+            f"any false match rate: {with_several(people)} of {len(people)} people have two photos "
+            f"or more, and {LEAST_PEOPLE} resolve 1 in 1,000"
+        )
+    if rates and rates[-1] > 1e-3:
+        cannot.append(f"a false match rate of 1 in 1,000: that takes {LEAST_PEOPLE} people")
+    attacked, others = attacked_and_others(people)
+    if is_telling(people):
+        can.append(f"a verdict on privacy, by attacks on {attacked} people")
+    else:
+        cannot.append(
+            f"that templates are private: {attacked} people can be attacked, with {others:,} faces "
+            f"of the others, and a PASS takes {LEAST_VICTIMS} with {LEAST_FACES:,}"
+        )
+    if roles.sample:
+        can.append(f"decoys like your people, by {len(roles.sample):,} photos of them")
+    else:
+        cannot.append(
+            "decoys like your people: that takes 300 photos of others of their kind (--like)"
+        )
+    if len(roles.faces) < FACES_PER_DIMENSION * n:
+        cannot.append(
+            f"that the decoys give nobody of {len(roles.faces):,} faces away: that takes "
+            f"{FACES_PER_DIMENSION * n:,}"
+        )
+    return can, cannot
+
+
+def _first(order: Sequence[str], albums: Albums, photos: int) -> list[str]:
+    """The first people who have so many photos together; none where decoys cannot be adapted."""
+    names, count = [], 0
+    for name in order:
+        if count >= photos:
+            break
+        names.append(name)
+        count += len(albums[name])
+    enough = count >= photos and len(names) >= MIN_DESCRIPTORS // 2
+    return names if enough else []
+
+
+def _without(albums: Albums, names: Collection[str]) -> Albums:
+    left = set(names)
+    return {name: photos for name, photos in albums.items() if name not in left}
+
+
+def _photos(albums: Albums, names: Sequence[str]) -> tuple[Path, ...]:
+    return tuple(photo for name in sorted(names) for photo in albums[name])

@@ -1,0 +1,117 @@
+// A challenge of head movements: the page says each by the clock, and takes frames meanwhile. It does
+// not wait until it sees one: a recording that shows all movements in turn would be waited for, too.
+
+import { after, picture, release } from "./camera.js";
+import { h, s } from "./dom.js";
+import { Problem, call } from "./service.js";
+import { FRONT, MOVE_BACK, MOVEMENTS, cameraTrouble } from "./words.js";
+
+const SIDE = 960;
+const READY_MS = 2500;
+// Frames of one movement: two on the way out, one back at the front.
+const OUT_MS = [1200, 600];
+const BACK_MS = 1300;
+
+// `frames(subject)` resolves to {challenge_id, photos}.
+export function headMovements() {
+  const video = h("video", { playsinline: true, muted: true, "aria-label": "Your camera" });
+  video.muted = true;
+  const outline = s("ellipse", { class: "outline", cx: "50", cy: "50", rx: "21", ry: "40" });
+  const overlay = s(
+    "svg",
+    { class: "overlay", viewBox: "0 0 100 100", preserveAspectRatio: "none", "aria-hidden": "true" },
+    outline,
+  );
+  const viewfinder = h("div", { class: "viewfinder", hidden: true }, video, overlay);
+  const arrow = h("span", { class: "arrow", "aria-hidden": "true" });
+  const words = h("span", {});
+  const told = h("p", { class: "movement", role: "status", "aria-live": "assertive", hidden: true }, arrow, words);
+  let stream = null;
+  let running = new AbortController();
+
+  function say(name) {
+    [words.textContent, arrow.textContent] = MOVEMENTS[name];
+    told.dataset.movement = name;
+    told.hidden = false;
+  }
+
+  async function start() {
+    try {
+      if (!navigator.mediaDevices) throw new Error("insecure");
+      return await navigator.mediaDevices.getUserMedia({
+        audio: false,
+        video: { facingMode: "user", width: { ideal: 1280 } },
+      });
+    } catch (error) {
+      throw new Problem({ code: "camera", message: cameraTrouble(error) });
+    }
+  }
+
+  async function frames(subject) {
+    stop();
+    running = new AbortController();
+    const { signal } = running;
+    try {
+      const opened = await start();
+      if (signal.aborted) release(opened);
+      signal.throwIfAborted();
+      stream = opened;
+      for (const track of stream.getVideoTracks()) {
+        for (const name of ["ended", "mute"]) track.addEventListener(name, () => lost(running), { signal });
+      }
+      video.srcObject = stream;
+      await video.play().catch(() => {});
+      viewfinder.hidden = false;
+      say(FRONT);
+      viewfinder.scrollIntoView({ block: "nearest" });
+      await after(READY_MS);
+      signal.throwIfAborted();
+      // Asked for now: its minute has begun.
+      const challenge = await call("POST", "/v1/challenges", {
+        body: JSON.stringify({ subject_id: subject }),
+        headers: { "Content-Type": "application/json" },
+        signal,
+      });
+      const photos = [await snap(signal)];
+      for (const movement of challenge.movements) {
+        say(movement);
+        for (const wait of OUT_MS) photos.push(await snap(signal, wait));
+        say(movement === "come_closer" ? MOVE_BACK : FRONT);
+        photos.push(await snap(signal, BACK_MS));
+      }
+      return { challenge_id: challenge.challenge_id, photos };
+    } catch (error) {
+      throw signal.reason instanceof Problem ? signal.reason : error;
+    } finally {
+      if (running.signal === signal) stop();
+    }
+  }
+
+  async function snap(signal, wait = 0) {
+    await after(wait);
+    signal.throwIfAborted();
+    return (await picture(video, video.videoWidth, video.videoHeight, { side: SIDE })).blob;
+  }
+
+  const lost = (run) => run.abort(new Problem({ code: "camera", message: "the camera has stopped" }));
+
+  function stop() {
+    running.abort();
+    release(stream);
+    video.srcObject = stream = null;
+    viewfinder.hidden = told.hidden = true;
+  }
+
+  const root = h(
+    "div",
+    { class: "head-movements" },
+    h(
+      "p",
+      { class: "hint" },
+      "The page will ask for three head movements and take frames of them, for about twelve seconds. Keep your face inside the outline.",
+    ),
+    told,
+    viewfinder,
+  );
+  return { root, frames, stop };
+}

@@ -1,0 +1,81 @@
+"""Faces that an attacker brings beside those of the audited set, without the victims' own."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from attacks.errors import AuditError
+from templates.contract.canonical import Json
+
+SAME_PHOTO = 0.999
+"""Cosine from which two embeddings are of one photo."""
+_TILE = 4096
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class FurtherFaces:
+    """Descriptors of one source.
+
+    Parameters
+    ----------
+    name
+        Of the folder or file that they are from.
+    descriptors : (A, n) float32
+        Unit rows.
+    people
+        A names; the empty name where it is not known who is shown.
+    left_out
+        How many more there were that show a victim.
+    """
+
+    name: str
+    descriptors: NDArray[np.float32]
+    people: tuple[str, ...]
+    left_out: int = 0
+
+    def to_json(self) -> dict[str, Json]:
+        """Return an entry of ``further_attacker_faces`` of the report's settings."""
+        return {"name": self.name, "faces": len(self.descriptors), "left_out": self.left_out}
+
+
+def strangers_among(
+    further: FurtherFaces,
+    descriptors: NDArray[np.float32],
+    identities: Sequence[str],
+    victims: NDArray[np.int64],
+) -> FurtherFaces:
+    """Leave out the photos of victims, and those of people who are named like them.
+
+    Parameters
+    ----------
+    descriptors, identities : (N, n) float32, N names
+        The audited set.
+    victims
+        Rows of the set; all photos of the people on them are compared.
+
+    Raises
+    ------
+    AuditError
+        Embeddings of another dimension.
+    """
+    if further.descriptors.shape[1] != descriptors.shape[1]:
+        raise AuditError(
+            f"{further.name} has embeddings of {further.descriptors.shape[1]} numbers, and the "
+            f"audited pack's have {descriptors.shape[1]}: embed it with the same pack"
+        )
+    names = np.asarray(identities, dtype=np.str_)
+    attacked = {str(names[row]) for row in victims}
+    photos = descriptors[np.isin(names, list(attacked))]
+    stranger = np.array([name not in attacked for name in further.people], dtype=np.bool_)
+    for start in range(0, len(stranger), _TILE):
+        rows = slice(start, start + _TILE)
+        nearest = (further.descriptors[rows] @ photos.T).max(axis=1, initial=-1.0)
+        stranger[rows] &= nearest < SAME_PHOTO
+    return replace(
+        further,
+        descriptors=further.descriptors[stranger],
+        people=tuple(np.asarray(further.people, dtype=np.str_)[stranger].tolist()),
+        left_out=int(np.count_nonzero(~stranger)),
+    )

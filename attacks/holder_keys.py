@@ -1,0 +1,97 @@
+"""Everything is stolen but the keys that people keep: what their templates then give.
+
+The thief has the database and every secret of the deployment, and undoes the tenants' rotations.
+A template whose holder keeps a key is still turned by a rotation that nothing stolen gives
+(docs/method.md §4.9). Beside each attack stands the same one with the key stolen too.
+``attacks.linkage`` has two such templates, ``attacks.several_templates`` several of one person.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from attacks.linkage import holder_rotations_of, turned, turned_back
+from attacks.outcomes import AttackOutcome, Knowledge, Leaked
+from attacks.recovery import recovery_outcome
+from attacks.system import System
+from templates.space.subspace import SubspaceBatch
+from verify.comparisons import through_wire
+
+Guess = Callable[[SubspaceBatch], NDArray[np.floating]]
+"""Guesses the descriptor of every template, (T, n)."""
+
+
+@dataclass(frozen=True)
+class Theft:
+    """What was stolen of templates whose holders keep a key."""
+
+    leaked: Leaked
+    variant: str
+    assumption: str
+
+    def of(self, system: System, batch: SubspaceBatch, enrollment: str) -> SubspaceBatch:
+        """Return templates as this thief sees them, stored under their holders' keys.
+
+        Parameters
+        ----------
+        enrollment
+            Its name: a person's key gives each enrollment another rotation.
+        """
+        rotations = holder_rotations_of(system, enrollment, len(batch))
+        stored = through_wire(turned(batch, rotations), contract_id=system.contract.contract_id)
+        return stored if self.leaked is Leaked.MASTER_KEY else turned_back(stored, rotations)
+
+
+THEFTS = (
+    Theft(
+        Leaked.MASTER_KEY,
+        "holder's key kept",
+        "The database and every secret of the deployment are stolen, and the key of the holder is "
+        "not, whose rotation still turns the template",
+    ),
+    Theft(
+        Leaked.HOLDER_KEYS,
+        "holder's key stolen",
+        "The database, every secret of the deployment and the holder's key are stolen",
+    ),
+)
+
+
+def guess_with_and_without_holder_keys(
+    system: System, guesses: Mapping[str, Guess]
+) -> list[AttackOutcome]:
+    """Guess the victims' descriptors from templates whose holders keep a key.
+
+    Parameters
+    ----------
+    guesses
+        How, by the name of the attack.
+
+    Returns
+    -------
+    list of AttackOutcome
+        For each attack the key kept, and the key stolen: a control, which is not judged, because
+        the same attack on un-rotated templates is.
+    """
+    outcomes = []
+    for theft in THEFTS:
+        seen = theft.of(system, system.templates, "enrollment")
+        control = theft.leaked is Leaked.HOLDER_KEYS
+        outcomes += [
+            recovery_outcome(
+                system,
+                guess(seen),
+                attack=attack,
+                variant=theft.variant,
+                leaked=theft.leaked,
+                knowledge=Knowledge.ALGORITHM,
+                assumption=f"{theft.assumption}; the attack is the one on an un-rotated template; "
+                "success is a match of the guess with a fresh photo"
+                + (" (a control)" if control else ""),
+                judged=not control,
+            )
+            for attack, guess in guesses.items()
+        ]
+    return outcomes

@@ -1,0 +1,111 @@
+"""What a thief with and without the holders' keys gets from one template, and from several.
+
+People, decoys and the attacker's faces are those of ``benchmarks.asked_and_linked``. The tables of
+docs/privacy.md "What leaked" are what this prints.
+
+Example
+-------
+::
+
+    python -m benchmarks.what_leaked --data ../shared/data
+"""
+
+import argparse
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from time import process_time
+
+import numpy as np
+from numpy.typing import NDArray
+
+from attacks.holder_keys import Guess, guess_with_and_without_holder_keys
+from attacks.learned import invert
+from attacks.likelihood import likeliest_guess
+from attacks.linkage import link
+from attacks.outcomes import GENERATED, AttackOutcome, Scheme
+from attacks.several_templates import several_templates
+from attacks.stored.foot_point import foot_points
+from attacks.system import System, enroll_victims
+from benchmarks.asked_and_linked import adapted_deployment
+from models.pack import ModelPack
+
+
+def shown(outcome: AttackOutcome) -> str:
+    """One line: what leaked, the attack, and its measure with interval and counts."""
+    measured, details = outcome.measured, outcome.details
+    beside = details.get("null_95_percent")
+    return (
+        f"{outcome.leaked} | {outcome.attack}, {outcome.variant} | {100 * measured.value:.1f} % "
+        f"({100 * measured.ci_low:.1f}-{100 * measured.ci_high:.1f}) of {measured.trials}"
+        + ("" if beside is None else f", null 95 % {100 * float(str(beside)):.1f} %")
+    )
+
+
+def attacks_on(
+    system: System, albums: Sequence[NDArray[np.float32]], args: argparse.Namespace
+) -> dict[str, Callable[[], list[AttackOutcome]]]:
+    """Return the attacks, by name."""
+    likeliest = likeliest_guess(system)
+
+    def of_one() -> list[AttackOutcome]:
+        guesses: dict[str, Guess] = {"foot-point": foot_points, "decoy-likelihood": likeliest}
+        outcomes: list[AttackOutcome] = []
+        if args.training_seconds:
+            inverter, outcomes = invert(system, seconds=args.training_seconds, seed=args.seed)
+            guesses["inverter"] = inverter
+        return [*outcomes, *guess_with_and_without_holder_keys(system, guesses)]
+
+    return {
+        "one": of_one,
+        "several": lambda: several_templates(system, albums, likeliest),
+        "linkage": lambda: link(system, liftings=1, most_people=args.linked),
+    }
+
+
+def main() -> None:
+    """Split, adapt, lift, attack, print."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
+    parser.add_argument("--descriptors", type=Path, help=".npz of the crops: paths, descriptors")
+    parser.add_argument("--victims", type=int, default=400)
+    parser.add_argument("--linked", type=int, default=60, help="people: time grows with the square")
+    parser.add_argument("--training-seconds", type=float, default=60.0, help="0: no inverter")
+    parser.add_argument("--dim", type=int, default=160)
+    parser.add_argument("--level", default="fmr-1e-3", help="that a match is judged at")
+    parser.add_argument("--calibrating", type=int, default=1200, help="photos to calibrate on")
+    parser.add_argument("--attacks", nargs="+", default=["one", "several", "linkage"])
+    parser.add_argument("--seed", type=int, default=0)
+    args = parser.parse_args()
+    population, source, attacker = adapted_deployment(
+        args.data, args.descriptors, victims=args.victims, seed=args.seed
+    )
+    info = ModelPack.load(args.data / "packs" / "w600k_mbf").info
+    calibrating = slice(0, args.calibrating)
+    system = enroll_victims(
+        replace(
+            population,
+            calibration=population.calibration[calibrating],
+            names=population.names[calibrating],
+        ),
+        Scheme("adversarial", GENERATED, args.dim),
+        source,
+        embedder_sha256=info.embedder_sha256,
+        preprocessing=info.preprocessing,
+        pool_of_owners=False,
+        lifted_probes=False,
+        seed=args.seed,
+    )
+    contract = replace(system.contract, default_level=args.level)
+    system = replace(system, attacker=attacker, contract=contract)
+    print(f"{len(population.victims)} victims; {len(attacker)} faces of the attacker", flush=True)
+    attacks = attacks_on(system, population.albums, args)
+    for name in args.attacks:
+        started = process_time()
+        for outcome in attacks[name]():
+            print(shown(outcome), flush=True)
+        print(f"{name}: {process_time() - started:.0f} s of the processor", flush=True)
+
+
+if __name__ == "__main__":
+    main()

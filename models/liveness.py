@@ -1,0 +1,311 @@
+"""How live a face looks: graphs of passive presentation attack detection, run on the whole frame.
+
+They see more than the aligned crop: the edge of a sheet or a screen lies around the face. What
+they cannot see is said in docs/liveness.md.
+"""
+
+import hashlib
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from models.errors import ModelError
+from models.sessions import Session
+
+Box = tuple[float, float, float, float]
+Region = tuple[int, int, int, int]
+CropShape = Literal["box", "square"]
+ScoreKind = Literal["softmax", "difference"]
+
+# A square is mirrored at this many times the input's resolution, or the frame's own.
+_FINER = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class LivenessInput:
+    """What a liveness graph is fed, and how its output is read.
+
+    Parameters
+    ----------
+    crop_scale
+        Sides of the crop over those of the face's box.
+    crop
+        ``box`` keeps the box's shape, is limited to the frame's size and moved into it; ``square``
+        has the longer side, and mirrors the frame where it reaches over the border.
+    size
+        Side of the square input in pixels.
+    channel_order
+        ``rgb`` or ``bgr``.
+    input_range
+        What the pixel values 0 and 255 become.
+    live_class
+        Place of the live class among the outputs, from 0.
+    score
+        ``softmax``: share of the live class, 0…1. ``difference``: of two logits, live less attack.
+    """
+
+    crop_scale: float
+    crop: CropShape
+    size: int
+    channel_order: str
+    input_range: tuple[float, float]
+    live_class: int
+    score: ScoreKind
+
+
+class LivenessGraph:
+    """One graph of passive presentation attack detection.
+
+    Parameters
+    ----------
+    session
+        A graph with one image input and one output (batch, classes).
+    input_name
+        Name of the image input.
+    sha256
+        Of its file.
+    expects
+        Crop, input and reading of the output.
+    normalised
+        Whether the graph ends in a softmax of its own.
+
+    Raises
+    ------
+    ModelError
+        Where the graph does not run on such an input, or its output does not fit.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        *,
+        input_name: str,
+        sha256: str,
+        expects: LivenessInput,
+        normalised: bool,
+    ) -> None:
+        self._session = session
+        self._input_name = input_name
+        self._normalised = normalised
+        self.expects = expects
+        self.file = session.name
+        self.sha256 = sha256
+        classes = self._output(np.zeros((expects.size, expects.size, 3), np.uint8)).size
+        if expects.live_class >= classes or classes < 2:
+            raise ModelError(
+                f"{self.file} tells {classes} classes apart; live_class {expects.live_class} is"
+                " none of them. Correct it in pack.toml."
+            )
+        if expects.score == "difference" and (classes != 2 or normalised):
+            raise ModelError(
+                f'{self.file} does not end in two logits: the score "difference" has no meaning;'
+                ' state "softmax" in pack.toml.'
+            )
+
+    @property
+    def graph_id(self) -> str:
+        """SHA-256 of the file's hash and of what the graph is fed.
+
+        A threshold belongs to both: another crop gives other scores.
+        """
+        stated = {"sha256": self.sha256, **asdict(self.expects)}
+        return hashlib.sha256(json.dumps(stated, sort_keys=True).encode()).hexdigest()
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON-able form."""
+        return {
+            "file": self.file,
+            "sha256": self.sha256,
+            "graph_id": self.graph_id,
+            **asdict(self.expects),
+            "input_range": list(self.expects.input_range),
+        }
+
+    def score(self, picture: NDArray[np.uint8], box: Box) -> float:
+        """Return how live the face in ``box`` looks to this graph alone."""
+        output = self._output(crop_face(picture, box, self.expects))
+        live = self.expects.live_class
+        if self.expects.score == "difference":
+            return float(output[live] - output[1 - live])
+        if self._normalised:
+            return float(output[live])
+        shares = np.exp(output - output.max())
+        return float(shares[live] / shares.sum())
+
+    def _output(self, crop: NDArray[np.uint8]) -> NDArray[np.float64]:
+        expects = self.expects
+        ordered = crop[..., ::-1] if expects.channel_order == "bgr" else crop
+        low, high = expects.input_range
+        values = ordered.astype(np.float32) * np.float32((high - low) / 255) + np.float32(low)
+        blob = np.ascontiguousarray(values.transpose(2, 0, 1)[None])
+        output = self._session.run({self._input_name: blob})[0]
+        if output.ndim != 2 or len(output) != 1 or not np.isfinite(output).all():
+            raise ModelError(
+                f"{self.file}: one crop must give one row of finite numbers; got shape"
+                f" {output.shape}."
+            )
+        return np.asarray(output[0], dtype=np.float64)
+
+
+class PassiveLiveness:
+    """The liveness graphs of a pack. Safe from several threads at once.
+
+    Parameters
+    ----------
+    graphs
+        One or more, which score in the same unit.
+
+    Raises
+    ------
+    ModelError
+        Where some score a share and others a difference, which have no mean.
+    """
+
+    def __init__(self, graphs: Sequence[LivenessGraph]) -> None:
+        kinds = {graph.expects.score for graph in graphs}
+        if len(kinds) != 1:
+            named = ", ".join(f"{graph.file} ({graph.expects.score})" for graph in graphs)
+            raise ModelError(
+                f"The liveness graphs score in different units: {named}. State one score for all"
+                " of them in pack.toml, or leave one kind in the folder."
+            )
+        self.members = tuple(graphs)
+
+    @property
+    def graphs(self) -> tuple[str, ...]:
+        """Ids of the graphs, sorted: what a threshold belongs to (`LivenessGraph.graph_id`)."""
+        return tuple(sorted(graph.graph_id for graph in self.members))
+
+    def score(self, picture: NDArray[np.uint8], box: Box) -> float:
+        """Return how live a face looks; higher is more live.
+
+        Parameters
+        ----------
+        picture
+            The whole upright frame, RGB uint8, shape (h, w, 3).
+        box
+            Of the face: x1, y1, x2, y2 in pixels. May reach over the border.
+
+        Returns
+        -------
+        float
+            Mean over the graphs: in 0…1, or a difference of logits.
+
+        Raises
+        ------
+        ModelError
+            If the box is empty, or inference fails.
+        """
+        return sum(graph.score(picture, box) for graph in self.members) / len(self.members)
+
+
+def crop_face(picture: NDArray[np.uint8], box: Box, expects: LivenessInput) -> NDArray[np.uint8]:
+    """Cut a face with its surroundings out of a frame, as the graph was trained.
+
+    Parameters
+    ----------
+    picture
+        RGB uint8, shape (h, w, 3).
+    box
+        x1, y1, x2, y2 in pixels.
+
+    Returns
+    -------
+    ndarray of uint8, shape (size, size, 3)
+
+    Raises
+    ------
+    ModelError
+        If the box has no area, or lies outside the frame.
+    """
+    height, width = picture.shape[:2]
+    x1, y1, x2, y2 = box
+    inside = min(x2, width) > max(x1, 0) and min(y2, height) > max(y1, 0)
+    if not (all(map(math.isfinite, box)) and inside):
+        raise ModelError("The box of a face has no area inside the frame.")
+    if expects.crop == "box":
+        left, top, right, bottom = box_region((width, height), box, expects.crop_scale)
+        return _resized(picture[top:bottom, left:right], (expects.size, expects.size))
+    return _square_crop(picture, square_region(box, expects.crop_scale), expects.size)
+
+
+def box_region(frame: tuple[int, int], box: Box, scale: float) -> Region:
+    """Grow a box about its centre, no larger than the frame, and move it into the frame.
+
+    This is how minivision's Silent-Face-Anti-Spoofing cuts the crops that MiniFASNet is trained
+    on: near a border the face is off the middle of the crop, and nothing is padded.
+
+    Parameters
+    ----------
+    frame
+        Width and height in pixels.
+
+    Returns
+    -------
+    tuple of int
+        First and past-the-last column and row: left, top, right, bottom.
+    """
+    sides = (box[2] - box[0], box[3] - box[1])
+    fitting = min(scale, *((length - 1) / side for length, side in zip(frame, sides, strict=True)))
+    first, last = [], []
+    for axis, length in enumerate(frame):
+        reach = sides[axis] * fitting
+        start = (box[axis] + box[axis + 2] - reach) / 2
+        start = min(max(start, 0.0), length - 1 - reach)
+        first.append(max(0, int(start)))
+        last.append(min(length, int(start + reach) + 1))
+    return first[0], first[1], last[0], last[1]
+
+
+def square_region(box: Box, scale: float) -> Region:
+    """Return the square about the box's centre whose side is the longer one times the scale.
+
+    It may reach over the border; left, top, right, bottom as in `box_region`.
+    """
+    side = max(1, int(max(box[2] - box[0], box[3] - box[1]) * scale))
+    left = math.floor((box[0] + box[2] - side) / 2)
+    top = math.floor((box[1] + box[3] - side) / 2)
+    return left, top, left + side, top + side
+
+
+def _square_crop(picture: NDArray[np.uint8], region: Region, size: int) -> NDArray[np.uint8]:
+    """Mirror the frame where the square reaches over its border, and resize.
+
+    What is in the frame of a large square is reduced before, so that memory does not depend on how
+    far it reaches.
+    """
+    height, width = picture.shape[:2]
+    left, top, right, bottom = region
+    columns = slice(max(left, 0), min(right, width))
+    rows = slice(max(top, 0), min(bottom, height))
+    side = min(right - left, _FINER * size)
+    ratio = side / (right - left)
+    before, shown = [], []
+    for part, start, end in ((columns, left, right), (rows, top, bottom)):
+        before.append(min(side - 1, round(ratio * (part.start - start))))
+        shown.append(max(1, side - before[-1] - round(ratio * (end - part.stop))))
+    inside = picture[rows, columns]
+    if ratio < 1:
+        inside = _resized(inside, (shown[0], shown[1]), cv2.INTER_AREA)
+    square = cv2.copyMakeBorder(
+        inside,
+        before[1],
+        side - before[1] - shown[1],
+        before[0],
+        side - before[0] - shown[0],
+        cv2.BORDER_REFLECT_101,
+    )
+    kind = cv2.INTER_AREA if side > size else cv2.INTER_LANCZOS4
+    return _resized(np.asarray(square, dtype=np.uint8), (size, size), kind)
+
+
+def _resized(
+    picture: NDArray[np.uint8], size: tuple[int, int], kind: int = cv2.INTER_LINEAR
+) -> NDArray[np.uint8]:
+    return np.asarray(cv2.resize(picture, size, interpolation=kind), dtype=np.uint8)

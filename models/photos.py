@@ -1,0 +1,42 @@
+"""Several photos of one person, each to the embedding of its face."""
+
+from collections.abc import Sequence
+
+from models.decoding import DEFAULT_LIMITS, ImageLimits
+from models.errors import ModelError, PhotoRejected
+from models.faces import FaceSample
+from models.pack import FacePolicy, ModelPack
+from models.quality import DEFAULT_QUALITY, QualityLimits
+
+
+def embed_photos(
+    pack: ModelPack,
+    photos: Sequence[bytes],
+    *,
+    policy: FacePolicy = FacePolicy.SINGLE,
+    quality: QualityLimits | None = DEFAULT_QUALITY,
+    limits: ImageLimits = DEFAULT_LIMITS,
+    liveness: bool = False,
+) -> list[FaceSample]:
+    """Embed photo files in their order; all or none.
+
+    Parameters
+    ----------
+    policy, quality, limits, liveness
+        See ``ModelPack.embed_photo``.
+
+    Raises
+    ------
+    PhotoRejected
+        Where one of them has no usable face, by its position.
+    """
+    samples = []
+    for index, photo in enumerate(photos):
+        try:
+            sample = pack.embed_photo(
+                photo, policy=policy, quality=quality, limits=limits, liveness=liveness
+            )
+        except ModelError as error:
+            raise PhotoRejected(index, error, count=len(photos)) from error
+        samples.append(sample)
+    return samples

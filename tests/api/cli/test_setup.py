@@ -1,0 +1,337 @@
+"""`veilface setup`: one command from photos to a service, which goes on where it was stopped."""
+
+import shutil
+import stat
+import tomllib
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from api.cli import setup as command
+from api.cli import setup_files
+from api.cli.errors import CommandError
+from api.cli.setup import assign_roles
+from api.settings import load_settings
+from models.demo import build_demo_pack
+from models.extraction import Extraction
+from tests.api.cli.conftest import Ran, World, draw, key_file, run
+from tests.once import made_once
+from verify import labelled_folder
+
+FACES = range(5000, 5100)
+PEOPLE = range(6000, 6025)
+
+
+def make_folders(root: Path) -> None:
+    build_demo_pack(root / "pack")
+    draw(root / "faces", FACES, range(1))
+    draw(root / "people", PEOPLE, range(2))
+
+
+@pytest.fixture
+def folders(
+    tmp_path_factory: pytest.TempPathFactory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Path:
+    """A newcomer's folder: a pack, faces and people, and nothing else."""
+    made = made_once(tmp_path_factory, "setup", make_folders)
+    folder = Path(shutil.copytree(made, tmp_path / "newcomer"))
+    monkeypatch.chdir(folder)
+    return folder
+
+
+def setup(*more: str | Path) -> Ran:
+    return run("setup", "people", "--faces", "faces", "--pack", "pack", *more)
+
+
+@pytest.fixture
+def stops(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let every run end before its calibration."""
+
+    def stop(*_: Any, **__: Any) -> None:
+        raise CommandError("stopped")
+
+    monkeypatch.setattr(command, "calibrate_folder", stop)
+
+
+def test_the_plan_is_shown_and_nothing_is_done(folders: Path) -> None:
+    before = sorted(folders.iterdir())
+    shown = setup("--dry-run")
+    assert shown.status == 0, shown.stderr
+    assert "25 people, 50 photos" in shown.stdout
+    assert "100 faces" in shown.stdout
+    assert "Can be promised:    thresholds for false match rates of 1 in 100." in shown.stdout
+    assert "Cannot be promised: that templates are private" in shown.stdout
+    plan = setup("--dry-run", "--json").json
+    assert (plan["people"], plan["photos"], plan["faces"], plan["sample"]) == (25, 50, 100, 0)
+    assert sorted(folders.iterdir()) == before
+
+
+def test_people_who_are_not_labelled_or_too_few_are_refused_with_the_reason(folders: Path) -> None:
+    for number, photo in enumerate(sorted(Path("people").glob("*/*.png"))):
+        photo.rename(folders / f"{number}.png")
+    for person in Path("people").iterdir():
+        person.rmdir()
+    for number in range(50):
+        (folders / f"{number}.png").rename(folders / "people" / f"{number}.png")
+    refused = setup()
+    assert refused.status == 1
+    assert "50 photos and no folder for a person: nobody is labelled" in refused.stderr
+    draw(folders / "few", range(3), range(2))
+    refused = run("setup", "few", "--faces", "faces", "--pack", "pack")
+    assert refused.status == 1
+    assert "Cannot be promised: any false match rate" in refused.stdout
+    assert "few resolves no false match rate" in refused.stderr
+    for more in ((), ("--dry-run",)):
+        refused = run("setup", "few", "--faces", "faces", "--pack", "pack", "--json", *more)
+        assert (refused.status, refused.json["people"], refused.json["can"]) == (1, 3, [])
+        assert refused.json["cannot"][0].startswith("any false match rate")
+    assert not (folders / "veilface-data").exists()
+
+
+def test_nobody_is_in_two_roles(tmp_path: Path) -> None:
+    people = draw(tmp_path / "people", range(3), range(2))
+    like = draw(tmp_path / "like", range(2, 5), range(1))
+    faces = draw(tmp_path / "faces", range(4, 8), range(1))
+    (faces / "alone.png").write_bytes(b"")
+    roles = assign_roles(labelled_folder(people), [faces], [like])
+    assert {path.parent.name for path in roles.sample} == {"person-3", "person-4"}
+    assert {path.parent.name for path in roles.faces} == {
+        "faces",
+        *(f"person-{i}" for i in (5, 6, 7)),
+    }
+    assert set(roles.calibration) == {"person-0", "person-1", "person-2"}
+    assert roles.left_out == 2
+    with pytest.raises(CommandError, match="everybody in --faces"):
+        assign_roles(labelled_folder(people), [people], [])
+    with pytest.raises(CommandError, match="everybody in --like"):
+        assign_roles(labelled_folder(people), [faces], [people])
+
+
+def test_a_folder_inside_another_gives_each_photo_one_role(tmp_path: Path) -> None:
+    people = draw(tmp_path / "all" / "people", range(3), range(2))
+    draw(tmp_path / "all" / "others", range(10, 14), range(1))
+    roles = assign_roles(labelled_folder(people), [tmp_path / "all"], [])
+    assert len(roles.faces) == 4
+
+
+@pytest.fixture
+def prepared(
+    world: World, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., Ran]:
+    """Set up where decoys and contract are there, in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*more: str | Path) -> Ran:
+        ran = run("setup", world.labelled, "--faces", world.decoy_faces, *more)
+        assert "a defect of veilface" not in ran.stderr
+        return ran
+
+    return partial(call, "--data-dir", data, "--accept-weak-privacy")
+
+
+def test_what_is_there_is_kept_and_the_rest_is_made(
+    world: World, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    arguments = ("setup", world.labelled, "--faces", world.decoy_faces, "--pack", world.pack)
+    kept = [data / "decoys.veil", data / "contract.json", key_file(data)]
+    before = [file.read_bytes() for file in kept]
+    first = run(*arguments, "--data-dir", data, "--json")
+    assert first.status == 1
+    assert "refuses this contract" in first.stderr
+    assert (first.json["servable"], first.json["contract_kept"]) == (False, True)
+    assert first.json["steps"] == {
+        **dict.fromkeys(("master key", "decoys", "contract"), "kept"),
+        **dict.fromkeys(("API key", "settings"), "made"),
+    }
+    assert [file.read_bytes() for file in kept] == before
+    token = key_file(data).with_name("api-key")
+    assert token.read_text().startswith("vf_")
+    assert stat.S_IMODE(token.stat().st_mode) == 0o600
+
+    # The settings name the rest: nothing need be said again.
+    text = Path("veilface.toml").read_text()
+    assert tomllib.loads(text) == {"data_dir": str(data), "pack": str(world.pack)}
+    again = run(*arguments[:4], "--accept-weak-privacy")
+    assert again.status == 0, again.stderr
+    assert again.stderr.count("is there and kept") == 4
+    assert "These are promises of a contract made anew." in again.stdout
+    privacy, accuracy = again.stdout.splitlines()[-4:-2]
+    assert privacy.startswith("Privacy:  FAIL.")
+    assert accuracy.startswith("Accuracy: ")
+    assert load_settings().accept_weak_privacy
+    checked = run("serve", "--check")
+    assert checked.status == 0, checked.stderr
+    keys = run("keys", "list", "--json").json
+    assert [(key["label"], key["rights"]) for key in keys] == [
+        ("setup", ["enroll", "erase", "verify"])
+    ]
+
+
+def test_an_api_key_that_the_store_does_not_take_is_replaced(
+    world: World, data: Path, prepared: Callable[..., Ran]
+) -> None:
+    prepared("--pack", world.pack)
+    file = key_file(data).with_name("api-key")
+    tokens = [file.read_text()]
+    prefix = tokens[0].split("_")[1]
+    assert run("keys", "revoke", prefix).status == 0
+    for text in (tokens[0], "hello\n"):
+        file.write_text(text)
+        ran = prepared("--json")
+        assert (ran.status, ran.json["steps"]["API key"]) == (0, "made"), ran.stderr
+        assert f"the store does not take the one of {file}" in ran.stderr
+        assert stat.S_IMODE(file.stat().st_mode) == 0o600
+        tokens.append(file.read_text())
+        assert prepared("--json").json["steps"]["API key"] == "kept"
+        assert file.read_text() == tokens[-1]
+    assert len(set(tokens)) == 3
+    # The last but one was written, and may be in use.
+    assert valid_prefixes() == [token.split("_")[1] for token in tokens[1:]]
+
+
+def valid_prefixes() -> list[str]:
+    return [
+        key["prefix"] for key in run("keys", "list", "--json").json if key["revoked_at"] is None
+    ]
+
+
+def test_an_api_key_of_a_run_that_was_killed_before_it_was_written_is_revoked(
+    world: World, data: Path, prepared: Callable[..., Ran], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def killed(*_: object) -> None:
+        raise CommandError("killed")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(setup_files, "create_private", killed)
+        assert prepared("--pack", world.pack).status == 1
+    settings = ("--data-dir", data, "--json")
+    of_another = run("keys", "create", "--right", "verify", "--label", "shop", *settings).json
+    lost = run("keys", "list", *settings).json[0]["prefix"]
+    ran = prepared("--pack", world.pack)
+    assert ran.status == 0, ran.stderr
+    assert f"revoked the API key {lost}, which a stopped run had made" in ran.stderr
+    written = key_file(data).with_name("api-key").read_text().split("_")[1]
+    assert valid_prefixes() == [of_another["prefix"], written]
+    assert "revoked" not in prepared().stderr
+
+
+def test_a_master_key_that_is_given_is_not_said_to_be_made(
+    world: World, data: Path, prepared: Callable[..., Ran], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = key_file(data)
+    monkeypatch.setenv("MASTER_KEYS", file.read_text().strip())
+    monkeypatch.setenv("VEILFACE_MASTER_KEY_VARIABLE", "MASTER_KEYS")
+    file.unlink()
+    ran = prepared("--pack", world.pack, "--json")
+    assert ran.status == 0, ran.stderr
+    assert "master key: of the variable MASTER_KEYS, no file is made" in ran.stderr
+    assert (ran.json["steps"]["master key"], ran.json["master_key_file"]) == ("given", None)
+    assert not file.exists()
+    monkeypatch.delenv("VEILFACE_MASTER_KEY_VARIABLE")
+    monkeypatch.setenv("VEILFACE_MASTER_KEY_COMMAND", "printenv MASTER_KEYS")
+    ran = prepared("--pack", world.pack)
+    assert "master key: of the setting master_key_command, no file is made" in ran.stderr
+    assert str(file) not in ran.stdout + ran.stderr
+
+
+def test_settings_of_somebody_else_are_kept(
+    world: World, data: Path, prepared: Callable[..., Ran]
+) -> None:
+    file = Path("veilface.toml")
+    file.write_text("port = 9000\n")
+    ran = prepared("--pack", world.pack)
+    assert ran.status == 1
+    assert file.read_text() == "port = 9000\n"
+    assert "says something else of data_dir, pack, accept_weak_privacy" in ran.stderr
+    assert f'data_dir = "{data}"' in ran.stderr
+    assert "Start it" not in ran.stdout
+    agreeing = (
+        f'port = 9000\npack = "{world.pack}"\ndata_dir = "data"\naccept_weak_privacy = true\n'
+    )
+    file.write_text(agreeing)
+    ran = prepared()
+    assert ran.status == 0, ran.stderr
+    assert file.read_text() == agreeing
+
+
+def test_settings_of_an_earlier_run_are_written_again_unless_somebody_added_to_them(
+    world: World, tmp_path: Path, prepared: Callable[..., Ran]
+) -> None:
+    file = Path("veilface.toml")
+    assert prepared("--pack", world.pack).status == 0
+    other = Path(shutil.copytree(world.pack, tmp_path / "other"))
+    ran = prepared("--pack", other)
+    assert ran.status == 0, ran.stderr
+    assert tomllib.loads(file.read_text())["pack"] == str(other)
+    file.write_text(added := f"{file.read_text()}port = 9000\n")
+    assert prepared("--pack", other).status == 0
+    refused = prepared("--pack", world.pack)
+    assert (refused.status, file.read_text()) == (1, added)
+    assert "says something else of pack," in refused.stderr
+
+
+def test_embeddings_of_a_run_that_was_killed_after_its_contract_are_deleted(
+    world: World, data: Path, prepared: Callable[..., Ran]
+) -> None:
+    """The long test kills one there; here are the files that it leaves."""
+    for name in ("setup-0123.cache", ".setup-0123.cache.draft"):
+        (data / name).write_bytes(b"sealed")
+    assert prepared("--pack", world.pack).status == 0
+    assert not list(data.glob("*.cache*")) + list(data.glob(".*.cache*"))
+
+
+def test_a_stopped_run_goes_on_without_embedding_again(
+    folders: Path, stops: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stopped = setup()
+    assert (stopped.status, "error: stopped" in stopped.stderr) == (1, True)
+    decoys = Path("veilface-data/decoys.veil").read_bytes()
+    caches = list(Path("veilface-data").glob("*.cache"))
+    assert len(caches) == 1
+    embedded: list[Extraction] = []
+    extract = command.extract
+
+    def seen(*given: Any, **more: Any) -> Extraction:
+        embedded.append(extract(*given, **more))
+        return embedded[-1]
+
+    monkeypatch.setattr(command, "extract", seen)
+    again = setup()
+    assert "decoys.veil is there and kept" in again.stderr
+    assert [(one.attempts, one.cached) for one in embedded] == [(50, 50)]
+    assert "50 embedded before" in again.stderr
+    assert Path("veilface-data/decoys.veil").read_bytes() == decoys
+
+    # Somebody new among the faces: the decoys are of another split.
+    draw(folders / "faces", range(7000, 7001), range(1))
+    refused = setup()
+    assert refused.status == 1
+    assert "photos were added or removed since" in refused.stderr
+
+
+def test_faces_that_are_photos_of_the_people_are_not_fitted(folders: Path, stops: None) -> None:
+    (folders / "faces" / "x.png").write_bytes((folders / "people/person-6000/0.png").read_bytes())
+    ran = setup()
+    assert "1 of --faces are photos of people in another role: left out" in ran.stderr
+
+
+@pytest.mark.long
+def test_from_nothing_to_a_contract(folders: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def killed(_: object) -> None:
+        raise CommandError("killed")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(command, "_drop_caches", killed)
+        assert "error: killed" in setup("--accept-weak-privacy").stderr
+    assert Path("veilface-data/contract.json").is_file()
+    assert list(Path("veilface-data").glob("*.cache"))
+    ran = setup("--accept-weak-privacy")
+    assert ran.status == 0, ran.stderr
+    assert "Start it: veilface serve" in ran.stdout
+    assert not list(Path("veilface-data").glob("*.cache"))
+    assert not list(Path("veilface-data").glob("*.key"))
+    assert run("serve", "--check").status == 0

@@ -1,0 +1,386 @@
+"""Challenges over REST: who passes, what fails and why, and what is used up."""
+
+import base64
+import threading
+from collections.abc import Iterator, Sequence
+from datetime import timedelta
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from api.http import challenges
+from api.http.app import create_app
+from api.http.errors import StartError
+from api.http.schemas import ChallengeAnswer, KeyAnswer, VerifyAnswer
+from api.process.opening import open_keyring, open_store
+from api.process.runtime import Runtime
+from models.pack import ModelPack
+from templates.contract.liveness_policy import LivenessPolicy
+from templates.keys.probe_signature import signed_probe
+from tests.api.client import Client
+from tests.api.deployment import Deployment, bearer, deploy, images, photo
+from tests.api.shapes import assert_answer, assert_error
+from tests.heads import POSES, performed
+from tests.heads import photo as flat_photo
+from tests.marked_heads import draw, encoded, frame, write_marked_pack
+
+Service = tuple[Client, Deployment]
+ANNA, BEN = 1, 2
+
+
+def serve(folder: Any, **changes: Any) -> Iterator[Service]:
+    pack = write_marked_pack(folder / "pack")
+    deployment = deploy(folder, pack=pack, **{"lockout_after": 0, **changes})
+    with Client(create_app(deployment.settings)) as client:
+        client.headers.update(bearer(deployment.token))
+        put = client.put("/v1/subjects/anna/enrollment", files=images(frame(person=ANNA)))
+        assert put.status_code == 201, put.text
+        yield client, deployment
+
+
+@pytest.fixture(scope="module")
+def off(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    """A deployment that asks for nothing."""
+    yield from serve(tmp_path_factory.mktemp("off"))
+
+
+@pytest.fixture(scope="module")
+def active(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    """A deployment that asks for a challenge."""
+    yield from serve(tmp_path_factory.mktemp("active"), liveness="active")
+
+
+def challenge(client: Client, subject: str | None = None, **options: Any) -> dict[str, Any]:
+    body = {} if subject is None else {"subject_id": subject}
+    return assert_answer(client.post("/v1/challenges", json=body, **options), 200, ChallengeAnswer)
+
+
+def answered(
+    client: Client,
+    challenge_id: str,
+    frames: Sequence[bytes],
+    subject: str = "anna",
+    **options: Any,
+) -> httpx.Response:
+    answer: httpx.Response = client.post(
+        f"/v1/subjects/{subject}/verify",
+        files=images(*frames),
+        data={"challenge_id": challenge_id},
+        **options,
+    )
+    return answer
+
+
+def frames_of(names: Sequence[str], person: int = ANNA) -> list[bytes]:
+    return [frame(name, person) for name in names]
+
+
+def liveness(answer: httpx.Response) -> tuple[str, str, str, str | None]:
+    body = assert_answer(answer, 200, VerifyAnswer)
+    return body["decision"], body["reason"], body["liveness"], body.get("liveness_failure")
+
+
+PASSED = ("accept", "match", "passed", None)
+
+
+def failed(why: str) -> tuple[str, str, str, str]:
+    return "reject", "liveness", "failed", why
+
+
+def test_who_makes_the_movements_is_accepted(active: Service) -> None:
+    client, _ = active
+    for subject in (None, "anna"):
+        asked = challenge(client, subject)
+        assert len(asked["movements"]) == len(set(asked["movements"])) == 3
+        assert (asked["min_frames"], asked["max_frames"]) == (5, 12)
+        frames = frames_of(performed(asked["movements"]))
+        assert liveness(answered(client, asked["challenge_id"], frames)) == PASSED
+
+
+def test_another_person_who_makes_them_is_no_match(active: Service) -> None:
+    client, _ = active
+    asked = challenge(client)
+    frames = frames_of(performed(asked["movements"]), BEN)
+    told = liveness(answered(client, asked["challenge_id"], frames))
+    assert told == ("reject", "no_match", "passed", None)
+    # Nobody is enrolled under this id, in the same shape.
+    asked = challenge(client)
+    frames = frames_of(performed(asked["movements"]))
+    token = active[1].key("verify")
+    answer = answered(client, asked["challenge_id"], frames, "nobody", headers=bearer(token))
+    assert liveness(answer) == ("reject", "no_match", "passed", None)
+
+
+def test_a_challenge_is_good_for_one_decision(active: Service) -> None:
+    client, deployment = active
+    asked = challenge(client)
+    frames = frames_of(performed(asked["movements"]))
+    assert liveness(answered(client, asked["challenge_id"], frames)) == PASSED
+    # Neither with the key that asked for it, nor with another one of the tenant.
+    other = bearer(deployment.key("verify"))
+    for headers in ({}, other):
+        again = answered(client, asked["challenge_id"], frames, headers=headers)
+        assert_error(again, 401, "replayed")
+        assert "seen before" in again.json()["error"]["message"]
+    # A rejection uses it up as well, whichever key it comes with.
+    asked = challenge(client)
+    frames = frames_of(performed(asked["movements"]))
+    still = answered(client, asked["challenge_id"], frames_of(["front"] * 5), headers=other)
+    assert liveness(still)[:3] == failed("")[:3]
+    assert_error(answered(client, asked["challenge_id"], frames), 401, "replayed")
+
+
+def test_what_came_with_an_error_may_be_sent_again(active: Service) -> None:
+    client, _ = active
+    asked = challenge(client)
+    frames = frames_of(performed(asked["movements"]))
+    faceless = encoded(draw(flat_photo(), marked=False))
+    answer = answered(client, asked["challenge_id"], [*frames[:5], faceless])
+    assert assert_error(answer, 422, "no_face")["image"] == 5
+    assert liveness(answered(client, asked["challenge_id"], frames)) == PASSED
+
+
+def test_frames_of_an_earlier_challenge_fail(active: Service) -> None:
+    client, _ = active
+    first = challenge(client)
+    second = challenge(client)
+    while second["movements"] == first["movements"]:
+        second = challenge(client)
+    frames = frames_of(performed(first["movements"]))
+    assert liveness(answered(client, first["challenge_id"], frames)) == PASSED
+    told = liveness(answered(client, second["challenge_id"], frames))
+    assert told in (failed("wrong_order"), failed("missing_movement"))
+
+
+def test_movements_in_another_order_fail(active: Service) -> None:
+    client, _ = active
+    asked = challenge(client)
+    frames = frames_of(performed(asked["movements"][::-1]))
+    assert liveness(answered(client, asked["challenge_id"], frames)) == failed("wrong_order")
+
+
+@pytest.mark.parametrize("turned", [False, True], ids=["in-the-plane", "tilted"])
+def test_a_still_photo_that_is_moved_fails(active: Service, turned: bool) -> None:
+    client, _ = active
+    asked = challenge(client)
+    frames = []
+    for number, name in enumerate(performed(asked["movements"])):
+        held: dict[str, Any] = {"roll": 10.0 * (number % 3), "at": (8.0 * number, -5.0 * number)}
+        if turned:
+            held = dict(POSES[name])
+        frames.append(encoded(draw(flat_photo(**held), ANNA)))
+    assert liveness(answered(client, asked["challenge_id"], frames)) == failed("no_turn")
+
+
+def test_frames_of_two_people_fail(active: Service) -> None:
+    """A photo of the subject for the frames that look ahead, and somebody else who turns."""
+    client, _ = active
+    asked = challenge(client)
+    names = performed(asked["movements"])
+    mixed = [frame(name, ANNA if name == "front" else BEN) for name in names]
+    told = liveness(answered(client, asked["challenge_id"], mixed))
+    assert told == failed("another_person")
+    # The frames that look ahead show two people.
+    asked = challenge(client)
+    names = performed(asked["movements"])
+    mixed = [frame(name, ANNA if number < 2 else BEN) for number, name in enumerate(names)]
+    told = liveness(answered(client, asked["challenge_id"], mixed))
+    assert told == failed("another_person")
+
+
+def test_why_is_told_to_keys_with_scores_only(active: Service) -> None:
+    client, deployment = active
+    asked = challenge(client)
+    headers = bearer(deployment.key("verify"))
+    answer = answered(client, asked["challenge_id"], frames_of(["front"] * 5), headers=headers)
+    assert liveness(answer) == ("reject", "liveness", "failed", None)
+
+
+def test_a_late_answer_is_refused(active: Service, monkeypatch: pytest.MonkeyPatch) -> None:
+    client, _ = active
+    monkeypatch.setattr(challenges, "LIFETIME", timedelta(seconds=-2))
+    late = challenge(client)
+    frames = frames_of(performed(late["movements"]))
+    monkeypatch.undo()
+    answer = answered(client, late["challenge_id"], frames)
+    assert_error(answer, 401, "replayed")
+    assert "expired" in answer.json()["error"]["message"]
+
+
+@pytest.mark.parametrize("count", [1, 4])
+def test_too_few_frames_are_refused(active: Service, count: int) -> None:
+    client, _ = active
+    asked = challenge(client)
+    answer = answered(client, asked["challenge_id"], [frame()] * count)
+    assert assert_error(answer, 422, "validation_failed") == {"field": "images"}
+
+
+def test_too_many_frames_are_refused(active: Service, off: Service) -> None:
+    client, _ = active
+    asked = challenge(client)
+    answer = answered(client, asked["challenge_id"], [frame()] * 13)
+    assert assert_error(answer, 413, "too_many_images") == {"limit": 12}
+    # Without a challenge the limit of photos holds.
+    answer = off[0].post("/v1/subjects/anna/verify", files=images(*[frame()] * 6))
+    assert assert_error(answer, 413, "too_many_images") == {"limit": 5}
+
+
+def test_a_challenge_of_another_tenant_or_subject_is_none(active: Service) -> None:
+    client, deployment = active
+    theirs = challenge(client, headers=bearer(deployment.key("verify", tenant="other")))
+    bobs = challenge(client, "bob")
+    good = challenge(client)["challenge_id"]
+    sealed = base64.urlsafe_b64decode(good + "=" * (-len(good) % 4))
+    altered = base64.urlsafe_b64encode(sealed[:-1] + bytes([sealed[-1] ^ 1])).decode().rstrip("=")
+    made_up = [altered, good[:40], "x", "é", base64.urlsafe_b64encode(bytes(200)).decode()]
+    for challenge_id in (theirs["challenge_id"], bobs["challenge_id"], *made_up):
+        answer = answered(client, challenge_id, [frame()] * 5)
+        assert assert_error(answer, 422, "validation_failed") == {"field": "challenge_id"}
+
+
+def test_a_challenge_needs_the_right_and_a_well_formed_request(active: Service) -> None:
+    client, deployment = active
+    enrolls = bearer(deployment.key("enroll"))
+    assert_error(client.post("/v1/challenges", json={}, headers=enrolls), 403, "forbidden")
+    for body in ({"subject": "anna"}, {"subject_id": 5}, {"subject_id": "a b"}):
+        assert_error(client.post("/v1/challenges", json=body), 422, "validation_failed")
+
+
+def test_a_policy_refuses_what_cannot_show_liveness(active: Service) -> None:
+    client, deployment = active
+    answer = client.post("/v1/subjects/anna/verify", files=images(frame(person=ANNA), name="image"))
+    assert assert_error(answer, 403, "forbidden") == {"liveness": "active"}
+    assert "POST /v1/challenges" in answer.json()["error"]["message"]
+    pack = ModelPack.load(deployment.settings.pack or "", threads=1)
+    embedding = pack.embed_photo(frame(person=ANNA)).embedding.astype(np.float64)
+    for probe in (embedding, embedding[None]):
+        body = signed_probe(deployment.token, "anna", probe)
+        answer = client.post("/v1/subjects/anna/verify", json=body)
+        assert assert_error(answer, 403, "forbidden") == {"liveness": "active"}
+        assert "embeddings and lifted probes cannot show" in answer.json()["error"]["message"]
+
+
+def test_without_a_policy_answers_are_as_they_were(off: Service) -> None:
+    client, _ = off
+    answer = client.post("/v1/subjects/anna/verify", files=images(frame(person=ANNA), name="image"))
+    assert liveness(answer) == ("accept", "match", "not_checked", None)
+    # Whoever answers a challenge is held against it all the same.
+    asked = challenge(client)
+    frames = frames_of(performed(asked["movements"]))
+    assert liveness(answered(client, asked["challenge_id"], frames)) == PASSED
+    asked = challenge(client)
+    still = frames_of(["front"] * 5)
+    assert liveness(answered(client, asked["challenge_id"], still)) == failed("no_turn")
+
+
+def test_a_key_may_ask_for_more_and_not_for_less(off: Service, active: Service) -> None:
+    for (client, deployment), of_key, holds in (
+        (off, LivenessPolicy.ACTIVE, "active"),
+        (active, LivenessPolicy.OFF, "active"),
+    ):
+        store = open_store(deployment.settings, open_keyring(deployment.settings))
+        made = store.api_keys.create("default", ["verify"], liveness=of_key)
+        store.close()
+        headers = bearer(made.token)
+        own = assert_answer(client.get("/v1/key", headers=headers), 200, KeyAnswer)
+        assert set(own["liveness"]) == set(own["levels"])
+        assert set(own["liveness"].values()) == {holds}
+        answer = client.post(
+            "/v1/subjects/anna/verify",
+            files=images(frame(person=ANNA), name="image"),
+            headers=headers,
+        )
+        assert assert_error(answer, 403, "forbidden") == {"liveness": holds}
+
+
+def test_a_key_that_asks_for_what_the_service_cannot_check_is_told_so(off: Service) -> None:
+    client, deployment = off
+    store = open_store(deployment.settings, open_keyring(deployment.settings))
+    made = store.api_keys.create("default", ["verify"], liveness=LivenessPolicy.PASSIVE)
+    store.close()
+    answer = client.post(
+        "/v1/subjects/anna/verify",
+        files=images(frame(person=ANNA), name="image"),
+        headers=bearer(made.token),
+    )
+    assert assert_error(answer, 403, "forbidden") == {"liveness": "passive"}
+    assert "no liveness graph" in answer.json()["error"]["message"]
+
+
+def test_a_level_may_ask_for_more(tmp_path: Any) -> None:
+    for client, _ in serve(tmp_path, liveness_levels="fmr-1e-3=active"):
+        own = client.get("/v1/key").json()["liveness"]
+        assert own == {"fmr-1e-2": "off", "fmr-1e-3": "active", "accuracy": "off"}
+        for level, status in (("fmr-1e-2", 200), ("fmr-1e-3", 403)):
+            answer = client.post(
+                "/v1/subjects/anna/verify",
+                files=images(frame(person=ANNA), name="image"),
+                data={"level": level},
+            )
+            assert answer.status_code == status
+
+
+@pytest.mark.parametrize(
+    ("changes", "remedy"),
+    [
+        ({"liveness": "active"}, "add a SCRFD or YuNet .onnx file"),
+        ({"liveness": "passive"}, "no liveness graph"),
+        ({"liveness_levels": "fmr-1e-3=both"}, "no liveness graph"),
+        ({"liveness_levels": "fmr-1e-9=active"}, "no level fmr-1e-9; it has accuracy"),
+    ],
+    ids=str,
+)
+def test_a_policy_that_cannot_be_checked_does_not_start(
+    tmp_path: Any, changes: dict[str, str], remedy: str
+) -> None:
+    # The tiny pack has no detector.
+    settings = deploy(tmp_path).settings
+    with pytest.raises(StartError, match=remedy):
+        Runtime.open(type(settings)(**{**settings.model_dump(exclude_unset=True), **changes}))
+
+
+def test_a_service_without_a_detector_gives_no_challenge(tmp_path: Any) -> None:
+    deployment = deploy(tmp_path)
+    with Client(create_app(deployment.settings)) as client:
+        client.headers.update(bearer(deployment.token))
+        assert_error(client.post("/v1/challenges", json={}), 404, "not_found")
+        answer = client.post(
+            "/v1/subjects/anna/verify",
+            files=images(*[photo(1)] * 5),
+            data={"challenge_id": "made-up"},
+        )
+        assert_error(answer, 422, "validation_failed")
+
+
+def test_of_many_sendings_at_once_one_is_answered(active: Service) -> None:
+    client, _ = active
+    asked = challenge(client)
+    frames = frames_of(performed(asked["movements"]))
+    answers: list[httpx.Response] = []
+    start = threading.Barrier(8)
+
+    def one() -> None:
+        start.wait()
+        answers.append(answered(client, asked["challenge_id"], frames))
+
+    threads = [threading.Thread(target=one) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(answer.status_code for answer in answers) == [200] + [401] * 7
+    (accepted,) = (answer for answer in answers if answer.status_code == 200)
+    assert liveness(accepted) == PASSED
+
+
+def test_failures_of_a_challenge_lock_after_five(tmp_path: Any) -> None:
+    for client, _ in serve(tmp_path, liveness="active", lockout_after=None, lockout_first_s=3600):
+        still = frames_of(["front"] * 5)
+        for _ in range(5):
+            told = answered(client, challenge(client)["challenge_id"], still)
+            assert liveness(told) == failed("no_turn")
+        asked = challenge(client)
+        frames = frames_of(performed(asked["movements"]))
+        assert_error(answered(client, asked["challenge_id"], frames), 423, "locked_out")

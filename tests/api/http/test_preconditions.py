@@ -1,0 +1,148 @@
+"""``If-None-Match`` and ``If-Match`` of an enrollment, on both databases."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+from httpx import Response
+
+from api.http.schemas import EnrollmentAnswer, ImportAnswer, SubjectAnswer
+from tests.api.client import Client
+from tests.api.deployment import Deployment, codes, images, photo
+from tests.api.http.test_enrollment import b64, lifted, path
+from tests.api.shapes import assert_answer, assert_error
+
+NEVER = {"If-None-Match": "*"}
+
+
+def only(template_id: str) -> dict[str, str]:
+    return {"If-Match": f'"{template_id}"'}
+
+
+def template_id(client: Client, subject: str) -> str:
+    answer = client.get(f"/v1/subjects/{subject}")
+    named = assert_answer(answer, 200, SubjectAnswer)["template_id"]
+    assert answer.headers["ETag"] == f'"{named}"'
+    return named
+
+
+def test_what_may_be_replaced(both: tuple[Client, Deployment]) -> None:
+    client, _ = both
+    sent = {"files": images(photo(1))}
+    refused = client.put(path("ann"), headers=only("0" * 32), **sent)
+    assert assert_error(refused, 409, "enrollment_conflict") == {"template_id": None}
+    assert client.get("/v1/subjects/ann").status_code == 404
+
+    created = client.put(path("ann"), headers=NEVER, **sent)
+    first = assert_answer(created, 201, EnrollmentAnswer)["template_id"]
+    assert created.headers["ETag"] == f'"{first}"'
+    for headers in (NEVER, only("0" * 32)):
+        refused = client.put(path("ann"), headers=headers, **sent)
+        assert assert_error(refused, 409, "enrollment_conflict") == {"template_id": first}
+        assert template_id(client, "ann") == first
+
+    replaced = client.put(path("ann"), headers=only(first), **sent)
+    second = assert_answer(replaced, 200, EnrollmentAnswer)["template_id"]
+    assert second == template_id(client, "ann") != first
+    # A template that was replaced is not there to be replaced again.
+    assert_error(client.put(path("ann"), headers=only(first), **sent), 409, "enrollment_conflict")
+    assert client.delete("/v1/subjects/ann").status_code == 200
+    assert_error(client.put(path("ann"), headers=only(second), **sent), 409, "enrollment_conflict")
+    assert client.put(path("ann"), headers=NEVER, **sent).status_code == 201
+
+
+def test_an_import_heeds_them(both: tuple[Client, Deployment]) -> None:
+    client, _ = both
+    client.put(path("ann"), files=images(photo(1)))
+    first = template_id(client, "ann")
+    sent = {"json": {"export": client.get("/v1/subjects/ann/export").json()["export"]}}
+
+    def bring(headers: dict[str, str]) -> Response:
+        return client.post("/v1/subjects/import", headers=headers, **sent)
+
+    for headers in (NEVER, only("0" * 32)):
+        assert assert_error(bring(headers), 409, "enrollment_conflict") == {"template_id": first}
+    assert template_id(client, "ann") == first
+    keyed = {"Idempotency-Key": "once"}
+    assert_answer(bring(only(first) | keyed), 200, ImportAnswer)
+    second = template_id(client, "ann")
+    assert second != first
+    assert_error(bring(NEVER | keyed), 409, "idempotency_conflict")
+    assert bring(only(first) | keyed).headers["Idempotency-Replayed"] == "true"
+    assert template_id(client, "ann") == second
+
+
+@pytest.mark.parametrize("headers", [NEVER, only("0" * 32), {"If-Match": "*"}])
+def test_an_erasure_does_not_pass_over_them(
+    both: tuple[Client, Deployment], headers: dict[str, str]
+) -> None:
+    client, _ = both
+    client.put(path("ann"), files=images(photo(1)))
+    refused = client.delete("/v1/subjects/ann", headers=headers)
+    details = assert_error(refused, 422, "validation_failed")
+    assert details == {"field": "If-Match, If-None-Match"}
+    assert template_id(client, "ann")
+    assert client.delete("/v1/subjects/ann").status_code == 200
+
+
+def test_a_refusal_is_audited(both: tuple[Client, Deployment]) -> None:
+    client, _ = both
+    for _ in range(2):
+        client.put(
+            path("ann"), files=images(photo(1)), headers=NEVER | {"X-Request-ID": "ann-ann-1"}
+        )
+    lines = list(client.app.state.runtime.store.audit_log.lines())
+    assert [
+        (line.action, line.outcome, line.request_id) for line in lines if line.action == "enroll"
+    ] == [("enroll", "created", "ann-ann-1"), ("enroll", "enrollment_conflict", "ann-ann-1")]
+
+
+def test_of_many_at_once_one_enrolls(both: tuple[Client, Deployment]) -> None:
+    client, deployment = both
+    deployment.allow_templates()
+    body = {"template": b64(lifted(deployment))}
+
+    def send(headers: dict[str, str]) -> list[int]:
+        with ThreadPoolExecutor(6) as threads:
+            sendings = [
+                threads.submit(client.put, path("ann"), json=body, headers=headers)
+                for _ in range(6)
+            ]
+            return sorted(codes(sending.result() for sending in sendings))
+
+    assert send(NEVER) == [201, 409, 409, 409, 409, 409]
+    assert send(only(template_id(client, "ann"))) == [200, 409, 409, 409, 409, 409]
+
+
+def test_a_repeated_write_is_answered_as_the_first(client: Client) -> None:
+    headers = {"Idempotency-Key": "one-write", **NEVER}
+    first = client.put(path("once"), files=images(photo(2)), headers=headers)
+    again = client.put(path("once"), files=images(photo(2)), headers=headers)
+    assert codes([first, again]) == [201, 201]
+    assert again.headers["Idempotency-Replayed"] == "true"
+    assert again.headers["ETag"] == first.headers["ETag"]
+    # Without the header it is another request.
+    other = client.put(
+        path("once"), files=images(photo(2)), headers={"Idempotency-Key": "one-write"}
+    )
+    assert_error(other, 409, "idempotency_conflict")
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"If-None-Match": '"0123"'},
+        {"If-None-Match": ""},
+        {"If-Match": "*"},
+        {"If-Match": "0123"},
+        {"If-Match": 'W/"0123"'},
+        {"If-Match": '"0123", "4567"'},
+        {"If-Match": '"../0"'},
+        {"If-Match": ""},
+        {"If-Match": '"0123"', "If-None-Match": "*"},
+    ],
+)
+def test_any_other_precondition_is_refused(client: Client, headers: dict[str, str]) -> None:
+    answer = client.put(path("other"), files=images(photo(3)), headers=headers)
+    assert assert_error(answer, 422, "validation_failed")["field"] == "If-Match, If-None-Match"
+    assert "0123" not in answer.text
+    assert client.get("/v1/subjects/other").status_code == 404

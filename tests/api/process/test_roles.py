@@ -1,0 +1,107 @@
+"""Who is in which role, and what so many people can show."""
+
+from pathlib import Path
+
+import pytest
+
+from api.process.roles import Roles, attacked_and_others, promises, resolved_rates, split_people
+
+
+def albums(*counts: tuple[int, int]) -> dict[str, list[Path]]:
+    """People as (how many, with how many photos each)."""
+    named: dict[str, list[Path]] = {}
+    for people, photos in counts:
+        for _ in range(people):
+            name = f"person-{len(named)}"
+            named[name] = [Path(name) / f"{photo}.jpg" for photo in range(photos)]
+    return named
+
+
+def roles(people: dict[str, list[Path]], *, faces: int, sample: int = 0) -> Roles:
+    return Roles(
+        faces=tuple(Path(f"{face}.jpg") for face in range(faces)),
+        sample=tuple(Path(f"like-{photo}.jpg") for photo in range(sample)),
+        calibration=people,
+    )
+
+
+@pytest.mark.parametrize(
+    ("counts", "sample", "people_left"),
+    [
+        (((80, 5),), 0, 80),  # the thresholds need all
+        (((140, 5),), 300, 80),  # 60 people have 300 photos, and 80 are left
+        (((139, 5),), 0, 139),
+        (((3_000, 1), (300, 4)), 600, 2_700),  # people with one photo come first
+        (((400, 4),), 300, 325),  # the verdict would need all, the thresholds do not
+    ],
+)
+def test_the_sample_gets_nobody_whom_the_calibration_needs(
+    counts: tuple[tuple[int, int], ...], sample: int, people_left: int
+) -> None:
+    people = albums(*counts)
+    photos, calibration = split_people(people)
+    assert (len(photos), len(calibration)) == (sample, people_left)
+    assert {photo.parent.name for photo in photos} | set(calibration) == set(people)
+    assert not {photo.parent.name for photo in photos} & set(calibration)
+
+
+def test_the_split_does_not_depend_on_the_order_of_the_folder() -> None:
+    people = albums((140, 5))
+    again = dict(reversed(people.items()))
+    assert split_people(people)[0] == split_people(again)[0]
+
+
+def test_a_sample_of_too_few_people_is_none() -> None:
+    """Decoys are adapted to 50 people or more: 45 have 300 photos."""
+    people = albums((45, 7), (100, 8))
+    photos, _ = split_people(people)
+    assert photos == ()
+
+
+@pytest.mark.parametrize(
+    ("counts", "rates"),
+    [
+        (((24, 50),), []),  # 276 pairs of people, and a rate of 1 in 100 takes 300
+        (((25, 50),), [1e-2]),
+        (((77, 4),), [1e-2]),
+        (((78, 4),), [1e-2, 1e-3]),
+        (((5, 2), (40, 1)), [1e-2]),
+        (((45, 1),), []),  # nobody has a second photo
+        (((300, 1), (10, 2)), [1e-2, 1e-3]),  # pairs enough for 1e-4, but 98,880 trials
+    ],
+)
+def test_rates_that_are_resolved(counts: tuple[tuple[int, int], ...], rates: list[float]) -> None:
+    assert resolved_rates(albums(*counts)) == rates
+
+
+def test_how_many_are_attacked_and_with_how_many_faces() -> None:
+    assert attacked_and_others(albums((200, 5))) == (100, 500)
+    assert attacked_and_others(albums((1_000, 1), (150, 4))) == (150, 1_000)
+    assert attacked_and_others(albums((10, 1))) == (0, 10)
+
+
+def test_promises_name_what_is_missing() -> None:
+    few = roles(albums((30, 4)), faces=300)
+    can, cannot = promises(few, n=512)
+    assert can == ["thresholds for false match rates of 1 in 100"]
+    said = " ".join(cannot)
+    assert all(part in said for part in ("80 people", "PASS takes 100", "--like", "2,048"))
+
+    many = roles(albums((1_000, 1), (150, 4)), faces=2_048, sample=300)
+    can, cannot = promises(many, n=512)
+    assert cannot == []
+    assert "attacks on 150 people" in " ".join(can)
+    assert "1 in 100, 1 in 1,000, 1 in 10,000" in can[0]
+
+    nobody = roles(albums((10, 1)), faces=2_048, sample=300)
+    can, cannot = promises(nobody, n=512)
+    assert "any false match rate: 0 of 10 people" in cannot[0]
+
+
+def test_the_digest_is_of_faces_and_sample() -> None:
+    people = albums((30, 4))
+    first = roles(people, faces=300, sample=100)
+    assert first.digest == roles(albums((31, 4)), faces=300, sample=100).digest
+    assert first.digest != roles(people, faces=299, sample=100).digest
+    assert first.digest != roles(people, faces=300, sample=99).digest
+    assert first.digest == Roles(tuple(reversed(first.faces)), first.sample, people).digest

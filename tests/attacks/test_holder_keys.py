@@ -1,0 +1,53 @@
+import numpy as np
+import pytest
+
+from attacks.holder_keys import THEFTS, guess_with_and_without_holder_keys
+from attacks.likelihood import likeliest_guess
+from attacks.outcomes import AttackOutcome, Leaked
+from attacks.stored.foot_point import foot_points
+from attacks.system import System
+from attacks.verdict import Status, judge
+from templates.space.subspace import SubspaceBatch
+
+
+@pytest.fixture(scope="module")
+def rows(weak_system: System) -> dict[tuple[str, Leaked], AttackOutcome]:
+    """Random lifting: whoever opens a template has the descriptor."""
+    guesses = {"foot-point": foot_points, "decoy-likelihood": likeliest_guess(weak_system)}
+    found = guess_with_and_without_holder_keys(weak_system, guesses)
+    return {(each.attack, each.leaked): each for each in found}
+
+
+def test_without_the_key_every_guess_is_at_chance_and_with_it_none_is(
+    rows: dict[tuple[str, Leaked], AttackOutcome],
+) -> None:
+    assert len(rows) == 4
+    # Few faces tell the likeliest of a span without decoys only roughly.
+    for attack, least in (("foot-point", 0.9), ("decoy-likelihood", 0.4)):
+        kept, stolen = rows[attack, Leaked.MASTER_KEY], rows[attack, Leaked.HOLDER_KEYS]
+        assert kept.measured.value <= 1 / 40
+        assert abs(float(str(kept.details["cosine_to_truth_mean"]))) < 0.1
+        assert stolen.measured.value > least
+        assert (kept.judged, stolen.judged) == (True, False)
+
+
+def test_without_the_key_a_guess_has_a_limit_of_next_to_nothing(
+    rows: dict[tuple[str, Leaked], AttackOutcome],
+) -> None:
+    (verdict,) = judge(rows.values())
+    (cell,) = verdict.cells
+    assert cell.limit == "success-without-key"
+    assert cell.status is not Status.FAIL
+
+
+def test_a_stolen_key_gives_the_template_back(system: System) -> None:
+    """To the rounding of float16; and each enrollment is turned in another way."""
+    kept, stolen = (theft.of(system, system.templates, "test") for theft in THEFTS)
+    assert isinstance(stolen, SubspaceBatch)
+    np.testing.assert_allclose(stolen.feet, system.templates.feet, atol=1e-3)
+    np.testing.assert_allclose(stolen.bases, system.templates.bases, atol=2e-3)
+    np.testing.assert_allclose(kept.foot_norms, system.templates.foot_norms, atol=1e-3)
+    cosines = np.einsum("ij,ij->i", foot_points(kept), foot_points(system.templates))
+    assert abs(cosines.mean()) < 0.1
+    again = THEFTS[0].of(system, system.templates, "another enrollment")
+    assert abs(np.einsum("ij,ij->i", foot_points(kept), foot_points(again)).mean()) < 0.1

@@ -1,0 +1,51 @@
+"""Both clients answer a challenge of a running service that asks for one."""
+
+import asyncio
+from collections.abc import Iterator
+
+import pytest
+
+from tests.api.deployment import deploy
+from tests.clients.conftest import Running, started
+from tests.heads import performed
+from tests.marked_heads import frame, write_marked_pack
+from veilface_client import AsyncClient, Client, Forbidden, InvalidRequest, Unauthorized
+
+
+@pytest.fixture(scope="module")
+def asking(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
+    folder = tmp_path_factory.mktemp("asking")
+    pack = write_marked_pack(folder / "pack")
+    with started(deploy(folder, pack=pack, liveness="active"), folder) as running:
+        yield running
+
+
+def test_a_challenge_is_answered_once(asking: Running) -> None:
+    with Client(asking.url, asking.deployment.token) as client:
+        client.enroll("anna", frame())
+        with pytest.raises(Forbidden) as refused:
+            client.verify("anna", frame())
+        assert refused.value.details == {"liveness": "active"}
+        challenge = client.challenge("anna")
+        frames = [frame(name) for name in performed(challenge.movements)]
+        with pytest.raises(InvalidRequest, match="5 to 12 frames"):
+            client.verify("anna", frames[:4], challenge=challenge)
+        decision = client.verify("anna", frames, challenge=challenge)
+        assert decision
+        assert (decision.liveness, decision.liveness_failure) == ("passed", None)
+        with pytest.raises(Unauthorized, match="seen before"):
+            client.verify("anna", frames, challenge=challenge)
+        still = client.verify("anna", [frame()] * 5, challenge=client.challenge())
+        assert not still
+        assert (still.reason, still.liveness_failure) == ("liveness", "no_turn")
+
+
+def test_a_challenge_is_answered_asynchronously(asking: Running) -> None:
+    async def accepted() -> bool:
+        async with AsyncClient(asking.url, asking.deployment.token) as client:
+            await client.enroll("ben", frame(person=2))
+            challenge = await client.challenge()
+            frames = [frame(name, 2) for name in performed(challenge.movements)]
+            return bool(await client.verify("ben", frames, challenge=challenge))
+
+    assert asyncio.run(accepted())

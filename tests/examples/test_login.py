@@ -1,0 +1,63 @@
+"""The login examples, as processes of their own, before a real service with the demo model."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+
+from tests.examples.conftest import EXAMPLES, PYTHON, Service, clean_environment, node, running
+from tests.ports import free_port
+from veilface_client import Client
+
+
+@pytest.fixture(params=["login.mjs", "login.py"], scope="module")
+def login(
+    request: pytest.FixtureRequest, service: Service, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[str]:
+    program = node() if request.param.endswith(".mjs") else PYTHON
+    port = free_port()
+    env = clean_environment(
+        VEILFACE_URL=service.url, VEILFACE_API_KEY=service.verifying, PORT=str(port)
+    )
+    log = tmp_path_factory.mktemp("login") / "login.log"
+    arguments = [program, str(EXAMPLES / "login" / request.param)]
+    with running(arguments, f"http://127.0.0.1:{port}/", env, log) as url:
+        yield url
+
+
+def test_who_is_let_in(login: str, service: Service) -> None:
+    accepted = httpx.post(f"{login}ann", content=service.photo(1, 4), timeout=60)
+    assert accepted.status_code == 204, accepted.text
+    cookie = accepted.headers["Set-Cookie"]
+    assert cookie.startswith("session=")
+    assert cookie.endswith("; HttpOnly; Secure; SameSite=Strict")
+    for name, photo in (("ann", service.photo(2, 0)), ("nobody", service.photo(1, 4))):
+        rejected = httpx.post(f"{login}{name}", content=photo, timeout=60)
+        assert (rejected.status_code, rejected.text) == (401, "this is somebody else")
+        assert "Set-Cookie" not in rejected.headers
+    with Client(service.url, service.token) as client:
+        client.reset_lockout("ann")
+
+
+@pytest.mark.parametrize(
+    ("name", "photo", "statuses"),
+    [("ann", b"no picture", {400}), ("..", b"no picture", {400, 404, 502}), ("ann", b"", {400})],
+)
+def test_what_is_no_attempt_opens_nothing(
+    login: str, name: str, photo: bytes, statuses: set[int]
+) -> None:
+    answer = httpx.post(httpx.URL(login).copy_with(raw_path=f"/{name}".encode()), content=photo)
+    assert answer.status_code in statuses
+    assert "Set-Cookie" not in answer.headers
+
+
+def test_an_example_without_its_service_opens_nothing(tmp_path: Path) -> None:
+    port, nobody = free_port(), free_port()
+    env = clean_environment(
+        VEILFACE_URL=f"http://127.0.0.1:{nobody}", VEILFACE_API_KEY="vf_key", PORT=str(port)
+    )
+    arguments = [node(), str(EXAMPLES / "login" / "login.mjs")]
+    with running(arguments, f"http://127.0.0.1:{port}/", env, tmp_path / "log") as url:
+        answer = httpx.post(f"{url}ann", content=b"x", timeout=60)
+    assert (answer.status_code, answer.text) == (502, "use your password")

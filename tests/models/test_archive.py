@@ -1,0 +1,183 @@
+"""Archives that strangers made: nothing is written but graphs, inside the folder."""
+
+import io
+import random
+import stat
+import struct
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from models import archive
+from models.archive import is_archive, unpack
+from models.errors import PackError
+
+GRAPH = b"a graph"
+
+
+def zipped(folder: Path, *entries: tuple[str | zipfile.ZipInfo, bytes]) -> Path:
+    path = folder / "pack.zip"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
+        for name, data in entries:
+            file.writestr(name, data)
+    return path
+
+
+def target(folder: Path) -> Path:
+    into = folder / "into"
+    into.mkdir()
+    return into
+
+
+def test_graphs_and_the_pack_file_are_taken_flat(tmp_path: Path) -> None:
+    path = zipped(
+        tmp_path,
+        ("buffalo/", b""),
+        ("buffalo/det.onnx", GRAPH),
+        ("buffalo/rec.ONNX", GRAPH),
+        ("buffalo/pack.toml", b"[embedder]"),
+        ("buffalo/README.md", b"hello"),
+        ("__MACOSX/buffalo/._det.onnx", b"leftover"),
+        ("run.py", b"import os"),
+    )
+    into = target(tmp_path)
+    files, left_out = unpack(path, into)
+    assert sorted(file.name for file in files) == ["det.onnx", "pack.toml", "rec.ONNX"]
+    assert sorted(into.iterdir()) == sorted(files)
+    assert (into / "det.onnx").read_bytes() == GRAPH
+    assert left_out == ["buffalo/README.md", "__MACOSX/buffalo/._det.onnx", "run.py"]
+
+
+def link() -> zipfile.ZipInfo:
+    entry = zipfile.ZipInfo("det.onnx")
+    entry.external_attr = (stat.S_IFLNK | 0o777) << 16
+    return entry
+
+
+@pytest.mark.parametrize(
+    ("entry", "reason"),
+    [
+        ("../det.onnx", "leads out of it"),
+        ("a/../../det.onnx", "leads out of it"),
+        ("/etc/det.onnx", "leads out of it"),
+        ("..\\det.onnx", "leads out of it"),
+        ("C:\\det.onnx", "leads out of it"),
+        ("\x1b[2J.txt", r"cannot be printed: '\\x1b\[2J.txt'"),
+        ("a\u202exnno.exe.onnx", r"cannot be printed: 'a\\u202exnno"),
+        (link(), "a link"),
+        ("det.txt", "no .onnx file"),
+    ],
+)
+def test_what_no_honest_archive_has_is_refused(
+    tmp_path: Path, entry: str | zipfile.ZipInfo, reason: str
+) -> None:
+    with pytest.raises(PackError, match=reason):
+        unpack(zipped(tmp_path, (entry, GRAPH)), target(tmp_path))
+    assert not list((tmp_path / "into").iterdir())
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["into", "pack.zip"]
+
+
+def test_two_graphs_of_one_name_are_refused(tmp_path: Path) -> None:
+    path = zipped(tmp_path, ("a/det.onnx", GRAPH), ("b/det.onnx", b"another"))
+    with pytest.raises(PackError, match="two files of the name"):
+        unpack(path, target(tmp_path))
+
+
+def test_an_archive_that_swells_is_stopped_while_it_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(archive, "MAX_FILE_BYTES", 5_000)
+    into = target(tmp_path)
+    path = zipped(tmp_path, ("det.onnx", bytes(10_000)))
+    # The directory states fewer bytes than there are.
+    data = bytearray(path.read_bytes())
+    for position in (22, data.index(b"PK\x01\x02") + 24):
+        assert int.from_bytes(data[position : position + 4], "little") == 10_000
+    with pytest.raises(PackError, match="too large"):
+        unpack(path, into)
+    assert (into / "det.onnx").stat().st_size <= 5_000
+
+    monkeypatch.setattr(archive, "MAX_FILE_BYTES", 20_000)
+    monkeypatch.setattr(archive, "MAX_TOTAL_BYTES", 15_000)
+    path = zipped(tmp_path, ("one.onnx", bytes(10_000)), ("two.onnx", bytes(10_000)))
+    with pytest.raises(PackError, match="too large"):
+        unpack(path, into)
+    monkeypatch.setattr(archive, "MAX_ENTRIES", 1)
+    with pytest.raises(PackError, match="more than 1 entries"):
+        unpack(path, into)
+
+
+def test_broken_and_encrypted_archives_are_refused(tmp_path: Path) -> None:
+    path = zipped(tmp_path, ("det.onnx", GRAPH * 100))
+    whole = path.read_bytes()
+    flagged = bytearray(whole)
+    for position in (6, flagged.index(b"PK\x01\x02") + 8):
+        flagged[position] |= 1
+    broken = bytearray(whole)
+    broken[45] ^= 0xFF
+    for number, data in enumerate((bytes(flagged), bytes(broken), whole[:-30], b"", b"PK" * 50)):
+        path.write_bytes(data)
+        into = tmp_path / f"into-{number}"
+        into.mkdir()
+        with pytest.raises(PackError, match="encrypted" if number == 0 else "cannot be read"):
+            unpack(path, into)
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_what_is_neither_stored_nor_deflated_is_refused(tmp_path: Path, method: int) -> None:
+    path = tmp_path / "pack.zip"
+    with zipfile.ZipFile(path, "w", method) as file:
+        file.writestr("det.onnx", GRAPH)
+    with pytest.raises(PackError, match=r"neither stored nor deflated: 'det\.onnx'"):
+        unpack(path, target(tmp_path))
+
+
+def test_a_name_that_goes_on_after_a_nul_is_refused(tmp_path: Path) -> None:
+    path = zipped(tmp_path, ("det.onnx-txt", GRAPH))
+    path.write_bytes(path.read_bytes().replace(b"det.onnx-txt", b"det.onnx\0txt"))
+    with pytest.raises(PackError, match=r"cannot be printed: 'det.onnx\\x00txt'"):
+        unpack(path, target(tmp_path))
+
+
+def test_an_archive_of_several_disks_is_one_and_is_refused(tmp_path: Path) -> None:
+    path = zipped(tmp_path, ("det.onnx", GRAPH))
+    data = path.read_bytes()
+    end = data.index(b"PK\x05\x06")
+    locator = b"PK\x06\x07" + struct.pack("<LQL", 1, end, 2)
+    path.write_bytes(data[:end] + locator + data[end:])
+    assert is_archive(path)
+    with pytest.raises(PackError, match="cannot be read"):
+        unpack(path, target(tmp_path))
+
+
+METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("seed", range(20))
+def test_no_damage_writes_outside_or_fails_otherwise(
+    tmp_path: Path, seed: int, method: int
+) -> None:
+    generator = random.Random(seed)
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", method) as file:
+        file.writestr("a/det.onnx", generator.randbytes(50) * 10)
+        file.writestr("a/README", GRAPH)
+        file.writestr("a/\N{GREEK SMALL LETTER ALPHA}.onnx", GRAPH)
+    whole = buffer.getvalue()
+    path = tmp_path / "pack.zip"
+    into = target(tmp_path)
+    for _ in range(20):
+        data = bytearray(whole)
+        for _ in range(generator.randint(1, 4)):
+            data[generator.randrange(len(data))] = generator.randrange(256)
+        path.write_bytes(data)
+        try:
+            files, _ = unpack(path, into)
+        except PackError:
+            files = list(into.iterdir())
+        assert all(file.parent == into for file in files)
+        assert sorted(entry.name for entry in tmp_path.iterdir()) == ["into", "pack.zip"]
+        for file in into.iterdir():
+            file.unlink()

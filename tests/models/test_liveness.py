@@ -1,0 +1,371 @@
+"""Liveness graphs: which file is one, what it is fed, and what its output means."""
+
+import io
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+from models.alignment import template
+from models.errors import ModelError, NoFace, PackError
+from models.liveness import LivenessInput, box_region, crop_face, square_region
+from models.pack import FacePolicy, ModelPack
+from models.pack_graphs import inspect
+from models.photos import embed_photos
+from models.sessions import Session
+from models.signature import Role
+from tests.models.graphs import (
+    fixed_face_detector,
+    mean_liveness,
+    pooling_embedder,
+    write_pack,
+)
+
+BOX = (30.0, 25.0, 80.0, 95.0)
+# The live class reads blue, the first attack red, the second is a constant 0.
+WEIGHTS = np.array([[0.0, 0.02, 0.0], [0.0, 0.0, 0.0], [0.02, 0.0, 0.0]])
+NAMED = "2.7_80x80_net"
+NET = mean_liveness(WEIGHTS)
+TWO = mean_liveness(np.array([[2.0, 0.0], [0.0, 1.0], [0.0, 0.0]]), size=64)
+
+
+def stated(**keys: object) -> str:
+    lines = [f"{key} = {value}" for key, value in keys.items()]
+    return "\n".join(["[[liveness]]", *lines, ""])
+
+
+DIFFERENCE = stated(
+    file='"two.onnx"',
+    crop_scale=1.5,
+    crop='"square"',
+    channel_order='"rgb"',
+    input_range="[0, 1]",
+    live_class=0,
+    score='"difference"',
+)
+
+
+def picture(seed: int = 0, height: int = 112, width: int = 112) -> np.ndarray:
+    """Smooth colours that differ everywhere."""
+    small = np.random.default_rng(seed).integers(30, 226, (5, 5, 3), dtype=np.uint8)
+    return cv2.resize(small, (width, height), interpolation=cv2.INTER_CUBIC)
+
+
+def png(pixels: np.ndarray) -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, "PNG")
+    return file.getvalue()
+
+
+def pack_of(folder, toml: str = "", **graphs: bytes) -> ModelPack:
+    detector = fixed_face_detector(BOX, template(112))
+    write_pack(folder, emb=pooling_embedder(), det=detector, **graphs)
+    if toml:
+        (folder / "pack.toml").write_text(toml)
+    return ModelPack.load(folder)
+
+
+def box_crop(frame: np.ndarray, box, scale: float) -> np.ndarray:
+    """The rule of minivision, in integers of one axis after the other."""
+    ends = []
+    for axis, length in ((1, frame.shape[0]), (0, frame.shape[1])):
+        side = box[axis + 2] - box[axis]
+        least = min(
+            scale,
+            (frame.shape[0] - 1) / (box[3] - box[1]),
+            (frame.shape[1] - 1) / (box[2] - box[0]),
+        )
+        low = box[axis] + side / 2 - side * least / 2
+        high = box[axis] + side / 2 + side * least / 2
+        if low < 0:
+            low, high = 0, high - low
+        if high > length - 1:
+            low, high = low - (high - length + 1), length - 1
+        ends.append((max(0, int(low + 1e-9)), min(length, int(high + 1e-9) + 1)))
+    (top, bottom), (left, right) = ends
+    return frame[top:bottom, left:right]
+
+
+def expects(**changes: object) -> LivenessInput:
+    plain = {
+        "crop_scale": 2.0,
+        "crop": "box",
+        "size": 80,
+        "channel_order": "bgr",
+        "input_range": (0.0, 255.0),
+        "live_class": 1,
+        "score": "softmax",
+    }
+    return LivenessInput(**(plain | changes))
+
+
+@pytest.mark.parametrize(
+    ("frame", "box", "scale", "region"),
+    [
+        # In the middle: about the centre.
+        ((100, 100), (40, 40, 60, 60), 2.0, (30, 30, 71, 71)),
+        # Another shape of the box is kept.
+        ((200, 200), (90, 80, 110, 120), 2.0, (80, 60, 121, 141)),
+        # At a border the crop is moved, not cut: 80 x 80 both.
+        ((100, 100), (0, 0, 20, 20), 4.0, (0, 0, 81, 81)),
+        ((100, 100), (80, 80, 100, 100), 4.0, (19, 19, 100, 100)),
+        # Larger than the frame: limited by its shorter side, 49.5 times 20.
+        ((1000, 100), (490, 40, 510, 60), 8.0, (450, 0, 550, 100)),
+    ],
+)
+def test_a_box_grows_into_the_frame(frame, box, scale, region):
+    assert box_region(frame, box, scale) == region
+
+
+@given(
+    st.integers(20, 400),
+    st.integers(20, 400),
+    st.floats(0.6, 6),
+    st.lists(st.floats(0, 1), min_size=4, max_size=4),
+)
+def test_the_region_of_a_box_is_in_the_frame_and_keeps_its_shape(width, height, scale, places):
+    x1, x2 = sorted(np.array(places[:2]) * (width - 2))
+    y1, y2 = sorted(np.array(places[2:]) * (height - 2))
+    box = (x1, y1, x2 + 2, y2 + 2)
+    left, top, right, bottom = box_region((width, height), box, scale)
+    assert 0 <= left < right <= width
+    assert 0 <= top < bottom <= height
+    sides = (box[2] - box[0], box[3] - box[1])
+    most = min(scale, (width - 1) / sides[0], (height - 1) / sides[1])
+    assert right - left == pytest.approx(sides[0] * most + 1, abs=1.01)
+    assert bottom - top == pytest.approx(sides[1] * most + 1, abs=1.01)
+
+
+@pytest.mark.parametrize("scale", [1.0, 2.7, 4.0])
+@pytest.mark.parametrize("box", [BOX, (0.0, 0.0, 40.0, 50.0), (75.5, 60.25, 118.0, 112.0)])
+def test_the_crop_of_a_box(box, scale):
+    frame = picture(1, 112, 130)
+    crop = crop_face(frame, box, expects(crop_scale=scale))
+    cut = box_crop(frame, box, scale)
+    expected = cv2.resize(cut, (80, 80), interpolation=cv2.INTER_LINEAR)
+    assert np.array_equal(crop, expected)
+
+
+def test_a_square_inside_the_frame_is_reduced_by_areas():
+    frame = picture(2, 200, 200)
+    box = (70.0, 60.0, 130.0, 140.0)
+    assert square_region(box, 1.5) == (40, 40, 160, 160)
+    crop = crop_face(frame, box, expects(crop="square", crop_scale=1.5, size=60))
+    blocks = frame[40:160, 40:160].astype(np.float64).reshape(60, 2, 60, 2, 3).mean(axis=(1, 3))
+    assert np.abs(crop - blocks).max() <= 0.5 + 1e-9
+
+
+@pytest.mark.parametrize(
+    ("box", "off"),
+    [
+        ((0.0, 0.0, 40.0, 80.0), 0),
+        ((120.0, 130.0, 190.0, 199.0), 0),
+        # So large a square is reduced first: the border lies on its reduced pixels.
+        ((0.0, 0.0, 199.0, 199.0), 6),
+    ],
+)
+def test_a_square_over_the_border_mirrors_the_frame(box, off):
+    frame = picture(3, 200, 200)
+    left, top, right, bottom = square_region(box, 1.5)
+    pad = 200
+    mirrored = np.pad(frame, ((pad, pad), (pad, pad), (0, 0)), mode="reflect")
+    cut = mirrored[top + pad : bottom + pad, left + pad : right + pad]
+    expected = cv2.resize(cut, (64, 64), interpolation=cv2.INTER_AREA).astype(int)
+    crop = crop_face(frame, box, expects(crop="square", crop_scale=1.5, size=64)).astype(int)
+    assert np.abs(crop - expected).max() <= off
+
+
+def test_the_memory_of_a_square_does_not_depend_on_how_far_it_reaches():
+    thin = picture(4, 4, 4000)
+    crop = crop_face(thin, (0.0, 0.0, 4000.0, 4.0), expects(crop="square", crop_scale=8.0))
+    assert crop.shape == (80, 80, 3)
+
+
+@pytest.mark.parametrize(
+    "box",
+    [
+        (10.0, 10.0, 10.0, 30.0),
+        (-30.0, 5.0, 0.0, 30.0),
+        (5.0, 112.0, 9.0, 130.0),
+        (float("nan"), 1.0, 9.0, 9.0),
+    ],
+)
+def test_a_box_outside_the_frame_is_refused(box):
+    with pytest.raises(ModelError, match="no area inside"):
+        crop_face(picture(), box, expects())
+
+
+def softmax(logits: np.ndarray) -> np.ndarray:
+    shares = np.exp(logits - logits.max())
+    return shares / shares.sum()
+
+
+def test_minifasnet_is_fed_bgr_from_0_to_255_and_its_share_of_class_1_is_the_score(tmp_path):
+    pack = pack_of(tmp_path, **{NAMED: NET})
+    frame = picture(5)
+    crop = cv2.resize(box_crop(frame, BOX, 2.7), (80, 80), interpolation=cv2.INTER_LINEAR)
+    means = crop.astype(np.float64).mean(axis=(0, 1))[::-1]
+    expected = softmax(means @ WEIGHTS)[1]
+    assert pack.liveness.score(frame, BOX) == pytest.approx(expected, abs=1e-5)
+    assert 0.05 < expected < 0.95
+
+
+def test_a_softmax_in_the_graph_is_not_taken_twice(tmp_path):
+    inside = pack_of(tmp_path / "a", **{NAMED: mean_liveness(WEIGHTS, softmax=True)})
+    outside = pack_of(tmp_path / "b", **{NAMED: NET})
+    scores = [pack.liveness.score(picture(5), BOX) for pack in (inside, outside)]
+    assert scores[0] == pytest.approx(scores[1], abs=1e-5)
+
+
+def test_several_graphs_are_averaged(tmp_path):
+    names = (NAMED, "4_0_0_80x80_net")
+    other = mean_liveness(WEIGHTS[:, [1, 0, 2]])
+    graphs = dict(zip(names, (NET, other), strict=True))
+    alone = [
+        pack_of(tmp_path / name, **{name: graph}).liveness.score(picture(6), BOX)
+        for name, graph in graphs.items()
+    ]
+    both = pack_of(tmp_path / "both", **graphs).liveness
+    assert both.score(picture(6), BOX) == pytest.approx(np.mean(alone))
+    assert abs(alone[0] - alone[1]) > 0.01
+    assert [graph.expects.crop_scale for graph in both.members] == [2.7, 4.0]
+
+
+def test_two_logits_as_pack_toml_states_them(tmp_path):
+    pack = pack_of(tmp_path, DIFFERENCE, two=TWO)
+    frame = picture(7)
+    left, top, right, bottom = square_region(BOX, 1.5)
+    assert 0 <= left < right <= 112
+    assert 0 <= top < bottom <= 112
+    cut = frame[top:bottom, left:right]
+    crop = cv2.resize(cut, (64, 64), interpolation=cv2.INTER_AREA).astype(np.float64) / 255
+    red, green, _ = crop.mean(axis=(0, 1))
+    assert pack.liveness.score(frame, BOX) == pytest.approx(2 * red - green, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("name", "scale"),
+    [
+        ("2.7_80x80_MiniFASNetV2", 2.7),
+        ("4_0_0_80x80_MiniFASNetV1SE", 4.0),
+        ("minifasnet_v1se_4.0_80x80", 4.0),
+        ("minifasnet_v2_2.7_80x80", 2.7),
+    ],
+)
+def test_the_scale_in_the_name_that_the_authors_give(tmp_path, name, scale):
+    assert pack_of(tmp_path, **{name: NET}).liveness.members[0].expects.crop_scale == scale
+
+
+def test_pack_toml_wins_over_the_name(tmp_path):
+    toml = stated(file=f'"{NAMED}.onnx"', crop_scale=3.0)
+    assert pack_of(tmp_path, toml, **{NAMED: NET}).liveness.members[0].expects.crop_scale == 3
+
+
+@pytest.mark.parametrize(
+    ("toml", "graphs", "said"),
+    [
+        ("", {"net": NET}, r"net\.onnx.*crop_scale in pack\.toml"),
+        (stated(file='"gone.onnx"'), {NAMED: NET}, r"gone\.onnx"),
+        (stated(file=f'"{NAMED}.onnx"', live_class=3), {NAMED: NET}, "3 classes.*live_class 3"),
+        (stated(file=f'"{NAMED}.onnx"', score='"difference"'), {NAMED: NET}, "two logits"),
+        (stated(file=f'"{NAMED}.onnx"', input_size=96), {NAMED: NET}, "takes 80 x 80"),
+        (DIFFERENCE, {NAMED: NET, "two": TWO}, "different units.*two"),
+        (stated(file='"emb.onnx"', crop_scale=2), {}, "no embedder"),
+    ],
+)
+def test_mistakes_are_named(tmp_path, toml, graphs, said):
+    with pytest.raises(PackError, match=said):
+        _ = pack_of(tmp_path, toml, **graphs).liveness
+
+
+def test_graphs_are_loaded_when_they_are_first_asked_for(tmp_path, monkeypatch):
+    started = []
+    load = Session.load
+    monkeypatch.setattr(Session, "load", lambda self: started.append(self.name) or load(self))
+    pack = pack_of(tmp_path, **{NAMED: NET})
+    data = png(picture(8))
+    pack.embed_photo(data, quality=None)
+    assert f"{NAMED}.onnx" not in started
+    for _ in range(2):
+        pack.embed_photo(data, quality=None, liveness=True)
+    assert started.count(f"{NAMED}.onnx") == 1
+
+
+def test_liveness_needs_the_whole_frame(tmp_path):
+    write_pack(tmp_path, emb=pooling_embedder(), **{NAMED: NET})
+    with pytest.raises(PackError, match="no detector"):
+        _ = ModelPack.load(tmp_path).liveness
+    assert ModelPack.load(tmp_path / "emb.onnx").liveness is None
+
+
+def test_a_graph_of_two_values_is_told_of_pack_toml(tmp_path):
+    write_pack(tmp_path, mask=mean_liveness(WEIGHTS[:, :2], size=112))
+    assert [(g.role, "[[liveness]]" in g.reason) for g in inspect(tmp_path)] == [
+        (Role.UNKNOWN, True)
+    ]
+
+
+def test_a_threshold_belongs_to_the_file_and_to_what_it_is_fed(tmp_path):
+    packs = [
+        pack_of(tmp_path / "a", **{NAMED: NET}),
+        pack_of(tmp_path / "b", **{"2.7_80x80_renamed": NET}),
+        pack_of(tmp_path / "c", **{"4.0_80x80_net": NET}),
+        pack_of(tmp_path / "d", **{NAMED: mean_liveness(WEIGHTS / 2)}),
+    ]
+    ids = [pack.liveness.graphs for pack in packs]
+    assert ids[0] == ids[1]
+    assert len(set(ids)) == 3
+
+
+def test_a_photo_is_decoded_and_detected_once(tmp_path, monkeypatch):
+    pack = pack_of(tmp_path, **{NAMED: NET})
+    detect, calls = ModelPack.detect, []
+    monkeypatch.setattr(
+        ModelPack, "detect", lambda self, image: calls.append(1) or detect(self, image)
+    )
+    data = png(picture(8))
+    plain = pack.embed_photo(data, quality=None)
+    sample = pack.embed_photo(data, quality=None, liveness=True)
+    assert len(calls) == 2
+    assert plain.liveness is None
+    assert sample.liveness == pytest.approx(pack.liveness.score(picture(8), BOX), abs=1e-4)
+    assert np.array_equal(sample.embedding, plain.embedding)
+    assert sample.box == pytest.approx(BOX, abs=1e-3)
+    several = embed_photos(pack, [data, data], quality=None, liveness=True)
+    assert [one.liveness for one in several] == [sample.liveness] * 2
+
+
+def test_a_pack_without_a_graph_has_no_liveness_and_says_so(tmp_path):
+    pack = pack_of(tmp_path)
+    assert pack.liveness is None
+    with pytest.raises(PackError, match="no liveness graph"):
+        pack.embed_photo(png(picture()), quality=None, liveness=True)
+    with pytest.raises(NoFace):
+        pack.embed_photo(png(np.zeros((112, 112, 3), np.uint8)), quality=None)
+
+
+SE = "minifasnet_v2se_1.5_128x128.onnx"
+
+
+@pytest.mark.parametrize("two_logits", [False, True])
+def test_real_graphs_tell_their_authors_photos_apart(
+    minifasnet_pack_dir, mbf_pack_dir, shared_data, tmp_path, two_logits
+):
+    folder = minifasnet_pack_dir
+    if two_logits:
+        folder = tmp_path / "pack"
+        shutil.copytree(mbf_pack_dir, folder, copy_function=shutil.copyfile)
+        folder.chmod(0o755)
+        shutil.copyfile(shared_data / "packs" / "liveness_minifasnet_se" / SE, folder / SE)
+        (folder / "pack.toml").write_text(DIFFERENCE.replace("two.onnx", SE))
+    pack = ModelPack.load(folder)
+    for photo in sorted((shared_data / "packs" / "liveness").glob("*.jpg")):
+        sample = pack.embed_photo(
+            photo.read_bytes(), policy=FacePolicy.LARGEST, quality=None, liveness=True
+        )
+        looks_live = sample.liveness > (0 if two_logits else 0.5)
+        assert looks_live == photo.stem.startswith("image_T")

@@ -1,0 +1,175 @@
+"""The page asks for head movements where the level does, and takes frames of them by the clock."""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from PIL import Image
+from playwright.sync_api import expect
+
+from tests.api.deployment import deploy, images
+from tests.api.http.test_passive_liveness import calibrated
+from tests.marked_heads import draw, encoded, frame, head, write_marked_pack
+from tests.web.access import assert_accessible
+from tests.web.browser_tab import BrowserTab
+from tests.web.camera import SIZE, FakeCamera
+from tests.web.conftest import OpenTab
+from tests.web.moving_head import camera_script
+from tests.web.served import Served, serving
+
+pytestmark = pytest.mark.long
+
+COUNT = """
+window.sentFrames = [];
+window.spokenWords = [];
+document.addEventListener("DOMContentLoaded", () => new MutationObserver(() => {
+  const words = document.querySelector(".movement")?.textContent;
+  if (words && words !== window.spokenWords.at(-1)) window.spokenWords.push(words);
+}).observe(document.body, { subtree: true, childList: true, characterData: true }));
+const send = window.fetch;
+window.fetch = (path, options) => {
+  if (path.endsWith("/verify")) window.sentFrames.push(options.body.getAll("images").length);
+  return send(path, options);
+};
+"""
+ANNA = 1
+START = "Start head movements"
+
+
+@pytest.fixture(scope="module")
+def asking(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """A service whose default level asks for a challenge, and another level does not."""
+    folder = tmp_path_factory.mktemp("asking")
+    pack = write_marked_pack(folder / "pack")
+    deployment = deploy(folder, pack=pack)
+    flags = ["--data-dir", str(folder / "data"), "--pack", str(pack)]
+    flags += ["--liveness-levels", "fmr-1e-3=active", "--lockout-after", "0"]
+    with serving(folder, deployment.settings, *flags, token=deployment.token) as served:
+        with served.client() as client:
+            files = images(frame(person=ANNA))
+            assert client.put("/v1/subjects/anna/enrollment", files=files).status_code == 201
+        yield served
+
+
+def opened(open_tab: OpenTab, served: Served, shown: str | None = None) -> BrowserTab:
+    tab = open_tab(served, sign_in=None)
+    tab.page.add_init_script(COUNT)
+    if shown is not None:
+        tab.page.add_init_script(camera_script(shown, person=ANNA))
+    tab.sign_in(served.token)
+    tab.page.get_by_label("Person's id").fill("anna")
+    return tab
+
+
+def test_who_follows_the_movements_is_accepted(open_tab: OpenTab, asking: Served) -> None:
+    tab = opened(open_tab, asking, "(asked) => asked")
+    page = tab.page
+    expect(page.locator(".picker")).to_be_hidden()
+    expect(page.get_by_text("cannot turn your head, ask the operator")).to_be_visible()
+    # No level is advertised as a way around.
+    expect(page.get_by_text("choose a level")).to_have_count(0)
+    assert_accessible(tab, "challenge-before")
+    with page.expect_response(re.compile("/v1/challenges$")) as given:
+        page.get_by_role("button", name=START).click()
+    expect(page.locator(".movement")).to_be_visible()
+    expect(page.locator(".outline")).to_be_visible()
+    asked = given.value.json()["movements"]
+    expect(page.locator(".verdict.accept")).to_contain_text("Accepted")
+    expect(page.locator(".verdict")).to_contain_text("passed")
+    assert page.evaluate("window.sentFrames") == [10]
+    poses = page.evaluate("window.shownPoses")
+    assert poses == ["front", *(pose for each in asked for pose in (each, "front"))]
+    # Who was asked to come closer is told to move back.
+    told = " ".join(page.evaluate("window.spokenWords"))
+    assert ("Move back" in told) == ("come_closer" in asked) == ("Come closer" in told)
+    # The camera is off, and the form is there again.
+    assert page.evaluate("window.cameraTrack.readyState") == "ended"
+    expect(page.locator(".movement")).to_be_hidden()
+    expect(page.get_by_role("button", name=START)).to_be_enabled()
+
+
+def test_who_sits_still_or_turns_the_wrong_way_is_rejected(
+    open_tab: OpenTab, asking: Served
+) -> None:
+    other = '(asked) => ({turn_left: "turn_right", look_up: "look_down"})[asked] ?? '
+    wrong = other + '(asked === "front" ? asked : "turn_left")'
+    for shown, why in (
+        ('() => "front"', "the head did not turn"),
+        (wrong, re.compile("a movement was not seen|another order")),
+    ):
+        tab = opened(open_tab, asking, shown)
+        tab.page.get_by_role("button", name=START).click()
+        expect(tab.page.locator(".verdict.reject")).to_contain_text(why)
+        expect(tab.page.locator(".verdict")).to_contain_text("a living person")
+        expect(tab.page.locator(".verdict")).to_contain_text("Follow each movement")
+
+
+def test_a_photo_before_the_browsers_own_camera_is_rejected(
+    open_tab: OpenTab, asking: Served, camera: FakeCamera, tmp_path: Path
+) -> None:
+    still = tmp_path / "still.png"
+    Image.fromarray(draw(head(), ANNA)).resize((SIZE[1], SIZE[1])).save(still)
+    camera.shows(still)
+    tab = opened(open_tab, asking)
+    tab.page.get_by_role("button", name=START).click()
+    expect(tab.page.locator(".verdict.reject")).to_contain_text("the head did not turn")
+
+
+def test_a_level_that_asks_for_none_takes_photos(
+    open_tab: OpenTab, asking: Served, tmp_path: Path
+) -> None:
+    photo = tmp_path / "anna.png"
+    photo.write_bytes(frame(person=ANNA))
+    tab = opened(open_tab, asking)
+    page = tab.page
+    page.get_by_label("Level").select_option("fmr-1e-2")
+    expect(page.get_by_role("button", name=START)).to_have_count(0)
+    page.get_by_label("Files").check()
+    page.get_by_label("Photos: JPEG").set_input_files(photo)
+    page.get_by_role("button", name="Verify", exact=True).click()
+    expect(page.locator(".verdict.accept")).to_contain_text("Accepted")
+
+
+def test_who_sends_photos_is_not_told_to_move(
+    open_tab: OpenTab, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    deployment = calibrated(tmp_path)
+    flags = ["--data-dir", str(deployment.settings.data_dir)]
+    flags += ["--pack", str(deployment.settings.pack), "--liveness", "passive"]
+    dark = tmp_path / "dark.png"
+    dark.write_bytes(encoded(draw(head(), ANNA, background=0)))
+    with serving(tmp_path, deployment.settings, *flags, token=deployment.token) as served:
+        with served.client() as client:
+            files = images(frame(person=ANNA))
+            assert client.put("/v1/subjects/anna/enrollment", files=files).status_code == 201
+        page = opened(open_tab, served).page
+        page.get_by_label("Files").check()
+        page.get_by_label("Photos: JPEG").set_input_files(dark)
+        page.get_by_role("button", name="Verify", exact=True).click()
+        expect(page.locator(".verdict.reject")).to_contain_text("Take new photos")
+        expect(page.locator(".verdict")).not_to_contain_text("movement")
+
+
+def test_leaving_ends_the_camera_and_sends_nothing(open_tab: OpenTab, asking: Served) -> None:
+    tab = opened(open_tab, asking, "(asked) => asked")
+    page = tab.page
+    page.get_by_role("button", name=START).click()
+    expect(page.locator(".movement")).to_be_visible()
+    tab.open("People")
+    assert page.evaluate("window.cameraTrack.readyState") == "ended"
+    page.wait_for_timeout(3000)
+    assert not any(url.endswith(("/v1/challenges", "/verify")) for url in tab.requests)
+
+
+def test_a_camera_that_is_refused_is_said(open_tab: OpenTab, asking: Served) -> None:
+    tab = open_tab(asking, sign_in=None)
+    tab.page.add_init_script(
+        "navigator.mediaDevices.getUserMedia = async () => "
+        '{ throw new DOMException("no", "NotAllowedError"); };'
+    )
+    tab.sign_in(asking.token)
+    tab.page.get_by_label("Person's id").fill("anna")
+    tab.page.get_by_role("button", name=START).click()
+    expect(tab.page.get_by_role("alert")).to_contain_text("Camera access was denied.")
+    expect(tab.page.get_by_role("button", name=START)).to_be_enabled()

@@ -1,0 +1,290 @@
+"""The document of a liveness evaluation, ``results.json``, and its report in Markdown."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from models.liveness import PassiveLiveness
+from templates.contract.document import Contract
+from templates.contract.levels import Rate
+from verify.evaluation.liveness.rates import apcer, bpcer, non_response
+from verify.evaluation.liveness.scores import ScoredSet
+from verify.evaluation.liveness.verified import VerifiedSet
+from verify.evaluation.markdown_cells import (
+    code,
+    count,
+    interval_cell,
+    percent,
+    plain,
+    significant,
+    table,
+)
+from verify.evaluation.results import Model, software
+from verify.evaluation.rows import Json
+from verify.metrics import equal_error_rate, error_curve
+
+FORMAT = "veilface liveness evaluation"
+VERSION = 1
+CONTRACT_POINT = "contract"
+LISTED_FAILURES = 20
+CURVE_POINTS = 400
+
+
+@dataclass(frozen=True)
+class OperatingPoint:
+    """A threshold and where it comes from: ``contract``, or ``bpcer-0.05`` of these photos."""
+
+    name: str
+    threshold: float
+
+
+def document(
+    scored: ScoredSet,
+    model: Model,
+    liveness: PassiveLiveness,
+    points: Sequence[OperatingPoint],
+    *,
+    contract: Contract | None,
+    verified: VerifiedSet | None,
+    unverified: str | None,
+    refused: Sequence[str],
+) -> Json:
+    """Put everything together.
+
+    Parameters
+    ----------
+    verified
+        Decisions of the whole verification; None where they were not measured, and ``unverified``
+        says why.
+    refused
+        Why operating points that were asked for are not there.
+    """
+    presented = scored.presented
+    species = [name for name in presented.species if len(scored.scored(name)[0])]
+    rows = [row for point in points for row in _rows(scored, species, point, verified)]
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "software": software(),
+        "model": {
+            **model.json(),
+            "liveness": [graph.as_dict() for graph in liveness.members],
+        },
+        "contract": None if contract is None else _contract(contract),
+        "dataset": {
+            "name": presented.name,
+            "kind": presented.kind,
+            "subjects": presented.subjects,
+            "live": len(scored.rows(None)),
+            "attacks": {name: len(scored.rows(name)) for name in presented.species},
+            "bpnrr": _rate(non_response(scored, None)),
+            "apnrr": {name: _rate(non_response(scored, name)) for name in presented.species},
+        },
+        "failures": [
+            {"image": failure.path.name, "code": failure.code, "reason": failure.reason}
+            for failure in scored.failures
+        ],
+        "rows": rows,
+        "eer": {
+            name: equal_error_rate(scored.scored(None)[0], scored.scored(name)[0])[0]
+            for name in species
+        },
+        "verification": _verification(verified, unverified),
+        "refused": list(refused),
+        "curves": [_curve(scored, name) for name in species],
+    }
+
+
+def _contract(contract: Contract) -> Json:
+    return {
+        "contract_id": contract.contract_id,
+        "liveness": None if contract.liveness is None else contract.liveness.to_json(),
+    }
+
+
+def _verification(verified: VerifiedSet | None, unverified: str | None) -> Json:
+    if verified is None:
+        return {"measured": False, "reason": unverified}
+    return {
+        "measured": True,
+        "level": verified.level,
+        "target_fmr": verified.target_fmr,
+        "enrolled_subjects": verified.enrolled,
+        "enrolled_photos": verified.enrolled_photos,
+        "left_out": list(verified.left_out),
+        "frr": _rate(verified.false_rejections(None)),
+    }
+
+
+def _rows(
+    scored: ScoredSet,
+    species: Sequence[str],
+    point: OperatingPoint,
+    verified: VerifiedSet | None,
+) -> list[Json]:
+    """Errors of one operating point: a row for each species, the worst marked."""
+    passed = {name: apcer(scored, name, point.threshold) for name in species}
+    worst = max(species, key=lambda name: passed[name].value)
+    rejected = bpcer(scored, point.threshold)
+    return [
+        {
+            "dataset": scored.presented.name,
+            "operating_point": point.name,
+            "threshold": point.threshold,
+            "species": name,
+            "worst": name == worst,
+            "apcer": _rate(passed[name]),
+            "bpcer": _rate(rejected),
+            "iapmr_without_liveness": _verified(verified, name, None),
+            "iapmr": _verified(verified, name, point.threshold),
+            "frr": None if verified is None else _rate(verified.false_rejections(point.threshold)),
+        }
+        for name in species
+    ]
+
+
+def _verified(verified: VerifiedSet | None, species: str, threshold: float | None) -> Json | None:
+    return None if verified is None else _rate(verified.iapmr(species, threshold))
+
+
+def _rate(rate: Rate) -> Json:
+    return {"value": rate.value if rate.trials else None, **rate.to_json()}
+
+
+def _curve(scored: ScoredSet, species: str) -> Json:
+    """APCER and BPCER at every threshold, thinned to a size that a figure shows."""
+    curve = error_curve(scored.scored(None)[0], scored.scored(species)[0])
+    total = len(curve.thresholds)
+    kept = np.unique(np.linspace(0, total - 1, min(total, CURVE_POINTS)).round().astype(int))
+    return {
+        "species": species,
+        "apcer": curve.fmr[kept].tolist(),
+        "bpcer": curve.fnmr[kept].tolist(),
+    }
+
+
+def markdown(results: Json) -> str:
+    """Return the report. It has no date, so that the same run gives the same text."""
+    dataset = results["dataset"]
+    parts = [f"# Presentation attack detection: {plain(dataset['name'])}", _provenance(results)]
+    for name in dict.fromkeys(row["operating_point"] for row in results["rows"]):
+        rows = [row for row in results["rows"] if row["operating_point"] == name]
+        parts += [f"## {_title(name)}", _headline(rows), _table(rows)]
+    parts += ["## Through the whole verification", *_through(results)]
+    parts += ["## Photos without a face", *_non_responses(results)]
+    if results["refused"]:
+        parts.append("## Not reported")
+        parts.append("\n".join(f"- {plain(sentence)}" for sentence in results["refused"]))
+    parts.append(HOW_TO_READ)
+    return "\n\n".join(parts) + "\n"
+
+
+HOW_TO_READ = """## How to read this
+
+- APCER: share of the attack photos of one species that are taken for live. The worst species is the headline, since an attacker chooses. BPCER: share of the live photos that are taken for attacks. ISO/IEC 30107-3.
+- In brackets the 95 % interval: people are resampled where they are known (never narrower than Wilson's), else Wilson's, as if the photos were independent. In parentheses errors of photos.
+- A threshold that was set on these very photos flatters: apply one of other photos, `--contract`.
+- D-EER: where APCER and BPCER are equal, or nearest to it.
+- IAPMR: share of the attacks with a photo of an enrolled person that the whole verification accepts for that person; a photo without a face is not accepted.
+- Another camera, light or attack gives other rates (docs/liveness.md)."""  # noqa: E501
+
+
+def _title(name: str) -> str:
+    if name == CONTRACT_POINT:
+        return "At the contract's threshold"
+    return f"Threshold set on these photos, BPCER at most {percent(float(name.split('-', 1)[1]))} %"
+
+
+def _provenance(results: Json) -> str:
+    model, dataset = results["model"], results["dataset"]
+    lines = [f"Model pack: {plain(model.get('pack'))}"]
+    lines += [
+        f"Liveness graph: {code(graph['file'])}, crop {graph['crop']} × {graph['crop_scale']:g}, "
+        f"score {graph['score']}, SHA-256 {graph['sha256'][:12]}"
+        for graph in model["liveness"]
+    ]
+    attacks = ", ".join(
+        f"{plain(name)} {count(photos)}" for name, photos in dataset["attacks"].items()
+    )
+    people = "subjects not known"
+    if dataset["subjects"] is not None:
+        people = f"{count(dataset['subjects'])} subjects"
+    lines.append(f"Photos: {count(dataset['live'])} live; attacks: {attacks}; {people}")
+    return "\n".join(f"- {line}" for line in lines)
+
+
+def _headline(rows: Sequence[Json]) -> str:
+    worst = next(row for row in rows if row["worst"])
+    return (
+        f"**APCER, in %: {interval_cell(worst['apcer'])}** (worst species: "
+        f"{plain(worst['species'])}); BPCER: {interval_cell(worst['bpcer'])}; threshold "
+        f"{significant(worst['threshold'])}."
+    )
+
+
+def _table(rows: Sequence[Json]) -> str:
+    return table(
+        ["species", "APCER %", "BPCER %"],
+        [
+            [plain(row["species"]), interval_cell(row["apcer"]), interval_cell(row["bpcer"])]
+            for row in rows
+        ],
+        [True, False, False],
+    )
+
+
+def _through(results: Json) -> list[str]:
+    facts = results["verification"]
+    if not facts["measured"]:
+        return [f"IAPMR was not measured: {plain(facts['reason'])}."]
+    left_out = (
+        f"; left out: {', '.join(map(plain, facts['left_out']))}" if facts["left_out"] else ""
+    )
+    lines = [
+        [
+            _point(row["operating_point"]),
+            plain(row["species"]),
+            interval_cell(row["iapmr_without_liveness"]),
+            interval_cell(row["iapmr"]),
+            interval_cell(row["frr"]),
+        ]
+        for row in results["rows"]
+    ]
+    return [
+        f"Level {plain(facts['level'])}; {count(facts['enrolled_subjects'])} subjects enrolled by "
+        f"{count(facts['enrolled_photos'])} live photos each{left_out}. FRR of their other live "
+        f"photos without liveness, in %: {interval_cell(facts['frr'])}.",
+        table(
+            ["threshold", "species", "IAPMR % without liveness", "IAPMR %", "FRR %"],
+            lines,
+            [True, True, False, False, False],
+        ),
+    ]
+
+
+def _point(name: str) -> str:
+    return name if name == CONTRACT_POINT else f"{name} of these photos"
+
+
+def _non_responses(results: Json) -> list[str]:
+    dataset = results["dataset"]
+    lines = [["live (BPNRR)", interval_cell(dataset["bpnrr"]), ""]]
+    lines += [
+        [f"{plain(name)} (APNRR)", interval_cell(rate), percent(results["eer"].get(name))]
+        for name, rate in dataset["apnrr"].items()
+    ]
+    parts = [
+        "They have no score, and are in neither APCER nor BPCER.",
+        table(["photos", "without a face %", "D-EER %"], lines, [True, False, False]),
+    ]
+    failures = results["failures"]
+    if failures:
+        listed = [
+            f"- {code(failure['image'])}: {plain(failure['code'])}"
+            for failure in failures[:LISTED_FAILURES]
+        ]
+        if len(failures) > LISTED_FAILURES:
+            listed.append(f"- and {count(len(failures) - LISTED_FAILURES)} more, in results.json")
+        parts.append("\n".join(listed))
+    return parts

@@ -1,0 +1,180 @@
+"""Photos, or the frames of a challenge, to one probe, and whether a living person made them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.decoding import DEFAULT_LIMITS, ImageLimits
+from models.errors import FaceError, ModelError, PackError, PhotoRejected
+from models.faces import FaceCrop
+from models.head_pose import HeadPose, head_pose
+from models.pack import FacePolicy, ModelPack
+from models.photos import embed_photos
+from models.quality import DEFAULT_QUALITY, QualityLimits
+from templates.contract.document import Contract
+from templates.errors import Uncalibrated
+from templates.space.agreement import InconsistentImages, mean_embedding
+from verify.challenge import LivenessFailure, Movement, frontal_frames, movements_failure
+
+MAX_PROBE_PHOTOS = 5
+"""Photos, or embeddings, that one probe may be the mean of."""
+
+MOVING = QualityLimits(
+    min_score=0.0,
+    min_sharpness=0.0,
+    min_brightness=0.0,
+    max_brightness=255.0,
+    max_yaw=90.0,
+    max_pitch=90.0,
+    max_roll=180.0,
+)
+"""What every frame must reach; those that are compared must reach the limits of photos too."""
+
+
+@dataclass(frozen=True, eq=False)
+class PhotoProbe:
+    """What photos or frames come to.
+
+    Attributes
+    ----------
+    embedding
+        Mean of the photos, of frames of those that look ahead, (n,) float32, unit norm.
+    photos
+        How many these are.
+    failure
+        Why they are not taken for a living person's; None where nothing speaks against it.
+    """
+
+    embedding: NDArray[np.float32] = field(repr=False)
+    photos: int
+    failure: LivenessFailure | None
+
+
+def probe_of_photos(
+    pack: ModelPack,
+    contract: Contract,
+    photos: Sequence[bytes],
+    *,
+    passive: bool,
+    policy: FacePolicy = FacePolicy.SINGLE,
+    quality: QualityLimits | None = DEFAULT_QUALITY,
+    limits: ImageLimits = DEFAULT_LIMITS,
+) -> PhotoProbe:
+    """Average photos of one person; with `passive`, say whether they look live on average.
+
+    Raises
+    ------
+    PhotoRejected
+        Where one photo has no usable face.
+    InconsistentImages
+        Where the photos do not show one person.
+    """
+    samples = embed_photos(
+        pack, photos, policy=policy, quality=quality, limits=limits, liveness=passive
+    )
+    rows = np.stack([sample.embedding for sample in samples])
+    mean = mean_embedding(rows, consistency=contract.probe_consistency)
+    scores = [sample.liveness for sample in samples if sample.liveness is not None]
+    failure = passive_failure(contract, scores) if passive else None
+    return PhotoProbe(mean, len(photos), failure)
+
+
+def probe_of_frames(
+    pack: ModelPack,
+    contract: Contract,
+    frames: Sequence[bytes],
+    movements: Sequence[Movement],
+    *,
+    passive: bool,
+    policy: FacePolicy = FacePolicy.SINGLE,
+    limits: ImageLimits = DEFAULT_LIMITS,
+) -> PhotoProbe:
+    """Make one probe of the frames of a challenge, and hold them against it.
+
+    The first frames that look ahead are averaged; every frame must show the same person, by the
+    limit for photos of one probe. A failure is no error: the probe is compared all the same, so
+    that both take the same time.
+
+    Parameters
+    ----------
+    movements
+        What the challenge asked for.
+    passive
+        Whether the frames that are averaged must look live too.
+
+    Raises
+    ------
+    PhotoRejected
+        Where a frame has no usable face, or the first one is not good enough to be compared.
+    """
+    read = [
+        _read(pack, frame, place, len(frames), passive=passive, policy=policy, limits=limits)
+        for place, frame in enumerate(frames)
+    ]
+    poses = [pose for _, pose in read]
+    faces = [face for face, _ in read]
+    ahead = [
+        place for place in frontal_frames(poses) if place == 0 or _is_good(pack, faces[place])
+    ][:MAX_PROBE_PHOTOS]
+    # Both before they are joined: the time would tell which one failed.
+    failures = [movements_failure(poses, movements)]
+    if passive:
+        scores = [faces[place].liveness for place in ahead]
+        failures.append(passive_failure(contract, [s for s in scores if s is not None]))
+    embeddings = pack.embed(np.stack([face.crop for face in faces]))
+    consistency = contract.probe_consistency
+    try:
+        mean = mean_embedding(embeddings[ahead], consistency=consistency)
+        photos, one_person = len(ahead), float((embeddings @ mean).min()) >= consistency
+    except InconsistentImages:
+        mean, photos, one_person = embeddings[0], 1, False
+    failures.append(None if one_person else LivenessFailure.ANOTHER_PERSON)
+    return PhotoProbe(mean, photos, next((why for why in failures if why is not None), None))
+
+
+def passive_failure(contract: Contract, scores: Sequence[float]) -> LivenessFailure | None:
+    """Say whether photos fall below the contract's liveness threshold, by their mean score.
+
+    Raises
+    ------
+    Uncalibrated
+        Where the contract has no liveness threshold.
+    """
+    if contract.liveness is None or not scores:
+        raise Uncalibrated("the contract has no liveness threshold")
+    live = contract.liveness.is_live(float(np.mean(scores)))
+    return None if live else LivenessFailure.PASSIVE
+
+
+def _read(
+    pack: ModelPack,
+    data: bytes,
+    place: int,
+    count: int,
+    *,
+    passive: bool,
+    policy: FacePolicy,
+    limits: ImageLimits,
+) -> tuple[FaceCrop, HeadPose]:
+    """Read one frame, and drop its picture; the first one must be good enough to be compared."""
+    quality = DEFAULT_QUALITY if place == 0 else MOVING
+    try:
+        taken = pack.crop_photo(
+            data, policy=policy, quality=quality, limits=limits, liveness=passive
+        )
+        if taken.face is None:
+            raise PackError("A challenge needs a pack with a detector.")
+        return taken, head_pose(taken.face.keypoints)
+    except ModelError as error:
+        raise PhotoRejected(place, error, count=count) from error
+
+
+def _is_good(pack: ModelPack, face: FaceCrop) -> bool:
+    """Whether the face of a frame is good enough to be compared, as one of a photo must be."""
+    try:
+        pack.require_quality(face)
+    except FaceError:
+        return False
+    return True
