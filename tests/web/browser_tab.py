@@ -61,7 +61,9 @@ class BrowserTab:
 
     def sign_in(self, token: str, *, keep: bool = False) -> None:
         """Sign in with a key."""
-        self.page.goto(self.url)
+        answer = self.page.goto(self.url)
+        assert answer is not None
+        assert answer.status == 200, answer.text()
         self.page.get_by_label("API key").fill(token)
         if keep:
             self.page.get_by_label("Keep me signed in until I close this tab").check()

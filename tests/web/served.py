@@ -49,10 +49,12 @@ def serving(
     """Start the command with these options; without a token, take the one that it prints."""
     port = free_port()
     log, shown = folder / "page.log", folder / "page.out"
+    # Every tab asks for the whole page anew: dozens a minute are more than one address may.
+    options = (*options, "--port", str(port), "--rate-limit-address", "off")
     environment = {k: v for k, v in os.environ.items() if not k.startswith("VEILFACE_")}
     with log.open("wb") as errors, shown.open("wb") as output:
         process = subprocess.Popen(
-            [sys.executable, "-m", "api.cli", "serve", *options, "--port", str(port)],
+            [sys.executable, "-m", "api.cli", "serve", *options],
             stdout=output,
             stderr=errors,
             env={**environment, "PYTHONUNBUFFERED": "1", "OMP_NUM_THREADS": "1"},
