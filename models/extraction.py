@@ -338,7 +338,7 @@ class _Bar:
         self._tell = wish if callable(wish) else None
         self._started = time.monotonic()
         self._done = 0
-        self._progress: "Progress | None" = None
+        self._progress: Progress | None = None
 
     def __enter__(self) -> "_Bar":
         return self

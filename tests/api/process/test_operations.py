@@ -481,8 +481,14 @@ def container_says(deployment: Deployment) -> int:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("tls", [False, True])
-@pytest.mark.parametrize("apart", [False, True])
+@pytest.mark.parametrize(
+    ("tls", "apart"),
+    [
+        (False, False),
+        (True, True),
+        *(pytest.param(tls, not tls, marks=pytest.mark.long) for tls in (False, True)),
+    ],
+)
 def test_the_containers_health_check_finds_the_service(
     tmp_path: Path, tls: bool, apart: bool
 ) -> None:
