@@ -187,7 +187,7 @@ def test_no_face_is_left_in_what_was_written(bench, tmp_path, monkeypatch):
 
     monkeypatch.setattr(scoring, "lift", recorded)
     out = tmp_path / "out"
-    ran = run(*bench.full, "--out", out)
+    ran = run(*bench.full, "--repeats", "1", "--out", out)
     assert ran.status == 0, ran.stderr
     assert list(temporary.iterdir()) == []
     written = [file.read_bytes() for file in out.rglob("*") if file.is_file()]
@@ -200,6 +200,8 @@ def test_no_face_is_left_in_what_was_written(bench, tmp_path, monkeypatch):
     assert not [needle for needle in needles if needle in whole]
 
 
+# `tests/verify/evaluation/test_backends.py` has local processes in `make test`.
+@pytest.mark.long
 def test_local_processes_give_the_same_rows_and_keep_no_file(bench, results, tmp_path, monkeypatch):
     temporary = tmp_path / "temporary"
     temporary.mkdir()
