@@ -331,7 +331,7 @@ def test_an_audit_of_more_attributes_than_a_figure_has_columns_is_refused() -> N
 
 
 def test_a_name_is_no_formula(tmp_path: Path) -> None:
-    results = sample_results(liftings=PAPER, dims=(2,))
+    results = sample_results(liftings=PAPER, dims=(2, 16))
     for part in ("rows", "datasets", "curves"):
         for entry in results[part]:
             entry["name" if part == "datasets" else "dataset"] = r"$\frac{1}{$ & $x$"
