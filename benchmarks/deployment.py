@@ -15,6 +15,8 @@ from sqlalchemy import create_engine, text
 from sqlalchemy.engine import make_url
 
 VEILFACE = Path(sys.executable).with_name("veilface")
+_START_S = 600.0
+"""For a service to get ready: on a busy machine, the imports alone take a minute."""
 DEFAULT_POSTGRES = "postgresql://postgres@127.0.0.1:5432/postgres"
 
 
@@ -72,7 +74,8 @@ def service(
         )
         url = f"http://127.0.0.1:{port}"
         try:
-            for _ in range(240):
+            end = time.monotonic() + _START_S
+            while time.monotonic() < end:
                 if process.poll() is not None:
                     raise SystemExit(f"veilface serve ended: {log.read_text()[-2000:]}")
                 try:

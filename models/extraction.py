@@ -10,17 +10,10 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeRemainingColumn,
-)
 
 from models.alignment import align
 from models.cache import EmbeddingCache
@@ -29,6 +22,9 @@ from models.errors import FaceError, ImageError
 from models.pack import FacePolicy, ModelPack
 from models.quality import QualityLimits
 from models.sessions import default_workers
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
 
 CHUNK = 128
 """Photos embedded together. Their crops are in memory at once, photos only one per thread."""
@@ -356,13 +352,15 @@ class _Bar:
         if self._progress is None:
             if time.monotonic() - self._started < _QUIET_SECONDS:
                 return
-            self._progress = Progress(
-                TextColumn("Embedding faces"),
-                BarColumn(),
-                MofNCompleteColumn(),
-                TextColumn("{task.fields[speed]:.0f} photos/s"),
-                TimeRemainingColumn(),
-                console=Console(stderr=True),
+            from rich import console, progress  # here: a service draws nothing
+
+            self._progress = progress.Progress(
+                progress.TextColumn("Embedding faces"),
+                progress.BarColumn(),
+                progress.MofNCompleteColumn(),
+                progress.TextColumn("{task.fields[speed]:.0f} photos/s"),
+                progress.TimeRemainingColumn(),
+                console=console.Console(stderr=True),
             )
             self._progress.start()
             self._progress.add_task("faces", total=self._total, speed=0.0)

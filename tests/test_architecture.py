@@ -70,6 +70,18 @@ def test_commands_write_no_file_where_a_link_of_somebody_else_leads() -> None:
     assert not wrong
 
 
+@pytest.mark.parametrize("folder", ["templates", "models", "enroll", "api/http", "api/process"])
+def test_what_a_service_never_uses_is_imported_where_it_is_used(folder: str) -> None:
+    """Each command, and each worker, would wait for it."""
+    slow = {"scipy.optimize", "scipy.stats", "rich", "rich.console", "rich.progress", "matplotlib"}
+    for path in (ROOT / folder).rglob("*.py"):
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.Import):
+                assert not slow & {alias.name for alias in node.names}, path
+            elif isinstance(node, ast.ImportFrom):
+                assert node.module not in slow, path
+
+
 @pytest.mark.parametrize("package", LAYERS)
 def test_packages_import_neither_tests_nor_the_layer_of_http(package: str) -> None:
     for path in (ROOT / package).rglob("*.py"):

@@ -17,7 +17,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 from scipy.special import expit
 
 from templates.decoys.fitting import (
@@ -159,6 +158,8 @@ def _log_odds(faces: Array, sample: Array) -> Array:
 
 def _separating(features: Array, truth: NDArray[np.bool_]) -> Array:
     """Weights (q,) of the ridge logistic regression in which both classes count the same."""
+    from scipy.optimize import minimize  # here: every command and worker would wait for it
+
     rows = np.hstack([features, np.ones((len(features), 1))])
     sides = np.where(truth, 1.0, -1.0)
     counts = np.where(truth, 0.5 / truth.mean(), 0.5 / (1 - truth.mean()))

@@ -49,7 +49,7 @@ def started(deployment: Deployment, folder: Path) -> Iterator[Running]:
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
     """A service with the tiny pack, on SQLite; five rejections lock a subject."""
     folder = tmp_path_factory.mktemp("service")
-    deployment = deploy(folder)
+    deployment = deploy(folder, rate_limit_key="off", rate_limit_address="off")
     deployment.allow_templates()
     with started(deployment, folder) as running:
         yield running

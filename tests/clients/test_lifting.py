@@ -486,8 +486,11 @@ def test_the_limit_is_that_of_everything_that_the_command_started(
     """The command has ended, and somebody else holds its output."""
     file = tmp_path / "grandchild"
     spy = Spy(tmp_path, GRANDCHILD.format(options="", file=str(file)))
-    with pytest.raises(LiftTimeout, match="longer than 10 s"):
-        make(Changing(), spy.command, lift_limit_s=10).lift(b"photo")
+    for limit in (1, 10, 100):
+        with pytest.raises(LiftTimeout, match=f"longer than {limit} s"):
+            make(Changing(), spy.command, lift_limit_s=limit).lift(b"photo")
+        if file.exists() and file.read_text():
+            break  # else this machine is so busy that the command was ended before it came so far
     wait_until(lambda: not runs(int(file.read_text())), what="the end of the grandchild")
 
 

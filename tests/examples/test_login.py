@@ -7,6 +7,7 @@ import httpx
 import pytest
 
 from tests.examples.conftest import EXAMPLES, PYTHON, Service, clean_environment, node, running
+from tests.patience import PATIENCE_S
 from tests.ports import free_port
 from veilface_client import Client
 
@@ -27,13 +28,13 @@ def login(
 
 
 def test_who_is_let_in(login: str, service: Service) -> None:
-    accepted = httpx.post(f"{login}ann", content=service.photo(1, 4), timeout=60)
+    accepted = httpx.post(f"{login}ann", content=service.photo(1, 4), timeout=PATIENCE_S)
     assert accepted.status_code == 204, accepted.text
     cookie = accepted.headers["Set-Cookie"]
     assert cookie.startswith("session=")
     assert cookie.endswith("; HttpOnly; Secure; SameSite=Strict")
     for name, photo in (("ann", service.photo(2, 0)), ("nobody", service.photo(1, 4))):
-        rejected = httpx.post(f"{login}{name}", content=photo, timeout=60)
+        rejected = httpx.post(f"{login}{name}", content=photo, timeout=PATIENCE_S)
         assert (rejected.status_code, rejected.text) == (401, "this is somebody else")
         assert "Set-Cookie" not in rejected.headers
     with Client(service.url, service.token) as client:
@@ -59,5 +60,5 @@ def test_an_example_without_its_service_opens_nothing(tmp_path: Path) -> None:
     )
     arguments = [node(), str(EXAMPLES / "login" / "login.mjs")]
     with running(arguments, f"http://127.0.0.1:{port}/", env, tmp_path / "log") as url:
-        answer = httpx.post(f"{url}ann", content=b"x", timeout=60)
+        answer = httpx.post(f"{url}ann", content=b"x", timeout=PATIENCE_S)
     assert (answer.status_code, answer.text) == (502, "use your password")

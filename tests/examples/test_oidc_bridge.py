@@ -20,6 +20,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption,
 from starlette.formparsers import MultiPartParser
 
 from tests.examples.conftest import EXAMPLES, PYTHON, Service, clean_environment, running
+from tests.patience import PATIENCE_S
 from tests.ports import free_port
 from veilface_client import Client
 
@@ -63,7 +64,7 @@ def bridge(service: Service, tmp_path_factory: pytest.TempPathFactory) -> Iterat
     ]  # fmt: skip
     with (
         running(arguments, url, env, folder / "log"),
-        httpx.Client(base_url=url, timeout=60) as client,
+        httpx.Client(base_url=url, timeout=PATIENCE_S) as client,
     ):
         yield client
 

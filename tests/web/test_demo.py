@@ -125,7 +125,7 @@ def test_drawn_photos_are_the_demos_only_and_always_the_same(demo: Served) -> No
               "../people/person-1/0.png", "person-1/../../../assets/main.js")  # fmt: skip
     for each in ("person-1/0.png", *absent):
         # Nothing resolves the dots on the way, as httpx and a browser would.
-        wire = HTTPConnection(urlsplit(demo.url).netloc, timeout=30)
+        wire = HTTPConnection(urlsplit(demo.url).netloc, timeout=PATIENCE_S)
         wire.request("GET", f"/demo/people/{each}")
         assert wire.getresponse().status == (404 if each in absent else 200), each
         wire.close()

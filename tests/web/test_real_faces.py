@@ -23,6 +23,9 @@ def test_one_person_from_enrollment_to_erasure(
     tmp_path: Path,
 ) -> None:
     own, other = people[WHO], people[OTHER]
+    with real.client() as client:  # whom an earlier test enrolled: at the end, nobody is left
+        for subject in client.get("/v1/subjects").json()["subjects"]:
+            assert client.delete(f"/v1/subjects/{subject['subject_id']}").is_success
     tab = open_tab(real)
     page = tab.page
 

@@ -1,7 +1,7 @@
 """A set of drawn people, a pack and decoys, and one full evaluation of them."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from models.demo import build_demo_pack
 from models.pack import ModelPack
 from models.synthetic import draw_face, encode_photo
 from tests.api.cli.conftest import Ran, run
+from tests.once import made_once
 
 PEOPLE, PHOTOS, FOLDS, PER_CLASS = 12, 4, 10, 3
 PAIRS = 2 * FOLDS * PER_CLASS
@@ -82,9 +83,7 @@ def pairs_of(folder: Path) -> list[tuple[Path, Path, bool]]:
     return found
 
 
-@pytest.fixture(scope="session")
-def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
-    root = tmp_path_factory.mktemp("bench")
+def make_bench(root: Path) -> None:
     build_demo_pack(root / "pack")
     labels = ["path,gender,race"]
     for person in range(PEOPLE):
@@ -112,7 +111,14 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
     unfinished = Bench(root, Ran(0, "", ""))
     first = run(*unfinished.full, "--out", root / "out", "--json")
     assert first.status == 0, first.stderr
-    return Bench(root, first)
+    (root / "first.json").write_text(json.dumps(asdict(first)))
+
+
+@pytest.fixture(scope="session")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
+    """Tests read it, in several processes."""
+    root = made_once(tmp_path_factory, "bench", make_bench)
+    return Bench(root, Ran(**json.loads((root / "first.json").read_text())))
 
 
 @pytest.fixture(scope="session")

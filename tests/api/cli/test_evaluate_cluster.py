@@ -56,6 +56,8 @@ def test_a_cluster_gives_the_same_bits(bench, results, cluster, tmp_path, monkey
     assert not [needle for needle in secrets(bench) if needle in b"\n".join(held)]
 
 
+# Without the command, `tests/verify/evaluation/test_acquisition.py` has it in `make test`.
+@pytest.mark.long
 def test_a_worker_without_the_pack_is_said_in_one_sentence(bench, cluster, tmp_path, monkeypatch):
     plain: Callable[..., Any] = embedder.PackSource
     absent = tmp_path / "elsewhere"

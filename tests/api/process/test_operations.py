@@ -533,6 +533,7 @@ def test_the_service_speaks_tls(tmp_path: Path) -> None:
         )
         assert answer.status_code == 200
         assert answer.headers["strict-transport-security"] == "max-age=31536000"
+        assert container_says(deployment) == 0
         with pytest.raises(httpx.ConnectError):
             httpx.get(
                 f"{url}/health/live", timeout=PATIENCE_S

@@ -1,5 +1,6 @@
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -34,6 +35,7 @@ from verify.evaluation.verification_set import (
 BROKEN = b"\x89PNG\r\n\x1a\nnot a photo"
 FACES = [encode_photo(draw_face(number)) for number in range(6)]
 LOCAL = Backend(None, 1)
+HERE = Backend("this process", 1)
 
 
 def verification_set(pictures: Sequence[Picture]) -> VerificationSet:
@@ -186,11 +188,28 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Backend]:
         yield Backend.parse(running.scheduler_address.replace("tcp", "dask"), jobs=1)
 
 
+def backwards(
+    backend: Backend, function: Callable[..., Any], shared: object, items: Iterable[object]
+) -> Iterator[tuple[int, Any]]:
+    yield from reversed([(i, function(shared, item)) for i, item in enumerate(items)])
+
+
+# A cluster takes ten seconds of the processor; `test_backends.py` has one in `make test`.
+@pytest.fixture(params=["here", pytest.param("cluster", marks=pytest.mark.long)])
+def elsewhere(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Backend:
+    """A cluster; or the same work in this process, the last first."""
+    if request.param == "cluster":
+        cluster: Backend = request.getfixturevalue("cluster")
+        return cluster
+    monkeypatch.setattr(acquisition, "spread", backwards)
+    return HERE
+
+
 def test_a_cluster_gives_the_same_descriptors(
     mixed: VerificationSet,
     pack: ModelPack,
     folder: Path,
-    cluster: Backend,
+    elsewhere: Backend,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     # Several chunks, which are ready in any order.
@@ -201,14 +220,14 @@ def test_a_cluster_gives_the_same_descriptors(
     here = acquired(pairs, pack, source_of(pack, folder))
     seen: list[int] = []
     with monkeypatch.context() as inside:
-        # Workers are processes of their own: nothing may be embedded in this one.
-        inside.setattr(ModelPack, "embed", None)
-        there = acquired(pairs, pack, source_of(pack, folder), backend=cluster, seen=seen)
+        if elsewhere != HERE:  # Workers are processes of their own: this one embeds nothing.
+            inside.setattr(ModelPack, "embed", None)
+        there = acquired(pairs, pack, source_of(pack, folder), backend=elsewhere, seen=seen)
     np.testing.assert_array_equal(there.rows, here.rows)
     np.testing.assert_array_equal(there.descriptors, here.descriptors)
     assert there.failures == here.failures
     assert sum(seen) == len(pairs.pictures)
-    check_mixed(acquired(mixed, pack, source_of(pack, folder), backend=cluster), pack)
+    check_mixed(acquired(mixed, pack, source_of(pack, folder), backend=elsewhere), pack)
 
 
 @pytest.mark.parametrize(
@@ -219,11 +238,11 @@ def test_a_cluster_gives_the_same_descriptors(
     ],
 )
 def test_a_worker_without_the_pack_is_named(
-    pack: ModelPack, folder: Path, cluster: Backend, changed: dict[str, object], reason: str
+    pack: ModelPack, folder: Path, elsewhere: Backend, changed: dict[str, object], reason: str
 ) -> None:
     pairs = verification_set([PictureBytes(f"{i}", face) for i, face in enumerate(FACES)])
     with pytest.raises(BackendError, match=reason):
-        acquired(pairs, pack, source_of(pack, folder, **changed), backend=cluster)
+        acquired(pairs, pack, source_of(pack, folder, **changed), backend=elsewhere)
 
 
 def test_a_worker_loads_the_pack_as_it_is_told(pack: ModelPack, folder: Path) -> None:

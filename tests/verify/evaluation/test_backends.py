@@ -10,25 +10,13 @@ import pytest
 from cryptography.exceptions import InvalidTag
 from distributed import Client, LocalCluster
 
-from tests.patience import wait_until
 from tests.verify.evaluation.materials import material
+from tests.verify.evaluation.tasks import add, die, kept_open, process
 from verify.evaluation import backends
 from verify.evaluation.backends import Backend, BackendError, spread
 from verify.evaluation.material import Parcel, fresh_key
 
 SECRET = b"a face descriptor"
-
-
-def add(shared: int, item: int) -> int:
-    return shared + item
-
-
-def process(shared: tuple[Path, int], item: object) -> int:
-    """Process of a task, once so many processes have begun one."""
-    folder, processes = shared
-    (folder / str(os.getpid())).touch()
-    wait_until(lambda: len(list(folder.iterdir())) >= processes, what="the other processes")
-    return os.getpid()
 
 
 @pytest.fixture(scope="module")
@@ -71,18 +59,10 @@ def test_a_cluster_does_the_same_work(cluster: str, tmp_path: Path) -> None:
     assert os.getpid() not in processes
 
 
-def kept_open() -> int:
-    return len(backends._LAST)
-
-
 def test_workers_of_a_cluster_keep_nothing(cluster: str) -> None:
     list(spread(Backend(cluster, 1), add, 100, range(4)))
     with Client(cluster, set_as_default=False) as client:  # type: ignore[no-untyped-call]
         assert set(client.run(kept_open).values()) == {0}
-
-
-def die(shared: object, item: object) -> None:
-    os._exit(1)
 
 
 @pytest.mark.filterwarnings("ignore:A worker stopped:UserWarning")

@@ -331,7 +331,7 @@ def test_agedb_broken_files(tmp_path: Path) -> None:
     scipy.io.savemat(file, {"other": np.zeros(3)})
     with pytest.raises(DatasetError, match="no variable named splits"):
         open_sets(tmp_path)
-    scipy.io.savemat(file, {"splits": np.zeros(2**25)}, do_compression=True)
+    scipy.io.savemat(file, {"splits": np.zeros(2**23 + 1)}, do_compression=True)
     with pytest.raises(DatasetError, match="unpack to more than"):
         open_sets(tmp_path)
 
