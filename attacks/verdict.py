@@ -81,7 +81,8 @@ LIMITS: tuple[Limit, ...] = (
     Limit(
         CLIMBING,
         0.1,
-        "share of templates opened by trying faces within a lockout's 5 or 50 attempts",
+        "share of templates opened by trying faces, or of embeddings recovered from decisions, "
+        "within a lockout's 5 or 50 attempts",
     ),
     Limit(
         WITH_KEY,
@@ -277,6 +278,8 @@ def cell_of(outcome: AttackOutcome, most: Mapping[str, float]) -> Cell:
 def _limit_of(outcome: AttackOutcome) -> str:
     several = outcome.knowledge is Knowledge.TEMPLATES
     of_a_template = outcome.breaks in _OF_A_TEMPLATE and not several
+    if outcome.details.get("lockout") is not None:
+        return CLIMBING
     if outcome.knowledge is Knowledge.RIGHT:
         return WITH_KEY
     if outcome.leaked is Leaked.HOLDER_KEYS and not of_a_template:

@@ -29,7 +29,7 @@ def fitted(
             m=m,
             metric=metric,
             stream=stream,
-        )
+        ).expectation
 
 
 @pytest.mark.parametrize("metric", Metric)
