@@ -123,6 +123,25 @@ def test_what_a_lockout_bounds_has_a_limit_and_a_cell_of_its_own() -> None:
     assert by_limit == {"climbing-success": Status.FAIL, "success-with-key": Status.UNLIMITED}
 
 
+def test_a_level_that_is_too_lax_for_a_limit_is_named() -> None:
+    """At FMR 1e-2 fifty faces open 39.5 % of any templates; where chance is below, nothing is."""
+    for chance, named in ((0.395, True), (0.049, False)):
+        tried = outcome(
+            Property.IMPERSONATION,
+            rate(43, 100),
+            leaked=Leaked.DATABASE,
+            chance=chance,
+            attack="hill-climbing",
+        )
+        cell = only_cell(tried)
+        assert (cell.limit, cell.status) == ("climbing-success", Status.FAIL)
+        assert (cell.reason is not None) == named
+        (line,) = headlines(judge([tried]))
+        assert ("It cannot hold: the false match rate of " in line) == named
+    far = only_cell(outcome(Property.CONFIDENTIALITY, rate(90, 100), chance=0.5))
+    assert (far.status, far.reason) == (Status.FAIL, None)
+
+
 def test_a_doubt_is_not_hidden_behind_a_small_success() -> None:
     known = outcome(Property.IRREVERSIBILITY, rate(1, 1000), attack="measured well")
     doubtful = outcome(Property.IRREVERSIBILITY, rate(0, 10), attack="measured on few")
