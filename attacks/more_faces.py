@@ -4,6 +4,7 @@
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
 from attacks.privacy import AttackSetup, SimulatedPeople, Theft, extrapolate, privacy_of
 from attacks.second_order import without_noise_moment
@@ -13,8 +14,9 @@ from templates.decoys import DecoyGenerator
 from templates.errors import DecoyError
 from templates.space.lifting import Strategy, plain_strategy
 
-DECOY_SHARES = (0.25, 0.5)
-"""Parts of the faces that decoys are fitted to instead; the thief has the other half of them."""
+DECOY_SHARES = (0.25, 0.5, 1.0)
+"""Parts of half of the faces that decoys are fitted to instead; the thief has the other half. No
+person has photos in both."""
 
 
 def more_faces(
@@ -64,11 +66,10 @@ def decoys_of_these_people(setup: AttackSetup, *, strategy: Strategy, m: int) ->
         ``found``; ``twice_the_decoy_faces``: the share that twice the most faces would leave, by
         :func:`attacks.privacy.extrapolate`. Empty where the faces are too few for a fit.
     """
-    half = len(setup.faces) // 2
-    thief, others = setup.faces[:half], setup.faces[half:]
+    thief, others = _halves(setup)
     found = []
     for share in DECOY_SHARES:
-        count = int(share * len(setup.faces))
+        count = int(share * len(others))
         try:
             source = DecoyGenerator.fit(others[:count], noise=setup.source.noise)
         except DecoyError:
@@ -84,8 +85,18 @@ def decoys_of_these_people(setup: AttackSetup, *, strategy: Strategy, m: int) ->
         found.append((count, privacy_of(own, strategy=strategy, m=m).strongest.found))
     return {
         "decoys_of_these_people": [
-            {"decoy_faces": count, "thief_faces": half, "found": one.to_json()}
+            {"decoy_faces": count, "thief_faces": len(thief), "found": one.to_json()}
             for count, one in found
         ],
         "twice_the_decoy_faces": extrapolate(found, to=2 * found[-1][0]),
     }
+
+
+def _halves(setup: AttackSetup) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Part the faces by person, at random, into a half for the thief and one for decoys."""
+    people, owner = np.unique(setup.owners, return_inverse=True)
+    place = np.random.default_rng([setup.seed, 4]).permutation(len(people))[owner]
+    order = np.argsort(place, kind="stable")
+    # The person in the middle is the thief's, with all photos.
+    thief = place <= place[order[(len(order) - 1) // 2]]
+    return setup.faces[thief], setup.faces[order[~thief[order]]]

@@ -212,6 +212,8 @@ class AttackSetup:
         The deployment's decoys.
     faces : (A, n) float32
         Of other people: the attacker's.
+    owners : (A,) int64
+        Whose each is; all different where that is not known.
     decoys
         Second moments of the source; of a pool, those of the generator that clients receive for it.
     attackers
@@ -227,6 +229,7 @@ class AttackSetup:
     fresh: Array32
     source: DecoySource
     faces: Array32
+    owners: NDArray[np.int64]
     decoys: Moments
     attackers: tuple[tuple[int, Moments], ...]
     simulated: SimulatedPeople | None
@@ -242,6 +245,7 @@ class AttackSetup:
         source: DecoySource,
         *,
         match_cosine: float,
+        owners: NDArray[np.int64] | None = None,
         fitted_to: int | None = None,
         most: int = MOST_LIFTED,
         seed: int = 0,
@@ -254,6 +258,8 @@ class AttackSetup:
             Of people who are in no fit and none of the attacker's; the first ``most`` count.
         attacker_faces : (A, n) float32
             Of other people of the same kind.
+        owners : (A,) int64
+            Whose each is; None: of a person of its own.
         fitted_to
             Of :meth:`SimulatedPeople.draw`; no attacker without limit where ``fitted_to`` is None.
 
@@ -268,7 +274,8 @@ class AttackSetup:
         if enrolled.shape[1] != n or attacker_faces.shape[1] != n:
             raise AuditError(f"the decoys have {n} dimensions, and the faces others")
         decoys = decoy_moments(source, seed=seed)
-        shuffled = np.random.default_rng([seed, 1]).permutation(np.asarray(attacker_faces))
+        order = np.random.default_rng([seed, 1]).permutation(len(attacker_faces))
+        shuffled = np.asarray(attacker_faces)[order]
         attackers = tuple(
             (count, Moments.of(drawn_towards(shuffled[:count], decoys.moment, noise=source.noise)))
             for count in face_counts(len(shuffled))
@@ -289,6 +296,7 @@ class AttackSetup:
             np.asarray(fresh[chosen], dtype=np.float32),
             source,
             shuffled,
+            order if owners is None else np.asarray(owners, dtype=np.int64)[order],
             decoys,
             attackers,
             simulated,
@@ -321,13 +329,15 @@ class AttackSetup:
         albums = [rng.permutation(np.flatnonzero(person == one)) for one in attacked]
         if not albums:
             raise AuditError("nobody has two photos")
+        others = ~np.isin(person, attacked)
         means = np.stack([rows[album[1 : photos + 1]].mean(axis=0) for album in albums])
         return cls.of(
             normalised(means).astype(np.float32),
             rows[[album[0] for album in albums]],
-            rows[~np.isin(person, attacked)],
+            rows[others],
             source,
             match_cosine=match_cosine,
+            owners=person[others],
             fitted_to=fitted_to,
             seed=seed,
         )

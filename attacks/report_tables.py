@@ -109,7 +109,8 @@ def _verdict_cell(cell: Row) -> str:
     status = cell["status"]
     shown = f"**{status}**" if status == "fail" else status
     if cell["reason"]:
-        shown += f", by design: {plain(cell['reason'])}"
+        why = "by design" if status == "no limit" else "cannot hold"
+        shown += f", {why}: {plain(cell['reason'])}"
     return (
         f"{significant(cell['value'])} [{significant(cell['ci_low'])}, "
         f"{significant(cell['ci_high'])}], chance {significant(cell['chance'])}: {name}: {shown}"

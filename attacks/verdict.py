@@ -81,7 +81,8 @@ LIMITS: tuple[Limit, ...] = (
     Limit(
         CLIMBING,
         0.1,
-        "share of templates opened by trying faces within a lockout's 5 or 50 attempts",
+        "share of templates opened by trying faces, or of embeddings recovered from decisions, "
+        "within a lockout's 5 or 50 attempts",
     ),
     Limit(
         WITH_KEY,
@@ -153,12 +154,23 @@ class Cell:
 
     @property
     def reason(self) -> str | None:
-        """Why a cell without a limit cannot hold; None where the operator set or lifted one."""
+        """Why a cell cannot hold: by design, where nobody set a limit; or by its level alone."""
+        if self.status is Status.FAIL and self._fails_by_chance:
+            return (
+                f"the false match rate of {self.outcome.level} alone gives "
+                f"{self.outcome.chance:.3g}; calibrate on more people, who resolve a stricter level"
+            )
         if self.status is not Status.UNLIMITED or self.limit != WITH_KEY:
             return None
         if self.outcome.knowledge is Knowledge.RIGHT:
             return _BY_ANSWERS
         return _BY_DESIGN.get(self.outcome.breaks)
+
+    @property
+    def _fails_by_chance(self) -> bool:
+        """Whether an attack that learns nothing exceeds the limit too."""
+        compared_with_chance = (Property.CONFIDENTIALITY, Property.UNLINKABILITY)
+        return self.outcome.breaks not in compared_with_chance and self.outcome.chance > self.most
 
     @property
     def rank(self) -> tuple[int, float]:
@@ -277,6 +289,8 @@ def cell_of(outcome: AttackOutcome, most: Mapping[str, float]) -> Cell:
 def _limit_of(outcome: AttackOutcome) -> str:
     several = outcome.knowledge is Knowledge.TEMPLATES
     of_a_template = outcome.breaks in _OF_A_TEMPLATE and not several
+    if outcome.details.get("lockout") is not None:
+        return CLIMBING
     if outcome.knowledge is Knowledge.RIGHT:
         return WITH_KEY
     if outcome.leaked is Leaked.HOLDER_KEYS and not of_a_template:
@@ -321,7 +335,8 @@ def _sentence(cell: Cell) -> str:
     outcome = cell.outcome
     name = outcome.attack + (f" ({outcome.variant})" if outcome.variant else "")
     bound = "" if cell.status is Status.UNLIMITED else f", limit {cell.most:.3g}"
-    reason = "" if cell.reason is None else f" By design: {cell.reason}."
+    why = "By design" if cell.status is Status.UNLIMITED else "It cannot hold"
+    reason = "" if cell.reason is None else f" {why}: {cell.reason}."
     return (
         f"{outcome.breaks} {_SAID[cell.status]}: {name}, leaked {outcome.leaked}, attacker with "
         f"{outcome.knowledge}: {cell.excess:.3g} [{cell.low:.3g}, {cell.high:.3g}]{bound}.{reason}"

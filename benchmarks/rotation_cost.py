@@ -76,7 +76,7 @@ def main() -> None:
             metric=Metric.SPHERICAL,
             stream=stream,
             templates=500,
-        )
+        ).expectation
     contract = calibrate(
         photos,
         [str(number // 3) for number in range(len(photos))],

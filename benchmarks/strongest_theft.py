@@ -2,25 +2,30 @@
 
 People of LFW are enrolled on up to three photos; decoys are fitted to other people of LFW, or to
 FairFace; every other photo of LFW is the attacker's. The rows of docs/privacy.md "The strongest
-attacker" are what this prints.
+attacker" are what this prints. With ``--like`` decoys are fitted to FairFace, UTKFace and
+All-Age-Faces, adapted to so many photos of further people of LFW, and have noise, as ``veilface
+decoys build --like`` makes them.
 
 Example
 -------
 ::
 
     python -m benchmarks.strongest_theft --data ../shared/data
+    python -m benchmarks.strongest_theft --like 300 600 --victims 400
 """
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path, PurePath
 
 import numpy as np
 from numpy.typing import NDArray
 
+from attacks.more_faces import unlimited
 from attacks.privacy import AttackSetup, Theft, privacy_of
 from models.extraction import Extractor
 from models.pack import ModelPack
-from templates.decoys import DecoyGenerator
+from templates.decoys import NOISE_ENERGY, DecoyGenerator
 from templates.space.embedding import normalised
 from templates.space.lifting import Strategy
 from verify import labelled_folder
@@ -67,12 +72,48 @@ def shown(theft: Theft) -> str:
     )
 
 
+def adapted(
+    data: Path,
+    sample: Array,
+    names: Sequence[str],
+    *,
+    victims: tuple[Array, Array],
+    faces: Array,
+    dims: Sequence[int],
+    seed: int,
+) -> None:
+    """Attack templates with decoys adapted to a sample; the last cell is of unlimited faces."""
+    base = [
+        stored(data / "embeddings" / f"{kind}.npz")[0]
+        for kind in ("fairface_more", "utkface", "allagefaces")
+    ]
+    noise = NOISE_ENERGY / sample.shape[1]
+    source = DecoyGenerator.adapt(np.concatenate(base), sample, names, noise=noise)
+    enrolled, fresh = victims
+    setup = AttackSetup.of(
+        enrolled,
+        fresh,
+        faces,
+        source,
+        match_cosine=MATCH_COSINE,
+        most=len(enrolled),
+        seed=seed,
+    )
+    for m in dims:
+        privacy = privacy_of(setup, strategy=Strategy.ADVERSARIAL, m=m)
+        found = [*privacy.thefts, unlimited(setup, strategy=Strategy.ADVERSARIAL, m=m)]
+        cells = " | ".join(f"{theft.faces}: {shown(theft)}" for theft in found)
+        print(f"| adapted to {len(sample)} | {m} | {cells} |", flush=True)
+
+
 def main() -> None:
     """Split, fit, lift, attack, print."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
     parser.add_argument("--descriptors", type=Path, help=".npz of the crops: paths, descriptors")
     parser.add_argument("--victims", type=int, default=VICTIMS)
+    parser.add_argument("--like", type=int, nargs="+", help="photos to adapt decoys to")
+    parser.add_argument("--dims", type=int, nargs="+", default=[160, 192], help="with --like")
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     rng = np.random.default_rng(args.seed)
@@ -87,6 +128,22 @@ def main() -> None:
     by_person = np.concatenate([np.flatnonzero(person == one) for one in others])
     stranger = ~np.isin(rest_names, people[attacked])
     attacker = np.concatenate([rows[by_person[OF_LFW:]], rest[stranger]])
+    if args.like:
+        single = np.flatnonzero(np.isin(person, others) & (counts[person] == 1))
+        sample = rng.permutation(single)[: max(args.like)]
+        kept = np.setdiff1d(by_person, sample)
+        rest = rest[stranger & ~np.isin(rest_names, names[sample])]
+        for size in args.like:
+            adapted(
+                args.data,
+                rows[sample[:size]],
+                names[sample[:size]].tolist(),
+                victims=(enrolled.astype(np.float32), fresh),
+                faces=np.concatenate([rows[kept], rest]),
+                dims=args.dims,
+                seed=args.seed,
+            )
+        return
     fairface = stored(args.data / "embeddings" / "fairface_more.npz")[0][:OF_FAIRFACE]
     print(f"{len(enrolled)} victims; the attacker has {len(attacker)} faces of LFW")
     for kind, fitted in (("LFW", rows[by_person[:OF_LFW]]), ("FairFace", fairface)):

@@ -26,7 +26,7 @@ from verify.calibration_mode import (
 from verify.cohort import client_source, people_like
 from verify.comparisons import Lifter, Progress, honest_norms
 from verify.consistency import Consistency, photo_consistency
-from verify.expectation import fit_expectation
+from verify.expectation import Climbers, ExpectationFit, fit_expectation
 from verify.group_rates import PeopleGroups, PhotoLabels, people_groups
 from verify.raw_pairs import SuspiciousPair, suspicious_pairs
 from verify.strangers import honest_score, make_nobody, strangers_like
@@ -57,6 +57,9 @@ class CalibrationReport:
     ten_folds
         Results of the ten-fold protocol, one per calibration in the contract's order; empty
         under protocol ``fmr``.
+    climbers
+        How often templates of nobody accept embeddings that climbed against the expectation; None
+        where an expectation was kept.
     """
 
     consistency: Consistency
@@ -65,6 +68,7 @@ class CalibrationReport:
     suspicious: tuple[SuspiciousPair, ...]
     suspicious_above: float
     ten_folds: tuple[TenFold, ...]
+    climbers: Climbers | None
 
 
 @dataclass(frozen=True)
@@ -184,7 +188,7 @@ def calibrate(
     consistency = photo_consistency(
         data, plan.person_of, photos=options.photos_per_enrollment, rng=rng
     )
-    run = _lay_out(
+    run, fit = _lay_out(
         data,
         plan,
         binding=binding,
@@ -222,6 +226,9 @@ def calibrate(
             else calibrate_points(part, kind)
         )
     calibrations = [result.calibration for result in results]
+    climbers = None if fit is None or not sets else fit.climbers_at(calibrations[0].levels[0])
+    if climbers is not None:
+        recorded = {**(recorded or {}), "climbing_probes": climbers.to_json()}
     contract = _contract(run, binding, calibrations, recorded or {})
     return Calibrated(
         contract,
@@ -234,6 +241,7 @@ def calibrate(
             ),
             suspicious_above=options.suspicious_above,
             ten_folds=tuple(one.folds for one in results if one.folds is not None),
+            climbers=climbers,
         ),
     )
 
@@ -283,7 +291,7 @@ def _lay_out(
     consistency: Consistency,
     facts: Mapping[str, Json],
     progress: Progress,
-) -> CalibrationRun:
+) -> tuple[CalibrationRun, ExpectationFit | None]:
     """Enroll everybody; fit the expectation and draw the strangers where none are given."""
     service = Lifter(binding.strategy, source, binding.contract_id)
     generator = client_source(source)
@@ -301,10 +309,11 @@ def _lay_out(
     halves = False
     if expectation is None or nobody is None:
         hidden = people_like(generator, means)
+    fit = None
     if expectation is None:
         progress("fitting expected similarities", 0.0)
         with Keystream.seeded("expectation", options.seed) as stream:
-            expectation = fit_expectation(
+            fit = fit_expectation(
                 generator,
                 hidden,
                 strategy=client.strategy,
@@ -312,13 +321,14 @@ def _lay_out(
                 metric=options.metric,
                 stream=stream,
             )
+        expectation = fit.expectation
     if nobody is None:
         progress("drawing strangers", 0.0)
         sources = strangers_like(generator, hidden, data, plan.person_of)
         halves = len(sources) == 2
         with Keystream.fresh() as stream:
             nobody = make_nobody(generator, strangers=sources, stream=stream)
-    return CalibrationRun(
+    run = CalibrationRun(
         descriptors=data,
         plan=plan,
         templates=templates,
@@ -334,6 +344,7 @@ def _lay_out(
         facts=facts,
         progress=progress,
     )
+    return run, fit
 
 
 def _protocol_pairs(

@@ -1,11 +1,14 @@
 """Fits what is expected of a point's similarity to templates of nobody (docs/method.md §6.1)."""
 
 from collections.abc import Iterator
+from dataclasses import asdict, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from templates.contract.canonical import Json
 from templates.contract.expectation import PointExpectation, point_features
+from templates.contract.levels import Level
 from templates.decoys import DecoySource
 from templates.distances import DEFAULT_STEPS, Metric, pairwise_distances, similarity
 from templates.errors import ContractError
@@ -23,12 +26,13 @@ CLIMBED = 300
 """Of those others, templates that wolves climb on: what is found on them is no measurement."""
 CLIMBERS, CLIMBS = 24, 2
 """Probes that climb, and how often the expectation is fitted anew to where they end. Without, they
-end where the fit is a tenth of a deviation too low (docs/thresholds.md)."""
+end where the fit is a tenth of a deviation too low (docs/thresholds.md). As many others climb when
+all is fitted, and only tell how good the fit is."""
 CLIMB_ROUNDS = 40
 CLIMB_THRESHOLD = 2.7
 """Of the ascents; between what Gaussian scores pass at FMR 1e-2 and at 1e-3."""
-CLIMB_WEIGHT = 3.0
-"""Weight of an end of an ascent in the fit, where a drawn probe has 1."""
+CLIMB_WEIGHT = 9.0
+"""Weight of the squared error at an end of an ascent, where that of a drawn probe has 1."""
 PEOPLE, WOLVES, BETWEEN = 900, 500, 300
 """Probes of the fit: people, wolves, and mixtures of one of either."""
 TESTED = 4
@@ -47,6 +51,71 @@ identity, as with random lifting, its forms hardly differ; on faces the smallest
 Array64 = NDArray[np.float64]
 
 
+@dataclass(frozen=True)
+class Climbers:
+    """How often templates of nobody accept probes that climbed and are in no fit.
+
+    Parameters
+    ----------
+    level
+        That decides.
+    accepted, most
+        Share of the templates that accept, of all probes and of the one that most accept.
+    probes, templates
+        Their numbers.
+    fitted
+        Whether where others climbed to is in the fit; where not, the form could not follow.
+    """
+
+    level: str
+    accepted: float
+    most: float
+    probes: int
+    templates: int
+    fitted: bool
+
+    def to_json(self) -> dict[str, Json]:
+        """What a contract records."""
+        return dict(asdict(self))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ExpectationFit:
+    """An expectation, and how far probes get that climb against it.
+
+    Parameters
+    ----------
+    expectation
+        What a decision rests on.
+    climbs
+        Fits that include where probes climbed to: ``CLIMBS``, or fewer where the form could not
+        follow these too, so that drawn probes alone count from there on.
+    climber_scores : (C, T) float64
+        Scores of further probes that climbed against the expectation, and are in no fit, with the
+        ``TEMPLATES`` templates of nobody that the fit compared probes with; no row where the metric
+        leaves nothing to climb.
+    """
+
+    expectation: PointExpectation
+    climbs: int
+    climber_scores: Array64
+
+    def climbers_at(self, level: Level) -> Climbers | None:
+        """Count by the threshold of a level; None where nothing climbed."""
+        if not len(self.climber_scores):
+            return None
+        accepted = (self.climber_scores >= level.threshold).mean(axis=1)
+        probes, templates = self.climber_scores.shape
+        return Climbers(
+            level=level.name,
+            accepted=float(accepted.mean()),
+            most=float(accepted.max()),
+            probes=probes,
+            templates=templates,
+            fitted=self.climbs == CLIMBS,
+        )
+
+
 def fit_expectation(
     source: DecoySource,
     hidden: DecoySource,
@@ -56,7 +125,7 @@ def fit_expectation(
     metric: Metric,
     stream: Keystream,
     templates: int = TEMPLATES,
-) -> PointExpectation:
+) -> ExpectationFit:
     """Fit mean and spread to probes, honest and hostile, against templates of nobody.
 
     Parameters
@@ -102,23 +171,34 @@ def fit_expectation(
     fit.add(probes, np.where(np.arange(len(probes)) % TESTED > 0, 1.0, 0.0))
     expectation = fit.expectation()
     fit.require(expectation)
-    if metric is Metric.EUCLIDEAN:  # the mean is exact, and has nowhere to climb
-        return expectation
     starts = np.concatenate([wolves[:: -(-WOLVES // CLIMBERS) * 2], people[: CLIMBERS // 2]])
-    for _ in range(CLIMBS):
-        ends = ascend_points(
-            starts.astype(np.float32),
-            climbed,
-            expectation,
-            threshold=CLIMB_THRESHOLD,
-            rounds=CLIMB_ROUNDS,
-        )
+    others = np.concatenate([wolves[1 :: -(-WOLVES // CLIMBERS) * 2], people[-(CLIMBERS // 2) :]])
+    if metric is Metric.EUCLIDEAN:  # the mean is exact, and has nowhere to climb
+        return ExpectationFit(expectation, 0, np.empty((0, templates)))
+    climbs = 0
+    while climbs < CLIMBS:
+        ends = _ascended(starts, climbed, expectation)
         fit.add(ends, np.full(len(ends), CLIMB_WEIGHT))
         closer = fit.expectation()
         if fit.problem(closer) is not None:  # the form cannot follow both: drawn probes count
             break
         expectation = closer
-    return expectation
+        climbs += 1
+    ends = _ascended(others, climbed, expectation)
+    return ExpectationFit(expectation, climbs, fit.scores(ends, expectation))
+
+
+def _ascended(
+    starts: Array64, climbed: SubspaceBatch, expectation: PointExpectation
+) -> NDArray[np.float32]:
+    """Climb as an attacker would who knows the expectation."""
+    return ascend_points(
+        starts.astype(np.float32),
+        climbed,
+        expectation,
+        threshold=CLIMB_THRESHOLD,
+        rounds=CLIMB_ROUNDS,
+    )
 
 
 def _kept(tiles: Iterator[Templates], count: int) -> SubspaceBatch:
@@ -156,28 +236,36 @@ class _Fit:
 
     def add(self, probes: NDArray[np.float32], weights: Array64) -> None:
         """Compare probes with the templates; those of weight 0 are left out of the fit."""
-        distances = pairwise_distances(
-            probes, self._templates, metric=self._metric, steps=DEFAULT_STEPS
-        )
-        close = np.asarray(similarity(distances), dtype=np.float64)
+        close = self._similarities(probes)
         self.probes = np.concatenate([self.probes, probes])
         self.means = np.append(self.means, close.mean(axis=1))
         self.spreads = np.append(self.spreads, close.std(axis=1, ddof=1))
         self.weights = np.append(self.weights, weights)
 
+    def scores(self, probes: NDArray[np.float32], expectation: PointExpectation) -> Array64:
+        """Return scores of probes that are not fitted with the templates, (P, T)."""
+        means, spreads = expectation.statistics(probes)
+        return np.asarray((self._similarities(probes) - means[:, None]) / spreads[:, None])
+
+    def _similarities(self, probes: NDArray[np.float32]) -> Array64:
+        distances = pairwise_distances(
+            probes, self._templates, metric=self._metric, steps=DEFAULT_STEPS
+        )
+        return np.asarray(similarity(distances), dtype=np.float64)
+
     def expectation(self) -> PointExpectation:
         """Fit by least squares: a deviation is the unit of the mean, 1 that of the log spread."""
         fitted = self.weights > 0
         features = point_features(self.probes[fitted], self._projector, self._foot)
-        weights = self.weights[fitted]
+        roots = np.sqrt(self.weights[fitted])
         spreads = np.maximum(self.spreads[fitted], 1e-12)
-        unit = weights / spreads
+        unit = roots / spreads
         return PointExpectation(
             metric=self._metric,
             projector=self._projector,
             foot=self._foot,
             mean=_least_squares(features * unit[:, None], self.means[fitted] * unit),
-            log_spread=_least_squares(features * weights[:, None], np.log(spreads) * weights),
+            log_spread=_least_squares(features * roots[:, None], np.log(spreads) * roots),
         )
 
     def problem(self, expectation: PointExpectation) -> str | None:

@@ -29,27 +29,40 @@ def ascend_points(
     rounds: int = ROUNDS,
 ) -> Array32:
     """Climb: unit rows (S, n) to unit rows (S, n), by the spherical metric."""
-    rows = targets.bases.reshape(-1, targets.n)
-    radii = targets.radii.astype(np.float32)
     points = normalised(starts.astype(np.float32))
     best, best_value = points, np.full(len(points), -np.inf)
     for step in step_lengths(rounds):
-        inside = (points @ rows.T).reshape(len(points), len(targets), -1)
-        lengths = np.maximum(np.linalg.norm(inside, axis=2), 1e-6)
-        similarities = points @ targets.feet.T + radii * lengths
-        value, by_similarity, *by_expected = point_slopes(
-            similarities, *expectation.statistics(points), threshold=threshold
-        )
+        value, further = climb_once(points, targets, expectation, threshold=threshold, step=step)
         best = np.where((value > best_value)[:, None], points, best)
         best_value = np.maximum(value, best_value)
-        weights = by_similarity.astype(np.float32)
-        inside *= (weights * radii / lengths)[:, :, None]
-        gradient = weights @ targets.feet + inside.reshape(len(points), -1) @ rows
-        for by, slope in zip(by_expected, expected_slopes(points, expectation), strict=True):
-            gradient += (by[:, None] * slope).astype(np.float32)
-        gradient -= np.einsum("si,si->s", gradient, points)[:, None] * points
-        points = normalised((points + step * normalised(gradient)).astype(np.float32))
+        points = further
     return np.ascontiguousarray(best, dtype=np.float32)
+
+
+def climb_once(
+    points: Array32,
+    targets: SubspaceBatch,
+    expectation: PointExpectation,
+    *,
+    threshold: float,
+    step: float,
+) -> tuple[Array64, Array32]:
+    """Return the objective at unit rows (S, n), (S,), and the rows a step uphill, in radians."""
+    rows = targets.bases.reshape(-1, targets.n)
+    radii = targets.radii.astype(np.float32)
+    inside = (points @ rows.T).reshape(len(points), len(targets), -1)
+    lengths = np.maximum(np.linalg.norm(inside, axis=2), 1e-6)
+    similarities = points @ targets.feet.T + radii * lengths
+    value, by_similarity, *by_expected = point_slopes(
+        similarities, *expectation.statistics(points), threshold=threshold
+    )
+    weights = by_similarity.astype(np.float32)
+    inside *= (weights * radii / lengths)[:, :, None]
+    gradient = weights @ targets.feet + inside.reshape(len(points), -1) @ rows
+    for by, slope in zip(by_expected, expected_slopes(points, expectation), strict=True):
+        gradient += (by[:, None] * slope).astype(np.float32)
+    gradient -= np.einsum("si,si->s", gradient, points)[:, None] * points
+    return value, normalised((points + step * normalised(gradient)).astype(np.float32))
 
 
 def point_slopes(

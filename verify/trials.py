@@ -64,7 +64,7 @@ def plan_trials(
     ----------
     most_templates
         Most people who are compared; those with two photos or more first, as they alone tell of
-        genuine probes. None for all.
+        genuine probes: of people with one photo fewer templates are made. None for all.
     """
     if photos_per_enrollment < 1:
         raise ValueError("an enrollment needs at least one photo")
@@ -134,8 +134,8 @@ def probe_sets(plan: TrialPlan, photos: int, *, most: int, rng: np.random.Genera
 
     A person's photos are put in a random order around a circle, and every run of ``photos`` of them
     is a set: as many sets as photos where those are more. Sets with photos that are enrolled make
-    impostor trials only. Impostors are drawn from all sets: people with many photos have most
-    genuine ones, and need not be like the others.
+    impostor trials only. Impostors are drawn from all sets, one of everybody before a second one of
+    anybody: who has many photos weighs no more than others as far as ``most`` allows.
     """
     everybodys = np.split(
         np.argsort(plan.person_of, kind="stable"),
@@ -147,8 +147,17 @@ def probe_sets(plan: TrialPlan, photos: int, *, most: int, rng: np.random.Genera
     if photos == 1:
         extra = np.setdiff1d(extra, genuine)[:, None]
     sets = np.concatenate([genuine, extra])
-    impostor = np.sort(rng.choice(len(sets), min(most, len(sets)), replace=False))
-    return ProbeSets(sets, len(genuine), impostor)
+    return ProbeSets(sets, len(genuine), _by_person(plan.person_of[sets[:, 0]], most, rng))
+
+
+def _by_person(people: Indices, most: int, rng: np.random.Generator) -> Indices:
+    """Draw ``most`` rows at random, in turns of one of each person, (P,) to (R,) rising."""
+    order = rng.permutation(len(people)).astype(np.int64)
+    order = order[np.argsort(people[order], kind="stable")]
+    sizes = np.bincount(people)
+    turn = np.arange(len(order)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+    turns = rng.permutation(len(order))
+    return np.sort(order[turns[np.argsort(turn[turns], kind="stable")]][:most])
 
 
 def _runs(people: Sequence[Indices], length: int, rng: np.random.Generator) -> Indices:

@@ -21,8 +21,10 @@ from attacks.audit import AuditPlan, run_audit
 from attacks.learned.extra import need
 from attacks.population import LEAST_FITTED
 from attacks.report import document
-from templates.contract.document import Contract
+from templates.contract.document import Binding, Contract
+from templates.decoys import DecoySource
 from templates.distances import on_device
+from templates.keys.sealing import Sealer
 from templates.space.lifting import Strategy
 from verify import labelled_folder
 
@@ -83,15 +85,16 @@ def templates(
     strategy: Annotated[
         Strategy | None,
         typer.Option(
-            help="How templates are lifted; not with --contract. Unset: adversarial.",
+            help="How templates are lifted; not with --contract. Unset: as by the contract in "
+            "`data_dir` where it is of these decoys, else adversarial.",
             show_default=False,
         ),
     ] = None,
     dim: Annotated[
         str | None,
         typer.Option(
-            help="Dimensions m of templates, such as 16,32; not with --contract. Unset: "
-            f"{DEFAULT_DIM}.",
+            help="Dimensions m of templates, such as 16,32; not with --contract. Unset: that of "
+            f"the contract in `data_dir` where it is of these decoys, else {DEFAULT_DIM}.",
             show_default=False,
         ),
     ] = None,
@@ -195,11 +198,19 @@ def templates(
         raise UsageError(
             "a contract says its strategy and dimension: leave out --strategy and --dim"
         )
+    source = (
+        None if fit_decoys else load_decoys(decoys or settings.resolved_decoys_file, sealer, pack)
+    )
+    if loaded is not None and source is not None:
+        loaded.binding.require_source(source_id=source.source_id, made_with=source.made_with)
+    served = _served(settings, sealer, source) if dim is None and loaded is None else None
+    if dim is None:
+        dim = str(DEFAULT_DIM if served is None else served.m)
+    if strategy is None:
+        strategy = Strategy.ADVERSARIAL if served is None else served.strategy
     plan = AuditPlan(
-        strategy=strategy or Strategy.ADVERSARIAL,
-        dims=listed_dims(
-            str(DEFAULT_DIM) if dim is None else dim, "--dim", n=pack.info.n, example="16,32"
-        ),
+        strategy=strategy,
+        dims=listed_dims(dim, "--dim", n=pack.info.n, example="16,32"),
         contract=loaded,
         victims=victims,
         owners=owners,
@@ -211,11 +222,6 @@ def templates(
         reconstruction=reconstruction,
         seed=seed,
     )
-    source = None
-    if not fit_decoys:
-        source = load_decoys(decoys or settings.resolved_decoys_file, sealer, pack)
-        if loaded is not None:
-            loaded.binding.require_source(source_id=source.source_id, made_with=source.made_with)
     labelled = labelled_folder(people)
     faces = extract(pack, labelled.paths, aligned=aligned, settings=settings, cache=cache)
     name_of = dict(zip(labelled.paths, labelled.identities, strict=True))
@@ -252,3 +258,15 @@ def templates(
         failure_to_acquire=acquired_json(faces),
     )
     conclude(report, out, pack, as_json=as_json)
+
+
+def _served(settings: Settings, sealer: Sealer, source: DecoySource | None) -> Binding | None:
+    """Return the scheme of the contract in ``data_dir``, where it lifts with this source."""
+    path = settings.resolved_contract_file
+    if source is None or not path.is_file():
+        return None
+    binding = Contract.load(path, sealer).binding
+    if binding.decoy_source_id != source.source_id:
+        return None
+    message(f"note: auditing {binding.strategy} templates of m = {binding.m}, as {path} has them")
+    return binding

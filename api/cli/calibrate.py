@@ -31,6 +31,7 @@ from templates.distances import Metric
 from templates.space.lifting import Strategy
 from verify import CalibrationOptions, CalibrationReport, labelled_folder
 from verify.evaluation.labels_file import read_labels
+from verify.expectation import Climbers
 
 MOST_SHOWN = 20
 
@@ -333,12 +334,30 @@ def _tell(contract: Contract, report: CalibrationReport) -> None:
             say(f"  {pair.first},{pair.second}  {pair.cosine:.3f}")
         if len(report.suspicious) > MOST_SHOWN:
             message(f"note: {len(report.suspicious) - MOST_SHOWN} more; see --json")
+    if report.climbers is not None:
+        say(_climbers_line(report.climbers))
     consistency = report.consistency
     say(
         f"Default level: {contract.default_level}. Photos of one enrollment must agree to "
         f"{contract.photo_consistency:.3f}: {shown_rate(consistency.refused)} of the genuine sets "
         f"do not; {shown_rate(consistency.fmr)} of the pairs of two people do. Photos of one probe "
         f"must agree to {contract.probe_consistency:.3f}."
+    )
+
+
+def _climbers_line(climbers: Climbers) -> str:
+    """Say what embeddings that climb gain, which nobody sends without the right to."""
+    unfitted = (
+        ""
+        if climbers.fitted
+        else " The expected similarity does not follow such probes; give the right `embeddings` "
+        "to nobody who may attack."
+    )
+    return (
+        f"Hostile embeddings: {climbers.probes} that climb are accepted by "
+        f"{100 * climbers.accepted:.2g} % of {climbers.templates:,} templates of nobody at "
+        f"{climbers.level}, the strongest of them by {100 * climbers.most:.2g} %; not judged."
+        f"{unfitted}"
     )
 
 

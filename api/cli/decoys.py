@@ -22,10 +22,10 @@ from api.process.preparation import (
     make_generator,
     make_pool,
 )
-from api.process.roles import FACES_PER_DIMENSION
 from api.settings import Settings
 from models.extraction import Extraction
 from templates.decoys import Attributes, DecoyGenerator
+from templates.decoys.fitting import FACES_PER_DIMENSION
 from verify.fairface_labels import label_files, read_labels
 
 app = typer.Typer(no_args_is_help=True)

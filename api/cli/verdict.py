@@ -25,7 +25,8 @@ def verdict_lines(verdict: Verdict | None) -> list[str]:
     return [
         f"Privacy:  {privacy.status}. A thief with {_attacker(privacy)} finds a match for "
         f"{shown_rate(privacy.rate)} of the templates at m = {m}; limit "
-        f"{100 * privacy.limit:.3g} %.{_unlimited(privacy)}{_shortfall(privacy)}",
+        f"{100 * privacy.limit:.3g} %.{_unlimited(privacy)}{_shortfall(privacy)}"
+        f"{_default_dim(privacy)}",
         f"Accuracy: {accuracy.status}. {shown_rate(accuracy.rate)} of genuine probes are rejected "
         f"at {basis['level']}, with {basis['enrolled_photos']} photos enrolled and "
         f"{basis['probe_photos']} shown; limit {100 * accuracy.limit:.3g} %."
@@ -133,6 +134,13 @@ def _more_photos(contract: Contract) -> list[str]:
         f"More photos: of {basis['enrolled_photos']} enrolled, rejected are {shown} shown; of "
         f"{basis['probe_photos']} shown, {enrolled} enrolled."
     ]
+
+
+def _default_dim(privacy: Judgement) -> str:
+    """Say that nothing speaks for the dimension."""
+    if privacy.basis.get("m_is") != "default, as none passes":
+        return ""
+    return " No dimension that was tried passes, so m is a default, no result of these people."
 
 
 def _unlimited(privacy: Judgement) -> str:

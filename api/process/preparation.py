@@ -45,7 +45,9 @@ from verify.own_decoys import SAME_PHOTO, require_others
 from verify.trials import chosen_photos
 
 DEFAULT_DIM = 64
-"""Dimension of stored templates where a search finds none that is private, and of an audit."""
+"""Dimension of stored templates where a search finds none that is private, and of an audit; of
+embeddings below 256 numbers a quarter of these: of 80 people with 128 numbers each, 20 of 160
+single probes are rejected at FMR 1e-3 with m = 64, and 3 with 32 (docs/thresholds.md)."""
 
 
 DEFAULT_PROBE_DIM = 4
@@ -304,13 +306,21 @@ def _operating_point(
         uncovered = f"the attacks are on {plain} lifting, not on what {strategy} chooses by"
     # With decoys in most of the dimensions little is left of a face for anybody.
     dims = [dim for dim in DIMS if dim <= 3 * source.n // 4] if m is None else []
+    otherwise = min(DEFAULT_DIM, source.n // 4) if m is None else m
     point = smallest_private(
         lambda dim: judge_privacy(privacy_of(setup, strategy=strategy, m=dim), uncovered=uncovered),
         dims,
-        otherwise=min(DEFAULT_DIM, source.n // 2) if m is None else m,
+        otherwise=otherwise,
     )
     judgement = point.tried[point.dim]
-    basis = {**judgement.basis, **more_faces(setup, judgement, strategy=strategy, m=point.dim)}
+    chosen = "asked for"
+    if m is None:
+        chosen = "smallest that passes" if judgement.status == "PASS" else "default, as none passes"
+    basis = {
+        **judgement.basis,
+        "m_is": chosen,
+        **more_faces(setup, judgement, strategy=strategy, m=point.dim),
+    }
     return OperatingPoint(point.dim, {**point.tried, point.dim: replace(judgement, basis=basis)})
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from attacks.operating_point import LEAST_FACES, LEAST_VICTIMS
 from attacks.privacy import MOST_LIFTED
-from templates.decoys.fitting import MIN_DESCRIPTORS
+from templates.decoys.fitting import FACES_PER_DIMENSION, MIN_DESCRIPTORS
 from verify.metrics import resolvable
 from verify.thresholds import EXPECTED_ERRORS, TARGETS
 
@@ -21,8 +21,6 @@ SAMPLE_PHOTOS = (600, 300)
 """Photos to adapt decoys to: what docs/decoys.md measured, the better first."""
 LEAST_PEOPLE = 80
 """With several photos each: as many resolve a false match rate of 1 in 1,000."""
-FACES_PER_DIMENSION = 4
-"""Below that many fitted faces, membership of the fit shows in the statistics (docs/decoys.md)."""
 
 Albums = Mapping[str, Sequence[Path]]
 

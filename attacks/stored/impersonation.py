@@ -11,6 +11,7 @@ from attacks.system import System
 from templates.contract.canonical import Json
 from templates.contract.document import Rate
 from templates.decoys import DecoyGenerator, DecoyPool
+from templates.decoys.fitting import FACES_PER_DIMENSION
 from templates.space.subspace import SubspaceBatch
 from verify.metrics import rate, subject_bootstrap
 
@@ -32,7 +33,8 @@ def impersonation_attack(
     faces : (N, n)
         One photo of each of some people: a generator is fitted to the first half of them, and the
         others are strangers to it. The attacker's where None. A generator that is fitted to few
-        people lets them in more often; a service's is fitted to thousands.
+        people lets them in, and a service's is fitted to thousands: with fewer than
+        ``FACES_PER_DIMENSION`` for each number the outcome is not judged.
     """
     if not decoy_count(system.scheme) or system.source is None:
         return []
@@ -60,6 +62,7 @@ def _pooled(system: System, pool: DecoyPool) -> AttackOutcome:
             f"The owner of a decoy comes with {same} to a template that holds their decoy; "
             "success is acceptance."
         ),
+        judged=True,
         details={"with_the_photo_of_the_pool": _rate(system, entries, lift.templates, pairs)},
     )
 
@@ -67,7 +70,8 @@ def _pooled(system: System, pool: DecoyPool) -> AttackOutcome:
 def _generated(system: System, faces: NDArray[np.float32]) -> AttackOutcome:
     half = len(faces) // 2
     fitted, strangers = faces[:half], faces[half:]
-    generator = DecoyGenerator.fit(fitted)
+    noise = 0.0 if system.source is None else system.source.noise
+    generator = DecoyGenerator.fit(fitted, noise=noise)
     lift = recorded_lift(
         system, system.victims.enrolled, "decoys of a fitted generator", source=generator
     )
@@ -88,6 +92,7 @@ def _generated(system: System, faces: NDArray[np.float32]) -> AttackOutcome:
             "chance is how often the other half is accepted there: "
             "the contract was calibrated with the scheme's own generator."
         ),
+        judged=half >= FACES_PER_DIMENSION * generator.n,
         details={"strangers": control.to_json(), "fitted_to": half},
     )
 
@@ -101,6 +106,7 @@ def _outcome(
     variant: str,
     chance: float,
     assumption: str,
+    judged: bool,
     details: dict[str, Json],
 ) -> AttackOutcome:
     by_level: dict[str, Json] = {}
@@ -121,6 +127,7 @@ def _outcome(
         level=system.level.name,
         measured=_counted(accepted, pairs, len(photos), len(templates)),
         chance=chance,
+        judged=judged,
         details={"people": len(np.unique(pairs[:, 0])), "by_level": by_level, **details},
     )
 

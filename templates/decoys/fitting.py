@@ -8,6 +8,8 @@ from templates.decoys.statistics import DescriptorStatistics, band_edges, leadin
 from templates.errors import DecoyError
 
 MIN_DESCRIPTORS = 100
+FACES_PER_DIMENSION = 4
+"""Below that many fitted faces, membership of the fit shows in the statistics (docs/decoys.md)."""
 MAX_DESCRIPTORS = 2_000_000
 _FOLDS = 10
 _COMPONENTS = 4

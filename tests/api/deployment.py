@@ -110,7 +110,7 @@ def expectation_of(source: DecoySource, binding: Binding) -> PointExpectation:
                 metric=Metric.SPHERICAL,
                 stream=stream,
                 templates=200,
-            )
+            ).expectation
     return known
 
 

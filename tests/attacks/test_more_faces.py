@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from attacks.more_faces import decoys_of_these_people, more_faces, unlimited
+from attacks.more_faces import _halves, decoys_of_these_people, more_faces, unlimited
 from attacks.operating_point import judge_privacy
 from attacks.privacy import AttackSetup, extrapolate, privacy_of
 from templates.contract.levels import Rate
@@ -28,14 +28,36 @@ def test_unlimited_faces_tell_more_than_few_and_hardly_more_than_many() -> None:
 
 def test_decoys_of_the_kind_are_measured_and_more_of_them_hide_more() -> None:
     told = decoys_of_these_people(setup_with(OTHER), strategy=Strategy.ADVERSARIAL, m=M)
-    few, many = told["decoys_of_these_people"]
-    assert (few["decoy_faces"], many["decoy_faces"], few["thief_faces"]) == (375, 750, 750)
-    found = [Rate.from_json(row["found"]) for row in (few, many)]
+    measured = told["decoys_of_these_people"]
+    assert [row["decoy_faces"] for row in measured] == [187, 375, 750]
+    assert {row["thief_faces"] for row in measured} == {750}
+    found = [Rate.from_json(row["found"]) for row in measured]
     strange = privacy_of(setup_with(OTHER), strategy=Strategy.ADVERSARIAL, m=M).strongest
     assert strange.found.value > found[0].value + 0.3
     assert told["twice_the_decoy_faces"] == extrapolate(
-        [(375, found[0]), (750, found[1])], to=1_500
+        list(zip((187, 375, 750), found, strict=True)), to=1_500
     )
+
+
+def test_a_person_with_many_photos_is_the_thiefs_or_the_decoys() -> None:
+    enrolled, faces = rows(20, FACES, 1), rows(300, FACES, 3)
+    owners = np.repeat(np.arange(30), [10] * 30)
+    setup = AttackSetup.of(
+        enrolled,
+        enrolled,
+        faces,
+        generator(tuple(OTHER)),
+        match_cosine=COSINE,
+        owners=owners,
+    )
+    # Rows and owners are shuffled alike.
+    place = {row.tobytes(): owner for row, owner in zip(faces, owners, strict=True)}
+    assert [place[row.tobytes()] for row in setup.faces] == setup.owners.tolist()
+    thief, others = _halves(setup)
+    assert len(thief) == len(others) == 150
+    people = [{place[row.tobytes()] for row in part} for part in (thief, others)]
+    assert not people[0] & people[1]
+    assert [len(part) for part in people] == [15, 15]
 
 
 def test_too_few_faces_for_a_fit_say_nothing() -> None:

@@ -19,6 +19,7 @@ def outcome(
     attack: str = "some attack",
     judged: bool = True,
     scheme: Scheme = SCHEME,
+    lockout: int | None = None,
 ) -> AttackOutcome:
     return AttackOutcome(
         attack=attack,
@@ -30,6 +31,7 @@ def outcome(
         measured=measured,
         chance=chance,
         judged=judged,
+        details={} if lockout is None else {"lockout": lockout},
     )
 
 
@@ -102,6 +104,42 @@ def test_a_d_sys_below_its_null_tells_nothing() -> None:
     cell = only_cell(outcome(Property.UNLINKABILITY, below, leaked=stolen, chance=0.2))
     assert (cell.excess, cell.low, cell.high) == (0.0, 0.0, 0.0)
     assert cell.status is Status.PASS
+
+
+def test_what_a_lockout_bounds_has_a_limit_and_a_cell_of_its_own() -> None:
+    """Decisions without end have none; those before a lockout are judged as faces tried are."""
+    endless, bounded = (
+        outcome(
+            Property.IRREVERSIBILITY,
+            rate(hits, 100),
+            leaked=Leaked.DATABASE,
+            knowledge=Knowledge.RIGHT,
+            lockout=lockout,
+        )
+        for hits, lockout in ((90, None), (11, 50))
+    )
+    (verdict,) = judge([endless, bounded])
+    by_limit = {cell.limit: cell.status for cell in verdict.cells}
+    assert by_limit == {"climbing-success": Status.FAIL, "success-with-key": Status.UNLIMITED}
+
+
+def test_a_level_that_is_too_lax_for_a_limit_is_named() -> None:
+    """At FMR 1e-2 fifty faces open 39.5 % of any templates; where chance is below, nothing is."""
+    for chance, named in ((0.395, True), (0.049, False)):
+        tried = outcome(
+            Property.IMPERSONATION,
+            rate(43, 100),
+            leaked=Leaked.DATABASE,
+            chance=chance,
+            attack="hill-climbing",
+        )
+        cell = only_cell(tried)
+        assert (cell.limit, cell.status) == ("climbing-success", Status.FAIL)
+        assert (cell.reason is not None) == named
+        (line,) = headlines(judge([tried]))
+        assert ("It cannot hold: the false match rate of " in line) == named
+    far = only_cell(outcome(Property.CONFIDENTIALITY, rate(90, 100), chance=0.5))
+    assert (far.status, far.reason) == (Status.FAIL, None)
 
 
 def test_a_doubt_is_not_hidden_behind_a_small_success() -> None:

@@ -64,7 +64,7 @@ def test_point_trials_agree_with_brute_force(most_templates: int | None) -> None
             metric=Metric.SPHERICAL,
             stream=stream,
             templates=200,
-        )
+        ).expectation
     impostors, genuine = point_trials(
         people.descriptors,
         plan,

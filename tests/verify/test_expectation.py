@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from templates.contract.expectation import PointExpectation
+from templates.contract.levels import Level
 from templates.decoys import DecoyGenerator
 from templates.distances import Metric, pairwise_distances, similarity
 from templates.errors import ContractError
@@ -11,16 +12,15 @@ from templates.keys.randomness import Keystream
 from templates.space.lifting import Strategy, lift
 from tests.verify.population import M, N, decoys, enrolled, photos_of, templates_of, unit
 from verify.cohort import people_like
-from verify.expectation import draw_wolves, fit_expectation
+from verify.expectation import ExpectationFit, _Fit, draw_wolves, fit_expectation
+from verify.metrics import rate
 from verify.point_ascent import ascend_points
 
 TEMPLATES = 1500
 
 
-def fitted(
-    strategy: Strategy, metric: Metric, m: int = M, *, source: DecoyGenerator | None = None
-) -> PointExpectation:
-    source = source or decoys()
+def fit_of(strategy: Strategy, metric: Metric, m: int = M) -> ExpectationFit:
+    source = decoys()
     with Keystream.seeded("fit") as stream:
         return fit_expectation(
             source,
@@ -30,6 +30,10 @@ def fitted(
             metric=metric,
             stream=stream,
         )
+
+
+def fitted(strategy: Strategy, metric: Metric, m: int = M) -> PointExpectation:
+    return fit_of(strategy, metric, m).expectation
 
 
 @pytest.mark.parametrize("metric", Metric)
@@ -129,6 +133,50 @@ def test_people_are_drawn_as_they_are_spread() -> None:
     same = decoys().source_id
     assert people_like(decoys(), people[: N - 1]).source_id == same
     assert people_like(decoys(), None).source_id == same
+
+
+def test_the_fit_tells_how_far_others_climb(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Probes that are in no fit gain less by an ascent where others of the same kind are fitted."""
+    level = Level("fmr-1e-2", 1e-2, 2.3, rate(1, 100), rate(1, 100))
+    accepted = []
+    for climbs in (0, 2):
+        with monkeypatch.context() as patch:
+            patch.setattr("verify.expectation.CLIMBS", climbs)
+            fit = fit_of(Strategy.ADVERSARIAL, Metric.SPHERICAL)
+        assert fit.climbs == climbs
+        found = fit.climbers_at(level)
+        assert found is not None
+        assert (found.probes, found.templates) == (24, 1_000)
+        assert found.fitted == (climbs == 2)
+        assert found.accepted <= found.most
+        accepted.append(found.accepted)
+    assert accepted[1] < accepted[0]
+    assert fit_of(Strategy.ADVERSARIAL, Metric.EUCLIDEAN).climbers_at(level) is None
+
+
+def test_a_fit_that_cannot_follow_climbers_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("verify.expectation.CLIMB_WEIGHT", 1e9)
+    fit = fit_of(Strategy.ADVERSARIAL, Metric.SPHERICAL)
+    found = fit.climbers_at(Level("fmr-1e-2", 1e-2, 2.3, rate(1, 100), rate(1, 100)))
+    assert found is not None
+    assert not found.fitted
+
+
+def test_a_weight_counts_as_so_many_probes() -> None:
+    templates = templates_of(enrolled(80, seed=5), seed=5)
+    projector = np.einsum("tmi,tmj->ij", templates.bases, templates.bases) / len(templates)
+    foot = templates.feet.mean(axis=0)
+    drawn, climbed = photos_of(40, 1, seed=6)[:, 0], photos_of(6, 1, seed=7)[:, 0]
+    weighted, repeated = (
+        _Fit(Metric.SPHERICAL, (projector + projector.T) / 2, foot, templates) for _ in range(2)
+    )
+    weighted.add(drawn, np.ones(40))
+    weighted.add(climbed, np.full(6, 3.0))
+    repeated.add(np.concatenate([drawn, *[climbed] * 3]), np.ones(58))
+    first, second = weighted.expectation(), repeated.expectation()
+    np.testing.assert_allclose(
+        np.stack(first.statistics(drawn)), np.stack(second.statistics(drawn)), rtol=1e-6
+    )
 
 
 def test_probes_that_climb_are_fitted_too(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -98,6 +98,22 @@ def test_sets_of_photos_are_runs_around_a_circle() -> None:
     assert [frozenset(np.flatnonzero(row).tolist()) for row in means] == sets
 
 
+def test_impostors_are_one_of_everybody_before_a_second_of_anybody() -> None:
+    names = ["often"] * 60 + [f"p{person}" for person in range(20) for _ in range(3)]
+    plan = plan_trials(names, photos_per_enrollment=2, rng=np.random.default_rng(0))
+    for photos in (1, 2):
+        for turns in (1, 2, 3):
+            most = turns * len(plan.people)
+            drawn = probe_sets(plan, photos, most=most, rng=np.random.default_rng(turns))
+            assert len(set(drawn.impostor.tolist())) == most
+            owners = plan.person_of[drawn.photos[drawn.impostor, 0]]
+            assert np.bincount(owners).tolist() == [turns] * len(plan.people)
+    first, second = (
+        probe_sets(plan, 2, most=21, rng=np.random.default_rng(seed)).impostor for seed in (0, 1)
+    )
+    assert first.tolist() != second.tolist()
+
+
 def test_only_genuine_sets_of_photos_that_disagree_are_refused() -> None:
     people = draw_people(8, photos=(6,))
     plan = plan_trials(people.names, photos_per_enrollment=1, rng=np.random.default_rng(0))

@@ -16,6 +16,8 @@ import attacks.audit
 import attacks.population
 import attacks.system
 from api.cli import audit_templates
+from api.process.opening import file_sealer, open_keyring
+from api.settings import Settings
 from attacks.audit import AuditPlan, AuditResult
 from attacks.databases import link_databases
 from attacks.outcomes import Knowledge, Property
@@ -27,8 +29,10 @@ from attacks.system import System
 from attacks.verdict import LIMITS, Status
 from models.demo import DEMO_NOTICE
 from models.extraction import Extraction
+from templates.decoys import DecoyGenerator, load_source
+from templates.space.lifting import Strategy
 from tests.api.cli.audit_bench import are_pictures, both, documented, draw_people, named_in
-from tests.api.cli.conftest import Ran, World, run
+from tests.api.cli.conftest import DIM, Ran, World, run
 from tests.attacks.stored.systems import system_of
 from tests.leaks import LeakSearch
 from verify import calibrate
@@ -165,6 +169,8 @@ def test_what_two_attacks_found_becomes_report_verdict_and_status(
 
     def two_attacks(plan: AuditPlan, faces: Extraction, *_: Any, **__: Any) -> AuditResult:
         assert (plan.victims, len(faces.descriptors)) == (20, 20)
+        # Those of the contract in data_dir, where nothing else is asked for.
+        assert (plan.dims, plan.strategy) == ((DIM,), Strategy.ADVERSARIAL)
         outcomes = [*foot_point_attack(system), *known_database_attack(system)]
         return AuditResult(outcomes, [], [], {"victims": plan.victims})
 
@@ -185,6 +191,19 @@ def test_what_two_attacks_found_becomes_report_verdict_and_status(
     kept = run(*asked, *most, "--out", tmp_path / "kept")
     assert kept.status == 0, kept.stderr
     assert kept.stdout.strip().endswith("PASSED")
+
+
+def test_a_contract_of_other_decoys_says_no_dimension(world: World) -> None:
+    settings = Settings(data_dir=world.data)
+    sealer = file_sealer(open_keyring(settings))
+    own = load_source(settings.resolved_decoys_file, sealer)
+    served = audit_templates._served(settings, sealer, own)
+    assert served is not None
+    assert served.m == DIM
+    rows = np.random.default_rng(0).normal(size=(150, own.n))
+    other = DecoyGenerator.fit(rows / np.linalg.norm(rows, axis=1, keepdims=True))
+    assert audit_templates._served(settings, sealer, other) is None
+    assert audit_templates._served(settings, sealer, None) is None
 
 
 @pytest.mark.long
