@@ -150,7 +150,8 @@ def evaluate(
     """Evaluate face verification with private templates: the LFW / CFP / AgeDB protocol.
 
     Writes results.json, results.csv, results.md, figures (PNG and SVG) and results.html, which has
-    all to read in one file, to --out. An interrupted run goes on where it stopped. docs/evaluation.md explains every figure.
+    all to read in one file, to --out. An interrupted run goes on where it stopped.
+    docs/evaluation.md explains every figure.
 
     Example: `veilface evaluate lfw.bin --pack buffalo_l --decoys decoys.veil --out lfw-results`
     """

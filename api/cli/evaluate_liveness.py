@@ -88,7 +88,8 @@ def evaluate_liveness(
 
     Reports APCER for each attack species, BPCER, photos without a face and, with a contract, its
     decoys and subjects, IAPMR through the whole verification. Writes results.json, results.csv,
-    results.md, a DET figure and results.html to --out. docs/liveness.md says what such graphs cannot see.
+    results.md, a DET figure and results.html to --out. docs/liveness.md says what such graphs
+    cannot see.
 
     Example: `veilface evaluate liveness photos --pack buffalo_l --contract contract.json
     --out liveness-results`
