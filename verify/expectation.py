@@ -1,6 +1,6 @@
 """Fits what is expected of a point's similarity to templates of nobody (docs/method.md §6.1)."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +40,8 @@ MOST_SPREAD = 0.4
 """Largest root mean square relative error of the spread."""
 AXES = 64
 _TILE_BYTES = 32 * 2**20
+_LIFTED, _COMPARED = 0.6, 0.8
+"""Shares of the time that have passed once templates are lifted, and probes compared with them."""
 _CUT = 1e-5
 """Of the largest singular value: smaller ones are left out. Where H is nearly a multiple of the
 identity, as with random lifting, its forms hardly differ; on faces the smallest is 2e-4."""
@@ -56,6 +58,7 @@ def fit_expectation(
     metric: Metric,
     stream: Keystream,
     templates: int = TEMPLATES,
+    progress: Callable[[float], None] = lambda _share: None,
 ) -> PointExpectation:
     """Fit mean and spread to probes, honest and hostile, against templates of nobody.
 
@@ -71,6 +74,8 @@ def fit_expectation(
         Nothing that is drawn is kept or secret.
     templates
         How many probes are compared with; half of those that are lifted.
+    progress
+        Called with the share that is done, from 0 to 1.
 
     Raises
     ------
@@ -88,11 +93,17 @@ def fit_expectation(
 
     tile = max(1, _TILE_BYTES // (8 * m * source.n))
     mean_template = MeanTemplate.empty(source.n)
+
+    def lift_told(count: int) -> Templates:
+        progress(_LIFTED * mean_template.counts.sum() / (2 * templates))
+        return lift_nobody(count)
+
     compared, climbed = (
-        _kept(mean_template.add(half, lift_nobody, templates, tile=tile), kept)
+        _kept(mean_template.add(half, lift_told, templates, tile=tile), kept)
         for half, kept in enumerate((templates, CLIMBED))
     )
     projector, foot = mean_template.estimate([source, hidden])
+    progress(_LIFTED)
     fit = _Fit(
         metric,
         np.asarray(projector, dtype=np.float32),
@@ -105,7 +116,8 @@ def fit_expectation(
     if metric is Metric.EUCLIDEAN:  # the mean is exact, and has nowhere to climb
         return expectation
     starts = np.concatenate([wolves[:: -(-WOLVES // CLIMBERS) * 2], people[: CLIMBERS // 2]])
-    for _ in range(CLIMBS):
+    for climb in range(CLIMBS):
+        progress(_COMPARED + (1 - _COMPARED) * climb / CLIMBS)
         ends = ascend_points(
             starts.astype(np.float32),
             climbed,
