@@ -51,7 +51,7 @@ class CalibrationReport:
         Sentences about the groups whose trials are too few for ``worst_group`` to heed them.
     suspicious
         People who may be one person under two names: look at them before believing a threshold
-        at FMR 1e-4 or below, then name them in ``aliases`` (docs/method.md §7.3).
+        at FMR 1e-4 or below, then name them in ``aliases`` (docs/design-measurements.md §1.3).
     suspicious_above
         Raw cosine that makes a pair suspicious.
     ten_folds
