@@ -77,9 +77,9 @@ class DecoyGenerator:
     References
     ----------
     docs/method.md §4.5: independence of the subject's attributes; docs/design-measurements.md
-    §1.3: a Gaussian with full covariance, which this refines. The bands are a Gaussian scale mixture: S. Lyu & E. P.
-    Simoncelli, "Modeling multiscale subbands of photographic images with fields of Gaussian scale
-    mixtures", PAMI 2009.
+    §1.3: a Gaussian with full covariance, which this refines. The bands are a Gaussian scale
+    mixture: S. Lyu & E. P. Simoncelli, "Modeling multiscale subbands of photographic images with
+    fields of Gaussian scale mixtures", PAMI 2009.
     """
 
     def __init__(
