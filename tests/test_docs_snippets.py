@@ -57,6 +57,11 @@ ELSEWHERE = {
     ("README.md", "make demo"): "tests/test_readme.py",
     ("README.md", "PACK=~/.insightface/models/buffalo_l"): "tests/test_readme.py",
     ("README.md", ". .venv/bin/activate"): "tests/test_readme.py",
+    (
+        "README.md",
+        "export VEILFACE_URL=http://127.0.0.1:8421 "
+        "VEILFACE_API_KEY=$(cat veilface-data-keys/api-key)",
+    ): "tests/examples/test_login.py",
     ("docs/evaluation.md", "LFW=~/lfw.bin"): "tests/test_readme.py",
     ("docs/cli.md", "veilface demo"): "tests/test_tutorial.py",
 }
