@@ -10,10 +10,13 @@ PYTEST = OMP_NUM_THREADS=1 $(VENV)/pytest --numprocesses=logical --maxprocesses=
 # Bytecode is kept: without it, every process that a test starts compiles all that it imports.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo extras test test-all lint types audit sbom wheels lock clean
+.PHONY: demo install extras docs test test-all lint types audit sbom wheels lock clean
 
 demo: .venv/core
 	$(VENV)/veilface demo
+
+# The program alone, into .venv: what the real path needs, and a host.
+install: .venv/core
 
 # What the service does without and some commands need: `make extras EXTRAS=evaluate,audit`.
 EXTRAS ?= all
@@ -48,6 +51,10 @@ sbom: | $(UV)
 	mkdir -p dist
 	$(UV) tool run --quiet --from cyclonedx-bom==7.5.0 cyclonedx-py requirements requirements.lock \
 		--output-reproducible --output-file dist/sbom.json
+
+# The site of docs/, in dist/docs; a link that leads nowhere fails.
+docs: | $(UV)
+	$(UV) tool run --quiet --from zensical==0.0.73 zensical build --strict
 
 # The wheels of both distributions; that of the client must do alone, in an environment of its own.
 wheels: | $(UV)

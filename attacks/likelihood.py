@@ -4,8 +4,8 @@ Decoys hide a descriptor only if they are spread as descriptors are. All unit po
 are mixtures of the descriptor and the decoys; along axes in which decoys vary less than faces do,
 only the descriptor has anything to contribute, and the mixture that holds most of it is found in
 closed form. Clients have the generator, so everybody can know its covariance. Not in the paper,
-whose decoys are real, nor in the measurements of docs/method.md §7.2, whose decoys and people are
-of one set.
+whose decoys are real, nor in the measurements of docs/design-measurements.md §1.2, whose decoys and
+people are of one set.
 """
 
 from collections.abc import Callable, Mapping, Sequence

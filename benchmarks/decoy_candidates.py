@@ -68,7 +68,7 @@ class SampledSource:
 
 
 def gaussian(data: FitData) -> Sampler:
-    """Full covariance of the embeddings (docs/method.md §7.3)."""
+    """Full covariance of the embeddings (docs/design-measurements.md §1.3)."""
     x = data.x
     return _affine(x.mean(axis=0), _root(np.cov(x, rowvar=False)))
 

@@ -1,9 +1,10 @@
 """Which decoy generator: told apart from real embeddings, accuracy, leakage, memorisation.
 
-Every figure of docs/decoys.md. Generators are fitted to 3,500 FairFace training faces and compared
-with faces of other people. Embeddings stay in memory; ``--embeddings`` reads an .npz computed
-elsewhere instead (keys ``lfw``, ``lfw_paths``, ``fairface_train``, ``fairface_train_paths``,
-``fairface_val``, ``fairface_val_paths``, optionally ``fairface_train_norm``).
+Every figure of docs/design-measurements.md §2. Generators are fitted to 3,500 FairFace training
+faces and compared with faces of other people. Embeddings stay in memory; ``--embeddings`` reads an
+.npz computed elsewhere instead (keys ``lfw``, ``lfw_paths``, ``fairface_train``,
+``fairface_train_paths``, ``fairface_val``, ``fairface_val_paths``, optionally
+``fairface_train_norm``).
 
 Example
 -------

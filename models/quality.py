@@ -60,7 +60,7 @@ class Quality:
 
 @dataclass(frozen=True, kw_only=True)
 class QualityLimits:
-    """What a face must reach. How the defaults were measured: docs/models.md.
+    """What a face must reach. How the defaults were measured: docs/quality-gate.md.
 
     Attributes
     ----------

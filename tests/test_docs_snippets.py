@@ -47,6 +47,8 @@ WHOLE_PAGES = {
     ("docs/tutorial.md", "sh"): "tests/test_tutorial.py",
     ("docs/client.md", "sh"): "tests/clients/test_docs.py",
     ("docs/client.md", "python"): "tests/clients/test_docs.py",
+    ("docs/private-client.md", "sh"): "tests/clients/test_docs.py",
+    ("docs/private-client.md", "python"): "tests/clients/test_docs.py",
     ("docs/webhooks.md", "python"): "tests/api/process/test_webhooks.py",
 }
 # Blocks that another test executes: page and first line.
@@ -55,6 +57,11 @@ ELSEWHERE = {
     ("README.md", "make demo"): "tests/test_readme.py",
     ("README.md", "PACK=~/.insightface/models/buffalo_l"): "tests/test_readme.py",
     ("README.md", ". .venv/bin/activate"): "tests/test_readme.py",
+    (
+        "README.md",
+        "export VEILFACE_URL=http://127.0.0.1:8421 "
+        "VEILFACE_API_KEY=$(cat veilface-data-keys/api-key)",
+    ): "tests/examples/test_login.py",
     ("docs/evaluation.md", "LFW=~/lfw.bin"): "tests/test_readme.py",
     ("docs/cli.md", "veilface demo"): "tests/test_tutorial.py",
 }
@@ -120,7 +127,7 @@ PARSED = {
         OWN_DATA
     ),
     ("docs/cli.md", "veilface bench distances"): OWN_DATA,
-    ("docs/decoys.md", "python -m benchmarks.decoy_generators --data ../shared/data "
+    ("docs/design-measurements.md", "python -m benchmarks.decoy_generators --data ../shared/data "
      "--part separation"): OWN_DATA,
     ("docs/evaluation.md", "PACK=~/.insightface/models/buffalo_l"): SETTINGS_ALONE,
     ("docs/evaluation.md", "veilface evaluate $BENCH/lfw.bin --pack $PACK --strategy raw,raw+flip "
@@ -134,7 +141,7 @@ PARSED = {
     ("docs/evaluation.md", "veilface decoys build $FACES --pack $PACK --out generator.veil"): (
         OWN_DATA
     ),
-    ("docs/evaluation.md", "veilface evaluate ~/lfw --pack $PACK --labels labels.csv "
+    ("docs/evaluation-columns.md", "veilface evaluate ~/lfw --pack $PACK --labels labels.csv "
      "--strategy raw,random --out groups"): OWN_DATA,
     ("docs/evaluation.md", "dask scheduler --host 127.0.0.1 --port 8786 &"): OWN_DATA,
     ("docs/liveness.md", "veilface calibrate --liveness booth --bpcer 0.05 --pack buffalo_l "

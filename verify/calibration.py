@@ -51,7 +51,7 @@ class CalibrationReport:
         Sentences about the groups whose trials are too few for ``worst_group`` to heed them.
     suspicious
         People who may be one person under two names: look at them before believing a threshold
-        at FMR 1e-4 or below, then name them in ``aliases`` (docs/method.md §7.3).
+        at FMR 1e-4 or below, then name them in ``aliases`` (docs/design-measurements.md §1.3).
     suspicious_above
         Raw cosine that makes a pair suspicious.
     ten_folds
@@ -79,9 +79,13 @@ class Calibrated:
     report: CalibrationReport
 
 
-def _part_of(progress: Progress, number: int, parts: int) -> Progress:
-    """Report the progress of one of several equal parts as progress of the whole."""
-    return lambda what, share: progress(what, (number + share) / parts)
+_FITTED = 0.7
+"""Share of the time that has passed, on LFW, once people are enrolled and expectations fitted."""
+
+
+def part_of(progress: Progress, first: float, last: float) -> Progress:
+    """Report the progress of what begins and ends at two shares as progress of the whole."""
+    return lambda what, share: progress(what, first + (last - first) * share)
 
 
 def _silent(_what: str, _share: float) -> None:
@@ -219,7 +223,10 @@ def calibrate(
     dims = [dim for dim in options.probe_dims if dim]
     kinds: list[ProbeSets | int] = [*sets, *dims]
     for number, kind in enumerate(kinds):
-        part = replace(run, progress=_part_of(progress, number, len(kinds)))
+        first, last = (
+            _FITTED + (1 - _FITTED) * place / len(kinds) for place in (number, number + 1)
+        )
+        part = replace(run, progress=part_of(progress, first, last))
         results.append(
             calibrate_lifted(part, kind, rng)
             if isinstance(kind, int)
@@ -311,7 +318,7 @@ def _lay_out(
         hidden = people_like(generator, means)
     fit = None
     if expectation is None:
-        progress("fitting expected similarities", 0.0)
+        fitting = part_of(progress, 0.0, _FITTED)
         with Keystream.seeded("expectation", options.seed) as stream:
             fit = fit_expectation(
                 generator,
@@ -320,10 +327,11 @@ def _lay_out(
                 m=binding.m,
                 metric=options.metric,
                 stream=stream,
+                progress=lambda share: fitting("fitting expected similarities", share),
             )
         expectation = fit.expectation
     if nobody is None:
-        progress("drawing strangers", 0.0)
+        progress("drawing strangers", _FITTED)
         sources = strangers_like(generator, hidden, data, plan.person_of)
         halves = len(sources) == 2
         with Keystream.fresh() as stream:

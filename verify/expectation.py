@@ -1,6 +1,6 @@
 """Fits what is expected of a point's similarity to templates of nobody (docs/method.md §6.1)."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -44,6 +44,8 @@ MOST_SPREAD = 0.4
 """Largest root mean square relative error of the spread."""
 AXES = 64
 _TILE_BYTES = 32 * 2**20
+_LIFTED, _COMPARED = 0.6, 0.8
+"""Shares of the time that have passed once templates are lifted, and probes compared with them."""
 _CUT = 1e-5
 """Of the largest singular value: smaller ones are left out. Where H is nearly a multiple of the
 identity, as with random lifting, its forms hardly differ; on faces the smallest is 2e-4."""
@@ -125,6 +127,7 @@ def fit_expectation(
     metric: Metric,
     stream: Keystream,
     templates: int = TEMPLATES,
+    progress: Callable[[float], None] = lambda _share: None,
 ) -> ExpectationFit:
     """Fit mean and spread to probes, honest and hostile, against templates of nobody.
 
@@ -140,6 +143,8 @@ def fit_expectation(
         Nothing that is drawn is kept or secret.
     templates
         How many probes are compared with; half of those that are lifted.
+    progress
+        Called with the share that is done, from 0 to 1.
 
     Raises
     ------
@@ -157,11 +162,17 @@ def fit_expectation(
 
     tile = max(1, _TILE_BYTES // (8 * m * source.n))
     mean_template = MeanTemplate.empty(source.n)
+
+    def lift_told(count: int) -> Templates:
+        progress(_LIFTED * mean_template.counts.sum() / (2 * templates))
+        return lift_nobody(count)
+
     compared, climbed = (
-        _kept(mean_template.add(half, lift_nobody, templates, tile=tile), kept)
+        _kept(mean_template.add(half, lift_told, templates, tile=tile), kept)
         for half, kept in enumerate((templates, CLIMBED))
     )
     projector, foot = mean_template.estimate([source, hidden])
+    progress(_LIFTED)
     fit = _Fit(
         metric,
         np.asarray(projector, dtype=np.float32),
@@ -177,6 +188,7 @@ def fit_expectation(
         return ExpectationFit(expectation, 0, np.empty((0, templates)))
     climbs = 0
     while climbs < CLIMBS:
+        progress(_COMPARED + (1 - _COMPARED) * climbs / (CLIMBS + 1))
         ends = _ascended(starts, climbed, expectation)
         fit.add(ends, np.full(len(ends), CLIMB_WEIGHT))
         closer = fit.expectation()

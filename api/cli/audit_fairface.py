@@ -148,8 +148,9 @@ def fairface(
 ) -> None:
     """Infer gender, race and age from templates: the paper's experiment, and stronger attackers.
 
-    Writes report.json, report.md and figures to --out; the paper's figure is among them. Exit
-    status 1: the strongest attacker exceeds the limit. docs/privacy.md explains every figure.
+    Writes report.json, report.md, figures, the paper's among them, and report.html, which has all
+    to read in one file, to --out. Exit status 1: the strongest attacker exceeds the limit.
+    docs/privacy.md explains every figure.
 
     Example: `veilface audit fairface fairface --pack buffalo_l --out audit`
     """

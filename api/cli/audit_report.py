@@ -13,6 +13,7 @@ from rich.table import Table
 
 from api.cli.console import demo_notice, emit, say, share_done, show, table
 from api.cli.errors import FAILED
+from api.cli.html_report import write_html
 from api.process.preparation import recorded_of
 from attacks.outcomes import Scheme
 from attacks.report import Document
@@ -23,6 +24,13 @@ from templates.keys.private_file import make_folder, replace_public
 
 Out = Annotated[Path, typer.Option(help="Folder of the report.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed for everything random.")]
+
+CAPTIONS = {
+    "figure": "Attributes inferred from templates, by dimension",
+    "frontier": "Accuracy over what the strongest attackers learn",
+    "linkage": "Local linkability D(s) of the templates of two tenants",
+    "oracle": "What the paper's oracle gets",
+}
 
 R = TypeVar("R")
 
@@ -86,7 +94,7 @@ def share_once_begun(description: str) -> Iterator[Callable[[float], None]]:
 def write_report(
     report: Document, out: Path, *, evaluation: Mapping[str, Any] | None = None
 ) -> list[Path]:
-    """Write the document, its Markdown and its figures; return their files.
+    """Write the document, its Markdown, its figures and its HTML; return their files.
 
     Parameters
     ----------
@@ -100,8 +108,10 @@ def write_report(
     files = [out / "report.json", out / "report.md"]
     text = json.dumps(report, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
     replace_public(files[0], text.encode())
-    replace_public(files[1], markdown(report).encode())
-    return [*files, *write_figures(report, out, evaluation=evaluation)]
+    written = markdown(report)
+    replace_public(files[1], written.encode())
+    figures = write_figures(report, out, evaluation=evaluation)
+    return [*files, *figures, write_html(out / "report.html", written, figures, CAPTIONS)]
 
 
 def model_json(pack: ModelPack) -> dict[str, Any]:
@@ -129,6 +139,7 @@ def conclude(
         for sentence in report["comparison_headlines"]:
             say(f"For comparison: {sentence}")
         say(f"{out}: {', '.join(path.name for path in files)}.")
+        say(f"To read it: {out / 'report.html'}")
         say("PASSED" if report["passed"] else "FAILED: a limit is exceeded.")
     if not report["passed"]:
         raise typer.Exit(FAILED)

@@ -175,8 +175,9 @@ def templates(
 ) -> None:
     """Attack private templates: inversion, linkage, renewal, impersonation, climbing.
 
-    Writes report.json, report.md and figures to --out. Every attack says what the attacker is
-    assumed to have. Exit status 1: an attack exceeds its limit. docs/privacy.md explains them.
+    Writes report.json, report.md, figures and report.html, which has all to read in one file, to
+    --out. Every attack says what the attacker is assumed to have. Exit status 1: an attack exceeds
+    its limit. docs/privacy.md explains them.
 
     Example: `veilface audit templates lfw --pack buffalo_l --decoys decoys.veil --out audit`
     """

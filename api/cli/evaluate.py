@@ -149,8 +149,9 @@ def evaluate(
 ) -> None:
     """Evaluate face verification with private templates: the LFW / CFP / AgeDB protocol.
 
-    Writes results.json, results.csv, results.md and figures (PNG and SVG) to --out. An
-    interrupted run goes on where it stopped. docs/evaluation.md explains every figure.
+    Writes results.json, results.csv, results.md, figures (PNG and SVG) and results.html, which has
+    all to read in one file, to --out. An interrupted run goes on where it stopped.
+    docs/evaluation.md explains every figure.
 
     Example: `veilface evaluate lfw.bin --pack buffalo_l --decoys decoys.veil --out lfw-results`
     """
@@ -220,6 +221,7 @@ def evaluate(
     for sentence in results["refused"]:
         say(f"Not reported: {sentence}.")
     say(f"{out}: {', '.join(path.name for path in written)}.")
+    say(f"To read it: {out / 'results.html'}")
 
 
 def _rates(text: str) -> tuple[float, ...]:

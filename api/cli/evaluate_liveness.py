@@ -9,6 +9,7 @@ import typer
 from api.cli.console import demo_notice, emit, message, progress, say, show, table
 from api.cli.descriptors import BULK, bulk_pack
 from api.cli.errors import CommandError, UsageError, require_extra
+from api.cli.html_report import write_html
 from api.cli.inputs import listed, load_decoys
 from api.cli.options import AsJson, takes_settings
 from api.process.opening import file_sealer, open_keyring
@@ -87,7 +88,8 @@ def evaluate_liveness(
 
     Reports APCER for each attack species, BPCER, photos without a face and, with a contract, its
     decoys and subjects, IAPMR through the whole verification. Writes results.json, results.csv,
-    results.md and a DET figure to --out. docs/liveness.md says what such graphs cannot see.
+    results.md, a DET figure and results.html to --out. docs/liveness.md says what such graphs
+    cannot see.
 
     Example: `veilface evaluate liveness photos --pack buffalo_l --contract contract.json
     --out liveness-results`
@@ -132,6 +134,7 @@ def evaluate_liveness(
         return
     _show(results)
     say(f"{out}: {', '.join(path.name for path in written)}.")
+    say(f"To read it: {out / 'results.html'}")
 
 
 def require_liveness(pack: ModelPack) -> PassiveLiveness:
@@ -233,8 +236,11 @@ def _write(results: Json, out: Path) -> list[Path]:
     text = json.dumps(results, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
     replace_public(files[0], text.encode())
     write_lines(results["rows"], files[1])
-    replace_public(files[2], markdown(results).encode())
-    return [*files, *write(liveness_figure(results), out, "det")]
+    report = markdown(results)
+    replace_public(files[2], report.encode())
+    figures = write(liveness_figure(results), out, "det")
+    captions = {"det": "Attacks taken for live over live photos taken for attacks (DET)"}
+    return [*files, *figures, write_html(out / "results.html", report, figures, captions)]
 
 
 def _show(results: Json) -> None:

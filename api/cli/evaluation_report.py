@@ -7,10 +7,18 @@ from typing import Any
 from rich.table import Table
 
 from api.cli.console import table
+from api.cli.html_report import write_html
 from api.cli.inputs import read_json
 from templates.keys.private_file import replace_public
 from verify.evaluation.rows import Json
 from verify.evaluation.tables import markdown, write_csv
+
+CAPTIONS = {
+    "figure": "Accuracy by lifting and dimension, beside that of raw embeddings",
+    "det": "False non-matches over false matches (DET)",
+    "roc": "Genuine pairs accepted over false matches (ROC)",
+    "frontier": "Accuracy over what the strongest attackers learn",
+}
 
 
 def read_audit(file: Path) -> Json:
@@ -29,7 +37,7 @@ def read_audit(file: Path) -> Json:
 
 
 def write_results(results: Json, out: Path, *, audit: Json | None) -> list[Path]:
-    """Write the document, the tables and the figures; return their files."""
+    """Write the document, the tables, the figures and the HTML; return their files."""
     # Imported here: drawing loads a library that nothing else needs.
     from verify.evaluation.figures import write_figures
 
@@ -41,8 +49,10 @@ def write_results(results: Json, out: Path, *, audit: Json | None) -> list[Path]
             (out / f"{name}{suffix}").unlink(missing_ok=True)
     replace_public(files[0], text.encode())
     write_csv(results, files[1])
-    replace_public(files[2], markdown(results).encode())
-    return [*files, *write_figures(results, out, audit=audit)]
+    report = markdown(results)
+    replace_public(files[2], report.encode())
+    figures = write_figures(results, out, audit=audit)
+    return [*files, *figures, write_html(out / "results.html", report, figures, CAPTIONS)]
 
 
 def summary(results: Json, dataset: str) -> Table:

@@ -72,8 +72,13 @@ def _say_where(settings: Settings) -> None:
     if settings.operations_port is not None:
         operations = _address(settings.operations_host, settings.operations_port)
         message(f"Health and metrics are on http://{operations}")
+    message(f"Veilface listens on {service_url(settings)}")
+
+
+def service_url(settings: Settings) -> str:
+    """Where the service of some settings answers."""
     scheme = "http" if settings.tls_certificate is None else "https"
-    message(f"Veilface listens on {scheme}://{_address(settings.host, settings.port)}")
+    return f"{scheme}://{_address(settings.host, settings.port)}"
 
 
 def _with_ports(settings: Settings) -> Settings:

@@ -1,5 +1,6 @@
 """``veilface setup``: from a pack and photos to a service that is judged and ready to start."""
 
+import shlex
 import time
 from collections.abc import Collection, Sequence
 from dataclasses import replace
@@ -144,12 +145,17 @@ def setup(
         message(f"error: {misled}")
     if refused or misled is not None:
         raise typer.Exit(1)
-    if serve:
-        from api.cli.serve import start
+    if as_json and not serve:
+        return
+    # Imported here: a server takes long to load.
+    from api.cli.serve import service_url, start
 
+    if not as_json:
+        if not serve:
+            say("Start it: veilface serve")
+        _tell_calls(service_url(settings), api_key_file(settings))
+    if serve:
         start(settings)
-    elif not as_json:
-        say("Start it: veilface serve")
 
 
 def assign_roles(labelled: LabelledFolder, faces: Sequence[Path], like: Sequence[Path]) -> Roles:
@@ -240,6 +246,16 @@ def _tell_plan(plan: dict[str, Any]) -> None:
             f"These are promises of a contract made anew. {plan['contract_file']} is there and "
             "kept: what it promises is in its own verdict."
         )
+
+
+def _tell_calls(service: str, key_file: Path) -> None:
+    """Show the two calls that a newcomer makes first, ready to paste into another shell."""
+    key = f'-H "Authorization: Bearer $(cat {shlex.quote(str(key_file))})"'
+    person = f"{service}/v1/subjects/anna"
+    say(
+        f"Enroll:   curl -X PUT {person}/enrollment {key} -F images=@anna1.jpg -F images=@anna2.jpg"
+    )
+    say(f"Verify:   curl -X POST {person}/verify {key} -F image=@anna3.jpg")
 
 
 def _prepared(

@@ -3,10 +3,10 @@
 The commands ``decoys build`` and ``calibrate`` and the demo are callers of these functions.
 """
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +26,9 @@ from models.pack import ModelPack
 from templates.contract.binding import embedding_id
 from templates.contract.canonical import Json
 from templates.contract.document import Binding, Contract
-from templates.contract.verdict import Verdict
+from templates.contract.verdict import Judgement, Verdict
 from templates.decoys import NOISE_ENERGY, Attributes, DecoyGenerator, DecoyPool, DecoySource
+from templates.distances.blas import single_threaded
 from templates.errors import ContractMismatch, VeilfaceError
 from templates.keys.rotation import ROTATION_VERSION
 from templates.space.lifting import Strategy, plain_strategy
@@ -38,6 +39,8 @@ from verify import (
     calibrate,
     read_lfw_pairs,
 )
+from verify.calibration import part_of
+from verify.comparisons import Progress
 from verify.consistency import match_cosine
 from verify.evaluation.attributes import resembling_rows
 from verify.group_rates import PhotoLabels
@@ -53,6 +56,10 @@ single probes are rejected at FMR 1e-3 with m = 64, and 3 with 32 (docs/threshol
 DEFAULT_PROBE_DIM = 4
 """Dimension of the lifted probes that a calibration takes. On LFW at m = 64, 5 % of genuine ones
 are rejected, 7 % at 8 and 15 % at 16 (docs/measurements.md); at 2 the FMR was above its target."""
+
+
+_SEARCHED = 0.2
+"""Share of a calibration's time that has passed, on LFW, once its dimension is found."""
 
 
 class PreparationError(VeilfaceError):
@@ -130,7 +137,8 @@ def make_generator(
     """
     rows, made, noise = extraction.descriptors, made_with(pack), NOISE_ENERGY / pack.info.n
     if like is None:
-        return DecoyGenerator.fit(rows, made_with=made, noise=noise)
+        with single_threaded():  # as below, in calibrate_folder
+            return DecoyGenerator.fit(rows, made_with=made, noise=noise)
     sample = like.extraction.descriptors
     twice = len(resembling_rows(sample, rows, cosine=SAME_PHOTO))
     if twice:
@@ -139,7 +147,8 @@ def make_generator(
             "would take them for people whom it has not seen. Give folders that share no people, "
             "or leave them out"
         )
-    return DecoyGenerator.adapt(rows, sample, like.people, made_with=made, noise=noise)
+    with single_threaded():
+        return DecoyGenerator.adapt(rows, sample, like.people, made_with=made, noise=noise)
 
 
 def make_pool(
@@ -215,7 +224,7 @@ def calibrate_folder(
     exclude: Collection[str] = (),
     aliases: Mapping[str, str] | None = None,
     labels: PhotoLabels | None = None,
-    progress: Callable[[str, float], None] | None = None,
+    progress: Progress = lambda _what, _share: None,
 ) -> CalibratedFolder:
     """Calibrate on the descriptors of a labelled folder; judge privacy, accuracy and groups.
 
@@ -227,6 +236,8 @@ def calibrate_folder(
         Dimension of the templates; None for the smallest at which they are private.
     labels
         Of the photos of ``extraction``, for rates by group of people.
+    progress
+        Called with what is being done and the share of the whole, which rises from 0 to 1.
 
     Raises
     ------
@@ -240,19 +251,46 @@ def calibrate_folder(
             f"templates of strategy {strategy} conceal nothing; `veilface evaluate` measures it, "
             "and no contract is made for it"
         )
+    # Thousands of products of small matrices: with a second thread for each, the library spends
+    # most of its time waiting. The distances have threads of their own.
+    with single_threaded():
+        return _calibrated(
+            folder, extraction, pack, source, strategy, m, options, exclude, aliases or {}, labels,
+            progress,
+        )  # fmt: skip
+
+
+def _calibrated(
+    folder: LabelledFolder,
+    extraction: Extraction,
+    pack: ModelPack,
+    source: DecoySource,
+    strategy: Strategy,
+    m: int | None,
+    options: CalibrationOptions,
+    exclude: Collection[str],
+    aliases: Mapping[str, str],
+    labels: PhotoLabels | None,
+    progress: Progress,
+) -> CalibratedFolder:
     name_of = dict(zip(folder.paths, folder.identities, strict=True))
     pairs_file = folder.root / "pairs.txt"
     pairs = None
     if options.protocol == "ten-fold" and pairs_file.is_file():
         missing = [failure.path for failure in extraction.failures]
         pairs = read_lfw_pairs(pairs_file, extraction.paths, missing=missing)
-    more: dict[str, Any] = {} if progress is None else {"progress": progress}
     names = [name_of[path] for path in extraction.paths]
-    kept, staying = chosen_photos(names, exclude=exclude, aliases=aliases or {})
+    kept, staying = chosen_photos(names, exclude=exclude, aliases=aliases)
     if len(kept):
         require_others(source, extraction.descriptors[kept], staying)
     point = _operating_point(
-        extraction.descriptors[kept], staying, source, strategy=strategy, m=m, options=options
+        extraction.descriptors[kept],
+        staying,
+        source,
+        strategy=strategy,
+        m=m,
+        options=options,
+        progress=part_of(progress, 0.0, _SEARCHED),
     )
     done = calibrate(
         extraction.descriptors,
@@ -268,7 +306,7 @@ def calibrate_folder(
         pairs=pairs,
         recorded=recorded_of(pack),
         dataset=folder.root.resolve().name,
-        **more,
+        progress=part_of(progress, _SEARCHED, 1.0),
     )
     verdict = Verdict(
         privacy=point.tried[point.dim],
@@ -288,8 +326,11 @@ def _operating_point(
     strategy: Strategy,
     m: int | None,
     options: CalibrationOptions,
+    progress: Progress,
 ) -> OperatingPoint:
     """Measure privacy: of one dimension, or of those on the way to the smallest that passes."""
+    what = "attacking templates"
+    progress(what, 0.0)
     setup = AttackSetup.of_people(
         descriptors,
         names,
@@ -307,11 +348,19 @@ def _operating_point(
     # With decoys in most of the dimensions little is left of a face for anybody.
     dims = [dim for dim in DIMS if dim <= 3 * source.n // 4] if m is None else []
     otherwise = min(DEFAULT_DIM, source.n // 4) if m is None else m
+    # The attackers are made, then a bisection and at most one dimension more is judged.
+    steps, done = 2 + len(dims).bit_length(), count(1)
+
+    def judge(dim: int) -> Judgement:
+        progress(what, next(done) / steps)
+        return judge_privacy(privacy_of(setup, strategy=strategy, m=dim), uncovered=uncovered)
+
     point = smallest_private(
-        lambda dim: judge_privacy(privacy_of(setup, strategy=strategy, m=dim), uncovered=uncovered),
+        judge,
         dims,
         otherwise=otherwise,
     )
+    progress(what, (steps - 1) / steps)
     judgement = point.tried[point.dim]
     chosen = "asked for"
     if m is None:

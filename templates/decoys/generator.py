@@ -2,9 +2,9 @@
 
 The generator holds moments, not descriptors, and is given to clients that lift on their own
 (docs/rest.md "The generator"). The moments still tell who holds a photo whether that person was in
-the fit, better than chance (docs/decoys.md "Whether it remembers people"). Every draw is fresh, so
-no decoy exists outside its one template, and it does not depend on the subject (docs/method.md §4.2
-to §4.5). docs/decoys.md says how it was chosen.
+the fit, better than chance (docs/design-measurements.md "Whether it remembers people"). Every draw
+is fresh, so no decoy exists outside its one template, and it does not depend on the subject
+(docs/method.md §4.2 to §4.5). docs/design-measurements.md says how it was chosen.
 """
 
 import hashlib
@@ -76,10 +76,10 @@ class DecoyGenerator:
 
     References
     ----------
-    docs/method.md §4.5 and §7.3: independence of the subject's attributes, and a Gaussian with full
-    covariance, which this refines. The bands are a Gaussian scale mixture: S. Lyu & E. P.
-    Simoncelli, "Modeling multiscale subbands of photographic images with fields of Gaussian scale
-    mixtures", PAMI 2009.
+    docs/method.md §4.5: independence of the subject's attributes; docs/design-measurements.md
+    §1.3: a Gaussian with full covariance, which this refines. The bands are a Gaussian scale
+    mixture: S. Lyu & E. P. Simoncelli, "Modeling multiscale subbands of photographic images with
+    fields of Gaussian scale mixtures", PAMI 2009.
     """
 
     def __init__(
@@ -270,7 +270,7 @@ class DecoyGenerator:
         """Write the generator as a plain file, which clients may have.
 
         It holds no descriptor, but tells who holds a photo whether that person was in the fit,
-        better than chance (docs/decoys.md).
+        better than chance (docs/design-measurements.md).
 
         Raises
         ------

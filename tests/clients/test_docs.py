@@ -14,7 +14,10 @@ from veilface_client import Client
 from veilface_client.errors import FAMILIES
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGES = ("docs/client.md", "clients/python/README.md")
+CLIENT, PRIVATE, DISTRIBUTION = PAGES = (
+    *("docs/client.md", "docs/private-client.md"),
+    "clients/python/README.md",
+)
 EXAMPLE = "http://127.0.0.1:8421"
 
 
@@ -66,7 +69,8 @@ def test_a_snippet_prints_what_it_says(
 
 def test_the_same_from_the_shell(service: Running, newcomer: tuple[Path, dict[str, str]]) -> None:
     folder, env = newcomer
-    install, _, script = blocks(PAGES[0], "sh")
+    install = blocks(CLIENT, "sh")[0]
+    (script,) = blocks(PRIVATE, "sh")
     assert install == "pip install ./clients/python\n"
     assert (ROOT / "clients" / "python" / "pyproject.toml").exists()
     done = subprocess.run(
@@ -80,7 +84,7 @@ def test_the_same_from_the_shell(service: Running, newcomer: tuple[Path, dict[st
     assert '"decision":"accept"' in done.stdout.replace(": ", ":")
 
 
-@pytest.mark.parametrize("page", PAGES)
+@pytest.mark.parametrize("page", [CLIENT, DISTRIBUTION])
 def test_the_command_as_the_pages_use_it(
     page: str, service: Running, newcomer: tuple[Path, dict[str, str]]
 ) -> None:
@@ -100,7 +104,7 @@ def test_the_command_as_the_pages_use_it(
 
 
 def test_the_table_of_classes_is_that_of_the_code() -> None:
-    text = (ROOT / PAGES[0]).read_text(encoding="utf-8")
+    text = (ROOT / CLIENT).read_text(encoding="utf-8")
     table = text.split("| class | codes |")[1].split("\n\n")[0]
     rows = re.findall(r"^\| `(\w+)`.*? \| (.*) \|$", table, flags=re.MULTILINE)
     stated = {code: name for name, codes in rows for code in re.findall(r"`(\w+)`", codes)}

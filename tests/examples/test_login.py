@@ -1,5 +1,7 @@
 """The login examples, as processes of their own, before a real service with the demo model."""
 
+import re
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -51,6 +53,38 @@ def test_what_is_no_attempt_opens_nothing(
     answer = httpx.post(httpx.URL(login).copy_with(raw_path=f"/{name}".encode()), content=photo)
     assert answer.status_code in statuses
     assert "Set-Cookie" not in answer.headers
+
+
+def test_the_readme_logs_in_by_the_example(service: Service, tmp_path: Path) -> None:
+    node()
+    root = EXAMPLES.parent
+    text = (root / "README.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"^```sh\n(export VEILFACE_URL=.*?)^```", text, flags=re.M | re.S)
+    port = free_port()
+    for theirs, here in (
+        ("http://127.0.0.1:8421", service.url),
+        ("http://127.0.0.1:3000", f"http://127.0.0.1:{port}"),
+    ):
+        assert theirs in block
+        block = block.replace(theirs, here)
+    (tmp_path / "examples").symlink_to(EXAMPLES)
+    (tmp_path / "veilface-data-keys").mkdir()
+    (tmp_path / "veilface-data-keys" / "api-key").write_text(f"{service.token}\n")
+    (tmp_path / "anna3.jpg").write_bytes(service.photo(1, 4))
+    with Client(service.url, service.token) as client:
+        client.enroll("anna", [service.photo(1, number) for number in range(3)])
+        done = subprocess.run(
+            ["bash", "-euo", "pipefail", "-c", f"trap 'kill $(jobs -p)' EXIT\n{block}"],
+            cwd=tmp_path,
+            env=clean_environment(PORT=str(port)),
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE_S,
+        )
+        client.erase("anna")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("HTTP/1.1 204")
+    assert "\nSet-Cookie: session=" in done.stdout
 
 
 def test_an_example_without_its_service_opens_nothing(tmp_path: Path) -> None:

@@ -104,7 +104,7 @@ def face_report(faces: FaceAudit) -> Any:
 
 @pytest.mark.long
 def test_an_audit_of_faces_writes_report_and_figures(faces: FaceAudit, face_report: Any) -> None:
-    files = ["report.json", "report.md", *both(["figure", "frontier"])]
+    files = ["report.json", "report.md", *both(["figure", "frontier"]), "report.html"]
     assert sorted(file.name for file in faces.out.iterdir()) == sorted(files)
     are_pictures(faces.out, ["figure", "frontier"])
     said = faces.first.json
@@ -217,7 +217,7 @@ def test_the_seed_gives_the_rows_and_a_kept_limit_is_status_0(
     assert report["outcomes"] == face_report["outcomes"]
     assert "frontier" not in report
     written = {file.name for file in (faces.root / "again").iterdir()}
-    assert written == {"report.json", "report.md", *both(["figure"])}
+    assert written == {"report.json", "report.md", "report.html", *both(["figure"])}
 
 
 def test_only_the_photos_that_the_limits_ask_for_are_embedded(

@@ -120,7 +120,7 @@ def people_report(people: TemplateAudit) -> Any:
 def test_an_audit_of_templates_writes_report_and_figures(
     people: TemplateAudit, people_report: Any
 ) -> None:
-    files = ["report.json", "report.md", *both(["linkage", "oracle"])]
+    files = ["report.json", "report.md", *both(["linkage", "oracle"]), "report.html"]
     assert sorted(file.name for file in people.out.iterdir()) == sorted(files)
     are_pictures(people.out, ["linkage", "oracle"])
     said = people.first.json

@@ -3,7 +3,8 @@
 import shutil
 import stat
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -159,9 +160,16 @@ def test_what_is_there_is_kept_and_the_rest_is_made(
     assert again.status == 0, again.stderr
     assert again.stderr.count("is there and kept") == 4
     assert "These are promises of a contract made anew." in again.stdout
-    privacy, accuracy = again.stdout.splitlines()[-4:-2]
+    privacy, accuracy, _key, start, enroll, verify = again.stdout.splitlines()[-6:]
     assert privacy.startswith("Privacy:  FAIL.")
     assert accuracy.startswith("Accuracy: ")
+    assert start == "Start it: veilface serve"
+    for call, rest in (
+        (enroll, "PUT http://127.0.0.1:8421/v1/subjects/anna/enrollment"),
+        (verify, "POST http://127.0.0.1:8421/v1/subjects/anna/verify"),
+    ):
+        assert f"curl -X {rest} -H " in call
+        assert f"$(cat {token})" in call
     assert load_settings().accept_weak_privacy
     checked = run("serve", "--check")
     assert checked.status == 0, checked.stderr
@@ -324,11 +332,22 @@ def test_from_nothing_to_a_contract(folders: Path, monkeypatch: pytest.MonkeyPat
     def killed(_: object) -> None:
         raise CommandError("killed")
 
+    shares: list[float] = []
+
+    @contextmanager
+    def recorded(_description: str) -> Iterator[Callable[[float], None]]:
+        yield shares.append
+
     with monkeypatch.context() as patch:
         patch.setattr(command, "_drop_caches", killed)
+        patch.setattr(command, "share_done", recorded)
         assert "error: killed" in setup("--accept-weak-privacy").stderr
     assert Path("veilface-data/contract.json").is_file()
     assert list(Path("veilface-data").glob("*.cache"))
+    # The search for the dimension counts too.
+    assert shares == sorted(shares)
+    assert (shares[0], shares[-1]) == (0.0, 1.0)
+    assert len([share for share in shares if 0 < share < 0.2]) >= 3
     ran = setup("--accept-weak-privacy")
     assert ran.status == 0, ran.stderr
     assert "Start it: veilface serve" in ran.stdout

@@ -1,4 +1,4 @@
-"""The claims of docs/method.md §7.2 and §4.5 on real faces, in small."""
+"""Claims of docs/design-measurements.md §1.2 and docs/method.md §4.5 on real faces, in small."""
 
 from pathlib import Path
 
