@@ -34,6 +34,36 @@ export function field(label, control, hint) {
   return h("div", { class: "field" }, parts);
 }
 
+// A box around a face, over a picture that fills its frame.
+export function faceBox() {
+  const box = s("rect", { class: "found", hidden: true });
+  const overlay = s("svg", { class: "overlay", preserveAspectRatio: "xMidYMid slice", "aria-hidden": "true" }, box);
+  // `found` is x1, y1, x2, y2 in pixels of a picture of this size, or null.
+  const mark = (found, width, height) => {
+    box.toggleAttribute("hidden", !found);
+    if (!found) return;
+    overlay.setAttribute("viewBox", `0 0 ${width} ${height}`);
+    const [x, y, right, bottom] = found;
+    const places = { x, y, width: right - x, height: bottom - y, rx: width / 80 };
+    for (const [name, value] of Object.entries(places)) box.setAttribute(name, value);
+  };
+  return { overlay, mark };
+}
+
+// A form, and beside it what comes of it: before that, what is to be done.
+export const workbench = (form, title, steps, ...outcome) =>
+  h(
+    "div",
+    { class: "work" },
+    form,
+    h(
+      "div",
+      { class: "outcome" },
+      outcome,
+      h("section", { class: "card empty" }, h("h2", {}, title), h("ol", {}, steps.map((each) => h("li", {}, each)))),
+    ),
+  );
+
 // Terms and values; a value that is null is left out.
 export function facts(pairs) {
   return h(

@@ -1,7 +1,7 @@
 import { bytes, facts, h, percent, table, when } from "./dom.js";
-import { offNote, subjectField } from "./enroll.js";
 import { picture } from "./picture.js";
 import { call, may, session, subjectPath } from "./service.js";
+import { offNote, subjectField } from "./subject.js";
 import { thiefCard } from "./verdict.js";
 import { lacking, problemBox } from "./words.js";
 

@@ -9,7 +9,8 @@ from playwright.sync_api import expect
 from tests.api.cli.conftest import run
 from tests.web.access import assert_accessible
 from tests.web.camera import FakeCamera
-from tests.web.conftest import OTHER, WHO, OpenTab
+from tests.web.conftest import OpenTab
+from tests.web.deployments import OTHER, WHO
 from tests.web.served import Served
 
 pytestmark = pytest.mark.long
