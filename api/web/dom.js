@@ -75,6 +75,9 @@ export function facts(pairs) {
   );
 }
 
+export const row = ([first, ...rest]) =>
+  h("tr", {}, h("th", { scope: "row" }, first), rest.map((each) => h("td", {}, each)));
+
 // A table that scrolls by itself where it is too wide; the keyboard reaches it.
 export function table(caption, head, rows) {
   return h(
@@ -85,13 +88,7 @@ export function table(caption, head, rows) {
       {},
       h("caption", {}, caption),
       h("thead", {}, h("tr", {}, head.map((each) => h("th", { scope: "col" }, each)))),
-      h(
-        "tbody",
-        {},
-        rows.map(([first, ...rest]) =>
-          h("tr", {}, h("th", { scope: "row" }, first), rest.map((each) => h("td", {}, each))),
-        ),
-      ),
+      h("tbody", {}, rows.map(row)),
     ),
   );
 }

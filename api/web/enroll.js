@@ -78,6 +78,8 @@ export function enrollView(id) {
       fields.disabled = false;
       if (answer) {
         const shown = enrolled(name, answer, picker.drop(sent));
+        // The field says who is enrolled.
+        subject.dispatchEvent(new Event("input"));
         result.replaceChildren(shown);
         shown.focus();
       }

@@ -1,4 +1,4 @@
-import { h, table, when } from "./dom.js";
+import { h, row, table, when } from "./dom.js";
 import { call, may } from "./service.js";
 import { offNote, subjectField } from "./subject.js";
 import { lacking, problemBox } from "./words.js";
@@ -12,7 +12,8 @@ export function logView(id) {
   subject.required = false;
   const problem = h("div", {});
   const said = h("p", { class: "hint", role: "status" });
-  const shown = table("Audit log", ["Time", "Action", "Outcome", "Detail", "Who", "Person (pseudonym)", "Request"], []);
+  const shown = table("Lines, the latest first", ["Time", "Action", "Outcome", "Detail", "Who", "Person (pseudonym)", "Request"], []);
+  shown.hidden = true;
   const lines = shown.querySelector("tbody");
   const more = h("button", { type: "button", class: "secondary", hidden: true, onclick: () => load() }, "Show earlier");
   let cursor = null;
@@ -30,7 +31,7 @@ export function logView(id) {
       const wanted = { limit: PAGE, ...(person ? { subject_id: person } : {}), ...(cursor ? { cursor } : {}) };
       const page = await call("GET", `/v1/audit-log?${new URLSearchParams(wanted)}`);
       if (!cursor) lines.replaceChildren();
-      lines.append(...page.lines.map(row));
+      lines.append(...page.lines.map((line) => row(cells(line))));
       cursor = page.next_cursor;
       more.hidden = cursor === null;
       const count = lines.childElementCount;
@@ -67,19 +68,18 @@ export function logView(id) {
           h("button", { type: "submit", class: "secondary" }, "Show"),
         ),
     problem,
-    said,
-    shown,
+    why ? null : h("div", { class: "card" }, shown, said),
     more,
   );
   return { root, stop() {} };
 }
 
-const row = (line) =>
-  h(
-    "tr",
-    {},
-    h("th", { scope: "row" }, when(line.at)),
-    [line.action, line.outcome, line.detail ?? "", line.actor ?? ""].map((each) => h("td", {}, each)),
-    h("td", {}, line.subject ? h("code", { title: line.subject }, line.subject.slice(0, 16)) : ""),
-    h("td", {}, line.request_id ? h("code", { title: line.request_id }, line.request_id.slice(0, 8)) : ""),
-  );
+const cells = ({ at, action, outcome, detail, actor, subject, request_id: request }) => [
+  when(at),
+  action,
+  outcome,
+  detail,
+  actor,
+  subject ? h("code", {}, subject.slice(0, 16)) : null,
+  request ? h("code", {}, request) : null,
+].map((each) => each ?? "");

@@ -3,7 +3,7 @@
 import { camera, check, picture, unasked } from "./camera.js";
 import { faceBox, h, newId } from "./dom.js";
 import { Problem, call } from "./service.js";
-import { guidance, problemBox, sentence } from "./words.js";
+import { DEMO, guidance, problemBox, sentence } from "./words.js";
 
 // What is larger is made smaller once, when it is chosen; the same bytes are then checked and sent.
 // Ten of the largest stay below what a request may have.
@@ -34,7 +34,6 @@ async function smaller(blob) {
 
 // `replaces`: what is chosen takes the place of what was chosen before.
 export function photoPicker({ most, replaces = false, onchange }) {
-  const demo = document.documentElement.dataset.demo === "yes";
   const photos = [];
   const tray = h("ul", { class: "tray", "aria-label": "Chosen photos" });
   const told = h("p", { class: "hint", role: "status" });
@@ -218,8 +217,8 @@ export function photoPicker({ most, replaces = false, onchange }) {
   }
 
   const name = newId("source");
-  const sources = Object.keys(SOURCES).filter((each) => demo || each !== "drawn");
-  const first = demo ? "drawn" : "camera";
+  const sources = Object.keys(SOURCES).filter((each) => DEMO || each !== "drawn");
+  const first = DEMO ? "drawn" : "camera";
   const sourceChoice = h(
     "fieldset",
     { class: "choice" },
@@ -242,7 +241,7 @@ export function photoPicker({ most, replaces = false, onchange }) {
     "div",
     { class: "picker" },
     sourceChoice,
-    demo
+    DEMO
       ? h("p", { class: "hint" }, "The demo model sees only cartoon faces, not real ones.")
       : null,
     panel,

@@ -4,7 +4,7 @@ import { holderKey } from "./holder.js";
 import { photoPicker } from "./photos.js";
 import { call, form, levels, may, moves, session, subjectPath } from "./service.js";
 import { offNote, subjectField, whyOff } from "./subject.js";
-import { livenessWords, problemBox } from "./words.js";
+import { DEMO, livenessWords, problemBox } from "./words.js";
 
 const REASONS = {
   match: "The face matches the enrolled person.",
@@ -20,8 +20,8 @@ const LIVENESS = {
 };
 
 const STEPS = [
-  "Choose the person: whom you enroll appears in the list.",
-  "Take three photos by one click, or choose up to five files.",
+  "Choose the person. Whoever is enrolled is in the list.",
+  DEMO ? "Choose a photo of a cartoon person." : "Take three photos by one click, or choose up to five files.",
   "Press Verify. The answer appears here: accepted or rejected, and how often a stranger would be accepted.",
 ];
 

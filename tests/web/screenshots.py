@@ -77,6 +77,7 @@ def take_pictures(browser: Browser, walk: Walk, served: Served, out: Path, prefi
         tab = BrowserTab.of(context, f"{url}/")
         for number, name in enumerate(walk(tab, served), start=1):
             if name.startswith(prefix):
+                tab.page.evaluate("scrollTo(0, 0)")
                 tab.page.screenshot(path=folder / f"{number:02}-{name}.png", full_page=True)
         context.close()
 

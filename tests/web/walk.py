@@ -4,11 +4,10 @@ import io
 from collections.abc import Iterator
 from pathlib import Path
 
-from PIL import Image
 from playwright.sync_api import expect
 
 from tests.web.browser_tab import BrowserTab
-from tests.web.camera import FakeCamera
+from tests.web.camera import FakeCamera, browsers_test_picture
 from tests.web.served import Served
 
 SUBJECT = "walker"
@@ -51,7 +50,7 @@ def walk_demo(tab: BrowserTab, demo: Served) -> Iterator[str]:
     page.get_by_label("Files", exact=True).check()
     yield "enroll-files"
     page.locator("input[type=file]").first.set_input_files(
-        {"name": "empty.png", "mimeType": "image/png", "buffer": plain_picture()}
+        {"name": "empty.png", "mimeType": "image/png", "buffer": without_a_face()}
     )
     expect(page.locator(".seen[data-state=bad]")).to_be_visible()
     button("button", name="Enroll", exact=True).click()
@@ -173,10 +172,10 @@ def walk_real(
         assert client.delete(f"/v1/subjects/{SUBJECT}").is_success
 
 
-def plain_picture() -> bytes:
-    """Draw a picture without a face."""
+def without_a_face() -> bytes:
+    """Draw a sharp picture without a face."""
     out = io.BytesIO()
-    Image.new("RGB", (240, 240), (0, 136, 0)).save(out, "PNG")
+    browsers_test_picture((240, 240)).save(out, "PNG")
     return out.getvalue()
 
 
