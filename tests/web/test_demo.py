@@ -168,6 +168,13 @@ def test_too_many_rejections_are_told_with_the_time_to_wait(
         expect(alert).to_contain_text(re.compile(r"Try again in \d+ s"))
         assert len(re.findall(r"\d+ s\b", alert.inner_text())) == 1, "one clock"
         expect(alert).to_contain_text(re.compile(r"request [0-9a-f]{32}"))
+        # An operator lifts it where it was met; others are not offered to.
+        page = tab.page
+        page.get_by_role("button", name="Lift the lock").click()
+        expect(page.get_by_text("The lock on locked is lifted.")).to_be_visible()
+        assert client.get("/v1/subjects/locked/lockout").status_code == 404
+        page.get_by_role("button", name="Verify", exact=True).click()
+        expect(page.locator(".verdict.accept")).to_be_visible()
         client.delete("/v1/subjects/locked")
 
 
