@@ -60,9 +60,7 @@ function signedIn(focus) {
       {},
       Object.entries(VIEWS)
         .filter(([name]) => name !== "log" || may("admin"))
-        .map(([name, [title]]) =>
-        h("li", {}, h("a", { href: `#/${name}`, "data-view": name }, title)),
-      ),
+        .map(([name, [title]]) => h("li", {}, h("a", { href: `#/${name}`, "data-view": name }, title))),
     ),
   );
   who.replaceChildren(

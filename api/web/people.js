@@ -1,4 +1,4 @@
-import { download, facts, field, h, openDialog } from "./dom.js";
+import { download, facts, field, h, openDialog, when } from "./dom.js";
 import { call, may, subjectPath } from "./service.js";
 import { about, offNote, people } from "./subject.js";
 import { lacking, problemBox } from "./words.js";

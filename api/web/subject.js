@@ -51,7 +51,7 @@ export function subjectField(id = "") {
   });
   const told = h("p", { class: "hint", role: "status" });
   const hint = "1 to 128 letters, digits or . _ @ : -";
-  const part = field("Person's id", input, searches ? `Type how it begins, or press ↓ to see people. ${hint}` : hint);
+  const part = field("Person's id", input, searches ? `Type how it begins, or pick from the list (click, or ↓). ${hint}` : hint);
   if (!searches) return [input, part];
   let running = new AbortController();
   let timer = 0;

@@ -16,5 +16,6 @@ def findings(page: Page) -> list[tuple[str, str]]:
 
 def assert_accessible(tab: BrowserTab, name: str) -> None:
     assert findings(tab.page) == [], name
+    assert "[object " not in tab.page.locator("body").inner_text(), name
     wide = tab.page.evaluate("document.documentElement.scrollWidth - innerWidth")
     assert wide <= 0, f"{name} scrolls sideways by {wide} px"
