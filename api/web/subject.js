@@ -50,7 +50,7 @@ export function subjectField(id = "") {
       : {}),
   });
   const told = h("p", { class: "hint", role: "status" });
-  const hint = "1 to 128 letters, digits or . _ @ : -";
+  const hint = "1 to 128 letters, digits or .\u00a0_\u00a0@\u00a0:\u00a0-";
   const part = field("Person's id", input, searches ? `Type how it begins, or pick from the list (click, or ↓). ${hint}` : hint);
   if (!searches) return [input, part];
   let running = new AbortController();

@@ -52,7 +52,7 @@ export function thiefCard(contract) {
       {},
       `At most ${percent(privacy.limit)} passes: `,
       mark(privacy.status),
-      privacy.shortfall ? `. Not enough to pass: ${privacy.shortfall}.` : ".",
+      short(privacy),
     ),
   );
 }
@@ -66,10 +66,18 @@ export function judged(title, judgement) {
   return h("div", {}, h("h3", {}, title), parts);
 }
 
-function counted({ rate, value, limit, status, basis }) {
+const short = ({ shortfall }) => (shortfall ? `. Not enough to pass: ${shortfall}.` : ".");
+
+function counted(judgement) {
+  const { rate, value, limit, status, basis } = judgement;
   const group = basis.group ? `in ${basis.attribute} ${basis.group}, ` : "";
   return [
     h("p", { class: "figure" }, h("span", { class: "figure-number" }, percent(value)), mark(status)),
-    h("p", { class: "hint" }, `${group}${rate.errors} of ${rate.trials.toLocaleString("en")}; at most ${percent(limit)} passes`),
+    h(
+      "p",
+      { class: "hint" },
+      `${group}${rate.errors} of ${rate.trials.toLocaleString("en")}; at most ${percent(limit)} passes`,
+      short(judgement),
+    ),
   ];
 }
