@@ -10,7 +10,7 @@ from tests.web.browser_tab import BrowserTab
 from tests.web.camera import FakeCamera, browsers_test_picture
 from tests.web.served import Served
 
-SUBJECT = "walker"
+SUBJECT = "alice"
 REFUSED_TOKEN = "vf_000000000000_" + "0" * 64
 
 
