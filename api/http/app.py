@@ -27,6 +27,7 @@ from api.http.openapi import DESCRIPTION, allowed_methods
 from api.http.protocol import Protocol
 from api.http.reference import DescribedApi, operation_id
 from api.http.routes import (
+    audit_log,
     challenges,
     contract,
     enrollment,
@@ -115,6 +116,7 @@ def create_app(
         challenges,
         verification,
         lockout,
+        audit_log,
         transfer,
     ):
         app.include_router(routes.router)

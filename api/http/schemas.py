@@ -188,6 +188,25 @@ class SubjectsAnswer(_Answer):
     next_cursor: str | None = Field(description="Send it as `cursor` for the next page.")
 
 
+class AuditLine(_Shape):
+    """One line of the audit log: who did what to which subject, and with which result."""
+
+    at: str = Field(examples=["2026-01-31T12:00:00Z"])
+    actor: str | None = Field(description="Of a request, its key.", examples=["key:0f3a5c7e9b1d"])
+    action: str = Field(examples=["verify"])
+    subject: str | None = Field(description="Pseudonym of the subject.", examples=[HEX])
+    outcome: str = Field(examples=["accept"])
+    detail: str | None = Field(examples=["fmr-1e-3"])
+    request_id: str | None
+
+
+class AuditLogAnswer(_Answer):
+    """One page of the tenant's audit log, the latest line first."""
+
+    lines: list[AuditLine]
+    next_cursor: str | None = Field(description="Send it as `cursor` for earlier lines.")
+
+
 class LockoutAnswer(_Answer):
     """Failed verifications of a subject, enrolled or not."""
 

@@ -2,9 +2,9 @@
 // the service says so. The photos that count are taken at full size, a burst of three when the
 // visitor says so, and each is asked about itself before it is handed on.
 
-import { h, s } from "./dom.js";
+import { faceBox, h } from "./dom.js";
 import { Problem, call, crops, form } from "./service.js";
-import { guidance, sentence } from "./words.js";
+import { cameraTrouble, guidance, sentence } from "./words.js";
 
 const EVERY_MS = 1000;
 const FRAME = 480;
@@ -37,15 +37,22 @@ export const check = (blob, face, signal) =>
 export const unasked = ({ status, code }) =>
   code !== "page_error" && (!status || status === 429 || status >= 500);
 
-function whyNot(error) {
-  if (!navigator.mediaDevices) {
-    return "Browsers allow the camera only over HTTPS or on localhost. Upload photos instead.";
+// The visitor's camera. `lost` is called where it is unplugged, forbidden, or taken by another program.
+export async function openCamera(signal, lost) {
+  let stream;
+  try {
+    if (!navigator.mediaDevices) throw new Error("insecure");
+    stream = await navigator.mediaDevices.getUserMedia({
+      audio: false,
+      video: { facingMode: "user", width: { ideal: PHOTO } },
+    });
+  } catch (error) {
+    throw new Problem({ code: "camera", message: cameraTrouble(error) });
   }
-  if (error?.name === "NotAllowedError") {
-    return "Camera access was denied. Allow it in the address bar, or upload photos.";
+  for (const track of stream.getVideoTracks()) {
+    for (const name of ["ended", "mute"]) track.addEventListener(name, lost, { signal });
   }
-  if (error?.name === "NotFoundError") return "No camera found. Upload photos instead.";
-  return "The camera cannot be used: another program may have it. Upload photos instead.";
+  return stream;
 }
 
 export const after = (ms) => new Promise((done) => setTimeout(done, ms));
@@ -57,8 +64,7 @@ export const release = (stream) => stream?.getTracks().forEach((each) => each.st
 export function camera({ onburst, face }) {
   const video = h("video", { playsinline: true, muted: true, "aria-label": "Your camera" });
   video.muted = true;
-  const frame = s("rect", { class: "found", rx: "6" });
-  const overlay = s("svg", { class: "overlay", "aria-hidden": "true" }, frame);
+  const { overlay, mark } = faceBox();
   const viewfinder = h("div", { class: "viewfinder", hidden: true }, video, overlay);
   const said = h("p", { class: "guidance", role: "status", "data-state": "idle" }, OFF);
   const start = h("button", { type: "button", class: "secondary", onclick: begin }, "Start camera");
@@ -82,22 +88,14 @@ export function camera({ onburst, face }) {
     refused.textContent = "";
     let opened = null;
     try {
-      if (!navigator.mediaDevices) throw new Error("insecure");
-      opened = await navigator.mediaDevices.getUserMedia({
-        audio: false,
-        video: { facingMode: "user", width: { ideal: PHOTO } },
-      });
+      opened = await openCamera(signal, lost);
     } catch (error) {
       start.disabled = false;
-      if (!signal.aborted) say(whyNot(error), "bad");
+      if (!signal.aborted) say(`${sentence(error.message)} Choose files instead.`, "bad");
       return;
     }
     if (over(signal)) return release(opened);
     stream = opened;
-    for (const track of stream.getVideoTracks()) {
-      // Unplugged, forbidden, or taken by another program.
-      for (const name of ["ended", "mute"]) track.addEventListener(name, lost, { signal });
-    }
     addEventListener("pagehide", lost, { signal });
     video.srcObject = stream;
     await video.play().catch(() => {});
@@ -126,7 +124,7 @@ export function camera({ onburst, face }) {
           const seen = await check(small.blob, face(), signal);
           if (over(signal)) return;
           say(guidance(seen), seen.usable ? "good" : "bad");
-          mark(seen.box, small);
+          mark(seen.box, small.width, small.height);
         } catch (error) {
           if (over(signal)) return;
           mark(null);
@@ -141,16 +139,6 @@ export function camera({ onburst, face }) {
         }
       }
       await after(Math.max(250, pause - (Date.now() - begun)));
-    }
-  }
-
-  function mark(box, size) {
-    frame.toggleAttribute("hidden", !box);
-    if (!box) return;
-    overlay.setAttribute("viewBox", `0 0 ${size.width} ${size.height}`);
-    const [x1, y1, x2, y2] = box;
-    for (const [name, value] of Object.entries({ x: x1, y: y1, width: x2 - x1, height: y2 - y1 })) {
-      frame.setAttribute(name, value);
     }
   }
 

@@ -1,10 +1,10 @@
 // A challenge of head movements: the page says each by the clock, and takes frames meanwhile. It does
 // not wait until it sees one: a recording that shows all movements in turn would be waited for, too.
 
-import { after, picture, release } from "./camera.js";
+import { after, openCamera, picture, release } from "./camera.js";
 import { h, s } from "./dom.js";
 import { Problem, call } from "./service.js";
-import { FRONT, MOVE_BACK, MOVEMENTS, cameraTrouble } from "./words.js";
+import { FRONT, MOVE_BACK, MOVEMENTS } from "./words.js";
 
 const SIDE = 960;
 const READY_MS = 2500;
@@ -35,30 +35,16 @@ export function headMovements() {
     told.hidden = false;
   }
 
-  async function start() {
-    try {
-      if (!navigator.mediaDevices) throw new Error("insecure");
-      return await navigator.mediaDevices.getUserMedia({
-        audio: false,
-        video: { facingMode: "user", width: { ideal: 1280 } },
-      });
-    } catch (error) {
-      throw new Problem({ code: "camera", message: cameraTrouble(error) });
-    }
-  }
-
   async function frames(subject) {
     stop();
     running = new AbortController();
-    const { signal } = running;
+    const run = running;
+    const { signal } = run;
     try {
-      const opened = await start();
+      const opened = await openCamera(signal, () => lost(run));
       if (signal.aborted) release(opened);
       signal.throwIfAborted();
       stream = opened;
-      for (const track of stream.getVideoTracks()) {
-        for (const name of ["ended", "mute"]) track.addEventListener(name, () => lost(running), { signal });
-      }
       video.srcObject = stream;
       await video.play().catch(() => {});
       viewfinder.hidden = false;

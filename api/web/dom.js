@@ -34,6 +34,36 @@ export function field(label, control, hint) {
   return h("div", { class: "field" }, parts);
 }
 
+// A box around a face, over a picture that fills its frame.
+export function faceBox() {
+  const box = s("rect", { class: "found", hidden: true });
+  const overlay = s("svg", { class: "overlay", preserveAspectRatio: "xMidYMid slice", "aria-hidden": "true" }, box);
+  // `found` is x1, y1, x2, y2 in pixels of a picture of this size, or null.
+  const mark = (found, width, height) => {
+    box.toggleAttribute("hidden", !found);
+    if (!found) return;
+    overlay.setAttribute("viewBox", `0 0 ${width} ${height}`);
+    const [x, y, right, bottom] = found;
+    const places = { x, y, width: right - x, height: bottom - y, rx: width / 80 };
+    for (const [name, value] of Object.entries(places)) box.setAttribute(name, value);
+  };
+  return { overlay, mark };
+}
+
+// A form, and beside it what comes of it: before that, what is to be done.
+export const workbench = (form, title, steps, ...outcome) =>
+  h(
+    "div",
+    { class: "work" },
+    form,
+    h(
+      "div",
+      { class: "outcome" },
+      outcome,
+      h("section", { class: "card empty" }, h("h2", {}, title), h("ol", {}, steps.map((each) => h("li", {}, each)))),
+    ),
+  );
+
 // Terms and values; a value that is null is left out.
 export function facts(pairs) {
   return h(
@@ -45,6 +75,9 @@ export function facts(pairs) {
   );
 }
 
+export const row = ([first, ...rest]) =>
+  h("tr", {}, h("th", { scope: "row" }, first), rest.map((each) => h("td", {}, each)));
+
 // A table that scrolls by itself where it is too wide; the keyboard reaches it.
 export function table(caption, head, rows) {
   return h(
@@ -55,13 +88,7 @@ export function table(caption, head, rows) {
       {},
       h("caption", {}, caption),
       h("thead", {}, h("tr", {}, head.map((each) => h("th", { scope: "col" }, each)))),
-      h(
-        "tbody",
-        {},
-        rows.map(([first, ...rest]) =>
-          h("tr", {}, h("th", { scope: "row" }, first), rest.map((each) => h("td", {}, each))),
-        ),
-      ),
+      h("tbody", {}, rows.map(row)),
     ),
   );
 }

@@ -1,33 +1,15 @@
-import { facts, field, h, openDialog } from "./dom.js";
+import { facts, h, openDialog, workbench } from "./dom.js";
 import { newHolderKey } from "./holder.js";
 import { photoPicker } from "./photos.js";
-import { call, form, may, nonce, session, subjectPath } from "./service.js";
-import { lacking, problemBox } from "./words.js";
+import { call, form, nonce, subjectPath } from "./service.js";
+import { offNote, subjectField, whyOff } from "./subject.js";
+import { problemBox } from "./words.js";
 
-export function subjectField(id = "") {
-  const input = h("input", {
-    type: "text",
-    required: true,
-    maxlength: "128",
-    pattern: "[A-Za-z0-9._@:\\-]{1,128}",
-    autocomplete: "off",
-    autocapitalize: "none",
-    spellcheck: "false",
-    value: id,
-  });
-  return [input, field("Person's id", input, "1 to 128 letters, digits or . _ @ : -")];
-}
-
-// What the key, or the service, does not allow: said once, above the form that it switches off.
-export function whyOff(right) {
-  if (!may(right)) return lacking(right);
-  if (!session.contract.photos) {
-    return "This service runs without a model pack: it accepts lifted templates but no photos.";
-  }
-  return null;
-}
-
-export const offNote = (why) => (why ? h("p", { class: "off", role: "note" }, why) : null);
+const STEPS = [
+  "The service finds the face in each photo and says at once whether the photo will do.",
+  "Your model turns the faces into one embedding, which is hidden in a set that holds decoys as well.",
+  "Only that set is stored, encrypted. Photos and embedding are forgotten.",
+];
 
 export function enrollView(id) {
   const why = whyOff("enroll");
@@ -95,8 +77,9 @@ export function enrollView(id) {
       const answer = await put(name, body);
       fields.disabled = false;
       if (answer) {
-        picker.drop(sent);
-        const shown = enrolled(name, answer);
+        const shown = enrolled(name, answer, picker.drop(sent));
+        // The field says who is enrolled.
+        subject.dispatchEvent(new Event("input"));
         result.replaceChildren(shown);
         shown.focus();
       }
@@ -119,6 +102,7 @@ export function enrollView(id) {
     send,
   );
 
+  const entry = h("form", { class: "card", onsubmit: submit }, fields);
   const root = h(
     "section",
     {},
@@ -126,13 +110,13 @@ export function enrollView(id) {
     h(
       "p",
       { class: "lead" },
-      "Your photos become one private template, which is encrypted; the photos are not kept. ",
+      "One to ten photos of a person become one private template. ",
       "Whoever is enrolled already is replaced only if you confirm it.",
     ),
     offNote(why),
-    h("form", { class: "card", onsubmit: submit }, fields),
-    result,
+    workbench(entry, "What happens to the photos", STEPS, result),
   );
+  picker?.dropOn(entry);
   return {
     root,
     stop() {
@@ -143,11 +127,16 @@ export function enrollView(id) {
   };
 }
 
-function enrolled(id, answer) {
+function enrolled(id, answer, thumbs) {
   return h(
     "div",
     { class: "verdict accept", role: "status", tabindex: "-1" },
     h("p", { class: "verdict-word" }, answer.replaced ? "Enrolled again" : "Enrolled"),
+    h(
+      "ol",
+      { class: "used", "aria-label": "Photos used" },
+      thumbs.map((each, index) => h("li", {}, each, ` Photo ${index + 1}: ${answer.images[index]?.status ?? "used"}`)),
+    ),
     facts([
       ["Person", id],
       ["Photos used", String(answer.images.length)],

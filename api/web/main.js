@@ -2,9 +2,10 @@
 
 import { h } from "./dom.js";
 import { enrollView } from "./enroll.js";
+import { logView } from "./log.js";
 import { peopleView } from "./people.js";
 import { serviceView } from "./panel.js";
-import { forgetKey, hasKey, learn, session, useKey } from "./service.js";
+import { forgetKey, hasKey, learn, may, session, useKey } from "./service.js";
 import { storedView } from "./stored.js";
 import { verifyView } from "./verify.js";
 import { problemBox } from "./words.js";
@@ -15,6 +16,7 @@ const VIEWS = {
   people: ["People", peopleView],
   stored: ["Stored", storedView],
   service: ["Service", serviceView],
+  log: ["Log", logView],
 };
 
 const main = document.getElementById("main");
@@ -56,9 +58,9 @@ function signedIn(focus) {
     h(
       "ul",
       {},
-      Object.entries(VIEWS).map(([name, [title]]) =>
-        h("li", {}, h("a", { href: `#/${name}`, "data-view": name }, title)),
-      ),
+      Object.entries(VIEWS)
+        .filter(([name]) => name !== "log" || may("admin"))
+        .map(([name, [title]]) => h("li", {}, h("a", { href: `#/${name}`, "data-view": name }, title))),
     ),
   );
   who.replaceChildren(
@@ -85,7 +87,7 @@ function signInView(problem = null) {
     spellcheck: "false",
     "aria-describedby": "key-hint",
   });
-  const keep = h("input", { type: "checkbox", id: "keep" });
+  const keep = h("input", { type: "checkbox", id: "keep", checked: true });
   const send = h("button", { type: "submit" }, "Sign in");
   const trouble = h("div", {}, problem ? problemBox(problem) : null);
 
@@ -155,6 +157,8 @@ document.querySelector(".skip").addEventListener("click", (event) => {
   main.focus();
 });
 addEventListener("hashchange", () => route());
+// What misses a form that takes photos must not replace the page.
+for (const type of ["dragover", "drop"]) addEventListener(type, (event) => event.preventDefault());
 
 if (hasKey()) {
   try {

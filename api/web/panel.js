@@ -10,7 +10,7 @@ const RIGHTS = {
   export: "export and import templates",
   scores: "see distances",
   embeddings: "send embeddings and templates",
-  admin: "lift lockouts",
+  admin: "lift lockouts and read the audit log",
 };
 
 export function serviceView() {
@@ -63,6 +63,18 @@ export function serviceView() {
     h(
       "section",
       { class: "card" },
+      h("h2", {}, "Verdict"),
+      h(
+        "div",
+        { class: "columns three" },
+        judged("Privacy: templates that a thief can open", contract.verdict?.privacy),
+        judged("Accuracy: people turned away wrongly", contract.verdict?.accuracy),
+        judged("Groups: strangers let in, in the worst group of people", contract.verdict?.groups),
+      ),
+    ),
+    h(
+      "section",
+      { class: "card" },
       h("h2", {}, "Contract"),
       h("p", { class: "hint" }, "What every template and threshold belongs to."),
       facts([
@@ -72,9 +84,6 @@ export function serviceView() {
         ["Lifting", `${contract.binding.strategy}, m = ${contract.binding.m}, n = ${contract.binding.n}`],
         ["Decoys", h("code", {}, contract.binding.decoy_source_id)],
         ["Default level", contract.default_level],
-        ["Privacy: templates that a thief can open", judged(contract.verdict?.privacy)],
-        ["Accuracy: people turned away wrongly", judged(contract.verdict?.accuracy)],
-        ["Groups: strangers let in, in the worst group of people", judged(contract.verdict?.groups)],
         ["Receipt key", h("code", {}, contract.receipt_key.public_key)],
       ]),
       h(

@@ -1,27 +1,41 @@
-import { download, facts, h, openDialog, when } from "./dom.js";
-import { offNote } from "./enroll.js";
+import { download, facts, field, h, openDialog, when } from "./dom.js";
 import { call, may, subjectPath } from "./service.js";
+import { about, offNote, people } from "./subject.js";
 import { lacking, problemBox } from "./words.js";
 
 const PAGE = 25;
+const PAUSE_MS = 200;
 
 export function peopleView() {
   const list = h("ul", { class: "people" });
   const said = h("p", { class: "hint", role: "status" }, "");
   const problem = h("div", {});
   const receipts = h("div", { class: "result" });
+  const prefix = h("input", { type: "search", autocomplete: "off", autocapitalize: "none", spellcheck: "false" });
   const more = h("button", { type: "button", class: "secondary", hidden: true, onclick: load }, "Show more");
   const title = h("h1", { tabindex: "-1" }, "People");
   const why = may("enroll") ? null : lacking("enroll");
   let cursor = null;
   let dialog = null;
+  let asked = 0;
+  let timer = 0;
+
+  function search() {
+    clearTimeout(timer);
+    timer = setTimeout(() => {
+      cursor = null;
+      load();
+    }, PAUSE_MS);
+  }
 
   async function load() {
+    const asking = (asked += 1);
     more.disabled = true;
     problem.replaceChildren();
     try {
-      const query = new URLSearchParams({ limit: String(PAGE), ...(cursor ? { cursor } : {}) });
-      const page = await call("GET", `/v1/subjects?${query}`);
+      const page = await people(prefix.value, { limit: PAGE, cursor });
+      if (asking !== asked) return;
+      if (!cursor) list.replaceChildren();
       const added = page.subjects.map(card);
       list.append(...added);
       if (cursor) added[0]?.querySelector("a, button")?.focus();
@@ -38,7 +52,10 @@ export function peopleView() {
     const shown = list.childElementCount;
     said.textContent = shown
       ? `${shown} ${shown === 1 ? "person" : "people"} shown${cursor ? ", with more to come" : ""}.`
-      : "Nobody is enrolled yet.";
+      : prefix.value
+        ? "Nobody’s id begins so."
+        : "Nobody is enrolled yet.";
+    none.hidden = shown > 0 || prefix.value !== "";
   }
 
   function card(person) {
@@ -62,17 +79,8 @@ export function peopleView() {
     );
     const item = h(
       "li",
-      { class: "card person" },
-      h("h2", {}, id),
-      h(
-        "p",
-        { class: "hint" },
-        person.enrolled_by === "photos" ? `${person.photos} photos, ` : "lifted by a client, ",
-        "enrolled ",
-        when(person.updated_at),
-        person.holder_key ? ", locked to a holder key" : "",
-        person.current ? "" : ". Enrolled under an earlier contract: enroll again",
-      ),
+      { class: "person" },
+      h("div", {}, h("h2", {}, id), h("p", { class: "hint" }, about(person))),
       h(
         "p",
         { class: "row" },
@@ -96,7 +104,19 @@ export function peopleView() {
     return shown;
   }
 
+  const none = h(
+    "section",
+    { class: "card empty", hidden: true },
+    h("h2", {}, "Enroll the first person"),
+    h("p", {}, "Three photos by one click are enough. Whoever is enrolled can be verified, and erased, at once."),
+    h("p", {}, h("a", { class: "button", href: "#/enroll" }, "Enroll")),
+  );
+  prefix.addEventListener("input", search);
   if (!why) load();
+  const stop = () => {
+    clearTimeout(timer);
+    dialog?.close();
+  };
   const root = h(
     "section",
     {},
@@ -106,11 +126,13 @@ export function peopleView() {
     may("erase") ? null : offNote(lacking("erase")),
     receipts,
     problem,
+    why ? null : h("div", { class: "find" }, field("Find people whose id begins with", prefix)),
     said,
+    none,
     list,
     more,
   );
-  return { root, stop: () => dialog?.close() };
+  return { root, stop };
 }
 
 // The dialog stays open during the work, so that a failure shows where it was caused; if the

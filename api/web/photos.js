@@ -1,9 +1,9 @@
 // Where photos come from (camera, files, in the demo cartoon people), and a tray of those chosen.
 
 import { camera, check, picture, unasked } from "./camera.js";
-import { h, newId } from "./dom.js";
+import { faceBox, h, newId } from "./dom.js";
 import { Problem, call } from "./service.js";
-import { guidance, problemBox, sentence } from "./words.js";
+import { DEMO, guidance, problemBox, sentence } from "./words.js";
 
 // What is larger is made smaller once, when it is chosen; the same bytes are then checked and sent.
 // Ten of the largest stay below what a request may have.
@@ -34,7 +34,6 @@ async function smaller(blob) {
 
 // `replaces`: what is chosen takes the place of what was chosen before.
 export function photoPicker({ most, replaces = false, onchange }) {
-  const demo = document.documentElement.dataset.demo === "yes";
   const photos = [];
   const tray = h("ul", { class: "tray", "aria-label": "Chosen photos" });
   const told = h("p", { class: "hint", role: "status" });
@@ -58,16 +57,19 @@ export function photoPicker({ most, replaces = false, onchange }) {
     }
   }
 
+  const takeFiles = (files) => take([...files].map((file) => ({ blob: file, name: file.name, seen: null })));
+
   // `seen` is what the service saw already in this very photo, or null.
   function add({ blob, name, seen }) {
-    const photo = { blob: null, name, url: URL.createObjectURL(blob) };
+    const photo = { blob: null, name, ...faceBox(), image: h("img", { alt: `Chosen photo, from ${name}` }) };
+    photo.thumb = h("span", { class: "thumb" }, photo.image, photo.overlay);
     photo.number = h("span", { class: "number" });
     photo.said = h("span", { class: "seen", "data-state": "idle" }, "Checking…");
     photo.item = h(
       "li",
       {},
+      photo.thumb,
       photo.number,
-      h("img", { src: photo.url, alt: `Chosen photo, from ${name}` }),
       photo.said,
       h(
         "button",
@@ -90,6 +92,8 @@ export function photoPicker({ most, replaces = false, onchange }) {
       if (!photos.includes(photo)) return;
       photo.blob = seen ? blob : await smaller(blob);
       if (!photos.includes(photo)) return;
+      // What is sent is what is shown: its faces are found in these pixels.
+      photo.image.src = URL.createObjectURL(photo.blob);
       onchange(ready());
       if (seen) tell(photo, seen);
       else look(photo);
@@ -97,11 +101,13 @@ export function photoPicker({ most, replaces = false, onchange }) {
   }
 
   function remove(photo) {
-    URL.revokeObjectURL(photo.url);
+    forget(photo);
     photo.item.remove();
     photos.splice(photos.indexOf(photo), 1);
     changed();
   }
+
+  const forget = (photo) => URL.revokeObjectURL(photo.image.src);
 
   function changed() {
     // The numbers that the service's messages use.
@@ -120,16 +126,21 @@ export function photoPicker({ most, replaces = false, onchange }) {
       } catch (error) {
         if (error.name === "AbortError") return;
         if (!(error instanceof Problem)) throw error;
-        if (unasked(error)) mark(photo, "Not checked yet.", "idle");
-        else mark(photo, sentence(error.message), "bad");
+        if (unasked(error)) say(photo, "Not checked yet.", "idle");
+        else say(photo, sentence(error.message), "bad");
       }
     });
   }
 
   const ended = new AbortController();
-  const tell = (photo, seen) => mark(photo, guidance(seen), seen.usable ? "good" : "bad");
 
-  function mark(photo, text, state) {
+  async function tell(photo, seen) {
+    say(photo, guidance(seen), seen.usable ? "good" : "bad");
+    await photo.image.decode().catch(() => {});
+    photo.mark(seen.box, photo.image.naturalWidth, photo.image.naturalHeight);
+  }
+
+  function say(photo, text, state) {
     photo.said.textContent = text;
     photo.said.dataset.state = state;
   }
@@ -146,12 +157,13 @@ export function photoPicker({ most, replaces = false, onchange }) {
         accept: "image/jpeg,image/png,image/webp",
         multiple: true,
         onchange: () => {
-          take([...input.files].map((file) => ({ blob: file, name: file.name, seen: null })));
+          takeFiles(input.files);
           input.value = "";
         },
       });
       const many = `Photos: JPEG, PNG or WebP, up to ${most}`;
-      return h("div", { class: "field" }, h("label", { for: input.id }, many), input);
+      const drag = h("p", { class: "hint" }, "Or drop them anywhere in this form.");
+      return h("div", { class: "drop" }, h("label", { for: input.id }, many), input, drag);
     },
     drawn() {
       const who = h("select", { id: newId("who") });
@@ -205,8 +217,8 @@ export function photoPicker({ most, replaces = false, onchange }) {
   }
 
   const name = newId("source");
-  const sources = Object.keys(SOURCES).filter((each) => demo || each !== "drawn");
-  const first = demo ? "drawn" : "camera";
+  const sources = Object.keys(SOURCES).filter((each) => DEMO || each !== "drawn");
+  const first = DEMO ? "drawn" : "camera";
   const sourceChoice = h(
     "fieldset",
     { class: "choice" },
@@ -229,42 +241,53 @@ export function photoPicker({ most, replaces = false, onchange }) {
     "div",
     { class: "picker" },
     sourceChoice,
-    demo
+    DEMO
       ? h("p", { class: "hint" }, "The demo model sees only cartoon faces, not real ones.")
       : null,
     panel,
+    tray,
+    told,
     h(
       "p",
       { class: "check" },
       largest,
       h("label", { for: largest.id }, "Others may be in the picture: use the large face near the middle"),
     ),
-    tray,
-    told,
   );
+  const holds = (event) => !root.hidden && !root.closest(":disabled") && event.dataTransfer?.types.includes("Files");
   return {
     root,
     face,
     ready,
+    // Let photos be dropped on a form.
+    dropOn(form) {
+      const over = (event) => form.classList.toggle("dropping", event.type === "dragover" && holds(event));
+      for (const type of ["dragover", "dragleave", "drop"]) form.addEventListener(type, over);
+      form.addEventListener("drop", (event) => holds(event) && takeFiles(event.dataTransfer.files));
+    },
     blobs: () => photos.map((each) => each.blob),
     chosen: () => [...photos],
     // What the service said of single photos, by their places among those `sent`.
     blame(problem, sent) {
       const { image, photos: unlike } = problem.details;
       if (Number.isInteger(image) && sent[image]) {
-        mark(sent[image], sentence(problem.message.replace(/^photo \d+ of \d+: /, "")), "bad");
+        say(sent[image], sentence(problem.message.replace(/^photo \d+ of \d+: /, "")), "bad");
       }
       for (const index of unlike ?? []) {
-        if (sent[index]) mark(sent[index], "Does not look like the person in the other photos.", "bad");
+        if (sent[index]) say(sent[index], "Does not look like the person in the other photos.", "bad");
       }
     },
     // Let go of the camera, which somebody else is to use.
     pause: () => choose(sourceChoice.querySelector(":checked").value),
-    drop: (sent) => sent.filter((each) => photos.includes(each)).forEach(remove),
+    // Empty the tray of what was sent, of which the pictures are handed out.
+    drop(sent) {
+      sent.filter((each) => photos.includes(each)).forEach(remove);
+      return sent.map((each) => each.thumb);
+    },
     stop: () => {
       live?.stop();
       ended.abort();
-      photos.forEach((each) => URL.revokeObjectURL(each.url));
+      photos.forEach(forget);
     },
   };
 }

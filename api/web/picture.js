@@ -32,13 +32,17 @@ export function picture(stored) {
   return h(
     "figure",
     { class: "picture" },
-    edgeOn(x, half, width, describe(stored)),
-    h("p", { class: "view" }, "Seen edge on: the line is the set."),
-    fromTheFront(half, width, stored),
-    h("p", { class: "view" }, "Seen along the line from the origin to the foot point."),
+    h(
+      "div",
+      { class: "columns" },
+      view(edgeOn(x, half, width, describe(stored)), "Seen edge on: the line is the set."),
+      view(fromTheFront(half, width, stored), "Seen along the line from the origin to the foot point."),
+    ),
     h("figcaption", {}, h("p", {}, describe(stored)), h("p", { class: "fine" }, legend(stored))),
   );
 }
+
+const view = (drawing, words) => h("div", {}, drawing, h("p", { class: "view" }, words));
 
 function edgeOn(x, half, width, words) {
   const at = (right, up) => [X + R * right, Y - R * up];

@@ -1,7 +1,7 @@
 import { bytes, facts, h, percent, table, when } from "./dom.js";
-import { offNote, subjectField } from "./enroll.js";
 import { picture } from "./picture.js";
 import { call, may, session, subjectPath } from "./service.js";
+import { offNote, subjectField } from "./subject.js";
 import { thiefCard } from "./verdict.js";
 import { lacking, problemBox } from "./words.js";
 
@@ -59,29 +59,35 @@ function truth(stored) {
   const by = stored.enrolled_by === "template" ? ", by the contract; lifted by a client" : "";
   return h(
     "div",
-    { class: "columns" },
-    h("section", { class: "card" }, h("h2", {}, "The set that hides the face"), picture(stored)),
+    {},
     h(
       "section",
       { class: "card" },
       h("h2", {}, `Stored about ${stored.subject_id}`),
-      facts([
-        ["In the database", `${bytes(stored.sealed_bytes)}, encrypted (AES-256-GCM)`],
-        ["Template inside", `${bytes(stored.wire_bytes)}, ${stored.dtype}`],
-        ["Similarity of foot point to face", stored.foot_point_similarity.toFixed(3)],
-        ["Dimension", `${stored.m} of ${stored.n}`],
-        ["Lifting", stored.strategy ? stored.strategy + by : "under another contract"],
-        ["Decoys", stored.decoys === null ? null : stored.decoys + by],
-        ["Made from", stored.photos ? `${stored.photos} photos, not kept` : "a template sent by a client"],
-        ["First enrolled", when(stored.created_at)],
-        ["Enrolled", when(stored.updated_at)],
-        ["Last accepted", when(stored.last_used_at)],
-        ["Contract", h("code", {}, `${stored.contract_id.slice(0, 16)}…`)],
-      ]),
+      h(
+        "div",
+        { class: "columns" },
+        facts([
+          ["In the database", `${bytes(stored.sealed_bytes)}, encrypted (AES-256-GCM)`],
+          ["Template inside", `${bytes(stored.wire_bytes)}, ${stored.dtype}`],
+          ["Similarity of foot point to face", stored.foot_point_similarity.toFixed(3)],
+          ["Dimension", `${stored.m} of ${stored.n}`],
+          ["Lifting", stored.strategy ? stored.strategy + by : "under another contract"],
+          ["Decoys", stored.decoys === null ? null : stored.decoys + by],
+        ]),
+        facts([
+          ["Made from", stored.photos ? `${stored.photos} photos, not kept` : "a template sent by a client"],
+          ["First enrolled", when(stored.created_at)],
+          ["Enrolled", when(stored.updated_at)],
+          ["Last accepted", when(stored.last_used_at)],
+          ["Contract", h("code", {}, `${stored.contract_id.slice(0, 16)}…`)],
+        ]),
+      ),
       h("h3", {}, "Some of its bytes, as stored in the database"),
       h("code", { class: "hex" }, stored.sealed_excerpt.match(/.{1,8}/g).join(" ")),
       h("p", { class: "fine" }, "Ciphertext: noise without the master key."),
     ),
+    h("section", { class: "card" }, h("h2", {}, "The set that hides the face"), picture(stored)),
   );
 }
 

@@ -52,7 +52,7 @@ export function thiefCard(contract) {
       {},
       `At most ${percent(privacy.limit)} passes: `,
       mark(privacy.status),
-      privacy.shortfall ? `. Not enough to pass: ${privacy.shortfall}.` : ".",
+      short(privacy),
     ),
   );
 }
@@ -60,15 +60,24 @@ export function thiefCard(contract) {
 export const mark = (status) =>
   h("strong", { class: status === "PASS" ? "ok" : "bad" }, status === "PASS" ? "✓ PASS" : "✗ FAIL");
 
-// One line of the verdict, for a list of facts.
-export function judged(judgement) {
-  if (!judgement) return "not measured";
+// One judgement of the verdict: its figure, what was counted, and the limit.
+export function judged(title, judgement) {
+  const parts = judgement ? counted(judgement) : [h("p", {}, "Not measured.")];
+  return h("div", {}, h("h3", {}, title), parts);
+}
+
+const short = ({ shortfall }) => (shortfall ? `. Not enough to pass: ${shortfall}.` : ".");
+
+function counted(judgement) {
   const { rate, value, limit, status, basis } = judgement;
-  const group = basis.group ? `${basis.attribute} ${basis.group}: ` : "";
-  return h(
-    "span",
-    {},
-    `${group}${percent(value)} (${rate.errors} of ${rate.trials}), limit ${percent(limit)}: `,
-    mark(status),
-  );
+  const group = basis.group ? `in ${basis.attribute} ${basis.group}, ` : "";
+  return [
+    h("p", { class: "figure" }, h("span", { class: "figure-number" }, percent(value)), mark(status)),
+    h(
+      "p",
+      { class: "hint" },
+      `${group}${rate.errors} of ${rate.trials.toLocaleString("en")}; at most ${percent(limit)} passes`,
+      short(judgement),
+    ),
+  ];
 }

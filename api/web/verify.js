@@ -1,10 +1,10 @@
 import { headMovements } from "./challenge.js";
-import { facts, field, h, oneIn, percent } from "./dom.js";
-import { offNote, subjectField, whyOff } from "./enroll.js";
+import { facts, field, h, oneIn, percent, workbench } from "./dom.js";
 import { holderKey } from "./holder.js";
 import { photoPicker } from "./photos.js";
-import { call, form, levels, moves, session, subjectPath } from "./service.js";
-import { livenessWords, problemBox } from "./words.js";
+import { call, form, levels, may, moves, session, subjectPath } from "./service.js";
+import { offNote, subjectField, whyOff } from "./subject.js";
+import { DEMO, livenessWords, problemBox } from "./words.js";
 
 const REASONS = {
   match: "The face matches the enrolled person.",
@@ -18,6 +18,12 @@ const LIVENESS = {
   movements: NOT_LIVE + "Follow each movement as it is asked for, in good light.",
   photos: NOT_LIVE + "Take new photos with the camera, of the face itself and in good light.",
 };
+
+const STEPS = [
+  "Choose the person. Whoever is enrolled is in the list.",
+  DEMO ? "Choose a photo of a cartoon person." : "Take three photos by one click, or choose up to five files.",
+  "Press Verify. The answer appears here: accepted or rejected, and how often a stranger would be accepted.",
+];
 
 export function verifyView(id) {
   const why = whyOff("verify");
@@ -95,6 +101,7 @@ export function verifyView(id) {
       if (asking === asked) {
         if (error.details && !moving()) picker.blame(error, sent);
         problem.replaceChildren(problemBox(error));
+        if (error.code === "locked_out" && may("admin")) problem.append(lifter(name));
       }
     }
     fields.disabled = false;
@@ -104,15 +111,34 @@ export function verifyView(id) {
     if (document.activeElement === document.body) send.focus();
   }
 
+  // For operators: the lock is lifted where it was met.
+  const lifter = (name) =>
+    h(
+      "button",
+      {
+        type: "button",
+        class: "secondary",
+        onclick: async () => {
+          try {
+            await call("DELETE", `${subjectPath(name)}/lockout`);
+            problem.replaceChildren(h("p", { class: "off", role: "status" }, `The lock on ${name} is lifted.`));
+            send.focus();
+          } catch (error) {
+            problem.prepend(problemBox(error));
+          }
+        },
+      },
+      "Lift the lock",
+    );
+
   const fields = h(
     "fieldset",
     { class: "plain", disabled: why !== null },
-    subjectPart,
-    field(
-      "Level",
-      level,
-      "How often a stranger is accepted, by calibration. Stricter levels reject the right person " +
-        "more often.",
+    h(
+      "div",
+      { class: "pair" },
+      subjectPart,
+      field("Level", level, "How often a stranger is accepted. Stricter levels reject the right person more often."),
     ),
     picker?.root ?? null,
     why ? null : movements.root,
@@ -121,16 +147,16 @@ export function verifyView(id) {
     send,
   );
 
+  const entry = h("form", { class: "card", onsubmit: submit }, fields);
   const root = h(
     "section",
     {},
     h("h1", { tabindex: "-1" }, "Verify"),
     h("p", { class: "lead" }, "Check whether photos show the person enrolled under an id. Several are averaged."),
     offNote(why),
-    h("form", { class: "card", onsubmit: submit }, fields),
-    problem,
-    result,
+    workbench(entry, "The decision", STEPS, problem, result),
   );
+  picker?.dropOn(entry);
   showWhatIsAsked();
   return {
     root,

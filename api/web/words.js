@@ -2,7 +2,7 @@
 
 import { h } from "./dom.js";
 
-const DEMO = document.documentElement.dataset.demo === "yes";
+export const DEMO = document.documentElement.dataset.demo === "yes";
 
 const REMEDIES = {
   unauthorized: "Check the API key: it may be mistyped, revoked or expired.",

@@ -7,7 +7,7 @@ The chain that shows whether a line was altered, removed or moved is in
 """
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from functools import partial
@@ -30,7 +30,7 @@ from templates.store.audit_chain import (
     line_hash,
     read_line,
 )
-from templates.store.audit_rows import read_end, read_head, read_lines
+from templates.store.audit_rows import read_end, read_head, read_lines, read_tenant_lines
 from templates.store.database import Database
 from templates.store.deployment import Secrets
 from templates.store.identifiers import (
@@ -43,6 +43,7 @@ from templates.store.schema import AuditHeadRow, AuditRow
 from templates.store.secret import Secret, SecretName
 
 BATCH = 1000
+SCANNED = 50_000
 MAX_ACTOR = 64
 MAX_REQUEST_ID = 64
 MAX_DETAIL = 64
@@ -54,6 +55,7 @@ _BEGIN_LOCK = "veilface audit chain"
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 # Made once: building a statement costs more than running it, and every write appends a line.
 _ADD_LINE = sa.insert(AuditRow.__table__)  # type: ignore[arg-type]
+_LAST_LINE = sa.select(sa.func.max(AuditRow.sequence))
 _MOVE_HEAD = sa.update(AuditHeadRow.__table__)  # type: ignore[arg-type]
 
 
@@ -320,6 +322,54 @@ class AuditLog:
         while rows := self._database.read(partial(read_lines, after=after, batch=batch)):
             yield from (read_line(row._mapping) for row in rows)
             after = rows[-1].sequence
+
+    def page(
+        self,
+        tenant: str,
+        *,
+        limit: int,
+        before: int | None = None,
+        pseudonyms: Sequence[str] = (),
+    ) -> tuple[list[Line], int | None]:
+        """Read the latest lines of a tenant, the latest first.
+
+        Parameters
+        ----------
+        tenant
+            Whose lines.
+        limit
+            So many lines at most.
+        before
+            What the page before returned; None begins at the end of the log.
+        pseudonyms
+            Only lines on a subject that has one of these.
+
+        Returns
+        -------
+        The lines, and the number to go on before, None at the beginning of the log. No more than
+        :data:`SCANNED` lines of all tenants are looked through, so a page may be short, or empty,
+        and not the last.
+
+        Raises
+        ------
+        StoreError
+            At a line that was altered so that it cannot be read.
+        """
+
+        def work(connection: Connection) -> tuple[list[Line], int | None]:
+            end = before
+            if end is None:
+                end = 1 + (connection.execute(_LAST_LINE).scalar_one() or 0)
+            above = max(0, end - 1 - SCANNED)
+            rows = read_tenant_lines(
+                connection, tenant, pseudonyms, above=above, before=end, limit=limit + 1
+            )
+            lines = [read_line(row._mapping) for row in rows[:limit]]
+            if len(rows) > limit:
+                return lines, lines[-1].sequence
+            return lines, above + 1 if above else None
+
+        return self._database.read(work)
 
     def verify(
         self,

@@ -59,6 +59,24 @@ def read_lines(connection: Connection, *, after: int | None, batch: int) -> Sequ
     return connection.execute(query.where(later).order_by(AuditRow.sequence).limit(batch)).all()
 
 
+def read_tenant_lines(
+    connection: Connection,
+    tenant: str,
+    pseudonyms: Sequence[str],
+    *,
+    above: int,
+    before: int,
+    limit: int,
+) -> Sequence[Any]:
+    """A tenant's lines between two numbers, the latest first; on subjects, only on `pseudonyms`."""
+    query = sa.select(*_line_columns(connection)).where(
+        AuditRow.tenant == tenant, AuditRow.sequence > above, AuditRow.sequence < before
+    )
+    if pseudonyms:
+        query = query.where(AuditRow.pseudonym.in_(pseudonyms))
+    return connection.execute(query.order_by(AuditRow.sequence.desc()).limit(limit)).all()
+
+
 def _sides(after: int | None) -> tuple[sa.ColumnElement[bool], sa.ColumnElement[bool]]:
     # Without a bound first: a line that was slipped in may have any number.
     if after is None:

@@ -12,6 +12,7 @@ OPAQUE_ID_RULE = "1 to 64 characters out of A-Z a-z 0-9 _ -"
 
 # A client or proxy may rewrite "." and ".." as path steps, and so name another resource.
 _SUBJECT_ID = re.compile(r"(?!\.{1,2}\Z)[A-Za-z0-9._@:-]{1,128}")
+_SUBJECT_PREFIX = re.compile(r"[A-Za-z0-9._@:-]{1,128}")
 _TENANT_NAME = re.compile(r"[A-Za-z0-9._-]{1,64}")
 _OPAQUE_ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
@@ -39,6 +40,12 @@ def utc_now() -> datetime:
 def checked_subject_id(text: str) -> str:
     """Return `text`, or raise :class:`InvalidIdentifier` with the rule."""
     return _checked(text, _SUBJECT_ID, f"a subject id has {SUBJECT_ID_RULE}")
+
+
+def checked_subject_prefix(text: str) -> str:
+    """Return `text`, with which a subject id begins, or raise :class:`InvalidIdentifier`."""
+    rule = SUBJECT_ID_RULE.partition(",")[0]
+    return _checked(text, _SUBJECT_PREFIX, f"what a subject id begins with has {rule}")
 
 
 def checked_tenant_name(text: str) -> str:

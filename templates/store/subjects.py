@@ -1,7 +1,5 @@
 """Subjects and their templates: put, get, describe, list."""
 
-import base64
-import binascii
 import uuid
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -11,16 +9,18 @@ from typing import Any
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
-from templates.errors import SealError, StoreBusy, StoreError
+from templates.errors import StoreBusy, StoreError
 from templates.keys.sealing import sealed_key_id
 from templates.store.audit_log import PROGRAM, By, Entry
 from templates.store.context import StoreContext
+from templates.store.cursors import close_cursor, open_cursor
 from templates.store.envelope import Owner, close_envelope
 from templates.store.identifiers import (
     InvalidIdentifier,
     UnknownTenant,
     checked_opaque_id,
     checked_subject_id,
+    checked_subject_prefix,
 )
 from templates.store.outbox import EventType
 from templates.store.schema import FailedAttemptsRow, SubjectRow, TemplateRow, TenantRow
@@ -297,7 +297,9 @@ class Subjects:
             lambda connection: connection.execute(query).one_or_none()
         )
 
-    def list(self, tenant: str, *, limit: int = 100, cursor: str | None = None) -> SubjectPage:
+    def list(
+        self, tenant: str, *, limit: int = 100, cursor: str | None = None, prefix: str = ""
+    ) -> SubjectPage:
         """Return a page of a tenant's subjects, in the order of their ids.
 
         A subject that stays enrolled while the pages are read appears exactly once, whatever is
@@ -311,43 +313,34 @@ class Subjects:
             1 to 1000.
         cursor
             `next_cursor` of the page before; it is sealed, so it shows no subject id.
+        prefix
+            Only subjects whose ids begin so.
 
         Raises
         ------
         InvalidIdentifier
-            For a limit out of range, or a cursor that this store did not give for this tenant.
+            For a limit out of range, a cursor that this store did not give for this tenant, or a
+            prefix with which no subject id begins.
         """
         if not 1 <= limit <= MAX_PAGE:
             raise InvalidIdentifier(f"the limit of a page is 1 to {MAX_PAGE}")
         query = of_tenant(RECORD_COLUMNS, tenant).order_by(SubjectRow.subject_id).limit(limit + 1)
+        keyring = self._context.keyring
         if cursor is not None:
-            query = query.where(SubjectRow.subject_id > self._after(tenant, cursor))
+            after = open_cursor(keyring, cursor, purpose=_CURSOR_PURPOSE, tenant=tenant)
+            query = query.where(SubjectRow.subject_id > after)
+        if prefix:
+            # A range, which the index of the ids serves: DEL is beyond every character of an id.
+            first = checked_subject_prefix(prefix)
+            query = query.where(SubjectRow.subject_id.between(first, f"{first}\x7f"))
         rows = self._context.database.read(lambda connection: connection.execute(query).all())
         records = tuple(read_record(row) for row in rows[:limit])
+        if len(rows) <= limit:
+            return SubjectPage(records, None)
+        last = records[-1].subject_id
         return SubjectPage(
-            records=records,
-            next_cursor=self._cursor(tenant, records[-1]) if len(rows) > limit else None,
+            records, close_cursor(keyring, last, purpose=_CURSOR_PURPOSE, tenant=tenant)
         )
-
-    def _cursor(self, tenant: str, last: SubjectRecord) -> str:
-        sealed = self._context.keyring.seal(
-            last.subject_id.encode(), purpose=_CURSOR_PURPOSE, bound_to=[tenant]
-        )
-        return base64.urlsafe_b64encode(sealed).decode().rstrip("=")
-
-    def _after(self, tenant: str, cursor: str) -> str:
-        if len(cursor) > 512:
-            raise InvalidIdentifier("this cursor is too long to be one of ours")
-        try:
-            sealed = base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4))
-            opened = self._context.keyring.open(
-                sealed, purpose=_CURSOR_PURPOSE, bound_to=[tenant], refresh=False
-            )
-        except (SealError, binascii.Error, ValueError):
-            raise InvalidIdentifier(
-                "this cursor was not given for this list: start again without one"
-            ) from None
-        return opened.decode()
 
 
 _TENANT = sa.select(TenantRow.id, TenantRow.rotation_epoch)

@@ -60,13 +60,13 @@ class BrowserTab:
         assert any(url.endswith("/assets/main.js") for url in self.requests)
 
     def sign_in(self, token: str, *, keep: bool = False) -> None:
-        """Sign in with a key."""
+        """Sign in with a key, which a reload of the tab forgets unless it is to be kept."""
         answer = self.page.goto(self.url)
         assert answer is not None
         assert answer.status == 200, answer.text()
         self.page.get_by_label("API key").fill(token)
-        if keep:
-            self.page.get_by_label("Keep me signed in until I close this tab").check()
+        kept = self.page.get_by_label("Keep me signed in until I close this tab")
+        kept.set_checked(keep)
         self.page.get_by_role("button", name="Sign in").click()
         expect(self.page.get_by_role("navigation", name="Views")).to_be_visible()
 

@@ -11,19 +11,12 @@ from playwright.sync_api import expect
 
 from models.demo import DEMO_NOTICE
 from tests.patience import PATIENCE_S
-from tests.web.browser_tab import BrowserTab
 from tests.web.camera import FakeCamera, browsers_test_picture
 from tests.web.conftest import OpenTab
 from tests.web.served import Served
+from tests.web.walk import choose
 
 pytestmark = pytest.mark.long
-
-
-def choose(tab: BrowserTab, person: str, shot: int) -> None:
-    """Take one photo of a drawn person."""
-    tab.page.get_by_label("Cartoon person").select_option(person)
-    tab.page.get_by_role("button", name=f"Choose photo {shot} of {person}", exact=True).click()
-    expect(tab.page.locator(".tray .seen[data-state=good]").last).to_be_visible()
 
 
 def test_a_visitor_enrolls_and_verifies_a_drawn_person(open_tab: OpenTab, demo: Served) -> None:
@@ -105,7 +98,7 @@ def test_every_screen_is_marked(open_tab: OpenTab, demo: Served) -> None:
     mark = tab.page.get_by_text(DEMO_NOTICE, exact=True)
     expect(mark).to_be_visible()
     tab.sign_in(demo.token)
-    for view in ("Verify", "Enroll", "People", "Stored", "Service"):
+    for view in ("Verify", "Enroll", "People", "Stored", "Service", "Log"):
         tab.open(view)
         expect(mark).to_be_visible()
         expect(mark).to_be_in_viewport()
@@ -175,6 +168,13 @@ def test_too_many_rejections_are_told_with_the_time_to_wait(
         expect(alert).to_contain_text(re.compile(r"Try again in \d+ s"))
         assert len(re.findall(r"\d+ s\b", alert.inner_text())) == 1, "one clock"
         expect(alert).to_contain_text(re.compile(r"request [0-9a-f]{32}"))
+        # An operator lifts it where it was met; others are not offered to.
+        page = tab.page
+        page.get_by_role("button", name="Lift the lock").click()
+        expect(page.get_by_text("The lock on locked is lifted.")).to_be_visible()
+        assert client.get("/v1/subjects/locked/lockout").status_code == 404
+        page.get_by_role("button", name="Verify", exact=True).click()
+        expect(page.locator(".verdict.accept")).to_be_visible()
         client.delete("/v1/subjects/locked")
 
 

@@ -13,7 +13,7 @@ from tests.web.conftest import OpenTab
 from tests.web.passkeys import Authenticator
 from tests.web.served import Served
 from tests.web.test_access import press_until
-from tests.web.test_demo import choose
+from tests.web.walk import choose
 
 pytestmark = pytest.mark.long
 

@@ -10,7 +10,7 @@ from playwright.sync_api import Error, Page, Route, expect
 from tests.patience import PATIENCE_S
 from tests.web.conftest import OpenTab
 from tests.web.served import Served
-from tests.web.test_demo import choose
+from tests.web.walk import choose
 
 pytestmark = pytest.mark.long
 

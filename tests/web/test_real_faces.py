@@ -9,7 +9,8 @@ from playwright.sync_api import expect
 from tests.api.cli.conftest import run
 from tests.web.access import assert_accessible
 from tests.web.camera import FakeCamera
-from tests.web.conftest import OTHER, WHO, OpenTab
+from tests.web.conftest import OpenTab
+from tests.web.deployments import OTHER, WHO
 from tests.web.served import Served
 
 pytestmark = pytest.mark.long
@@ -38,8 +39,20 @@ def test_one_person_from_enrollment_to_erasure(
     page.get_by_label("Files").check()
     page.get_by_label("Photos: JPEG").set_input_files(own[1])
     expect(page.locator(".tray .seen[data-state=good]")).to_have_count(4)
+    # Each has the box where the service found the face.
+    expect(page.locator(".tray .found:not([hidden])")).to_have_count(4)
+    with real.client() as client:
+        told = client.post("/v1/photos/check", files={"image": own[1].read_bytes()}).json()["box"]
+    drawn = page.locator(".tray .found").last
+    x, y, width, height = (
+        float(drawn.get_attribute(name) or "nan") for name in ("x", "y", "width", "height")
+    )
+    assert [x, y, x + width, y + height] == pytest.approx(told)
+    assert page.locator(".tray .overlay").last.get_attribute("viewBox") == "0 0 250 250"
     page.get_by_role("button", name="Enroll", exact=True).click()
     expect(page.locator(".verdict")).to_contain_text("Enrolled")
+    expect(page.get_by_role("list", name="Photos used").locator("img")).to_have_count(4)
+    expect(page.locator(".verdict .found:not([hidden])")).to_have_count(4)
     expect(page.locator(".verdict")).to_be_focused()
     page.get_by_role("link", name="Verify this person").click()
 

@@ -9,16 +9,21 @@ from tests.web.served import Served
 pytestmark = pytest.mark.long
 
 
-def test_the_key_is_kept_only_where_it_is_asked_for(open_tab: OpenTab, demo: Served) -> None:
+def test_a_reload_keeps_the_session_unless_that_is_not_wanted(
+    open_tab: OpenTab, demo: Served
+) -> None:
     tab = open_tab(demo)
     page = tab.page
     assert page.evaluate("sessionStorage.length + localStorage.length") == 0
     assert page.evaluate("document.cookie") == ""
     page.reload()
     expect(page.get_by_role("heading", level=1, name="Sign in")).to_be_visible()
+    expect(page.get_by_label("Keep me signed in until I close this tab")).to_be_checked()
     tab.sign_in(demo.token, keep=True)
+    tab.open("People")
     page.reload()
-    expect(page.get_by_role("heading", level=1, name="Verify")).to_be_visible()
+    expect(page.get_by_role("heading", level=1, name="People")).to_be_visible()
+    assert page.evaluate("localStorage.length") == 0
     page.get_by_role("button", name="Sign out").click()
     expect(page.get_by_role("heading", level=1, name="Sign in")).to_be_focused()
     assert page.evaluate("sessionStorage.length + localStorage.length") == 0
@@ -33,6 +38,7 @@ def test_what_a_key_may_not_do_is_switched_off_with_the_reason(
     tab = open_tab(demo, sign_in=demo.key("verify"))
     page = tab.page
     expect(page.get_by_label("Person's id")).to_be_enabled()
+    expect(page.get_by_role("link", name="Log")).to_have_count(0)
     for view in ("Enroll", "People", "Stored"):
         tab.open(view)
         expect(

@@ -33,10 +33,15 @@ async def list_subjects(
     gate: GateDep,
     limit: Annotated[int, Query(ge=1, le=1000, description="Subjects on one page.")] = 100,
     cursor: Annotated[str | None, Query(description="`next_cursor` of the page before.")] = None,
+    prefix: Annotated[
+        str, Query(max_length=128, description="Only subjects whose ids begin so.")
+    ] = "",
 ) -> Response:
     """Right: `enroll`. Metadata only, in the order of the subject ids."""
     page = await gate.query(
-        lambda: runtime.store.subjects.list(caller.tenant, limit=limit, cursor=cursor)
+        lambda: runtime.store.subjects.list(
+            caller.tenant, limit=limit, cursor=cursor, prefix=prefix
+        )
     )
     return answer(
         request,

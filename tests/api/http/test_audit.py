@@ -1,15 +1,18 @@
 """Every call that does something, or is refused to, leaves a line; none of them names a face."""
 
+import json
 from typing import Any
 
 import pytest
 
+from api.http.schemas import AuditLogAnswer
 from templates.keys.probe_signature import signed_probe
 from templates.store.audit_chain import Line
 from templates.store.audit_log import AuditLog
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, images, photo
 from tests.api.http.test_enrollment import b64, lifted
+from tests.api.shapes import assert_answer, assert_error
 
 
 def lines(client: Client, after: int = 0) -> list[Line]:
@@ -70,6 +73,47 @@ def test_what_is_done_is_written_with_who_did_it(service: tuple[Client, Deployme
         assert line.actor == f"key:{prefix}"
         assert line.tenant == "default"
         assert line.request_id == answer.headers["x-request-id"]
+
+
+def test_who_administers_reads_the_log_of_the_tenant(
+    service: tuple[Client, Deployment],
+) -> None:
+    client, deployment = service
+    client.post("/v1/subjects/alice/verify", files=images(photo(2, 5), name="image"))
+    store = client.app.state.runtime.store
+    written = [line for line in lines(client) if line.tenant == "default"][::-1]
+    seen: list[dict[str, Any]] = []
+    cursor: dict[str, str] = {}
+    while True:
+        page = assert_answer(
+            client.get("/v1/audit-log", params={"limit": "2", **cursor}), 200, AuditLogAnswer
+        )
+        seen += page["lines"]
+        if page["next_cursor"] is None:
+            break
+        cursor = {"cursor": page["next_cursor"]}
+    names = ("actor", "action", "outcome", "detail", "request_id")
+    assert [[told[name] for name in names] for told in seen] == [
+        [getattr(line, name) for name in names] for line in written
+    ]
+    assert [told["subject"] for told in seen] == [line.pseudonym for line in written]
+    assert "alice" not in json.dumps(seen)
+    about = client.get("/v1/audit-log?subject_id=alice").json()["lines"]
+    pseudonym = store.signer.pseudonym("default", "alice")
+    assert [told["action"] for told in about] == ["verify", "enroll"]
+    assert {told["subject"] for told in about} == {pseudonym}
+    # Another tenant reads its own, and no cursor of this one.
+    store.tenants.create("elsewhere")
+    other = bearer(store.api_keys.create("elsewhere", ("admin",)).token)
+    told = client.get("/v1/audit-log", headers=other).json()["lines"]
+    assert not {each["request_id"] for each in told} & {each["request_id"] for each in seen[:1]}
+    assert {each["action"] for each in told}.isdisjoint({"enroll", "verify"})
+    refused = client.get("/v1/audit-log", params=cursor, headers=other)
+    assert_error(refused, 422, "validation_failed")
+    for bad in ("subject_id=.", "cursor=1", "limit=0"):
+        assert_error(client.get(f"/v1/audit-log?{bad}"), 422, "validation_failed")
+    verifier = bearer(deployment.key("verify", "enroll"))
+    assert_error(client.get("/v1/audit-log", headers=verifier), 403, "forbidden")
 
 
 def test_refusals_are_written_with_their_code(service: tuple[Client, Deployment]) -> None:

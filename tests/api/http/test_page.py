@@ -25,7 +25,7 @@ POLICY = {
     "require-trusted-types-for": "'script'",
     "trusted-types": "'none'",
 }
-MOST_BYTES = 100 * 1024
+MOST_BYTES = 120 * 1024
 MARKUP = re.compile(
     r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|eval\(|new Function|style="
 )

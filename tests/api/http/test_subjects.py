@@ -29,6 +29,10 @@ def test_pages_hold_every_subject_once(both: tuple[Client, Deployment]) -> None:
         if cursor is None:
             break
     assert seen == sorted(names)
+    found = assert_answer(client.get("/v1/subjects?prefix=b%40"), 200, SubjectsAnswer)
+    assert [entry["subject_id"] for entry in found["subjects"]] == ["b@x.org"]
+    for bad in ("%00", "a%2Fb", "a" * 129):
+        assert_error(client.get(f"/v1/subjects?prefix={bad}"), 422, "validation_failed")
 
 
 def test_a_description_has_no_template(client: Client, deployment: Deployment) -> None:

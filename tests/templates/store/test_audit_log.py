@@ -9,6 +9,7 @@ import tracemalloc
 from collections.abc import Callable, Iterator
 from dataclasses import astuple
 from datetime import UTC, datetime
+from itertools import chain
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -156,6 +157,35 @@ def test_lines_are_read_in_batches_from_anywhere(filled: TemplateStore) -> None:
     assert numbers == list(range(1, LINES + 1))
     assert [line.sequence for line in filled.audit_log.lines(after=6, batch=1)] == [7, 8]
     assert list(filled.audit_log.lines(after=LINES)) == []
+
+
+def test_the_latest_lines_of_a_tenant_come_first(
+    filled: TemplateStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = filled.audit_log
+    for _ in range(3):
+        log.record(Entry("verify", "accept", By(), tenant="other"))
+    log.record(entry(1))
+    expected = [line for line in log.lines() if line.tenant == "default"][::-1]
+
+    def pages(limit: int, pseudonyms: tuple[str, ...] = ()) -> list[list[Line]]:
+        lines, before = log.page("default", limit=limit, pseudonyms=pseudonyms)
+        read = [lines]
+        while before is not None:
+            lines, before = log.page("default", limit=limit, before=before, pseudonyms=pseudonyms)
+            read.append(lines)
+        return read
+
+    for limit in (1, 4, 1000):
+        assert list(chain.from_iterable(pages(limit))) == expected
+        assert {len(page) for page in pages(limit)[:-1]} <= {limit}
+    (about_one,) = pages(1000, (f"{1:064x}",))
+    assert [line.pseudonym for line in about_one] == [f"{1:064x}"] * 2
+    # However many lines are others', a page looks through a few, and the next ones go on.
+    monkeypatch.setattr("templates.store.audit_log.SCANNED", 2)
+    assert list(chain.from_iterable(pages(1000))) == expected
+    assert [] in pages(1000)
+    assert log.page("nobody", limit=5, before=2) == ([], None)
 
 
 def test_an_intact_log_verifies_in_batches(filled: TemplateStore) -> None:

@@ -287,6 +287,16 @@ def test_pages_hold_every_subject_once_in_order(store: TemplateStore) -> None:
             break
     assert seen == sorted(names)  # by code point, whatever the database's language
     assert pages == 3
+    for prefix in ("a", "a.", "z1", "Z", "q", "a" * 128):
+        records = store.subjects.list("default", prefix=prefix).records
+        begin = [name for name in sorted(names) if name.startswith(prefix)]
+        assert [record.subject_id for record in records] == begin, prefix
+    first = store.subjects.list("default", prefix="a", limit=4)
+    rest = store.subjects.list("default", prefix="a", cursor=first.next_cursor)
+    assert [each.subject_id for each in rest.records] == ["a:b", "a@b", "a_b"][-2:]
+    for bad in ("a/b", "%", "a\0", "a\x7f", "a" * 129):
+        with pytest.raises(InvalidIdentifier, match="begins with"):
+            store.subjects.list("default", prefix=bad)
 
 
 def test_a_page_that_ends_with_the_last_subject_is_the_last(store: TemplateStore) -> None:

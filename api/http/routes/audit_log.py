@@ -1,0 +1,78 @@
+"""The audit log of a tenant, for operators' desks."""
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query, Request
+from starlette.responses import Response
+
+from api.http.answers import answer
+from api.http.deps import Administers, GateDep, RuntimeDep, note_subject
+from api.http.openapi import EVERY_CALL, error_responses
+from api.http.schemas import AuditLogAnswer
+from api.http.values import iso_time
+from templates.store.audit_chain import Line
+from templates.store.cursors import close_cursor, open_cursor
+from templates.store.identifiers import checked_subject_id
+
+router = APIRouter(prefix="/v1/audit-log", tags=["audit log"])
+
+_CURSOR_PURPOSE = "audit-log-cursor"
+
+
+@router.get(
+    "",
+    response_model=AuditLogAnswer,
+    responses=error_responses(*EVERY_CALL, "forbidden", "validation_failed"),
+    summary="The tenant's audit log, page by page",
+)
+async def get_audit_log(
+    request: Request,
+    caller: Administers,
+    runtime: RuntimeDep,
+    gate: GateDep,
+    limit: Annotated[int, Query(ge=1, le=1000, description="Lines on one page, at most.")] = 100,
+    cursor: Annotated[str | None, Query(description="`next_cursor` of the page before.")] = None,
+    subject_id: Annotated[str | None, Query(description="Only lines on this subject.")] = None,
+) -> Response:
+    """Right: `admin`. The latest line first; subjects are named by their pseudonyms.
+
+    Nothing is verified here: that takes the whole log, and `veilface audit-log verify`. A page may
+    be short, or empty, where other tenants have most of the lines: only `next_cursor` says whether
+    there are earlier ones.
+    """
+    store, tenant = runtime.store, caller.tenant
+    pseudonyms: tuple[str, ...] = ()
+    if subject_id is not None:
+        pseudonyms = store.signer.pseudonyms(tenant, checked_subject_id(subject_id))
+        note_subject(request, pseudonyms[0])
+
+    def work() -> dict[str, Any]:
+        before = None
+        if cursor is not None:
+            opened = open_cursor(runtime.keyring, cursor, purpose=_CURSOR_PURPOSE, tenant=tenant)
+            before = int(opened)
+        lines, earlier = store.audit_log.page(
+            tenant, limit=limit, before=before, pseudonyms=pseudonyms
+        )
+        return {
+            "lines": [_told(line) for line in lines],
+            "next_cursor": None
+            if earlier is None
+            else close_cursor(
+                runtime.keyring, str(earlier), purpose=_CURSOR_PURPOSE, tenant=tenant
+            ),
+        }
+
+    return answer(request, await gate.query(work))
+
+
+def _told(line: Line) -> dict[str, Any]:
+    return {
+        "at": iso_time(line.at),
+        "actor": line.actor,
+        "action": line.action,
+        "subject": line.pseudonym,
+        "outcome": line.outcome,
+        "detail": line.detail,
+        "request_id": line.request_id,
+    }

@@ -1,0 +1,112 @@
+"""Take a picture of every view of the page in every state, for a person to look at.
+
+Serves the demo and, where the real models and faces are present, a real pack; walks through the
+page in Chromium at two sizes, light and dark, and writes a PNG for each state.
+
+Example
+-------
+::
+
+    python -m tests.web.screenshots OUT
+    python -m tests.web.screenshots OUT --only verify
+    python -m tests.web.screenshots docs --docs
+"""
+
+import argparse
+import io
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import partial
+from itertools import product
+from pathlib import Path
+from typing import Literal
+
+from PIL import Image
+from playwright.sync_api import Browser, expect, sync_playwright
+
+from tests.conftest import DEFAULT_SHARED_DATA
+from tests.patience import PATIENCE_S
+from tests.web.browser_tab import BrowserTab
+from tests.web.camera import FakeCamera
+from tests.web.deployments import OTHER, WHO, demo_service, real_service
+from tests.web.served import Served
+from tests.web.walk import walk_demo, walk_real
+
+Scheme = Literal["light", "dark"]
+Walk = Callable[[BrowserTab, Served], Iterator[str]]
+
+SIZES = ((1280, 800), (390, 844))
+SCHEMES: tuple[Scheme, ...] = ("light", "dark")
+SHOWN_IN_DOCS = "verify-accepted"
+COLOURS = 256
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """Where pictures go, and which are taken."""
+
+    out: Path
+    only: str = ""
+    docs: bool = False
+
+    def take(self, browser: Browser, walk: Walk, served: Served) -> None:
+        """Walk at each size and in each scheme, and take a picture of the states that are meant."""
+        for (width, height), scheme in product(SIZES, SCHEMES):
+            folder = self.out / f"{width}-{scheme}"
+            context = browser.new_context(
+                viewport={"width": width, "height": height},
+                color_scheme=scheme,
+                reduced_motion="reduce",
+            )
+            # Passkeys belong to a name.
+            tab = BrowserTab.of(context, served.url.replace("127.0.0.1", "localhost") + "/")
+            for number, name in enumerate(walk(tab, served), start=1):
+                if self.docs and name == SHOWN_IN_DOCS:
+                    taken = Image.open(io.BytesIO(picture_of(tab))).convert("RGB")
+                    # In few colours, so that it is small.
+                    taken.quantize(COLOURS).save(self.out / "web-page.png", optimize=True)
+                    return
+                if name.startswith(self.only) and not self.docs:
+                    folder.mkdir(parents=True, exist_ok=True)
+                    (folder / f"{number:02}-{name}.png").write_bytes(picture_of(tab))
+            context.close()
+
+
+def picture_of(tab: BrowserTab) -> bytes:
+    """The whole page, as a PNG."""
+    tab.page.evaluate("scrollTo(0, 0)")
+    return tab.page.screenshot(full_page=True)
+
+
+def main() -> None:
+    """Serve, walk and take the pictures."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("out", type=Path, metavar="OUT")
+    parser.add_argument("--only", default="", metavar="NAME", help="states that begin so")
+    parser.add_argument("--docs", action="store_true", help="the picture of the documentation")
+    pictures = Pictures(**vars(parser.parse_args()))
+    data = Path(os.environ.get("VEILFACE_TEST_DATA", DEFAULT_SHARED_DATA))
+    expect.set_options(timeout=1000 * PATIENCE_S)
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
+        work = Path(folder)
+        camera = FakeCamera(work / "camera.mjpeg")
+        browser = stack.enter_context(sync_playwright()).chromium.launch(
+            executable_path=os.environ.get("VEILFACE_TEST_BROWSER") or shutil.which("chromium"),
+            args=["--no-sandbox", *camera.flags],
+        )
+        demo = stack.enter_context(demo_service(work / "demo"))
+        pictures.take(browser, walk_demo, demo)
+        if data.exists() and not pictures.docs:
+            lfw, pack = data / "lfw", data / "packs" / "w600k_mbf"
+            real = stack.enter_context(real_service(work / "real", pack, lfw / "aligned112"))
+            faces = [sorted((lfw / "photos" / name).glob("*.jpg")) for name in (WHO, OTHER)]
+            walk = partial(walk_real, camera=camera, own=faces[0], other=faces[1])
+            pictures.take(browser, walk, real)
+
+
+if __name__ == "__main__":
+    main()

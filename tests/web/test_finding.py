@@ -1,0 +1,184 @@
+"""People are searched and picked, photos are dropped, and operators read the log."""
+
+from collections.abc import Iterator
+
+import pytest
+from playwright.sync_api import expect
+
+from tests.web.conftest import OpenTab
+from tests.web.served import Served
+from tests.web.walk import choose
+
+pytestmark = pytest.mark.long
+
+NAMES = ("found-ada", "found-ben", "found-ben-2")
+
+
+@pytest.fixture(autouse=True)
+def enrolled(demo: Served) -> Iterator[None]:
+    """Three people whose ids begin alike."""
+    photo = (demo.settings.data_dir / "people" / "person-2" / "0.png").read_bytes()
+    with demo.client() as client:
+        for name in NAMES:
+            path = f"/v1/subjects/{name}/enrollment"
+            assert client.put(path, files={"images": ("0.png", photo)}).is_success
+        yield
+        for name in NAMES:
+            assert client.delete(f"/v1/subjects/{name}").is_success
+
+
+@pytest.mark.parametrize("view", ["Verify", "Enroll", "Stored", "Log"])
+def test_a_person_is_picked_from_those_whose_ids_begin_so(
+    open_tab: OpenTab, demo: Served, view: str
+) -> None:
+    tab = open_tab(demo)
+    page = tab.page
+    tab.open(view)
+    field = page.get_by_role("combobox", name="Person's id")
+    options = page.get_by_role("listbox", name="People").get_by_role("option")
+    field.press_sequentially("found-")
+    expect(options).to_have_count(3)
+    expect(field).to_have_attribute("aria-expanded", "true")
+    for _ in range(2):
+        field.press("ArrowDown")
+    active = page.locator("[role=option][aria-selected=true]")
+    expect(active).to_contain_text("found-ben")
+    assert field.get_attribute("aria-activedescendant") == active.get_attribute("id")
+    field.press("Enter")
+    expect(field).to_have_value("found-ben")
+    expect(field).to_be_focused()
+    # One that is enrolled is enough said, though another id begins with it.
+    expect(page.get_by_text("✓ 1 photo, enrolled")).to_be_visible()
+    expect(options).to_have_count(0)
+    expect(field).to_have_attribute("aria-expanded", "false")
+
+    # All of them, by the mouse; and Escape leaves the field as it was.
+    field.fill("")
+    field.click()
+    expect(options.first).to_be_visible()
+    field.press("Escape")
+    expect(options).to_have_count(0)
+    expect(field).to_have_value("")
+    field.press("ArrowDown")
+    options.filter(has_text="found-ada").click()
+    expect(field).to_have_value("found-ada")
+
+
+def test_an_id_that_nobody_has_is_typed_as_it_is(open_tab: OpenTab, demo: Served) -> None:
+    tab = open_tab(demo)
+    page = tab.page
+    field = page.get_by_label("Person's id")
+    field.fill("found-nobody")
+    expect(page.get_by_text("Nobody is enrolled under this id.")).to_be_visible()
+    choose(tab, "person-2", 1)
+    page.get_by_role("button", name="Verify", exact=True).click()
+    expect(page.get_by_role("alert")).to_contain_text("not_enrolled")
+    # A search that fails says nothing: the form does, when it is sent.
+    page.route("**/v1/subjects?*", lambda route: route.abort())
+    field.fill("found-a")
+    expect(page.get_by_text("Nobody is enrolled under this id.")).to_have_count(0)
+    page.wait_for_timeout(500)
+    expect(page.get_by_role("listbox", name="People")).to_have_count(0)
+    assert set(tab.complaints) == {"Failed to load resource: net::ERR_FAILED"}
+    tab.complaints.clear()
+
+
+def test_who_may_not_list_people_types_the_id(open_tab: OpenTab, demo: Served) -> None:
+    tab = open_tab(demo, sign_in=demo.key("verify"))
+    page = tab.page
+    page.get_by_label("Person's id").fill("found-")
+    choose(tab, "person-2", 1)
+    expect(page.get_by_role("combobox", name="Person's id")).to_have_count(0)
+    assert not [url for url in tab.requests if "/v1/subjects" in url]
+
+
+def test_people_are_found_by_how_their_ids_begin(open_tab: OpenTab, demo: Served) -> None:
+    tab = open_tab(demo)
+    page = tab.page
+    tab.open("People")
+    people = page.locator("li.person")
+    expect(people.filter(has_text="person-2")).to_have_count(1)
+    search = page.get_by_label("Find people whose id begins with")
+    search.fill("found-ben")
+    expect(people).to_have_count(2)
+    expect(page.get_by_text("2 people shown.")).to_be_visible()
+    search.fill("found-z")
+    expect(page.get_by_text("Nobody’s id begins so.")).to_be_visible()
+    expect(page.get_by_text("Enroll the first person")).to_be_hidden()
+    search.fill("found-a")
+    expect(people).to_have_count(1)
+
+
+DROP = """
+async ([selector, url]) => {
+  const blob = url ? await (await fetch(url)).blob() : new Blob(["text"]);
+  const data = new DataTransfer();
+  data.items.add(new File([blob], "dropped.png", { type: "image/png" }));
+  const target = document.querySelector(selector);
+  const told = { bubbles: true, cancelable: true, dataTransfer: data };
+  const over = !target.dispatchEvent(new DragEvent("dragover", told));
+  const lit = document.querySelector("form.dropping") !== null;
+  return [over, lit, !target.dispatchEvent(new DragEvent("drop", told))];
+}
+"""
+
+
+def test_photos_are_dropped_on_the_form(open_tab: OpenTab, demo: Served) -> None:
+    tab = open_tab(demo)
+    page = tab.page
+    tab.open("Enroll")
+    url = "/demo/people/person-1/0.png"
+    for count in (1, 2):
+        assert page.evaluate(DROP, ["form", url]) == [True, True, True]
+        expect(page.locator(".tray .seen[data-state=good]")).to_have_count(count)
+    expect(page.locator("form.dropping")).to_have_count(0)
+    expect(page.get_by_label("Remove photo from dropped.png")).to_have_count(2)
+    # What misses the form is taken by nobody, and does not replace the page.
+    assert page.evaluate(DROP, ["h1", url]) == [True, False, True]
+    expect(page.locator(".tray li")).to_have_count(2)
+    # Where the form is switched off, it takes nothing.
+    tab.sign_in(demo.key("verify"))
+    tab.open("Enroll")
+    assert page.evaluate(DROP, ["form", url])[1] is False
+
+
+def test_operators_read_the_audit_log(open_tab: OpenTab, demo: Served) -> None:
+    tab = open_tab(demo)
+    page = tab.page
+    tab.open("Log")
+    rows = page.get_by_role("row")
+    expect(rows.nth(1)).to_be_visible()
+    newest = page.locator("tbody tr").first
+    expect(newest).to_contain_text("enroll")
+    page.get_by_label("Person's id").fill("found-ada")
+    page.get_by_role("button", name="Show", exact=True).click()
+    with demo.client() as client:
+        told = client.get("/v1/audit-log?subject_id=found-ada").json()["lines"]
+        expect(rows).to_have_count(1 + len(told))
+        all_of_them = client.get("/v1/audit-log?limit=1000").json()["lines"]
+    pseudonym = told[0]["subject"][:16]
+    expect(page.locator("tbody tr").filter(has_text=pseudonym)).to_have_count(len(told))
+    assert "found-ada" not in page.get_by_role("table").inner_text()
+    # All lines, page by page.
+    page.get_by_label("Person's id").fill("")
+    page.get_by_role("button", name="Show", exact=True).click()
+    expect(rows).to_have_count(1 + min(50, len(all_of_them)))
+    if len(all_of_them) > 50:
+        page.get_by_role("button", name="Show earlier").click()
+        expect(rows).to_have_count(1 + min(100, len(all_of_them)))
+
+
+def test_what_is_printed_is_what_was_found(open_tab: OpenTab, demo: Served) -> None:
+    tab = open_tab(demo, color_scheme="dark")
+    page = tab.page
+    page.get_by_label("Person's id").fill("found-ada")
+    choose(tab, "person-2", 1)
+    page.get_by_role("button", name="Verify", exact=True).click()
+    expect(page.locator(".verdict.accept")).to_be_visible()
+    page.emulate_media(media="print")
+    expect(page.locator(".verdict")).to_be_visible()
+    expect(page.get_by_text("demo model: not for authentication").first).to_be_visible()
+    for hidden in ("navigation", "button"):
+        expect(page.get_by_role(hidden)).to_have_count(0)
+    ground = page.evaluate("getComputedStyle(document.body).backgroundColor")
+    assert ground == "rgb(255, 255, 255)"
