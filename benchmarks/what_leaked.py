@@ -19,6 +19,8 @@ from time import process_time
 import numpy as np
 from numpy.typing import NDArray
 
+from attacks.chosen_enrollment import chosen_enrollment
+from attacks.databases import link_databases
 from attacks.holder_keys import Guess, guess_with_and_without_holder_keys
 from attacks.learned import invert
 from attacks.likelihood import likeliest_guess
@@ -60,6 +62,10 @@ def attacks_on(
         "one": of_one,
         "several": lambda: several_templates(system, albums, likeliest),
         "linkage": lambda: link(system, liftings=1, most_people=args.linked),
+        "databases": lambda: link_databases(
+            system, accounts=(args.accounts,), most_people=args.linked
+        ),
+        "chosen": lambda: chosen_enrollment(system),
     }
 
 
@@ -74,7 +80,10 @@ def main() -> None:
     parser.add_argument("--dim", type=int, default=160)
     parser.add_argument("--level", default="fmr-1e-3", help="that a match is judged at")
     parser.add_argument("--calibrating", type=int, default=1200, help="photos to calibrate on")
-    parser.add_argument("--attacks", nargs="+", default=["one", "several", "linkage"])
+    parser.add_argument("--accounts", type=int, default=100, help="in both databases")
+    parser.add_argument(
+        "--attacks", nargs="+", default=["one", "several", "linkage", "databases", "chosen"]
+    )
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     population, source, attacker = adapted_deployment(
