@@ -21,7 +21,11 @@ from numpy.typing import NDArray
 
 from attacks.chosen_enrollment import chosen_enrollment
 from attacks.databases import link_databases
-from attacks.holder_keys import Guess, guess_with_and_without_holder_keys
+from attacks.holder_keys import (
+    Guess,
+    guess_from_few_decoys,
+    guess_with_and_without_holder_keys,
+)
 from attacks.learned import invert
 from attacks.likelihood import likeliest_guess
 from attacks.linkage import link
@@ -56,7 +60,8 @@ def attacks_on(
         if args.training_seconds:
             inverter, outcomes = invert(system, seconds=args.training_seconds, seed=args.seed)
             guesses["inverter"] = inverter
-        return [*outcomes, *guess_with_and_without_holder_keys(system, guesses)]
+        outcomes += guess_with_and_without_holder_keys(system, guesses)
+        return outcomes + guess_from_few_decoys(system)
 
     return {
         "one": of_one,
