@@ -125,9 +125,8 @@ from tests.api.client import Client
 from tests.api.deployment import images, photo
 
 api.http.idempotency.answer = lambda *_, **__: os.kill(os.getpid(), signal.SIGKILL)
-headers, fields = json.loads(sys.argv[1])
+path, headers, fields = json.loads(sys.argv[1])
 with Client(app_from_environment()) as client:
-    path = "/v1/subjects/ada/enrollment"
     client.put(path, files=images(photo(1)), headers=headers, data=fields)
 """
 
@@ -137,14 +136,20 @@ def test_a_retry_does_not_meet_its_own_write_of_a_service_that_was_killed(
     client: Client, deployment: Deployment, storage: str
 ) -> None:
     """The precondition is of the first sending: what that one wrote does not count."""
-    headers = {"Idempotency-Key": "key-1", "If-None-Match": "*"}
+    subject, headers = f"{storage}-1", {"Idempotency-Key": f"{storage}-1", "If-None-Match": "*"}
     fields = {} if storage == "service" else {"storage": storage}
     ended = subprocess.run(
         [
             sys.executable,
             "-c",
             KILLED_AFTER_THE_COMMIT,
-            json.dumps([headers | bearer(deployment.token), fields]),
+            json.dumps(
+                [
+                    f"/v1/subjects/{subject}/enrollment",
+                    headers | bearer(deployment.token),
+                    fields,
+                ]
+            ),
         ],
         cwd=ROOT,
         env={
@@ -155,8 +160,8 @@ def test_a_retry_does_not_meet_its_own_write_of_a_service_that_was_killed(
         check=False,
     )
     assert ended.returncode == -signal.SIGKILL, ended.stderr.decode()
-    written = client.get("/v1/subjects/ada").json()["template_id"]
-    again = put(client, "key-1", photo(1), subject="ada", headers=headers, data=fields)
+    written = client.get(f"/v1/subjects/{subject}").json()["template_id"]
+    again = put(client, None, photo(1), subject=subject, headers=headers, data=fields)
     if storage == "service":
         assert (again.status_code, again.json()["template_id"]) == (201, written)
         assert again.headers["Idempotency-Replayed"] == "true"
@@ -165,7 +170,7 @@ def test_a_retry_does_not_meet_its_own_write_of_a_service_that_was_killed(
         assert again.json()["held_template"]
     # The control: another request does meet it.
     assert_error(
-        put(client, "key-2", photo(1), subject="ada", headers=headers | {"Idempotency-Key": "2"}),
+        put(client, None, photo(1), subject=subject, headers={**headers, "Idempotency-Key": "2"}),
         409,
         "enrollment_conflict",
     )
