@@ -87,9 +87,9 @@ class Moments:
     @classmethod
     def of_both(cls, first: "Moments", second: "Moments") -> "Moments":
         """Moments of two halves of a database that are as large as each other."""
-        spread = sum((half.axes * half.variances) @ half.axes.T for half in (first, second))
+        spreads = [(half.axes * half.variances) @ half.axes.T for half in (first, second)]
         return cls._of(
-            spread / 2,
+            (spreads[0] + spreads[1]) / 2,
             mean=(first.mean + second.mean) / 2,
             power=(first.power + second.power) / 2,
             templates=first.templates + second.templates,
