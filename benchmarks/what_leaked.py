@@ -28,13 +28,15 @@ from attacks.holder_keys import (
 )
 from attacks.learned import invert
 from attacks.likelihood import likeliest_guess
-from attacks.linkage import link
-from attacks.outcomes import GENERATED, AttackOutcome, Scheme
-from attacks.several_templates import several_templates
+from attacks.linkage import foot_lengths, holder_rotations_of, link, linkage_outcome, turned
+from attacks.outcomes import GENERATED, AttackOutcome, Leaked, Scheme
+from attacks.several_templates import enrolled, several_templates
 from attacks.stored.foot_point import foot_points
 from attacks.system import System, enroll_victims
+from attacks.unlinkability import unlinkability
 from benchmarks.asked_and_linked import adapted_deployment
 from models.pack import ModelPack
+from verify.comparisons import through_wire
 
 
 def shown(outcome: AttackOutcome) -> str:
@@ -46,6 +48,33 @@ def shown(outcome: AttackOutcome) -> str:
         f"({100 * measured.ci_low:.1f}-{100 * measured.ci_high:.1f}) of {measured.trials}"
         + ("" if beside is None else f", null 95 % {100 * float(str(beside)):.1f} %")
     )
+
+
+def lengths(system: System) -> list[AttackOutcome]:
+    """Link two enrollments of the same photos under kept keys, by what no rotation hides."""
+    first = enrolled(system, "the deployment's secret")
+    contract_id, count = system.contract.contract_id, len(first)
+    outcomes = []
+    for name in ("the deployment's secret", "another secret"):
+        sides = [
+            through_wire(
+                turned(side, holder_rotations_of(system, where, count)), contract_id=contract_id
+            )
+            for where, side in (("first", first), ("second", enrolled(system, name)))
+        ]
+        measured = unlinkability(foot_lengths(sides[0], sides[1])[None], seed=system.seed)
+        outcomes.append(
+            linkage_outcome(
+                system,
+                measured,
+                attack="foot-lengths",
+                variant=f"{name}, nearest for {measured.first_rank:.1%} of {count}",
+                leaked=Leaked.MASTER_KEY,
+                assumption="Two enrollments of the same photos under kept keys",
+                judged=False,
+            )
+        )
+    return outcomes
 
 
 def attacks_on(
@@ -66,6 +95,7 @@ def attacks_on(
     return {
         "one": of_one,
         "several": lambda: several_templates(system, albums, likeliest),
+        "lengths": lambda: lengths(system),
         "linkage": lambda: link(system, liftings=1, most_people=args.linked),
         "databases": lambda: link_databases(
             system, accounts=(args.accounts,), most_people=args.linked
@@ -87,7 +117,9 @@ def main() -> None:
     parser.add_argument("--calibrating", type=int, default=1200, help="photos to calibrate on")
     parser.add_argument("--accounts", type=int, default=100, help="in both databases")
     parser.add_argument(
-        "--attacks", nargs="+", default=["one", "several", "linkage", "databases", "chosen"]
+        "--attacks",
+        nargs="+",
+        default=["one", "several", "lengths", "linkage", "databases", "chosen"],
     )
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
