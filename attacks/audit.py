@@ -16,7 +16,11 @@ from attacks.decision_walk import VICTIMS, reconstruct_from_decisions
 from attacks.errors import AuditError
 from attacks.further_faces import SAME_PHOTO, FurtherFaces, strangers_among
 from attacks.hill_climbing import Ask, climb_service, dictionary_outcomes
-from attacks.holder_keys import Guess, guess_with_and_without_holder_keys
+from attacks.holder_keys import (
+    Guess,
+    guess_from_few_decoys,
+    guess_with_and_without_holder_keys,
+)
 from attacks.learned import FaceCrops, invert, reconstruct
 from attacks.learned.inverter import SECONDS, Inverter
 from attacks.likelihood import (
@@ -281,7 +285,8 @@ def _attacks(
             "foot-point": foot_points,
             "decoy-likelihood": likeliest_guess(system, known),
         }
-        return guess_with_and_without_holder_keys(system, guesses | inverters)
+        outcomes = guess_with_and_without_holder_keys(system, guesses | inverters)
+        return outcomes + guess_from_few_decoys(system, known)
 
     def drawn() -> list[AttackOutcome]:
         if crops is None:

@@ -20,7 +20,7 @@ from scipy.linalg import svd
 
 from attacks.decisions import decide
 from attacks.errors import AuditError
-from attacks.linkage import rotations_of, turned, turned_back
+from attacks.linkage import holder_rotations_of, rotations_of, turned, turned_back
 from attacks.outcomes import AttackOutcome, Knowledge, Leaked, Property
 from attacks.recovery import fmr_of
 from attacks.stored.honest_probes import honest_embedding, points_inside
@@ -34,7 +34,7 @@ from templates.space.subspace import SubspaceBatch
 from verify.comparisons import through_wire
 from verify.metrics import rate
 
-ACCOUNTS = (2, 5, 10, 20, 80)
+ACCOUNTS = (5, 50, 500)
 """Accounts that the attacker enrolls: n / (m + 1) fix a common rotation, half of them nearly."""
 ALIGNMENTS = 30
 """Most steps of the estimate; with enough accounts it is settled after two."""
@@ -180,8 +180,9 @@ def chosen_enrollment(
     -------
     list of AttackOutcome
         Named ``chosen-enrollment``, one for each number of accounts; ``alignment`` in ``details``
-        is the largest tr(R̂ᵀR) / n of a victim's R, 1 where it is known. Then two controls that are
-        not judged: the largest number with one rotation for all templates, and the tenant's key.
+        is the largest tr(R̂ᵀR) / n of a victim's R, 1 where it is known. Then the same against
+        victims who keep keys, with the tenant's stolen. Last two controls that are not judged: the
+        largest number with one rotation for all templates, and the tenant's key.
 
     Raises
     ------
@@ -198,9 +199,13 @@ def chosen_enrollment(
     sent = system.lift(system.attacker[:most], "templates that the attacker enrolls")
     outcomes = []
     common = of_accounts[:1]
-    for number, enrolled, rotations, judged in (
-        *((number, of_accounts[:number], of_victims, True) for number in numbers),
-        (most, common * most, common * people, False),
+    # Keys of other people: the attacker's own would open no more than its own templates.
+    holders = holder_rotations_of(system, tenant, people + most)
+    kept, own = holders[:people], holders[people:]
+    for number, enrolled, rotations, setting in (
+        *((number, of_accounts[:number], of_victims, _SECRET) for number in numbers),
+        *((number, own[:number], kept, _KEPT) for number in numbers),
+        (most, common * most, common * people, _COMMON),
     ):
         sides = Sides(sent[:number], _as_stored(system, sent[:number], enrolled))
         estimate = estimate_from_sets(sides)
@@ -210,15 +215,14 @@ def chosen_enrollment(
             _outcome(
                 system,
                 points,
-                variant=f"{number} accounts" + ("" if judged else ", one rotation for all"),
+                variant=f"{number} accounts" + setting.name,
                 leaked=Leaked.MASTER_KEY,
                 assumption=f"The right to send templates and embeddings, with which the attacker "
                 f"has enrolled {number} templates of its own lifting, and the tenant's whole "
-                "stolen database, whose key is secret; it estimates a rotation from the "
+                f"stolen database, {setting.stolen}; it estimates a rotation from the "
                 "templates that it sent and what became of them, and sends a unit point of every "
-                "victim's template, turned back, as an embedding; success is acceptance"
-                + ("" if judged else " (a control: all templates are turned alike)"),
-                judged=judged,
+                f"victim's template, turned back, as an embedding; success is {setting.success}",
+                judged=setting is not _COMMON,
                 details={"accounts": number, "alignment": _alignment(estimate, rotations)},
             )
         )
@@ -237,6 +241,26 @@ def chosen_enrollment(
             details={},
         ),
     ]
+
+
+class _Setting(NamedTuple):
+    name: str
+    stolen: str
+    success: str
+
+
+_SECRET = _Setting("", "whose key is secret", "acceptance")
+_KEPT = _Setting(
+    ", holders' keys kept",
+    "its key, and all but the keys that the victims keep",
+    "acceptance as with the victim's key. To choose a key, and send what its rotation turns into "
+    'the template, needs no account (docs/threat-model.md "A key that the person keeps")',
+)
+_COMMON = _Setting(
+    ", one rotation for all",
+    "whose key is secret",
+    "acceptance (a control: all templates are turned alike)",
+)
 
 
 def _outcome(

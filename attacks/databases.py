@@ -5,17 +5,26 @@ the mean and the second moments of a stolen database would tell which axes were 
 the attacker knows how un-rotated templates are spread (decoys come from a generator that clients
 have); and accounts of the attacker's own, in both databases, would tell more. Where each template
 has a rotation of its own, no two have anything in common to estimate. Both are measured: the first
-as a control that the attack is one. Neither is in the paper.
+as a control that the attack is one. Who has the master key undoes the tenants' rotations, and is
+left with the holders', where people keep keys, be the databases two tenants' or two halves of one.
+Neither is in the paper.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from attacks.errors import AuditError
-from attacks.linkage import linkage_outcome, nearest_similarities, rotations_of, turned
+from attacks.linkage import (
+    foot_lengths,
+    holder_rotations_of,
+    linkage_outcome,
+    nearest_similarities,
+    rotations_of,
+    turned,
+)
 from attacks.outcomes import AttackOutcome, Knowledge, Leaked
 from attacks.system import System
 from attacks.unlinkability import unlinkability
@@ -67,14 +76,38 @@ class Moments:
         for start in range(0, len(batch), _TILE):
             rows = batch.bases[start : start + _TILE].reshape(-1, batch.n).astype(np.float64)
             spread += rows.T @ rows
-        variances, axes = np.linalg.eigh(spread * batch.n / (len(batch) * batch.m))
-        return cls(
+        return cls._of(
+            spread * batch.n / (len(batch) * batch.m),
             mean=batch.feet.mean(axis=0, dtype=np.float64),
-            variances=np.maximum(variances[::-1], 1e-9),
-            axes=axes[:, ::-1],
             power=float((batch.foot_norms**2).mean()),
             templates=len(batch),
             m=batch.m,
+        )
+
+    @classmethod
+    def of_both(cls, first: "Moments", second: "Moments") -> "Moments":
+        """Moments of two halves of a database that are as large as each other."""
+        spreads = [(half.axes * half.variances) @ half.axes.T for half in (first, second)]
+        return cls._of(
+            (spreads[0] + spreads[1]) / 2,
+            mean=(first.mean + second.mean) / 2,
+            power=(first.power + second.power) / 2,
+            templates=first.templates + second.templates,
+            m=first.m,
+        )
+
+    @classmethod
+    def _of(
+        cls, spread: Array64, *, mean: Array64, power: float, templates: int, m: int
+    ) -> "Moments":
+        variances, axes = np.linalg.eigh(spread)
+        return cls(
+            mean=mean,
+            variances=np.maximum(variances[::-1], 1e-9),
+            axes=axes[:, ::-1],
+            power=power,
+            templates=templates,
+            m=m,
         )
 
 
@@ -184,6 +217,10 @@ class _Tenant:
         """One of each template."""
         return rotations_of(system, f"database {self.name}", "template", len(self.lifted))
 
+    def holders_rotations(self, system: System) -> list[Rotation]:
+        """One of each template, by a key that its holder has for both tenants."""
+        return holder_rotations_of(system, f"database {self.name}", len(self.lifted))
+
     def stolen(self, rotations: Sequence[Rotation]) -> _Database:
         """The database, each template in its rotation."""
         stored = turned(self.lifted, rotations)
@@ -227,8 +264,10 @@ def link_databases(
     -------
     list of AttackOutcome
         Named ``database-linkage``: for each number of accounts, by the estimated rotation
-        (whitened foot points, and nearest points) and, where there are accounts, by signatures.
-        Last, for the largest number, a control that is not judged: one rotation for a tenant.
+        (whitened foot points, and nearest points), by the lengths of the foot points, which no
+        rotation changes, and, where there are accounts, by signatures. Then, for the largest
+        number, with the master key stolen and the holders' keys kept: two tenants, and one that is
+        split in two. Last a control that is not judged: one rotation for a tenant.
 
     Raises
     ------
@@ -247,31 +286,64 @@ def link_databases(
         drawn = client_source(system.lifter.source).draw(strangers, 1, stream=stream)[:, 0, :]
     lifted = Moments.of(system.lift(drawn, "database lifted by the attacker"))
     rotated = [tenant.own_rotations(system) for tenant in tenants]
+    held = [tenant.holders_rotations(system) for tenant in tenants]
     alike = [[own_rotations[0]] * len(own_rotations) for own_rotations in rotated]
-    stolen, control = (
+    stolen, kept, control = (
         [tenant.stolen(turns) for tenant, turns in zip(tenants, side, strict=True)]
-        for side in (rotated, alike)
+        for side in (rotated, held, alike)
     )
-    settings = [(number, stolen) for number in numbers] + [(len(own), control)] * bool(numbers)
+    whole = Moments.of_both(*(side.moments for side in kept))
+    settings = [_Setting(number, stolen, _TENANTS_KEYS) for number in numbers]
+    if numbers:
+        halves = [replace(side, moments=whole) for side in kept]
+        settings += [
+            _Setting(len(own), kept, _HOLDERS_KEYS, "holders' keys kept, "),
+            _Setting(len(own), halves, _HALVES, "two halves of one tenant, holders' keys kept, "),
+            _Setting(len(own), control, _TENANTS_KEYS, "one rotation a tenant, "),
+        ]
     return [
         linkage_outcome(
             system,
             unlinkability(score[None], permutations=permutations, seed=system.seed),
             attack="database-linkage",
-            variant=f"{number} accounts, {'one rotation a tenant, ' if sides is control else ''}"
-            f"{name}",
+            variant=f"{setting.accounts} accounts, {setting.name}{name}",
             leaked=Leaked.MASTER_KEY,
             knowledge=Knowledge.TEMPLATES,
-            assumption=f"The whole databases of two tenants, whose keys are secret, how templates "
-            f"are lifted, and {number} accounts with both, with the descriptors enrolled there; "
-            "success is D_sys of the templates of the people in both"
-            + (" (a control: each tenant has one rotation for all)" if sides is control else ""),
-            judged=sides is stolen,
-            details={"accounts": number, "strangers": strangers},
+            assumption=f"{setting.stolen}, how templates are lifted, and {setting.accounts} "
+            "accounts with both, with the descriptors enrolled there; success is D_sys of the "
+            "templates of the people in both"
+            + (
+                " (a control: each tenant has one rotation for all)"
+                if setting.sides is control
+                else ""
+            ),
+            judged=setting.sides is not control,
+            details={"accounts": setting.accounts, "strangers": strangers},
         )
-        for number, sides in settings
-        for name, score in _scores(sides, lifted, own[:number]).items()
+        for setting in settings
+        for name, score in _scores(setting.sides, lifted, own[: setting.accounts]).items()
     ]
+
+
+_TENANTS_KEYS = "The whole databases of two tenants, whose keys are secret"
+_HOLDERS_KEYS = (
+    "The whole databases of two tenants and every secret of the deployment, but not the keys that "
+    "people keep, each the same for both"
+)
+_HALVES = (
+    "The whole database of a tenant, in which the people are twice, and every secret of the "
+    "deployment, but not the keys that people keep, each the same for both"
+)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class _Setting:
+    """Two databases as they were stolen, and how the rows about them are named."""
+
+    accounts: int
+    sides: Sequence[_Database]
+    stolen: str
+    name: str = ""
 
 
 def _scores(
@@ -288,6 +360,7 @@ def _scores(
     scores = {
         "estimated rotations, foot points": whitened_cosines(left, right, lifted),
         "estimated rotations, nearest points": nearest_similarities(left, right),
+        "foot lengths": foot_lengths(left, right),
     }
     if number:
         first, second = sides

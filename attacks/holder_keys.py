@@ -2,25 +2,32 @@
 
 The thief has the database and every secret of the deployment, and undoes the tenants' rotations.
 A template whose holder keeps a key is still turned by a rotation that nothing stolen gives
-(docs/method.md §4.9). Beside each attack stands the same one with the key stolen too.
+(docs/method.md §4.9). Beside each attack stands the same one with the key stolen too, and beside
+both, on templates of so few decoys that it must succeed, what shows that it is an attack at all.
 ``attacks.linkage`` has two such templates, ``attacks.several_templates`` several of one person.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from attacks.likelihood import likeliest_guess
 from attacks.linkage import holder_rotations_of, turned, turned_back
 from attacks.outcomes import AttackOutcome, Knowledge, Leaked
 from attacks.recovery import recovery_outcome
+from attacks.stored.foot_point import foot_points
 from attacks.system import System
 from templates.space.subspace import SubspaceBatch
 from verify.comparisons import through_wire
 
 Guess = Callable[[SubspaceBatch], NDArray[np.floating]]
 """Guesses the descriptor of every template, (T, n)."""
+
+
+CONTROL_DIM = 4
+"""Dimension of the templates that show that the attacks work."""
 
 
 @dataclass(frozen=True)
@@ -95,3 +102,45 @@ def guess_with_and_without_holder_keys(
             for attack, guess in guesses.items()
         ]
     return outcomes
+
+
+def guess_from_few_decoys(
+    system: System, faces: NDArray[np.float32] | None = None
+) -> list[AttackOutcome]:
+    """Make the same attacks on templates of m = 4: a control, which is not judged.
+
+    Parameters
+    ----------
+    faces : (A, n) float32
+        Faces that the attacker has beside the system's.
+
+    Returns
+    -------
+    list of AttackOutcome
+        Foot point and likelihood, with the key kept and stolen; none where the system's own
+        templates are of no more dimensions.
+    """
+    scheme = replace(system.scheme, dim=CONTROL_DIM)
+    if system.scheme.dim <= CONTROL_DIM:
+        return []
+    templates = system.lift(system.victims.enrolled, "few decoys", m=CONTROL_DIM)
+    guesses: dict[str, Guess] = {
+        "foot-point": foot_points,
+        "decoy-likelihood": likeliest_guess(replace(system, scheme=scheme), faces),
+    }
+    return [
+        recovery_outcome(
+            system,
+            guess(theft.of(system, templates, "few decoys")),
+            attack=attack,
+            variant=f"{theft.variant}, m = {CONTROL_DIM}",
+            leaked=theft.leaked,
+            knowledge=Knowledge.ALGORITHM,
+            assumption=f"{theft.assumption}; the template is of m = {CONTROL_DIM}, at which the "
+            "attack must succeed with the key; success is a match of the guess with a fresh photo "
+            "(a control)",
+            judged=False,
+        )
+        for theft in THEFTS
+        for attack, guess in guesses.items()
+    ]

@@ -1,8 +1,11 @@
-"""Several templates of one person: of the same photos, and of others.
+"""Several templates of one person: of the same photos, of some of them, and of others.
 
 The service draws the decoys of the same photos under a secret: enrolled again, they give the same
-template in another rotation, and who opens both has one. Templates of different photos come near
-each other in the person. A thief without the holder's key opens neither.
+template in another rotation, and who opens both has one. Two secrets give two lifts, which come
+near each other in the descriptor: the control, and what two tenants have of a person who keeps a
+key and gave both the same photos. Photos that overlap those of an earlier enrollment give two lifts
+of nearly one descriptor, and different photos come near each other in the person. A thief without
+the holder's key opens none of them.
 """
 
 from collections.abc import Sequence
@@ -14,14 +17,22 @@ from attacks.holder_keys import THEFTS, Guess, Theft
 from attacks.outcomes import AttackOutcome, Knowledge, Leaked
 from attacks.population import Subjects
 from attacks.recovery import recovery_outcome
-from attacks.stored.intersection import in_memory, nearest_common_points
+from attacks.stored.intersection import nearest_common_points
 from attacks.system import System
+from enroll import Enroller
+from templates.contract import wire
+from templates.keys.randomness import KEY_BYTES, Keystream
+from templates.keys.rotation import TenantRotation
 from templates.space.embedding import normalised
 from templates.space.subspace import SubspaceBatch
 
 COUNTS = (1, 2, 3, 4, 5)
-SAME = 2
-"""Enrollments of the same photos."""
+SAME, TWO_SECRETS = "the same photos", "the same photos under two lift secrets"
+OVERLAPS = {
+    "two of three photos the same": ((0, 1, 2), (0, 1, 3)),
+    "one photo more": ((0, 1), (0, 1, 2)),
+}
+"""Photos of two enrollments that overlap."""
 JUDGED_PEOPLE = 20
 """Of fewer people a share says too little to judge by."""
 
@@ -51,13 +62,28 @@ def several_templates(
     list of AttackOutcome
         Named ``several-templates``: for each T the mean of the guesses from all and, from two on,
         the point that is nearest to all; with the key kept, the largest T only. T = 1 is not
-        judged: it is what the others are held against.
+        judged: it is what the others are held against; and neither are two lift secrets.
     """
-    once = in_memory(system, "photos that are enrolled again")
-    outcomes = []
-    for count in (1, SAME):
-        batches = [once] * count
-        outcomes += _guessed(system, batches, guess, "the same photos", system.victims, count)
+    first, again = (enrolled(system, "the deployment's secret") for _ in range(2))
+    other = enrolled(system, "another secret")
+    outcomes = [
+        outcome
+        for batches, name in (
+            ([first], SAME),
+            ([first, again], SAME),
+            ([first, other], TWO_SECRETS),
+        )
+        for outcome in _guessed(system, batches, guess, name, system.victims, len(batches))
+    ]
+    for name, chosen in OVERLAPS.items():
+        enough = [album for album in photos if len(album) > max(map(max, chosen)) + 1]
+        if enough:
+            batches = [
+                system.lift(_means(enough, numbers), f"{name}, photos {numbers}")
+                for numbers in chosen
+            ]
+            people = _people(enough, _means(enough, range(max(map(max, chosen)) + 1)))
+            outcomes += _guessed(system, batches, guess, name, people, len(batches))
     reached = [count for count in counts if any(len(album) > count for album in photos)]
     for count in reached:
         enough = [album for album in photos if len(album) > count]
@@ -65,15 +91,51 @@ def several_templates(
             system.lift(np.stack([album[number] for album in enough]), f"photo {number} of {count}")
             for number in range(count)
         ]
-        means = np.stack([album[:count].mean(axis=0, dtype=np.float64) for album in enough])
-        people = Subjects(
-            enrolled=normalised(means).astype(np.float32),
-            fresh=np.stack([album[-1] for album in enough]),
-            photos=np.full(len(enough), count),
-            shown=np.full(len(enough), -1),  # of no folder
-        )
+        people = _people(enough, _means(enough, range(count)))
         outcomes += _guessed(system, batches, guess, "different photos", people, max(reached))
     return outcomes
+
+
+def enrolled(system: System, secret: str) -> SubspaceBatch:
+    """Enroll the victims as a service does, and undo the tenant's rotations.
+
+    Parameters
+    ----------
+    secret
+        Names the deployment's secret that decoys are drawn under.
+    """
+    contract = system.contract
+    with Keystream.seeded("audit", system.seed, "lift secret", secret) as stream:
+        rotation = TenantRotation(stream.token(KEY_BYTES), system.templates.n)
+        enroller = Enroller(
+            contract,
+            system.lifter.source,
+            rotation=rotation,
+            lift_secret=stream.token(KEY_BYTES),
+        )
+    templates = []
+    for row in system.victims.enrolled:
+        stored = enroller.from_embeddings(row[None])
+        turned = wire.decode(stored.wire).subspace
+        own = rotation.of(stored.template_id, contract.binding.rotation_version)
+        templates.append(turned.turned_by(own.turned_back))
+    return SubspaceBatch.of(templates)
+
+
+def _means(albums: Sequence[NDArray[np.float32]], numbers: Sequence[int]) -> NDArray[np.float32]:
+    """Descriptors of some photos of every person, (V, n)."""
+    means = [album[list(numbers)].mean(axis=0, dtype=np.float64) for album in albums]
+    return normalised(np.stack(means)).astype(np.float32)
+
+
+def _people(albums: Sequence[NDArray[np.float32]], descriptors: NDArray[np.float32]) -> Subjects:
+    """The people of some albums, whose last photo is the fresh one."""
+    return Subjects(
+        enrolled=descriptors,
+        fresh=np.stack([album[-1] for album in albums]),
+        photos=np.full(len(albums), 1),
+        shown=np.full(len(albums), -1),  # of no folder
+    )
 
 
 def _guessed(
@@ -112,6 +174,7 @@ def _of_theft(
     if count > 1:
         guesses["nearest to all"] = nearest_common_points(seen)
     enough = len(people) >= JUDGED_PEOPLE
+    control = count == 1 or photos == TWO_SECRETS
     return [
         recovery_outcome(
             system,
@@ -126,8 +189,9 @@ def _of_theft(
                 ""
                 if enough
                 else f" (not judged: fewer than {JUDGED_PEOPLE} people have the photos)"
-            ),
-            judged=enough and count > 1,
+            )
+            + (" (a control: no service draws so)" if photos == TWO_SECRETS else ""),
+            judged=enough and not control,
             people=None if people is system.victims else people,
             details={"templates": count, "people": len(people)},
         )

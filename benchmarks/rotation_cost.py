@@ -18,7 +18,7 @@ import time
 
 import numpy as np
 
-from enroll import Enroller
+from enroll import Enroller, Holder
 from templates.contract import wire
 from templates.contract.document import Binding
 from templates.decoys import DecoyGenerator
@@ -96,7 +96,7 @@ def main() -> None:
     rotation = TenantRotation(bytes(KEY_BYTES), args.n)
     key = bytes(range(KEY_BYTES))
     enroller = Enroller(contract, source, rotation=rotation, lift_secret=bytes(KEY_BYTES))
-    stored = enroller.from_embeddings(photos[:2], holder_key=key)
+    stored = enroller.from_embeddings(photos[:2], holder=Holder(key, "tenant", "subject"))
     verifiers = {
         BOTH: Verifier(contract, rotation=rotation),
         TENANT: TenantOnly(contract, rotation=rotation),

@@ -19,16 +19,24 @@ from time import process_time
 import numpy as np
 from numpy.typing import NDArray
 
-from attacks.holder_keys import Guess, guess_with_and_without_holder_keys
+from attacks.chosen_enrollment import chosen_enrollment
+from attacks.databases import link_databases
+from attacks.holder_keys import (
+    Guess,
+    guess_from_few_decoys,
+    guess_with_and_without_holder_keys,
+)
 from attacks.learned import invert
 from attacks.likelihood import likeliest_guess
-from attacks.linkage import link
-from attacks.outcomes import GENERATED, AttackOutcome, Scheme
-from attacks.several_templates import several_templates
+from attacks.linkage import foot_lengths, holder_rotations_of, link, linkage_outcome, turned
+from attacks.outcomes import GENERATED, AttackOutcome, Leaked, Scheme
+from attacks.several_templates import enrolled, several_templates
 from attacks.stored.foot_point import foot_points
 from attacks.system import System, enroll_victims
+from attacks.unlinkability import unlinkability
 from benchmarks.asked_and_linked import adapted_deployment
 from models.pack import ModelPack
+from verify.comparisons import through_wire
 
 
 def shown(outcome: AttackOutcome) -> str:
@@ -40,6 +48,33 @@ def shown(outcome: AttackOutcome) -> str:
         f"({100 * measured.ci_low:.1f}-{100 * measured.ci_high:.1f}) of {measured.trials}"
         + ("" if beside is None else f", null 95 % {100 * float(str(beside)):.1f} %")
     )
+
+
+def lengths(system: System) -> list[AttackOutcome]:
+    """Link two enrollments of the same photos under kept keys, by what no rotation hides."""
+    first = enrolled(system, "the deployment's secret")
+    contract_id, count = system.contract.contract_id, len(first)
+    outcomes = []
+    for name in ("the deployment's secret", "another secret"):
+        sides = [
+            through_wire(
+                turned(side, holder_rotations_of(system, where, count)), contract_id=contract_id
+            )
+            for where, side in (("first", first), ("second", enrolled(system, name)))
+        ]
+        measured = unlinkability(foot_lengths(sides[0], sides[1])[None], seed=system.seed)
+        outcomes.append(
+            linkage_outcome(
+                system,
+                measured,
+                attack="foot-lengths",
+                variant=f"{name}, nearest for {measured.first_rank:.1%} of {count}",
+                leaked=Leaked.MASTER_KEY,
+                assumption="Two enrollments of the same photos under kept keys",
+                judged=False,
+            )
+        )
+    return outcomes
 
 
 def attacks_on(
@@ -54,12 +89,18 @@ def attacks_on(
         if args.training_seconds:
             inverter, outcomes = invert(system, seconds=args.training_seconds, seed=args.seed)
             guesses["inverter"] = inverter
-        return [*outcomes, *guess_with_and_without_holder_keys(system, guesses)]
+        outcomes += guess_with_and_without_holder_keys(system, guesses)
+        return outcomes + guess_from_few_decoys(system)
 
     return {
         "one": of_one,
         "several": lambda: several_templates(system, albums, likeliest),
+        "lengths": lambda: lengths(system),
         "linkage": lambda: link(system, liftings=1, most_people=args.linked),
+        "databases": lambda: link_databases(
+            system, accounts=(args.accounts,), most_people=args.linked
+        ),
+        "chosen": lambda: chosen_enrollment(system),
     }
 
 
@@ -74,7 +115,12 @@ def main() -> None:
     parser.add_argument("--dim", type=int, default=160)
     parser.add_argument("--level", default="fmr-1e-3", help="that a match is judged at")
     parser.add_argument("--calibrating", type=int, default=1200, help="photos to calibrate on")
-    parser.add_argument("--attacks", nargs="+", default=["one", "several", "linkage"])
+    parser.add_argument("--accounts", type=int, default=100, help="in both databases")
+    parser.add_argument(
+        "--attacks",
+        nargs="+",
+        default=["one", "several", "lengths", "linkage", "databases", "chosen"],
+    )
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     population, source, attacker = adapted_deployment(

@@ -3,10 +3,11 @@
 Imports the layer below only: ``templates`` and ``models``.
 """
 
-from enroll.enroller import Enroller, Enrollment, PhotoResult
+from enroll.enroller import Enroller, Enrollment, Holder, PhotoResult
 
 __all__ = [
     "Enroller",
     "Enrollment",
+    "Holder",
     "PhotoResult",
 ]

@@ -2,9 +2,9 @@
 
 The order matters: the photos' embeddings are averaged first and lifted once, because two lifts of
 one person meet in that person's descriptor (docs/method.md §4.6). For the same reason the photos
-decide the decoys, under a secret of the deployment: enrolled again, they give the same set. The
-template's rotations come last, the holder's and then the tenant's, so that clients never need the
-tenant's.
+decide the decoys, under a secret of the deployment: enrolled again, they give the same set; where
+the person keeps a key, for the same subject only. The template's rotations come last, the holder's
+and then the tenant's, so that clients never need the tenant's.
 """
 
 import secrets
@@ -31,6 +31,23 @@ from templates.space.subspace import AffineSubspace
 
 MAX_PHOTOS = 10
 WIRE_DTYPE: wire.WireDtype = "float16"
+
+
+@dataclass(frozen=True)
+class Holder:
+    """A person who keeps a key for an enrollment.
+
+    Parameters
+    ----------
+    key
+        32 secret bytes without which the template accepts nobody; it is not kept.
+    tenant, subject
+        Whom it is kept for.
+    """
+
+    key: HolderKey = field(repr=False)
+    tenant: str
+    subject: str
 
 
 @dataclass(frozen=True)
@@ -113,7 +130,7 @@ class Enroller:
         photos: Sequence[bytes],
         *,
         attributes: Attributes | None = None,
-        holder_key: HolderKey | None = None,
+        holder: Holder | None = None,
         policy: FacePolicy = FacePolicy.SINGLE,
         quality: QualityLimits | None = DEFAULT_QUALITY,
         limits: ImageLimits = DEFAULT_LIMITS,
@@ -123,7 +140,7 @@ class Enroller:
         Parameters
         ----------
         policy, quality, limits
-            See ``ModelPack.embed_photo``; ``attributes`` and ``holder_key`` see
+            See ``ModelPack.embed_photo``; ``attributes`` and ``holder`` see
             ``from_embeddings``.
 
         Raises
@@ -147,7 +164,7 @@ class Enroller:
             unit_rows(embeddings, n=info.n, most=MAX_PHOTOS),
             photos,
             attributes=attributes,
-            holder_key=holder_key,
+            holder=holder,
             results=[PhotoResult(index, sample.quality) for index, sample in enumerate(samples)],
         )
 
@@ -156,7 +173,7 @@ class Enroller:
         embeddings: NDArray[np.floating],
         *,
         attributes: Attributes | None = None,
-        holder_key: HolderKey | None = None,
+        holder: Holder | None = None,
     ) -> Enrollment:
         """Enroll from 1 to 10 unit embeddings of one person, (k, n).
 
@@ -164,9 +181,8 @@ class Enroller:
         ----------
         attributes
             The subject's gender and race, for hybrid+ only. Used here and forgotten.
-        holder_key
-            32 secret bytes without which the template accepts nobody; it is not kept. None: the
-            template needs no key.
+        holder
+            Whose key the template needs; None: it needs none.
 
         Raises
         ------
@@ -180,7 +196,7 @@ class Enroller:
             rows,
             [row.tobytes() for row in rows],
             attributes=attributes,
-            holder_key=holder_key,
+            holder=holder,
             results=[PhotoResult(index) for index in range(len(rows))],
         )
 
@@ -190,14 +206,17 @@ class Enroller:
         photos: Sequence[bytes],
         *,
         attributes: Attributes | None,
-        holder_key: HolderKey | None,
+        holder: Holder | None,
         results: Sequence[PhotoResult],
     ) -> Enrollment:
         contract, binding = self._contract, self._contract.binding
         descriptor = mean_embedding(rows, consistency=contract.photo_consistency)
         named = [attributes or Attributes()] if binding.strategy is Strategy.HYBRID_PLUS else None
         with lift_stream(
-            self._lift_secret, contract_id=contract.contract_id, photos=photos
+            self._lift_secret,
+            contract_id=contract.contract_id,
+            photos=photos,
+            holder=None if holder is None else (holder.tenant, holder.subject),
         ) as stream:
             lifted = lift(
                 descriptor[None],
@@ -207,10 +226,10 @@ class Enroller:
                 stream=stream,
                 attributes=named,
             )
-        turned, salt = self._turned_by_holder(lifted[0], holder_key)
+        turned, salt = self._turned_by_holder(lifted[0], holder)
         return self._finish(turned, per_photo=tuple(results), holder_salt=salt)
 
-    def from_template(self, data: bytes, *, holder_key: HolderKey | None = None) -> Enrollment:
+    def from_template(self, data: bytes, *, holder: Holder | None = None) -> Enrollment:
         """Enroll a template that a client lifted, in the wire format, un-rotated.
 
         The set is kept; its basis is drawn anew. A template that lies near strangers, as a wolf
@@ -219,7 +238,7 @@ class Enroller:
 
         Parameters
         ----------
-        holder_key
+        holder
             See ``from_embeddings``.
 
         Raises
@@ -237,7 +256,7 @@ class Enroller:
                 "the template lies nearer to strangers than the contract recorded of honest ones: "
                 "lift photos of one person with the contract's decoys"
             )
-        turned, salt = self._turned_by_holder(subspace, holder_key)
+        turned, salt = self._turned_by_holder(subspace, holder)
         return self._of(turned, holder_salt=salt)
 
     def from_export(self, data: bytes, *, holder_salt: str | None = None) -> Enrollment:
@@ -280,13 +299,13 @@ class Enroller:
         return self._finish(spanned, per_photo=(), holder_salt=holder_salt)
 
     def _turned_by_holder(
-        self, subspace: AffineSubspace, key: HolderKey | None
+        self, subspace: AffineSubspace, holder: Holder | None
     ) -> tuple[AffineSubspace, str | None]:
         """Turn a template by a new rotation of its holder's; returns it with the salt."""
-        if key is None:
+        if holder is None:
             return subspace, None
         salt = secrets.token_hex(16)
-        rotation = holder_rotation(key, salt, self._contract.binding.n)
+        rotation = holder_rotation(holder.key, salt, self._contract.binding.n)
         return subspace.turned_by(rotation.turned), salt
 
     def _finish(

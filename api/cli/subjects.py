@@ -20,7 +20,7 @@ from api.limits.admission import MAX_JSON_BYTES
 from api.process.opening import weak_privacy
 from api.process.runtime import Runtime
 from api.settings import Settings
-from enroll.enroller import MAX_PHOTOS
+from enroll.enroller import MAX_PHOTOS, Holder
 from models.errors import PhotoRejected
 from models.pack import FacePolicy, ModelPack
 from templates.decoys import Attributes
@@ -141,7 +141,7 @@ def enroll(
                 pack,
                 data,
                 attributes=Attributes(gender, race),
-                holder_key=holder_key,
+                holder=None if holder_key is None else Holder(holder_key, name, subject),
                 policy=face,
                 limits=runtime.image_limits,
             )

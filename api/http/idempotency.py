@@ -1,8 +1,9 @@
 """Writes that carry an Idempotency-Key: done once, answered as often as asked.
 
-Only successes are kept. A write that was refused changed nothing, so its key is given back and the
-client may send a better photo under the same key. Neither is an answer kept that holds a template
-for its holder: the store would have it for a day, and the next one with the same key replaces it.
+Only successes are kept, in the transaction of the write. A write that was refused changed nothing,
+so its key is given back and the client may send a better photo under the same key. Neither is an
+answer kept that holds a template for its holder: the store would have it for a day, and the next
+request with the same key replaces it.
 """
 
 import contextlib
@@ -21,7 +22,8 @@ from api.http.preconditions import etag
 from api.process.runtime import Runtime
 from templates.errors import StoreError
 from templates.keys.sealing import encode_parts
-from templates.store.idempotency import Answer
+from templates.store.idempotency import Answer, Claim
+from templates.store.subjects import Once, StoredTemplate
 
 
 @dataclass(frozen=True)
@@ -29,14 +31,21 @@ class Outcome:
     """What a write answers, its template id included.
 
     It holds no subject id, because it is kept for a day.
-
-    Not `kept`, because it holds what the store must not: asked again, the write is done again.
     """
 
     status: int
     body: Mapping[str, Any]
     replayed: bool = False
-    kept: bool = True
+
+
+def kept_with(claim: Claim | None, outcome: Callable[[StoredTemplate], Outcome]) -> Once | None:
+    """Return what ``Subjects.put`` keeps for a claim: the answer that `outcome` gives."""
+
+    def kept(stored: StoredTemplate) -> Answer:
+        answered = outcome(stored)
+        return Answer(answered.status, json.dumps(dict(answered.body)).encode())
+
+    return None if claim is None else Once(claim, kept)
 
 
 async def once(
@@ -47,7 +56,7 @@ async def once(
     operation: str,
     asked: Sequence[str | bytes],
     subject: str | None,
-    work: Callable[[], Outcome],
+    work: Callable[[Claim | None], Outcome],
     run: Callable[[Callable[[], Outcome]], Awaitable[Outcome]],
     add: Mapping[str, Any] | None = None,
 ) -> Response:
@@ -61,7 +70,7 @@ async def once(
     subject
         Erasing this subject removes the record.
     work
-        The write; runs in a thread.
+        The write, which keeps its answer with :func:`kept_with`; runs in a thread.
     run
         Which threads: the gate's ``compute`` or ``query``.
     add
@@ -76,7 +85,7 @@ async def once(
 
     def guarded() -> Outcome:
         if key is None:
-            return work()
+            return work(None)
         records = runtime.store.idempotency
         claim = records.claim(
             caller.tenant,
@@ -88,20 +97,11 @@ async def once(
         if isinstance(claim, Answer):
             return Outcome(claim.status, json.loads(claim.body), replayed=True)
         try:
-            outcome = work()
+            return work(claim)
         except BaseException:
             with contextlib.suppress(StoreError):
                 records.release(claim)
             raise
-        # The write is done; that its record could not be kept must not turn it into a failure.
-        with contextlib.suppress(StoreError):
-            if outcome.kept:
-                records.finish(
-                    claim, status=outcome.status, body=json.dumps(dict(outcome.body)).encode()
-                )
-            else:
-                records.release(claim)
-        return outcome
 
     outcome = await run(guarded)
     headers = {"ETag": etag(outcome.body["template_id"])}

@@ -74,11 +74,21 @@ def plain_strategy(strategy: Strategy) -> Strategy:
     return _PLAIN.get(strategy, strategy)
 
 
-def lift_stream(secret: bytes, *, contract_id: str, photos: Sequence[bytes]) -> Keystream:
+def lift_stream(
+    secret: bytes,
+    *,
+    contract_id: str,
+    photos: Sequence[bytes],
+    holder: tuple[str, str] | None = None,
+) -> Keystream:
     """Return the stream that one set of photos is lifted from: the same whenever they come again.
 
     Two lifts of one descriptor with different decoys meet in it (docs/method.md §4.6). From this
     stream they are one set, which tells no more than either; other photos give other decoys.
+
+    Only a template that its holder's key turns is told apart by tenant and subject: nobody sees two
+    of those meet without the keys, and one set would show by the length of its foot point, which
+    no rotation hides, that two enrollments are of the same photos (docs/privacy.md "What leaked").
 
     Parameters
     ----------
@@ -89,9 +99,12 @@ def lift_stream(secret: bytes, *, contract_id: str, photos: Sequence[bytes]) -> 
     photos : sequence of bytes
         What was sent, in any order: the files, or the bytes of the embeddings. Not what a model
         made of the files, which another processor rounds in another way.
+    holder : (tenant, subject), optional
+        Whose key turns the template; not the key, which may be replaced by another one.
     """
     digests = sorted(hashlib.sha256(photo).digest() for photo in photos)
-    parts = encode_parts("lift", contract_id, *digests)
+    whose = ["lift"] if holder is None else ["lift for a holder", *holder]
+    parts = encode_parts(*whose, contract_id, *digests)
     return Keystream(hmac.digest(secret, parts, hashlib.sha256))
 
 

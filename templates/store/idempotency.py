@@ -1,15 +1,17 @@
 """Idempotency records: a repeated write with the same key is answered, not done again.
 
-A write first claims its key, then runs, then leaves its answer. A claim that its worker did not
-finish (it was killed) lapses after a minute, so that the client's next try may run. Keys and
-requests are kept as HMAC-SHA256 under a secret of the deployment: a record does not tell whose
+A write first claims its key, then runs, and leaves its answer in its own transaction: a worker that
+is killed has done both or neither. A claim that was not finished lapses after a minute, so that the
+client's next try may run. An answer that holds a template for its holder is not kept; the record
+then says what was written, so that the next try may replace that, whatever its precondition. Keys
+and requests are kept as HMAC-SHA256 under a secret of the deployment: a record does not tell whose
 photo was sent to somebody who holds the photo. Answers must hold no biometric data. An answer
 carries a MAC: one that somebody else wrote is not given, and the write runs.
 """
 
 import hmac
 import uuid
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
 from typing import Any
 
@@ -38,7 +40,11 @@ class IdempotencyConflict(StoreError):
 
 @dataclass(frozen=True)
 class Claim:
-    """The right to run a write; hand it back by ``finish`` or ``release``."""
+    """The right to run a write, which ends with ``finish`` or ``release``.
+
+    `written` is the template that an earlier run of the same request has written, whose answer was
+    not kept.
+    """
 
     tenant_id: str
     actor: str
@@ -46,6 +52,7 @@ class Claim:
     request_hash: bytes = field(repr=False)
     token: str = field(repr=False)
     expires_at: datetime
+    written: str | None = None
 
 
 @dataclass(frozen=True)
@@ -103,6 +110,7 @@ class Idempotency:
                 IdempotencyRow.expires_at <= now,
                 sa.and_(IdempotencyRow.status.is_(None), IdempotencyRow.claimed_until <= now),
             )
+            claim = replace(claim, written=self._written(connection, claim))
             connection.execute(sa.delete(IdempotencyRow).where(*_is(claim), lapsed))
             if self._insert(connection, claim, pseudonym, now):
                 return claim
@@ -114,11 +122,19 @@ class Idempotency:
                 return claim
             if not hmac.compare_digest(row.request_hash, request_hash):
                 raise IdempotencyConflict("this idempotency key was used for another request")
-            if row.status is None or row.body is None:
+            if row.status is None:
                 raise IdempotencyConflict("the first request with this key is still running")
-            return Answer(row.status, row.body)
+            return Answer(row.status, row.body or b"")
 
         return context.write(work, lock=f"idempotency {tenant} {actor} {lock}")
+
+    def _written(self, connection: Connection, claim: Claim) -> str | None:
+        """Return what an earlier run of the request wrote whose answer was not kept."""
+        row = connection.execute(_RECORD.where(*_is(claim))).one_or_none()
+        if row is None or row.status is not None or row.body is None:
+            return None
+        same = hmac.compare_digest(row.request_hash, claim.request_hash)
+        return row.body.decode() if same and self._is_authentic(row) else None
 
     def _insert(
         self, connection: Connection, claim: Claim, pseudonym: str | None, now: datetime
@@ -135,34 +151,67 @@ class Idempotency:
             claimed_until=now + CLAIM,
             created_at=now,
             expires_at=claim.expires_at,
+            **({} if claim.written is None else self._noted(claim, None, claim.written.encode())),
         )
+
+    def _noted(self, claim: Claim, status: int | None, body: bytes) -> dict[str, Any]:
+        """Columns of a record that holds something, with their MAC."""
+        noted: dict[str, Any] = {"status": status, "body": body}
+        row = {**vars(claim), "claim": claim.token, **noted}
+        noted["mac"] = row_mac(self._context.audit_log.row_key(), IdempotencyRow, row)
+        return noted
 
     def _is_authentic(self, row: Any) -> bool:
         return is_authentic(self._context.audit_log.row_key(), IdempotencyRow, row._mapping)
 
-    def finish(self, claim: Claim, *, status: int, body: bytes) -> bool:
-        """Leave the answer; False if the claim is gone (lapsed, or the subject was erased)."""
-        if len(body) > MAX_BODY_BYTES:
+    def finish(self, connection: Connection, claim: Claim, answer: Answer) -> None:
+        """Leave the answer, in the transaction of the write.
+
+        Nothing is left where the subject was erased since the claim.
+
+        Raises
+        ------
+        IdempotencyConflict
+            If the claim lapsed, and another run of the request has it: the write is taken back.
+        """
+        if len(answer.body) > MAX_BODY_BYTES:
             raise StoreError(f"an answer of more than {MAX_BODY_BYTES} bytes is not kept")
-        row = {**vars(claim), "claim": claim.token, "status": status, "body": body}
+        self._leave(connection, claim, self._noted(claim, answer.status, answer.body))
 
-        def work(connection: Connection) -> bool:
-            mac = row_mac(self._context.audit_log.row_key(), IdempotencyRow, row)
-            statement = (
-                sa.update(IdempotencyRow)
-                .where(*_is(claim), IdempotencyRow.claim == claim.token)
-                .values(status=status, body=body, mac=mac)
-            )
-            return connection.execute(statement).rowcount == 1
+    def note_written(self, connection: Connection, claim: Claim, template_id: str) -> None:
+        """Leave what was written in place of an answer that must not be kept; see ``finish``.
 
-        return self._context.write(work)
+        The next run of the same request may begin at once.
+        """
+        noted = self._noted(claim, None, template_id.encode())
+        self._leave(connection, claim, {**noted, "claimed_until": self._context.clock()})
+
+    def _leave(self, connection: Connection, claim: Claim, noted: dict[str, Any]) -> None:
+        ours = sa.update(IdempotencyRow).where(*_is(claim), IdempotencyRow.claim == claim.token)
+        if connection.execute(ours.values(**noted)).rowcount == 1:
+            return
+        if connection.execute(_RECORD.where(*_is(claim))).one_or_none() is not None:
+            raise IdempotencyConflict("another run of this request has taken over meanwhile")
 
     def release(self, claim: Claim) -> None:
-        """Give the key back, because the write failed and may be tried again."""
-        statement = sa.delete(IdempotencyRow).where(
+        """Give the key back, because the write failed and may be tried again.
+
+        An answer stays, and so does a note: the commit may have gone through though its news did
+        not.
+        """
+        unanswered = sa.and_(
             *_is(claim), IdempotencyRow.claim == claim.token, IdempotencyRow.status.is_(None)
         )
-        self._context.database.write(lambda connection: connection.execute(statement))
+        noted = IdempotencyRow.body.is_not(None)
+
+        def work(connection: Connection) -> None:
+            now = self._context.clock()
+            connection.execute(sa.delete(IdempotencyRow).where(unanswered, ~noted))
+            connection.execute(
+                sa.update(IdempotencyRow).where(unanswered, noted).values(claimed_until=now)
+            )
+
+        self._context.database.write(work)
 
     def expire(self) -> int:
         """Remove records that are older than a day; returns how many."""

@@ -81,9 +81,10 @@ def test_best_known_points_lie_in_their_templates_and_in_the_span(system: System
 
 
 def test_no_number_of_accounts_opens_victims_with_rotations_of_their_own(system: System) -> None:
-    one, enough, common, opened = chosen_enrollment(system, accounts=(1, 20, 10_000))
-    assert [each.details["accounts"] for each in (one, enough, common)] == [1, 20, 20]
-    for row in (one, enough):
+    *judged, common, opened = chosen_enrollment(system, accounts=(1, 20, 10_000))
+    assert [each.details["accounts"] for each in (*judged, common)] == [1, 20, 1, 20, 20]
+    assert ["holders' keys kept" in each.variant for each in judged] == [False] * 2 + [True] * 2
+    for row in judged:
         assert row.judged
         assert (row.leaked, row.knowledge) == (Leaked.MASTER_KEY, Knowledge.TEMPLATES)
         assert row.breaks is Property.IMPERSONATION
@@ -95,7 +96,7 @@ def test_no_number_of_accounts_opens_victims_with_rotations_of_their_own(system:
     assert opened.leaked is Leaked.HOLDER_KEYS
     assert not common.judged
     assert not opened.judged
-    assert [one, enough] == chosen_enrollment(system, accounts=(1, 20))[:2]
+    assert judged == chosen_enrollment(system, accounts=(1, 20))[:4]
 
 
 def test_an_attacker_without_faces_is_refused(system: System) -> None:

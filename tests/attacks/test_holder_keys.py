@@ -1,7 +1,11 @@
 import numpy as np
 import pytest
 
-from attacks.holder_keys import THEFTS, guess_with_and_without_holder_keys
+from attacks.holder_keys import (
+    THEFTS,
+    guess_from_few_decoys,
+    guess_with_and_without_holder_keys,
+)
 from attacks.likelihood import likeliest_guess
 from attacks.outcomes import AttackOutcome, Leaked
 from attacks.stored.foot_point import foot_points
@@ -38,6 +42,21 @@ def test_without_the_key_a_guess_has_a_limit_of_next_to_nothing(
     (cell,) = verdict.cells
     assert cell.limit == "success-without-key"
     assert cell.status is not Status.FAIL
+
+
+def test_of_few_decoys_the_key_gives_the_person_away_and_nothing_without_it(
+    system: System, weak_system: System
+) -> None:
+    rows = {(each.attack, each.leaked): each for each in guess_from_few_decoys(system)}
+    assert len(rows) == 4
+    for attack in ("foot-point", "decoy-likelihood"):
+        assert rows[attack, Leaked.MASTER_KEY].measured.value <= 1 / 40
+        stolen = rows[attack, Leaked.HOLDER_KEYS]
+        assert stolen.measured.value > 0.3
+        assert stolen.scheme == system.scheme
+        assert "m = 4" in stolen.variant
+    assert not any(each.judged for each in rows.values())
+    assert guess_from_few_decoys(weak_system) == []  # of two dimensions itself
 
 
 def test_a_stolen_key_gives_the_template_back(system: System) -> None:

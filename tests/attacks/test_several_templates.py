@@ -3,7 +3,7 @@ import pytest
 
 from attacks.likelihood import likeliest_guess
 from attacks.outcomes import AttackOutcome, Knowledge, Leaked
-from attacks.several_templates import several_templates
+from attacks.several_templates import enrolled, several_templates
 from attacks.system import System
 from tests.verify.synthetic import unit
 
@@ -51,6 +51,35 @@ def test_the_same_photos_twice_give_no_more_than_once(
     assert abs(nearness(twice) - nearness(once)) < 0.02
     # They meet in all of the template, of which no point is nearer than another.
     assert nearness(nearest) < float(system.templates.foot_norms.mean()) + 0.05
+
+
+def test_two_secrets_give_two_lifts_which_meet_in_the_person(
+    system: System, rows: dict[str, AttackOutcome]
+) -> None:
+    """The control of the row above: the same attack where a secret drew other decoys."""
+    one, other = (
+        rows[f"the same photos{secrets}, 2 templates, {NEAREST}, {STOLEN}"]
+        for secrets in ("", " under two lift secrets")
+    )
+    assert one.judged
+    assert not other.judged
+    assert nearness(other) > nearness(one) + 0.3
+    assert other.measured.value > one.measured.value + 0.3
+    first, again = (enrolled(system, "a secret") for _ in range(2))
+    np.testing.assert_allclose(first.foot_norms, again.foot_norms, atol=1e-3)
+    moved = np.abs(first.foot_norms - enrolled(system, "another").foot_norms)
+    assert np.median(moved) > 0.01
+
+
+def test_photos_that_overlap_give_two_lifts_of_nearly_one_descriptor(
+    rows: dict[str, AttackOutcome],
+) -> None:
+    """Nearer to the person than two templates of different photos."""
+    different = nearness(rows[f"different photos, 2 templates, {NEAREST}, {STOLEN}"])
+    assert nearness(rows[f"one photo more, 2 templates, {NEAREST}, {STOLEN}"]) > different
+    assert not any("two of three" in variant for variant in rows)  # nobody has a fifth photo
+    kept = rows[f"one photo more, 2 templates, {NEAREST}, {KEPT}"]
+    assert kept.measured.value <= 1 / PEOPLE
 
 
 def test_more_photos_lead_to_the_person(rows: dict[str, AttackOutcome]) -> None:

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from enroll import Enroller, Enrollment
+from enroll import Enroller, Enrollment, Holder
 from models.errors import NoFace, PhotoRejected
 from templates.contract import wire
 from templates.contract.document import Contract
 from templates.decoys import Attributes, DecoyPool
 from templates.errors import ContractMismatch, InvalidEmbedding, InvalidTemplate, VeilfaceError
+from templates.keys.rotation import holder_rotation
 from templates.space.agreement import InconsistentImages
 from templates.space.lifting import Strategy, lift
 from templates.space.subspace import AffineSubspace
@@ -109,6 +110,35 @@ def test_other_photos_another_deployment_and_another_contract_give_other_decoys(
         shared = first.basis.astype(np.float64) @ second.basis.T
         # Shared decoys would give principal angles of 0; generic 6-spaces of 64 numbers do not.
         assert np.linalg.svd(shared, compute_uv=False).max() < 0.99
+
+
+def without_key(enrollment: Enrollment, key: bytes) -> AffineSubspace:
+    """Un-rotated, as the descriptors are: what opens it has the holder's key as well."""
+    assert enrollment.holder_salt is not None
+    rotation = holder_rotation(key, enrollment.holder_salt, N)
+    return stored_template(enrollment).turned_by(rotation.turned_back)
+
+
+def test_of_a_holder_the_same_photos_give_the_same_set_for_one_subject_only(
+    enroller: Enroller,
+) -> None:
+    """Whatever key they have; to others of the same photos not even the length is alike."""
+    keys = [bytes(range(32)), bytes(range(1, 33))]
+    mine = [
+        without_key(enroller.from_embeddings(rows, holder=Holder(key, "bank", "ada")), key)
+        for key, rows in zip(keys, (PHOTOS[:3], PHOTOS[2::-1]), strict=True)
+    ]
+    assert largest_angle(*mine) < 1e-2
+    assert abs(mine[0].foot_norm - mine[1].foot_norm) < 1e-3
+    plain = stored_template(enroller.from_embeddings(PHOTOS[:3]))
+    others = [plain] + [
+        without_key(enroller.from_embeddings(PHOTOS[:3], holder=Holder(keys[0], *whose)), keys[0])
+        for whose in (("shop", "ada"), ("bank", "eve"), ("banka", "da"))
+    ]
+    for other in others:
+        assert largest_angle(mine[0], other) > 0.5
+        assert abs(mine[0].foot_norm - other.foot_norm) > 2e-3
+    assert len({round(other.foot_norm, 3) for other in others}) == 4
 
 
 def test_a_stranger_among_the_photos_is_named_without_numbers_of_them(enroller: Enroller) -> None:

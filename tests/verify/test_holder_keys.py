@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 import verify.verifier
-from enroll import Enroller, Enrollment
+from enroll import Enroller, Enrollment, Holder
 from templates.contract import wire
 from templates.contract.document import Contract
 from templates.keys.rotation import SignedCosineRotation, holder_rotation
@@ -18,6 +18,7 @@ from tests.verify.synthetic import N, draw_people, make_generator, tenant_rotati
 from verify import Calibrated, Decision, StandIn, Verifier, lift_stand_in
 
 KEY, OTHER = bytes(range(32)), bytes(range(1, 33))
+HOLDER = Holder(KEY, "default", "ada")
 PEOPLE = draw_people(2, photos=(3,), seed=56).descriptors
 ROTATION = tenant_rotation()
 
@@ -51,7 +52,7 @@ def verifier(contract: Contract) -> Verifier:
 
 @pytest.fixture(scope="module")
 def keyed(enroller: Enroller) -> Enrollment:
-    return enroller.from_embeddings(PEOPLE[:1], holder_key=KEY)
+    return enroller.from_embeddings(PEOPLE[:1], holder=HOLDER)
 
 
 def lifted_by_a_client(contract: Contract, descriptor: NDArray[np.float32], m: int) -> bytes:
@@ -86,7 +87,7 @@ def test_the_tenants_key_alone_does_not_turn_a_template_back(keyed: Enrollment) 
 
 
 def test_two_enrollments_under_one_key_are_turned_differently(enroller: Enroller) -> None:
-    first, second = (enroller.from_embeddings(PEOPLE[:1], holder_key=KEY) for _ in range(2))
+    first, second = (enroller.from_embeddings(PEOPLE[:1], holder=HOLDER) for _ in range(2))
     assert first.holder_salt != second.holder_salt
     exchanged = dataclasses.replace(first, holder_salt=second.holder_salt)
     assert not without_both(exchanged, KEY).contains(PEOPLE[:1].astype(float), tol=0.3).any()
@@ -145,7 +146,7 @@ def test_clients_templates_and_lifted_probes_need_it_too(
     contract: Contract, verifier: Verifier, enroller: Enroller
 ) -> None:
     data = lifted_by_a_client(contract, PEOPLE[0], contract.binding.m)
-    enrollment = enroller.from_template(data, holder_key=KEY)
+    enrollment = enroller.from_template(data, holder=HOLDER)
     turned_back = without_both(enrollment, KEY)
     assert turned_back.contains(PEOPLE[:1].astype(float), tol=3e-3).all()
     probe = lifted_by_a_client(contract, PEOPLE[0], 2)

@@ -28,19 +28,20 @@ from api.http.deps import (
 )
 from api.http.errors import ApiError
 from api.http.holder_keys import FIELD, HolderKeyHeaderDep, digest, holder_key_of
-from api.http.idempotency import Outcome, once
+from api.http.idempotency import Outcome, kept_with, once
 from api.http.openapi import BODY, ENROLLMENT_BODY, EVERY_CALL, IDEMPOTENT, PHOTO, error_responses
 from api.http.preconditions import PreconditionDep, asked
 from api.http.schemas import EnrollmentAnswer
 from api.http.values import face_policy, one_of, storage_of
 from api.process.runtime import Runtime
-from enroll import Enrollment
+from enroll import Enrollment, Holder
 from models.quality import Quality
 from templates.decoys import Attributes
 from templates.keys.holder_key import wipe
 from templates.store.audit_log import By
+from templates.store.idempotency import Claim
 from templates.store.subject_rows import Source, Storage
-from templates.store.subjects import Precondition
+from templates.store.subjects import Precondition, StoredTemplate
 
 router = APIRouter(prefix="/v1/subjects", tags=["subjects"])
 
@@ -121,11 +122,11 @@ async def enroll(
         storage = storage_of(body)
         holder_key = holder_key_of(holder_key_header, body)
 
-        def work() -> Outcome:
+        def work(claim: Claim | None) -> Outcome:
             epoch = runtime.epoch(caller.tenant)
             try:
                 enrollment = runtime.enroller(caller.tenant, epoch).from_template(
-                    template, holder_key=holder_key
+                    template, holder=_holder(holder_key, caller, subject)
                 )
             finally:
                 wipe(holder_key)
@@ -138,6 +139,7 @@ async def enroll(
                 Source.TEMPLATE,
                 storage,
                 precondition,
+                claim,
                 by(request),
             )
 
@@ -177,14 +179,14 @@ async def _enroll_photos(
     attributes = parse_attributes(form.fields.get("attributes"))
     holder_key = holder_key_of(holder_key_header, form.fields)
 
-    def work() -> Outcome:
+    def work(claim: Claim | None) -> Outcome:
         epoch = runtime.epoch(caller.tenant)
         try:
             enrollment = runtime.enroller(caller.tenant, epoch).from_photos(
                 pack,
                 photos,
                 attributes=attributes,
-                holder_key=holder_key,
+                holder=_holder(holder_key, caller, subject),
                 policy=policy,
                 limits=runtime.image_limits,
             )
@@ -199,6 +201,7 @@ async def _enroll_photos(
             Source.PHOTOS,
             storage,
             precondition,
+            claim,
             by(request),
         )
 
@@ -253,6 +256,10 @@ def parse_attributes(text: str | None) -> Attributes:
     return Attributes(gender=value.get("gender"), race=value.get("race"))
 
 
+def _holder(key: bytearray | None, caller: Caller, subject: str) -> Holder | None:
+    return None if key is None else Holder(key, caller.tenant, subject)
+
+
 def _named(storage: Storage) -> list[str]:
     """What a request asks for beside the default: records of earlier versions name nothing."""
     return [] if storage is Storage.SERVICE else [storage.value]
@@ -271,33 +278,39 @@ def _stored(
     source: Source,
     storage: Storage,
     precondition: Precondition | None,
+    claim: Claim | None,
     who: By,
 ) -> Outcome:
-    stored = runtime.put(
-        tenant,
-        subject,
-        epoch,
-        enrollment,
-        source=source,
-        photos=len(enrollment.per_photo),
-        storage=storage,
-        precondition=precondition,
-        by=who,
+    def outcome(stored: StoredTemplate) -> Outcome:
+        body: dict[str, Any] = {
+            "template_id": stored.template_id,
+            "contract_id": enrollment.contract_id,
+            "replaced": not stored.created,
+            "holder_key": enrollment.holder_salt is not None,
+            "images": [
+                {
+                    "index": result.index,
+                    "status": "used",
+                    "quality": _quality(result.quality),
+                }
+                for result in enrollment.per_photo
+            ],
+        }
+        if stored.held_template is not None:
+            body["held_template"] = base64.b64encode(stored.held_template).decode("ascii")
+        return Outcome(201 if stored.created else 200, body)
+
+    return outcome(
+        runtime.put(
+            tenant,
+            subject,
+            epoch,
+            enrollment,
+            source=source,
+            photos=len(enrollment.per_photo),
+            storage=storage,
+            precondition=precondition,
+            once=kept_with(claim, outcome),
+            by=who,
+        )
     )
-    body: dict[str, Any] = {
-        "template_id": stored.template_id,
-        "contract_id": enrollment.contract_id,
-        "replaced": not stored.created,
-        "holder_key": enrollment.holder_salt is not None,
-        "images": [
-            {
-                "index": result.index,
-                "status": "used",
-                "quality": _quality(result.quality),
-            }
-            for result in enrollment.per_photo
-        ],
-    }
-    if stored.held_template is not None:
-        body["held_template"] = base64.b64encode(stored.held_template).decode("ascii")
-    return Outcome(201 if stored.created else 200, body, kept=stored.held_template is None)

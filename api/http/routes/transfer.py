@@ -11,13 +11,15 @@ from api.http.audit import by
 from api.http.bodies import base64_field, reject_unknown, sent_json
 from api.http.deps import Exports, GateDep, IdempotencyDep, RuntimeDep, SubjectDep, note_subject
 from api.http.errors import ApiError
-from api.http.idempotency import Outcome, once
+from api.http.idempotency import Outcome, kept_with, once
 from api.http.openapi import BODY, EVERY_CALL, IDEMPOTENT, IMPORT_BODY, error_responses
 from api.http.preconditions import PreconditionDep, asked
 from api.http.schemas import ExportAnswer, ImportAnswer
 from api.http.transfer import open_export
+from templates.store.idempotency import Claim
 from templates.store.identifiers import checked_subject_id
 from templates.store.subject_rows import Source
+from templates.store.subjects import StoredTemplate
 
 router = APIRouter(prefix="/v1/subjects", tags=["transfer"])
 
@@ -126,7 +128,7 @@ async def import_subject(
             caller.tenant, exported.stamp, restore=restore, by=by(request)
         )
 
-        def work() -> Outcome:
+        def work(claim: Claim | None) -> Outcome:
             epoch = runtime.epoch(caller.tenant)
             enroller = runtime.enroller(caller.tenant, epoch)
             salt = exported.holder_salt
@@ -136,6 +138,18 @@ async def import_subject(
                 enrollment = enroller.from_export(exported.wire, holder_salt=salt)
             else:
                 enrollment = enroller.from_template(exported.wire)
+
+            def outcome(stored: StoredTemplate) -> Outcome:
+                return Outcome(
+                    201 if stored.created else 200,
+                    {
+                        "template_id": stored.template_id,
+                        "contract_id": enrollment.contract_id,
+                        "replaced": not stored.created,
+                        "holder_key": salt is not None,
+                    },
+                )
+
             stored = runtime.put(
                 caller.tenant,
                 exported.subject_id,
@@ -144,18 +158,11 @@ async def import_subject(
                 source=Source(exported.source),
                 photos=exported.photos,
                 precondition=precondition,
+                once=kept_with(claim, outcome),
                 by=by(request),
                 guard=guard,
             )
-            return Outcome(
-                201 if stored.created else 200,
-                {
-                    "template_id": stored.template_id,
-                    "contract_id": enrollment.contract_id,
-                    "replaced": not stored.created,
-                    "holder_key": salt is not None,
-                },
-            )
+            return outcome(stored)
 
         return await once(
             request,

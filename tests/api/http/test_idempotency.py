@@ -1,8 +1,15 @@
+import json
+import os
+import signal
+import subprocess
+import sys
 import threading
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from api.http.app import environment_of
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, images, photo
 from tests.api.shapes import assert_error
@@ -106,6 +113,67 @@ def test_many_at_once_write_once(both: tuple[Client, Deployment]) -> None:
     final = put(client, "at-once", photo(1), subject="once")
     assert final.status_code == 201
     assert final.headers["idempotency-replayed"] == "true"
+
+
+ROOT = Path(__file__).resolve().parents[3]
+KILLED_AFTER_THE_COMMIT = """
+import json, os, signal, sys
+
+import api.http.idempotency
+from api.http.app import app_from_environment
+from tests.api.client import Client
+from tests.api.deployment import images, photo
+
+api.http.idempotency.answer = lambda *_, **__: os.kill(os.getpid(), signal.SIGKILL)
+path, headers, fields = json.loads(sys.argv[1])
+with Client(app_from_environment()) as client:
+    client.put(path, files=images(photo(1)), headers=headers, data=fields)
+"""
+
+
+@pytest.mark.parametrize("storage", ["service", pytest.param("holder", marks=pytest.mark.long)])
+def test_a_retry_does_not_meet_its_own_write_of_a_service_that_was_killed(
+    client: Client, deployment: Deployment, storage: str
+) -> None:
+    """The precondition is of the first sending: what that one wrote does not count."""
+    subject, headers = f"{storage}-1", {"Idempotency-Key": f"{storage}-1", "If-None-Match": "*"}
+    fields = {} if storage == "service" else {"storage": storage}
+    ended = subprocess.run(
+        [
+            sys.executable,
+            "-c",
+            KILLED_AFTER_THE_COMMIT,
+            json.dumps(
+                [
+                    f"/v1/subjects/{subject}/enrollment",
+                    headers | bearer(deployment.token),
+                    fields,
+                ]
+            ),
+        ],
+        cwd=ROOT,
+        env={
+            **{name: text for name, text in os.environ.items() if not name.startswith("VEILFACE_")},
+            **environment_of(deployment.settings),
+        },
+        capture_output=True,
+        check=False,
+    )
+    assert ended.returncode == -signal.SIGKILL, ended.stderr.decode()
+    written = client.get(f"/v1/subjects/{subject}").json()["template_id"]
+    again = put(client, None, photo(1), subject=subject, headers=headers, data=fields)
+    if storage == "service":
+        assert (again.status_code, again.json()["template_id"]) == (201, written)
+        assert again.headers["Idempotency-Replayed"] == "true"
+    else:  # the template was lost with the answer: another one is made
+        assert (again.status_code, again.json()["replaced"]) == (200, True)
+        assert again.json()["held_template"]
+    # The control: another request does meet it.
+    assert_error(
+        put(client, None, photo(1), subject=subject, headers={**headers, "Idempotency-Key": "2"}),
+        409,
+        "enrollment_conflict",
+    )
 
 
 def test_records_hold_no_subject_and_no_token(client: Client, deployment: Deployment) -> None:

@@ -11,7 +11,7 @@ from templates.keys.sealing import MasterKeyring, encode_parts
 from templates.store import By, LockedOut, NewApiKey, Right, TemplateStore
 from templates.store.record_check import ACTOR_NEVER_CREATED, KEY_ALTERED, RecordProblem
 from templates.store.secret import SecretName
-from tests.templates.store.conftest import Clock, put
+from tests.templates.store.conftest import Clock, finish, put
 from tests.templates.store.test_attempts import attempt
 
 STRIPPED = (
@@ -42,7 +42,7 @@ def filled(store: TemplateStore) -> tuple[TemplateStore, NewApiKey]:
     for _ in range(5):
         attempt(store)
     claim = store.idempotency.claim("default", actor="a", key="k", request=b"r")
-    store.idempotency.finish(claim, status=200, body=b"{}")
+    finish(store, claim, status=200, body=b"{}")
     return store, made
 
 

@@ -22,7 +22,7 @@ from templates.store.schema import (
     TemplateRow,
 )
 from tests.patience import PATIENCE_S
-from tests.templates.store.conftest import CONTRACT, Clock, compact_until, put
+from tests.templates.store.conftest import CONTRACT, Clock, compact_until, finish, put
 
 
 def count(database: Database, table: type[Base]) -> int:
@@ -40,7 +40,7 @@ def test_everything_about_the_subject_goes_at_once(
             "default", actor="key", key=f"enroll {name}", request=b"r", subject_id=name
         )
         assert isinstance(claim, Claim)
-        store.idempotency.finish(claim, status=201, body=name.encode())
+        finish(store, claim, status=201, body=name.encode())
         failed = sa.insert(FailedAttemptsRow).values(
             tenant_id=store.tenants.get("default").id,
             pseudonym=store.signer.pseudonym("default", name),

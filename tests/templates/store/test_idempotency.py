@@ -9,13 +9,15 @@ from templates.store import (
     Answer,
     Claim,
     IdempotencyConflict,
+    Storage,
     TemplateStore,
     UnknownTenant,
     idempotency,
 )
 from templates.store.database import Database
 from templates.store.schema import IdempotencyRow
-from tests.templates.store.conftest import Clock
+from templates.store.subjects import EnrollmentConflict, Once, Precondition, StoredTemplate
+from tests.templates.store.conftest import Clock, finish, put, template_id
 
 
 def claim(store: TemplateStore, key: str = "k", request: bytes = b"r", **more: str) -> Claim:
@@ -31,12 +33,12 @@ def answer(store: TemplateStore, key: str = "k", request: bytes = b"r") -> Answe
 
 
 def test_a_repeated_request_gets_the_first_answer(store: TemplateStore) -> None:
-    assert store.idempotency.finish(claim(store), status=201, body=b'{"ok":true}')
+    finish(store, claim(store), status=201, body=b'{"ok":true}')
     assert answer(store) == answer(store) == Answer(201, b'{"ok":true}')
 
 
 def test_another_request_with_the_key_is_a_conflict(store: TemplateStore) -> None:
-    store.idempotency.finish(claim(store), status=201, body=b"")
+    finish(store, claim(store), status=201, body=b"")
     with pytest.raises(IdempotencyConflict, match="another request"):
         claim(store, request=b"something else")
 
@@ -57,21 +59,22 @@ def test_a_running_request_is_a_conflict_until_its_claim_lapses(
         claim(store)
     clock.pass_by(seconds=1)
     alive = claim(store)
-    assert not store.idempotency.finish(dead, status=500, body=b"late")
-    assert store.idempotency.finish(alive, status=200, body=b"alive")
+    with pytest.raises(IdempotencyConflict, match="taken over"):
+        finish(store, dead, status=500, body=b"late")
+    finish(store, alive, status=200, body=b"alive")
     assert answer(store).body == b"alive"
 
 
 def test_a_released_key_is_free(store: TemplateStore) -> None:
     store.idempotency.release(claim(store))
     again = claim(store, request=b"other")
-    store.idempotency.finish(again, status=200, body=b"")
+    finish(store, again, status=200, body=b"")
     store.idempotency.release(again)  # an answer stays
     assert answer(store, request=b"other").status == 200
 
 
 def test_answers_are_kept_for_a_day(store: TemplateStore, clock: Clock) -> None:
-    store.idempotency.finish(claim(store), status=200, body=b"")
+    finish(store, claim(store), status=200, body=b"")
     clock.pass_by(hours=23)
     claim(store, key="later")
     assert store.idempotency.expire() == 0
@@ -82,12 +85,13 @@ def test_answers_are_kept_for_a_day(store: TemplateStore, clock: Clock) -> None:
 
 def test_erasing_the_subject_takes_its_records_and_late_answers(store: TemplateStore) -> None:
     done = claim(store, key="done", subject_id="ada")
-    store.idempotency.finish(done, status=201, body=b"about ada")
+    finish(store, done, status=201, body=b"about ada")
     running = claim(store, key="running", subject_id="ada")
-    store.idempotency.finish(claim(store, key="eve", subject_id="eve"), status=201, body=b"eve")
+    finish(store, claim(store, key="eve", subject_id="eve"), status=201, body=b"eve")
     store.erasures.erase("default", "ada")
-    assert not store.idempotency.finish(running, status=201, body=b"about ada")
-    claim(store, key="done")
+    finish(store, running, status=201, body=b"about ada")
+    for key in ("done", "running"):
+        claim(store, key=key)
     assert answer(store, key="eve").body == b"eve"
 
 
@@ -132,7 +136,7 @@ def test_nonsense_is_refused(store: TemplateStore) -> None:
     with pytest.raises(UnknownTenant):
         store.idempotency.claim("nobody", actor="a", key="k", request=b"")
     with pytest.raises(StoreError, match="not kept"):
-        store.idempotency.finish(claim(store), status=200, body=bytes(65 * 1024))
+        finish(store, claim(store), status=200, body=bytes(65 * 1024))
 
 
 def test_many_expired_records_go_in_small_transactions(
@@ -155,3 +159,93 @@ def test_many_expired_records_go_in_small_transactions(
     assert sizes == [3, 3, 2]
     assert store.idempotency.expire() == 0
     assert sizes == [3, 3, 2]
+
+
+NEVER = Precondition(None)
+
+
+def once(claimed: Claim) -> Once:
+    """Answer with the template's id."""
+
+    def answered(stored: StoredTemplate) -> Answer:
+        return Answer(201 if stored.created else 200, stored.template_id.encode())
+
+    return Once(claimed, answered)
+
+
+def test_an_enrollment_leaves_its_answer_in_its_own_transaction(
+    store: TemplateStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = put(store, "ada", b"wire", precondition=NEVER, once=once(claim(store)))
+    assert answer(store) == Answer(201, first.template_id.encode())
+    # Neither is there where the transaction does not come to its end.
+    running = claim(store, key="other")
+
+    def fail(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(type(store.idempotency), "_leave", fail)
+        with pytest.raises(KeyboardInterrupt):
+            put(store, "eve", b"wire", precondition=NEVER, once=once(running))
+    assert template_id(store, "eve") is None
+    with pytest.raises(IdempotencyConflict, match="still running"):
+        claim(store, key="other")
+    store.idempotency.release(running)
+    put(store, "eve", b"wire", precondition=NEVER, once=once(claim(store, key="other")))
+    # What a commit whose news was lost has left is not given back.
+    store.idempotency.release(running)
+    assert answer(store, key="other").status == 201
+
+
+def test_a_run_that_was_taken_over_writes_nothing(store: TemplateStore, clock: Clock) -> None:
+    """It stood still for more than a minute, and the client's next try went ahead."""
+    late = claim(store)
+    clock.pass_by(minutes=1)
+    first = put(store, "ada", b"wire", once=once(claim(store)))
+    with pytest.raises(IdempotencyConflict, match="taken over"):
+        put(store, "ada", b"wire", once=once(late))
+    assert template_id(store, "ada") == first.template_id
+    assert answer(store).body == first.template_id.encode()
+
+
+def test_the_next_run_may_replace_a_held_template_that_an_earlier_one_wrote(
+    store: TemplateStore,
+) -> None:
+    """Whatever the precondition: the answer with the template was lost, and is not kept."""
+
+    def hold(key: str, request: bytes = b"r") -> StoredTemplate:
+        claimed = claim(store, key=key, request=request)
+        held = {"storage": Storage.HOLDER, "precondition": NEVER, "once": once(claimed)}
+        try:
+            return put(store, "ada", b"wire", **held)
+        except EnrollmentConflict:
+            store.idempotency.release(claimed)
+            raise
+
+    first = hold("k")
+    # A try that does not come to its end leaves the note of the one before.
+    lost = claim(store)
+    assert lost.written == first.template_id
+    with pytest.raises(IdempotencyConflict, match="still running"):
+        claim(store)
+    store.idempotency.release(lost)
+    second = hold("k")
+    assert (second.created, template_id(store, "ada")) == (False, second.template_id)
+    # Another request has no part in it, nor has this one once something else was written.
+    with pytest.raises(EnrollmentConflict):
+        hold("another key")
+    other = put(store, "ada", b"wire")
+    with pytest.raises(EnrollmentConflict):
+        hold("k")
+    assert template_id(store, "ada") == other.template_id
+    with pytest.raises(EnrollmentConflict):
+        hold("k", request=b"another request")
+
+
+def test_a_note_that_somebody_else_wrote_is_none(store: TemplateStore) -> None:
+    """Or who writes the database would have another's template replaced."""
+    put(store, "ada", b"wire", storage=Storage.HOLDER, once=once(claim(store)))
+    forged = sa.update(IdempotencyRow).values(body=b"0" * 32)
+    store.database.write(lambda connection: connection.execute(forged))
+    assert claim(store).written is None
