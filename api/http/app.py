@@ -33,9 +33,11 @@ from api.http.routes import (
     health,
     lockout,
     own_key,
+    pack,
     photo_check,
     stored,
     subjects,
+    tokens,
     transfer,
     verification,
 )
@@ -108,6 +110,8 @@ def create_app(
     for routes in (
         own_key,
         contract,
+        pack,
+        tokens,
         enrollment,
         photo_check,
         subjects,

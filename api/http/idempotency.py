@@ -1,4 +1,4 @@
-"""Writes that carry an Idempotency-Key: done once, answered as often as asked.
+"""Requests that carry an Idempotency-Key: done once, answered as often as asked.
 
 Only successes are kept. A write that was refused changed nothing, so its key is given back and the
 client may send a better photo under the same key. Neither is an answer kept that holds a template
@@ -26,7 +26,7 @@ from templates.store.idempotency import Answer
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a write answers, its template id included.
+    """What a request answers; of an enrollment, its template id included.
 
     It holds no subject id, because it is kept for a day.
 
@@ -49,9 +49,8 @@ async def once(
     subject: str | None,
     work: Callable[[], Outcome],
     run: Callable[[Callable[[], Outcome]], Awaitable[Outcome]],
-    add: Mapping[str, Any] | None = None,
-) -> Response:
-    """Do a write and answer it; with a key that was used before, answer what it answered then.
+) -> Outcome:
+    """Do a write; with a key that was used before, return what it answered then.
 
     Parameters
     ----------
@@ -64,8 +63,6 @@ async def once(
         The write; runs in a thread.
     run
         Which threads: the gate's ``compute`` or ``query``.
-    add
-        Fields of the answer that are not kept.
 
     Raises
     ------
@@ -80,7 +77,7 @@ async def once(
         records = runtime.store.idempotency
         claim = records.claim(
             caller.tenant,
-            actor=caller.prefix,
+            actor=caller.name,
             key=key,
             request=hashlib.sha256(encode_parts(operation, *asked)).digest(),
             subject_id=subject,
@@ -103,8 +100,17 @@ async def once(
                 records.release(claim)
         return outcome
 
-    outcome = await run(guarded)
-    headers = {"ETag": etag(outcome.body["template_id"])}
-    if outcome.replayed:
-        headers["Idempotency-Replayed"] = "true"
+    return await run(guarded)
+
+
+def written(
+    request: Request, outcome: Outcome, *, add: Mapping[str, Any] | None = None
+) -> Response:
+    """Answer an enrollment; `add` is what the answer has beside what is kept."""
+    headers = {"ETag": etag(outcome.body["template_id"]), **replay_header(outcome)}
     return answer(request, {**outcome.body, **(add or {})}, status=outcome.status, headers=headers)
+
+
+def replay_header(outcome: Outcome) -> dict[str, str]:
+    """Return the header that tells an answer that is given again."""
+    return {"Idempotency-Replayed": "true"} if outcome.replayed else {}

@@ -32,6 +32,7 @@ from api.process.opening import (
     prepare_database,
     try_inference,
 )
+from api.process.served_graphs import served_graphs
 from api.settings import Settings
 from enroll import Enroller, Enrollment
 from enroll.enroller import WIRE_DTYPE
@@ -46,6 +47,7 @@ from templates.keys.rotation import HAAR_VERSION, TenantRotation
 from templates.keys.sealing import MasterKeyring
 from templates.store import TemplateStore
 from templates.store.audit_log import By
+from templates.store.lockout import Nonce
 from templates.store.secret import SecretName
 from templates.store.subject_rows import Source, Storage, SubjectTemplate
 from templates.store.subjects import Guard, Precondition, StoredTemplate
@@ -142,6 +144,7 @@ class Runtime:
             deployment=self.settings.liveness,
             levels=self.settings.liveness_of_levels,
         )
+        self.graphs = served_graphs(self.settings, self.pack)
         self.stand_ins = StandIns(self.contract, self.keyring, key=self._stand_in_key)
 
     @classmethod
@@ -313,12 +316,13 @@ class Runtime:
         photos: int,
         storage: Storage = Storage.SERVICE,
         precondition: Precondition | None = None,
+        nonce: Nonce | None = None,
         by: By,
         guard: Guard | None = None,
     ) -> StoredTemplate:
         """Store an enrollment in place of an earlier one.
 
-        `storage`, `precondition` and `guard` are those of ``Subjects.put``.
+        `storage`, `precondition`, `nonce` and `guard` are those of ``Subjects.put``.
         """
         binding = self.contract.binding
         return self.store.subjects.put(
@@ -337,6 +341,7 @@ class Runtime:
             storage=storage,
             precondition=precondition,
             guard=guard,
+            nonce=nonce,
             by=by,
         )
 

@@ -28,7 +28,7 @@ from api.http.deps import (
 )
 from api.http.errors import ApiError
 from api.http.holder_keys import FIELD, HolderKeyHeaderDep, digest, holder_key_of
-from api.http.idempotency import Outcome, once
+from api.http.idempotency import Outcome, once, written
 from api.http.openapi import BODY, ENROLLMENT_BODY, EVERY_CALL, IDEMPOTENT, PHOTO, error_responses
 from api.http.preconditions import PreconditionDep, asked
 from api.http.schemas import EnrollmentAnswer
@@ -39,6 +39,7 @@ from models.quality import Quality
 from templates.decoys import Attributes
 from templates.keys.holder_key import wipe
 from templates.store.audit_log import By
+from templates.store.lockout import Nonce
 from templates.store.subject_rows import Source, Storage
 from templates.store.subjects import Precondition
 
@@ -51,6 +52,7 @@ CODES = (
     *IDEMPOTENT,
     "too_many_images",
     "forbidden",
+    "replayed",
     "invalid_template",
     "contract_mismatch",
     "enrollment_conflict",
@@ -95,6 +97,8 @@ async def enroll(
     An earlier enrollment is replaced, unless a header says otherwise: `If-None-Match: *` never
     replaces, `If-Match: "template id"` replaces only that template. Otherwise the answer is
     `enrollment_conflict`, with the `template_id` that is enrolled, or null.
+
+    A token for this subject may stand in the place of the API key; the enrollment uses it up.
     """
     settings = runtime.settings
     query = query_of(request, ("face",))
@@ -122,8 +126,9 @@ async def enroll(
         holder_key = holder_key_of(holder_key_header, body)
 
         def work() -> Outcome:
-            epoch = runtime.epoch(caller.tenant)
             try:
+                nonce = _unused_nonce(runtime, caller)
+                epoch = runtime.epoch(caller.tenant)
                 enrollment = runtime.enroller(caller.tenant, epoch).from_template(
                     template, holder_key=holder_key
                 )
@@ -138,10 +143,11 @@ async def enroll(
                 Source.TEMPLATE,
                 storage,
                 precondition,
+                nonce,
                 by(request),
             )
 
-        return await once(
+        outcome = await once(
             request,
             caller,
             idempotency_key,
@@ -157,6 +163,7 @@ async def enroll(
             work=work,
             run=partial(gate.compute, key=caller.prefix),
         )
+        return written(request, outcome)
 
 
 async def _enroll_photos(
@@ -178,8 +185,9 @@ async def _enroll_photos(
     holder_key = holder_key_of(holder_key_header, form.fields)
 
     def work() -> Outcome:
-        epoch = runtime.epoch(caller.tenant)
         try:
+            nonce = _unused_nonce(runtime, caller)
+            epoch = runtime.epoch(caller.tenant)
             enrollment = runtime.enroller(caller.tenant, epoch).from_photos(
                 pack,
                 photos,
@@ -199,10 +207,11 @@ async def _enroll_photos(
             Source.PHOTOS,
             storage,
             precondition,
+            nonce,
             by(request),
         )
 
-    return await once(
+    outcome = await once(
         request,
         caller,
         idempotency_key,
@@ -221,6 +230,7 @@ async def _enroll_photos(
         work=work,
         run=partial(request.app.state.gate.compute, key=caller.prefix),
     )
+    return written(request, outcome)
 
 
 def parse_attributes(text: str | None) -> Attributes:
@@ -253,6 +263,22 @@ def parse_attributes(text: str | None) -> Attributes:
     return Attributes(gender=value.get("gender"), race=value.get("race"))
 
 
+def _unused_nonce(runtime: Runtime, caller: Caller) -> Nonce | None:
+    """Return what the enrollment uses up; None where it came with an API key.
+
+    Raises
+    ------
+    Replayed
+        Where the token was used: before anything is decoded, and after a repeated request had its
+        answer.
+    """
+    if caller.subject_token is None:
+        return None
+    nonce = caller.subject_token.nonce
+    runtime.store.nonces.require_unused(nonce)
+    return nonce
+
+
 def _named(storage: Storage) -> list[str]:
     """What a request asks for beside the default: records of earlier versions name nothing."""
     return [] if storage is Storage.SERVICE else [storage.value]
@@ -271,6 +297,7 @@ def _stored(
     source: Source,
     storage: Storage,
     precondition: Precondition | None,
+    nonce: Nonce | None,
     who: By,
 ) -> Outcome:
     stored = runtime.put(
@@ -282,6 +309,7 @@ def _stored(
         photos=len(enrollment.per_photo),
         storage=storage,
         precondition=precondition,
+        nonce=nonce,
         by=who,
     )
     body: dict[str, Any] = {

@@ -32,14 +32,15 @@ from api.http.bodies import (
     text_field,
 )
 from api.http.challenges import FIELD as CHALLENGE
-from api.http.challenges import MAX_ID, opened_challenge
-from api.http.deps import GateDep, RuntimeDep, SubjectDep, Verifies, query_of
+from api.http.challenges import MAX_ID, Challenge, opened_challenge
+from api.http.deps import GateDep, IdempotencyDep, RuntimeDep, SubjectDep, Verifies, query_of
 from api.http.errors import ApiError
-from api.http.holder_keys import FIELD, HolderKeyHeaderDep, holder_key_of
-from api.http.openapi import BODY, EVERY_CALL, PHOTO, VERIFY_BODY, error_responses
+from api.http.holder_keys import FIELD, HolderKeyHeaderDep, digest, holder_key_of
+from api.http.idempotency import Outcome, once, replay_header
+from api.http.openapi import BODY, EVERY_CALL, IDEMPOTENT, PHOTO, VERIFY_BODY, error_responses
 from api.http.schemas import VerifyAnswer
 from api.http.signatures import FIELDS as SIGNATURE_FIELDS
-from api.http.signatures import checked_nonce
+from api.http.signatures import checked_signature, nonce_in_time
 from api.http.values import (
     embedding_of,
     embeddings_of,
@@ -80,13 +81,17 @@ PROBES = ("embedding", "embeddings", "template")
 
 @dataclass(frozen=True)
 class Probe:
-    """What is compared, how, with whose template, and what keeps it from a second use."""
+    """What is compared, how, with whose template, and what keeps it from a second use.
+
+    `asked` is what tells the request from another one, but for the holder's key.
+    """
 
     kind: Literal["photo", "frames", "embedding", "template"]
     compare: Callable[[Verifier, OpenedTemplate], Decision]
     held_template: bytes | None = field(repr=False)
     nonce: Nonce | None
     holder_key: bytearray | None = field(repr=False)
+    asked: tuple[str | bytes, ...] = field(repr=False)
 
 
 CODES = (
@@ -102,6 +107,7 @@ CODES = (
     "uncalibrated",
     "replayed",
     "locked_out",
+    *IDEMPOTENT,
 )
 
 
@@ -120,6 +126,7 @@ async def verify(
     runtime: RuntimeDep,
     gate: GateDep,
     holder_key_header: HolderKeyHeaderDep,
+    idempotency_key: IdempotencyDep,
 ) -> Response:
     """Rights: `verify`, and `embeddings` for a probe that is not a photo.
 
@@ -144,6 +151,9 @@ async def verify(
     Where the subject's holder keeps the template, it comes with the probe as `held_template`. One
     that is missing, altered, replaced or another subject's is a rejection; where the service
     stores the template, it changes nothing.
+
+    A token for this subject may stand in the place of the API key; the decision uses it up. With
+    a token an `Idempotency-Key` is taken: the same request gets the same answer once more.
     """
     query = query_of(request, ("level", "face"))
     async with gate.admitted(caller.prefix):
@@ -156,19 +166,38 @@ async def verify(
                 probe = await _sent_probe(
                     request, runtime, caller, subject, query, holder_key_header
                 )
-        decision = await gate.compute(
-            partial(_decide_and_wipe, runtime, caller, subject, probe, by(request)),
-            key=caller.prefix,
+
+        def work() -> Outcome:
+            decision = _decide_and_wipe(runtime, caller, subject, probe, by(request))
+            return Outcome(200, _body(decision, caller))
+
+        outcome = await once(
+            request,
+            caller,
+            # A browser that lost its answer has no other token. An answer to an API key may hold
+            # a distance, which is not kept.
+            None if caller.subject_token is None else idempotency_key,
+            operation="verify",
+            asked=[subject, *probe.asked, *digest(probe.holder_key)],
+            subject=subject,
+            work=work,
+            run=partial(gate.compute, key=caller.prefix),
         )
-    request.state.log["security_level"] = decision.level
-    request.state.log["decision"] = "accept" if decision.accepted else "reject"
-    request.state.log["liveness"] = decision.liveness
-    count_decision(
-        accepted=decision.accepted,
-        reason=decision.reason,
-        level=decision.level,
-        probe=probe.kind,
-    )
+    body = outcome.body
+    request.state.log["security_level"] = body["level"]
+    request.state.log["decision"] = body["decision"]
+    request.state.log["liveness"] = body["liveness"]
+    if not outcome.replayed:
+        count_decision(
+            accepted=body["decision"] == "accept",
+            reason=body["reason"],
+            level=body["level"],
+            probe=probe.kind,
+        )
+    return answer(request, body, headers=replay_header(outcome))
+
+
+def _body(decision: Decision, caller: Caller) -> dict[str, Any]:
     body: dict[str, Any] = {
         "decision": "accept" if decision.accepted else "reject",
         "reason": decision.reason,
@@ -182,7 +211,7 @@ async def verify(
         body["distance"] = decision.distance
         if decision.liveness_failure is not None:
             body["liveness_failure"] = str(decision.liveness_failure)
-    return answer(request, body)
+    return body
 
 
 async def _photo_probe(
@@ -213,6 +242,7 @@ async def _photo_probe(
         challenge = opened_challenge(
             runtime.keyring, challenge_id, tenant=caller.tenant, subject=subject
         )
+    nonce = _nonce(caller, challenge)
     embed: Callable[[Verifier], PhotoProbe]
     if challenge is None:
 
@@ -247,9 +277,34 @@ async def _photo_probe(
             return decision
         return decision.with_liveness(probe.failure)
 
-    if challenge is None:
-        return Probe("photo", compare, held_template, nonce=None, holder_key=holder_key)
-    return Probe("frames", compare, held_template, challenge.nonce, holder_key)
+    return Probe(
+        "photo" if challenge is None else "frames",
+        compare,
+        held_template,
+        nonce,
+        holder_key,
+        asked=(level, str(policy), challenge_id or "", held_template or b"", *photos),
+    )
+
+
+def _nonce(caller: Caller, challenge: Challenge | None) -> Nonce | None:
+    """Return what a decision on photos uses up.
+
+    Raises
+    ------
+    ApiError
+        ``validation_failed`` where a token comes with a challenge that was not asked for with it.
+    """
+    token = caller.subject_token
+    if token is None:
+        return None if challenge is None else challenge.nonce
+    if challenge is not None and challenge.nonce.value != token.nonce.value:
+        raise ApiError(
+            "validation_failed",
+            "this challenge was not asked for with this token: ask for one with it",
+            {"field": CHALLENGE},
+        )
+    return token.nonce
 
 
 def _check_count(count: int, settings: Settings, *, is_challenge: bool) -> None:
@@ -293,15 +348,12 @@ async def _sent_probe(
         sent = base64_field(value, "template", code="invalid_template")
     else:
         sent = embedding_of(value) if kind == "embedding" else embeddings_of(value)
-    nonce = checked_nonce(
-        body,
-        sent,
-        key=caller.probe_key,
-        key_prefix=caller.prefix,
-        subject_id=subject,
-        level=asked,
-        window_s=settings.probe_window_s,
-    )
+    signed = checked_signature(body, sent, key=caller.probe_key, subject_id=subject, level=asked)
+    if caller.subject_token is None:
+        nonce = nonce_in_time(*signed, key_prefix=caller.prefix, window_s=settings.probe_window_s)
+    else:
+        # It ends by this clock, and not by that of a browser, and is good once.
+        nonce = caller.subject_token.nonce
     level = _level(runtime, caller, asked)
     runtime.liveness.require(level, of_key=caller.liveness, photos=False, challenge=False)
     holder_key = holder_key_of(holder_key_header, body)
@@ -317,11 +369,19 @@ async def _sent_probe(
             )
 
     return Probe(
-        "template" if kind == "template" else "embedding", compare, held_template, nonce, holder_key
+        "template" if kind == "template" else "embedding",
+        compare,
+        held_template,
+        nonce,
+        holder_key,
+        # The HMAC is of all that is signed.
+        asked=(body["hmac"], held_template or b""),
     )
 
 
 def _level(runtime: Runtime, caller: Caller, asked: str | None) -> str:
+    if caller.subject_token is not None:
+        asked = caller.subject_token.level_of(asked)
     return runtime.levels.in_force(asked, lowest_of_key=caller.lowest_level)
 
 
