@@ -110,7 +110,7 @@ class Replayed(StoreError):
     def __init__(
         self,
         message: str = (
-            "this was used before: sign each probe with a nonce of its own, and ask for another "
+            "this was seen before: sign each probe with a nonce of its own, and ask for another "
             "challenge or token"
         ),
         *,

@@ -63,9 +63,21 @@ async def list_pack(request: Request, runtime: RuntimeDep) -> Response:
                 "application/octet-stream": {"schema": {"type": "string", "format": "binary"}}
             },
         },
-        206: {"description": "The range of bytes that was asked for."},
+        206: {
+            "description": "The range of bytes that was asked for.",
+            "content": {
+                "application/octet-stream": {"schema": {"type": "string", "format": "binary"}}
+            },
+        },
         304: {"description": "The client's copy is the same."},
-        **error_responses(*EVERY_CALL, "forbidden", "not_found", "replayed", "model_unavailable"),
+        **error_responses(
+            *EVERY_CALL,
+            "forbidden",
+            "not_found",
+            "replayed",
+            "validation_failed",
+            "model_unavailable",
+        ),
     },
     summary="One graph",
 )
