@@ -156,7 +156,11 @@ TOKEN_BODY = _body(
             "properties": {
                 "subject_id": {"type": "string", "examples": ["alice"]},
                 "action": {"type": "string", "enum": list(ACTIONS)},
-                "level": {**LEVEL, "description": "For `verify`; left out, the one in force."},
+                "level": {
+                    "anyOf": [{"type": "string"}, {"type": "null"}],
+                    "description": "For `verify`; left out, the one in force.",
+                    "examples": ["fmr-1e-3"],
+                },
                 "lifetime_s": {
                     "type": "integer",
                     "minimum": 1,
