@@ -347,6 +347,11 @@ class Settings(BaseSettings):
     api_docs: bool = Field(
         True, description="Serve the reference of the API at `/docs`, for whoever reaches it."
     )
+    serve_pack: bool = Field(
+        False,
+        description="Give the contract's graphs, at `/v1/pack`, to clients that have a token or an "
+        "API key, and let the page run them. Mind the licence of the weights (docs/models.md).",
+    )
     audit_report_file: Path | None = Field(
         None,
         description="The `report.json` that `veilface audit templates` or `veilface audit "

@@ -22,7 +22,7 @@
     │   │   ├── AlteredTenant    its row is not as this program left it [11]
     │   │   └── RetiredRotation  no rotation key of this epoch any more [11]
     │   ├── LockedOut            too many failed attempts on the subject [12]
-    │   ├── Replayed             a signed probe that was seen before [12]
+    │   ├── Replayed             a signed probe or a token that was seen before [12]
     │   ├── BrokenAuditLog       an audit log whose head or key is missing or forged [13]
     │   ├── ExportSuperseded     an export from before an erasure, or of a retired key [14]
     │   ├── EnrollmentConflict   another template than the one that a write may replace [17]

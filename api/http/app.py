@@ -34,9 +34,11 @@ from api.http.routes import (
     health,
     lockout,
     own_key,
+    pack,
     photo_check,
     stored,
     subjects,
+    tokens,
     transfer,
     verification,
 )
@@ -109,6 +111,8 @@ def create_app(
     for routes in (
         own_key,
         contract,
+        pack,
+        tokens,
         enrollment,
         photo_check,
         subjects,

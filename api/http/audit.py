@@ -20,6 +20,7 @@ ACTIONS = {
     "erase_subject": "erase",
     "export_subject": "export",
     "get_stored": "inspect",
+    "create_token": "token",
     "import_subject": "import",
     "unlock_subject": "unlock",
 }

@@ -1,21 +1,25 @@
-"""Who calls, and what they may do: API keys with a tenant and rights."""
+"""Who calls, and what they may do: API keys with a tenant and rights, and tokens under them."""
 
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from typing import Annotated
 
 from fastapi import Depends, Request, Security
 from fastapi.security import APIKeyHeader, HTTPAuthorizationCredentials, HTTPBearer
 
 from api.http.errors import ApiError
+from api.http.tokens import SubjectToken, opened_token, prefix_of
 from api.limits.admission import Gate
 from api.limits.rates import RateLimits
 from api.process.runtime import Runtime
 from templates.contract.liveness_policy import LivenessPolicy
 from templates.keys.api_token import is_token, probe_key
+from templates.store.api_keys import ApiKey
+from templates.store.lockout import Replayed
 
 _bearer = HTTPBearer(
-    auto_error=False, scheme_name="bearer", description="`Authorization: Bearer vf_…`"
+    auto_error=False, scheme_name="bearer", description="`Authorization: Bearer vf_…`, or `vft_…`"
 )
 _header = APIKeyHeader(
     name="X-API-Key", auto_error=False, scheme_name="apiKey", description="`X-API-Key: vf_…`"
@@ -24,14 +28,36 @@ _header = APIKeyHeader(
 
 @dataclass(frozen=True)
 class Caller:
-    """An API key that was recognised."""
+    """An API key that was recognised, or a token that it asked for.
+
+    Attributes
+    ----------
+    prefix, tenant, lowest_level, liveness
+        Of the API key.
+    key_id
+        Its row's id.
+    rights
+        Of the key. With a token: what it is for, and ``embeddings`` where the key has it.
+    token
+        What the request came with.
+    subject_token
+        What it is good for, where it is not the API key itself.
+    """
 
     prefix: str
     tenant: str
+    key_id: str = field(repr=False)
     rights: frozenset[str]
     token: str = field(repr=False, compare=False)
     lowest_level: str | None = None
     liveness: LivenessPolicy | None = None
+    subject_token: SubjectToken | None = None
+
+    @property
+    def name(self) -> str:
+        """What it is counted by, and what keeps its idempotency keys apart from others'."""
+        token = self.subject_token
+        return self.prefix if token is None else f"{self.prefix}:{token.token_id}"
 
     @property
     def probe_key(self) -> bytes:
@@ -71,34 +97,75 @@ async def caller(
     ------
     ApiError
         ``unauthorized``, in the same words for an absent, an unknown and a revoked key;
-        ``overloaded``; ``rate_limited``.
+        ``overloaded``; ``rate_limited``; ``forbidden`` for what a token is not for.
+    Replayed
+        Where a token comes too late.
     """
     runtime: Runtime = request.app.state.runtime
     gate: Gate = request.app.state.gate
     token = bearer.credentials if bearer is not None else header
     refused = ApiError(
         "unauthorized",
-        "send a valid API key: Authorization: Bearer vf_… or X-API-Key",
+        "send a valid API key or token: Authorization: Bearer vf_… or X-API-Key",
         {},
         {"WWW-Authenticate": "Bearer"},
     )
-    # What is no token costs no query.
-    if token is None or not is_token(token):
+    if token is None:
         raise refused
-    api_key = await gate.query(lambda: runtime.store.api_keys.verify(token))
+    api_key, subject_token = await _recognised(runtime, gate, token)
     if api_key is None:
         raise refused
-    request.state.log.update(tenant=api_key.tenant, key_id=api_key.prefix)
-    rate_limits: RateLimits = request.app.state.rate_limits
-    await rate_limits.count_key(api_key.prefix)
-    return Caller(
+    rights = frozenset(map(str, api_key.rights))
+    if subject_token is not None:
+        rights &= {subject_token.action, "embeddings"}
+    known = Caller(
         prefix=api_key.prefix,
         tenant=api_key.tenant,
-        rights=frozenset(map(str, api_key.rights)),
+        key_id=api_key.id,
+        rights=rights,
         token=token,
         lowest_level=api_key.lowest_level,
         liveness=api_key.liveness,
+        subject_token=subject_token,
     )
+    request.state.log.update(tenant=known.tenant, key_id=known.prefix)
+    rate_limits: RateLimits = request.app.state.rate_limits
+    await rate_limits.count_key(known.name)
+    if subject_token is not None:
+        _require_token(request, runtime, known, subject_token)
+    return known
+
+
+async def _recognised(
+    runtime: Runtime, gate: Gate, token: str
+) -> tuple[ApiKey | None, SubjectToken | None]:
+    """Look up an API key, or that of a token; what is neither costs no query."""
+    if is_token(token):
+        return await gate.query(lambda: runtime.store.api_keys.verify(token)), None
+    prefix = prefix_of(token)
+    if prefix is None:
+        return None, None
+    api_key = await gate.query(lambda: runtime.store.api_keys.valid(prefix))
+    if api_key is None:
+        return None, None
+    subject_token = opened_token(runtime.keyring, token, key_id=api_key.id)
+    return (None, None) if subject_token is None else (api_key, subject_token)
+
+
+def _require_token(request: Request, runtime: Runtime, caller: Caller, token: SubjectToken) -> None:
+    """Refuse a call that a token is not for, or that comes too late for it."""
+    request.state.log["token_id"] = token.token_id
+    pseudonym = runtime.store.signer.pseudonym(caller.tenant, token.subject)
+    note_subject(request, pseudonym)
+    if datetime.now(UTC) > token.expires_at:
+        raise Replayed("the token has expired: ask your server for another one")
+    token.require(request.scope["route"].name, request.path_params.get("subject_id"))
+
+
+def note_subject(request: Request, pseudonym: str) -> None:
+    """Keep the subject's pseudonym for the audit log, and its beginning for the request's line."""
+    request.state.pseudonym = pseudonym
+    request.state.log["subject"] = pseudonym[:16]
 
 
 CallerDep = Annotated[Caller, Depends(caller)]

@@ -7,7 +7,7 @@ import base64
 import binascii
 import json
 import secrets
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 
 from api.http.bodies import parse_json
@@ -37,7 +37,12 @@ class Challenge:
 
 
 def new_challenge(
-    keyring: MasterKeyring, *, tenant: str, key_prefix: str, subject: str | None
+    keyring: MasterKeyring,
+    *,
+    tenant: str,
+    key_prefix: str,
+    subject: str | None,
+    token_nonce: Nonce | None = None,
 ) -> tuple[str, Challenge]:
     """Draw a challenge; return its id and what it asks.
 
@@ -49,9 +54,16 @@ def new_challenge(
         Of the key that asks for it, under which its nonce is kept, whichever key answers.
     subject
         The only one that it can be answered for; None for any.
+    token_nonce
+        Of the token that it is asked for with: one decision uses up both. The challenge ends no
+        later than the token.
     """
     expires = datetime.now(UTC).replace(microsecond=0) + LIFETIME
-    nonce = Nonce(key_prefix, secrets.token_urlsafe(18), expires)
+    if token_nonce is None:
+        nonce = Nonce(key_prefix, secrets.token_urlsafe(18), expires)
+    else:
+        expires = min(expires, token_nonce.expires_at)
+        nonce = replace(token_nonce, expires_at=expires)
     challenge = Challenge(draw_movements(), nonce)
     body = {
         "movements": [str(movement) for movement in challenge.movements],

@@ -5,7 +5,7 @@ from typing import Annotated
 
 from fastapi import Depends, Header, Path, Request
 
-from api.http.auth import Caller, CallerDep, holding
+from api.http.auth import Caller, CallerDep, holding, note_subject
 from api.http.errors import ApiError
 from api.limits.admission import Gate
 from api.process.runtime import Runtime
@@ -45,12 +45,6 @@ async def subject_of(
     return subject_id
 
 
-def note_subject(request: Request, pseudonym: str) -> None:
-    """Keep the subject's pseudonym for the audit log, and its beginning for the request's line."""
-    request.state.pseudonym = pseudonym
-    request.state.log["subject"] = pseudonym[:16]
-
-
 async def idempotency_key_of(
     idempotency_key: Annotated[
         str | None,
@@ -80,6 +74,23 @@ async def idempotency_key_of(
     return idempotency_key
 
 
+async def enrolls_or_verifies(caller: CallerDep) -> Caller:
+    """Demand one of the rights to send a photo, or a token for a browser that will.
+
+    Raises
+    ------
+    ApiError
+        ``forbidden``.
+    """
+    if not caller.rights & {"enroll", "verify"}:
+        raise ApiError(
+            "forbidden",
+            "this API key lacks the rights enroll and verify, and one of them is needed",
+            {"missing": ["enroll", "verify"]},
+        )
+    return caller
+
+
 def query_of(request: Request, known: Collection[str]) -> dict[str, str]:
     """Return the query, refusing what nobody reads: a misspelt `level` is not the default.
 
@@ -105,6 +116,7 @@ GateDep = Annotated[Gate, Depends(gate_of)]
 SubjectDep = Annotated[str, Depends(subject_of)]
 IdempotencyDep = Annotated[str | None, Depends(idempotency_key_of)]
 Enrolls = Annotated[Caller, Depends(holding("enroll"))]
+EnrollsOrVerifies = Annotated[Caller, Depends(enrolls_or_verifies)]
 Verifies = Annotated[Caller, Depends(holding("verify"))]
 Erases = Annotated[Caller, Depends(holding("erase"))]
 Administers = Annotated[Caller, Depends(holding("admin"))]

@@ -69,15 +69,19 @@ ERROR_CODES: dict[str, ErrorCode] = {
         ErrorCode(
             "unauthorized",
             401,
-            "The API key is missing, unknown or revoked, or the `hmac` of a probe is wrong.",
+            "The API key or token is missing, unknown or revoked, or the `hmac` of a probe is "
+            "wrong.",
         ),
         ErrorCode(
-            "replayed", 401, "The signed probe or the challenge was used before, or has expired."
+            "replayed",
+            401,
+            "The signed probe, the challenge or the token was used before, or has expired.",
         ),
         ErrorCode(
             "forbidden",
             403,
-            "The API key lacks the right or asks for too low a level, the tenant forbids it, or "
+            "The API key lacks the right or asks for too low a level, the token is for something "
+            "else, the tenant forbids it, or "
             "liveness is asked for and the probe cannot show it.",
         ),
         ErrorCode("not_enrolled", 404, "Nobody is enrolled under this id."),

@@ -1,4 +1,4 @@
-"""Writes that carry an Idempotency-Key: done once, answered as often as asked.
+"""Requests that carry an Idempotency-Key: done once, answered as often as asked.
 
 Only successes are kept, in the transaction of the write. A write that was refused changed nothing,
 so its key is given back and the client may send a better photo under the same key. Neither is an
@@ -28,7 +28,7 @@ from templates.store.subjects import Once, StoredTemplate
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a write answers, its template id included.
+    """What a request answers; of an enrollment, its template id included.
 
     It holds no subject id, because it is kept for a day.
     """
@@ -37,15 +37,14 @@ class Outcome:
     body: Mapping[str, Any]
     replayed: bool = False
 
+    def to_keep(self) -> Answer:
+        """Return what the store keeps of it."""
+        return Answer(self.status, json.dumps(dict(self.body)).encode())
+
 
 def kept_with(claim: Claim | None, outcome: Callable[[StoredTemplate], Outcome]) -> Once | None:
     """Return what ``Subjects.put`` keeps for a claim: the answer that `outcome` gives."""
-
-    def kept(stored: StoredTemplate) -> Answer:
-        answered = outcome(stored)
-        return Answer(answered.status, json.dumps(dict(answered.body)).encode())
-
-    return None if claim is None else Once(claim, kept)
+    return None if claim is None else Once(claim, lambda stored: outcome(stored).to_keep())
 
 
 async def once(
@@ -58,9 +57,8 @@ async def once(
     subject: str | None,
     work: Callable[[Claim | None], Outcome],
     run: Callable[[Callable[[], Outcome]], Awaitable[Outcome]],
-    add: Mapping[str, Any] | None = None,
-) -> Response:
-    """Do a write and answer it; with a key that was used before, answer what it answered then.
+) -> Outcome:
+    """Do a write; with a key that was used before, return what it answered then.
 
     Parameters
     ----------
@@ -70,11 +68,9 @@ async def once(
     subject
         Erasing this subject removes the record.
     work
-        The write, which keeps its answer with :func:`kept_with`; runs in a thread.
+        The write, which keeps its answer in its own transaction; runs in a thread.
     run
         Which threads: the gate's ``compute`` or ``query``.
-    add
-        Fields of the answer that are not kept.
 
     Raises
     ------
@@ -89,7 +85,7 @@ async def once(
         records = runtime.store.idempotency
         claim = records.claim(
             caller.tenant,
-            actor=caller.prefix,
+            actor=caller.name,
             key=key,
             request=hashlib.sha256(encode_parts(operation, *asked)).digest(),
             subject_id=subject,
@@ -103,8 +99,17 @@ async def once(
                 records.release(claim)
             raise
 
-    outcome = await run(guarded)
-    headers = {"ETag": etag(outcome.body["template_id"])}
-    if outcome.replayed:
-        headers["Idempotency-Replayed"] = "true"
+    return await run(guarded)
+
+
+def written(
+    request: Request, outcome: Outcome, *, add: Mapping[str, Any] | None = None
+) -> Response:
+    """Answer an enrollment; `add` is what the answer has beside what is kept."""
+    headers = {"ETag": etag(outcome.body["template_id"]), **replay_header(outcome)}
     return answer(request, {**outcome.body, **(add or {})}, status=outcome.status, headers=headers)
+
+
+def replay_header(outcome: Outcome) -> dict[str, str]:
+    """Return the header that tells an answer that is given again."""
+    return {"Idempotency-Replayed": "true"} if outcome.replayed else {}

@@ -78,6 +78,20 @@ class Levels:
             {"lowest_level": lowest},
         )
 
+    def require_known(self, level: str) -> None:
+        """Refuse a level that the contract does not have, before anything is decided at it.
+
+        Raises
+        ------
+        ApiError
+            ``uncalibrated``.
+        """
+        if level not in self._rates:
+            raise ApiError(
+                "uncalibrated",
+                "the contract has no such level: it has " + ", ".join(self._rates),
+            )
+
     def allowed(self, *, lowest_of_key: str | None = None) -> list[str]:
         """Return the levels that may be asked for, in the contract's order."""
         return [name for name in self._rates if self._may_ask(name, lowest_of_key)]

@@ -15,6 +15,7 @@ from api.http.schemas import (
     TemplateRequest,
     VerifyRequest,
 )
+from api.http.tokens import ACTIONS, LONGEST_S
 from templates.keys.holder_key import PATTERN as HOLDER_KEY_PATTERN
 from verify import MAX_FRAMES, MAX_PROBE_PHOTOS
 
@@ -144,6 +145,31 @@ CHALLENGE_BODY = _body(
             },
         },
         "examples": {"subject": {"value": {"subject_id": "alice"}}},
+    },
+)
+TOKEN_BODY = _body(
+    None,
+    {
+        "schema": {
+            "type": "object",
+            "required": ["subject_id", "action"],
+            "properties": {
+                "subject_id": {"type": "string", "examples": ["alice"]},
+                "action": {"type": "string", "enum": list(ACTIONS)},
+                "level": {
+                    "anyOf": [{"type": "string"}, {"type": "null"}],
+                    "description": "For `verify`; left out, the one in force.",
+                    "examples": ["fmr-1e-3"],
+                },
+                "lifetime_s": {
+                    "type": "integer",
+                    "minimum": 1,
+                    "maximum": LONGEST_S,
+                    "default": LONGEST_S,
+                },
+            },
+        },
+        "examples": {"verify": {"value": {"subject_id": "alice", "action": "verify"}}},
     },
 )
 VERIFY_BODY = _body(

@@ -13,6 +13,8 @@ CURL: Mapping[str, str] = {
     "getOwnKey": 'curl -H "$AUTH" $URL/v1/key',
     "getContract": 'curl -H "$AUTH" -o contract.json $URL/v1/contract',
     "getGenerator": 'curl -H "$AUTH" -o generator.veil $URL/v1/contract/generator',
+    "createToken": 'curl -H "$AUTH" -H "Content-Type: application/json" \\\n'
+    """  -d '{"subject_id": "alice", "action": "verify"}' $URL/v1/tokens""",
     "checkPhoto": 'curl -H "$AUTH" -F image=@alice-1.jpg $URL/v1/photos/check',
     "enroll": 'curl -X PUT -H "$AUTH" -H "If-None-Match: *" \\\n'
     "  -F images=@alice-1.jpg -F images=@alice-2.jpg $URL/v1/subjects/alice/enrollment",

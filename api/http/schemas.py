@@ -162,6 +162,61 @@ class ChallengeAnswer(_Answer):
     expires_at: str = Field(examples=["2026-01-31T12:01:00Z"])
 
 
+class TokenAnswer(_Answer):
+    """A token for one call of one subject."""
+
+    token: str = Field(
+        description="For the browser, as `Authorization: Bearer vft_…`. It is shown once.",
+        examples=["vft_0f3a5c7e9b1d_AR8k"],
+    )
+    token_id: str = Field(
+        description="For your server, to ask what came of it.",
+        examples=["pX3q0u5mC1oV8n2JdE7yRw4k"],
+    )
+    subject_id: str = Field(examples=["alice"])
+    action: Literal["verify", "enroll"]
+    level: str | None = Field(
+        description="The only level that it verifies at; null for an enrollment.",
+        examples=["fmr-1e-3"],
+    )
+    expires_at: str = Field(examples=["2026-01-31T12:02:00Z"])
+
+
+class TokenOutcomeAnswer(_Answer):
+    """What a token was used for."""
+
+    token_id: str
+    used: bool = Field(
+        description="False, too, for a token that this key did not ask for, or of another subject."
+    )
+    outcome: Literal["accept", "reject", "locked_out", "created", "replaced"] | None = Field(
+        description="Null where it was not used."
+    )
+    level: str | None = Field(description="Of a verification that used it.", examples=["fmr-1e-3"])
+    used_at: str | None = Field(examples=["2026-01-31T12:00:21Z"])
+
+
+class PackFileEntry(_Shape):
+    """One graph of the pack."""
+
+    role: Literal["detector", "embedder"]
+    kind: Literal["scrfd", "yunet"] | None = Field(description="Of a detector.")
+    file: str = Field(examples=["w600k_mbf.onnx"])
+    sha256: str = Field(examples=[HEX])
+    bytes: int = Field(examples=[13616099])
+    path: str = Field(description="Where it is, on this service.", examples=[f"/v1/pack/{HEX}"])
+    input_size: list[int] = Field(description="Width and height.", examples=[[112, 112]])
+
+
+class PackAnswer(_Answer):
+    """The graphs that the contract names, for clients that embed."""
+
+    name: str = Field(examples=["buffalo_sc"])
+    licence: str | None = Field(description="What is known of a pack of this name.")
+    contract_id: str = Field(examples=[HEX])
+    files: list[PackFileEntry]
+
+
 class Subject(_Shape):
     """A subject, without its template."""
 

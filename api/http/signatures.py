@@ -16,17 +16,15 @@ from templates.store.lockout import Nonce, Replayed
 FIELDS = ("nonce", "timestamp", "hmac")
 
 
-def checked_nonce(
+def checked_signature(
     body: Mapping[str, Any],
     probe: bytes | NDArray[np.float64],
     *,
     key: bytes,
-    key_prefix: str,
     subject_id: str,
     level: str | None,
-    window_s: float,
-) -> Nonce:
-    """Check the signature of a probe; return its nonce, which the decision will use up.
+) -> tuple[str, int]:
+    """Check the signature of a probe; return its nonce and timestamp, which are any.
 
     Parameters
     ----------
@@ -34,18 +32,14 @@ def checked_nonce(
         The request, with the fields ``nonce``, ``timestamp`` and ``hmac``.
     probe
         Wire bytes, or the numbers of an embedding, (n,) float64, or of several, (k, n).
-    key, key_prefix
-        The probe key of the API key that the request came with, and that key's prefix.
-    window_s
-        Seconds that the timestamp may be away from this machine's clock, either way.
+    key
+        The probe key of the API key, or of the token, that the request came with.
 
     Raises
     ------
     ApiError
         ``validation_failed`` for a field that is missing or no nonce, time or HMAC;
         ``unauthorized`` where the HMAC is another one than that of this probe.
-    Replayed
-        Where the timestamp is out of the window.
     """
     nonce, timestamp, mac = (body.get(name) for name in FIELDS)
     if not isinstance(nonce, str) or not NONCE.fullmatch(nonce):
@@ -58,10 +52,26 @@ def checked_nonce(
     if not hmac.compare_digest(expected, mac):
         raise ApiError(
             "unauthorized",
-            "the probe's hmac is not that of these fields under this API key; docs/rest.md says "
-            "what is signed",
+            "the probe's hmac is not that of these fields under this API key or token; "
+            "docs/rest.md says what is signed",
             {"field": "hmac"},
         )
+    return nonce, timestamp
+
+
+def nonce_in_time(nonce: str, timestamp: int, *, key_prefix: str, window_s: float) -> Nonce:
+    """Return the nonce of a probe that an API key signed, which the decision will use up.
+
+    Parameters
+    ----------
+    window_s
+        Seconds that the timestamp may be away from this machine's clock, either way.
+
+    Raises
+    ------
+    Replayed
+        Where it is further away.
+    """
     if abs(time.time() - timestamp) > window_s:
         raise Replayed(
             f"the probe's timestamp is more than {window_s:g} s away from the server's clock: "

@@ -23,6 +23,7 @@ FIELDS = frozenset(
         "duration_ms",
         "tenant",
         "key_id",
+        "token_id",
         "subject",
         "decision",
         "liveness",

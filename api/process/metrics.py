@@ -77,6 +77,9 @@ STEP_SECONDS = Histogram(
     buckets=SECONDS,
     registry=REGISTRY,
 )
+TOKENS = Counter(
+    "veilface_tokens", "Tokens that were made for browsers.", ("action",), registry=REGISTRY
+)
 LOCKED_OUT = Counter(
     "veilface_lockouts",
     "Verifications that were refused because their subject was locked for a while or disabled.",

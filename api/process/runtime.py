@@ -32,6 +32,7 @@ from api.process.opening import (
     prepare_database,
     try_inference,
 )
+from api.process.served_graphs import served_graphs
 from api.settings import Settings
 from enroll import Enroller, Enrollment
 from enroll.enroller import WIRE_DTYPE
@@ -46,6 +47,7 @@ from templates.keys.rotation import HAAR_VERSION, TenantRotation
 from templates.keys.sealing import MasterKeyring
 from templates.store import TemplateStore
 from templates.store.audit_log import By
+from templates.store.lockout import Nonce
 from templates.store.secret import SecretName
 from templates.store.subject_rows import Source, Storage, SubjectTemplate
 from templates.store.subjects import Guard, Once, Precondition, StoredTemplate
@@ -142,6 +144,7 @@ class Runtime:
             deployment=self.settings.liveness,
             levels=self.settings.liveness_of_levels,
         )
+        self.graphs = served_graphs(self.settings, self.pack)
         self.stand_ins = StandIns(self.contract, self.keyring, key=self._stand_in_key)
 
     @classmethod
@@ -314,12 +317,13 @@ class Runtime:
         storage: Storage = Storage.SERVICE,
         precondition: Precondition | None = None,
         once: Once | None = None,
+        nonce: Nonce | None = None,
         by: By,
         guard: Guard | None = None,
     ) -> StoredTemplate:
         """Store an enrollment in place of an earlier one.
 
-        `storage`, `precondition`, `once` and `guard` are those of ``Subjects.put``.
+        `storage`, `precondition`, `once`, `nonce` and `guard` are those of ``Subjects.put``.
         """
         binding = self.contract.binding
         return self.store.subjects.put(
@@ -339,6 +343,7 @@ class Runtime:
             precondition=precondition,
             once=once,
             guard=guard,
+            nonce=nonce,
             by=by,
         )
 

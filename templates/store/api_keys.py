@@ -179,11 +179,27 @@ class ApiKeys:
             return None
         expected = _NOBODYS_HASH if row is None else row.token_hash
         same = hmac.compare_digest(_token_hash(token), expected)
-        if row is None or not same:
+        return self._valid(row) if same else None
+
+    def valid(self, prefix: str) -> ApiKey | None:
+        """Return the key of a prefix, or None where :meth:`verify` would return none.
+
+        For what the service itself made under that key: whoever knows a prefix has no key.
+        """
+        try:
+            row = self._row(prefix)
+        except (ValueError, TypeError):
+            warn("an API key's row is not authentic and was passed over", key_id=prefix)
+            return None
+        return self._valid(row)
+
+    def _valid(self, row: Any) -> ApiKey | None:
+        """Return the key of a row if it is good now, and note that it is used."""
+        if row is None:
             return None
         key, now = self._read(row), self._context.clock()
         if not key.authentic:
-            warn("an API key's row is not authentic and was passed over", key_id=prefix)
+            warn("an API key's row is not authentic and was passed over", key_id=key.prefix)
         if not key.is_valid_at(now):
             return None
         self._note_use(key, now)

@@ -8,8 +8,6 @@ from its table changes nothing.
 """
 
 import contextlib
-import hashlib
-import hmac
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from datetime import timedelta
@@ -20,13 +18,13 @@ import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
 from templates.errors import StoreError
-from templates.keys.sealing import encode_parts
 from templates.store.attempt_queries import NOTE_USE, before, named, standing
 from templates.store.audit_log import By, Entry
 from templates.store.context import StoreContext
-from templates.store.deployment import insert_once
+from templates.store.idempotency import Answer, Claim, Idempotency
 from templates.store.identifiers import UnknownTenant, checked_subject_id
 from templates.store.lockout import LockedOut, LockoutPolicy, Nonce, Replayed, Superseded
+from templates.store.nonces import Nonces, spend
 from templates.store.outbox import EventType
 from templates.store.schema import FailedAttemptsRow, UsedNonceRow
 from templates.store.standing import UNKNOWN_RETENTION, AttemptsStatus, Standing
@@ -83,8 +81,10 @@ D = TypeVar("D", bound=Decided)
 class Attempts:
     """Repository of failed attempts and used nonces."""
 
-    def __init__(self, context: StoreContext, policy: LockoutPolicy) -> None:
+    def __init__(self, context: StoreContext, nonces: Nonces, policy: LockoutPolicy) -> None:
         self._context = context
+        self._nonces = nonces
+        self._idempotency = Idempotency(context)
         self._standing = Standing(context, policy)
 
     def begin(
@@ -134,6 +134,7 @@ class Attempts:
         contract_ids: Sequence[str] | None = None,
         level: str,
         nonce: Nonce | None,
+        kept: tuple[Claim, Answer] | None = None,
         by: By,
     ) -> None:
         """Count a decision, in one transaction, before anybody is told of it.
@@ -160,6 +161,8 @@ class Attempts:
             Security level of the decision, for the audit log.
         nonce
             Of a signed probe; None for a photo.
+        kept
+            What is answered under an idempotency key, and its claim.
         by
             Who asked.
 
@@ -171,12 +174,17 @@ class Attempts:
             If the subject is locked now.
         Superseded
             If the subject's template is another one now. Nothing is written.
+        IdempotencyConflict
+            If another run of the same request has taken over. Nothing is written.
         UnknownTenant, StoreError, StoreUnavailable
         """
 
         def work(connection: Connection) -> LockedOut | Replayed | None:
             asked = self._asked(tenant, subject_id, nonce, contract_ids)
-            return self._record(connection, asked, accepted, template_id, nonce, level, by)
+            refusal = self._record(connection, asked, accepted, template_id, nonce, level, by)
+            if kept is not None and refusal is None:
+                self._idempotency.finish(connection, *kept)
+            return refusal
 
         refusal = self._context.write(work, lock=subject_lock(tenant, subject_id))
         if refusal is not None:
@@ -191,6 +199,7 @@ class Attempts:
         contract_ids: Sequence[str],
         nonce: Nonce | None,
         held_template: bytes | None = None,
+        kept: Callable[[D], tuple[Claim, Answer] | None] = lambda _decided: None,
         by: By,
     ) -> D:
         """:meth:`begin`, a decision and :meth:`conclude` while nobody replaces the template.
@@ -202,7 +211,8 @@ class Attempts:
 
         Raises
         ------
-        LockedOut, Replayed, UnknownTenant, SealError, StoreError, StoreUnavailable
+        LockedOut, Replayed, IdempotencyConflict, UnknownTenant, SealError, StoreError,
+        StoreUnavailable
         """
 
         def work(connection: Connection) -> D | LockedOut | Replayed:
@@ -212,6 +222,8 @@ class Attempts:
             refusal = self._record(
                 connection, asked, decided.accepted, attempt.template_id, nonce, decided.level, by
             )
+            if refusal is None and (answered := kept(decided)) is not None:
+                self._idempotency.finish(connection, *answered)
             return decided if refusal is None else refusal
 
         outcome = self._context.write(work, lock=subject_lock(tenant, subject_id))
@@ -297,14 +309,8 @@ class Attempts:
             "earlier_contract_id": None if contract_ids is None else contract_ids[-1],
             "key_prefix": None if nonce is None else nonce.key_prefix,
             "nonce_hash": None if nonce is None else nonce.hash,
-            "nonce_digest": None if nonce is None else self._digest(nonce),
+            "nonce_digest": None if nonce is None else self._nonces.digest(nonce),
         }
-
-    def _digest(self, nonce: Nonce) -> str:
-        """What the audit log keeps of a nonce."""
-        message = encode_parts("nonce", nonce.key_prefix, nonce.hash)
-        row_key = self._context.audit_log.row_key()
-        return hmac.new(row_key, message, hashlib.sha256).hexdigest()
 
     def _before(self, connection: Connection, asked: dict[str, Any]) -> Any:
         """Row of :func:`before`, where nothing refuses the attempt."""
@@ -352,7 +358,8 @@ class Attempts:
         refusal: LockedOut | Replayed | None = None
         new_status: AttemptsStatus | None = None
         try:
-            _use(connection, nonce, row)
+            if nonce is not None:
+                spend(connection, nonce, key_id=row.api_key_id, used=row.used)
             self._standing.refuse_locked(status)
             of_contract = contract_ids[0] is None or row.contract_id in contract_ids
             if (row.template_id if of_contract else None) != template_id:
@@ -406,18 +413,3 @@ def _one(connection: Connection, query: Callable[[int], Any], asked: dict[str, A
     if row is None:
         raise UnknownTenant.named(asked["tenant"])
     return row
-
-
-def _use(connection: Connection, nonce: Nonce | None, row: Any) -> None:
-    if nonce is None:
-        return
-    if row.api_key_id is None:
-        raise StoreError("there is no API key of this prefix")
-    if row.used or not insert_once(
-        connection,
-        UsedNonceRow,
-        api_key_id=row.api_key_id,
-        nonce_hash=nonce.hash,
-        expires_at=nonce.expires_at,
-    ):
-        raise Replayed

@@ -97,7 +97,7 @@ class LockedOut(StoreError):
 
 
 class Replayed(StoreError):
-    """A signed probe, or an answer to a challenge, that was seen before.
+    """A signed probe, an answer to a challenge, or a token, that was seen before.
 
     Attributes
     ----------
@@ -110,8 +110,8 @@ class Replayed(StoreError):
     def __init__(
         self,
         message: str = (
-            "this probe was seen before: sign each probe with a nonce of its own, or ask for "
-            "another challenge"
+            "this was seen before: sign each probe with a nonce of its own, and ask for another "
+            "challenge or token"
         ),
         *,
         recorded: bool = False,
@@ -122,9 +122,9 @@ class Replayed(StoreError):
 
 @dataclass(frozen=True)
 class Nonce:
-    """The nonce of a signed probe or a challenge; kept until its time alone would refuse it.
+    """The nonce of a signed probe, a challenge or a token; kept until its time alone refuses it.
 
-    `key_prefix` is of the key that the probe is signed with, or that asked for the challenge.
+    `key_prefix` is of the key that the probe is signed with, or that asked for the others.
     """
 
     key_prefix: str

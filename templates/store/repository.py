@@ -17,6 +17,7 @@ from templates.store.idempotency import Idempotency
 from templates.store.identifiers import Clock, utc_now
 from templates.store.known_calibrations import KnownCalibrations
 from templates.store.lockout import LockoutPolicy
+from templates.store.nonces import Nonces
 from templates.store.record_check import RecordProblem, check_records
 from templates.store.renewal import Renewal
 from templates.store.rerotation import Rerotation
@@ -72,8 +73,9 @@ class TemplateStore:
         self.outbox = context.outbox
         self.tenants = Tenants(context)
         self.api_keys = ApiKeys(context, self.tenants)
-        self.subjects = Subjects(context)
-        self.attempts = Attempts(context, lockout)
+        self.nonces = Nonces(context)
+        self.subjects = Subjects(context, self.nonces)
+        self.attempts = Attempts(context, self.nonces, lockout)
         self.erasures = Erasures(context)
         self.retention = RetentionJob(context, self.erasures)
         self.transfers = Transfers(context)

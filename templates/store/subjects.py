@@ -23,6 +23,8 @@ from templates.store.identifiers import (
     checked_subject_id,
     checked_subject_prefix,
 )
+from templates.store.lockout import Nonce
+from templates.store.nonces import Nonces
 from templates.store.outbox import EventType
 from templates.store.schema import FailedAttemptsRow, SubjectRow, TemplateRow, TenantRow
 from templates.store.subject_rows import (
@@ -129,9 +131,10 @@ class SubjectPage:
 class Subjects:
     """Repository of subjects."""
 
-    def __init__(self, context: StoreContext) -> None:
+    def __init__(self, context: StoreContext, nonces: Nonces) -> None:
         self._context = context
         self._idempotency = Idempotency(context)
+        self._nonces = nonces
 
     def put(
         self,
@@ -152,6 +155,7 @@ class Subjects:
         precondition: Precondition | None = None,
         once: Once | None = None,
         guard: Guard | None = None,
+        nonce: Nonce | None = None,
         by: By = PROGRAM,
     ) -> StoredTemplate:
         """Store a template, or replace the one there is, in one transaction.
@@ -182,6 +186,8 @@ class Subjects:
             Called in the transaction with its connection and the subject's pseudonyms, before
             anything is written. What it raises takes the enrollment back; what it returns goes
             into the audit log before the enrollment's own line.
+        nonce
+            Of the token that allows the enrollment, which uses it up; None where none is needed.
         by
             Who enrolls, for the audit log.
 
@@ -192,6 +198,8 @@ class Subjects:
             If the subject does not meet the precondition.
         IdempotencyConflict
             If another run of the same request has taken over.
+        Replayed
+            If the nonce was used before.
 
         Notes
         -----
@@ -224,6 +232,7 @@ class Subjects:
                 written = None if once is None else once.claim.written
                 if enrolled not in {precondition.template_id, written or precondition.template_id}:
                     raise EnrollmentConflict(enrolled)
+            nonce_digest = None if nonce is None else self._nonces.use(connection, nonce)
             guard_entry = None if guard is None else guard(connection, pseudonyms)
             now = context.clock()
             is_new, subject_pk = enrolled_pk is None, enrolled_pk or uuid.uuid4().hex
@@ -255,7 +264,9 @@ class Subjects:
                 context.audit_log.append(connection, guard_entry)
             outcome = "created" if is_new else "replaced"
             detail = storage.value if is_held else None
-            entry = Entry("enroll", outcome, by, tenant, pseudonym, detail=detail)
+            entry = Entry(
+                "enroll", outcome, by, tenant, pseudonym, detail=detail, nonce=nonce_digest
+            )
             context.audit_log.append(connection, entry)
             context.outbox.add(
                 connection,

@@ -13,7 +13,7 @@ import numpy as np
 from anyio.from_thread import BlockingPortal, start_blocking_portal
 from fastapi import FastAPI
 
-from templates.keys.api_token import is_token
+from templates.keys.api_token import SUBJECT_TOKEN, is_token
 from templates.keys.probe_signature import sign_probe
 
 # A service begins by looking through its process for garbage. In one that holds all the tests, this
@@ -28,7 +28,9 @@ def signed(path: str, authorization: str, options: dict[str, Any]) -> dict[str, 
     body = options.get("json")
     if body is None and isinstance(options.get("content"), str):
         body = json.loads(options["content"])
-    if verifies is None or not is_token(token) or not isinstance(body, dict) or "hmac" in body:
+    if verifies is None or not isinstance(body, dict) or "hmac" in body:
+        return options
+    if not (is_token(token) or SUBJECT_TOKEN.fullmatch(token)):
         return options
     probe = _probe_of(body)
     if probe is None:

@@ -6,7 +6,8 @@ from fastapi import APIRouter, Query, Request
 from starlette.responses import Response
 
 from api.http.answers import answer
-from api.http.deps import Administers, GateDep, RuntimeDep, note_subject
+from api.http.auth import note_subject
+from api.http.deps import Administers, GateDep, RuntimeDep
 from api.http.openapi import EVERY_CALL, error_responses
 from api.http.schemas import AuditLogAnswer
 from api.http.values import iso_time

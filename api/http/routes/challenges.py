@@ -19,7 +19,7 @@ router = APIRouter(prefix="/v1/challenges", tags=["subjects"])
 @router.post(
     "",
     response_model=ChallengeAnswer,
-    responses=error_responses(*EVERY_CALL, *BODY, "forbidden", "not_found"),
+    responses=error_responses(*EVERY_CALL, *BODY, "forbidden", "not_found", "replayed"),
     openapi_extra=CHALLENGE_BODY,
     summary="Ask for a challenge of head movements",
 )
@@ -30,6 +30,9 @@ async def create_challenge(
 
     The frames of a person who makes the movements in this order go to the verification as
     `images`, with the `challenge_id`. It answers alike whether the subject is enrolled or not.
+
+    With a token it is for the token's subject, and answered with the same token; it does not use
+    the token up.
     """
     async with gate.admitted(caller.prefix):
         body = await sent_json(request, runtime.settings)
@@ -37,9 +40,17 @@ async def create_challenge(
     subject = text_field(body.get("subject_id"), "subject_id", max_length=128)
     if subject is not None:
         checked_subject_id(subject)
+    token = caller.subject_token
+    if token is not None:
+        token.require_subject(subject)
+        subject = token.subject
     runtime.liveness.require_challenges()
     challenge_id, challenge = new_challenge(
-        runtime.keyring, tenant=caller.tenant, key_prefix=caller.prefix, subject=subject
+        runtime.keyring,
+        tenant=caller.tenant,
+        key_prefix=caller.prefix,
+        subject=subject,
+        token_nonce=None if token is None else token.nonce,
     )
     return answer(
         request,

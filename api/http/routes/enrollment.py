@@ -28,7 +28,7 @@ from api.http.deps import (
 )
 from api.http.errors import ApiError
 from api.http.holder_keys import FIELD, HolderKeyHeaderDep, digest, holder_key_of
-from api.http.idempotency import Outcome, kept_with, once
+from api.http.idempotency import Outcome, kept_with, once, written
 from api.http.openapi import BODY, ENROLLMENT_BODY, EVERY_CALL, IDEMPOTENT, PHOTO, error_responses
 from api.http.preconditions import PreconditionDep, asked
 from api.http.schemas import EnrollmentAnswer
@@ -40,6 +40,7 @@ from templates.decoys import Attributes
 from templates.keys.holder_key import wipe
 from templates.store.audit_log import By
 from templates.store.idempotency import Claim
+from templates.store.lockout import Nonce
 from templates.store.subject_rows import Source, Storage
 from templates.store.subjects import Precondition, StoredTemplate
 
@@ -52,6 +53,7 @@ CODES = (
     *IDEMPOTENT,
     "too_many_images",
     "forbidden",
+    "replayed",
     "invalid_template",
     "contract_mismatch",
     "enrollment_conflict",
@@ -96,6 +98,8 @@ async def enroll(
     An earlier enrollment is replaced, unless a header says otherwise: `If-None-Match: *` never
     replaces, `If-Match: "template id"` replaces only that template. Otherwise the answer is
     `enrollment_conflict`, with the `template_id` that is enrolled, or null.
+
+    A token for this subject may stand in the place of the API key; the enrollment uses it up.
     """
     settings = runtime.settings
     query = query_of(request, ("face",))
@@ -123,8 +127,9 @@ async def enroll(
         holder_key = holder_key_of(holder_key_header, body)
 
         def work(claim: Claim | None) -> Outcome:
-            epoch = runtime.epoch(caller.tenant)
             try:
+                nonce = _unused_nonce(runtime, caller)
+                epoch = runtime.epoch(caller.tenant)
                 enrollment = runtime.enroller(caller.tenant, epoch).from_template(
                     template, holder=_holder(holder_key, caller, subject)
                 )
@@ -140,10 +145,11 @@ async def enroll(
                 storage,
                 precondition,
                 claim,
+                nonce,
                 by(request),
             )
 
-        return await once(
+        outcome = await once(
             request,
             caller,
             idempotency_key,
@@ -159,6 +165,7 @@ async def enroll(
             work=work,
             run=partial(gate.compute, key=caller.prefix),
         )
+        return written(request, outcome)
 
 
 async def _enroll_photos(
@@ -180,8 +187,9 @@ async def _enroll_photos(
     holder_key = holder_key_of(holder_key_header, form.fields)
 
     def work(claim: Claim | None) -> Outcome:
-        epoch = runtime.epoch(caller.tenant)
         try:
+            nonce = _unused_nonce(runtime, caller)
+            epoch = runtime.epoch(caller.tenant)
             enrollment = runtime.enroller(caller.tenant, epoch).from_photos(
                 pack,
                 photos,
@@ -202,10 +210,11 @@ async def _enroll_photos(
             storage,
             precondition,
             claim,
+            nonce,
             by(request),
         )
 
-    return await once(
+    outcome = await once(
         request,
         caller,
         idempotency_key,
@@ -224,6 +233,7 @@ async def _enroll_photos(
         work=work,
         run=partial(request.app.state.gate.compute, key=caller.prefix),
     )
+    return written(request, outcome)
 
 
 def parse_attributes(text: str | None) -> Attributes:
@@ -260,6 +270,22 @@ def _holder(key: bytearray | None, caller: Caller, subject: str) -> Holder | Non
     return None if key is None else Holder(key, caller.tenant, subject)
 
 
+def _unused_nonce(runtime: Runtime, caller: Caller) -> Nonce | None:
+    """Return what the enrollment uses up; None where it came with an API key.
+
+    Raises
+    ------
+    Replayed
+        Where the token was used: before anything is decoded, and after a repeated request had its
+        answer.
+    """
+    if caller.subject_token is None:
+        return None
+    nonce = caller.subject_token.nonce
+    runtime.store.nonces.require_unused(nonce)
+    return nonce
+
+
 def _named(storage: Storage) -> list[str]:
     """What a request asks for beside the default: records of earlier versions name nothing."""
     return [] if storage is Storage.SERVICE else [storage.value]
@@ -279,6 +305,7 @@ def _stored(
     storage: Storage,
     precondition: Precondition | None,
     claim: Claim | None,
+    nonce: Nonce | None,
     who: By,
 ) -> Outcome:
     def outcome(stored: StoredTemplate) -> Outcome:
@@ -311,6 +338,7 @@ def _stored(
             storage=storage,
             precondition=precondition,
             once=kept_with(claim, outcome),
+            nonce=nonce,
             by=who,
         )
     )

@@ -39,6 +39,9 @@ HEADERS = {
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Resource-Policy": "same-origin",
 }
+WITH_GRAPHS = HEADERS["Content-Security-Policy"].replace(
+    "script-src 'self'", "script-src 'self' 'wasm-unsafe-eval'"
+)
 DEMO_MARK = ('data-demo="no"', 'data-demo="yes"')
 
 FIRST_STRANGER = 101
@@ -65,6 +68,9 @@ class Served:
     def answer(self, request: Request) -> Response:
         """Return the file, or that the browser's copy is still the same."""
         headers = {**HEADERS, "ETag": self.etag}
+        if request.app.state.settings.serve_pack:
+            # The page runs the graphs, and a runtime of theirs is WebAssembly.
+            headers["Content-Security-Policy"] = WITH_GRAPHS
         tags = request.headers.get("if-none-match", "").split(",")
         copies = {tag.strip().removeprefix("W/") for tag in tags}
         if copies & {self.etag, "*"}:

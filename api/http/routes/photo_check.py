@@ -1,14 +1,13 @@
 """Would this photo do? The detector and the limits of enrollment, and nothing after them."""
 
-from typing import Annotated, Any
+from typing import Any
 
-from fastapi import APIRouter, Depends, Request
+from fastapi import APIRouter, Request
 from starlette.responses import Response
 
 from api.http.answers import answer
-from api.http.auth import Caller, CallerDep
 from api.http.bodies import content_type, reject_unknown, sent_form
-from api.http.deps import GateDep, RuntimeDep, query_of
+from api.http.deps import EnrollsOrVerifies, GateDep, RuntimeDep, query_of
 from api.http.errors import ApiError, plain_details
 from api.http.openapi import BODY, CHECK_BODY, CHECKED_PHOTO, EVERY_CALL, error_responses
 from api.http.schemas import PhotoCheckAnswer
@@ -19,26 +18,6 @@ from models.errors import FaceError
 router = APIRouter(prefix="/v1/photos", tags=["photos"])
 
 
-async def sending_photos(caller: CallerDep) -> Caller:
-    """Demand one of the rights to send a photo.
-
-    Raises
-    ------
-    ApiError
-        ``forbidden``.
-    """
-    if not caller.rights & {"enroll", "verify"}:
-        raise ApiError(
-            "forbidden",
-            "this API key lacks the rights enroll and verify, and one of them is needed",
-            {"missing": ["enroll", "verify"]},
-        )
-    return caller
-
-
-SendsPhotos = Annotated[Caller, Depends(sending_photos)]
-
-
 @router.post(
     "/check",
     response_model=PhotoCheckAnswer,
@@ -47,7 +26,7 @@ SendsPhotos = Annotated[Caller, Depends(sending_photos)]
     summary="Would this photo do?",
 )
 async def check_photo(
-    request: Request, caller: SendsPhotos, runtime: RuntimeDep, gate: GateDep
+    request: Request, caller: EnrollsOrVerifies, runtime: RuntimeDep, gate: GateDep
 ) -> Response:
     """Right: `enroll` or `verify`. For guidance before a camera: finds the face, measures it.
 

@@ -8,10 +8,11 @@ from starlette.responses import Response
 
 from api.http.answers import answer
 from api.http.audit import by
+from api.http.auth import note_subject
 from api.http.bodies import base64_field, reject_unknown, sent_json
-from api.http.deps import Exports, GateDep, IdempotencyDep, RuntimeDep, SubjectDep, note_subject
+from api.http.deps import Exports, GateDep, IdempotencyDep, RuntimeDep, SubjectDep
 from api.http.errors import ApiError
-from api.http.idempotency import Outcome, kept_with, once
+from api.http.idempotency import Outcome, kept_with, once, written
 from api.http.openapi import BODY, EVERY_CALL, IDEMPOTENT, IMPORT_BODY, error_responses
 from api.http.preconditions import PreconditionDep, asked
 from api.http.schemas import ExportAnswer, ImportAnswer
@@ -164,7 +165,7 @@ async def import_subject(
             )
             return outcome(stored)
 
-        return await once(
+        imported = await once(
             request,
             caller,
             idempotency_key,
@@ -173,5 +174,5 @@ async def import_subject(
             subject=exported.subject_id,
             work=work,
             run=partial(gate.compute, key=caller.prefix),
-            add={"subject_id": exported.subject_id},
         )
+        return written(request, imported, add={"subject_id": exported.subject_id})

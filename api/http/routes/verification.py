@@ -11,82 +11,47 @@ no more are answered than of requests that come one after the other.
 
 import contextlib
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
-import numpy as np
 from fastapi import APIRouter, Request
-from numpy.typing import NDArray
 from starlette.responses import Response
 
 from api.http.answers import answer
 from api.http.audit import by
 from api.http.auth import Caller
-from api.http.bodies import (
-    base64_field,
-    content_type,
-    reject_unknown,
-    sent_form,
-    sent_json,
-    text_field,
-)
-from api.http.challenges import FIELD as CHALLENGE
-from api.http.challenges import MAX_ID, opened_challenge
-from api.http.deps import GateDep, RuntimeDep, SubjectDep, Verifies, query_of
+from api.http.deps import GateDep, IdempotencyDep, RuntimeDep, SubjectDep, Verifies, query_of
 from api.http.errors import ApiError
-from api.http.holder_keys import FIELD, HolderKeyHeaderDep, holder_key_of
-from api.http.openapi import BODY, EVERY_CALL, PHOTO, VERIFY_BODY, error_responses
+from api.http.holder_keys import HolderKeyHeaderDep, digest
+from api.http.idempotency import Outcome, once, replay_header
+from api.http.openapi import BODY, EVERY_CALL, IDEMPOTENT, PHOTO, VERIFY_BODY, error_responses
+from api.http.probes import Probe, sent_probe
 from api.http.schemas import VerifyAnswer
-from api.http.signatures import FIELDS as SIGNATURE_FIELDS
-from api.http.signatures import checked_nonce
-from api.http.values import (
-    embedding_of,
-    embeddings_of,
-    face_policy,
-    held_template_of,
-    one_of,
-)
 from api.process.metrics import count_decision, step
 from api.process.runtime import Runtime
-from api.settings import Settings
 from templates.errors import ContractMismatch
 from templates.keys.holder_key import wipe
 from templates.store.attempts import Attempt
 from templates.store.audit_log import By
-from templates.store.lockout import Nonce, Superseded
+from templates.store.idempotency import Answer, Claim
+from templates.store.lockout import Superseded
 from templates.store.tenants import RetiredRotation
 from verify import (
-    MAX_FRAMES,
-    MAX_PROBE_PHOTOS,
-    MIN_FRAMES,
     Decision,
     OpenedTemplate,
-    PhotoProbe,
     StandIn,
     Verifier,
 )
 
 router = APIRouter(prefix="/v1/subjects", tags=["subjects"])
 
+Kept = Callable[[Decision], tuple[Claim, Answer] | None]
+"""What the store keeps of a decision under an idempotency key; None without one."""
+
 DECISIONS = 3
 """Times that a probe is decided while others may replace the template before the record; then they
 must wait for it."""
-
-
-PROBES = ("embedding", "embeddings", "template")
-"""Fields that hold a probe that is not a photo."""
-
-
-@dataclass(frozen=True)
-class Probe:
-    """What is compared, how, with whose template, and what keeps it from a second use."""
-
-    kind: Literal["photo", "frames", "embedding", "template"]
-    compare: Callable[[Verifier, OpenedTemplate], Decision]
-    held_template: bytes | None = field(repr=False)
-    nonce: Nonce | None
-    holder_key: bytearray | None = field(repr=False)
 
 
 CODES = (
@@ -102,6 +67,7 @@ CODES = (
     "uncalibrated",
     "replayed",
     "locked_out",
+    *IDEMPOTENT,
 )
 
 
@@ -120,6 +86,7 @@ async def verify(
     runtime: RuntimeDep,
     gate: GateDep,
     holder_key_header: HolderKeyHeaderDep,
+    idempotency_key: IdempotencyDep,
 ) -> Response:
     """Rights: `verify`, and `embeddings` for a probe that is not a photo.
 
@@ -144,31 +111,51 @@ async def verify(
     Where the subject's holder keeps the template, it comes with the probe as `held_template`. One
     that is missing, altered, replaced or another subject's is a rejection; where the service
     stores the template, it changes nothing.
+
+    A token for this subject may stand in the place of the API key; the decision uses it up. With
+    a token an `Idempotency-Key` is taken: the same request gets the same answer once more.
     """
     query = query_of(request, ("level", "face"))
     async with gate.admitted(caller.prefix):
         with step("body"):
-            if content_type(request) == "multipart/form-data":
-                probe = await _photo_probe(
-                    request, runtime, caller, subject, query, holder_key_header
-                )
-            else:
-                probe = await _sent_probe(
-                    request, runtime, caller, subject, query, holder_key_header
-                )
-        decision = await gate.compute(
-            partial(_decide_and_wipe, runtime, caller, subject, probe, by(request)),
-            key=caller.prefix,
+            probe = await sent_probe(request, runtime, caller, subject, query, holder_key_header)
+
+        def work(claim: Claim | None) -> Outcome:
+            def kept(decision: Decision) -> tuple[Claim, Answer] | None:
+                if claim is None:
+                    return None
+                return claim, Outcome(200, _body(decision, caller)).to_keep()
+
+            decision = _decide_and_wipe(runtime, caller, subject, probe, kept, by(request))
+            return Outcome(200, _body(decision, caller))
+
+        outcome = await once(
+            request,
+            caller,
+            # A browser that lost its answer has no other token. An answer to an API key may hold
+            # a distance, which is not kept.
+            None if caller.subject_token is None else idempotency_key,
+            operation="verify",
+            asked=[subject, *probe.asked, *digest(probe.holder_key)],
+            subject=subject,
+            work=work,
+            run=partial(gate.compute, key=caller.prefix),
         )
-    request.state.log["security_level"] = decision.level
-    request.state.log["decision"] = "accept" if decision.accepted else "reject"
-    request.state.log["liveness"] = decision.liveness
-    count_decision(
-        accepted=decision.accepted,
-        reason=decision.reason,
-        level=decision.level,
-        probe=probe.kind,
-    )
+    body = outcome.body
+    request.state.log["security_level"] = body["level"]
+    request.state.log["decision"] = body["decision"]
+    request.state.log["liveness"] = body["liveness"]
+    if not outcome.replayed:
+        count_decision(
+            accepted=body["decision"] == "accept",
+            reason=body["reason"],
+            level=body["level"],
+            probe=probe.kind,
+        )
+    return answer(request, body, headers=replay_header(outcome))
+
+
+def _body(decision: Decision, caller: Caller) -> dict[str, Any]:
     body: dict[str, Any] = {
         "decision": "accept" if decision.accepted else "reject",
         "reason": decision.reason,
@@ -182,161 +169,21 @@ async def verify(
         body["distance"] = decision.distance
         if decision.liveness_failure is not None:
             body["liveness_failure"] = str(decision.liveness_failure)
-    return answer(request, body)
-
-
-async def _photo_probe(
-    request: Request,
-    runtime: Runtime,
-    caller: Caller,
-    subject: str,
-    query: dict[str, str],
-    holder_key_header: str | None,
-) -> Probe:
-    pack = runtime.required_pack()
-    settings = runtime.settings
-    form = await sent_form(request, settings, max_images=MAX_FRAMES)
-    photos = form.images("image", "images")
-    reject_unknown(form.fields, ("level", "face", "held_template", CHALLENGE, FIELD))
-    challenge_id = text_field(form.fields.get(CHALLENGE), CHALLENGE, max_length=MAX_ID)
-    _check_count(len(photos), settings, is_challenge=challenge_id is not None)
-    held_template = held_template_of(form.fields)
-    level = _level(runtime, caller, one_of(form.fields, query, "level"))
-    policy = face_policy(one_of(form.fields, query, "face"))
-    holder_key = holder_key_of(holder_key_header, form.fields)
-
-    liveness = runtime.liveness.require(
-        level, of_key=caller.liveness, photos=True, challenge=challenge_id is not None
-    )
-    challenge = None
-    if challenge_id is not None:
-        challenge = opened_challenge(
-            runtime.keyring, challenge_id, tenant=caller.tenant, subject=subject
-        )
-    embed: Callable[[Verifier], PhotoProbe]
-    if challenge is None:
-
-        def embed(verifier: Verifier) -> PhotoProbe:
-            return verifier.photo_probe(
-                pack, photos, passive=liveness.passive, policy=policy, limits=runtime.image_limits
-            )
-    else:
-
-        def embed(verifier: Verifier) -> PhotoProbe:
-            return verifier.frames_probe(
-                pack,
-                photos,
-                challenge.movements,
-                passive=liveness.passive,
-                policy=policy,
-                limits=runtime.image_limits,
-            )
-
-    probes: list[PhotoProbe] = []
-
-    def compare(verifier: Verifier, stored: OpenedTemplate) -> Decision:
-        if not probes:  # a probe may be decided more than once
-            with step("photo"):
-                probes.append(embed(verifier))
-        (probe,) = probes
-        with step("decide"):
-            decision = verifier.decide_embedding(
-                probe.embedding, stored, holder_key=holder_key, level=level, photos=probe.photos
-            )
-        if challenge is None and not liveness.passive:
-            return decision
-        return decision.with_liveness(probe.failure)
-
-    if challenge is None:
-        return Probe("photo", compare, held_template, nonce=None, holder_key=holder_key)
-    return Probe("frames", compare, held_template, challenge.nonce, holder_key)
-
-
-def _check_count(count: int, settings: Settings, *, is_challenge: bool) -> None:
-    """Refuse more photos than a probe has, or fewer frames than show movements."""
-    most = MAX_FRAMES if is_challenge else min(MAX_PROBE_PHOTOS, settings.max_images)
-    if count > most:
-        raise ApiError("too_many_images", f"at most {most} photos in one request", {"limit": most})
-    if is_challenge and count < MIN_FRAMES:
-        raise ApiError(
-            "validation_failed",
-            f"a challenge is answered by {MIN_FRAMES} to {MAX_FRAMES} frames",
-            {"field": "images"},
-        )
-
-
-async def _sent_probe(
-    request: Request,
-    runtime: Runtime,
-    caller: Caller,
-    subject: str,
-    query: dict[str, str],
-    holder_key_header: str | None,
-) -> Probe:
-    caller.require("embeddings")
-    settings = runtime.settings
-    body = await sent_json(request, settings)
-    reject_unknown(body, (*PROBES, "level", "held_template", FIELD, *SIGNATURE_FIELDS))
-    named = [kind for kind in PROBES if kind in body]
-    if len(named) != 1:
-        raise ApiError(
-            "validation_failed",
-            "send exactly one of embedding, embeddings and template, or photos",
-        )
-    if "face" in query:
-        raise ApiError("validation_failed", "face applies to photos only", {"field": "face"})
-    asked = one_of(body, query, "level")
-    held_template = held_template_of(body)
-    kind, value = named[0], body[named[0]]
-    sent: bytes | NDArray[np.float64]
-    if kind == "template":
-        sent = base64_field(value, "template", code="invalid_template")
-    else:
-        sent = embedding_of(value) if kind == "embedding" else embeddings_of(value)
-    nonce = checked_nonce(
-        body,
-        sent,
-        key=caller.probe_key,
-        key_prefix=caller.prefix,
-        subject_id=subject,
-        level=asked,
-        window_s=settings.probe_window_s,
-    )
-    level = _level(runtime, caller, asked)
-    runtime.liveness.require(level, of_key=caller.liveness, photos=False, challenge=False)
-    holder_key = holder_key_of(holder_key_header, body)
-
-    def compare(verifier: Verifier, stored: OpenedTemplate) -> Decision:
-        with step("decide"):
-            if isinstance(sent, bytes):
-                return verifier.decide_template(sent, stored, holder_key=holder_key, level=level)
-            rows = np.atleast_2d(sent)
-            mean = verifier.average(rows)
-            return verifier.decide_embedding(
-                mean, stored, holder_key=holder_key, level=level, photos=len(rows)
-            )
-
-    return Probe(
-        "template" if kind == "template" else "embedding", compare, held_template, nonce, holder_key
-    )
-
-
-def _level(runtime: Runtime, caller: Caller, asked: str | None) -> str:
-    return runtime.levels.in_force(asked, lowest_of_key=caller.lowest_level)
+    return body
 
 
 def _decide_and_wipe(
-    runtime: Runtime, caller: Caller, subject: str, probe: Probe, who: By
+    runtime: Runtime, caller: Caller, subject: str, probe: Probe, kept: Kept, who: By
 ) -> Decision:
     """Decide, and forget the holder's key: here, because nobody waits for a cancelled thread."""
     try:
-        return _decide_and_record(runtime, caller, subject, probe, who)
+        return _decide_and_record(runtime, caller, subject, probe, kept, who)
     finally:
         wipe(probe.holder_key)
 
 
 def _decide_and_record(
-    runtime: Runtime, caller: Caller, subject: str, probe: Probe, who: By
+    runtime: Runtime, caller: Caller, subject: str, probe: Probe, kept: Kept, who: By
 ) -> Decision:
     """Decide and record; a template that was replaced or erased meanwhile accepts nobody."""
     attempts, contract_ids = runtime.store.attempts, runtime.contract.binding.contract_ids
@@ -367,6 +214,7 @@ def _decide_and_record(
                     contract_ids=contract_ids,
                     level=decision.level,
                     nonce=probe.nonce,
+                    kept=kept(decision),
                     by=who,
                 )
             return decision
@@ -377,6 +225,7 @@ def _decide_and_record(
         contract_ids=contract_ids,
         nonce=probe.nonce,
         held_template=probe.held_template,
+        kept=kept,
         by=who,
     )
 

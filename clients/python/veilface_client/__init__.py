@@ -45,6 +45,8 @@ from veilface_client.results import (
     Receipt,
     Subject,
     SubjectPage,
+    Token,
+    TokenOutcome,
     Unlocked,
 )
 from veilface_client.retries import Retries
@@ -87,6 +89,8 @@ __all__ = [
     "ServiceError",
     "Subject",
     "SubjectPage",
+    "Token",
+    "TokenOutcome",
     "Unauthorized",
     "Unavailable",
     "UnexpectedAnswer",

@@ -11,7 +11,7 @@ from typing import Self, TypeVar
 import httpx
 
 from veilface_client import calls, flows, private_flows, results
-from veilface_client.calls import Call, Face, Storage
+from veilface_client.calls import Action, Call, Face, Storage
 from veilface_client.connection import DEFAULT_TIMEOUT, options, signing_token
 from veilface_client.errors import UnexpectedAnswer
 from veilface_client.flows import Flow, Send, Wait, Work
@@ -114,6 +114,23 @@ class AsyncSession:
     ) -> results.Imported:
         """Import what :meth:`export` returned."""
         return await self._send(calls.import_(exported, restore=restore, key=idempotency_key))
+
+    async def create_token(
+        self,
+        subject: str,
+        action: Action,
+        *,
+        level: str | None = None,
+        lifetime_s: int | None = None,
+    ) -> results.Token:
+        """Ask for a token for a browser. Right: ``verify`` or ``enroll``, as the action."""
+        return await self._send(
+            calls.create_token(subject, action, level=level, lifetime_s=lifetime_s)
+        )
+
+    async def token_outcome(self, subject: str, token_id: str) -> results.TokenOutcome:
+        """Ask what came of a token that this key asked for: never believe the page."""
+        return await self._send(calls.token_outcome(subject, token_id))
 
     async def ready(self) -> results.Health:
         """Ask once whether the service can answer."""

@@ -23,6 +23,7 @@ from veilface_client.signature import signed_probe
 T = TypeVar("T")
 Face = Literal["single", "largest"]
 Storage = Literal["service", "holder"]
+Action = Literal["verify", "enroll"]
 
 _SUBJECT = re.compile(r"[A-Za-z0-9._@:-]{1,128}")
 _KEY = re.compile(r"[\x21-\x7e]{1,255}")
@@ -193,6 +194,33 @@ def challenge(subject: str | None) -> Call[results.Challenge]:
         "/v1/challenges",
         lambda answer: parse(results.Challenge, answer),
         lambda: {"json": body},
+    )
+
+
+def create_token(
+    subject: str, action: Action, *, level: str | None, lifetime_s: int | None
+) -> Call[results.Token]:
+    """Ask for a token for a browser; one that is lost harms nobody."""
+    subject_path(subject)
+    body: dict[str, Any] = {"subject_id": subject, "action": action, **_fields(level=level)}
+    if lifetime_s is not None:
+        body["lifetime_s"] = lifetime_s
+    return Call(
+        "POST",
+        "/v1/tokens",
+        lambda answer: parse(results.Token, answer),
+        lambda: {"json": body},
+    )
+
+
+def token_outcome(subject: str, token_id: str) -> Call[results.TokenOutcome]:
+    """What came of a token."""
+    if not _TEMPLATE_ID.fullmatch(token_id):
+        raise ValueError("a token_id has 1 to 64 characters out of A-Z a-z 0-9 _ -")
+    return Call(
+        "GET",
+        subject_path(subject, f"/tokens/{token_id}"),
+        lambda answer: parse(results.TokenOutcome, answer),
     )
 
 

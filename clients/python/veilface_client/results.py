@@ -98,6 +98,37 @@ class Challenge(Answer):
     expires_at: str
 
 
+class Token(Answer):
+    """A token for one call of one subject, which a browser may hold.
+
+    ``token`` is for the page; ``token_id`` stays on your server, to ask what came of it.
+    """
+
+    token: str = Field(repr=False)
+    token_id: str
+    subject_id: str
+    action: str
+    level: str | None
+    expires_at: AwareDatetime
+
+
+class TokenOutcome(Answer):
+    """What a token was used for; true if and only if it accepted the subject.
+
+    ``outcome`` is ``accept``, ``reject``, ``locked_out``, ``created`` or ``replaced``, and None
+    where the token was not used.
+    """
+
+    token_id: str
+    used: bool
+    outcome: str | None
+    level: str | None
+    used_at: AwareDatetime | None
+
+    def __bool__(self) -> bool:
+        return self.outcome == "accept"
+
+
 class Subject(Value):
     """A subject, without its template."""
 

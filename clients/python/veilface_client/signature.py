@@ -9,6 +9,7 @@ import time
 from typing import Any
 
 TOKEN = re.compile(r"vf_[0-9a-f]{12}_([0-9a-f]{64})")
+SUBJECT_TOKEN = re.compile(r"vft_[0-9a-f]{12}_[A-Za-z0-9_-]{128,768}")
 
 _INFO = b"veilface/1/probe-key"
 
@@ -20,13 +21,10 @@ def signed_probe(
 
     Notes
     -----
-    The key is HKDF-SHA256 (RFC 5869) of the secret part of the API key, without salt; one block of
-    output is all 32 bytes of it.
+    The key is HKDF-SHA256 (RFC 5869) of the secret part of the API key, or of the whole text of a
+    token for a browser, without salt; one block of output is all 32 bytes of it.
     """
-    match = TOKEN.fullmatch(token)
-    if match is None:
-        raise ValueError("only an API key of the service signs probes")
-    extracted = hmac.digest(bytes(32), bytes.fromhex(match[1]), "sha256")
+    extracted = hmac.digest(bytes(32), _secret_of(token), "sha256")
     key = hmac.digest(extracted, _INFO + b"\x01", "sha256")
     nonce, timestamp = secrets.token_urlsafe(18), int(time.time())
     lines = (
@@ -45,3 +43,17 @@ def signed_probe(
         "hmac": hmac.digest(key, "\n".join(lines).encode(), "sha256").hex(),
     }
     return body if level is None else {**body, "level": level}
+
+
+def signs(token: str) -> bool:
+    """Whether probes can be signed with it: an API key, or a token for a browser."""
+    return bool(TOKEN.fullmatch(token) or SUBJECT_TOKEN.fullmatch(token))
+
+
+def _secret_of(token: str) -> bytes:
+    match = TOKEN.fullmatch(token)
+    if match is not None:
+        return bytes.fromhex(match[1])
+    if SUBJECT_TOKEN.fullmatch(token) is None:
+        raise ValueError("only an API key or a token of the service signs probes")
+    return token.encode("ascii")

@@ -375,6 +375,35 @@ def test_of_many_sendings_at_once_one_is_answered(active: Service) -> None:
     assert liveness(accepted) == PASSED
 
 
+def test_a_challenge_of_a_token_and_the_token_are_used_up_together(active: Service) -> None:
+    client, _ = active
+
+    def token() -> dict[str, str]:
+        body = {"subject_id": "anna", "action": "verify"}
+        return bearer(client.post("/v1/tokens", json=body).json()["token"])
+
+    def attempt(asked: dict[str, Any], headers: dict[str, str]) -> httpx.Response:
+        frames = frames_of(performed(asked["movements"]))
+        return answered(client, asked["challenge_id"], frames, headers=headers)
+
+    mine, others = token(), token()
+    first, second = challenge(client, headers=mine), challenge(client, "anna", headers=mine)
+    refused = client.post("/v1/challenges", json={"subject_id": "ben"}, headers=mine)
+    assert assert_error(refused, 403, "forbidden") == {"token": "subject"}
+    # Photos alone, a challenge of the API key's, and one of another token's.
+    alone = client.post("/v1/subjects/anna/verify", files=images(frame()), headers=mine)
+    assert assert_error(alone, 403, "forbidden")["liveness"] == "active"
+    for asked in (challenge(client), challenge(client, headers=others)):
+        assert_error(attempt(asked, mine), 422, "validation_failed")
+    assert liveness(attempt(first, mine)) == PASSED
+    for asked, headers in ((first, mine), (second, mine), (second, {})):
+        assert_error(attempt(asked, headers), 401, "replayed")
+    # With an API key, as a server may whose page asked: that is the token's one attempt.
+    asked = challenge(client, headers=others)
+    assert liveness(attempt(asked, {})) == PASSED
+    assert_error(attempt(asked, others), 401, "replayed")
+
+
 def test_failures_of_a_challenge_lock_after_five(tmp_path: Any) -> None:
     for client, _ in serve(tmp_path, liveness="active", lockout_after=None, lockout_first_s=3600):
         still = frames_of(["front"] * 5)

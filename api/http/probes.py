@@ -1,0 +1,256 @@
+"""Probes as requests bring them: photos, frames, embeddings or a lifted template, read and checked.
+
+Nothing is decoded or compared here: what a :class:`Probe` has is done later, in a compute slot.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from fastapi import Request
+from numpy.typing import NDArray
+
+from api.http.auth import Caller
+from api.http.bodies import (
+    base64_field,
+    content_type,
+    reject_unknown,
+    sent_form,
+    sent_json,
+    text_field,
+)
+from api.http.challenges import FIELD as CHALLENGE
+from api.http.challenges import MAX_ID, Challenge, opened_challenge
+from api.http.errors import ApiError
+from api.http.holder_keys import FIELD, holder_key_of
+from api.http.signatures import FIELDS as SIGNATURE_FIELDS
+from api.http.signatures import checked_signature, nonce_in_time
+from api.http.values import (
+    embedding_of,
+    embeddings_of,
+    face_policy,
+    held_template_of,
+    one_of,
+)
+from api.process.metrics import step
+from api.process.runtime import Runtime
+from api.settings import Settings
+from templates.store.lockout import Nonce
+from verify import (
+    MAX_FRAMES,
+    MAX_PROBE_PHOTOS,
+    MIN_FRAMES,
+    Decision,
+    OpenedTemplate,
+    PhotoProbe,
+    Verifier,
+)
+
+PROBES = ("embedding", "embeddings", "template")
+"""Fields that hold a probe that is not a photo."""
+
+
+@dataclass(frozen=True)
+class Probe:
+    """What is compared, how, with whose template, and what keeps it from a second use.
+
+    `asked` is what tells the request from another one, but for the holder's key.
+    """
+
+    kind: Literal["photo", "frames", "embedding", "template"]
+    compare: Callable[[Verifier, OpenedTemplate], Decision]
+    held_template: bytes | None = field(repr=False)
+    nonce: Nonce | None
+    holder_key: bytearray | None = field(repr=False)
+    asked: tuple[str | bytes, ...] = field(repr=False)
+
+
+async def sent_probe(
+    request: Request,
+    runtime: Runtime,
+    caller: Caller,
+    subject: str,
+    query: dict[str, str],
+    holder_key_header: str | None,
+) -> Probe:
+    """Read the probe of a request; `query` has no names but ``level`` and ``face``.
+
+    Raises
+    ------
+    ApiError, VeilfaceError
+        Whatever is wrong with it, or forbids it, that can be told without decoding anything.
+    """
+    read = _photos if content_type(request) == "multipart/form-data" else _signed
+    return await read(request, runtime, caller, subject, query, holder_key_header)
+
+
+async def _photos(
+    request: Request,
+    runtime: Runtime,
+    caller: Caller,
+    subject: str,
+    query: dict[str, str],
+    holder_key_header: str | None,
+) -> Probe:
+    pack = runtime.required_pack()
+    settings = runtime.settings
+    form = await sent_form(request, settings, max_images=MAX_FRAMES)
+    photos = form.images("image", "images")
+    reject_unknown(form.fields, ("level", "face", "held_template", CHALLENGE, FIELD))
+    challenge_id = text_field(form.fields.get(CHALLENGE), CHALLENGE, max_length=MAX_ID)
+    _check_count(len(photos), settings, is_challenge=challenge_id is not None)
+    held_template = held_template_of(form.fields)
+    level = _level(runtime, caller, one_of(form.fields, query, "level"))
+    policy = face_policy(one_of(form.fields, query, "face"))
+    holder_key = holder_key_of(holder_key_header, form.fields)
+
+    liveness = runtime.liveness.require(
+        level, of_key=caller.liveness, photos=True, challenge=challenge_id is not None
+    )
+    challenge = None
+    if challenge_id is not None:
+        challenge = opened_challenge(
+            runtime.keyring, challenge_id, tenant=caller.tenant, subject=subject
+        )
+    nonce = _nonce(caller, challenge)
+    embed: Callable[[Verifier], PhotoProbe]
+    if challenge is None:
+
+        def embed(verifier: Verifier) -> PhotoProbe:
+            return verifier.photo_probe(
+                pack, photos, passive=liveness.passive, policy=policy, limits=runtime.image_limits
+            )
+    else:
+
+        def embed(verifier: Verifier) -> PhotoProbe:
+            return verifier.frames_probe(
+                pack,
+                photos,
+                challenge.movements,
+                passive=liveness.passive,
+                policy=policy,
+                limits=runtime.image_limits,
+            )
+
+    probes: list[PhotoProbe] = []
+
+    def compare(verifier: Verifier, stored: OpenedTemplate) -> Decision:
+        if not probes:  # a probe may be decided more than once
+            with step("photo"):
+                probes.append(embed(verifier))
+        (probe,) = probes
+        with step("decide"):
+            decision = verifier.decide_embedding(
+                probe.embedding, stored, holder_key=holder_key, level=level, photos=probe.photos
+            )
+        if challenge is None and not liveness.passive:
+            return decision
+        return decision.with_liveness(probe.failure)
+
+    return Probe(
+        "photo" if challenge is None else "frames",
+        compare,
+        held_template,
+        nonce,
+        holder_key,
+        asked=(level, str(policy), challenge_id or "", held_template or b"", *photos),
+    )
+
+
+def _nonce(caller: Caller, challenge: Challenge | None) -> Nonce | None:
+    """Return what a decision on photos uses up.
+
+    Raises
+    ------
+    ApiError
+        ``validation_failed`` where a token comes with a challenge that was not asked for with it.
+    """
+    token = caller.subject_token
+    if token is None:
+        return None if challenge is None else challenge.nonce
+    if challenge is not None and challenge.nonce.value != token.nonce.value:
+        raise ApiError(
+            "validation_failed",
+            "this challenge was not asked for with this token: ask for one with it",
+            {"field": CHALLENGE},
+        )
+    return token.nonce
+
+
+def _check_count(count: int, settings: Settings, *, is_challenge: bool) -> None:
+    """Refuse more photos than a probe has, or fewer frames than show movements."""
+    most = MAX_FRAMES if is_challenge else min(MAX_PROBE_PHOTOS, settings.max_images)
+    if count > most:
+        raise ApiError("too_many_images", f"at most {most} photos in one request", {"limit": most})
+    if is_challenge and count < MIN_FRAMES:
+        raise ApiError(
+            "validation_failed",
+            f"a challenge is answered by {MIN_FRAMES} to {MAX_FRAMES} frames",
+            {"field": "images"},
+        )
+
+
+async def _signed(
+    request: Request,
+    runtime: Runtime,
+    caller: Caller,
+    subject: str,
+    query: dict[str, str],
+    holder_key_header: str | None,
+) -> Probe:
+    caller.require("embeddings")
+    settings = runtime.settings
+    body = await sent_json(request, settings)
+    reject_unknown(body, (*PROBES, "level", "held_template", FIELD, *SIGNATURE_FIELDS))
+    named = [kind for kind in PROBES if kind in body]
+    if len(named) != 1:
+        raise ApiError(
+            "validation_failed",
+            "send exactly one of embedding, embeddings and template, or photos",
+        )
+    if "face" in query:
+        raise ApiError("validation_failed", "face applies to photos only", {"field": "face"})
+    asked = one_of(body, query, "level")
+    held_template = held_template_of(body)
+    kind, value = named[0], body[named[0]]
+    sent: bytes | NDArray[np.float64]
+    if kind == "template":
+        sent = base64_field(value, "template", code="invalid_template")
+    else:
+        sent = embedding_of(value) if kind == "embedding" else embeddings_of(value)
+    signed = checked_signature(body, sent, key=caller.probe_key, subject_id=subject, level=asked)
+    if caller.subject_token is None:
+        nonce = nonce_in_time(*signed, key_prefix=caller.prefix, window_s=settings.probe_window_s)
+    else:
+        # It ends by this clock, and not by that of a browser, and is good once.
+        nonce = caller.subject_token.nonce
+    level = _level(runtime, caller, asked)
+    runtime.liveness.require(level, of_key=caller.liveness, photos=False, challenge=False)
+    holder_key = holder_key_of(holder_key_header, body)
+
+    def compare(verifier: Verifier, stored: OpenedTemplate) -> Decision:
+        with step("decide"):
+            if isinstance(sent, bytes):
+                return verifier.decide_template(sent, stored, holder_key=holder_key, level=level)
+            rows = np.atleast_2d(sent)
+            mean = verifier.average(rows)
+            return verifier.decide_embedding(
+                mean, stored, holder_key=holder_key, level=level, photos=len(rows)
+            )
+
+    return Probe(
+        "template" if kind == "template" else "embedding",
+        compare,
+        held_template,
+        nonce,
+        holder_key,
+        # The HMAC is of all that is signed.
+        asked=(body["hmac"], held_template or b""),
+    )
+
+
+def _level(runtime: Runtime, caller: Caller, asked: str | None) -> str:
+    if caller.subject_token is not None:
+        asked = caller.subject_token.level_of(asked)
+    return runtime.levels.in_force(asked, lowest_of_key=caller.lowest_level)

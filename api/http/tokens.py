@@ -1,0 +1,181 @@
+"""Subject tokens: what a browser holds in place of an API key, for one call of one subject.
+
+A token is sealed under the master key and bound to the row of the API key that asked for it, so
+that any worker knows it and nothing is stored of it. Its nonce is used up with what it is for, in
+the same transaction. Sealed, and not only authenticated, because a probe is signed with it: what is
+in it must not let anybody guess it.
+"""
+
+import base64
+import binascii
+import json
+import secrets
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
+from typing import Literal, get_args
+
+from api.http.bodies import parse_json
+from api.http.errors import ApiError
+from templates.errors import SealError
+from templates.keys.api_token import SUBJECT_TOKEN
+from templates.keys.sealing import MasterKeyring
+from templates.store.lockout import Nonce
+
+Action = Literal["verify", "enroll"]
+ACTIONS: tuple[Action, ...] = get_args(Action)
+LONGEST_S = 120
+_PURPOSE = "subject-token"
+
+CALLS: dict[str, frozenset[Action]] = {
+    "enroll": frozenset({"enroll"}),
+    "verify": frozenset({"verify"}),
+    "create_challenge": frozenset({"verify"}),
+    "get_contract": frozenset(ACTIONS),
+    "get_generator": frozenset(ACTIONS),
+    "list_pack": frozenset(ACTIONS),
+    "get_pack_file": frozenset(ACTIONS),
+}
+"""Routes that take a token, by the name of their function, and of which action. No other does."""
+
+
+@dataclass(frozen=True)
+class SubjectToken:
+    """What a token is good for.
+
+    Attributes
+    ----------
+    subject, action
+        The only subject, and the only thing that is done to it.
+    level
+        Security level of a verification; None for an enrollment.
+    token_id
+        Names it in logs and answers; nothing can be done with it alone.
+    key_prefix, expires_at
+        Of the API key that asked for it, and when it ends.
+    """
+
+    subject: str
+    action: Action
+    level: str | None
+    token_id: str
+    key_prefix: str
+    expires_at: datetime
+
+    @property
+    def nonce(self) -> Nonce:
+        """What a use of the token uses up."""
+        return nonce_of(self.key_prefix, self.token_id, self.expires_at)
+
+    def require(self, route: str, subject: str | None) -> None:
+        """Refuse a call that the token is not for; `subject` is the one that the path names.
+
+        Raises
+        ------
+        ApiError
+            ``forbidden``.
+        """
+        if self.action not in CALLS.get(route, ()):
+            raise _another("call", f"this token is good to {self.action}, and not for this call")
+        self.require_subject(subject)
+
+    def require_subject(self, subject: str | None) -> None:
+        """Refuse another subject than the token's; None is none.
+
+        Raises
+        ------
+        ApiError
+            ``forbidden``.
+        """
+        if subject not in (None, self.subject):
+            raise _another("subject", "this token is for another subject")
+
+    def level_of(self, asked: str | None) -> str | None:
+        """Return the level to decide at, where a request asks for one or for none.
+
+        Raises
+        ------
+        ApiError
+            ``forbidden``.
+        """
+        if asked not in (None, self.level):
+            raise _another(
+                "level", "this token is for another security level: ask for its own, or for none"
+            )
+        return self.level
+
+
+def _another(what: str, message: str) -> ApiError:
+    return ApiError("forbidden", message, {"token": what})
+
+
+def nonce_of(key_prefix: str, token_id: str, expires_at: datetime) -> Nonce:
+    """Nonce of a token. No probe's is like it: those have no colon."""
+    return Nonce(key_prefix, f"token:{token_id}", expires_at)
+
+
+@dataclass(frozen=True)
+class NewToken:
+    """A token that was just made; its text is shown once."""
+
+    token: SubjectToken
+    text: str = field(repr=False)
+
+
+def new_token(
+    keyring: MasterKeyring,
+    *,
+    key_id: str,
+    key_prefix: str,
+    subject: str,
+    action: Action,
+    level: str | None,
+    lifetime_s: int,
+) -> NewToken:
+    """Make a token.
+
+    Parameters
+    ----------
+    key_id, key_prefix
+        Row id and prefix of the API key that asks for it. The id is in the database alone, so that
+        the master key does not suffice to make a token.
+    lifetime_s
+        1 to ``LONGEST_S``.
+    """
+    expires = datetime.now(UTC).replace(microsecond=0) + timedelta(seconds=lifetime_s)
+    token = SubjectToken(subject, action, level, secrets.token_urlsafe(18), key_prefix, expires)
+    body = {
+        "subject": subject,
+        "action": action,
+        "level": level,
+        "id": token.token_id,
+        "expires": int(expires.timestamp()),
+    }
+    sealed = keyring.seal(json.dumps(body).encode(), purpose=_PURPOSE, bound_to=[key_id])
+    text = base64.urlsafe_b64encode(sealed).rstrip(b"=").decode("ascii")
+    return NewToken(token, f"vft_{key_prefix}_{text}")
+
+
+def prefix_of(text: str) -> str | None:
+    """Return the prefix of the API key that a token names; None for what is no token."""
+    match = SUBJECT_TOKEN.fullmatch(text)
+    return None if match is None else match[1]
+
+
+def opened_token(keyring: MasterKeyring, text: str, *, key_id: str) -> SubjectToken | None:
+    """Open a token that the API key of this row asked for, in time or not; None for any other."""
+    match = SUBJECT_TOKEN.fullmatch(text)
+    if match is None:
+        return None
+    try:
+        sealed = base64.b64decode(match[2] + "=" * (-len(match[2]) % 4), b"-_", validate=True)
+        body = parse_json(keyring.open(sealed, purpose=_PURPOSE, bound_to=[key_id], refresh=False))
+    except (SealError, binascii.Error, ValueError):
+        return None
+    return SubjectToken(
+        subject=body["subject"],
+        action=body["action"],
+        level=body["level"],
+        token_id=body["id"],
+        key_prefix=match[1],
+        expires_at=datetime.fromtimestamp(body["expires"], UTC),
+    )

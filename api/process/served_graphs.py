@@ -1,0 +1,118 @@
+"""The graphs of the pack that clients may fetch: named by their hashes, found out at the start."""
+
+import hashlib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from api.http.errors import ApiError, StartError
+from api.settings import Settings
+from models.errors import PackError
+from models.known_packs import KNOWN_PACKS
+from models.pack import ModelPack
+from models.pack_graphs import locate
+
+
+@dataclass(frozen=True)
+class ServedGraph:
+    """One graph.
+
+    Attributes
+    ----------
+    role, kind
+        Of a detector, `kind` says how its output is read.
+    file, sha256, size
+        Name, SHA-256 (hexadecimal) and bytes of its file.
+    input_size
+        Width and height in pixels.
+    path, modified_ns
+        Where the file is, and when it was changed last.
+    """
+
+    role: Literal["detector", "embedder"]
+    kind: str | None
+    file: str
+    sha256: str
+    size: int
+    input_size: tuple[int, int]
+    path: Path = field(repr=False)
+    modified_ns: int = field(repr=False)
+
+    def require_unchanged(self) -> None:
+        """Refuse to give a file that is another one than at the start.
+
+        Raises
+        ------
+        ApiError
+            ``model_unavailable``.
+        """
+        try:
+            now = self.path.stat()
+        except OSError:
+            now = None
+        if now is None or (now.st_size, now.st_mtime_ns) != (self.size, self.modified_ns):
+            raise ApiError(
+                "model_unavailable",
+                "the pack's files were changed since the service started: it must start again",
+                {},
+                {"Retry-After": "60"},
+            )
+
+
+def served_graphs(settings: Settings, pack: ModelPack | None) -> dict[str, ServedGraph]:
+    """Return the graphs by their hashes, the detector first; none where the setting is off.
+
+    Raises
+    ------
+    StartError
+        If there is no pack, or a file is not the one that was loaded.
+    """
+    if not settings.serve_pack:
+        return {}
+    if pack is None or settings.pack is None:
+        raise StartError("setting serve_pack: there is no pack to serve; set pack as well")
+    try:
+        folder = locate(settings.pack)[0].folder
+    except PackError as error:
+        raise StartError(f"setting serve_pack: {error}") from None
+    detector, side = pack.info.detector, pack.crop_size
+    graphs = []
+    if detector is not None:
+        graphs.append(
+            _read(
+                folder / detector.file,
+                "detector",
+                detector.kind,
+                detector.sha256,
+                detector.input_size,
+            )
+        )
+    embedder = folder / pack.info.embedder_file
+    graphs.append(_read(embedder, "embedder", None, pack.info.embedder_sha256, (side, side)))
+    return {graph.sha256: graph for graph in graphs}
+
+
+def licence_of(pack: ModelPack) -> str | None:
+    """Return what is known of the licence of a pack of this name."""
+    known = KNOWN_PACKS.get(pack.info.name.lower())
+    return None if known is None else known.licence
+
+
+def _read(
+    path: Path,
+    role: Literal["detector", "embedder"],
+    kind: str | None,
+    sha256: str,
+    input_size: tuple[int, int],
+) -> ServedGraph:
+    try:
+        before = path.stat()
+        with path.open("rb") as file:
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise StartError(f"setting serve_pack: {path} cannot be read: {error.strerror}") from None
+    if digest != sha256:
+        raise StartError(f"setting serve_pack: {path} was changed while the service started")
+    return ServedGraph(
+        role, kind, path.name, sha256, before.st_size, input_size, path, before.st_mtime_ns
+    )

@@ -1,0 +1,500 @@
+"""Tokens for browsers: what one is good for, what it is refused for, and what a thief has of it."""
+
+import base64
+import hashlib
+import hmac
+import threading
+import time
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from cryptography.hazmat.primitives.hashes import SHA256
+from cryptography.hazmat.primitives.kdf.hkdf import HKDF
+
+from api.http.app import create_app
+from api.http.schemas import (
+    ContractAnswer,
+    EnrollmentAnswer,
+    TokenAnswer,
+    TokenOutcomeAnswer,
+    VerifyAnswer,
+)
+from api.http.tokens import new_token
+from api.process.opening import open_keyring, open_store
+from tests.api.client import Client
+from tests.api.deployment import Deployment, bearer, deploy, images, photo
+from tests.api.http.test_enrollment import b64, lifted
+from tests.api.shapes import assert_answer, assert_error
+from tests.patience import wait_until
+
+Service = tuple[Client, Deployment]
+LAX, STRICT = "fmr-1e-2", "fmr-1e-3"  # the contract's default is the strict one
+
+
+def issue(client: Client, action: str = "verify", subject: str = "alice", **more: Any) -> Any:
+    options = {"headers": more.pop("headers")} if "headers" in more else {}
+    body = {"subject_id": subject, "action": action, **more}
+    return assert_answer(client.post("/v1/tokens", json=body, **options), 201, TokenAnswer)
+
+
+def verify(
+    client: Client, token: str, person: int = 1, subject: str = "alice", **options: Any
+) -> httpx.Response:
+    headers = {**bearer(token), **options.pop("headers", {})}
+    files = images(photo(person, 5), name="image")
+    path = f"/v1/subjects/{subject}/verify"
+    answer: httpx.Response = client.post(path, files=files, headers=headers, **options)
+    return answer
+
+
+def enroll(
+    client: Client, token: str, person: int = 3, subject: str = "carol", **headers: str
+) -> httpx.Response:
+    answer: httpx.Response = client.put(
+        f"/v1/subjects/{subject}/enrollment",
+        files=images(photo(person)),
+        headers={**bearer(token), **headers},
+    )
+    return answer
+
+
+def outcome(client: Client, issued: Any, subject: str = "alice", **options: Any) -> Any:
+    answer = client.get(f"/v1/subjects/{subject}/tokens/{issued['token_id']}", **options)
+    return assert_answer(answer, 200, TokenOutcomeAnswer)
+
+
+def at_once(count: int, call: Any) -> list[httpx.Response]:
+    answers: list[httpx.Response] = []
+    start = threading.Barrier(count)
+
+    def one(number: int) -> None:
+        start.wait()
+        answers.append(call(number))
+
+    threads = [threading.Thread(target=one, args=(number,)) for number in range(count)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    return answers
+
+
+@pytest.fixture
+def service(both: Service) -> Service:
+    """A fresh service on each database, with ``alice`` enrolled."""
+    client, _ = both
+    answer = client.put("/v1/subjects/alice/enrollment", files=images(photo(1), photo(1, 1)))
+    assert answer.status_code == 201
+    return both
+
+
+@pytest.fixture(scope="module")
+def shared(client: Client, deployment: Deployment) -> Service:
+    """The module's service on SQLite, with ``alice`` enrolled."""
+    answer = client.put("/v1/subjects/alice/enrollment", files=images(photo(1), photo(1, 1)))
+    assert answer.status_code == 201
+    return client, deployment
+
+
+def test_a_token_is_good_for_one_decision(service: Service) -> None:
+    client, _ = service
+    for person, decision in ((1, "accept"), (2, "reject")):
+        issued = issue(client)
+        before = outcome(client, issued)
+        assert before["used"] is False
+        assert [before[name] for name in ("outcome", "level", "used_at")] == [None] * 3
+        body = assert_answer(verify(client, issued["token"], person), 200, VerifyAnswer)
+        assert (body["decision"], body["level"]) == (decision, STRICT)
+        assert_error(verify(client, issued["token"], person), 401, "replayed")
+        told = outcome(client, issued)
+        assert (told["used"], told["outcome"], told["level"]) == (True, decision, STRICT)
+
+
+def test_a_token_is_good_for_one_enrollment(service: Service) -> None:
+    client, _ = service
+    issued = issue(client, "enroll", "carol")
+    assert issued["level"] is None
+    assert assert_answer(enroll(client, issued["token"]), 201, EnrollmentAnswer)
+    # Not even the same photos, and nobody else's.
+    for person in (3, 4):
+        assert_error(enroll(client, issued["token"], person), 401, "replayed")
+    assert outcome(client, issued, "carol")["outcome"] == "created"
+    assert verify(client, issue(client, "verify", "carol")["token"], 3, "carol").json()["decision"]
+    again = issue(client, "enroll", "carol")
+    assert enroll(client, again["token"]).status_code == 200
+    assert outcome(client, again, "carol")["outcome"] == "replaced"
+
+
+@pytest.mark.parametrize("action", ["verify", "enroll"])
+def test_of_eight_uses_at_once_one_passes(service: Service, action: str) -> None:
+    """In two processes' worth of services on one database, and after both are opened anew."""
+    client, deployment = service
+    with Client(create_app(deployment.settings)) as beside:
+        token = issue(client, action)["token"]
+        use = verify if action == "verify" else enroll
+        answers = at_once(8, lambda i: use((client, beside)[i % 2], token, 1, "alice"))
+    assert sorted(answer.status_code for answer in answers) == [200] + [401] * 7
+    for answer in answers:
+        if answer.status_code == 401:
+            assert_error(answer, 401, "replayed")
+    with Client(create_app(deployment.settings)) as restarted:
+        assert_error(use(restarted, token, 1, "alice"), 401, "replayed")
+
+
+def test_a_token_outlives_a_restart_and_its_key_does_not(service: Service) -> None:
+    client, deployment = service
+    key = deployment.key("verify")
+    kept, revoked = (issue(client, headers=bearer(key))["token"] for _ in range(2))
+    with Client(create_app(deployment.settings)) as restarted:
+        assert verify(restarted, kept).json()["decision"] == "accept"
+        store = open_store(deployment.settings, open_keyring(deployment.settings))
+        try:
+            assert store.api_keys.revoke(key[3:15])
+        finally:
+            store.close()
+        assert_error(verify(restarted, revoked), 401, "unauthorized")
+    assert_error(verify(client, revoked), 401, "unauthorized")
+
+
+def test_a_late_token_is_refused(shared: Service) -> None:
+    client, _ = shared
+    issued = issue(client, lifetime_s=1)
+    ends = datetime.fromisoformat(issued["expires_at"])
+    wait_until(lambda: datetime.now(UTC) > ends, what="the token's end")
+    assert_error(verify(client, issued["token"]), 401, "replayed")
+    for path in ("/v1/contract", "/v1/pack"):
+        assert_error(client.get(path, headers=bearer(issued["token"])), 401, "replayed")
+    assert outcome(client, issued)["used"] is False
+
+
+def test_a_token_is_for_its_subject_action_and_level_only(shared: Service) -> None:
+    client, _ = shared
+    client.put("/v1/subjects/bob/enrollment", files=images(photo(2)))
+    lax, strict = issue(client, level=LAX)["token"], issue(client, level=STRICT)["token"]
+    for token, level in ((strict, LAX), (lax, STRICT), (lax, "accuracy")):
+        for options in ({"params": {"level": level}}, {"data": {"level": level}}):
+            refused = verify(client, token, **options)
+            assert assert_error(refused, 403, "forbidden") == {"token": "level"}
+    refused = verify(client, strict, 2, "bob")
+    assert assert_error(refused, 403, "forbidden") == {"token": "subject"}
+    refused = enroll(client, strict, 1, "alice")
+    assert assert_error(refused, 403, "forbidden") == {"token": "call"}
+    writing = issue(client, "enroll")["token"]
+    refused = verify(client, writing)
+    assert assert_error(refused, 403, "forbidden") == {"token": "call"}
+    assert assert_error(enroll(client, writing, 2, "bob"), 403, "forbidden") == {"token": "subject"}
+    # None of it used a token up, and its own level may be named.
+    assert verify(client, lax, params={"level": LAX}).json()["level"] == LAX
+    assert verify(client, strict).json()["level"] == STRICT
+    assert enroll(client, writing, 1, "alice").status_code == 200
+
+
+def test_no_other_call_takes_a_token(shared: Service) -> None:
+    client, _ = shared
+    document = client.get("/v1/openapi.json").json()
+    taken = {
+        "enroll", "verify", "createChallenge", "getContract", "getGenerator", "listPack",
+        "getPackFile",
+    }  # fmt: skip
+    tokens = [issue(client, action)["token"] for action in ("verify", "enroll")]
+    seen = set()
+    for path, entry in document["paths"].items():
+        for method, operation in entry.items():
+            if operation["operationId"] in taken or "security" not in operation:
+                continue
+            seen.add(operation["operationId"])
+            at = path.replace("{subject_id}", "alice").replace("{token_id}", "x")
+            for token in tokens:
+                refused = client.request(method.upper(), at, headers=bearer(token))
+                assert assert_error(refused, 403, "forbidden") == {"token": "call"}
+    assert {"eraseSubject", "createToken", "getSubject", "exportSubject", "checkPhoto"} <= seen
+
+
+def test_what_a_token_may_read(shared: Service) -> None:
+    client, deployment = shared
+    plain = deployment.key("verify")
+    token = issue(client, headers=bearer(plain))["token"]
+    assert_answer(client.get("/v1/contract", headers=bearer(token)), 200, ContractAnswer)
+    refused = client.get("/v1/contract/generator", headers=bearer(token))
+    assert assert_error(refused, 403, "forbidden") == {"missing": ["embeddings"]}
+    lifting = issue(client)["token"]
+    assert client.get("/v1/contract/generator", headers=bearer(lifting)).status_code == 200
+    assert verify(client, lifting).status_code == 200
+
+
+def test_a_token_tells_no_distance_and_not_who_is_enrolled(shared: Service) -> None:
+    client, _ = shared  # of a key with all rights
+    body = verify(client, issue(client)["token"]).json()
+    unknown = verify(client, issue(client, subject="nobody")["token"], subject="nobody").json()
+    assert set(body) == set(unknown)
+    assert "distance" not in body
+    assert (unknown["decision"], unknown["reason"]) == ("reject", "no_match")
+
+
+def test_what_came_with_an_error_leaves_the_token(shared: Service) -> None:
+    client, _ = shared
+    token = issue(client)["token"]
+    path = "/v1/subjects/alice/verify"
+    refused = client.post(path, files=images(b"no photo", name="image"), headers=bearer(token))
+    assert_error(refused, 400, "unsupported_image")
+    assert verify(client, token).json()["decision"] == "accept"
+    token = issue(client, "enroll", "dora")["token"]
+    refused = client.put(
+        "/v1/subjects/dora/enrollment", files=images(photo(3), photo(4)), headers=bearer(token)
+    )
+    assert_error(refused, 422, "inconsistent_images")
+    assert enroll(client, token, 3, "dora").status_code == 201
+
+
+def test_a_probe_is_signed_with_the_token(shared: Service) -> None:
+    """Signed here by the documentation alone, with a clock that is wrong by a day."""
+    client, _ = shared
+    numbers = client.app.state.runtime.pack.embed_photo(photo(1, 5)).embedding
+    issued, other = issue(client), issue(client)
+
+    def body(token: str) -> dict[str, Any]:
+        key = HKDF(SHA256(), 32, salt=None, info=b"veilface/1/probe-key").derive(token.encode())
+        nonce, at = "0123456789abcdef", int(time.time()) - 86_400
+        digest = hashlib.sha256((numbers.astype("<f8") + 0.0).tobytes()).hexdigest()
+        text = f"veilface-probe-1\nalice\n\nembedding\n{digest}\n{nonce}\n{at}"
+        mac = hmac.new(key, text.encode(), hashlib.sha256).hexdigest()
+        return {
+            "embedding": [float(number) for number in numbers],
+            "nonce": nonce, "timestamp": at, "hmac": mac,
+        }  # fmt: skip
+
+    def send(token: str, sent: dict[str, Any]) -> httpx.Response:
+        answer: httpx.Response = client.post(
+            "/v1/subjects/alice/verify", json=sent, headers=bearer(token), sign=False
+        )
+        return answer
+
+    assert_error(send(issued["token"], body(other["token"])), 401, "unauthorized")
+    sent = body(issued["token"])
+    assert send(issued["token"], sent).json()["decision"] == "accept"
+    assert_error(send(issued["token"], sent), 401, "replayed")
+    # The same body under another token of the same subject.
+    assert_error(send(other["token"], sent), 401, "unauthorized")
+
+
+def test_embeddings_and_templates_need_the_right_of_the_key(service: Service) -> None:
+    client, deployment = service
+    numbers = client.app.state.runtime.pack.embed_photo(photo(1, 5)).embedding
+    photos_only = issue(client, headers=bearer(deployment.key("verify")))["token"]
+    sent = {"embedding": [float(number) for number in numbers]}
+    refused = client.post("/v1/subjects/alice/verify", json=sent, headers=bearer(photos_only))
+    assert assert_error(refused, 403, "forbidden") == {"missing": ["embeddings"]}
+    template = {"template": b64(lifted(deployment))}
+    path = "/v1/subjects/carol/enrollment"
+    allowed = deployment.key("enroll", "embeddings")
+    for key, details in (
+        (deployment.key("enroll"), {"missing": ["embeddings"]}),
+        (allowed, {"tenant_setting": "template_enrollment"}),
+    ):
+        token = issue(client, "enroll", "carol", headers=bearer(key))["token"]
+        refused = client.put(path, json=template, headers=bearer(token))
+        assert assert_error(refused, 403, "forbidden") == details
+    deployment.allow_templates()
+    assert client.put(path, json=template, headers=bearer(token)).status_code == 201
+    assert_error(client.put(path, json=template, headers=bearer(token)), 401, "replayed")
+
+
+def test_a_lost_answer_is_given_again(service: Service) -> None:
+    client, deployment = service
+    for action, use, subject in (("verify", verify, "alice"), ("enroll", enroll, "carol")):
+        token = issue(client, action, subject)["token"]
+        again = {"Idempotency-Key": "one-attempt"}
+        sent = {"headers": again} if action == "verify" else again
+
+        def ask(
+            token: str, person: int, sent: Any = sent, use: Any = use, of: str = subject
+        ) -> Any:
+            return use(client, token, person, of, **sent)
+
+        first, second = ask(token, 1), ask(token, 1)
+        assert second.headers["idempotency-replayed"] == "true"
+        assert second.status_code == first.status_code in (200, 201)
+        bodies = [{**answer.json(), "request_id": ""} for answer in (first, second)]
+        assert bodies[0] == bodies[1]
+        # Another probe under the key, the same without the key, and the key of another token.
+        assert_error(ask(token, 2), 409, "idempotency_conflict")
+        assert_error(use(client, token, 1, subject), 401, "replayed")
+        other = ask(issue(client, action, subject)["token"], 1)
+        assert "idempotency-replayed" not in other.headers
+        assert other.status_code == 200
+    # It counted once, and so did the decisions of the log.
+    lines = [line for line in audit(deployment) if line.action == "verify"]
+    assert [line.outcome for line in lines if line.outcome != "idempotency_conflict"] == [
+        "accept", "replayed", "accept",
+    ]  # fmt: skip
+
+
+def test_an_api_key_repeats_no_verification(shared: Service) -> None:
+    """Its answer may hold a distance, which is not kept."""
+    client, _ = shared
+    headers = {"Idempotency-Key": "with-a-key"}
+    for _ in range(2):
+        answer = client.post(
+            "/v1/subjects/alice/verify", files=images(photo(1, 5), name="image"), headers=headers
+        )
+        assert "distance" in answer.json()
+        assert "idempotency-replayed" not in answer.headers
+
+
+def test_a_theft_of_an_answered_request_gives_nothing(service: Service) -> None:
+    client, _ = service
+    used, writing = issue(client)["token"], issue(client, "enroll", "carol")["token"]
+    assert verify(client, used, headers={"Idempotency-Key": "mine"}).json()["decision"] == "accept"
+    assert enroll(client, writing).status_code == 201
+    assert_error(verify(client, used), 401, "replayed")
+    assert_error(verify(client, used, headers={"Idempotency-Key": "thief"}), 401, "replayed")
+    for person in (1, 2):
+        assert_error(verify(client, used, person, "carol"), 403, "forbidden")
+        assert_error(enroll(client, writing, person), 401, "replayed")
+    # One bit of it changed is no token: neither its end, its subject nor its level can be moved.
+    _, prefix, sealed = used.split("_", 2)
+    raw = bytearray(base64.urlsafe_b64decode(sealed + "=" * (-len(sealed) % 4)))
+    for at in (0, 5, 15, 30, len(raw) // 2, len(raw) - 1):
+        altered = bytes(raw[:at]) + bytes([raw[at] ^ 1]) + bytes(raw[at + 1 :])
+        text = base64.urlsafe_b64encode(altered).decode().rstrip("=")
+        assert_error(verify(client, f"vft_{prefix}_{text}"), 401, "unauthorized")
+    # Under the prefix of another key it does not open.
+    other = issue(client, headers=bearer(client.headers["Authorization"][7:]))["token"]
+    assert other[4:16] == prefix
+    assert_error(verify(client, f"vft_{'0' * 12}_{sealed}"), 401, "unauthorized")
+    assert verify(client, other).json()["decision"] == "accept"
+
+
+def test_the_master_key_alone_makes_no_token(shared: Service) -> None:
+    client, deployment = shared
+    prefix = deployment.token[3:15]
+    forged = new_token(
+        open_keyring(deployment.settings),
+        key_id="0" * 32,
+        key_prefix=prefix,
+        subject="alice",
+        action="enroll",
+        level=None,
+        lifetime_s=120,
+    )
+    assert_error(enroll(client, forged.text, 2, "alice"), 401, "unauthorized")
+
+
+def test_who_may_ask_for_which_token(shared: Service) -> None:
+    client, deployment = shared
+    for key, action, missing in (
+        (deployment.key("verify"), "enroll", "enroll"),
+        (deployment.key("enroll"), "verify", "verify"),
+        (deployment.key("scores", "erase"), "verify", "verify"),
+    ):
+        body = {"subject_id": "alice", "action": action}
+        refused = client.post("/v1/tokens", json=body, headers=bearer(key))
+        assert assert_error(refused, 403, "forbidden") == {"missing": [missing]}
+    good = {"subject_id": "alice", "action": "verify"}
+    for change, code in (
+        ({"subject_id": None}, "validation_failed"),
+        ({"subject_id": "a/b"}, "validation_failed"),
+        ({"action": "erase"}, "validation_failed"),
+        ({"action": ["verify"]}, "validation_failed"),
+        ({"lifetime_s": 121}, "validation_failed"),
+        ({"lifetime_s": 0}, "validation_failed"),
+        ({"lifetime_s": 1.5}, "validation_failed"),
+        ({"lifetime_s": True}, "validation_failed"),
+        ({"action": "enroll", "level": STRICT}, "validation_failed"),
+        ({"level": "fmr-1e-9"}, "uncalibrated"),
+        ({"lvel": STRICT}, "validation_failed"),
+    ):
+        assert_error(client.post("/v1/tokens", json={**good, **change}), 422, code)
+
+
+def test_the_lowest_level_of_the_key_holds(shared: Service) -> None:
+    client, deployment = shared
+    store = open_store(deployment.settings, open_keyring(deployment.settings))
+    try:
+        key = store.api_keys.create("default", ["verify"], lowest_level=STRICT).token
+    finally:
+        store.close()
+    body = {"subject_id": "alice", "action": "verify", "level": LAX}
+    refused = client.post("/v1/tokens", json=body, headers=bearer(key))
+    assert assert_error(refused, 403, "forbidden") == {"lowest_level": STRICT}
+    assert issue(client, headers=bearer(key))["level"] == STRICT
+
+
+def test_the_outcome_is_told_to_the_key_that_asked(service: Service) -> None:
+    client, deployment = service
+    mine, others = deployment.key("verify"), deployment.key("verify")
+    issued = issue(client, headers=bearer(mine))
+    assert verify(client, issued["token"]).json()["decision"] == "accept"
+    assert outcome(client, issued, headers=bearer(mine))["outcome"] == "accept"
+    assert not outcome(client, issued, headers=bearer(others))["used"]
+    # A page that shows the token of another person is found out.
+    assert not outcome(client, issued, "bob", headers=bearer(mine))["used"]
+
+
+def audit(deployment: Deployment) -> list[Any]:
+    store = open_store(deployment.settings, open_keyring(deployment.settings))
+    try:
+        return list(store.audit_log.lines())
+    finally:
+        store.close()
+
+
+def test_the_audit_log_and_the_metrics_tell_of_tokens(service: Service) -> None:
+    client, deployment = service
+    issued = issue(client)
+    verify(client, issued["token"])
+    verify(client, issued["token"])
+    verify(client, issued["token"], subject="bob")
+    lines = audit(deployment)[-4:]
+    assert [(line.action, line.outcome) for line in lines] == [
+        ("token", "issued"), ("verify", "accept"), ("verify", "replayed"), ("verify", "forbidden"),
+    ]  # fmt: skip
+    assert lines[0].detail == f"verify {issued['token_id']}"
+    assert len({(line.actor, line.pseudonym) for line in lines}) == 1
+    text = client.get("/metrics").text
+    assert 'veilface_tokens_total{action="verify"}' in text
+    store = open_store(deployment.settings, open_keyring(deployment.settings))
+    try:
+        assert store.audit_log.verify().intact
+        assert not store.check_records()
+    finally:
+        store.close()
+
+
+def test_tokens_have_a_rate_of_their_own(tmp_path: Path) -> None:
+    deployment = deploy(tmp_path, rate_limit_key="3/hour", lockout_after=0)
+    with Client(create_app(deployment.settings)) as client:
+        first, second = (issue(client, headers=bearer(deployment.token))["token"] for _ in range(2))
+        for _ in range(3):
+            assert client.get("/v1/contract", headers=bearer(first)).status_code == 200
+        assert_error(client.get("/v1/contract", headers=bearer(first)), 429, "rate_limited")
+        # Neither another visitor nor the server that asks for tokens is held up.
+        assert client.get("/v1/contract", headers=bearer(second)).status_code == 200
+        issue(client, headers=bearer(deployment.token))
+
+
+def test_a_page_of_an_allowed_origin_uses_a_token(tmp_path: Path) -> None:
+    origin = "https://shop.example"
+    deployment = deploy(tmp_path, cors_origins=origin, lockout_after=0)
+    with Client(create_app(deployment.settings)) as client:
+        preflight = client.request(
+            "OPTIONS",
+            "/v1/subjects/alice/verify",
+            headers={
+                "Origin": origin,
+                "Access-Control-Request-Method": "POST",
+                "Access-Control-Request-Headers": "authorization, idempotency-key",
+            },
+        )
+        assert preflight.status_code == 204
+        allowed = preflight.headers["access-control-allow-headers"].lower()
+        assert {"authorization", "idempotency-key", "if-none-match"} <= set(allowed.split(", "))
+        token = issue(client, headers=bearer(deployment.token))["token"]
+        answer = verify(client, token, headers={"Origin": origin})
+        assert answer.headers["access-control-allow-origin"] == origin
+        again = verify(client, token, headers={"Origin": origin})
+        assert_error(again, 401, "replayed")
+        assert again.headers["access-control-allow-origin"] == origin
