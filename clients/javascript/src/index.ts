@@ -1,0 +1,1 @@
+export * from "./models/pack.js"; export * from "./models/image.js"; export * from "./models/errors.js";
