@@ -1,1 +1,11 @@
-export * from "./models/pack.js"; export * from "./models/image.js"; export * from "./models/errors.js";
+export * from "./models/errors.js";
+export * from "./models/image.js";
+export * from "./models/pack.js";
+export * from "./templates/agreement.js";
+export * from "./templates/contract.js";
+export * from "./templates/errors.js";
+export * from "./templates/generator.js";
+export * from "./templates/lifting.js";
+export * from "./templates/randomness.js";
+export * from "./templates/subspace.js";
+export * from "./templates/wire.js";
