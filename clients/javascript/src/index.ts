@@ -1,6 +1,16 @@
+export * from "./errors.js";
 export * from "./models/errors.js";
 export * from "./models/image.js";
 export * from "./models/pack.js";
+export type { Runtime } from "./models/runtime.js";
+export * from "./service/answers.js";
+export { Client, type ClientOptions, type EnrollOptions, type VerifyOptions } from "./service/client.js";
+export * from "./service/errors.js";
+export { newHolderKey } from "./service/holder-keys.js";
+export { Enrollable, Probe } from "./service/lifts.js";
+export { PrivateClient, type Photo, type PrivateOptions } from "./service/private-client.js";
+export { DEFAULT_RETRIES, type Retries } from "./service/retries.js";
+export { signedProbe } from "./service/signature.js";
 export * from "./templates/agreement.js";
 export * from "./templates/contract.js";
 export * from "./templates/errors.js";

@@ -1,4 +1,4 @@
-"""Lifting in JavaScript: of one key the same template as Python's, in bytes that the server reads."""
+"""Lifting in JavaScript: of one key Python's template, in bytes that the server reads."""
 
 import base64
 import hashlib
@@ -10,15 +10,15 @@ import pytest
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from models.pack import ModelPack
 from templates.contract import wire
-from templates.contract.document import Binding, Contract
+from templates.contract.binding import Binding
 from templates.decoys import DecoyGenerator
 from templates.errors import VeilfaceError
 from templates.keys.randomness import Keystream
+from templates.keys.rotation import ROTATION_VERSION
 from templates.space.agreement import InconsistentImages, mean_embedding, weakest_split
 from templates.space.lifting import Strategy, lift
-from tests.api.deployment import make_contract, make_source, unit, write_pack
+from tests.api.deployment import make_source, unit
 from tests.clients.javascript.conftest import Node
 
 CONTRACT_ID = "ab" * 32
@@ -90,7 +90,9 @@ def compare_lifts(
         theirs = lift(descriptor[None], strategy=strategy, m=m, source=source, stream=stream)[0]
         foot, basis = unb64(ours["foot"], "<f4"), unb64(ours["basis"], "<f4").reshape(m, source.n)
         worst = max(
-            worst, float(np.abs(foot - theirs.foot).max()), float(np.abs(basis - theirs.basis).max())
+            worst,
+            float(np.abs(foot - theirs.foot).max()),
+            float(np.abs(basis - theirs.basis).max()),
         )
         decoded = wire.decode(base64.b64decode(ours["wire"]))
         assert decoded.contract_id == CONTRACT_ID
@@ -119,18 +121,30 @@ def test_lifts_of_a_real_dimension(node: Node, shared_data: Path) -> None:
     assert compare_lifts(node, source, cases, unit(rows[5000:5001])[0]) < 1e-6
 
 
-@pytest.fixture(scope="module")
-def contract(tmp_path_factory: pytest.TempPathFactory) -> tuple[Contract, Binding]:
-    folder = tmp_path_factory.mktemp("contract")
-    made = make_contract(ModelPack.load(write_pack(folder / "tiny"), threads=1), make_source())
-    return made, made.binding
+BINDING = Binding(
+    embedder_sha256="5e" * 32,
+    preprocessing={
+        "version": 2,
+        "alignment": "arcface-112",
+        "size": 112,
+        "channel_order": "rgb",
+        "mean": [123.675, 116.28, 103.53],
+        "scale": [127.5, 127.5, 128.0],
+        "flip": True,
+    },
+    n=64,
+    strategy=Strategy.ADVERSARIAL,
+    m=8,
+    decoy_source_id=make_source().source_id,
+    rotation_version=ROTATION_VERSION,
+)
 
 
-def public(contract: Contract, **changes: Any) -> dict[str, Any]:
+def public(**changes: Any) -> dict[str, Any]:
     """What ``GET /v1/contract`` answers, as far as a client reads it."""
     return {
-        "contract_id": contract.binding.contract_id,
-        "binding": contract.binding.to_json(),
+        "contract_id": BINDING.contract_id,
+        "binding": BINDING.to_json(),
         "recorded": {},
         "calibrations": [{"mode": "p2s", "probe_m": 0}, {"mode": "s2s", "probe_m": 2}],
         "photo_consistency": 0.2,
@@ -139,50 +153,42 @@ def public(contract: Contract, **changes: Any) -> dict[str, Any]:
     }
 
 
-def test_templates_hold_the_mean_and_no_key_twice(
-    node: Node, contract: tuple[Contract, Binding]
-) -> None:
+def test_templates_hold_the_mean_and_no_key_twice(node: Node) -> None:
     """Without a key of the test: each template is another, and contains the descriptor."""
-    made, binding = contract
     rows = unit(people(1, 64) + 0.05 * people(3, 64))
     shared = {
-        "contract": public(made),
+        "contract": public(),
         "generator": b64(make_source().to_bytes()),
         "embeddings": [b64(row.tobytes()) for row in rows],
     }
     questions = [{"call": "template", "probe": probe, **shared} for probe in (False, False, True)]
-    templates = [
-        base64.b64decode(answer["value"]) for answer in node("lift.js", questions)
-    ]
+    templates = [base64.b64decode(answer["value"]) for answer in node("lift.js", questions)]
     assert templates[0] != templates[1]
     mean = mean_embedding(rows, consistency=0.2)
-    for data, m in zip(templates, (binding.m, binding.m, 2), strict=True):
+    for data, m in zip(templates, (BINDING.m, BINDING.m, 2), strict=True):
         decoded = wire.decode(data)
-        assert decoded.contract_id == binding.contract_id
+        assert decoded.contract_id == BINDING.contract_id
         assert decoded.subspace.m == m
         assert decoded.subspace.contains(mean[None], tol=2e-3).all()
 
 
-def test_contracts_and_generators_that_hide_nothing_are_refused(
-    node: Node, contract: tuple[Contract, Binding]
-) -> None:
-    made, _ = contract
+def test_contracts_and_generators_that_hide_nothing_are_refused(node: Node) -> None:
     generator = make_source().to_bytes()
     flat = bytearray(generator)
     # The last numbers of the axes' tensor: the axes are not orthogonal then.
     start = 8 + int.from_bytes(flat[:8], "little")
     flat[start + 256 : start + 512] = flat[start : start + 256]
     narrow = _narrow()
-    altered = public(made)
+    altered = public()
     altered["binding"] = {**altered["binding"], "m": 3}
     cases: list[tuple[dict[str, Any], bytes, str]] = [
         (altered, generator, "ContractError"),
-        (public(made), source_of(64).to_bytes(), "ContractError"),
-        (public(made), bytes(flat), "DecoyError"),
-        (public(made), narrow, "DecoyError"),
-        (public(made), generator[:-4], "DecoyError"),
-        (public(made), b"\xff" * 64, "DecoyError"),
-        (public(made, calibrations=[]), generator, "ContractError"),
+        (public(), source_of(64).to_bytes(), "ContractError"),
+        (public(), bytes(flat), "DecoyError"),
+        (public(), narrow, "DecoyError"),
+        (public(), generator[:-4], "DecoyError"),
+        (public(), b"\xff" * 64, "DecoyError"),
+        (public(calibrations=[]), generator, "ContractError"),
     ]
     questions = [
         {

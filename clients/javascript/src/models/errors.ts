@@ -14,8 +14,10 @@
  * Messages name the cause and the remedy. They never hold a pixel or a number of an embedding.
  */
 
+import { VeilfaceError } from "../errors.js";
+
 /** Base of all errors between a photo and its embedding. */
-export class ModelError extends Error {
+export class ModelError extends VeilfaceError {
   override name = "ModelError";
 }
 

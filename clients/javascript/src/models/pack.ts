@@ -41,16 +41,38 @@ export interface PackGraphs {
   readonly detector?: Uint8Array;
 }
 
-/** One face of a photo, before it is embedded. */
-export interface FaceCrop {
-  readonly crop: RgbImage;
-  readonly quality: Quality;
-  readonly face: Face | undefined;
+/** One face of a photo, before it is embedded. Printing it shows no pixel. */
+export class FaceCrop {
+  readonly #crop: RgbImage;
+
+  constructor(
+    crop: RgbImage,
+    readonly quality: Quality,
+    /** As it was detected; undefined for crops that came aligned. */
+    readonly face: Face | undefined,
+  ) {
+    this.#crop = crop;
+  }
+
+  /** Aligned on the template. */
+  get crop(): RgbImage {
+    return this.#crop;
+  }
 }
 
-/** One face of a photo, embedded: n values of unit norm. */
-export interface FaceSample extends FaceCrop {
-  readonly embedding: Float32Array;
+/** One face of a photo, embedded. Printing it shows no number of the embedding. */
+export class FaceSample extends FaceCrop {
+  readonly #embedding: Float32Array;
+
+  constructor(taken: FaceCrop, embedding: Float32Array) {
+    super(taken.crop, taken.quality, taken.face);
+    this.#embedding = embedding;
+  }
+
+  /** n values of unit norm. */
+  get embedding(): Float32Array {
+    return this.#embedding;
+  }
 }
 
 /** An embedder with its preprocessing and, usually, a detector. Make one with `load`. */
@@ -121,7 +143,7 @@ export class ModelPack {
     }
     const quality = measure(crop, face);
     check(quality, limits, this.detector?.recommendedScore ?? 0);
-    return { crop, quality, face };
+    return new FaceCrop(crop, quality, face);
   }
 
   /**
@@ -135,7 +157,7 @@ export class ModelPack {
     if (embedding.length !== this.n) {
       throw new ModelError(`the embedder gives ${embedding.length} numbers, not ${this.n}`);
     }
-    return { ...taken, embedding };
+    return new FaceSample(taken, embedding);
   }
 
   /** Free what ONNX Runtime holds. */

@@ -12,8 +12,10 @@
  * Messages never hold a number of an embedding or of a template.
  */
 
+import { VeilfaceError } from "../errors.js";
+
 /** Base of all errors between embeddings and a private template. */
-export class TemplateError extends Error {
+export class TemplateError extends VeilfaceError {
   override name = "TemplateError";
 }
 

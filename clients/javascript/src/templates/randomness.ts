@@ -11,17 +11,17 @@ const CONSTANTS = [0x61707865, 0x3320646e, 0x79622d32, 0x6b206574];
  * is made: who sees one template must not be able to predict the next one's randomness.
  */
 export class Keystream {
-  private readonly state = new Uint32Array(16);
-  private readonly block = new Uint32Array(16);
-  private at = 16;
-  private destroyed = false;
+  readonly #state = new Uint32Array(16);
+  readonly #block = new Uint32Array(16);
+  #at = 16;
+  #destroyed = false;
 
   /** @param key 32 bytes, used for one stream only; so the nonce may be zero. */
   constructor(key: Uint8Array) {
     if (key.length !== KEY_BYTES) throw new RangeError(`a keystream key has ${KEY_BYTES} bytes`);
-    this.state.set(CONSTANTS);
+    this.#state.set(CONSTANTS);
     const words = new DataView(key.buffer, key.byteOffset, KEY_BYTES);
-    for (let i = 0; i < 8; i++) this.state[4 + i] = words.getUint32(4 * i, true);
+    for (let i = 0; i < 8; i++) this.#state[4 + i] = words.getUint32(4 * i, true);
   }
 
   /** A stream under a new key of the platform's cryptographic generator. */
@@ -34,49 +34,49 @@ export class Keystream {
 
   /** Overwrite the key; later draws throw. */
   destroy(): void {
-    this.state.fill(0);
-    this.block.fill(0);
-    this.destroyed = true;
+    this.#state.fill(0);
+    this.#block.fill(0);
+    this.#destroyed = true;
   }
 
   /** Sample U([low, high)) with 53 random bits each. */
   uniform(count: number, low = 0, high = 1): Float64Array {
     const scale = (high - low) * 2 ** -53;
-    return this.samples(count, (upper, lower) => (upper * 2 ** 21 + (lower >>> 11)) * scale + low);
+    return this.#samples(count, (upper, lower) => (upper * 2 ** 21 + (lower >>> 11)) * scale + low);
   }
 
   /** Sample N(0, 1) by the inverse distribution function, one word of the stream each. */
   normal(count: number): Float64Array {
-    return this.samples(count, (upper, lower) =>
+    return this.#samples(count, (upper, lower) =>
       inverseNormal((upper * 2 ** 20 + (lower >>> 12) + 0.5) * 2 ** -52),
     );
   }
 
-  private samples(count: number, of: (upper: number, lower: number) => number): Float64Array {
+  #samples(count: number, of: (upper: number, lower: number) => number): Float64Array {
     const out = new Float64Array(count);
     for (let i = 0; i < count; i++) {
-      if (this.at === 16) this.nextBlock();
-      out[i] = of(this.block[this.at + 1], this.block[this.at]);
-      this.at += 2;
+      if (this.#at === 16) this.#nextBlock();
+      out[i] = of(this.#block[this.#at + 1], this.#block[this.#at]);
+      this.#at += 2;
     }
     return out;
   }
 
   /** The next 64 bytes (RFC 8439, section 2.3). */
-  private nextBlock(): void {
-    if (this.destroyed) throw new Error("this keystream was destroyed: make a fresh one");
-    const x = this.block;
-    x.set(this.state);
+  #nextBlock(): void {
+    if (this.#destroyed) throw new Error("this keystream was destroyed: make a fresh one");
+    const x = this.#block;
+    x.set(this.#state);
     for (let round = 0; round < 10; round++) {
       for (let i = 0; i < 4; i++) quarterRound(x, i, 4 + i, 8 + i, 12 + i);
       for (let i = 0; i < 4; i++) {
         quarterRound(x, i, 4 + ((i + 1) % 4), 8 + ((i + 2) % 4), 12 + ((i + 3) % 4));
       }
     }
-    for (let i = 0; i < 16; i++) x[i] += this.state[i];
+    for (let i = 0; i < 16; i++) x[i] += this.#state[i];
     // 2**32 blocks are 256 GiB: no template comes near.
-    this.state[12] += 1;
-    this.at = 0;
+    this.#state[12] += 1;
+    this.#at = 0;
   }
 }
 

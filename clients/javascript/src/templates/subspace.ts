@@ -3,12 +3,25 @@
 import { LiftingError } from "./errors.js";
 import type { Keystream } from "./randomness.js";
 
-/** One private template, foot + span(basis). */
-export interface AffineSubspace {
+/** One private template, foot + span(basis). Printing it shows no number of it. */
+export class AffineSubspace {
+  readonly #foot: Float32Array;
+  readonly #basis: Float32Array;
+
+  constructor(foot: Float32Array, basis: Float32Array) {
+    this.#foot = foot;
+    this.#basis = basis;
+  }
+
   /** Foot point, n values, orthogonal to the basis. */
-  readonly foot: Float32Array;
+  get foot(): Float32Array {
+    return this.#foot;
+  }
+
   /** Orthonormal rows: m · n values, row by row. */
-  readonly basis: Float32Array;
+  get basis(): Float32Array {
+    return this.#basis;
+  }
 }
 
 // Directions closer than this to the span of the others, relative to their length, are noise.
@@ -84,7 +97,7 @@ export function templateThrough(
   const basis = combined(combined(turn, orthonormalised(projected)), span);
   const stored = new Float32Array(m * n);
   basis.forEach((row, i) => stored.set(row, i * n));
-  return { foot: Float32Array.from(foot), basis: stored };
+  return new AffineSubspace(Float32Array.from(foot), stored);
 }
 
 /** The product of two matrices by their rows. */
