@@ -47,6 +47,7 @@ WHOLE_PAGES = {
     ("docs/tutorial.md", "sh"): "tests/test_tutorial.py",
     ("docs/client.md", "sh"): "tests/clients/test_docs.py",
     ("docs/client.md", "python"): "tests/clients/test_docs.py",
+    ("docs/javascript.md", "js"): "tests/clients/javascript/test_docs.py",
     ("docs/webhooks.md", "python"): "tests/api/process/test_webhooks.py",
 }
 # Blocks that another test executes: page and first line.
