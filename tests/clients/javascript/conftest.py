@@ -4,7 +4,7 @@ import json
 import os
 import shutil
 import subprocess
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +25,8 @@ def _built() -> bool:
     )
 
 
-@pytest.fixture(scope="session")
-def node() -> Node:
-    """``node(driver, payload, environment)``: runs a driver of the package's ``test/python``.
-
-    The payload is its stdin as JSON; what it writes to stdout is returned.
-    """
+def require_client() -> str:
+    """Return the path of node; skip where it, or the built package, is absent."""
     executable = shutil.which("node")
     missing = None
     if executable is None:
@@ -41,13 +37,23 @@ def node() -> Node:
         if os.environ.get("VEILFACE_REQUIRE_NODE") == "1":
             pytest.fail(missing)
         pytest.skip(missing)
+    return str(executable)
 
-    def run(driver: str, payload: object, environment: Mapping[str, str] | None = None) -> Any:
+
+@pytest.fixture(scope="session")
+def node() -> Node:
+    """``node(driver, payload)``: runs a driver of the package's ``test/python``.
+
+    The payload is its stdin as JSON; what it writes to stdout is returned.
+    """
+    executable = require_client()
+
+    def run(driver: str, payload: object) -> Any:
         done = subprocess.run(
-            [str(executable), f"test/python/{driver}"],
+            [executable, f"test/python/{driver}"],
             cwd=PACKAGE,
             input=json.dumps(payload),
-            env={"PATH": os.environ.get("PATH", ""), **(environment or {})},
+            env={"PATH": os.environ["PATH"]},
             text=True,
             capture_output=True,
             check=False,

@@ -52,8 +52,8 @@ def test_a_program_prints_what_it_says(
 
 
 def test_the_page_of_the_readme_is_that_of_the_docs() -> None:
-    assert blocks("clients/javascript/README.md", "js") == FOR_PAGES
-    assert len(FOR_PAGES) == 1
+    assert blocks("clients/javascript/README.md", "js") == FOR_PAGES[:1]
+    assert len(FOR_PAGES) == 2
 
 
 def test_every_code_of_the_service_has_its_class() -> None:

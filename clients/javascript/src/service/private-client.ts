@@ -61,6 +61,13 @@ export class PrivateClient extends Session {
     this.#options = options;
   }
 
+  /** A client under another bearer, such as the next token, with what this one has fetched. */
+  as(bearer: string): PrivateClient {
+    const other = new PrivateClient(this.url, bearer, this.#options);
+    other.#inputs = this.#inputs;
+    return other;
+  }
+
   /** Fetch contract, generator and graphs now, so that the first lift need not wait for them. */
   async prepare(): Promise<void> {
     await this.#prepared();
