@@ -16,7 +16,10 @@ export interface RuntimeSession {
   readonly outputNames: readonly string[];
   /** Shape of each input, a text for a size that is open; ONNX Runtime 1.21 and later. */
   readonly inputMetadata: readonly unknown[];
-  run(feeds: Readonly<Record<string, unknown>>): Promise<Readonly<Record<string, unknown>>>;
+  run(
+    feeds: Readonly<Record<string, unknown>>,
+    options?: object,
+  ): Promise<Readonly<Record<string, unknown>>>;
   release(): Promise<void>;
 }
 
@@ -25,6 +28,9 @@ export interface Tensor {
   readonly dims: readonly number[];
   readonly data: Float32Array;
 }
+
+// Detectors state other output shapes than they give: a warning for each, with every photo.
+const ERRORS_ONLY = { logSeverityLevel: 3 };
 
 /** A graph with one image input, (batch, 3, height, width). */
 export class Graph {
@@ -39,7 +45,7 @@ export class Graph {
   static async load(runtime: Runtime, bytes: Uint8Array, options?: object): Promise<Graph> {
     let session: RuntimeSession;
     try {
-      session = await runtime.InferenceSession.create(bytes, options);
+      session = await runtime.InferenceSession.create(bytes, { ...ERRORS_ONLY, ...options });
     } catch (error) {
       throw new PackError(`ONNX Runtime does not load a graph of the pack: ${String(error)}`);
     }
@@ -60,7 +66,10 @@ export class Graph {
   /** Run on a batch of images; the outputs by their names. */
   async run(data: Float32Array, dims: readonly number[]): Promise<Map<string, Tensor>> {
     const input = new this.runtime.Tensor("float32", data, dims);
-    const outputs = await this.session.run({ [this.session.inputNames[0]]: input });
+    const outputs = await this.session.run(
+      { [this.session.inputNames[0]]: input },
+      ERRORS_ONLY,
+    );
     return new Map(this.outputNames.map((name) => [name, outputs[name] as Tensor]));
   }
 
