@@ -10,7 +10,7 @@ PYTEST = OMP_NUM_THREADS=1 $(VENV)/pytest --numprocesses=logical --maxprocesses=
 # Bytecode is kept: without it, every process that a test starts compiles all that it imports.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo install extras docs test test-all lint types audit sbom wheels lock clean
+.PHONY: demo install extras docs test test-all lint types javascript audit sbom wheels lock clean
 
 demo: .venv/core
 	$(VENV)/veilface demo
@@ -37,6 +37,10 @@ lint: .venv/dev
 
 types: .venv/dev
 	$(VENV)/mypy
+
+# The client for browsers and Node, by Node's own tools: needs Node 20 or newer, and npm.
+javascript:
+	cd clients/javascript && npm ci --no-audit --no-fund && npm run build && npm test
 
 # What the release depends on: known vulnerabilities, and a bill of materials (CycloneDX). Without
 # an advisory service nothing is audited, which fails with status 3 of the script, and is said.
@@ -88,4 +92,4 @@ lock: | $(UV)
 	echo hatchling | $(UV) pip compile --quiet --upgrade - --universal --generate-hashes --python-version 3.11 -o deploy/build.lock
 
 clean:
-	rm -rf .venv .bootstrap dist .schemathesis templates/distances/kernels/__pycache__ .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf .venv .bootstrap dist clients/javascript/dist clients/javascript/node_modules .schemathesis templates/distances/kernels/__pycache__ .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -1,0 +1,90 @@
+/**
+ * What can go wrong between a photo and its embedding.
+ *
+ * ```text
+ * ModelError
+ * ├── PackError                a pack that is not that of the contract, or does not run
+ * └── FaceError                .code, .details: a picture with no usable face in it
+ *     ├── NoFace
+ *     ├── MultipleFaces
+ *     ├── FaceTooSmall
+ *     └── LowQuality
+ * ```
+ *
+ * Messages name the cause and the remedy. They never hold a pixel or a number of an embedding.
+ */
+
+import { VeilfaceError } from "../errors.js";
+
+/** Base of all errors between a photo and its embedding. */
+export class ModelError extends VeilfaceError {
+  override name = "ModelError";
+}
+
+/** A pack that is not that of the contract, or does not run. */
+export class PackError extends ModelError {
+  override name = "PackError";
+}
+
+/** What was measured, and its limit. */
+export interface Measured {
+  readonly value: number;
+  readonly limit: number;
+}
+
+/** A picture that was read, in which no usable face was found. */
+export class FaceError extends ModelError {
+  override name = "FaceError";
+
+  /**
+   * @param code the same as in the REST contract.
+   * @param details measured values and limits, by what was measured.
+   */
+  constructor(
+    readonly code: "no_face" | "multiple_faces" | "face_too_small" | "low_quality",
+    message: string,
+    readonly details: Readonly<Record<string, unknown>> = {},
+  ) {
+    super(message);
+  }
+}
+
+/** No face was found. */
+export class NoFace extends FaceError {
+  override name = "NoFace";
+
+  constructor() {
+    super("no_face", "No face was found; send an upright photo of one face.");
+  }
+}
+
+/** More than one face that could be meant was found. */
+export class MultipleFaces extends FaceError {
+  override name = "MultipleFaces";
+
+  constructor(faces: number) {
+    super(
+      "multiple_faces",
+      `The photo shows ${faces} faces; send one that shows a single face.`,
+      { faces },
+    );
+  }
+}
+
+/** The face is too small in the photo. */
+export class FaceTooSmall extends FaceError {
+  override name = "FaceTooSmall";
+
+  constructor(message: string, details: Readonly<Record<string, unknown>>) {
+    super("face_too_small", message, details);
+  }
+}
+
+/** The face was found and failed at least one limit of the quality gate. */
+export class LowQuality extends FaceError {
+  override name = "LowQuality";
+
+  constructor(message: string, details: Readonly<Record<string, unknown>>) {
+    super("low_quality", message, details);
+  }
+}

@@ -1,0 +1,433 @@
+/** The client that sends photos, and what it shares with the private one. */
+
+import type { VeilfaceError } from "../errors.js";
+import { sha256, type FacePolicy, type PackGraphs } from "../models/pack.js";
+import type { PublicContract } from "../templates/contract.js";
+import type {
+  Answer,
+  Challenge,
+  Decision,
+  Enrollment,
+  PackList,
+  Receipt,
+  Subject,
+  SubjectPage,
+  Token,
+  TokenOutcome,
+} from "./answers.js";
+import { randomText } from "./base64.js";
+import { ConnectionFailed, errorOf, UnexpectedAnswer } from "./errors.js";
+import { holderKeyField } from "./holder-keys.js";
+import { DEFAULT_RETRIES, waitFor, type Resend, type Retries } from "./retries.js";
+import { isToken } from "./signature.js";
+
+const SUBJECT = /^(?!\.{1,2}$)[A-Za-z0-9._@:-]{1,128}$/;
+const VISIBLE = /^[\x21-\x7e]+$/;
+const IDEMPOTENCY_KEY = /^[\x21-\x7e]{1,255}$/;
+const TEMPLATE_ID = /^[A-Za-z0-9_-]{1,64}$/;
+// Connections that were never made, as Node names them; a browser does not tell.
+const NEVER_MADE = new Set(["ECONNREFUSED", "ENOTFOUND", "EAI_AGAIN", "UND_ERR_CONNECT_TIMEOUT"]);
+
+/** How a client connects. */
+export interface ClientOptions {
+  readonly retries?: Partial<Retries>;
+  /** Seconds for each sending. */
+  readonly timeout?: number;
+  /** In the place of the platform's `fetch`. */
+  readonly fetch?: typeof fetch;
+}
+
+/** What an enrollment may replace: anything, nothing (false), or the template of this id only. */
+export type Replace = boolean | string;
+
+/** Options of every enrollment. */
+export interface EnrollOptions {
+  readonly face?: FacePolicy;
+  /** With `holder` the answer has the sealed template, which the service does not keep. */
+  readonly storage?: "service" | "holder";
+  /** 32 bytes of `newHolderKey()`, without which the enrollment accepts nobody. */
+  readonly holderKey?: Uint8Array;
+  readonly replace?: Replace;
+}
+
+/** Options of every verification. */
+export interface VerifyOptions {
+  readonly level?: string;
+  readonly face?: FacePolicy;
+  readonly heldTemplate?: string;
+  readonly holderKey?: Uint8Array;
+}
+
+/** One call: what is sent, made anew for each sending, and how its answer is read. */
+export interface Call<T> {
+  readonly method: "GET" | "POST" | "PUT" | "DELETE";
+  readonly path: string;
+  readonly headers?: Readonly<Record<string, string>>;
+  readonly body?: () => FormData | object | Promise<object>;
+  readonly read: (response: Response) => Promise<T>;
+  readonly resend?: Resend;
+}
+
+/** The calls that carry no face: what `Client` and `PrivateClient` share. */
+export class Session {
+  readonly url: string;
+  readonly #bearer: string;
+  readonly #retries: Retries;
+  readonly #timeout: number;
+  readonly #fetch: typeof fetch;
+
+  /**
+   * @param url where the service is: `https://faces.example.org`.
+   * @param bearer an API key, or in a page a token of one call.
+   */
+  constructor(url: string, bearer: string, options: ClientOptions = {}) {
+    const parsed = URL.canParse(url) ? new URL(url) : undefined;
+    if (
+      parsed === undefined ||
+      !/^https?:$/.test(parsed.protocol) ||
+      parsed.username + parsed.password + parsed.search !== ""
+    ) {
+      throw new RangeError("the URL is that of the service: https://HOST[:PORT]");
+    }
+    // fetch would repeat a header that it cannot send in its error.
+    if (!VISIBLE.test(bearer)) {
+      throw new RangeError("the API key has a character that no API key has, or is empty");
+    }
+    this.url = url.replace(/\/+$/, "");
+    this.#bearer = bearer;
+    this.#retries = { ...DEFAULT_RETRIES, ...options.retries };
+    this.#timeout = options.timeout ?? 60;
+    this.#fetch = options.fetch ?? ((input, init) => fetch(input, init));
+  }
+
+  /** The bearer, for signatures. */
+  protected get bearer(): string {
+    return this.#bearer;
+  }
+
+  /** List one page of subjects. Right: `enroll`. */
+  page({ limit = 100, cursor }: { limit?: number; cursor?: string } = {}): Promise<SubjectPage> {
+    const query = new URLSearchParams({ limit: String(limit), ...(cursor && { cursor }) });
+    const read = answer<SubjectPage>({ subjects: "object" });
+    return this.send({ method: "GET", path: `/v1/subjects?${query}`, read });
+  }
+
+  /** Iterate over all subjects, in the order of their ids, a page at a time. */
+  async *subjects(pageSize = 100): AsyncGenerator<Subject> {
+    let cursor: string | undefined;
+    do {
+      const page = await this.page({ limit: pageSize, ...(cursor !== undefined && { cursor }) });
+      yield* page.subjects;
+      if (page.next_cursor !== null && page.next_cursor === cursor) {
+        throw new UnexpectedAnswer("the page names itself as the next one");
+      }
+      cursor = page.next_cursor ?? undefined;
+    } while (cursor !== undefined);
+  }
+
+  /** Describe a subject, without its template. Right: `enroll`. */
+  describe(subject: string): Promise<Subject & Answer> {
+    const read = answer<Subject & Answer>({ template_id: "string" });
+    return this.send({ method: "GET", path: subjectPath(subject), read });
+  }
+
+  /** Erase a subject, for good; keep the receipt. Right: `erase`. */
+  erase(subject: string): Promise<Receipt> {
+    return this.send({
+      method: "DELETE",
+      path: subjectPath(subject),
+      headers: idempotency(),
+      read: answer<Receipt>({ receipt: "object", claims: "object" }),
+    });
+  }
+
+  /** Fetch the contract in force. */
+  contract(): Promise<PublicContract & Answer> {
+    const read = answer<PublicContract & Answer>({ contract_id: "string", binding: "object" });
+    return this.send({ method: "GET", path: "/v1/contract", read });
+  }
+
+  /** Fetch the bytes of the decoy generator. Right: `embeddings`. */
+  generator(): Promise<Uint8Array> {
+    return this.send({ method: "GET", path: "/v1/contract/generator", read: readBytes });
+  }
+
+  /** Fetch the graphs that the contract names, and check the SHA-256 of each. */
+  async pack(): Promise<PackGraphs> {
+    const list = await this.send({
+      method: "GET",
+      path: "/v1/pack",
+      read: answer<PackList>({ files: "object" }),
+    });
+    const graphs: { -readonly [role in keyof PackGraphs]?: Uint8Array } = {};
+    for (const file of list.files) {
+      const path = `/v1/pack/${encodeURIComponent(file.sha256)}`;
+      const bytes = await this.send({ method: "GET", path, read: readBytes });
+      if ((await sha256(bytes)) !== file.sha256) {
+        throw new UnexpectedAnswer(`the ${file.role} that came is not the one that was asked for`);
+      }
+      graphs[file.role] = bytes;
+    }
+    const { embedder, ...rest } = graphs;
+    if (embedder === undefined) throw new UnexpectedAnswer("the pack has no embedder");
+    return { embedder, ...rest };
+  }
+
+  /** Ask for a token that a page may hold. Right: that of the action. */
+  token(
+    subject: string,
+    {
+      action,
+      level,
+      lifetime,
+    }: { action: "verify" | "enroll"; level?: string; /** Seconds. */ lifetime?: number },
+  ): Promise<Token> {
+    subjectPath(subject);
+    return this.send({
+      method: "POST",
+      path: "/v1/tokens",
+      body: () => fields({ subject_id: subject, action, level, lifetime_s: lifetime }),
+      read: answer<Token>({ token: "string", token_id: "string" }, ["token"]),
+    });
+  }
+
+  /** Ask what came of a token: never believe the page. Right: that of the action. */
+  tokenOutcome(subject: string, tokenId: string): Promise<TokenOutcome> {
+    const path = subjectPath(subject, `/tokens/${encodeURIComponent(tokenId)}`);
+    return this.send({ method: "GET", path, read: answer<TokenOutcome>({ used: "boolean" }) });
+  }
+
+  /** Ask for a challenge of head movements, for one verification. Right: `verify`. */
+  challenge(subject?: string): Promise<Challenge> {
+    return this.send({
+      method: "POST",
+      path: "/v1/challenges",
+      body: () => fields({ subject_id: subject }),
+      read: answer<Challenge>({ challenge_id: "string", movements: "object" }),
+    });
+  }
+
+  /** Ask once whether the service can answer; otherwise `Unavailable`. */
+  ready(): Promise<Answer & { readonly status: string }> {
+    const read = answer<Answer & { status: string }>({ status: "string" });
+    return this.send({ method: "GET", path: "/health/ready", read, resend: "never" });
+  }
+
+  /** Send a call until it is answered, or the retries say that it is enough. */
+  protected async send<T>(call: Call<T>): Promise<T> {
+    for (let sending = 1; ; sending++) {
+      const outcome = await this.#sendOnce(call);
+      if (!("failure" in outcome)) return outcome.value;
+      const wait = waitFor(outcome.failure, {
+        sending,
+        resend: call.resend ?? "when-lost",
+        retries: this.#retries,
+      });
+      if (wait === undefined) throw outcome.failure;
+      await new Promise((resolve) => setTimeout(resolve, 1000 * wait));
+    }
+  }
+
+  async #sendOnce<T>(call: Call<T>): Promise<{ value: T } | { failure: VeilfaceError }> {
+    const headers: Record<string, string> = {
+      ...call.headers,
+      Authorization: `Bearer ${this.#bearer}`,
+      Accept: "application/json, */*",
+    };
+    const content = await call.body?.();
+    if (content !== undefined && !(content instanceof FormData)) {
+      headers["Content-Type"] = "application/json";
+    }
+    let response: Response;
+    let value: T;
+    try {
+      response = await this.#fetch(this.url + call.path, {
+        method: call.method,
+        headers,
+        redirect: "manual",
+        credentials: "omit",
+        signal: AbortSignal.timeout(1000 * this.#timeout),
+        ...(content !== undefined && {
+          body: content instanceof FormData ? content : JSON.stringify(content),
+        }),
+      });
+      if (!response.ok) return { failure: await errorOf(response) };
+      value = await call.read(response);
+    } catch (error) {
+      if (error instanceof UnexpectedAnswer) return { failure: error };
+      // Without its cause: its text may repeat a header.
+      return { failure: connectionFailed(error) };
+    }
+    return { value };
+  }
+}
+
+/** Sends photos to the service, which embeds them. */
+export class Client extends Session {
+  /**
+   * Enroll a subject by 1 to 10 photos of one person, or replace its enrollment. Right: `enroll`.
+   *
+   * @param options.attributes `gender` and `race`, for services that lift with hybrid+.
+   * @param options.idempotencyKey of this one logical write; made anew where it is not given.
+   */
+  enroll(
+    subject: string,
+    photos: readonly Blob[],
+    options: EnrollOptions & {
+      readonly attributes?: Readonly<Record<string, string>>;
+      readonly idempotencyKey?: string;
+    } = {},
+  ): Promise<Enrollment> {
+    const { attributes, face, storage, holderKey, replace, idempotencyKey } = options;
+    const more = {
+      attributes: attributes && JSON.stringify(attributes),
+      face,
+      storage,
+      ...holderKeyField(holderKey),
+    };
+    return this.send({
+      method: "PUT",
+      path: subjectPath(subject, "/enrollment"),
+      headers: { ...idempotency(idempotencyKey), ...precondition(replace) },
+      body: () => form("images", photos, more),
+      read: readEnrollment,
+    });
+  }
+
+  /**
+   * Check whether 1 to 5 photos of one person show the subject. Right: `verify`.
+   *
+   * A rejection is no error: ask the decision for `accepted`.
+   *
+   * @param options.challenge the photos are then the frames that answer it, in their order, as the
+   *   camera gives them, not mirrored.
+   */
+  verify(
+    subject: string,
+    photos: readonly Blob[],
+    options: VerifyOptions & { readonly challenge?: Challenge } = {},
+  ): Promise<Decision> {
+    const { level, face, heldTemplate, holderKey, challenge } = options;
+    const more = {
+      level,
+      face,
+      challenge_id: challenge?.challenge_id,
+      held_template: heldTemplate,
+      ...holderKeyField(holderKey),
+    };
+    // Under a token a verification that is sent again gets the answer of the first.
+    const token = isToken(this.bearer);
+    return this.send({
+      method: "POST",
+      path: subjectPath(subject, "/verify"),
+      headers: token ? idempotency() : {},
+      body: () => form("image", photos, more),
+      read: readDecision,
+      resend: token ? "when-lost" : "when-not-done",
+    });
+  }
+}
+
+/** The path of a subject; a subject id needs no escapes in it. */
+export function subjectPath(subject: string, rest = ""): string {
+  if (!SUBJECT.test(subject)) {
+    throw new RangeError("a subject id has 1 to 128 characters out of A-Z a-z 0-9 . _ @ : -");
+  }
+  return `/v1/subjects/${subject}${rest}`;
+}
+
+/** The header of a write: the caller's key, or one that is made for this call. */
+export function idempotency(key: string = randomText(24)): Record<string, string> {
+  if (!IDEMPOTENCY_KEY.test(key)) {
+    throw new RangeError("an idempotency key has 1 to 255 visible ASCII characters");
+  }
+  return { "Idempotency-Key": key };
+}
+
+/** The header that says what an enrollment may replace; none where it is anything. */
+export function precondition(replace: Replace = true): Record<string, string> {
+  if (replace === true) return {};
+  if (replace === false) return { "If-None-Match": "*" };
+  if (!TEMPLATE_ID.test(replace)) {
+    throw new RangeError("replace is true, false, or the template_id of an enrollment");
+  }
+  return { "If-Match": `"${replace}"` };
+}
+
+/** The members that are there. */
+export function fields(values: Readonly<Record<string, unknown>>): Record<string, unknown> {
+  return Object.fromEntries(Object.entries(values).filter(([, value]) => value !== undefined));
+}
+
+function form(
+  name: string,
+  photos: readonly Blob[],
+  more: Readonly<Record<string, string | undefined>>,
+): FormData {
+  const data = new FormData();
+  // A file name of the user's machine is nobody else's business.
+  for (const photo of photos) data.append(name, photo, "photo");
+  for (const [field, value] of Object.entries(fields(more))) data.append(field, String(value));
+  return data;
+}
+
+type Kind = "string" | "boolean" | "object";
+
+/** Read JSON that must have these members; those of `concealed` are not printed with it. */
+function answer<T extends object>(
+  members: Readonly<Record<string, Kind>>,
+  concealed: readonly string[] = [],
+): (response: Response) => Promise<T> {
+  return async (response) => {
+    const text = await response.text();
+    let body: unknown;
+    try {
+      body = JSON.parse(text);
+    } catch {
+      throw new UnexpectedAnswer("the answer is not JSON; is the URL that of the service?");
+    }
+    if (typeof body !== "object" || body === null) {
+      throw new UnexpectedAnswer("the answer is no JSON object");
+    }
+    const found = body as Record<string, unknown>;
+    const missing = Object.keys(members).filter((name) => typeof found[name] !== members[name]);
+    if (missing.length > 0) {
+      throw new UnexpectedAnswer(`the answer lacks ${missing.join(", ")}`);
+    }
+    for (const name of concealed) {
+      if (name in found) Object.defineProperty(found, name, { enumerable: false });
+    }
+    return found as T;
+  };
+}
+
+export const readEnrollment = answer<Enrollment>({ template_id: "string", replaced: "boolean" }, [
+  "held_template",
+]);
+
+/** A decision that is neither accept nor reject is none. */
+export async function readDecision(response: Response): Promise<Decision> {
+  const read = answer<Decision>({ decision: "string", level: "string" });
+  const decision = await read(response);
+  if (decision.decision !== "accept" && decision.decision !== "reject") {
+    throw new UnexpectedAnswer("the answer is no decision");
+  }
+  return { ...decision, accepted: decision.decision === "accept" };
+}
+
+async function readBytes(response: Response): Promise<Uint8Array> {
+  return new Uint8Array(await response.arrayBuffer());
+}
+
+function connectionFailed(error: unknown): ConnectionFailed {
+  const { name, cause } = error as { name?: string; cause?: { code?: string } };
+  if (cause?.code !== undefined && NEVER_MADE.has(cause.code)) {
+    return new ConnectionFailed(`the service was not reached (${cause.code})`, false);
+  }
+  const why = name === "TimeoutError" ? "it took too long" : "the connection failed";
+  return new ConnectionFailed(
+    `no answer arrived (${why}); the service may have done what was asked`,
+    true,
+  );
+}
+

@@ -1,0 +1,233 @@
+/** The client that never sends a face: it embeds and lifts here, and sends private templates. */
+
+import { VeilfaceError } from "../errors.js";
+import { decodeImage, type RgbImage } from "../models/image.js";
+import { ModelPack, type FacePolicy, type PackGraphs } from "../models/pack.js";
+import type { Runtime } from "../models/runtime.js";
+import { liftTemplate, requireContract, type PublicContract } from "../templates/contract.js";
+import { DecoyGenerator } from "../templates/generator.js";
+import type { Decision, Enrollment } from "./answers.js";
+import { base64 } from "./base64.js";
+import {
+  fields,
+  idempotency,
+  precondition,
+  readDecision,
+  readEnrollment,
+  Session,
+  subjectPath,
+  type ClientOptions,
+  type EnrollOptions,
+  type VerifyOptions,
+} from "./client.js";
+import { ContractMismatch, UnexpectedAnswer } from "./errors.js";
+import { holderKeyField } from "./holder-keys.js";
+import { Enrollable, Probe } from "./lifts.js";
+import { canSign, isToken, signedProbe } from "./signature.js";
+
+const LOOKS = 3;
+
+/** A picture; in a browser also a file of one. */
+export type Photo = RgbImage | Blob;
+
+/** How a private client embeds. */
+export interface PrivateOptions extends ClientOptions {
+  /** The module `onnxruntime-web` or `onnxruntime-node`. */
+  readonly runtime: Runtime;
+  /** Where the graphs of a contract are; by default the service's own (`GET /v1/pack`). */
+  readonly graphs?: (contract: PublicContract) => Promise<PackGraphs>;
+  /** Of ONNX Runtime, such as `{ executionProviders: ["webgpu", "wasm"] }`. */
+  readonly sessionOptions?: object;
+  /** Dimension of probes; by default the largest that the contract takes. */
+  readonly dim?: number;
+}
+
+interface LiftInputs {
+  readonly contract: PublicContract;
+  readonly generator: DecoyGenerator;
+  readonly pack: ModelPack;
+}
+
+/** Embeds and lifts here, and sends private templates only. Rights: `embeddings` beside the call's. */
+export class PrivateClient extends Session {
+  readonly #options: PrivateOptions;
+  #inputs: Promise<LiftInputs> | undefined;
+
+  constructor(url: string, bearer: string, options: PrivateOptions) {
+    if (!canSign(bearer)) {
+      throw new RangeError("only an API key (vf_…) or a token (vft_…) of the service signs probes");
+    }
+    super(url, bearer, options);
+    this.#options = options;
+  }
+
+  /** A client under another bearer, such as the next token, with what this one has fetched. */
+  as(bearer: string): PrivateClient {
+    const other = new PrivateClient(this.url, bearer, this.#options);
+    other.#inputs = this.#inputs;
+    return other;
+  }
+
+  /** Fetch contract, generator and graphs now, so that the first lift need not wait for them. */
+  async prepare(): Promise<void> {
+    await this.#prepared();
+  }
+
+  /** Lift a probe; nothing is sent of it. */
+  async lift(photos: readonly Photo[], { face }: { face?: FacePolicy } = {}): Promise<Probe> {
+    const inputs = await this.#prepared();
+    return new Probe(await this.#lifted(inputs, photos, face, true), inputs.contract.contract_id);
+  }
+
+  /**
+   * Lift a template that enrolls; nothing is sent of it.
+   *
+   * Never enroll the same photos twice: two lifts of them give the embedding away.
+   */
+  async liftEnrollment(
+    photos: readonly Photo[],
+    { face }: { face?: FacePolicy } = {},
+  ): Promise<Enrollable> {
+    const inputs = await this.#prepared();
+    const template = await this.#lifted(inputs, photos, face, false);
+    return new Enrollable(template, inputs.contract.contract_id);
+  }
+
+  /**
+   * Lift photos here (or take a lift of {@link liftEnrollment}), and enroll by it alone.
+   *
+   * After an error repeat with its `lift`, never with the photos.
+   */
+  async enroll(
+    subject: string,
+    photos: readonly Photo[] | Enrollable,
+    options: EnrollOptions = {},
+  ): Promise<Enrollment> {
+    subjectPath(subject);
+    if (photos instanceof Enrollable) return this.#enroll(subject, photos, options);
+    return this.#withFreshContract(
+      () => this.liftEnrollment(photos, options),
+      (lift) => this.#enroll(subject, lift, options),
+    );
+  }
+
+  /** Lift photos here (or take a probe of {@link lift}), and verify by it alone. */
+  async verify(
+    subject: string,
+    photos: readonly Photo[] | Probe,
+    options: VerifyOptions = {},
+  ): Promise<Decision> {
+    subjectPath(subject);
+    if (photos instanceof Probe) return this.#verify(subject, photos, options);
+    return this.#withFreshContract(
+      () => this.lift(photos, options),
+      (lift) => this.#verify(subject, lift, options),
+    );
+  }
+
+  /** Free what ONNX Runtime holds. */
+  async close(): Promise<void> {
+    const inputs = this.#inputs;
+    this.#inputs = undefined;
+    await (await inputs)?.pack.release();
+  }
+
+  #prepared(): Promise<LiftInputs> {
+    this.#inputs ??= this.#fetched().catch((error: unknown) => {
+      this.#inputs = undefined;
+      throw error;
+    });
+    return this.#inputs;
+  }
+
+  async #fetched(): Promise<LiftInputs> {
+    for (let look = 0; look < LOOKS; look++) {
+      const contract = await this.contract();
+      const generator = await DecoyGenerator.fromBytes(await this.generator());
+      // The contract may have changed between the two answers, or between two workers.
+      if (generator.sourceId !== contract.binding.decoy_source_id) continue;
+      await requireContract(contract, generator);
+      const graphs = await (this.#options.graphs?.(contract) ?? this.pack());
+      const { runtime, sessionOptions } = this.#options;
+      const pack = await ModelPack.load(runtime, contract, graphs, sessionOptions);
+      return { contract, generator, pack };
+    }
+    throw new UnexpectedAnswer("the generator of the service is not that of its contract");
+  }
+
+  async #lifted(
+    { contract, generator, pack }: LiftInputs,
+    photos: readonly Photo[],
+    face: FacePolicy | undefined,
+    probe: boolean,
+  ): Promise<Uint8Array> {
+    if (photos.length === 0) throw new RangeError("there is no photo: at least one is needed");
+    const embeddings: Float32Array[] = [];
+    for (const photo of photos) {
+      const image = photo instanceof Blob ? await decodeImage(photo) : photo;
+      embeddings.push((await pack.embedPhoto(image, { policy: face })).embedding);
+    }
+    return liftTemplate(contract, generator, embeddings, { probe, dim: this.#options.dim });
+  }
+
+  /** Lift and send; once more under the contract in force where it is another one by now. */
+  async #withFreshContract<L extends Enrollable | Probe, T>(
+    lift: () => Promise<L>,
+    send: (lift: L) => Promise<T>,
+  ): Promise<T> {
+    const first = await lift();
+    try {
+      return await send(first);
+    } catch (error) {
+      if (!(error instanceof ContractMismatch)) throw error;
+      await this.close();
+      const { contract } = await this.#prepared();
+      // Else it is the subject's stored template that is of another contract.
+      if (contract.contract_id === first.contractId) throw error;
+    }
+    return send(await lift());
+  }
+
+  async #enroll(subject: string, lift: Enrollable, options: EnrollOptions): Promise<Enrollment> {
+    const { storage, holderKey, replace } = options;
+    const headers = { ...idempotency(await lift.keyFor(subject)), ...precondition(replace) };
+    const template = base64(lift.template);
+    const body = fields({ template, storage, ...holderKeyField(holderKey) });
+    const path = subjectPath(subject, "/enrollment");
+    return this.#naming(lift, () =>
+      this.send({ method: "PUT", path, headers, body: () => body, read: readEnrollment }),
+    );
+  }
+
+  async #verify(subject: string, lift: Probe, options: VerifyOptions): Promise<Decision> {
+    const { level, heldTemplate, holderKey } = options;
+    const more = fields({ held_template: heldTemplate, ...holderKeyField(holderKey) });
+    const token = isToken(this.bearer);
+    const key = await lift.keyFor(subject);
+    // Under a token a request that is repeated must be the same; under a key its nonce is another.
+    const once = token ? { nonce: key, timestamp: lift.liftedAt } : {};
+    return this.#naming(lift, () =>
+      this.send({
+        method: "POST",
+        path: subjectPath(subject, "/verify"),
+        headers: token ? idempotency(key) : {},
+        body: async () => ({
+          ...(await signedProbe(this.bearer, subject, lift.template, { level, ...once })),
+          ...more,
+        }),
+        read: readDecision,
+        resend: token ? "when-lost" : "when-not-done",
+      }),
+    );
+  }
+
+  /** The error that ends a lift's sending has it, so that callers can repeat it. */
+  async #naming<T>(lift: Enrollable | Probe, send: () => Promise<T>): Promise<T> {
+    try {
+      return await send();
+    } catch (error) {
+      if (error instanceof VeilfaceError && !(error instanceof ContractMismatch)) error.lift = lift;
+      throw error;
+    }
+  }
+}

@@ -1,0 +1,101 @@
+/** What a client needs of a contract, and the lift that it describes. */
+
+import type { PackContract } from "../models/pack.js";
+import { sha256 } from "../models/pack.js";
+import { meanEmbedding } from "./agreement.js";
+import { ContractError } from "./errors.js";
+import type { DecoyGenerator } from "./generator.js";
+import { lift, type Strategy } from "./lifting.js";
+import { Keystream } from "./randomness.js";
+import { encode } from "./wire.js";
+
+/** The answer of `GET /v1/contract`, as far as a client reads it. */
+export interface PublicContract extends PackContract {
+  readonly contract_id: string;
+  readonly binding: PackContract["binding"] & {
+    readonly strategy: Strategy;
+    readonly m: number;
+    readonly decoy_source_id: string;
+    readonly rotation_version: string;
+  };
+  readonly calibrations: readonly { readonly mode: string; readonly probe_m: number }[];
+  readonly photo_consistency: number;
+  readonly probe_consistency: number;
+}
+
+/**
+ * Refuse a contract that is not what its id hashes, and a generator other than the contract's or
+ * of another embedding space, whose decoys would hide nothing.
+ */
+export async function requireContract(
+  contract: PublicContract,
+  generator: DecoyGenerator,
+): Promise<void> {
+  const { binding } = contract;
+  if ((await digest(binding)) !== contract.contract_id) {
+    throw new ContractError("the contract_id is not the hash of the binding");
+  }
+  if (generator.sourceId !== binding.decoy_source_id) {
+    throw new ContractError("the decoy generator is not that of the contract");
+  }
+  const { embedder_sha256, preprocessing } = binding;
+  const space = await digest({ embedder_sha256, preprocessing });
+  if (generator.madeWith !== undefined && generator.madeWith !== space) {
+    throw new ContractError("the decoys are of another model or preprocessing, and hide nothing");
+  }
+}
+
+/**
+ * The dimension of a lift: that of the contract for an enrollment, one that is calibrated for a
+ * probe; without `dim` the largest of these.
+ */
+export function liftDimension(
+  contract: PublicContract,
+  { probe, dim }: { probe: boolean; dim?: number | undefined },
+): number {
+  if (!probe) return contract.binding.m;
+  const known = contract.calibrations
+    .filter(({ mode }) => mode === "s2s")
+    .map(({ probe_m }) => probe_m);
+  const chosen = dim ?? Math.max(...known);
+  if (!known.includes(chosen)) {
+    throw new ContractError(
+      known.length === 0
+        ? "the contract takes no lifted probes; calibrate it with --probe-dims"
+        : `the contract takes lifted probes of dimension ${known.join(", ")}, not ${chosen}`,
+    );
+  }
+  return chosen;
+}
+
+/** Average the embeddings of one person, lift them once, and encode the template's bytes. */
+export function liftTemplate(
+  contract: PublicContract,
+  generator: DecoyGenerator,
+  embeddings: readonly Float32Array[],
+  options: { probe: boolean; dim?: number | undefined },
+): Uint8Array {
+  const { binding, contract_id, photo_consistency, probe_consistency } = contract;
+  const m = liftDimension(contract, options);
+  const consistency = options.probe ? probe_consistency : photo_consistency;
+  const descriptor = meanEmbedding(embeddings, consistency);
+  const stream = Keystream.fresh();
+  try {
+    const subspace = lift(descriptor, { strategy: binding.strategy, m, generator, stream });
+    return encode(subspace, contract_id);
+  } finally {
+    stream.destroy();
+  }
+}
+
+/** SHA-256 of the canonical JSON: sorted keys, no spaces. */
+function digest(value: unknown): Promise<string> {
+  return sha256(new TextEncoder().encode(JSON.stringify(sorted(value))));
+}
+
+function sorted(value: unknown): unknown {
+  if (Array.isArray(value)) return value.map(sorted);
+  if (typeof value !== "object" || value === null) return value;
+  const members = Object.entries(value).sort(([a], [b]) => (a < b ? -1 : 1));
+  return Object.fromEntries(members.map(([name, member]) => [name, sorted(member)]));
+}

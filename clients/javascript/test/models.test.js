@@ -1,0 +1,112 @@
+import assert from "node:assert/strict";
+import { test } from "node:test";
+import { inspect } from "node:util";
+
+import { intersectionOverUnion, nonMaximumSuppression } from "../dist/models/boxes.js";
+import { letterbox } from "../dist/models/detection.js";
+import { similarityTransform, template } from "../dist/models/alignment.js";
+import {
+  FaceCrop,
+  fromImageData,
+  LowQuality,
+  ModelPack,
+  MultipleFaces,
+  NoFace,
+  PackError,
+  resizeArea,
+  resizeLinear,
+  rgbImage,
+  roundHalfEven,
+  warpAffine,
+} from "../dist/index.js";
+import { check, DEFAULT_QUALITY, measurePose, selectFace } from "../dist/models/quality.js";
+
+const face = (box, score = 0.9) => ({ box, score, keypoints: template(112) });
+const flat = (width, height, value) =>
+  rgbImage(new Uint8Array(3 * width * height).fill(value), width, height);
+
+test("a canvas gives RGB without its alpha", () => {
+  const image = fromImageData({ data: [1, 2, 3, 255, 4, 5, 6, 0], width: 2, height: 1 });
+  assert.deepEqual([...image.data], [1, 2, 3, 4, 5, 6]);
+  assert.throws(() => rgbImage(new Uint8Array(5), 1, 2), RangeError);
+});
+
+test("halves are rounded to the even number", () => {
+  assert.deepEqual([0.5, 1.5, 2.5, -0.5, 1.4, 1.6].map(roundHalfEven), [0, 2, 2, 0, 1, 2]);
+});
+
+test("resizing keeps a flat picture flat, and a ramp a ramp", () => {
+  for (const resize of [resizeLinear, resizeArea]) {
+    assert.ok(resize(flat(50, 40, 77), 31, 23).data.every((value) => value === 77));
+  }
+  const ramp = rgbImage(Uint8Array.from({ length: 30 }, (_, i) => 20 * Math.floor(i / 3)), 10, 1);
+  const twice = resizeLinear(ramp, 20, 1).data.filter((_, i) => i % 3 === 0);
+  assert.deepEqual([...twice.subarray(0, 6)], [0, 5, 15, 25, 35, 45]);
+  assert.deepEqual([...resizeArea(ramp, 5, 1).data.filter((_, i) => i % 3 === 0)], [10, 50, 90, 130, 170]);
+});
+
+test("a warp moves pixels, and is black outside", () => {
+  const image = flat(4, 4, 200);
+  const moved = warpAffine(image, [1, 0, 1, 0, 1, 0], 4).data;
+  assert.deepEqual([...moved.subarray(0, 12)], [0, 0, 0, ...Array(9).fill(200)]);
+  assert.equal(warpAffine(image, [1, 0, 0.5, 0, 1, 0], 4).data[0], 100);
+});
+
+test("a similarity is found again", () => {
+  const [a, b, x, y] = [1.3, 0.4, 7, -3];
+  const moved = template(112).map(([u, v]) => [a * u - b * v + x, b * u + a * v + y]);
+  const matrix = similarityTransform(template(112), moved);
+  [a, -b, x, b, a, y].forEach((value, i) => assert.ok(Math.abs(matrix[i] - value) < 1e-9));
+  assert.throws(() => similarityTransform(Array(5).fill([1, 1]), template(112)), RangeError);
+  assert.throws(() => template(100), PackError);
+});
+
+test("the better of two boxes that overlap is kept", () => {
+  const boxes = [face([0, 0, 10, 10], 0.7), face([1, 0, 11, 10], 0.9), face([50, 0, 60, 10], 0.6)];
+  assert.deepEqual(nonMaximumSuppression(boxes, 0.4).map(({ score }) => score), [0.9, 0.6]);
+  assert.equal(intersectionOverUnion([0, 0, 10, 10], [0, 0, 10, 20]), 0.5);
+});
+
+test("a picture lies in the corner of its canvas, its sides cut to whole pixels", () => {
+  const { canvas, scale } = letterbox(flat(300, 200, 9), [640, 640], true);
+  assert.equal(scale, 426 / 200);
+  assert.deepEqual([canvas.data[3 * (425 * 640)], canvas.data[3 * (426 * 640)]], [9, 0]);
+  assert.equal(letterbox(flat(300, 200, 9), [640, 640], false).scale, 1);
+});
+
+test("the face that is meant is the first that is large enough", () => {
+  const [speck, large, other] = [[0, 0, 9, 9], [0, 0, 90, 90], [5, 5, 60, 60]].map((box) => face(box));
+  assert.equal(selectFace([speck, large], true, DEFAULT_QUALITY), large);
+  assert.throws(() => selectFace([large, other], true, DEFAULT_QUALITY), MultipleFaces);
+  assert.equal(selectFace([large, other], false, DEFAULT_QUALITY), large);
+  assert.throws(() => selectFace([], true, DEFAULT_QUALITY), NoFace);
+});
+
+test("every limit that a face fails is named", () => {
+  const quality = { score: 0.3, face_size: 90, sharpness: 0.1, brightness: 250, yaw: -80, pitch: 0, roll: 0 };
+  assert.throws(
+    () => check(quality, DEFAULT_QUALITY, 0.6),
+    (error) =>
+      error instanceof LowQuality &&
+      Object.keys(error.details).join() === "score,blur,brightness,pose" &&
+      error.details.pose.yaw.limit === 70,
+  );
+  const straight = measurePose(template(112));
+  assert.ok(Math.abs(straight.roll) < 1e-9 && Math.abs(straight.yaw) < 10);
+});
+
+test("a graph is not run before its hash is that of the contract", async () => {
+  const runtime = { InferenceSession: { create: () => assert.fail("it was loaded") } };
+  const preprocessing = { version: 2, alignment: "arcface-112", size: 112 };
+  const contract = { binding: { embedder_sha256: "0".repeat(64), preprocessing, n: 4 }, recorded: {} };
+  const graphs = { embedder: new Uint8Array(3) };
+  await assert.rejects(ModelPack.load(runtime, contract, graphs), /the contract names 0000/);
+  const detector = { ...graphs, detector: new Uint8Array(3) };
+  await assert.rejects(ModelPack.load(runtime, contract, detector), PackError);
+});
+
+test("no pixel is printed", () => {
+  const crop = new FaceCrop(flat(2, 2, 171), { score: 1 }, undefined);
+  assert.ok(!inspect(crop, { depth: 9 }).includes("171"));
+  assert.ok(!JSON.stringify(crop).includes("171"));
+});

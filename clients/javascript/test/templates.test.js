@@ -1,0 +1,106 @@
+import assert from "node:assert/strict";
+import { test } from "node:test";
+import { inspect } from "node:util";
+
+import {
+  AffineSubspace,
+  DecoyError,
+  DecoyGenerator,
+  encode,
+  float16,
+  InconsistentImages,
+  Keystream,
+  LiftingError,
+  meanEmbedding,
+  weakestSplit,
+} from "../dist/index.js";
+import { orthonormalised, rowsOf, templateThrough } from "../dist/templates/subspace.js";
+
+const dot = (a, b) => a.reduce((sum, value, i) => sum + value * b[i], 0);
+
+test("the keystream is ChaCha20 (RFC 8439, appendix A.1, test vector 1)", () => {
+  const stream = new Keystream(new Uint8Array(32));
+  const word = Number(BigInt("0x903df1a0ade0b876") >> 11n) * 2 ** -53; // its first eight bytes
+  const [first] = stream.uniform(1);
+  // 76 b8 e0 ad a0 f1 3d 90, little-endian
+  assert.equal(first, word);
+});
+
+test("streams of the platform's generator differ, and end when they are destroyed", () => {
+  const [one, other] = [Keystream.fresh(), Keystream.fresh()];
+  assert.notEqual(one.uniform(1)[0], other.uniform(1)[0]);
+  assert.ok(!/[0-9]{3}/.test(inspect(one, { depth: 9 })), "its key is not printed");
+  one.destroy();
+  assert.throws(() => one.uniform(8), /destroyed/);
+  assert.throws(() => new Keystream(new Uint8Array(31)), RangeError);
+});
+
+test("a template contains its point, is orthonormal, and hides which directions made it", () => {
+  const n = 24;
+  const draw = () => rowsOf(new Keystream(new Uint8Array(32).fill(3)).normal(6 * n), n);
+  const [point, ...directions] = draw();
+  const mixed = directions.map((row, i) =>
+    i === 0 ? row : row.map((value, j) => value + 2 * directions[0][j]),
+  );
+  const templates = [directions, mixed].map((rows) =>
+    templateThrough(point, rows, new Keystream(new Uint8Array(32).fill(9))),
+  );
+  const rows = rowsOf(Float64Array.from(templates[0].basis), n);
+  rows.forEach((row, i) =>
+    rows.forEach((other, j) => assert.ok(Math.abs(dot(row, other) - (i === j ? 1 : 0)) < 1e-6)),
+  );
+  const gap = point.map((value, i) => value - templates[0].foot[i]);
+  rows.forEach((row) => {
+    const along = dot(row, gap);
+    gap.forEach((value, i) => (gap[i] = value - along * row[i]));
+  });
+  assert.ok(Math.sqrt(dot(gap, gap)) < 1e-5);
+  templates[0].basis.forEach((value, i) => assert.ok(Math.abs(value - templates[1].basis[i]) < 1e-6));
+});
+
+test("directions that depend on each other are refused", () => {
+  const row = Float64Array.from([1, 2, 3]);
+  assert.throws(() => orthonormalised([row, row.map((value) => 2 * value)]), LiftingError);
+  assert.throws(() => orthonormalised([new Float64Array(3)]), LiftingError);
+});
+
+test("numbers are rounded to float16 as IEEE 754 says", () => {
+  const cases = [
+    [0, 0x0000], [-0, 0x8000], [1, 0x3c00], [-1, 0xbc00], [0.5, 0x3800], [2 ** -14, 0x0400],
+    [2 ** -24, 0x0001], [2 ** -25, 0x0000], [1.5 * 2 ** -24, 0x0002], [1 - 2 ** -12, 0x3c00],
+    [1 - 2 ** -11, 0x3bff], [0.1, 0x2e66], [2 ** -14 - 2 ** -25, 0x0400],
+  ];
+  for (const [value, bits] of cases) assert.equal(float16(value), bits, String(value));
+});
+
+test("a template's bytes are a header of whole eights, then foot and basis", () => {
+  const template = new AffineSubspace(Float32Array.of(0, 0.5), Float32Array.of(1, 0));
+  const bytes = encode(template, "ab".repeat(32));
+  const length = Number(new DataView(bytes.buffer).getBigUint64(0, true));
+  assert.equal(length % 8, 0);
+  const header = JSON.parse(new TextDecoder().decode(bytes.subarray(8, 8 + length)));
+  assert.deepEqual(header.basis, { dtype: "F16", shape: [1, 2], data_offsets: [4, 8] });
+  assert.deepEqual([...bytes.subarray(8 + length)], [0, 0, 0, 0x38, 0, 0x3c, 0, 0]);
+  assert.ok(!inspect(template).includes("0.5"), "no number of it is printed");
+});
+
+test("photos that part into two people are named", () => {
+  const [one, other] = [Float32Array.of(1, 0, 0), Float32Array.of(0, 1, 0)];
+  const near = Float32Array.of(0.96, 0, 0.28);
+  assert.deepEqual(weakestSplit([one, near, other]).apart, [2]);
+  assert.throws(
+    () => meanEmbedding([one, near, other], 0.5),
+    (error) => error instanceof InconsistentImages && error.others.join() === "0,1",
+  );
+  assert.ok(meanEmbedding([one, near], 0.5)[0] > 0.98);
+  assert.throws(() => meanEmbedding([one, one.map((value) => -value)], -1), InconsistentImages);
+});
+
+test("bytes that are no generator are refused without being repeated", async () => {
+  const text = new TextEncoder().encode('{"secret": 1}');
+  const bytes = Uint8Array.from([text.length, 0, 0, 0, 0, 0, 0, 0, ...text]);
+  await assert.rejects(DecoyGenerator.fromBytes(bytes), (error) => {
+    return error instanceof DecoyError && !error.message.includes("secret");
+  });
+  await assert.rejects(DecoyGenerator.fromBytes(new Uint8Array(4)), DecoyError);
+});

@@ -1,0 +1,209 @@
+"""The JavaScript client before a real service: photos, private templates, tokens."""
+
+import base64
+from collections.abc import Sequence
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+import pytest
+
+from templates.keys.probe_signature import sign_probe
+from tests.api.deployment import photo, picture
+from tests.clients.conftest import Running
+from tests.clients.javascript.conftest import Node
+from tests.clients.proxy import Proxy
+from tests.ports import free_port
+
+
+def png(person: int, shot: int = 0) -> dict[str, str]:
+    return {"png": base64.b64encode(photo(person, shot)).decode()}
+
+
+def rgb(person: int, shot: int = 0) -> dict[str, str]:
+    return {"rgb": base64.b64encode(picture(person, shot).tobytes()).decode()}
+
+
+def calls(
+    node: Node,
+    service: Running,
+    steps: Sequence[dict[str, Any]],
+    *,
+    url: str | None = None,
+    **more: Any,
+) -> list[dict[str, Any]]:
+    """Outcomes of calls, one after the other."""
+    return list(
+        node(
+            "serve.js",
+            {
+                "url": url or service.url,
+                "bearer": service.deployment.token,
+                "embedder": str(service.pack / "tiny.onnx"),
+                "steps": steps,
+                **more,
+            },
+        )
+    )
+
+
+def test_photos(node: Node, service: Running) -> None:
+    key = {"holderKey": {"kept": "holderKey"}}
+    enrolled, again, found, wrong, refused, held, keyless, with_key, erased, nobody = calls(
+        node,
+        service,
+        [
+            {"kind": "photos", **step}
+            for step in (
+                {"call": "enroll", "args": ["js-anna", [png(1, 0), png(1, 1)]]},
+                {"call": "enroll", "args": ["js-anna", [png(1)], {"replace": False}]},
+                {"call": "verify", "args": ["js-anna", [png(1, 2)], {"level": "fmr-1e-3"}]},
+                {"call": "verify", "args": ["js-anna", [png(2)]]},
+                {"call": "verify", "args": ["js-anna", [{"png": "AAAA"}]]},
+                {"call": "enroll", "args": ["js-emil", [png(3)], {**key, "storage": "holder"}]},
+                {"call": "verify", "args": ["js-emil", [png(3, 1)]]},
+                {"call": "describe", "args": ["js-emil"]},
+                {"call": "erase", "args": ["js-anna"]},
+                {"call": "describe", "args": ["js-anna"]},
+            )
+        ],
+    )
+    assert enrolled["value"]["replaced"] is False
+    assert len(enrolled["value"]["images"]) == 2
+    assert again["error"] == "EnrollmentConflict"
+    assert again["details"]["template_id"] == enrolled["value"]["template_id"]
+    assert (found["value"]["accepted"], found["value"]["level"]) == (True, "fmr-1e-3")
+    assert (wrong["value"]["accepted"], wrong["value"]["reason"]) == (False, "no_match")
+    assert (refused["error"], refused["code"]) == ("PhotoRefused", "unsupported_image")
+    assert held["value"]["holder_key"] is True
+    assert "held_template" not in held["shown"], "the only copy of a template is not printed"
+    assert keyless["value"]["accepted"] is False
+    assert with_key["value"]["storage"] == "holder"
+    assert erased["value"]["claims"]["held"] is True
+    assert (nobody["error"], nobody["status"]) == ("NotEnrolled", 404)
+
+
+def test_private_templates(node: Node, service: Running) -> None:
+    """Lifted in Node, decided by the service; nothing that was sent has a picture in it."""
+    token = service.deployment.token
+    key = {"holderKey": {"kept": "holderKey"}}
+    probe = {"kept": "probe"}
+    with Proxy(service.port) as proxy:
+        outcomes = calls(
+            node,
+            service,
+            [
+                {"call": "enroll", "args": ["js-bert", [rgb(4, 0), rgb(4, 1)], key]},
+                {"call": "describe", "args": ["js-bert"]},
+                {"call": "lift", "args": [[rgb(4, 2)]], "keep": "probe"},
+                {"call": "verify", "args": ["js-bert", probe, key]},
+                {
+                    "call": "verify",
+                    "args": ["js-bert", probe, {**key, "level": "fmr-1e-2"}],
+                },
+                {"call": "verify", "args": ["js-bert", probe]},
+                {"call": "verify", "args": ["js-bert", [rgb(5)], key]},
+                {"call": "enroll", "args": ["js-bert", [rgb(4), rgb(5)], key]},
+            ],
+            url=proxy.url,
+        )
+        sent = proxy.sent
+    enrolled, described, probe, found, levelled, keyless, wrong, two = outcomes
+    assert enrolled["value"]["images"] == []
+    assert described["value"]["enrolled_by"] == "template"
+    assert "template" not in probe["shown"]
+    assert found["value"]["accepted"] is True
+    assert levelled["value"]["level"] == "fmr-1e-2", "signed anew, else it would be replayed"
+    assert keyless["value"]["accepted"] is False
+    assert wrong["value"]["accepted"] is False
+    assert two["error"] == "InconsistentImages"
+    assert all(token not in str(outcome) for outcome in outcomes)
+    assert sent.count(b"GET /v1/contract/generator") == 1, "fetched once, and kept"
+    for shot in range(3):
+        pixels = picture(4, shot).tobytes()
+        assert pixels[:64] not in sent
+        assert base64.b64encode(pixels)[:64] not in sent
+
+
+def test_a_lost_answer(node: Node, service: Running) -> None:
+    """The same write once more, by the client itself or with the lift that the error has."""
+    probe: dict[str, Any] = {"call": "verify", "args": ["js-lost", [rgb(6, 1)]]}
+    lift = {"kept": "lift"}
+    outcomes = calls(
+        node,
+        service,
+        [
+            {"call": "prepare"},
+            {"call": "enroll", "args": ["js-lost", [rgb(6, 0)]], "lost": 1},
+            {"call": "enroll", "args": ["js-lost", lift]},
+            {**probe, "lost": 1},
+            {"call": "verify", "args": ["js-lost", lift]},
+        ],
+        retries={"sendings": 1},
+    )
+    _, first, again, lost, decided = outcomes
+    assert (first["error"], first["sent"]) == ("ConnectionFailed", True)
+    assert first["lift"].startswith("Enrollable")
+    assert again["value"]["replaced"] is False, "the same write"
+    assert (lost["error"], decided["value"]["accepted"]) == ("ConnectionFailed", True)
+    enrolled, lost = calls(
+        node,
+        service,
+        [
+            {"call": "enroll", "args": ["js-resent", [rgb(6, 0)]], "lost": 0},
+            {**probe, "lost": 3},
+        ],
+        retries={"first": 0.01},
+    )
+    assert enrolled["value"]["replaced"] is False
+    assert lost["error"] == "ConnectionFailed"
+
+
+def test_no_service(node: Node, service: Running) -> None:
+    (outcome,) = calls(
+        node,
+        service,
+        [{"call": "ready"}],
+        url=f"http://127.0.0.1:{free_port()}",
+        retries={"sendings": 1},
+    )
+    assert (outcome["error"], outcome["sent"]) == ("ConnectionFailed", False)
+
+
+@pytest.mark.parametrize("level", [None, "fmr-1e-3"])
+def test_signatures_are_those_of_the_service(node: Node, level: str | None) -> None:
+    bearer = f"vf_{'0' * 12}_{'5e' * 32}"
+    template = np.arange(40, dtype=np.uint8).tobytes()
+    given = {"bearer": bearer, "subject": "anna", "template": base64.b64encode(template).decode()}
+    body = node("sign.js", {**given, "level": level})
+    again = sign_probe(
+        bearer, "anna", template, level=level, nonce=body["nonce"], timestamp=body["timestamp"]
+    )
+    assert body["hmac"] == again.hmac
+    assert base64.b64decode(body["template"]) == template
+    assert body.get("level") == level
+
+
+@pytest.mark.skipif(find_spec("api.http.routes.tokens") is None, reason="there are no tokens yet")
+def test_tokens(node: Node, service: Running) -> None:
+    """A backend asks for a token, a page uses it once, and the backend asks what came of it."""
+    page, probe = {"as": "token"}, {"kept": "probe"}
+    steps = [
+        {"call": "enroll", "args": ["js-dora", [rgb(7, 0), rgb(7, 1)]]},
+        {"call": "token", "args": ["js-dora", {"action": "verify"}], "keep": "token"},
+        {**page, "call": "lift", "args": [[rgb(7, 2)]], "keep": "probe"},
+        {**page, "call": "verify", "args": ["js-dora", probe]},
+        {**page, "call": "verify", "args": ["js-dora", probe]},
+        {**page, "call": "verify", "args": ["js-dora", [rgb(7, 2)]]},
+        {**page, "call": "describe", "args": ["js-dora"]},
+    ]
+    _, made, _, first, repeated, another, described = calls(node, service, steps)
+    assert "vft_" not in made["shown"]
+    assert first["value"]["accepted"] is True
+    assert repeated["value"]["accepted"] is True, "the same request: its answer again"
+    assert (another["error"], another["code"]) == ("Unauthorized", "replayed")
+    assert described["error"] == "Forbidden"
+    (outcome,) = calls(
+        node, service, [{"call": "tokenOutcome", "args": ["js-dora", made["value"]["token_id"]]}]
+    )
+    assert (outcome["value"]["used"], outcome["value"]["outcome"]) == (True, "accept")
