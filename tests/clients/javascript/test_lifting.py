@@ -244,9 +244,8 @@ def test_photos_of_two_people_are_told_as_python_tells_them(node: Node) -> None:
 def hostile_generators() -> dict[str, bytes]:
     """Bytes of a generator of 70 dimensions in which one thing is wrong, by what that is."""
     good = source_of(70).to_bytes()
-    read: tuple[Any, dict[str, NDArray[Any]]]
-    read = container.decode(good, what="generator", max_bytes=len(good))
-    fields, arrays = read
+    decoded, arrays = container.decode(good, what="generator", max_bytes=len(good))
+    fields: dict[str, Any] = dict(decoded)
     centres = arrays["centres"]
     energy = np.array(centres)
     energy[0, -1] = 11.0
