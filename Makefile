@@ -10,7 +10,7 @@ PYTEST = OMP_NUM_THREADS=1 $(VENV)/pytest --numprocesses=logical --maxprocesses=
 # Bytecode is kept: without it, every process that a test starts compiles all that it imports.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo install extras docs test test-all lint types javascript audit sbom wheels lock clean
+.PHONY: demo install extras docs test test-all lint types javascript javascript-package audit sbom wheels lock clean
 
 demo: .venv/core
 	$(VENV)/veilface demo
@@ -41,6 +41,17 @@ types: .venv/dev
 # The client for browsers and Node, by Node's own tools: needs Node 20 or newer, and npm.
 javascript:
 	cd clients/javascript && npm ci --no-audit --no-fund && npm run build && npm test
+
+# The package as a registry would get it, in dist/npm: installed alone, both of its exports load.
+javascript-package: javascript
+	rm -rf dist/npm && mkdir -p dist/npm/alone
+	cd clients/javascript && npm pack --silent --pack-destination ../../dist/npm
+	cd dist/npm/alone && echo '{"private": true, "type": "module"}' > package.json \
+		&& npm install --no-audit --no-fund --silent --ignore-scripts --omit=peer ../veilface-client-*.tgz \
+		&& node --input-type=module -e 'import { PrivateClient } from "veilface-client"; import { defineLogin } from "veilface-client/login";' \
+		&& test -f node_modules/veilface-client/dist/index.d.ts \
+		&& test -f node_modules/veilface-client/dist/element/login.d.ts
+	rm -rf dist/npm/alone
 
 # What the release depends on: known vulnerabilities, and a bill of materials (CycloneDX). Without
 # an advisory service nothing is audited, which fails with status 3 of the script, and is said.

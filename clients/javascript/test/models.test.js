@@ -6,8 +6,10 @@ import { intersectionOverUnion, nonMaximumSuppression } from "../dist/models/box
 import { letterbox } from "../dist/models/detection.js";
 import { similarityTransform, template } from "../dist/models/alignment.js";
 import {
+  decodeImage,
   FaceCrop,
   fromImageData,
+  ImageError,
   LowQuality,
   ModelPack,
   MultipleFaces,
@@ -17,6 +19,7 @@ import {
   resizeLinear,
   rgbImage,
   roundHalfEven,
+  sha256,
   warpAffine,
 } from "../dist/index.js";
 import { check, DEFAULT_QUALITY, measurePose, selectFace } from "../dist/models/quality.js";
@@ -109,4 +112,50 @@ test("no pixel is printed", () => {
   const crop = new FaceCrop(flat(2, 2, 171), { score: 1 }, undefined);
   assert.ok(!inspect(crop, { depth: 9 }).includes("171"));
   assert.ok(!JSON.stringify(crop).includes("171"));
+});
+
+/** A runtime whose graphs have this many outputs, and those that are held. */
+function runtimeOf(outputs, run = async () => ({})) {
+  const held = new Set();
+  const create = async () => {
+    const session = {
+      inputNames: ["x"],
+      inputMetadata: [{ shape: [1, 3, 112, 112] }],
+      outputNames: Array.from({ length: outputs }, (_, i) => String(i)),
+      run,
+      release: async () => void held.delete(session),
+    };
+    held.add(session);
+    return session;
+  };
+  return { held, runtime: { InferenceSession: { create }, Tensor: class {} } };
+}
+const sizes = { version: 2, alignment: "arcface-112", size: 112, mean: [0, 0, 0], scale: [1, 1, 1] };
+
+test("what was loaded is freed where a later graph is refused", async () => {
+  const { held, runtime } = runtimeOf(2);
+  const bytes = new Uint8Array(3);
+  const hash = await sha256(bytes);
+  const binding = { embedder_sha256: hash, preprocessing: sizes, n: 4 };
+  const contract = (detector_sha256) => ({ binding, recorded: { detector_sha256 } });
+  const graphs = { embedder: bytes, detector: bytes };
+  await assert.rejects(ModelPack.load(runtime, contract("0".repeat(64)), graphs), PackError);
+  await assert.rejects(ModelPack.load(runtime, contract(hash), graphs), /neither SCRFD/);
+  assert.equal(held.size, 0);
+});
+
+test("what ONNX Runtime and the browser throw has this package's classes", async () => {
+  const { runtime } = runtimeOf(1, async () => {
+    throw new Error("out of memory");
+  });
+  const bytes = new Uint8Array(3);
+  const binding = { embedder_sha256: await sha256(bytes), preprocessing: sizes, n: 4 };
+  const pack = await ModelPack.load(runtime, { binding, recorded: {} }, { embedder: bytes });
+  const noise = Uint8Array.from({ length: 3 * 112 * 112 }, (_, i) => (i * 7919) % 251);
+  await assert.rejects(pack.embedPhoto(rgbImage(noise, 112, 112)), PackError);
+  globalThis.createImageBitmap = async () => {
+    throw new DOMException("not decoded", "InvalidStateError");
+  };
+  await assert.rejects(decodeImage(new Blob(["text"])), (error) =>
+    error instanceof ImageError && error.code === "unsupported_image");
 });

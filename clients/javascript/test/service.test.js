@@ -15,7 +15,8 @@ import {
   UnexpectedAnswer,
 } from "../dist/index.js";
 import { DEFAULT_RETRIES } from "../dist/index.js";
-import { FAMILIES } from "../dist/service/errors.js";
+import * as errors from "../dist/service/errors.js";
+import { LiftInputs, SharedInputs } from "../dist/service/lift-inputs.js";
 import { waitFor } from "../dist/service/retries.js";
 
 const KEY = `vf_${"0".repeat(12)}_${"5e".repeat(32)}`;
@@ -139,7 +140,7 @@ test("a graph of another hash than was asked for is not taken", (t) =>
 test("a wait that is longer than the patience is not waited for", () => {
   const ask = { sending: 1, resend: "when-lost", retries: DEFAULT_RETRIES };
   const told = (code, retryAfter) =>
-    new FAMILIES[code]({ code, message: "said", status: 429, retryAfter });
+    new errors.FAMILIES[code]({ code, message: "said", status: 429, retryAfter });
   assert.equal(waitFor(told("rate_limited", 31), ask), undefined);
   const wait = waitFor(told("rate_limited", 5), ask);
   assert.ok(wait >= 5 && wait <= 5.25);
@@ -148,7 +149,7 @@ test("a wait that is longer than the patience is not waited for", () => {
 });
 
 test("keys, URLs and subjects are checked before anything is sent, and keys not repeated", async () => {
-  for (const url of ["ftp://host", "https://a:b@host", "host"]) {
+  for (const url of ["ftp://host", "https://a:b@host", "host", "https://host/#", "https://host?"]) {
     assert.throws(() => new Client(url, KEY), RangeError);
   }
   assert.throws(() => new Client("http://host", "vf_ secret"), (raised) => !raised.message.includes("secret"));
@@ -170,4 +171,124 @@ test("a token signs with all of its text, a key with its secret; neither signs a
   assert.equal(new Set([key.hmac, token.hmac, other.hmac]).size, 3);
   assert.match(key.hmac, /^[0-9a-f]{64}$/);
   await assert.rejects(signedProbe("vf_other", "anna", template), RangeError);
+});
+
+test("more photos than the service takes are refused before they are sent or embedded", (t) =>
+  answering(t, [decision], async (client, requests) => {
+    const lifting = new PrivateClient(client.url, KEY, { runtime: {} });
+    const photos = (count) => Array(count).fill(PHOTOS[0]);
+    for (const count of [0, 6]) {
+      await assert.rejects(async () => client.verify("anna", photos(count)), RangeError);
+      await assert.rejects(async () => lifting.lift(photos(count)), RangeError);
+    }
+    for (const count of [0, 11]) {
+      await assert.rejects(async () => client.enroll("anna", photos(count)), RangeError);
+      await assert.rejects(async () => lifting.liftEnrollment(photos(count)), RangeError);
+    }
+    assert.equal(requests.length, 0);
+    await client.verify("anna", photos(6), { challenge: { challenge_id: "c", max_frames: 6 } });
+    assert.equal(requests.length, 1);
+  }));
+
+test("null is no object, and no list", async (t) => {
+  await answering(t, [{ body: { contract_id: "c", binding: null } }], (client) =>
+    assert.rejects(client.contract(), UnexpectedAnswer));
+  await answering(t, [{ body: { subjects: { length: 1 } } }], (client) =>
+    assert.rejects(client.page(), UnexpectedAnswer));
+  const body = { error: { code: "forbidden", message: "said", details: null }, request_id: 7 };
+  await answering(t, [{ status: 403, body }], (client) =>
+    assert.rejects(client.contract(), (raised) => {
+      assert.deepEqual([raised.details, raised.requestId], [{}, undefined]);
+      return true;
+    }));
+});
+
+test("errors keep their names where a minifier renames their classes", () => {
+  for (const [name, family] of Object.entries(errors)) {
+    if (!(family.prototype instanceof Error)) continue;
+    const Renamed = { [name]: class extends family {} }[name];
+    Object.defineProperty(Renamed, "name", { value: "t" });
+    Object.defineProperty(family, "name", { value: "e" });
+    assert.equal(new Renamed({ message: "said" }).name, name);
+  }
+});
+
+/** Bytes that come in pieces, each when it is asked for. */
+const inPieces = (pull) => new Response(new ReadableStream({ pull }, { highWaterMark: 0 }));
+
+test("a graph may take longer than the timeout, but not stand still for it", async () => {
+  const pause = (ms) => new Promise((resolve) => setTimeout(resolve, ms));
+  let pieces = 0;
+  const slow = async () =>
+    inPieces(async (stream) => {
+      await pause(100);
+      if (++pieces <= 15) stream.enqueue(Uint8Array.of(pieces));
+      else stream.close();
+    });
+  const patient = new Client("http://host", KEY, { timeout: 1, fetch: slow });
+  assert.deepEqual([...(await patient.generator())], Array.from({ length: 15 }, (_, i) => i + 1));
+  const stuck = async (_, { signal }) =>
+    inPieces((stream) => new Promise((resolve) => {
+      signal.addEventListener("abort", () => resolve(stream.error(signal.reason)));
+    }));
+  const retries = { sendings: 1 };
+  const waiting = new Client("http://host", KEY, { timeout: 0.05, fetch: stuck, retries });
+  await assert.rejects(waiting.generator(), /took too long/);
+});
+
+test("a signal ends what runs, and whatever is called after it", async () => {
+  const ended = new AbortController();
+  let sent = 0;
+  const client = new Client("http://host", KEY, {
+    signal: ended.signal,
+    fetch: (_, { signal }) => {
+      sent++;
+      return new Promise((_resolve, reject) =>
+        signal.addEventListener("abort", () => reject(signal.reason)));
+    },
+  });
+  const call = assert.rejects(client.contract(), { name: "AbortError" });
+  await new Promise((resolve) => setTimeout(resolve));
+  ended.abort();
+  await call;
+  await assert.rejects(client.contract(), { name: "AbortError" });
+  assert.equal(sent, 1);
+});
+
+test("what clients share is fetched once, and freed once when nobody needs it", async () => {
+  const released = [];
+  const fetching = (id) => async () =>
+    new LiftInputs({ contract_id: id }, {}, { release: async () => void released.push(id) });
+  const shared = new SharedInputs();
+  shared.join();
+  await assert.rejects(shared.taken(async () => assert.fail("refused")), /refused/);
+  const [one, other] = await Promise.all([shared.taken(fetching("a")), shared.taken(fetching("b"))]);
+  assert.equal(one, other);
+  await one.leave();
+  // One client learns of another contract while the other still lifts by this one.
+  await shared.forget("a");
+  assert.deepEqual(released, []);
+  await other.leave();
+  assert.deepEqual(released, ["a"]);
+  const renewed = await shared.taken(fetching("b"));
+  await shared.forget("a");
+  await renewed.leave();
+  assert.equal(await shared.taken(fetching("c")), renewed, "a sibling does not forget the new one");
+  await renewed.leave();
+  await shared.leave();
+  assert.deepEqual(released, ["a"]);
+  await shared.leave();
+  assert.deepEqual(released, ["a", "b"]);
+  await assert.rejects(shared.taken(fetching("d")), /closed/);
+});
+
+test("a client that is closed while its preparation fails says nothing, and is closed", async () => {
+  const retries = { sendings: 1 };
+  const fetch = async () => new Response("", { status: 503 });
+  const client = new PrivateClient("http://host", KEY, { runtime: {}, retries, fetch });
+  const preparing = assert.rejects(client.prepare(), Unavailable);
+  await client.close();
+  await preparing;
+  await assert.rejects(client.prepare(), /closed/);
+  assert.throws(() => client.as(KEY), /closed/);
 });

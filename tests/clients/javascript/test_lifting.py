@@ -12,8 +12,9 @@ from scipy.special import ndtri
 
 from templates.contract import wire
 from templates.contract.binding import Binding
-from templates.decoys import DecoyGenerator
-from templates.errors import VeilfaceError
+from templates.decoys import DecoyGenerator, container
+from templates.decoys.statistics import MAX_COMPONENTS
+from templates.errors import DecoyError, VeilfaceError
 from templates.keys.randomness import Keystream
 from templates.keys.rotation import ROTATION_VERSION
 from templates.space.agreement import InconsistentImages, mean_embedding, weakest_split
@@ -238,3 +239,83 @@ def test_photos_of_two_people_are_told_as_python_tells_them(node: Node) -> None:
             assert (answer["apart"], answer["others"]) == (list(split.apart), list(split.others))
         else:
             np.testing.assert_allclose(unb64(answer["value"], "<f4"), expected, atol=1e-6)
+
+
+def hostile_generators() -> dict[str, bytes]:
+    """Bytes of a generator of 70 dimensions in which one thing is wrong, by what that is."""
+    good = source_of(70).to_bytes()
+    decoded, arrays = container.decode(good, what="generator", max_bytes=len(good))
+    fields: dict[str, Any] = dict(decoded)
+    centres = arrays["centres"]
+    energy = np.array(centres)
+    energy[0, -1] = 11.0
+    unlike = np.array(arrays["axes"])
+    unlike[1] = unlike[0]
+    few = np.array(arrays["axes"])
+    few[4:] *= 1e-5
+
+    def altered(**parts: NDArray[Any]) -> bytes:
+        return container.encode(fields, {**arrays, **parts})
+
+    def weighted(weights: NDArray[Any]) -> bytes:
+        count = len(weights)
+        return altered(
+            weights=weights.astype(np.float32),
+            centres=np.repeat(centres[:1], count, axis=0),
+            spreads=np.repeat(arrays["spreads"][:1], count, axis=0),
+        )
+
+    def said(**more: Any) -> bytes:
+        return container.encode({**fields, **more}, arrays)
+
+    size = int.from_bytes(good[:8], "little")
+    header, body = good[8 : 8 + size], good[8 + size :]
+
+    def headed(text: bytes) -> bytes:
+        return len(text).to_bytes(8, "little") + text + body
+
+    return {
+        "a log energy": altered(centres=energy),
+        "components": weighted(np.full(MAX_COMPONENTS + 1, 1 / (MAX_COMPONENTS + 1))),
+        "a number that is not finite": altered(mean=np.full(70, np.nan, np.float32)),
+        "a large number": altered(mean=np.full(70, 2e3, np.float32)),
+        "no length": altered(axes=np.zeros((70, 70), np.float32)),
+        "weights that add up to 2": weighted(np.ones(2)),
+        "a weight of 0": weighted(np.eye(2)[0]),
+        "axes that are not orthogonal": altered(axes=unlike),
+        "decoys in few dimensions": altered(axes=few),
+        "centres that do not fit": altered(centres=centres[:, :-1]),
+        "one dimension": altered(mean=np.zeros(1, np.float32)),
+        "another part": altered(more=np.zeros(1, np.float32)),
+        "a shape of another rank": altered(mean=arrays["mean"][None]),
+        "bytes as numbers": altered(mean=np.zeros(70, np.uint8)),
+        "another version": said(version=2),
+        "another field": said(more="field"),
+        "a made_with that is no hash": said(made_with="ab"),
+        "a noise that is too large": said(noise="0.2"),
+        "a noise that is a number": said(noise=0),
+        "a noise in another writing": said(noise="1e-5"),
+        "bytes behind": good + b"\0",
+        "bytes that lack": good[:-1],
+        "a header that is padded": headed(header + b" " * 8),
+        "a header with a mark": headed(b"\xef\xbb\xbf" + header),
+        "a part twice": headed(header.rstrip()[:-1] + b',"mean":' + b"{}}"),
+        "a header that is too large": headed(header + b" " * 2**16),
+        "no header": b"\xff" * 8 + body,
+    }
+
+
+def test_generators_that_python_refuses_are_refused(node: Node) -> None:
+    hostile = hostile_generators()
+    for data in hostile.values():
+        with pytest.raises(DecoyError):
+            DecoyGenerator.from_bytes(data)
+    noises = [0.0, 1.5e-07, 2.5e-05, 1e-4, 0.0125, 0.1]
+    good = [source_of(70, noise).to_bytes() for noise in noises]
+    answers = node(
+        "lift.js",
+        [{"call": "read", "generator": b64(data)} for data in (*hostile.values(), *good)],
+    )
+    for what, answer in zip(hostile, answers, strict=False):
+        assert answer.get("error") == "DecoyError", what
+    assert [answer.get("value") for answer in answers[len(hostile) :]] == noises

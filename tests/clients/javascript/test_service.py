@@ -188,7 +188,7 @@ def test_signatures_are_those_of_the_service(node: Node, level: str | None) -> N
 def test_tokens(node: Node, service: Running) -> None:
     """A backend asks for a token, a page uses it once, and the backend asks what came of it."""
     page, probe = {"as": "token"}, {"kept": "probe"}
-    steps = [
+    steps: list[dict[str, Any]] = [
         {"call": "enroll", "args": ["js-dora", [rgb(7, 0), rgb(7, 1)]]},
         {"call": "token", "args": ["js-dora", {"action": "verify"}], "keep": "token"},
         {**page, "call": "lift", "args": [[rgb(7, 2)]], "keep": "probe"},

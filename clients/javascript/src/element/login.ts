@@ -11,8 +11,23 @@ export interface Authorization {
   readonly holderKey?: Uint8Array;
 }
 
-/** What the element says to the person; give others for another language. */
-export const WORDS = {
+/** What the element says to the person. */
+export interface Words {
+  readonly start: string;
+  readonly take: string;
+  readonly enroll: string;
+  readonly waiting: string;
+  readonly working: string;
+  readonly accept: string;
+  readonly reject: string;
+  readonly enrolled: string;
+  readonly camera: string;
+  /** By an error's `code`, or its `name` where it has none; the error's message for all others. */
+  readonly errors: Readonly<Record<string, string>>;
+}
+
+/** The texts in English; give others for another language. */
+export const WORDS: Words = {
   start: "Start camera",
   take: "Log in",
   enroll: "Enroll",
@@ -22,6 +37,7 @@ export const WORDS = {
   reject: "That did not match. Try again.",
   enrolled: "You are enrolled.",
   camera: "The camera cannot be used.",
+  errors: {},
 };
 
 const STYLE = `
@@ -35,29 +51,40 @@ output { display: block; min-height: 1.5em; }
 const BURST = 3;
 const BETWEEN_FRAMES = 150; // milliseconds, so that the frames are not one picture three times
 
+// A server that renders pages imports this module too, and has no elements.
+const Base = globalThis.HTMLElement ?? (class {} as typeof HTMLElement);
+
 /**
  * The element. Set `runtime` and `authorize`; then it asks for the camera when it is told to, takes
  * a burst, lifts it in the page, sends the template alone, and tells the page by an event:
  * `veilface-result` with the decision (or enrollment) as its detail, `veilface-error` with the error.
  *
  * The attribute `service` is the service's URL, by default the page's own origin; `action` is
- * `verify` (by default) or `enroll`. Parts for styling: `video`, `button`, `status`.
+ * `verify` (by default) or `enroll`; `face` is `single` (by default: a second face is an error) or
+ * `largest`. Parts for styling: `video`, `button`, `status`.
+ *
+ * Taken out of the page it stops the camera and ends the attempt: nothing more is sent or told.
  *
  * Never believe the event alone: your server asks the service what came of the token.
  */
-export class VeilfaceLogin extends HTMLElement {
+export class VeilfaceLogin extends Base {
   /** Of `PrivateClient`: the ONNX Runtime, and where the graphs are. */
-  options: PrivateOptions | undefined;
-  /** Asks your server for a token; called for each attempt, because a token is good for one. */
+  options: Omit<PrivateOptions, "signal"> | undefined;
+  /**
+   * Asks your server for a token, which is good for one call and for minutes: called once to fetch
+   * the graphs, which may take longer than that, and once for each attempt.
+   */
   authorize: (() => Promise<Authorization>) | undefined;
-  words = WORDS;
+  words: Words = WORDS;
 
   readonly #video = document.createElement("video");
   readonly #button = document.createElement("button");
   readonly #status = document.createElement("output");
   #camera: MediaStream | undefined;
   // Graphs stay loaded from one attempt to the next.
-  #client: PrivateClient | undefined;
+  #client: Promise<PrivateClient> | undefined;
+  // Aborted when the element leaves the page; another one when it comes back.
+  #stay = new AbortController();
 
   constructor() {
     super();
@@ -77,30 +104,75 @@ export class VeilfaceLogin extends HTMLElement {
   }
 
   connectedCallback(): void {
+    if (this.#stay.signal.aborted) this.#stay = new AbortController();
     this.#button.textContent = this.words.start;
   }
 
   disconnectedCallback(): void {
+    this.#stay.abort();
     this.#stop();
-    void this.#client?.close();
+    this.#say("");
+    void this.#client?.then((client) => client.close()).catch(() => undefined);
     this.#client = undefined;
   }
 
   /** Take a burst, lift and send it; the decision (or enrollment) also comes as an event. */
   async attempt(): Promise<Decision | Enrollment> {
+    const { signal } = this.#stay;
+    const { authorize } = this.#given();
+    const photos = await this.#burst(signal);
+    const prepared = await this.#prepared(signal);
+    signal.throwIfAborted();
+    const { subject, token, holderKey } = await authorize();
+    signal.throwIfAborted();
+    const client = prepared.as(token);
+    try {
+      const face = this.getAttribute("face") === "largest" ? "largest" : "single";
+      const more = { face, ...(holderKey && { holderKey }) } as const;
+      const result = await (this.getAttribute("action") === "enroll"
+        ? client.enroll(subject, photos, more)
+        : client.verify(subject, photos, more));
+      signal.throwIfAborted();
+      return result;
+    } finally {
+      await client.close();
+    }
+  }
+
+  #given(): { options: Omit<PrivateOptions, "signal">; authorize: () => Promise<Authorization> } {
     const { options, authorize } = this;
     if (options === undefined || authorize === undefined) {
       throw new Error("<veilface-login> needs its properties options and authorize");
     }
-    const photos = await this.#burst();
-    const { subject, token, holderKey } = await authorize();
+    return { options, authorize };
+  }
+
+  /** The client whose graphs are loaded, or will be; what failed is tried again the next time. */
+  #prepared(signal: AbortSignal): Promise<PrivateClient> {
+    if (this.#client === undefined) {
+      const client: Promise<PrivateClient> = this.#prepare(signal).catch((error: unknown) => {
+        if (this.#client === client) this.#client = undefined;
+        throw error;
+      });
+      this.#client = client;
+    }
+    return this.#client;
+  }
+
+  async #prepare(signal: AbortSignal): Promise<PrivateClient> {
+    const { options, authorize } = this.#given();
+    const { token } = await authorize();
+    signal.throwIfAborted();
     const url = this.getAttribute("service") ?? location.origin;
-    const client = this.#client?.as(token) ?? new PrivateClient(url, token, options);
-    this.#client = client;
-    const more = { face: "largest", ...(holderKey && { holderKey }) } as const;
-    return this.getAttribute("action") === "enroll"
-      ? client.enroll(subject, photos, more)
-      : client.verify(subject, photos, more);
+    const client = new PrivateClient(url, token, { ...options, signal });
+    try {
+      await client.prepare();
+      signal.throwIfAborted();
+      return client;
+    } catch (error) {
+      await client.close();
+      throw error;
+    }
   }
 
   async #clicked(): Promise<void> {
@@ -114,13 +186,23 @@ export class VeilfaceLogin extends HTMLElement {
   }
 
   async #start(): Promise<void> {
+    const { signal } = this.#stay;
     try {
-      this.#camera = await navigator.mediaDevices.getUserMedia({
+      const camera = await navigator.mediaDevices.getUserMedia({
         video: { facingMode: "user", width: { ideal: 640 }, height: { ideal: 480 } },
       });
-      this.#video.srcObject = this.#camera;
+      // The person may have left while the browser asked them.
+      if (signal.aborted) {
+        camera.getTracks().forEach((track) => track.stop());
+        return;
+      }
+      this.#camera = camera;
+      this.#video.srcObject = camera;
       await this.#video.play();
+      if (signal.aborted) return;
     } catch (error) {
+      if (signal.aborted) return;
+      this.#stop();
       this.#say(this.words.camera);
       this.#tell("veilface-error", error);
       return;
@@ -128,24 +210,29 @@ export class VeilfaceLogin extends HTMLElement {
     const enrolls = this.getAttribute("action") === "enroll";
     this.#button.textContent = enrolls ? this.words.enroll : this.words.take;
     this.#say(this.words.waiting);
+    // While the person looks; the attempt waits for it, and tells what went wrong.
+    this.#prepared(signal).catch(() => undefined);
   }
 
   async #try(): Promise<void> {
+    const { signal } = this.#stay;
     this.#say(this.words.working);
     try {
       const result = await this.attempt();
+      if (signal.aborted) return;
       this.#stop();
       if ("accepted" in result) this.#say(result.accepted ? this.words.accept : this.words.reject);
       else this.#say(this.words.enrolled);
       this.#tell("veilface-result", result);
     } catch (error) {
-      this.#say(error instanceof Error ? error.message : String(error));
+      if (signal.aborted) return;
+      this.#say(this.#wordsOf(error));
       this.#tell("veilface-error", error);
     }
   }
 
   /** The frames of a moment, as the camera gives them, not mirrored. */
-  async #burst(): Promise<RgbImage[]> {
+  async #burst(signal: AbortSignal): Promise<RgbImage[]> {
     const { videoWidth: width, videoHeight: height } = this.#video;
     const context = new OffscreenCanvas(width, height).getContext("2d", {
       willReadFrequently: true,
@@ -154,6 +241,7 @@ export class VeilfaceLogin extends HTMLElement {
     const photos: RgbImage[] = [];
     for (let frame = 0; frame < BURST; frame++) {
       if (frame > 0) await new Promise((resolve) => setTimeout(resolve, BETWEEN_FRAMES));
+      signal.throwIfAborted();
       context.drawImage(this.#video, 0, 0);
       photos.push(fromImageData(context.getImageData(0, 0, width, height)));
     }
@@ -165,6 +253,13 @@ export class VeilfaceLogin extends HTMLElement {
     this.#camera = undefined;
     this.#video.srcObject = null;
     this.#button.textContent = this.words.start;
+  }
+
+  #wordsOf(error: unknown): string {
+    if (!(error instanceof Error)) return String(error);
+    const { code, name } = error as Error & { code?: unknown };
+    const key = typeof code === "string" ? code : name;
+    return Object.hasOwn(this.words.errors, key) ? this.words.errors[key] : error.message;
   }
 
   #say(text: string): void {

@@ -4,6 +4,7 @@
  * ```text
  * ModelError
  * ├── PackError                a pack that is not that of the contract, or does not run
+ * ├── ImageError               .code: a file that is no picture that can be read
  * └── FaceError                .code, .details: a picture with no usable face in it
  *     ├── NoFace
  *     ├── MultipleFaces
@@ -24,6 +25,16 @@ export class ModelError extends VeilfaceError {
 /** A pack that is not that of the contract, or does not run. */
 export class PackError extends ModelError {
   override name = "PackError";
+}
+
+/** A file that is no picture that can be read. */
+export class ImageError extends ModelError {
+  override name = "ImageError";
+  readonly code = "unsupported_image";
+
+  constructor() {
+    super("The file is not a picture that this browser reads; send a JPEG or PNG.");
+  }
 }
 
 /** What was measured, and its limit. */

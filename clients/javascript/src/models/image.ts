@@ -1,5 +1,7 @@
 /** Pictures as arrays, and the three ways in which they are resampled, as OpenCV does it. */
 
+import { ImageError } from "./errors.js";
+
 /** A picture: RGB, 8 bits a channel, row by row from the top. */
 export interface RgbImage {
   readonly width: number;
@@ -38,13 +40,15 @@ export function fromImageData(pixels: {
 /**
  * Decode a photo in a browser, upright: the EXIF orientation is applied.
  *
- * Colours stay as they are in the file, as the service reads them. Throws what `createImageBitmap`
- * throws of a file that is no picture.
+ * Colours stay as they are in the file, as the service reads them. Throws `ImageError` of a
+ * file that is no picture.
  */
 export async function decodeImage(photo: Blob): Promise<RgbImage> {
   const bitmap = await createImageBitmap(photo, {
     imageOrientation: "from-image",
     colorSpaceConversion: "none",
+  }).catch(() => {
+    throw new ImageError();
   });
   try {
     const canvas = new OffscreenCanvas(bitmap.width, bitmap.height);

@@ -115,9 +115,15 @@ export class ModelPack {
       preprocessing,
     );
     if (graphs.detector === undefined) return new ModelPack(n, embedder, undefined);
-    await requireSha256("detector", graphs.detector, recorded.detector_sha256);
-    const size = recorded.detector_input_size?.[0] ?? DEFAULT_SIZE;
-    return new ModelPack(n, embedder, await loadDetector(runtime, graphs.detector, size, options));
+    try {
+      await requireSha256("detector", graphs.detector, recorded.detector_sha256);
+      const size = recorded.detector_input_size?.[0] ?? DEFAULT_SIZE;
+      const detector = await loadDetector(runtime, graphs.detector, size, options);
+      return new ModelPack(n, embedder, detector);
+    } catch (error) {
+      await embedder.release();
+      throw error;
+    }
   }
 
   /** Faces of a picture, the one most likely meant first. */
@@ -209,6 +215,7 @@ async function loadDetector(
     height !== undefined && width !== undefined ? [height, width] : undefined;
   const isYuNet = YUNET_OUTPUTS.every((name) => graph.outputNames.includes(name));
   if (!isYuNet && graph.outputNames.length !== 9) {
+    await graph.release();
     throw new PackError("the detector is neither SCRFD with five points nor YuNet");
   }
   return isYuNet ? new YuNet(graph, size, fixed) : new Scrfd(graph, size, fixed);

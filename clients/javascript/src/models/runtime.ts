@@ -14,7 +14,7 @@ export interface Runtime {
 export interface RuntimeSession {
   readonly inputNames: readonly string[];
   readonly outputNames: readonly string[];
-  /** Shape of each input, a text for a size that is open; ONNX Runtime 1.21 and later. */
+  /** Shape of each input, a text for a size that is open; ONNX Runtime 1.22 and later. */
   readonly inputMetadata: readonly unknown[];
   run(
     feeds: Readonly<Record<string, unknown>>,
@@ -51,6 +51,7 @@ export class Graph {
     }
     const input = session.inputMetadata?.[0] as { shape?: readonly unknown[] } | undefined;
     if (session.inputNames.length !== 1 || input?.shape?.length !== 4) {
+      await session.release();
       throw new PackError("a graph of the pack has not one image input, or ONNX Runtime is too old");
     }
     const shape = input.shape.map((size) =>
@@ -66,10 +67,12 @@ export class Graph {
   /** Run on a batch of images; the outputs by their names. */
   async run(data: Float32Array, dims: readonly number[]): Promise<Map<string, Tensor>> {
     const input = new this.runtime.Tensor("float32", data, dims);
-    const outputs = await this.session.run(
-      { [this.session.inputNames[0]]: input },
-      ERRORS_ONLY,
-    );
+    let outputs: Readonly<Record<string, unknown>>;
+    try {
+      outputs = await this.session.run({ [this.session.inputNames[0]]: input }, ERRORS_ONLY);
+    } catch (error) {
+      throw new PackError(`ONNX Runtime does not run a graph of the pack: ${String(error)}`);
+    }
     return new Map(this.outputNames.map((name) => [name, outputs[name] as Tensor]));
   }
 

@@ -21,6 +21,10 @@ import { holderKeyField } from "./holder-keys.js";
 import { DEFAULT_RETRIES, waitFor, type Resend, type Retries } from "./retries.js";
 import { isToken } from "./signature.js";
 
+/** The most photos of one enrollment, and of one probe. */
+export const ENROLL_PHOTOS = 10;
+export const PROBE_PHOTOS = 5;
+
 const SUBJECT = /^(?!\.{1,2}$)[A-Za-z0-9._@:-]{1,128}$/;
 const VISIBLE = /^[\x21-\x7e]+$/;
 const IDEMPOTENCY_KEY = /^[\x21-\x7e]{1,255}$/;
@@ -31,8 +35,10 @@ const NEVER_MADE = new Set(["ECONNREFUSED", "ENOTFOUND", "EAI_AGAIN", "UND_ERR_C
 /** How a client connects. */
 export interface ClientOptions {
   readonly retries?: Partial<Retries>;
-  /** Seconds for each sending. */
+  /** Seconds without an answer, or of a graph without another byte, after which a sending ends. */
   readonly timeout?: number;
+  /** Ends whatever the client does; calls are then rejected with its reason. */
+  readonly signal?: AbortSignal;
   /** In the place of the platform's `fetch`. */
   readonly fetch?: typeof fetch;
 }
@@ -64,7 +70,8 @@ export interface Call<T> {
   readonly path: string;
   readonly headers?: Readonly<Record<string, string>>;
   readonly body?: () => FormData | object | Promise<object>;
-  readonly read: (response: Response) => Promise<T>;
+  /** Long answers tell of each piece that came, so that slow ones are not taken for lost. */
+  readonly read: (response: Response, alive: () => void) => Promise<T>;
   readonly resend?: Resend;
 }
 
@@ -75,6 +82,7 @@ export class Session {
   readonly #retries: Retries;
   readonly #timeout: number;
   readonly #fetch: typeof fetch;
+  readonly #signal: AbortSignal | undefined;
 
   /**
    * @param url where the service is: `https://faces.example.org`.
@@ -85,7 +93,9 @@ export class Session {
     if (
       parsed === undefined ||
       !/^https?:$/.test(parsed.protocol) ||
-      parsed.username + parsed.password + parsed.search !== ""
+      // Also one that is empty: paths are put behind the text.
+      /[?#]/.test(url) ||
+      parsed.username + parsed.password !== ""
     ) {
       throw new RangeError("the URL is that of the service: https://HOST[:PORT]");
     }
@@ -97,6 +107,7 @@ export class Session {
     this.#bearer = bearer;
     this.#retries = { ...DEFAULT_RETRIES, ...options.retries };
     this.#timeout = options.timeout ?? 60;
+    this.#signal = options.signal;
     this.#fetch = options.fetch ?? ((input, init) => fetch(input, init));
   }
 
@@ -108,7 +119,7 @@ export class Session {
   /** List one page of subjects. Right: `enroll`. */
   page({ limit = 100, cursor }: { limit?: number; cursor?: string } = {}): Promise<SubjectPage> {
     const query = new URLSearchParams({ limit: String(limit), ...(cursor && { cursor }) });
-    const read = answer<SubjectPage>({ subjects: "object" });
+    const read = answer<SubjectPage>({ subjects: "array" });
     return this.send({ method: "GET", path: `/v1/subjects?${query}`, read });
   }
 
@@ -157,7 +168,7 @@ export class Session {
     const list = await this.send({
       method: "GET",
       path: "/v1/pack",
-      read: answer<PackList>({ files: "object" }),
+      read: answer<PackList>({ files: "array" }),
     });
     const graphs: { -readonly [role in keyof PackGraphs]?: Uint8Array } = {};
     for (const file of list.files) {
@@ -203,7 +214,7 @@ export class Session {
       method: "POST",
       path: "/v1/challenges",
       body: () => fields({ subject_id: subject }),
-      read: answer<Challenge>({ challenge_id: "string", movements: "object" }),
+      read: answer<Challenge>({ challenge_id: "string", movements: "array" }),
     });
   }
 
@@ -216,6 +227,7 @@ export class Session {
   /** Send a call until it is answered, or the retries say that it is enough. */
   protected async send<T>(call: Call<T>): Promise<T> {
     for (let sending = 1; ; sending++) {
+      this.#signal?.throwIfAborted();
       const outcome = await this.#sendOnce(call);
       if (!("failure" in outcome)) return outcome.value;
       const wait = waitFor(outcome.failure, {
@@ -238,27 +250,41 @@ export class Session {
     if (content !== undefined && !(content instanceof FormData)) {
       headers["Content-Type"] = "application/json";
     }
-    let response: Response;
-    let value: T;
+    const sending = new AbortController();
+    const end = (): void => sending.abort();
+    let late = false;
+    let timer: ReturnType<typeof setTimeout> | undefined;
+    const alive = (): void => {
+      clearTimeout(timer);
+      timer = setTimeout(() => {
+        late = true;
+        end();
+      }, 1000 * this.#timeout);
+    };
+    this.#signal?.addEventListener("abort", end);
+    alive();
     try {
-      response = await this.#fetch(this.url + call.path, {
+      const response = await this.#fetch(this.url + call.path, {
         method: call.method,
         headers,
         redirect: "manual",
         credentials: "omit",
-        signal: AbortSignal.timeout(1000 * this.#timeout),
+        signal: sending.signal,
         ...(content !== undefined && {
           body: content instanceof FormData ? content : JSON.stringify(content),
         }),
       });
       if (!response.ok) return { failure: await errorOf(response) };
-      value = await call.read(response);
+      return { value: await call.read(response, alive) };
     } catch (error) {
+      this.#signal?.throwIfAborted();
       if (error instanceof UnexpectedAnswer) return { failure: error };
       // Without its cause: its text may repeat a header.
-      return { failure: connectionFailed(error) };
+      return { failure: connectionFailed(error, late) };
+    } finally {
+      clearTimeout(timer);
+      this.#signal?.removeEventListener("abort", end);
     }
-    return { value };
   }
 }
 
@@ -278,6 +304,7 @@ export class Client extends Session {
       readonly idempotencyKey?: string;
     } = {},
   ): Promise<Enrollment> {
+    requirePhotos(photos, ENROLL_PHOTOS);
     const { attributes, face, storage, holderKey, replace, idempotencyKey } = options;
     const more = {
       attributes: attributes && JSON.stringify(attributes),
@@ -307,6 +334,8 @@ export class Client extends Session {
     photos: readonly Blob[],
     options: VerifyOptions & { readonly challenge?: Challenge } = {},
   ): Promise<Decision> {
+    // How many frames answer a challenge, the challenge says.
+    requirePhotos(photos, options.challenge?.max_frames ?? PROBE_PHOTOS);
     const { level, face, heldTemplate, holderKey, challenge } = options;
     const more = {
       level,
@@ -354,6 +383,13 @@ export function precondition(replace: Replace = true): Record<string, string> {
   return { "If-Match": `"${replace}"` };
 }
 
+/** Refuse photos that the service would refuse for their number. */
+export function requirePhotos(photos: readonly unknown[], most: number): void {
+  if (photos.length < 1 || photos.length > most) {
+    throw new RangeError(`1 to ${most} photos are taken, not ${photos.length}`);
+  }
+}
+
 /** The members that are there. */
 export function fields(values: Readonly<Record<string, unknown>>): Record<string, unknown> {
   return Object.fromEntries(Object.entries(values).filter(([, value]) => value !== undefined));
@@ -371,7 +407,10 @@ function form(
   return data;
 }
 
-type Kind = "string" | "boolean" | "object";
+type Kind = "string" | "boolean" | "object" | "array";
+
+const kindOf = (value: unknown): string =>
+  value === null ? "null" : Array.isArray(value) ? "array" : typeof value;
 
 /** Read JSON that must have these members; those of `concealed` are not printed with it. */
 function answer<T extends object>(
@@ -390,7 +429,7 @@ function answer<T extends object>(
       throw new UnexpectedAnswer("the answer is no JSON object");
     }
     const found = body as Record<string, unknown>;
-    const missing = Object.keys(members).filter((name) => typeof found[name] !== members[name]);
+    const missing = Object.keys(members).filter((name) => kindOf(found[name]) !== members[name]);
     if (missing.length > 0) {
       throw new UnexpectedAnswer(`the answer lacks ${missing.join(", ")}`);
     }
@@ -415,16 +454,28 @@ export async function readDecision(response: Response): Promise<Decision> {
   return { ...decision, accepted: decision.decision === "accept" };
 }
 
-async function readBytes(response: Response): Promise<Uint8Array> {
-  return new Uint8Array(await response.arrayBuffer());
+async function readBytes(response: Response, alive: () => void): Promise<Uint8Array> {
+  const reader = response.body?.getReader();
+  const pieces: Uint8Array[] = [];
+  for (let piece = await reader?.read(); piece?.value !== undefined; piece = await reader?.read()) {
+    alive();
+    pieces.push(piece.value);
+  }
+  const bytes = new Uint8Array(pieces.reduce((sum, { length }) => sum + length, 0));
+  let at = 0;
+  for (const piece of pieces) {
+    bytes.set(piece, at);
+    at += piece.length;
+  }
+  return bytes;
 }
 
-function connectionFailed(error: unknown): ConnectionFailed {
-  const { name, cause } = error as { name?: string; cause?: { code?: string } };
+function connectionFailed(error: unknown, late: boolean): ConnectionFailed {
+  const { cause } = error as { cause?: { code?: string } };
   if (cause?.code !== undefined && NEVER_MADE.has(cause.code)) {
     return new ConnectionFailed(`the service was not reached (${cause.code})`, false);
   }
-  const why = name === "TimeoutError" ? "it took too long" : "the connection failed";
+  const why = late ? "it took too long" : "the connection failed";
   return new ConnectionFailed(
     `no answer arrived (${why}); the service may have done what was asked`,
     true,

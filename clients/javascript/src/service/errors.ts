@@ -44,6 +44,8 @@ export interface ErrorFacts {
 
 /** The service answered with an error. */
 export class ServiceError extends VeilfaceError {
+  // Each class writes its name out: a minifier renames the class.
+  override name = "ServiceError";
   readonly code: string;
   readonly status: number;
   readonly details: Readonly<Record<string, unknown>>;
@@ -52,7 +54,6 @@ export class ServiceError extends VeilfaceError {
 
   constructor(facts: ErrorFacts) {
     super(facts.message);
-    this.name = new.target.name;
     this.code = facts.code;
     this.status = facts.status;
     this.details = facts.details ?? {};
@@ -62,33 +63,61 @@ export class ServiceError extends VeilfaceError {
 }
 
 /** The request is wrong, and will be every time. */
-export class InvalidRequest extends ServiceError {}
+export class InvalidRequest extends ServiceError {
+  override name = "InvalidRequest";
+}
 /** A photo does not serve; `details.image` is its position in an enrollment. */
-export class PhotoRefused extends ServiceError {}
+export class PhotoRefused extends ServiceError {
+  override name = "PhotoRefused";
+}
 /** The API key or token is unknown, revoked or used, or a probe's signature is wrong. */
-export class Unauthorized extends ServiceError {}
+export class Unauthorized extends ServiceError {
+  override name = "Unauthorized";
+}
 /** The API key or token lacks a right. */
-export class Forbidden extends ServiceError {}
+export class Forbidden extends ServiceError {
+  override name = "Forbidden";
+}
 /** There is nothing to return. */
-export class NotFound extends ServiceError {}
+export class NotFound extends ServiceError {
+  override name = "NotFound";
+}
 /** Nobody is enrolled under this id. */
-export class NotEnrolled extends NotFound {}
+export class NotEnrolled extends NotFound {
+  override name = "NotEnrolled";
+}
 /** What the request builds on is not so. */
-export class Conflict extends ServiceError {}
+export class Conflict extends ServiceError {
+  override name = "Conflict";
+}
 /** A template of another contract. */
-export class ContractMismatch extends Conflict {}
+export class ContractMismatch extends Conflict {
+  override name = "ContractMismatch";
+}
 /** The subject has another template than may be replaced; `details.template_id` is it. */
-export class EnrollmentConflict extends Conflict {}
+export class EnrollmentConflict extends Conflict {
+  override name = "EnrollmentConflict";
+}
 /** The idempotency key was used for another request, or that one still runs. */
-export class IdempotencyConflict extends Conflict {}
+export class IdempotencyConflict extends Conflict {
+  override name = "IdempotencyConflict";
+}
 /** Too many failed attempts on the subject; `details.disabled`: an operator must act. */
-export class LockedOut extends ServiceError {}
+export class LockedOut extends ServiceError {
+  override name = "LockedOut";
+}
 /** Too many requests with this API key or from this address. */
-export class RateLimited extends ServiceError {}
+export class RateLimited extends ServiceError {
+  override name = "RateLimited";
+}
 /** The service failed. */
-export class ServerFailed extends ServiceError {}
+export class ServerFailed extends ServiceError {
+  override name = "ServerFailed";
+}
 /** The service cannot do it now. */
-export class Unavailable extends ServerFailed {}
+export class Unavailable extends ServerFailed {
+  override name = "Unavailable";
+}
 
 /** No answer arrived. */
 export class ConnectionFailed extends VeilfaceError {
@@ -160,6 +189,9 @@ const BY_STATUS: Readonly<Record<number, Family>> = {
   504: Unavailable,
 };
 
+const plain = (value: unknown): Record<string, unknown> =>
+  typeof value === "object" && value !== null && !Array.isArray(value) ? { ...value } : {};
+
 /** Give an answer that is no success its error. */
 export async function errorOf(response: Response): Promise<VeilfaceError> {
   const { status } = response;
@@ -171,13 +203,15 @@ export async function errorOf(response: Response): Promise<VeilfaceError> {
   const retryAfter = /^[0-9]{1,9}$/.test(header) ? Number(header) : undefined;
   try {
     const body = (await response.json()) as {
-      error: { code: unknown; message: unknown; details?: Record<string, unknown> };
-      request_id?: string;
+      error: { code: unknown; message: unknown; details?: unknown };
+      request_id?: unknown;
     };
-    const { code, message, details = {} } = body.error;
+    const { code, message } = body.error;
+    const details = plain(body.error.details);
     if (typeof code === "string" && typeof message === "string") {
       const family = Object.hasOwn(FAMILIES, code) ? FAMILIES[code] : fallback;
-      return new family({ code, message, status, details, requestId: body.request_id, retryAfter });
+      const requestId = typeof body.request_id === "string" ? body.request_id : undefined;
+      return new family({ code, message, status, details, requestId, retryAfter });
     }
   } catch {
     // A proxy's page may repeat the request's headers: nothing of it is passed on.

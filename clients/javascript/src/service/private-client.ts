@@ -9,11 +9,14 @@ import { DecoyGenerator } from "../templates/generator.js";
 import type { Decision, Enrollment } from "./answers.js";
 import { base64 } from "./base64.js";
 import {
+  ENROLL_PHOTOS,
   fields,
   idempotency,
   precondition,
+  PROBE_PHOTOS,
   readDecision,
   readEnrollment,
+  requirePhotos,
   Session,
   subjectPath,
   type ClientOptions,
@@ -23,6 +26,7 @@ import {
 import { ContractMismatch, UnexpectedAnswer } from "./errors.js";
 import { holderKeyField } from "./holder-keys.js";
 import { Enrollable, Probe } from "./lifts.js";
+import { LiftInputs, SharedInputs } from "./lift-inputs.js";
 import { canSign, isToken, signedProbe } from "./signature.js";
 
 const LOOKS = 3;
@@ -42,16 +46,11 @@ export interface PrivateOptions extends ClientOptions {
   readonly dim?: number;
 }
 
-interface LiftInputs {
-  readonly contract: PublicContract;
-  readonly generator: DecoyGenerator;
-  readonly pack: ModelPack;
-}
-
 /** Embeds and lifts here, and sends private templates only. Rights: `embeddings` beside the call's. */
 export class PrivateClient extends Session {
   readonly #options: PrivateOptions;
-  #inputs: Promise<LiftInputs> | undefined;
+  #shared: SharedInputs;
+  #closed = false;
 
   constructor(url: string, bearer: string, options: PrivateOptions) {
     if (!canSign(bearer)) {
@@ -59,24 +58,33 @@ export class PrivateClient extends Session {
     }
     super(url, bearer, options);
     this.#options = options;
+    this.#shared = new SharedInputs();
   }
 
-  /** A client under another bearer, such as the next token, with what this one has fetched. */
+  /**
+   * A client under another bearer, such as the next token, with what this one has fetched or will.
+   *
+   * Close both: what ONNX Runtime holds is freed with the last of them.
+   */
   as(bearer: string): PrivateClient {
+    this.#requireOpen();
     const other = new PrivateClient(this.url, bearer, this.#options);
-    other.#inputs = this.#inputs;
+    other.#shared = this.#shared.join();
     return other;
   }
 
   /** Fetch contract, generator and graphs now, so that the first lift need not wait for them. */
   async prepare(): Promise<void> {
-    await this.#prepared();
+    await this.#with(async () => undefined);
   }
 
   /** Lift a probe; nothing is sent of it. */
   async lift(photos: readonly Photo[], { face }: { face?: FacePolicy } = {}): Promise<Probe> {
-    const inputs = await this.#prepared();
-    return new Probe(await this.#lifted(inputs, photos, face, true), inputs.contract.contract_id);
+    requirePhotos(photos, PROBE_PHOTOS);
+    return this.#with(
+      async (inputs) =>
+        new Probe(await this.#lifted(inputs, photos, face, true), inputs.contract.contract_id),
+    );
   }
 
   /**
@@ -88,9 +96,11 @@ export class PrivateClient extends Session {
     photos: readonly Photo[],
     { face }: { face?: FacePolicy } = {},
   ): Promise<Enrollable> {
-    const inputs = await this.#prepared();
-    const template = await this.#lifted(inputs, photos, face, false);
-    return new Enrollable(template, inputs.contract.contract_id);
+    requirePhotos(photos, ENROLL_PHOTOS);
+    return this.#with(
+      async (inputs) =>
+        new Enrollable(await this.#lifted(inputs, photos, face, false), inputs.contract.contract_id),
+    );
   }
 
   /**
@@ -125,19 +135,25 @@ export class PrivateClient extends Session {
     );
   }
 
-  /** Free what ONNX Runtime holds. */
+  /** Free what ONNX Runtime holds, where no other client and no lift needs it. */
   async close(): Promise<void> {
-    const inputs = this.#inputs;
-    this.#inputs = undefined;
-    await (await inputs)?.pack.release();
+    if (this.#closed) return;
+    this.#closed = true;
+    await this.#shared.leave();
   }
 
-  #prepared(): Promise<LiftInputs> {
-    this.#inputs ??= this.#fetched().catch((error: unknown) => {
-      this.#inputs = undefined;
-      throw error;
-    });
-    return this.#inputs;
+  #requireOpen(): void {
+    if (this.#closed) throw new Error("this client was closed: make another one");
+  }
+
+  async #with<T>(use: (inputs: LiftInputs) => Promise<T>): Promise<T> {
+    this.#requireOpen();
+    const inputs = await this.#shared.taken(() => this.#fetched());
+    try {
+      return await use(inputs);
+    } finally {
+      await inputs.leave();
+    }
   }
 
   async #fetched(): Promise<LiftInputs> {
@@ -150,7 +166,7 @@ export class PrivateClient extends Session {
       const graphs = await (this.#options.graphs?.(contract) ?? this.pack());
       const { runtime, sessionOptions } = this.#options;
       const pack = await ModelPack.load(runtime, contract, graphs, sessionOptions);
-      return { contract, generator, pack };
+      return new LiftInputs(contract, generator, pack);
     }
     throw new UnexpectedAnswer("the generator of the service is not that of its contract");
   }
@@ -161,9 +177,9 @@ export class PrivateClient extends Session {
     face: FacePolicy | undefined,
     probe: boolean,
   ): Promise<Uint8Array> {
-    if (photos.length === 0) throw new RangeError("there is no photo: at least one is needed");
     const embeddings: Float32Array[] = [];
     for (const photo of photos) {
+      this.#options.signal?.throwIfAborted();
       const image = photo instanceof Blob ? await decodeImage(photo) : photo;
       embeddings.push((await pack.embedPhoto(image, { policy: face })).embedding);
     }
@@ -180,10 +196,10 @@ export class PrivateClient extends Session {
       return await send(first);
     } catch (error) {
       if (!(error instanceof ContractMismatch)) throw error;
-      await this.close();
-      const { contract } = await this.#prepared();
+      await this.#shared.forget(first.contractId);
+      const inForce = await this.#with(async ({ contract }) => contract.contract_id);
       // Else it is the subject's stored template that is of another contract.
-      if (contract.contract_id === first.contractId) throw error;
+      if (inForce === first.contractId) throw error;
     }
     return send(await lift());
   }

@@ -13,7 +13,15 @@ const SMALLEST_NORM = 1e-4;
 const SMALLEST_SHARE = 1 / 8;
 const CHECKED_FROM = 64;
 const ORTHOGONAL = 1e-3;
-const PARTS = ["mean", "axes", "weights", "centres", "spreads"] as const;
+const MAX_HEADER = 64 * 1024;
+const MAX_DIMENSION = 4096;
+const MAX_COMPONENTS = 64;
+const LARGEST_NOISE = 0.1;
+const LARGEST_SCALE = 1e3;
+const SMALLEST_SCALE = 1e-6;
+const LARGEST_LOG_ENERGY = 10;
+// As the bytes have them.
+const PARTS = ["axes", "centres", "mean", "spreads", "weights"] as const;
 
 type Parts = Record<(typeof PARTS)[number], Float64Array>;
 
@@ -47,26 +55,8 @@ export class DecoyGenerator {
    * @throws DecoyError if they are no generator, or one whose decoys would hide nothing.
    */
   static async fromBytes(bytes: Uint8Array): Promise<DecoyGenerator> {
-    const { fields, tensors } = readContainer(bytes);
-    const noise = fields["noise"] === undefined ? 0 : Number(fields["noise"]);
-    const madeWith = fields["made_with"];
-    if (
-      fields["format"] !== "veilface decoy generator" ||
-      fields["version"] !== 1 ||
-      !(noise >= 0 && noise <= 0.1) ||
-      (madeWith !== undefined && typeof madeWith !== "string")
-    ) {
-      throw new DecoyError("this is not a decoy generator of version 1");
-    }
-    const n = tensors.get("mean")?.length ?? 0;
-    const count = tensors.get("weights")?.length ?? 0;
-    const q = leadingAxes(n) + bandEdges(n).length - 1;
-    const sizes = { mean: n, axes: n * n, weights: count, centres: count * q, spreads: count * q * q };
-    if (n < 2 || count < 1 || PARTS.some((name) => tensors.get(name)?.length !== sizes[name])) {
-      throw new DecoyError("the parts of the decoy generator do not fit each other");
-    }
-    const parts = Object.fromEntries(PARTS.map((name) => [name, tensors.get(name)])) as Parts;
-    checkValues(parts);
+    const { n, madeWith, noise, parts } = readContainer(bytes);
+    checkValues(parts, n);
     checkSpread(parts, n);
     return new DecoyGenerator(await sha256(bytes), n, madeWith, noise, parts);
   }
@@ -126,14 +116,17 @@ function chosen(weights: Float64Array, uniform: number): number {
   return component < 0 ? weights.length - 1 : component;
 }
 
-function checkValues({ mean, axes, weights, centres, spreads }: Parts): void {
+function checkValues({ mean, axes, weights, centres, spreads }: Parts, n: number): void {
+  const lead = leadingAxes(n);
+  const q = lead + bandEdges(n).length - 1;
   const largest = (values: Float64Array): number =>
     values.reduce((most, value) => Math.max(most, Math.abs(value)), 0);
   const total = weights.reduce((sum, weight) => sum + weight, 0);
   if (
     ![mean, axes, weights, centres, spreads].every((part) => part.every(Number.isFinite)) ||
-    [mean, axes, centres, spreads].some((part) => largest(part) > 1e3) ||
-    largest(axes) < 1e-6 ||
+    [mean, axes, centres, spreads].some((part) => largest(part) > LARGEST_SCALE) ||
+    largest(axes) < SMALLEST_SCALE ||
+    largest(centres.filter((_, i) => i % q >= lead)) > LARGEST_LOG_ENERGY ||
     !weights.every((weight) => weight > 0) ||
     Math.abs(total - 1) > 1e-4
   ) {
@@ -191,32 +184,86 @@ function checkSpread({ axes, weights, centres, spreads }: Parts, n: number): voi
   }
 }
 
-/** The plain fields and the float32 tensors of a safetensors file of Veilface. */
+/** What a generator's bytes hold; refuses all that Python would not write byte for byte. */
 function readContainer(bytes: Uint8Array): {
-  fields: Record<string, unknown>;
-  tensors: Map<string, Float64Array>;
+  n: number;
+  madeWith: string | undefined;
+  noise: number;
+  parts: Parts;
 } {
+  const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
+  const size = bytes.length < 8 ? Infinity : Number(view.getBigUint64(0, true));
+  if (size > Math.min(MAX_HEADER, bytes.length - 8)) {
+    throw new DecoyError("the decoy generator is cut off, or no safetensors file");
+  }
+  let fields: Record<string, unknown>;
+  let n: unknown;
+  let count: unknown;
   try {
-    const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
-    const start = 8 + Number(view.getBigUint64(0, true));
-    const header = JSON.parse(new TextDecoder().decode(bytes.subarray(8, start))) as Record<
-      string,
-      { dtype?: string; data_offsets?: [number, number]; veilface?: string }
-    >;
-    const { __metadata__: metadata, ...entries } = header;
-    const tensors = new Map<string, Float64Array>();
-    for (const [name, { dtype, data_offsets: offsets }] of Object.entries(entries)) {
-      if (dtype !== "F32" || offsets === undefined) throw new DecoyError("not float32");
-      const at = (i: number): number => view.getFloat32(start + offsets[0] + 4 * i, true);
-      const count = (offsets[1] - offsets[0]) / 4;
-      // Before the array: a hostile header could ask for one that is larger than memory.
-      if (!Number.isInteger(count) || start + offsets[1] > bytes.length) throw new RangeError();
-      tensors.set(name, Float64Array.from({ length: count }, (_, i) => at(i)));
-    }
-    const fields = JSON.parse(metadata?.veilface ?? "") as Record<string, unknown>;
-    return { fields, tensors };
+    const header = JSON.parse(new TextDecoder().decode(bytes.subarray(8, 8 + size)));
+    fields = JSON.parse(header.__metadata__.veilface);
+    [n, count] = [header.mean.shape[0], header.weights.shape[0]];
   } catch {
     // The parser's own words may quote the input.
     throw new DecoyError("the decoy generator is not a valid safetensors file of this kind");
   }
+  if (!isUpTo(n, 2, MAX_DIMENSION) || !isUpTo(count, 1, MAX_COMPONENTS)) {
+    throw new DecoyError(
+      `a decoy generator has 2 to ${MAX_DIMENSION} dimensions and 1 to ${MAX_COMPONENTS} components`,
+    );
+  }
+  const { format, version, made_with: madeWith, noise = "0.0", ...others } = fields;
+  if (
+    format !== "veilface decoy generator" ||
+    version !== 1 ||
+    !isNoise(noise) ||
+    !(madeWith === undefined || (typeof madeWith === "string" && /^[0-9a-f]{64}$/.test(madeWith))) ||
+    Object.keys(others).length > 0
+  ) {
+    throw new DecoyError("this is not a decoy generator of version 1");
+  }
+  const q = leadingAxes(n) + bandEdges(n).length - 1;
+  const shapes = {
+    axes: [n, n],
+    centres: [count, q],
+    mean: [n],
+    spreads: [count, q, q],
+    weights: [count],
+  };
+  const start = 8 + size;
+  let end = 0;
+  const entries: Record<string, object> = {};
+  const parts: Partial<Parts> = {};
+  for (const name of PARTS) {
+    const from = end;
+    const length = shapes[name].reduce((product, side) => product * side, 1);
+    end += 4 * length;
+    entries[name] = { dtype: "F32", shape: shapes[name], data_offsets: [from, end] };
+    // Before the array: a hostile header could ask for one that is larger than memory.
+    if (start + end > bytes.length) break;
+    const at = (_: unknown, i: number): number => view.getFloat32(start + from + 4 * i, true);
+    parts[name] = Float64Array.from({ length }, at);
+  }
+  const sortedFields = Object.fromEntries(Object.entries(fields).sort(([a], [b]) => (a < b ? -1 : 1)));
+  const text = JSON.stringify({ __metadata__: { veilface: JSON.stringify(sortedFields) }, ...entries });
+  const written = new TextEncoder().encode(text.padEnd(8 * Math.ceil(text.length / 8), " "));
+  if (
+    start + end !== bytes.length ||
+    written.length !== size ||
+    !written.every((byte, i) => byte === bytes[8 + i])
+  ) {
+    throw new DecoyError("the decoy generator is not in its one encoding, or its parts do not fit");
+  }
+  return { n, madeWith, noise: Number(noise), parts: parts as Parts };
+}
+
+const isUpTo = (value: unknown, least: number, most: number): value is number =>
+  Number.isInteger(value) && (value as number) >= least && (value as number) <= most;
+
+/** Whether it is a variance from 0 to 0.1, written as Python writes it. */
+function isNoise(value: unknown): value is string {
+  const noise = typeof value === "string" ? Number(value) : NaN;
+  if (!(noise >= 0 && noise <= LARGEST_NOISE)) return false;
+  if (noise === 0) return value === "0.0";
+  return value === (noise >= 1e-4 ? String(noise) : noise.toExponential().replace(/e-(\d)$/, "e-0$1"));
 }

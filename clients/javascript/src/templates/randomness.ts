@@ -53,6 +53,7 @@ export class Keystream {
   }
 
   #samples(count: number, of: (upper: number, lower: number) => number): Float64Array {
+    if (this.#destroyed) throw new Error("this keystream was destroyed: make a fresh one");
     const out = new Float64Array(count);
     for (let i = 0; i < count; i++) {
       if (this.#at === 16) this.#nextBlock();
@@ -64,7 +65,6 @@ export class Keystream {
 
   /** The next 64 bytes (RFC 8439, section 2.3). */
   #nextBlock(): void {
-    if (this.#destroyed) throw new Error("this keystream was destroyed: make a fresh one");
     const x = this.#block;
     x.set(this.#state);
     for (let round = 0; round < 10; round++) {

@@ -24,6 +24,10 @@ const calls = {
     return [stream.uniform(count), stream.normal(count), stream.uniform(count, -1, 1)].map(text);
   },
 
+  async read({ generator }) {
+    return (await DecoyGenerator.fromBytes(bytes(generator))).noise;
+  },
+
   async lift({ key, descriptor, generator, strategy, m, contract_id }) {
     const source = await DecoyGenerator.fromBytes(bytes(generator));
     const stream = new Keystream(bytes(key));

@@ -1,0 +1,124 @@
+/** The element in a page that has only what it uses of one; in a browser: tests/web. */
+
+import assert from "node:assert/strict";
+import { test } from "node:test";
+
+const { VeilfaceLogin: ForServers } = await import("../dist/element/login.js?rendered-by-a-server");
+
+class Part {
+  part = { add() {} };
+  #clicked = () => {};
+  addEventListener(_, listener) { this.#clicked = listener; }
+  click() { this.#clicked(); }
+  play() { return Promise.resolve(); }
+  videoWidth = 4;
+  videoHeight = 4;
+}
+
+class Page extends EventTarget {
+  #attributes = new Map();
+  getAttribute(name) { return this.#attributes.get(name) ?? null; }
+  setAttribute(name, value) { this.#attributes.set(name, value); }
+  attachShadow() { return { append: (...parts) => ([this.video, this.button, this.status] = parts) }; }
+}
+
+Object.assign(globalThis, {
+  HTMLElement: Page,
+  document: { createElement: () => new Part() },
+  CSSStyleSheet: class { replaceSync() {} },
+  OffscreenCanvas: class {
+    getContext() {
+      return { drawImage() {}, getImageData: () => ({ data: new Uint8Array(64), width: 4, height: 4 }) };
+    }
+  },
+});
+const { VeilfaceLogin } = await import("../dist/element/login.js");
+
+const settled = () => new Promise((resolve) => setTimeout(resolve));
+
+/** An element in a page, the tracks of its camera, and what it told. */
+function element({ authorize, fetch, camera = async () => {} } = {}) {
+  const tracks = [];
+  Object.defineProperty(globalThis, "navigator", {
+    configurable: true,
+    value: {
+      mediaDevices: {
+        getUserMedia: async () => {
+          await camera();
+          const track = { stopped: false, stop() { this.stopped = true; } };
+          tracks.push(track);
+          return { getTracks: () => [track] };
+        },
+      },
+    },
+  });
+  const login = new VeilfaceLogin();
+  const told = [];
+  for (const name of ["veilface-result", "veilface-error"]) {
+    login.addEventListener(name, ({ detail }) => told.push(detail));
+  }
+  login.setAttribute("service", "http://127.0.0.1:1");
+  login.options = { runtime: {}, fetch, retries: { sendings: 1 } };
+  login.authorize = authorize;
+  login.connectedCallback();
+  return { login, tracks, told };
+}
+
+test("a server that renders pages can import it", () => {
+  assert.equal(typeof ForServers, "function");
+});
+
+test("a camera that is granted after the element left is stopped at once", async () => {
+  let grant;
+  const { login, tracks, told } = element({ camera: () => new Promise((resolve) => (grant = resolve)) });
+  login.button.click();
+  await settled();
+  login.disconnectedCallback();
+  grant();
+  await settled();
+  assert.deepEqual([tracks.map(({ stopped }) => stopped), told], [[true], []]);
+});
+
+test("an attempt ends with the element: no token is asked for, and nothing told", async () => {
+  let tokens = 0;
+  let sent;
+  const aborted = new Promise((resolve) => {
+    sent = (_, { signal }) =>
+      new Promise((_resolve, reject) => {
+        signal.addEventListener("abort", () => {
+          resolve();
+          reject(signal.reason);
+        });
+      });
+  });
+  const authorize = async () => ({ subject: "anna", token: `vft_${"a".repeat(20)}${tokens++}` });
+  const { login, tracks, told } = element({ authorize, fetch: sent });
+  login.button.click();
+  await settled();
+  const attempt = assert.rejects(login.attempt(), { name: "AbortError" });
+  await settled();
+  login.disconnectedCallback();
+  await Promise.all([aborted, attempt]);
+  await settled();
+  assert.deepEqual([tokens, tracks.map(({ stopped }) => stopped), told], [1, [true], []]);
+});
+
+test("graphs are fetched while the person looks, and what failed is tried again by the attempt", async () => {
+  const asked = [];
+  const fetch = async (url, { headers }) => {
+    asked.push([new URL(url).pathname, headers.Authorization.slice(-1)]);
+    return new Response("", { status: 503 });
+  };
+  let tokens = 0;
+  const authorize = async () => ({ subject: "anna", token: `vft_${"a".repeat(20)}${tokens++}` });
+  const { login, told } = element({ authorize, fetch });
+  login.button.click();
+  await settled();
+  assert.deepEqual(asked, [["/v1/contract", "0"]], "while the person looks");
+  login.words = { ...login.words, errors: { http_503: "Später." } };
+  await assert.rejects(login.attempt(), { name: "Unavailable" });
+  assert.deepEqual(asked[1], ["/v1/contract", "1"], "what failed is tried again");
+  login.button.click();
+  while (told.length === 0) await settled();
+  assert.equal(login.status.value, "Später.");
+});
