@@ -19,12 +19,13 @@ from api.http.errors import ApiError
 from templates.errors import SealError
 from templates.keys.api_token import SUBJECT_TOKEN
 from templates.keys.sealing import MasterKeyring
-from templates.store.lockout import Nonce
+from templates.store.lockout import Nonce, Replayed
 
 Action = Literal["verify", "enroll"]
 ACTIONS: tuple[Action, ...] = get_args(Action)
 LONGEST_S = 120
 _PURPOSE = "subject-token"
+_NONCE = "token:"
 
 CALLS: dict[str, frozenset[Action]] = {
     "enroll": frozenset({"enroll"}),
@@ -36,6 +37,8 @@ CALLS: dict[str, frozenset[Action]] = {
     "get_pack_file": frozenset(ACTIONS),
 }
 """Routes that take a token, by the name of their function, and of which action. No other does."""
+USES = frozenset(ACTIONS)
+"""Those of them that use it up."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +68,22 @@ class SubjectToken:
     def nonce(self) -> Nonce:
         """What a use of the token uses up."""
         return nonce_of(self.key_prefix, self.token_id, self.expires_at)
+
+    @property
+    def late(self) -> bool:
+        """Whether its time is over."""
+        return datetime.now(UTC) > self.expires_at
+
+    def require_in_time(self) -> None:
+        """Refuse a token whose time is over.
+
+        Raises
+        ------
+        Replayed
+            Without a line in the audit log: whoever finds an old token could write there for ever.
+        """
+        if self.late:
+            raise Replayed("the token has expired: ask your server for another one", recorded=True)
 
     def require(self, route: str, subject: str | None) -> None:
         """Refuse a call that the token is not for; `subject` is the one that the path names.
@@ -110,7 +129,12 @@ def _another(what: str, message: str) -> ApiError:
 
 def nonce_of(key_prefix: str, token_id: str, expires_at: datetime) -> Nonce:
     """Nonce of a token. No probe's is like it: those have no colon."""
-    return Nonce(key_prefix, f"token:{token_id}", expires_at)
+    return Nonce(key_prefix, f"{_NONCE}{token_id}", expires_at)
+
+
+def is_of_token(nonce: Nonce) -> bool:
+    """Whether it is a token's."""
+    return nonce.value.startswith(_NONCE)
 
 
 @dataclass(frozen=True)
