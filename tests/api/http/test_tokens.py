@@ -8,6 +8,7 @@ import time
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import httpx
 import pytest
@@ -421,10 +422,12 @@ def test_only_a_token_that_opens_notes_the_use_of_its_key(shared: Service) -> No
         assert_error(asked(f"vft_{key.prefix}_{token.split('_', 2)[2]}"), 401, "unauthorized")
         assert_error(asked(made(-60)), 401, "replayed")
         noted = store.api_keys.get(key.prefix)
-        assert noted is not None and noted.last_used_at is None
+        assert noted is not None
+        assert noted.last_used_at is None
         assert asked(made(60)).status_code == 200
         noted = store.api_keys.get(key.prefix)
-        assert noted is not None and noted.last_used_at is not None
+        assert noted is not None
+        assert noted.last_used_at is not None
     finally:
         store.close()
 
@@ -456,8 +459,9 @@ def test_a_token_that_ends_while_its_body_comes_is_refused(
     client, deployment = shared
     for use, action in ((verify, "verify"), (enroll, "enroll")):
         issued = issue(client, action)
-        looks = iter((False, False))  # as it is opened, as the call is looked at; then it is late
-        monkeypatch.setattr(SubjectToken, "late", property(lambda _token: next(looks, True)))
+        # As it is opened, and as the call is looked at; then it is late.
+        late = Mock(side_effect=[False, False, True])
+        monkeypatch.setattr(SubjectToken, "late", property(late))
         before = len(audit(deployment))
         assert_error(use(client, issued["token"], 1, "alice"), 401, "replayed")
         assert len(audit(deployment)) == before
