@@ -271,8 +271,8 @@ def _unused_nonce(runtime: Runtime, caller: Caller) -> Nonce | None:
     Raises
     ------
     Replayed
-        Where the token was used or is late: before anything is decoded, and after a repeated request had its
-        answer.
+        Where the token was used or is late: before anything is decoded, and after a repeated
+        request had its answer.
     """
     if caller.subject_token is None:
         return None

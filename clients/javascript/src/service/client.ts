@@ -152,7 +152,7 @@ export class Session {
     return this.send({ method: "GET", path: "/v1/contract/generator", read: readBytes });
   }
 
-  /** Fetch the graphs that the contract names, and check the SHA-256 of each. */
+  /** Fetch the graphs of the contract, with a token, and check the SHA-256 of each. */
   async pack(): Promise<PackGraphs> {
     const list = await this.send({
       method: "GET",
