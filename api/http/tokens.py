@@ -20,6 +20,7 @@ from templates.errors import SealError
 from templates.keys.api_token import SUBJECT_TOKEN
 from templates.keys.sealing import MasterKeyring
 from templates.store.lockout import Nonce, Replayed
+from templates.store.subjects import Precondition
 
 Action = Literal["verify", "enroll"]
 ACTIONS: tuple[Action, ...] = get_args(Action)
@@ -55,6 +56,8 @@ class SubjectToken:
         Names it in logs and answers; nothing can be done with it alone.
     key_prefix, expires_at
         Of the API key that asked for it, and when it ends.
+    replace
+        Whether its enrollment may replace an earlier one.
     """
 
     subject: str
@@ -63,6 +66,7 @@ class SubjectToken:
     token_id: str
     key_prefix: str
     expires_at: datetime
+    replace: bool = True
 
     @property
     def nonce(self) -> Nonce:
@@ -122,6 +126,20 @@ class SubjectToken:
             )
         return self.level
 
+    def precondition(self, asked: Precondition | None) -> Precondition | None:
+        """Return what the subject must have for an enrollment, where a request asks for something.
+
+        Raises
+        ------
+        ApiError
+            ``forbidden``.
+        """
+        if self.replace:
+            return asked
+        if asked is not None and asked.template_id is not None:
+            raise _another("replace", "this token replaces no enrollment: send no If-Match with it")
+        return Precondition(None)
+
 
 def _another(what: str, message: str) -> ApiError:
     return ApiError("forbidden", message, {"token": what})
@@ -154,6 +172,7 @@ def new_token(
     action: Action,
     level: str | None,
     lifetime_s: int,
+    replace: bool = True,
 ) -> NewToken:
     """Make a token.
 
@@ -166,11 +185,14 @@ def new_token(
         1 to ``LONGEST_S``.
     """
     expires = datetime.now(UTC).replace(microsecond=0) + timedelta(seconds=lifetime_s)
-    token = SubjectToken(subject, action, level, secrets.token_urlsafe(18), key_prefix, expires)
+    token = SubjectToken(
+        subject, action, level, secrets.token_urlsafe(18), key_prefix, expires, replace
+    )
     body = {
         "subject": subject,
         "action": action,
         "level": level,
+        "replace": replace,
         "id": token.token_id,
         "expires": int(expires.timestamp()),
     }
@@ -202,4 +224,5 @@ def opened_token(keyring: MasterKeyring, text: str, *, key_id: str) -> SubjectTo
         token_id=body["id"],
         key_prefix=match[1],
         expires_at=datetime.fromtimestamp(body["expires"], UTC),
+        replace=body["replace"],
     )

@@ -102,6 +102,8 @@ async def enroll(
     """
     settings = runtime.settings
     query = query_of(request, ("face",))
+    if caller.subject_token is not None:
+        precondition = caller.subject_token.precondition(precondition)
     async with gate.admitted(caller.prefix):
         if content_type(request) == "multipart/form-data":
             runtime.required_pack()

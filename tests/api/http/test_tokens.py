@@ -131,6 +131,22 @@ def test_a_token_is_good_for_one_enrollment(service: Service) -> None:
     assert outcome(client, again, "carol")["outcome"] == "replaced"
 
 
+def test_a_token_for_a_first_enrollment_replaces_nobody(service: Service) -> None:
+    client, _ = service
+    tokens = [issue(client, "enroll", "carol", replace=False) for _ in range(2)]
+    refused = enroll(client, tokens[0]["token"], **{"If-Match": '"' + "0" * 32 + '"'})
+    assert assert_error(refused, 403, "forbidden") == {"token": "replace"}
+    first = assert_answer(enroll(client, tokens[0]["token"]), 201, EnrollmentAnswer)
+    for headers in ({}, {"If-None-Match": "*"}):
+        refused = enroll(client, tokens[1]["token"], 4, **headers)
+        told = assert_error(refused, 409, "enrollment_conflict")
+        assert told == {"template_id": first["template_id"]}
+    assert outcome(client, tokens[1], "carol")["outcome"] is None
+    assert enroll(client, issue(client, "enroll", "carol", replace=True)["token"]).json()[
+        "replaced"
+    ]
+
+
 @pytest.mark.parametrize("action", ["verify", "enroll"])
 def test_of_eight_uses_at_once_one_passes(service: Service, action: str) -> None:
     """In two processes' worth of services on one database, and after both are opened anew."""
@@ -507,6 +523,8 @@ def test_who_may_ask_for_which_token(shared: Service) -> None:
         ({"action": "enroll", "level": STRICT}, "validation_failed"),
         ({"level": "fmr-1e-9"}, "uncalibrated"),
         ({"lvel": STRICT}, "validation_failed"),
+        ({"replace": False}, "validation_failed"),
+        ({"action": "enroll", "replace": "no"}, "validation_failed"),
     ):
         assert_error(client.post("/v1/tokens", json={**good, **change}), 422, code)
 

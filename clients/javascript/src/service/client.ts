@@ -180,13 +180,21 @@ export class Session {
       action,
       level,
       lifetime,
-    }: { action: "verify" | "enroll"; level?: string; /** Seconds. */ lifetime?: number },
+      replace,
+    }: {
+      action: "verify" | "enroll";
+      level?: string;
+      /** Seconds. */
+      lifetime?: number;
+      /** Whether an enrollment may replace an earlier one. */
+      replace?: boolean;
+    },
   ): Promise<Token> {
     subjectPath(subject);
     return this.send({
       method: "POST",
       path: "/v1/tokens",
-      body: () => fields({ subject_id: subject, action, level, lifetime_s: lifetime }),
+      body: () => fields({ subject_id: subject, action, level, lifetime_s: lifetime, replace }),
       read: answer<Token>({ token: "string", token_id: "string" }, ["token"]),
     });
   }
