@@ -349,8 +349,8 @@ class Settings(BaseSettings):
     )
     serve_pack: bool = Field(
         False,
-        description="Give the contract's graphs, at `/v1/pack`, to clients that have a token or an "
-        "API key, and let the page run them. Mind the licence of the weights (docs/models.md).",
+        description="Give the contract's graphs, at `/v1/pack`, to pages that have a token, "
+        "and let the page run them. Mind the licence of the weights (docs/models.md).",
     )
     audit_report_file: Path | None = Field(
         None,

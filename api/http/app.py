@@ -44,7 +44,7 @@ from api.http.routes import (
 )
 from api.http.routes.page import page_routes
 from api.http.routes.reference import reference_routes
-from api.limits.admission import Gate
+from api.limits.admission import Downloads, Gate
 from api.limits.rates import RateLimits
 from api.process.allocator import keep_few_arenas
 from api.process.housekeeping import purge_regularly
@@ -186,6 +186,7 @@ async def _open(
     readiness = Readiness(runtime.store, runtime.pack, gate, runtime.keyring)
     app.state.rate_limits, app.state.runtime = rate_limits, runtime
     app.state.gate, app.state.readiness = gate, readiness
+    app.state.downloads = Downloads(settings.max_in_flight // 4)
     app.state.scrapes = anyio.CapacityLimiter(1)
     await anyio.to_thread.run_sync(join_shared_directory)
     set_build(version=VERSION, contract_id=runtime.contract.contract_id)

@@ -2,21 +2,19 @@
 
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from typing import Annotated
 
 from fastapi import Depends, Request, Security
 from fastapi.security import APIKeyHeader, HTTPAuthorizationCredentials, HTTPBearer
 
 from api.http.errors import ApiError
-from api.http.tokens import SubjectToken, opened_token, prefix_of
+from api.http.tokens import USES, SubjectToken, opened_token, prefix_of
 from api.limits.admission import Gate
 from api.limits.rates import RateLimits
 from api.process.runtime import Runtime
 from templates.contract.liveness_policy import LivenessPolicy
 from templates.keys.api_token import is_token, probe_key
 from templates.store.api_keys import ApiKey
-from templates.store.lockout import Replayed
 
 _bearer = HTTPBearer(
     auto_error=False, scheme_name="bearer", description="`Authorization: Bearer vf_…`, or `vft_…`"
@@ -99,7 +97,7 @@ async def caller(
         ``unauthorized``, in the same words for an absent, an unknown and a revoked key;
         ``overloaded``; ``rate_limited``; ``forbidden`` for what a token is not for.
     Replayed
-        Where a token comes too late.
+        Where a token comes too late, or was used.
     """
     runtime: Runtime = request.app.state.runtime
     gate: Gate = request.app.state.gate
@@ -132,7 +130,7 @@ async def caller(
     rate_limits: RateLimits = request.app.state.rate_limits
     await rate_limits.count_key(known.name)
     if subject_token is not None:
-        _require_token(request, runtime, known, subject_token)
+        await _require_token(request, runtime, gate, known, subject_token)
     return known
 
 
@@ -145,21 +143,38 @@ async def _recognised(
     prefix = prefix_of(token)
     if prefix is None:
         return None, None
-    api_key = await gate.query(lambda: runtime.store.api_keys.valid(prefix))
+    return await gate.query(lambda: _of_token(runtime, token, prefix))
+
+
+def _of_token(
+    runtime: Runtime, token: str, prefix: str
+) -> tuple[ApiKey, SubjectToken] | tuple[None, None]:
+    """Open a token; the use of its key is noted for no other text under the key's prefix."""
+    api_keys = runtime.store.api_keys
+    api_key = api_keys.valid(prefix)
     if api_key is None:
         return None, None
     subject_token = opened_token(runtime.keyring, token, key_id=api_key.id)
-    return (None, None) if subject_token is None else (api_key, subject_token)
+    if subject_token is None:
+        return None, None
+    if not subject_token.late:
+        api_keys.note_use(api_key)
+    return api_key, subject_token
 
 
-def _require_token(request: Request, runtime: Runtime, caller: Caller, token: SubjectToken) -> None:
+async def _require_token(
+    request: Request, runtime: Runtime, gate: Gate, caller: Caller, token: SubjectToken
+) -> None:
     """Refuse a call that a token is not for, or that comes too late for it."""
     request.state.log["token_id"] = token.token_id
     pseudonym = runtime.store.signer.pseudonym(caller.tenant, token.subject)
     note_subject(request, pseudonym)
-    if datetime.now(UTC) > token.expires_at:
-        raise Replayed("the token has expired: ask your server for another one")
-    token.require(request.scope["route"].name, request.path_params.get("subject_id"))
+    token.require_in_time()
+    route = request.scope["route"].name
+    token.require(route, request.path_params.get("subject_id"))
+    if route not in USES:
+        # Those find it out themselves, once a repeated request had its answer.
+        await gate.query(lambda: runtime.store.nonces.require_unused(token.nonce))
 
 
 def note_subject(request: Request, pseudonym: str) -> None:

@@ -21,6 +21,7 @@ from api.http.auth import Caller
 from api.http.preconditions import etag
 from api.process.runtime import Runtime
 from templates.errors import StoreError
+from templates.keys.holder_key import wipe
 from templates.keys.sealing import encode_parts
 from templates.store.idempotency import Answer, Claim
 from templates.store.subjects import Once, StoredTemplate
@@ -57,6 +58,7 @@ async def once(
     subject: str | None,
     work: Callable[[Claim | None], Outcome],
     run: Callable[[Callable[[], Outcome]], Awaitable[Outcome]],
+    holder_key: bytearray | None = None,
 ) -> Outcome:
     """Do a write; with a key that was used before, return what it answered then.
 
@@ -71,6 +73,9 @@ async def once(
         The write, which keeps its answer in its own transaction; runs in a thread.
     run
         Which threads: the gate's ``compute`` or ``query``.
+    holder_key
+        What is forgotten in the end: in the thread, because nobody waits for one whose request was
+        cancelled, and where the answer is given again too.
 
     Raises
     ------
@@ -99,7 +104,13 @@ async def once(
                 records.release(claim)
             raise
 
-    return await run(guarded)
+    def guarded_and_wiped() -> Outcome:
+        try:
+            return guarded()
+        finally:
+            wipe(holder_key)
+
+    return await run(guarded_and_wiped)
 
 
 def written(

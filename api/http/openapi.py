@@ -167,6 +167,11 @@ TOKEN_BODY = _body(
                     "maximum": LONGEST_S,
                     "default": LONGEST_S,
                 },
+                "replace": {
+                    "type": "boolean",
+                    "default": True,
+                    "description": "For `enroll`; false: as `If-None-Match: *`.",
+                },
             },
         },
         "examples": {"verify": {"value": {"subject_id": "alice", "action": "verify"}}},

@@ -26,6 +26,7 @@ from api.http.errors import ApiError
 from api.http.holder_keys import FIELD, holder_key_of
 from api.http.signatures import FIELDS as SIGNATURE_FIELDS
 from api.http.signatures import checked_signature, nonce_in_time
+from api.http.tokens import is_of_token
 from api.http.values import (
     embedding_of,
     embeddings_of,
@@ -164,18 +165,23 @@ def _nonce(caller: Caller, challenge: Challenge | None) -> Nonce | None:
     Raises
     ------
     ApiError
-        ``validation_failed`` where a token comes with a challenge that was not asked for with it.
+        ``validation_failed`` where a challenge was asked for with a token, and comes without it,
+        or was not, and comes with one. A decision under an API key, at whatever level it asks for,
+        must not be taken for the token's.
     """
-    token = caller.subject_token
-    if token is None:
-        return None if challenge is None else challenge.nonce
-    if challenge is not None and challenge.nonce.value != token.nonce.value:
+    token = None if caller.subject_token is None else caller.subject_token.nonce
+    if challenge is None:
+        return token
+    if token is None and not is_of_token(challenge.nonce):
+        return challenge.nonce
+    if token is None or challenge.nonce.value != token.value:
         raise ApiError(
             "validation_failed",
-            "this challenge was not asked for with this token: ask for one with it",
+            "a challenge is answered with the token that it was asked for with, and one of an API "
+            "key with an API key: ask for one with what you send",
             {"field": CHALLENGE},
         )
-    return token.nonce
+    return token
 
 
 def _check_count(count: int, settings: Settings, *, is_challenge: bool) -> None:

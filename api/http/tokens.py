@@ -19,12 +19,14 @@ from api.http.errors import ApiError
 from templates.errors import SealError
 from templates.keys.api_token import SUBJECT_TOKEN
 from templates.keys.sealing import MasterKeyring
-from templates.store.lockout import Nonce
+from templates.store.lockout import Nonce, Replayed
+from templates.store.subjects import Precondition
 
 Action = Literal["verify", "enroll"]
 ACTIONS: tuple[Action, ...] = get_args(Action)
 LONGEST_S = 120
 _PURPOSE = "subject-token"
+_NONCE = "token:"
 
 CALLS: dict[str, frozenset[Action]] = {
     "enroll": frozenset({"enroll"}),
@@ -36,6 +38,8 @@ CALLS: dict[str, frozenset[Action]] = {
     "get_pack_file": frozenset(ACTIONS),
 }
 """Routes that take a token, by the name of their function, and of which action. No other does."""
+USES = frozenset(ACTIONS)
+"""Those of them that use it up."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +56,8 @@ class SubjectToken:
         Names it in logs and answers; nothing can be done with it alone.
     key_prefix, expires_at
         Of the API key that asked for it, and when it ends.
+    replace
+        Whether its enrollment may replace an earlier one.
     """
 
     subject: str
@@ -60,11 +66,28 @@ class SubjectToken:
     token_id: str
     key_prefix: str
     expires_at: datetime
+    replace: bool = True
 
     @property
     def nonce(self) -> Nonce:
         """What a use of the token uses up."""
         return nonce_of(self.key_prefix, self.token_id, self.expires_at)
+
+    @property
+    def late(self) -> bool:
+        """Whether its time is over."""
+        return datetime.now(UTC) > self.expires_at
+
+    def require_in_time(self) -> None:
+        """Refuse a token whose time is over.
+
+        Raises
+        ------
+        Replayed
+            Without a line in the audit log: whoever finds an old token could write there for ever.
+        """
+        if self.late:
+            raise Replayed("the token has expired: ask your server for another one", recorded=True)
 
     def require(self, route: str, subject: str | None) -> None:
         """Refuse a call that the token is not for; `subject` is the one that the path names.
@@ -103,6 +126,20 @@ class SubjectToken:
             )
         return self.level
 
+    def precondition(self, asked: Precondition | None) -> Precondition | None:
+        """Return what the subject must have for an enrollment, where a request asks for something.
+
+        Raises
+        ------
+        ApiError
+            ``forbidden``.
+        """
+        if self.replace:
+            return asked
+        if asked is not None and asked.template_id is not None:
+            raise _another("replace", "this token replaces no enrollment: send no If-Match with it")
+        return Precondition(None)
+
 
 def _another(what: str, message: str) -> ApiError:
     return ApiError("forbidden", message, {"token": what})
@@ -110,7 +147,12 @@ def _another(what: str, message: str) -> ApiError:
 
 def nonce_of(key_prefix: str, token_id: str, expires_at: datetime) -> Nonce:
     """Nonce of a token. No probe's is like it: those have no colon."""
-    return Nonce(key_prefix, f"token:{token_id}", expires_at)
+    return Nonce(key_prefix, f"{_NONCE}{token_id}", expires_at)
+
+
+def is_of_token(nonce: Nonce) -> bool:
+    """Whether it is a token's."""
+    return nonce.value.startswith(_NONCE)
 
 
 @dataclass(frozen=True)
@@ -130,6 +172,7 @@ def new_token(
     action: Action,
     level: str | None,
     lifetime_s: int,
+    replace: bool = True,
 ) -> NewToken:
     """Make a token.
 
@@ -142,11 +185,14 @@ def new_token(
         1 to ``LONGEST_S``.
     """
     expires = datetime.now(UTC).replace(microsecond=0) + timedelta(seconds=lifetime_s)
-    token = SubjectToken(subject, action, level, secrets.token_urlsafe(18), key_prefix, expires)
+    token = SubjectToken(
+        subject, action, level, secrets.token_urlsafe(18), key_prefix, expires, replace
+    )
     body = {
         "subject": subject,
         "action": action,
         "level": level,
+        "replace": replace,
         "id": token.token_id,
         "expires": int(expires.timestamp()),
     }
@@ -178,4 +224,5 @@ def opened_token(keyring: MasterKeyring, text: str, *, key_id: str) -> SubjectTo
         token_id=body["id"],
         key_prefix=match[1],
         expires_at=datetime.fromtimestamp(body["expires"], UTC),
+        replace=body["replace"],
     )

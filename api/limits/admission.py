@@ -1,8 +1,8 @@
 """Limits before allocation: how much of a body is read, for how long, and what waits for a turn."""
 
 from collections import Counter, OrderedDict, deque
-from collections.abc import AsyncGenerator, AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager, contextmanager
 from typing import TypeVar
 
 import anyio
@@ -19,6 +19,8 @@ MAX_WAITING_QUERIES = 256
 """Requests that may wait for their turn to ask the database, most of all whose API key it is."""
 
 RETRY_AFTER_S = 1
+MOST_OF_TOKEN = 4
+"""Files that one token may fetch at the same time: a pack has two."""
 SHARE = 3
 """Times as many places for bodies as are left that one API key may take."""
 
@@ -218,6 +220,39 @@ class Gate:
             return await anyio.to_thread.run_sync(work, limiter=self._queries)
         finally:
             self._asking -= 1
+
+
+class Downloads:
+    """Bounds the files that one worker sends at the same time: a client may take them slowly.
+
+    Parameters
+    ----------
+    most
+        Files at the same time; one API key has half of them, and one token ``MOST_OF_TOKEN``.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = max(1, most)
+        self._sent: Counter[str] = Counter()
+
+    @contextmanager
+    def place(self, *, key: str, token: str) -> Iterator[None]:
+        """Take a place for one file.
+
+        Raises
+        ------
+        ApiError
+            ``overloaded``, with ``Retry-After``.
+        """
+        limits = {"": self._most, key: max(1, self._most // 2), token: MOST_OF_TOKEN}
+        if any(self._sent[name] >= most for name, most in limits.items()):
+            raise overloaded()
+        self._sent.update(limits.keys())
+        try:
+            yield
+        finally:
+            self._sent.subtract(limits.keys())
+            self._sent = +self._sent  # forgets whom it counts no more
 
 
 def overloaded() -> ApiError:

@@ -33,8 +33,9 @@ function open(response, session) {
 
 async function credentials(request) {
   if (!(Number(request.headers["content-length"]) <= 1000)) throw new Refused(400, "too large");
-  const { name, password } = await json(request).catch(() => ({}));
-  if (!/^[\w.@-]{1,64}$/.test(name) || !/^.{8,256}$/s.test(password)) {
+  const { name, password } = (await json(request).catch(() => null)) ?? {};
+  const texts = typeof name === "string" && typeof password === "string";
+  if (!texts || !/^[\w.@-]{1,64}$/.test(name) || !/^.{8,256}$/s.test(password)) {
     throw new Refused(422, "a name, and a password of 8 to 256 characters");
   }
   return { name, password };
@@ -78,7 +79,9 @@ const routes = {
     const { subject } = session.account;
     const enrolled = await veilface(`/subjects/${subject}`);
     const action = enrolled ? "verify" : "enroll";
-    const { token, token_id } = await veilface("/tokens", { subject_id: subject, action });
+    // The first face only: who holds an older token must not replace it.
+    const first = enrolled ? {} : { replace: false };
+    const { token, token_id } = await veilface("/tokens", { subject_id: subject, action, ...first });
     session.tokenId = token_id; // it stays here: the page could name another one
     const [method, path] = enrolled ? ["POST", "verify"] : ["PUT", "enrollment"];
     return [200, { action, method, url: `${service}/v1/subjects/${subject}/${path}`, token }];

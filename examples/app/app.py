@@ -111,8 +111,9 @@ def token(session: HasPassword) -> dict[str, str]:
     try:
         CLIENT.describe(subject)
     except NotEnrolled:
+        # The first face only: who holds an older token must not replace it.
         action, method, path = "enroll", "PUT", "enrollment"
-        issued = CLIENT.create_token(subject, "enroll")
+        issued = CLIENT.create_token(subject, "enroll", replace=False)
     else:
         action, method, path = "verify", "POST", "verify"
         issued = CLIENT.create_token(subject, "verify")

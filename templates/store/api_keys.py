@@ -179,12 +179,16 @@ class ApiKeys:
             return None
         expected = _NOBODYS_HASH if row is None else row.token_hash
         same = hmac.compare_digest(_token_hash(token), expected)
-        return self._valid(row) if same else None
+        key = self._valid(row) if same else None
+        if key is not None:
+            self.note_use(key)
+        return key
 
     def valid(self, prefix: str) -> ApiKey | None:
         """Return the key of a prefix, or None where :meth:`verify` would return none.
 
-        For what the service itself made under that key: whoever knows a prefix has no key.
+        For what the service itself made under that key: whoever knows a prefix has no key. So the
+        use is not noted: see :meth:`note_use`.
         """
         try:
             row = self._row(prefix)
@@ -194,16 +198,13 @@ class ApiKeys:
         return self._valid(row)
 
     def _valid(self, row: Any) -> ApiKey | None:
-        """Return the key of a row if it is good now, and note that it is used."""
+        """Return the key of a row if it is good now."""
         if row is None:
             return None
         key, now = self._read(row), self._context.clock()
         if not key.authentic:
             warn("an API key's row is not authentic and was passed over", key_id=key.prefix)
-        if not key.is_valid_at(now):
-            return None
-        self._note_use(key, now)
-        return key
+        return key if key.is_valid_at(now) else None
 
     def get(self, prefix: str) -> ApiKey | None:
         """Return a key by its prefix, or None."""
@@ -361,8 +362,9 @@ class ApiKeys:
         values["liveness"] = _asked(row.liveness)
         return ApiKey(**values, authentic=self._is_authentic(row))
 
-    def _note_use(self, key: ApiKey, now: datetime) -> None:
-        # To the minute, so that verifying does not turn every request into a write.
+    def note_use(self, key: ApiKey) -> None:
+        """Note that a key is used: to the minute, so that not every request is a write."""
+        now = self._context.clock()
         due = now - _USE_IS_NOTED_EVERY
         if key.last_used_at is not None and key.last_used_at > due:
             return

@@ -102,7 +102,7 @@ class Replayed(StoreError):
     Attributes
     ----------
     recorded
-        Whether the audit log has a line of it.
+        Whether the audit log has a line of it, or gets none.
     """
 
     recorded = False

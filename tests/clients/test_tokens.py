@@ -6,7 +6,7 @@ import pytest
 
 from tests.api.deployment import photo
 from tests.clients.conftest import Running, service
-from veilface_client import AsyncClient, Client, Forbidden, Unauthorized
+from veilface_client import AsyncClient, Client, EnrollmentConflict, Forbidden, Unauthorized
 from veilface_client.signature import signed_probe
 
 __all__ = ["service"]
@@ -20,6 +20,9 @@ def test_a_token_is_used_once_and_its_outcome_is_told(service: Running) -> None:
             with pytest.raises(Unauthorized, match="seen before"):
                 page.enroll("tina", photo(2))
         assert server.token_outcome("tina", writing.token_id).outcome == "created"
+        late = server.create_token("tina", "enroll", replace=False)
+        with Client(service.url, late.token) as page, pytest.raises(EnrollmentConflict):
+            page.enroll("tina", photo(2))
         for person in (1, 2):
             issued = server.create_token("tina", "verify", level="fmr-1e-3", lifetime_s=60)
             assert issued.token not in repr(issued)

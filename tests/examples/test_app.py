@@ -120,6 +120,37 @@ def test_who_knows_the_password_alone_stays_out(app: str, service: Service) -> N
         client.reset_lockout(subject)
 
 
+def test_an_older_token_replaces_no_face(app: str, service: Service) -> None:
+    """Who knew the password before the first face came holds a token that enrolls."""
+    owner, thief = Visitor(app), Visitor(app)
+    assert owner.sign("register", "fay") == 201
+    assert thief.sign("login", "fay") == 204
+    given = thief.send("POST", "token").json()
+    owner.show(service.photo(1, 0))
+    assert given["action"] == "enroll"
+    refused = httpx.put(
+        given["url"],
+        files={"images": service.photo(3, 0)},
+        headers={"Authorization": f"Bearer {given['token']}"},
+        timeout=60,
+    )
+    assert refused.json()["error"]["code"] == "enrollment_conflict"
+    assert thief.send("POST", "face").json() == {"accepted": False}
+    assert owner.send("POST", "face").json() == {"accepted": True}
+
+
+def test_only_texts_are_a_name_and_a_password(app: str) -> None:
+    for name, password in (
+        (["gus"], PASSWORD),
+        ("gus", [PASSWORD]),
+        ("gus", 1234567890),
+        (7, None),
+    ):
+        answer = Visitor(app).send("POST", "register", json={"name": name, "password": password})
+        assert answer.status_code == 422
+    assert Visitor(app).send("POST", "register", json=None).status_code in (400, 422)
+
+
 def test_the_page_is_served_with_its_policy(app: str, service: Service) -> None:
     page, script = httpx.get(app), httpx.get(f"{app}page.js")
     policy = page.headers["Content-Security-Policy"]

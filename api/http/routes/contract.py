@@ -18,7 +18,7 @@ router = APIRouter(prefix="/v1/contract", tags=["contract"])
 @router.get(
     "",
     response_model=ContractAnswer,
-    responses=error_responses(*EVERY_CALL),
+    responses=error_responses(*EVERY_CALL, "replayed"),
     summary="The contract and its security levels",
 )
 async def get_contract(
@@ -50,7 +50,7 @@ async def get_contract(
                 "application/octet-stream": {"schema": {"type": "string", "format": "binary"}}
             },
         },
-        **error_responses(*EVERY_CALL, "forbidden", "not_found"),
+        **error_responses(*EVERY_CALL, "forbidden", "not_found", "replayed"),
     },
     summary="The decoy generator, for clients that lift",
 )

@@ -37,7 +37,6 @@ from api.process.runtime import Runtime
 from enroll import Enrollment, Holder
 from models.quality import Quality
 from templates.decoys import Attributes
-from templates.keys.holder_key import wipe
 from templates.store.audit_log import By
 from templates.store.idempotency import Claim
 from templates.store.lockout import Nonce
@@ -103,6 +102,8 @@ async def enroll(
     """
     settings = runtime.settings
     query = query_of(request, ("face",))
+    if caller.subject_token is not None:
+        precondition = caller.subject_token.precondition(precondition)
     async with gate.admitted(caller.prefix):
         if content_type(request) == "multipart/form-data":
             runtime.required_pack()
@@ -127,14 +128,11 @@ async def enroll(
         holder_key = holder_key_of(holder_key_header, body)
 
         def work(claim: Claim | None) -> Outcome:
-            try:
-                nonce = _unused_nonce(runtime, caller)
-                epoch = runtime.epoch(caller.tenant)
-                enrollment = runtime.enroller(caller.tenant, epoch).from_template(
-                    template, holder=_holder(holder_key, caller, subject)
-                )
-            finally:
-                wipe(holder_key)
+            nonce = _unused_nonce(runtime, caller)
+            epoch = runtime.epoch(caller.tenant)
+            enrollment = runtime.enroller(caller.tenant, epoch).from_template(
+                template, holder=_holder(holder_key, caller, subject)
+            )
             return _stored(
                 runtime,
                 caller.tenant,
@@ -164,6 +162,7 @@ async def enroll(
             subject=subject,
             work=work,
             run=partial(gate.compute, key=caller.prefix),
+            holder_key=holder_key,
         )
         return written(request, outcome)
 
@@ -187,19 +186,16 @@ async def _enroll_photos(
     holder_key = holder_key_of(holder_key_header, form.fields)
 
     def work(claim: Claim | None) -> Outcome:
-        try:
-            nonce = _unused_nonce(runtime, caller)
-            epoch = runtime.epoch(caller.tenant)
-            enrollment = runtime.enroller(caller.tenant, epoch).from_photos(
-                pack,
-                photos,
-                attributes=attributes,
-                holder=_holder(holder_key, caller, subject),
-                policy=policy,
-                limits=runtime.image_limits,
-            )
-        finally:
-            wipe(holder_key)
+        nonce = _unused_nonce(runtime, caller)
+        epoch = runtime.epoch(caller.tenant)
+        enrollment = runtime.enroller(caller.tenant, epoch).from_photos(
+            pack,
+            photos,
+            attributes=attributes,
+            holder=_holder(holder_key, caller, subject),
+            policy=policy,
+            limits=runtime.image_limits,
+        )
         return _stored(
             runtime,
             caller.tenant,
@@ -232,6 +228,7 @@ async def _enroll_photos(
         subject=subject,
         work=work,
         run=partial(request.app.state.gate.compute, key=caller.prefix),
+        holder_key=holder_key,
     )
     return written(request, outcome)
 
@@ -276,11 +273,13 @@ def _unused_nonce(runtime: Runtime, caller: Caller) -> Nonce | None:
     Raises
     ------
     Replayed
-        Where the token was used: before anything is decoded, and after a repeated request had its
-        answer.
+        Where the token was used or is late: before anything is decoded, and after a repeated
+        request had its answer.
     """
     if caller.subject_token is None:
         return None
+    # Once more: the body and the turn to compute may have taken a while.
+    caller.subject_token.require_in_time()
     nonce = caller.subject_token.nonce
     runtime.store.nonces.require_unused(nonce)
     return nonce

@@ -1,32 +1,84 @@
 """The graphs of the pack, for clients that embed: listed, and given by their hashes."""
 
+from contextlib import AbstractContextManager
+from pathlib import Path as FilePath
 from typing import Annotated
 
+import anyio
 from fastapi import APIRouter, Depends, Path, Request
+from starlette.requests import ClientDisconnect
 from starlette.responses import FileResponse, Response
+from starlette.types import Receive, Scope, Send
 
 from api.http.answers import answer
-from api.http.auth import caller
+from api.http.auth import Caller, CallerDep
 from api.http.deps import RuntimeDep
 from api.http.errors import ApiError
 from api.http.openapi import EVERY_CALL, error_responses
 from api.http.schemas import PackAnswer
+from api.limits.admission import Downloads
 from api.process.served_graphs import licence_of
 
 router = APIRouter(prefix="/v1/pack", tags=["contract"])
 
 KEPT = "private, max-age=31536000, immutable"
+FIRST_S = 30.0
+SLOWEST_BYTES_S = 64 * 1024
+"""How long a download may take: some seconds, and more of them the larger the file is."""
+
+
+async def holding_token(caller: CallerDep) -> Caller:
+    """Demand a token.
+
+    Raises
+    ------
+    ApiError
+        ``forbidden`` for an API key.
+    """
+    if caller.subject_token is None:
+        raise ApiError(
+            "forbidden",
+            "the graphs are for pages: ask for a token (POST /v1/tokens), and send that",
+            {"token": "missing"},
+        )
+    return caller
+
+
+class _GraphFile(FileResponse):
+    """The whole of a file, while there is a place for it and its time lasts."""
+
+    def __init__(
+        self,
+        path: FilePath,
+        *,
+        headers: dict[str, str],
+        place: AbstractContextManager[None],
+        seconds: float,
+    ) -> None:
+        headers = {**headers, "Accept-Ranges": "none"}
+        super().__init__(path, media_type="application/octet-stream", headers=headers)
+        self._place, self._seconds = place, seconds
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        whole = {**scope, "headers": [pair for pair in scope["headers"] if pair[0] != b"range"]}
+        with self._place, anyio.move_on_after(self._seconds) as time:
+            await super().__call__(whole, receive, send)
+        if time.cancelled_caught:
+            raise ClientDisconnect
 
 
 @router.get(
     "",
-    dependencies=[Depends(caller)],
+    dependencies=[Depends(holding_token)],
     response_model=PackAnswer,
     responses=error_responses(*EVERY_CALL, "forbidden", "not_found", "replayed"),
     summary="The graphs that the contract names",
 )
 async def list_pack(request: Request, runtime: RuntimeDep) -> Response:
-    """Any valid key or token may read it, where the deployment serves its pack (`serve_pack`)."""
+    """With a token, of any action, where the deployment serves its pack (`serve_pack`).
+
+    An API key is `forbidden`: its server has no use for the graphs.
+    """
     pack = runtime.pack
     if pack is None or not runtime.graphs:
         raise _not_served()
@@ -54,17 +106,10 @@ async def list_pack(request: Request, runtime: RuntimeDep) -> Response:
 
 @router.get(
     "/{sha256}",
-    dependencies=[Depends(caller)],
     response_class=Response,
     responses={
         200: {
             "description": "The graph's file, ONNX. `ETag` is its SHA-256.",
-            "content": {
-                "application/octet-stream": {"schema": {"type": "string", "format": "binary"}}
-            },
-        },
-        206: {
-            "description": "The range of bytes that was asked for.",
             "content": {
                 "application/octet-stream": {"schema": {"type": "string", "format": "binary"}}
             },
@@ -83,12 +128,15 @@ async def list_pack(request: Request, runtime: RuntimeDep) -> Response:
 )
 async def get_pack_file(
     request: Request,
+    caller: Annotated[Caller, Depends(holding_token)],
     runtime: RuntimeDep,
     sha256: Annotated[str, Path(description="Of a file of GET /v1/pack.")],
 ) -> Response:
-    """Any valid key or token may fetch it, where the deployment serves its pack.
+    """With a token, of any action, where the deployment serves its pack.
 
     The path names the content, so a copy stays good for ever. Check its SHA-256 before it is run.
+    `Range` is ignored. More files at the same time than there are places for are `overloaded`,
+    and a client that takes one more slowly than 64 KiB a second is cut off.
     """
     # Looked up among the few that are served: no part of the path reaches the file system.
     graph = runtime.graphs.get(sha256)
@@ -99,7 +147,13 @@ async def get_pack_file(
     if {tag.strip().removeprefix("W/") for tag in tags} & {headers["ETag"], "*"}:
         return Response(status_code=304, headers=headers)
     graph.require_unchanged()
-    return FileResponse(graph.path, media_type="application/octet-stream", headers=headers)
+    downloads: Downloads = request.app.state.downloads
+    return _GraphFile(
+        graph.path,
+        headers=headers,
+        place=downloads.place(key=caller.prefix, token=caller.name),
+        seconds=FIRST_S + graph.size / SLOWEST_BYTES_S,
+    )
 
 
 def _not_served() -> ApiError:

@@ -38,12 +38,12 @@ async def create_token(
 
     A browser holds it in place of an API key: it is good for one decision at one level, or for one
     enrollment, and for what a client needs before: a challenge, the contract, the generator, the
-    pack. It answers alike whether the subject is enrolled or not. Ask with its `token_id` what
-    came of it; never believe the page.
+    pack. With `"replace": false` its enrollment replaces nobody. It answers alike whether the
+    subject is enrolled or not. Ask with its `token_id` what came of it; never believe the page.
     """
     async with gate.admitted(caller.prefix):
         body = await sent_json(request, runtime.settings)
-    reject_unknown(body, ("subject_id", "action", "level", "lifetime_s"))
+    reject_unknown(body, ("subject_id", "action", "level", "lifetime_s", "replace"))
     subject = text_field(body.get("subject_id"), "subject_id", max_length=128)
     if subject is None:
         raise _wrong("subject_id", "subject_id must be there")
@@ -63,6 +63,9 @@ async def create_token(
     lifetime_s = body.get("lifetime_s", LONGEST_S)
     if type(lifetime_s) is not int or not 1 <= lifetime_s <= LONGEST_S:
         raise _wrong("lifetime_s", f"lifetime_s must be whole seconds, 1 to {LONGEST_S}")
+    replace = body.get("replace", True)
+    if type(replace) is not bool or (action == "verify" and "replace" in body):
+        raise _wrong("replace", "replace is true or false, and for the action enroll only")
     made = new_token(
         runtime.keyring,
         key_id=caller.key_id,
@@ -71,6 +74,7 @@ async def create_token(
         action=action,
         level=level,
         lifetime_s=lifetime_s,
+        replace=replace,
     )
     token = made.token
     entry = Entry(

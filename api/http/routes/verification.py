@@ -31,7 +31,6 @@ from api.http.schemas import VerifyAnswer
 from api.process.metrics import count_decision, step
 from api.process.runtime import Runtime
 from templates.errors import ContractMismatch
-from templates.keys.holder_key import wipe
 from templates.store.attempts import Attempt
 from templates.store.audit_log import By
 from templates.store.idempotency import Answer, Claim
@@ -126,7 +125,10 @@ async def verify(
                     return None
                 return claim, Outcome(200, _body(decision, caller)).to_keep()
 
-            decision = _decide_and_wipe(runtime, caller, subject, probe, kept, by(request))
+            if caller.subject_token is not None:
+                # Once more: the body and the turn to compute may have taken a while.
+                caller.subject_token.require_in_time()
+            decision = _decide_and_record(runtime, caller, subject, probe, kept, by(request))
             return Outcome(200, _body(decision, caller))
 
         outcome = await once(
@@ -140,6 +142,7 @@ async def verify(
             subject=subject,
             work=work,
             run=partial(gate.compute, key=caller.prefix),
+            holder_key=probe.holder_key,
         )
     body = outcome.body
     request.state.log["security_level"] = body["level"]
@@ -170,16 +173,6 @@ def _body(decision: Decision, caller: Caller) -> dict[str, Any]:
         if decision.liveness_failure is not None:
             body["liveness_failure"] = str(decision.liveness_failure)
     return body
-
-
-def _decide_and_wipe(
-    runtime: Runtime, caller: Caller, subject: str, probe: Probe, kept: Kept, who: By
-) -> Decision:
-    """Decide, and forget the holder's key: here, because nobody waits for a cancelled thread."""
-    try:
-        return _decide_and_record(runtime, caller, subject, probe, kept, who)
-    finally:
-        wipe(probe.holder_key)
 
 
 def _decide_and_record(

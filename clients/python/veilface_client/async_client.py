@@ -122,10 +122,14 @@ class AsyncSession:
         *,
         level: str | None = None,
         lifetime_s: int | None = None,
+        replace: bool = True,
     ) -> results.Token:
-        """Ask for a token for a browser. Right: ``verify`` or ``enroll``, as the action."""
+        """Ask for a token for a browser. Right: ``verify`` or ``enroll``, as the action.
+
+        With `replace` False its enrollment replaces nobody, as :meth:`enroll` with the same.
+        """
         return await self._send(
-            calls.create_token(subject, action, level=level, lifetime_s=lifetime_s)
+            calls.create_token(subject, action, level=level, lifetime_s=lifetime_s, replace=replace)
         )
 
     async def token_outcome(self, subject: str, token_id: str) -> results.TokenOutcome:

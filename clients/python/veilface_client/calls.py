@@ -198,13 +198,20 @@ def challenge(subject: str | None) -> Call[results.Challenge]:
 
 
 def create_token(
-    subject: str, action: Action, *, level: str | None, lifetime_s: int | None
+    subject: str,
+    action: Action,
+    *,
+    level: str | None,
+    lifetime_s: int | None,
+    replace: bool,
 ) -> Call[results.Token]:
     """Ask for a token for a browser; one that is lost harms nobody."""
     subject_path(subject)
     body: dict[str, Any] = {"subject_id": subject, "action": action, **_fields(level=level)}
     if lifetime_s is not None:
         body["lifetime_s"] = lifetime_s
+    if not replace:
+        body["replace"] = False
     return Call(
         "POST",
         "/v1/tokens",

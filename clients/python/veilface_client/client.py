@@ -141,9 +141,15 @@ class Session:
         *,
         level: str | None = None,
         lifetime_s: int | None = None,
+        replace: bool = True,
     ) -> results.Token:
-        """Ask for a token for a browser. Right: ``verify`` or ``enroll``, as the action."""
-        return self._send(calls.create_token(subject, action, level=level, lifetime_s=lifetime_s))
+        """Ask for a token for a browser. Right: ``verify`` or ``enroll``, as the action.
+
+        With `replace` False its enrollment replaces nobody, as :meth:`enroll` with the same.
+        """
+        return self._send(
+            calls.create_token(subject, action, level=level, lifetime_s=lifetime_s, replace=replace)
+        )
 
     def token_outcome(self, subject: str, token_id: str) -> results.TokenOutcome:
         """Ask what came of a token that this key asked for: never believe the page."""

@@ -1,14 +1,19 @@
 """The graphs for clients that embed: who gets them, how they are named and kept."""
 
 import hashlib
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+import anyio
 import pytest
+from starlette.requests import ClientDisconnect
 
 from api.http.app import create_app
-from api.http.errors import StartError
+from api.http.errors import ApiError, StartError
+from api.http.routes.pack import _GraphFile
 from api.http.schemas import PackAnswer
+from api.limits.admission import MOST_OF_TOKEN, Downloads
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, deploy
 from tests.api.shapes import assert_answer, assert_error
@@ -37,9 +42,13 @@ def token_of(client: Client, action: str) -> str:
     return token
 
 
+def with_token(client: Client, action: str = "verify") -> dict[str, str]:
+    return bearer(token_of(client, action))
+
+
 def test_it_lists_the_graphs_that_the_contract_names(serving: tuple[Client, Deployment]) -> None:
     client, deployment = serving
-    listed = assert_answer(client.get("/v1/pack"), 200, PackAnswer)
+    listed = assert_answer(client.get("/v1/pack", headers=with_token(client)), 200, PackAnswer)
     contract = client.get("/v1/contract").json()
     assert listed["contract_id"] == contract["contract_id"]
     assert listed["licence"] == "non-commercial research only (InsightFace)"
@@ -57,7 +66,7 @@ def test_it_lists_the_graphs_that_the_contract_names(serving: tuple[Client, Depl
 def test_a_token_fetches_a_graph_and_keeps_it(serving: tuple[Client, Deployment]) -> None:
     client, deployment = serving
     for action in ("verify", "enroll"):
-        headers = bearer(token_of(client, action))
+        headers = with_token(client, action)
         entry = client.get("/v1/pack", headers=headers).json()["files"][-1]
         answer = client.get(entry["path"], headers=headers)
         assert answer.status_code == 200
@@ -70,31 +79,39 @@ def test_a_token_fetches_a_graph_and_keeps_it(serving: tuple[Client, Deployment]
             entry["path"], headers={**headers, "If-None-Match": answer.headers["etag"]}
         )
         assert (kept.status_code, kept.content) == (304, b"")
-        part = client.get(entry["path"], headers={**headers, "Range": "bytes=8-23"})
-        assert (part.status_code, part.content) == (206, answer.content[8:24])
+        # All of it, whatever range is asked for.
+        for asked in ("bytes=8-23", "bytes=0-1,4-5", "bytes=99999999-", "pages=1"):
+            whole = client.get(entry["path"], headers={**headers, "Range": asked})
+            assert (whole.status_code, whole.content) == (200, answer.content)
+            assert whole.headers["accept-ranges"] == "none"
 
 
 def test_nothing_else_is_served(serving: tuple[Client, Deployment]) -> None:
     client, deployment = serving
-    entry = client.get("/v1/pack").json()["files"][0]
+    token = with_token(client)
+    listed = client.get("/v1/pack", headers=token).json()["files"]
+    entry = listed[0]
+    for path in ("/v1/pack", entry["path"]):
+        # To no API key, whatever its rights.
+        assert assert_error(client.get(path), 403, "forbidden") == {"token": "missing"}
     for headers in ({"Authorization": ""}, bearer("vft_" + "0" * 12 + "_" + "A" * 200)):
         for path in ("/v1/pack", entry["path"]):
             assert_error(client.get(path, headers=headers), 401, "unauthorized")
     others = [path for path in folder_of(deployment).iterdir() if path.suffix == ".onnx"]
     unlisted = {hashlib.sha256(path.read_bytes()).hexdigest() for path in others} - {
-        listed["sha256"] for listed in client.get("/v1/pack").json()["files"]
+        one["sha256"] for one in listed
     }
     for name in (
         *unlisted, entry["file"], "0" * 64, entry["sha256"].upper(), "..", "%2e%2e%2fpack.toml",
         "..%2f..%2fmaster.key", "pack.toml",
     ):  # fmt: skip
-        assert_error(client.get(f"/v1/pack/{name}"), 404, "not_found")
+        assert_error(client.get(f"/v1/pack/{name}", headers=token), 404, "not_found")
 
 
 def test_it_is_off_by_default(client: Client) -> None:
     sha256 = client.get("/v1/contract").json()["binding"]["embedder_sha256"]
     for path in ("/v1/pack", f"/v1/pack/{sha256}"):
-        assert_error(client.get(path), 404, "not_found")
+        assert_error(client.get(path, headers=with_token(client)), 404, "not_found")
 
 
 def test_webassembly_is_allowed_only_where_the_pack_is_served(
@@ -114,6 +131,7 @@ def test_a_file_that_was_changed_is_not_given_under_the_old_hash(tmp_path: Path)
     deployment = deploy(tmp_path, serve_pack=True)
     with Client(create_app(deployment.settings)) as client:
         client.headers.update(bearer(deployment.token))
+        client.headers.update(with_token(client))
         (entry,) = client.get("/v1/pack").json()["files"]
         assert client.get(entry["path"]).status_code == 200
         file = folder_of(deployment) / entry["file"]
@@ -127,3 +145,63 @@ def test_a_service_without_a_pack_has_none_to_serve(deployment: Deployment) -> N
     settings = deployment.settings.model_copy(update={"serve_pack": True, "pack": None})
     with pytest.raises(StartError, match="serve_pack: there is no pack"):
         Client(create_app(settings)).__enter__()
+
+
+def test_slow_downloads_take_few_places(serving: tuple[Client, Deployment]) -> None:
+    client, _ = serving
+    mine, others = with_token(client), with_token(client)
+    path = client.get("/v1/pack", headers=mine).json()["files"][0]["path"]
+    downloads = client.app.state.downloads
+    key, token_id = client.get("/v1/key").json()["prefix"], "another"
+    for _ in range(MOST_OF_TOKEN + 1):  # each gives its place back
+        assert client.get(path, headers=mine).status_code == 200
+    with ExitStack() as held:
+        for number in range(client.app.state.runtime.settings.max_in_flight // 8):
+            held.enter_context(downloads.place(key=key, token=f"{token_id}-{number}"))
+        refused = client.get(path, headers=mine)
+        assert_error(refused, 503, "overloaded")
+        assert int(refused.headers["retry-after"]) >= 1
+        # The list, and a copy that is kept, need no place; no other call does.
+        assert client.get("/v1/pack", headers=mine).status_code == 200
+        kept = client.get(path, headers={**mine, "If-None-Match": "*"})
+        assert kept.status_code == 304
+        assert client.get("/v1/contract", headers=others).status_code == 200
+    assert client.get(path, headers=mine).status_code == 200
+
+
+def test_a_token_a_key_and_all_together_have_their_places() -> None:
+    downloads = Downloads(16)
+    with ExitStack() as held:
+        for _ in range(MOST_OF_TOKEN):
+            held.enter_context(downloads.place(key="a", token="a:1"))
+        with pytest.raises(ApiError, match="try again"), downloads.place(key="a", token="a:1"):
+            pass
+        for number in range(MOST_OF_TOKEN):
+            held.enter_context(downloads.place(key="a", token=f"a:x{number}"))
+        with pytest.raises(ApiError, match="try again"), downloads.place(key="a", token="a:2"):
+            pass
+        for number in range(8):
+            held.enter_context(downloads.place(key="b", token=f"b:{number}"))
+        with pytest.raises(ApiError, match="try again"), downloads.place(key="c", token="c:1"):
+            pass
+    with downloads.place(key="a", token="a:1"):
+        pass
+
+
+def test_a_download_ends_with_its_time(tmp_path: Path) -> None:
+    file = tmp_path / "graph.onnx"
+    file.write_bytes(bytes(1000))
+    downloads, began = Downloads(2), []
+    place = downloads.place(key="a", token="a:1")
+    response = _GraphFile(file, headers={}, place=place, seconds=0.05)
+
+    async def never(message: Any = None) -> Any:
+        began.append(message)
+        await anyio.sleep_forever()
+
+    scope = {"type": "http", "method": "GET", "headers": []}
+    with pytest.raises(ClientDisconnect):
+        anyio.run(response, scope, never, never)
+    assert began
+    with downloads.place(key="a", token="a:1"):
+        pass

@@ -8,12 +8,14 @@ import time
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import httpx
 import pytest
 from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
+from api.http import holder_keys
 from api.http.app import create_app
 from api.http.schemas import (
     ContractAnswer,
@@ -22,8 +24,9 @@ from api.http.schemas import (
     TokenOutcomeAnswer,
     VerifyAnswer,
 )
-from api.http.tokens import new_token
+from api.http.tokens import SubjectToken, new_token
 from api.process.opening import open_keyring, open_store
+from templates.keys.holder_key import decode_holder_key
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, deploy, images, photo
 from tests.api.http.test_enrollment import b64, lifted
@@ -128,6 +131,22 @@ def test_a_token_is_good_for_one_enrollment(service: Service) -> None:
     assert outcome(client, again, "carol")["outcome"] == "replaced"
 
 
+def test_a_token_for_a_first_enrollment_replaces_nobody(service: Service) -> None:
+    client, _ = service
+    tokens = [issue(client, "enroll", "carol", replace=False) for _ in range(2)]
+    refused = enroll(client, tokens[0]["token"], **{"If-Match": '"' + "0" * 32 + '"'})
+    assert assert_error(refused, 403, "forbidden") == {"token": "replace"}
+    first = assert_answer(enroll(client, tokens[0]["token"]), 201, EnrollmentAnswer)
+    for headers in ({}, {"If-None-Match": "*"}):
+        refused = enroll(client, tokens[1]["token"], 4, **headers)
+        told = assert_error(refused, 409, "enrollment_conflict")
+        assert told == {"template_id": first["template_id"]}
+    assert outcome(client, tokens[1], "carol")["outcome"] is None
+    assert enroll(client, issue(client, "enroll", "carol", replace=True)["token"]).json()[
+        "replaced"
+    ]
+
+
 @pytest.mark.parametrize("action", ["verify", "enroll"])
 def test_of_eight_uses_at_once_one_passes(service: Service, action: str) -> None:
     """In two processes' worth of services on one database, and after both are opened anew."""
@@ -160,13 +179,18 @@ def test_a_token_outlives_a_restart_and_its_key_does_not(service: Service) -> No
 
 
 def test_a_late_token_is_refused(shared: Service) -> None:
-    client, _ = shared
+    client, deployment = shared
     issued = issue(client, lifetime_s=1)
     ends = datetime.fromisoformat(issued["expires_at"])
     wait_until(lambda: datetime.now(UTC) > ends, what="the token's end")
+    before = len(audit(deployment))
     assert_error(verify(client, issued["token"]), 401, "replayed")
     for path in ("/v1/contract", "/v1/pack"):
         assert_error(client.get(path, headers=bearer(issued["token"])), 401, "replayed")
+    erasure = client.delete("/v1/subjects/alice", headers=bearer(issued["token"]))
+    assert_error(erasure, 401, "replayed")
+    # An old token that somebody finds writes nothing to the audit log.
+    assert len(audit(deployment)) == before
     assert outcome(client, issued)["used"] is False
 
 
@@ -354,6 +378,12 @@ def test_a_theft_of_an_answered_request_gives_nothing(service: Service) -> None:
     for person in (1, 2):
         assert_error(verify(client, used, person, "carol"), 403, "forbidden")
         assert_error(enroll(client, writing, person), 401, "replayed")
+    # Nor what a client needs before: the token is good for nothing any more.
+    for token in (used, writing):
+        for path in ("/v1/contract", "/v1/contract/generator", "/v1/pack", f"/v1/pack/{'0' * 64}"):
+            assert_error(client.get(path, headers=bearer(token)), 401, "replayed")
+    asked = client.post("/v1/challenges", json={}, headers=bearer(used))
+    assert_error(asked, 401, "replayed")
     # One bit of it changed is no token: neither its end, its subject nor its level can be moved.
     _, prefix, sealed = used.split("_", 2)
     raw = bytearray(base64.urlsafe_b64decode(sealed + "=" * (-len(sealed) % 4)))
@@ -366,6 +396,93 @@ def test_a_theft_of_an_answered_request_gives_nothing(service: Service) -> None:
     assert other[4:16] == prefix
     assert_error(verify(client, f"vft_{'0' * 12}_{sealed}"), 401, "unauthorized")
     assert verify(client, other).json()["decision"] == "accept"
+
+
+def test_a_theft_of_an_earlier_request_gives_the_one_call(shared: Service) -> None:
+    """A token that no decision and no enrollment used up is whole, whoever holds it."""
+    client, _ = shared
+    token, writing = issue(client)["token"], issue(client, "enroll", "erin")["token"]
+    for held in (token, writing):
+        assert client.get("/v1/contract", headers=bearer(held)).status_code == 200
+    refused = client.put(
+        "/v1/subjects/erin/enrollment", files=images(photo(3), photo(4)), headers=bearer(writing)
+    )
+    assert_error(refused, 422, "inconsistent_images")
+    assert verify(client, token, 2).json()["decision"] == "reject"  # the thief's
+    assert enroll(client, writing, 4, "erin").status_code == 201
+    assert_error(verify(client, token), 401, "replayed")  # and nothing is left for the visitor
+    assert_error(enroll(client, writing, 3, "erin"), 401, "replayed")
+
+
+def test_only_a_token_that_opens_notes_the_use_of_its_key(shared: Service) -> None:
+    client, deployment = shared
+    token = issue(client)["token"]
+    store = open_store(deployment.settings, open_keyring(deployment.settings))
+    try:
+        key = store.api_keys.create("default", ["verify"]).key
+
+        def asked(text: str) -> httpx.Response:
+            return client.get("/v1/contract", headers=bearer(text))
+
+        def made(lifetime_s: int) -> str:
+            return new_token(
+                open_keyring(deployment.settings),
+                key_id=key.id,
+                key_prefix=key.prefix,
+                subject="alice",
+                action="verify",
+                level=STRICT,
+                lifetime_s=lifetime_s,
+            ).text
+
+        assert_error(asked(f"vft_{key.prefix}_{token.split('_', 2)[2]}"), 401, "unauthorized")
+        assert_error(asked(made(-60)), 401, "replayed")
+        noted = store.api_keys.get(key.prefix)
+        assert noted is not None
+        assert noted.last_used_at is None
+        assert asked(made(60)).status_code == 200
+        noted = store.api_keys.get(key.prefix)
+        assert noted is not None
+        assert noted.last_used_at is not None
+    finally:
+        store.close()
+
+
+def test_a_holders_key_is_forgotten_where_nothing_is_decided(
+    shared: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    client, _ = shared
+    keys: list[bytearray] = []
+
+    def decoded(text: str) -> bytearray:
+        keys.append(decode_holder_key(text))
+        return keys[-1]
+
+    monkeypatch.setattr(holder_keys, "decode_holder_key", decoded)
+    token = issue(client)["token"]
+    headers = {
+        "Idempotency-Key": "one-attempt",
+        "Veilface-Holder-Key": base64.urlsafe_b64encode(bytes(range(32))).decode(),
+    }
+    answers = [verify(client, token, person, headers=headers) for person in (1, 1, 2)]
+    assert [answer.status_code for answer in answers] == [200, 200, 409]
+    assert [bytes(key) for key in keys] == [bytes(32)] * 3
+
+
+def test_a_token_that_ends_while_its_body_comes_is_refused(
+    shared: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    client, deployment = shared
+    for use, action in ((verify, "verify"), (enroll, "enroll")):
+        issued = issue(client, action)
+        # As it is opened, and as the call is looked at; then it is late.
+        late = Mock(side_effect=[False, False, True])
+        monkeypatch.setattr(SubjectToken, "late", property(late))
+        before = len(audit(deployment))
+        assert_error(use(client, issued["token"], 1, "alice"), 401, "replayed")
+        assert len(audit(deployment)) == before
+        monkeypatch.undo()
+        assert outcome(client, issued)["used"] is False
 
 
 def test_the_master_key_alone_makes_no_token(shared: Service) -> None:
@@ -406,6 +523,8 @@ def test_who_may_ask_for_which_token(shared: Service) -> None:
         ({"action": "enroll", "level": STRICT}, "validation_failed"),
         ({"level": "fmr-1e-9"}, "uncalibrated"),
         ({"lvel": STRICT}, "validation_failed"),
+        ({"replace": False}, "validation_failed"),
+        ({"action": "enroll", "replace": "no"}, "validation_failed"),
     ):
         assert_error(client.post("/v1/tokens", json={**good, **change}), 422, code)
 

@@ -163,7 +163,7 @@ export class Session {
     return this.send({ method: "GET", path: "/v1/contract/generator", read: readBytes });
   }
 
-  /** Fetch the graphs that the contract names, and check the SHA-256 of each. */
+  /** Fetch the graphs of the contract, with a token, and check the SHA-256 of each. */
   async pack(): Promise<PackGraphs> {
     const list = await this.send({
       method: "GET",
@@ -191,13 +191,21 @@ export class Session {
       action,
       level,
       lifetime,
-    }: { action: "verify" | "enroll"; level?: string; /** Seconds. */ lifetime?: number },
+      replace,
+    }: {
+      action: "verify" | "enroll";
+      level?: string;
+      /** Seconds. */
+      lifetime?: number;
+      /** Whether an enrollment may replace an earlier one. */
+      replace?: boolean;
+    },
   ): Promise<Token> {
     subjectPath(subject);
     return this.send({
       method: "POST",
       path: "/v1/tokens",
-      body: () => fields({ subject_id: subject, action, level, lifetime_s: lifetime }),
+      body: () => fields({ subject_id: subject, action, level, lifetime_s: lifetime, replace }),
       read: answer<Token>({ token: "string", token_id: "string" }, ["token"]),
     });
   }

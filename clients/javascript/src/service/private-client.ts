@@ -38,7 +38,7 @@ export type Photo = RgbImage | Blob;
 export interface PrivateOptions extends ClientOptions {
   /** The module `onnxruntime-web` or `onnxruntime-node`. */
   readonly runtime: Runtime;
-  /** Where the graphs of a contract are; by default the service's own (`GET /v1/pack`). */
+  /** Where the graphs of a contract are; by default the service gives them, to a token. */
   readonly graphs?: (contract: PublicContract) => Promise<PackGraphs>;
   /** Of ONNX Runtime, such as `{ executionProviders: ["webgpu", "wasm"] }`. */
   readonly sessionOptions?: object;
