@@ -1,6 +1,6 @@
 // Sign-in, navigation and focus; each view is a module of its own.
 
-import { h } from "./dom.js";
+import { carriesFiles, h, takesFiles } from "./dom.js";
 import { enrollView } from "./enroll.js";
 import { logView } from "./log.js";
 import { peopleView } from "./people.js";
@@ -157,8 +157,12 @@ document.querySelector(".skip").addEventListener("click", (event) => {
   main.focus();
 });
 addEventListener("hashchange", () => route());
-// What misses a form that takes photos must not replace the page.
-for (const type of ["dragover", "drop"]) addEventListener(type, (event) => event.preventDefault());
+// Files that miss a form that takes photos must not replace the page.
+for (const type of ["dragover", "drop"]) {
+  addEventListener(type, (event) => {
+    if (carriesFiles(event) && !takesFiles(event.target)) event.preventDefault();
+  });
+}
 
 if (hasKey()) {
   try {
