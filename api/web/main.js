@@ -87,7 +87,7 @@ function signInView(problem = null) {
     spellcheck: "false",
     "aria-describedby": "key-hint",
   });
-  const keep = h("input", { type: "checkbox", id: "keep", checked: true });
+  const keep = h("input", { type: "checkbox", id: "keep", checked: true, "aria-describedby": "keep-hint" });
   const send = h("button", { type: "submit" }, "Sign in");
   const trouble = h("div", {}, problem ? problemBox(problem) : null);
 
@@ -143,6 +143,11 @@ function signInView(problem = null) {
         ),
       ),
       h("p", { class: "check" }, keep, h("label", { for: "keep" }, "Keep me signed in until I close this tab")),
+      h(
+        "p",
+        { class: "hint", id: "keep-hint" },
+        "A reload keeps it; a browser that restores the tab may bring it back. Sign out ends it.",
+      ),
       send,
     ),
     trouble,
