@@ -211,8 +211,8 @@ def test_a_page_begins_at_the_head_and_shows_altered_lines_as_such(
 ) -> None:
     log = filled.audit_log
     expected: list[tuple[int, Line | None]] = [
-        (line.sequence, line) for line in log.lines() if line.tenant == "default"
-    ][::-1]
+        (line.sequence, line) for line in reversed(list(log.lines())) if line.tenant == "default"
+    ]
     attacker(COPY.format(number, "hash", "previous_hash"))
     assert log.page("default", limit=100) == (expected, None)
     # One that cannot be read, one that can, and one that would hide those before it.
