@@ -19,6 +19,7 @@ ACTIONS = {
     "verify": "verify",
     "erase_subject": "erase",
     "export_subject": "export",
+    "get_audit_log": "audit-log",
     "get_stored": "inspect",
     "create_token": "token",
     "import_subject": "import",

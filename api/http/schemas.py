@@ -244,15 +244,23 @@ class SubjectsAnswer(_Answer):
 
 
 class AuditLine(_Shape):
-    """One line of the audit log: who did what to which subject, and with which result."""
+    """One line of the audit log: who did what to which subject, and with which result.
 
-    at: str = Field(examples=["2026-01-31T12:00:00Z"])
+    Of a line that was altered there is its number, and nothing else.
+    """
+
+    at: str | None = Field(examples=["2026-01-31T12:00:00Z"])
     actor: str | None = Field(description="Of a request, its key.", examples=["key:0f3a5c7e9b1d"])
-    action: str = Field(examples=["verify"])
+    action: str | None = Field(examples=["verify"])
     subject: str | None = Field(description="Pseudonym of the subject.", examples=[HEX])
-    outcome: str = Field(examples=["accept"])
+    outcome: str | None = Field(examples=["accept"])
     detail: str | None = Field(examples=["fmr-1e-3"])
     request_id: str | None
+    altered: bool = Field(
+        description="True: not as it was written; run `veilface audit-log verify`.",
+        examples=[False],
+    )
+    sequence: int | None = Field(description="Number of an altered line; null for others.")
 
 
 class AuditLogAnswer(_Answer):

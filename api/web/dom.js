@@ -131,3 +131,7 @@ export function download(name, text, type = "application/json") {
   h("a", { href: url, download: name }).click();
   setTimeout(() => URL.revokeObjectURL(url), 10000);
 }
+
+// Of a drag: whether it carries files, and whether what it is over takes them by itself.
+export const carriesFiles = (event) => event.dataTransfer?.types.includes("Files") ?? false;
+export const takesFiles = (target) => target.closest?.("input[type=file]:enabled") != null;

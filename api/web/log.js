@@ -16,33 +16,39 @@ export function logView(id) {
   shown.hidden = true;
   const lines = shown.querySelector("tbody");
   const more = h("button", { type: "button", class: "secondary", hidden: true, onclick: () => load() }, "Show earlier");
+  // Of the lines that are shown.
   let cursor = null;
   let person = id;
+  let asked = 0;
 
   async function load(event) {
     event?.preventDefault();
-    if (event) {
-      person = subject.value;
-      cursor = null;
-    }
+    const asking = (asked += 1);
+    const about = event ? subject.value : person;
+    const from = event ? null : cursor;
     more.disabled = true;
     problem.replaceChildren();
+    let page;
     try {
-      const wanted = { limit: PAGE, ...(person ? { subject_id: person } : {}), ...(cursor ? { cursor } : {}) };
-      const page = await call("GET", `/v1/audit-log?${new URLSearchParams(wanted)}`);
-      if (!cursor) lines.replaceChildren();
-      lines.append(...page.lines.map((line) => row(cells(line))));
-      cursor = page.next_cursor;
-      more.hidden = cursor === null;
-      const count = lines.childElementCount;
-      shown.hidden = count === 0;
-      said.textContent = count
-        ? `${count} lines shown${cursor ? ", with earlier ones to come" : ""}.`
-        : `No line${person ? ` about ${person}` : ""}${cursor ? " yet: look further back" : ""}.`;
+      const wanted = { limit: PAGE, ...(about ? { subject_id: about } : {}), ...(from ? { cursor: from } : {}) };
+      page = await call("GET", `/v1/audit-log?${new URLSearchParams(wanted)}`);
     } catch (error) {
-      problem.replaceChildren(problemBox(error));
+      if (asking === asked) problem.replaceChildren(problemBox(error));
     }
+    // Another question was asked meanwhile, and its answer counts.
+    if (asking !== asked) return;
     more.disabled = false;
+    if (!page) return;
+    person = about;
+    cursor = page.next_cursor;
+    if (!from) lines.replaceChildren();
+    lines.append(...page.lines.map((line) => row(line.altered ? altered(line) : cells(line))));
+    more.hidden = cursor === null;
+    const count = lines.childElementCount;
+    shown.hidden = count === 0;
+    said.textContent = count
+      ? `${count} lines shown${cursor ? ", with earlier ones to come" : ""}.`
+      : `No line${person ? ` about ${person}` : ""}${cursor ? " yet: look further back" : ""}.`;
   }
 
   if (!why) load();
@@ -54,9 +60,9 @@ export function logView(id) {
       "p",
       { class: "lead" },
       "Who did what to whom in this key’s tenant, the latest first. A line names a person by a pseudonym only. ",
-      "Nothing is verified here: ",
+      "Whether lines were removed or moved is not seen here: ",
       h("code", {}, "veilface audit-log verify"),
-      " shows whether a line was altered or removed.",
+      " shows it.",
     ),
     offNote(why),
     why
@@ -83,3 +89,13 @@ const cells = ({ at, action, outcome, detail, actor, subject, request_id: reques
   subject ? h("code", {}, subject.slice(0, 16)) : null,
   request ? h("code", {}, request) : null,
 ].map((each) => each ?? "");
+
+const altered = ({ sequence }) => [
+  `Line ${sequence}`,
+  "altered",
+  "",
+  ["Not as it was written. Run ", h("code", {}, "veilface audit-log verify")],
+  "",
+  "",
+  "",
+];

@@ -1,6 +1,6 @@
 // Sign-in, navigation and focus; each view is a module of its own.
 
-import { h } from "./dom.js";
+import { carriesFiles, h, takesFiles } from "./dom.js";
 import { enrollView } from "./enroll.js";
 import { logView } from "./log.js";
 import { peopleView } from "./people.js";
@@ -87,7 +87,7 @@ function signInView(problem = null) {
     spellcheck: "false",
     "aria-describedby": "key-hint",
   });
-  const keep = h("input", { type: "checkbox", id: "keep", checked: true });
+  const keep = h("input", { type: "checkbox", id: "keep", checked: true, "aria-describedby": "keep-hint" });
   const send = h("button", { type: "submit" }, "Sign in");
   const trouble = h("div", {}, problem ? problemBox(problem) : null);
 
@@ -143,6 +143,11 @@ function signInView(problem = null) {
         ),
       ),
       h("p", { class: "check" }, keep, h("label", { for: "keep" }, "Keep me signed in until I close this tab")),
+      h(
+        "p",
+        { class: "hint", id: "keep-hint" },
+        "A reload keeps it; a browser that restores the tab may bring it back. Sign out ends it.",
+      ),
       send,
     ),
     trouble,
@@ -157,8 +162,12 @@ document.querySelector(".skip").addEventListener("click", (event) => {
   main.focus();
 });
 addEventListener("hashchange", () => route());
-// What misses a form that takes photos must not replace the page.
-for (const type of ["dragover", "drop"]) addEventListener(type, (event) => event.preventDefault());
+// Files that miss a form that takes photos must not replace the page.
+for (const type of ["dragover", "drop"]) {
+  addEventListener(type, (event) => {
+    if (carriesFiles(event) && !takesFiles(event.target)) event.preventDefault();
+  });
+}
 
 if (hasKey()) {
   try {

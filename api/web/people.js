@@ -43,6 +43,7 @@ export function peopleView() {
       more.hidden = cursor === null;
       count();
     } catch (error) {
+      if (asking !== asked) return;
       problem.replaceChildren(problemBox(error));
     }
     more.disabled = false;

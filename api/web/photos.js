@@ -1,7 +1,7 @@
 // Where photos come from (camera, files, in the demo cartoon people), and a tray of those chosen.
 
 import { camera, check, picture, unasked } from "./camera.js";
-import { faceBox, h, newId } from "./dom.js";
+import { carriesFiles, faceBox, h, newId, takesFiles } from "./dom.js";
 import { Problem, call } from "./service.js";
 import { DEMO, guidance, problemBox, sentence } from "./words.js";
 
@@ -47,6 +47,8 @@ export function photoPicker({ most, replaces = false, onchange }) {
 
   // A burst, some files or a cartoon: what is chosen at one time.
   function take(together) {
+    // The view was left while they were on their way.
+    if (ended.signal.aborted) return;
     if (replaces) [...photos].forEach(remove);
     const room = most - photos.length;
     together.slice(0, room).forEach(add);
@@ -57,7 +59,13 @@ export function photoPicker({ most, replaces = false, onchange }) {
     }
   }
 
-  const takeFiles = (files) => take([...files].map((file) => ({ blob: file, name: file.name, seen: null })));
+  // What is no picture, such as a key file, is not sent to the service to find that out.
+  function takeFiles(files) {
+    const pictures = [...files].filter((file) => file.type.startsWith("image/"));
+    const others = [...files].filter((file) => !pictures.includes(file));
+    if (pictures.length) take(pictures.map((file) => ({ blob: file, name: file.name, seen: null })));
+    if (others.length) told.textContent = `No picture: ${others.map((file) => file.name).join(", ")}.`;
+  }
 
   // `seen` is what the service saw already in this very photo, or null.
   function add({ blob, name, seen }) {
@@ -254,7 +262,8 @@ export function photoPicker({ most, replaces = false, onchange }) {
       h("label", { for: largest.id }, "Others may be in the picture: use the large face near the middle"),
     ),
   );
-  const holds = (event) => !root.hidden && !root.closest(":disabled") && event.dataTransfer?.types.includes("Files");
+  const holds = (event) =>
+    !root.hidden && !root.closest(":disabled") && carriesFiles(event) && !takesFiles(event.target);
   return {
     root,
     face,
@@ -288,6 +297,8 @@ export function photoPicker({ most, replaces = false, onchange }) {
       live?.stop();
       ended.abort();
       photos.forEach(forget);
+      // One that is still decoded gets no address.
+      photos.length = 0;
     },
   };
 }

@@ -1,5 +1,5 @@
-// Calls to the service, all to the page's own origin. The key is in memory; only where the visitor
-// asks for it is it kept in this tab's session storage.
+// Calls to the service, all to the page's own origin. The key is in memory, and unless the visitor
+// unticks it in this tab's session storage, which a browser may restore with the tab from its disk.
 
 const KEPT = "veilface-key";
 let key = kept((storage) => storage.getItem(KEPT)) ?? null;

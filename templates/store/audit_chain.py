@@ -195,6 +195,15 @@ def is_true_line(keys: LineKeys, line: Line) -> bool:
     return hmac.compare_digest(line_hash(keys.of(line.sequence), vars(line)), line.hash)
 
 
+def true_line(keys: LineKeys, values: Mapping[str, Any]) -> Line | None:
+    """:meth:`Line.read`; None where the line is not as it was written."""
+    try:
+        line = Line.read(values)
+    except ValueError:
+        return None
+    return line if is_true_line(keys, line) else None
+
+
 def head_mac(key: bytes, head: Anchor) -> bytes:
     """MAC of the head row of a database whose rows are authenticated."""
     return _head_mac(key, head, "head of authenticated rows")
@@ -234,7 +243,7 @@ class Chain:
     def step(self, values: Mapping[str, Any]) -> None:
         """Check the next line, given as :meth:`Line.read` takes it."""
         sequence, expected = values["sequence"], self._last.sequence + 1
-        line = self._true_line(values)
+        line = true_line(self._keys, values)
         self._lines += 1
         if sequence > expected:
             self._report(Problem(expected, MISSING, through=sequence - 1))
@@ -247,13 +256,6 @@ class Chain:
         self._last = Anchor(sequence, values["hash"] or b"")  # where it lost its NOT NULL
         self._trusted = line is not None
         self._anchored |= self._last == self._anchor
-
-    def _true_line(self, values: Mapping[str, Any]) -> Line | None:
-        try:
-            line = Line.read(values)
-        except ValueError:
-            return None
-        return line if is_true_line(self._keys, line) else None
 
     def _follows(self, line: Line) -> bool:
         # Beside a gap or an altered line, which are reported, there is nothing to compare with.

@@ -29,8 +29,15 @@ from templates.store.audit_chain import (
     is_head_before_authentication,
     line_hash,
     read_line,
+    true_line,
 )
-from templates.store.audit_rows import read_end, read_head, read_lines, read_tenant_lines
+from templates.store.audit_rows import (
+    read_end,
+    read_head,
+    read_lines,
+    read_tenant_erasures,
+    read_tenant_lines,
+)
 from templates.store.database import Database
 from templates.store.deployment import Secrets
 from templates.store.identifiers import (
@@ -55,7 +62,6 @@ _BEGIN_LOCK = "veilface audit chain"
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 # Made once: building a statement costs more than running it, and every write appends a line.
 _ADD_LINE = sa.insert(AuditRow.__table__)  # type: ignore[arg-type]
-_LAST_LINE = sa.select(sa.func.max(AuditRow.sequence))
 _MOVE_HEAD = sa.update(AuditHeadRow.__table__)  # type: ignore[arg-type]
 
 
@@ -330,8 +336,11 @@ class AuditLog:
         limit: int,
         before: int | None = None,
         pseudonyms: Sequence[str] = (),
-    ) -> tuple[list[Line], int | None]:
+    ) -> tuple[list[tuple[int, Line | None]], int | None]:
         """Read the latest lines of a tenant, the latest first.
+
+        It begins at the line that the head names, and ends after the last erasure of a tenant of
+        this name: the lines before are not this tenant's.
 
         Parameters
         ----------
@@ -346,30 +355,40 @@ class AuditLog:
 
         Returns
         -------
-        The lines, and the number to go on before, None at the beginning of the log. No more than
-        :data:`SCANNED` lines of all tenants are looked through, so a page may be short, or empty,
-        and not the last.
+        The lines by their numbers, None for one that was altered; and the number to go on before,
+        None at the beginning of the log. That lines were removed or moved, only :meth:`verify`
+        finds. No more than :data:`SCANNED` lines of all tenants are looked through, so a page may
+        be short, or empty, and not the last.
 
         Raises
         ------
-        StoreError
-            At a line that was altered so that it cannot be read.
+        BrokenAuditLog
+            If the head row, or the key of the chain, is missing or forged.
         """
 
-        def work(connection: Connection) -> tuple[list[Line], int | None]:
-            end = before
-            if end is None:
-                end = 1 + (connection.execute(_LAST_LINE).scalar_one() or 0)
-            above = max(0, end - 1 - SCANNED)
+        def work(connection: Connection) -> tuple[list[tuple[int, Line | None]], int | None]:
+            keys = self.line_keys()
+            head = self._head(connection, keys.current).sequence
+            end = head + 1 if before is None else min(before, head + 1)
+            start = self._last_erasure(connection, tenant, keys, head)
+            above = max(start, end - 1 - SCANNED)
             rows = read_tenant_lines(
                 connection, tenant, pseudonyms, above=above, before=end, limit=limit + 1
             )
-            lines = [read_line(row._mapping) for row in rows[:limit]]
+            lines = [(row.sequence, true_line(keys, row._mapping)) for row in rows[:limit]]
             if len(rows) > limit:
-                return lines, lines[-1].sequence
-            return lines, above + 1 if above else None
+                return lines, lines[-1][0]
+            return lines, above + 1 if above > start else None
 
-        return self._database.read(work)
+        self.prepare()
+        return self._secrets.read(work)
+
+    def _last_erasure(self, connection: Connection, tenant: str, keys: LineKeys, head: int) -> int:
+        for row in read_tenant_erasures(connection, tenant, through=head):
+            # A made-up one would hide the lines before it.
+            if true_line(keys, row._mapping) is not None:
+                return int(row.sequence)
+        return 0
 
     def verify(
         self,

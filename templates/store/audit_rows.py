@@ -5,14 +5,14 @@ their types they would end the verification instead of failing it.
 """
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
 from templates.store.audit_chain import Anchor, Line
-from templates.store.schema import AuditHeadRow, AuditRow
+from templates.store.schema import TENANT_LINES, AuditHeadRow, AuditRow
 
 
 class LogEnd(NamedTuple):
@@ -75,6 +75,18 @@ def read_tenant_lines(
     if pseudonyms:
         query = query.where(AuditRow.pseudonym.in_(pseudonyms))
     return connection.execute(query.order_by(AuditRow.sequence.desc()).limit(limit)).all()
+
+
+def read_tenant_erasures(connection: Connection, tenant: str, *, through: int) -> Iterator[Any]:
+    """Lines that tell of the tenant's erasures, up to a number, the latest first."""
+    query = sa.select(*_line_columns(connection)).where(
+        AuditRow.tenant == tenant,
+        AuditRow.outcome == "erased",
+        AuditRow.action == "tenant-erase",
+        TENANT_LINES,  # which has an index
+        AuditRow.sequence <= through,
+    )
+    yield from connection.execute(query.order_by(AuditRow.sequence.desc()))
 
 
 def _sides(after: int | None) -> tuple[sa.ColumnElement[bool], sa.ColumnElement[bool]]:

@@ -75,9 +75,12 @@ def test_an_id_that_nobody_has_is_typed_as_it_is(open_tab: OpenTab, demo: Served
     expect(page.get_by_role("alert")).to_contain_text("not_enrolled")
     # A search that fails says nothing: the form does, when it is sent.
     page.route("**/v1/subjects?*", lambda route: route.abort())
-    field.fill("found-a")
+    with (
+        page.expect_console_message(lambda said: "ERR_FAILED" in said.text),
+        page.expect_event("requestfailed"),
+    ):
+        field.fill("found-a")
     expect(page.get_by_text("Nobody is enrolled under this id.")).to_have_count(0)
-    page.wait_for_timeout(500)
     expect(page.get_by_role("listbox", name="People")).to_have_count(0)
     assert set(tab.complaints) == {"Failed to load resource: net::ERR_FAILED"}
     tab.complaints.clear()
@@ -111,9 +114,11 @@ def test_people_are_found_by_how_their_ids_begin(open_tab: OpenTab, demo: Served
 
 DROP = """
 async ([selector, url]) => {
-  const blob = url ? await (await fetch(url)).blob() : new Blob(["text"]);
   const data = new DataTransfer();
-  data.items.add(new File([blob], "dropped.png", { type: "image/png" }));
+  const add = (parts, name, type) => data.items.add(new File(parts, name, { type }));
+  if (url === "text") data.setData("text/plain", "dragged");
+  else if (url === "key file") add(["key"], "key.txt", "text/plain");
+  else add([await (await fetch(url)).blob()], "dropped.png", "image/png");
   const target = document.querySelector(selector);
   const told = { bubbles: true, cancelable: true, dataTransfer: data };
   const over = !target.dispatchEvent(new DragEvent("dragover", told));
@@ -121,6 +126,8 @@ async ([selector, url]) => {
   return [over, lit, !target.dispatchEvent(new DragEvent("drop", told))];
 }
 """
+"""Drop a picture, a key file or text on an element; whether the page takes it over from the browser
+while it is above, lights up its form, and takes it over when it is dropped."""
 
 
 def test_photos_are_dropped_on_the_form(open_tab: OpenTab, demo: Served) -> None:
@@ -135,6 +142,16 @@ def test_photos_are_dropped_on_the_form(open_tab: OpenTab, demo: Served) -> None
     expect(page.get_by_label("Remove photo from dropped.png")).to_have_count(2)
     # What misses the form is taken by nobody, and does not replace the page.
     assert page.evaluate(DROP, ["h1", url]) == [True, False, True]
+    expect(page.locator(".tray li")).to_have_count(2)
+    # What is no picture is not sent anywhere; the field for the key file takes it by itself; and
+    # text is dragged as ever.
+    assert page.evaluate(DROP, ["form", "key file"]) == [True, True, True]
+    expect(page.get_by_text("No picture: key.txt.")).to_be_visible()
+    page.get_by_label("Lock it to a key file").check()
+    for dropped in ("key file", url):
+        field = "input[type=file][required]"
+        assert page.evaluate(DROP, [field, dropped]) == [False, False, False]
+    assert page.evaluate(DROP, ["h1", "text"]) == [False, False, False]
     expect(page.locator(".tray li")).to_have_count(2)
     # Where the form is switched off, it takes nothing.
     tab.sign_in(demo.key("verify"))

@@ -145,6 +145,81 @@ def test_a_late_refusal_of_another_key_does_not_sign_out(open_tab: OpenTab, demo
     tab.complaints[:] = [each for each in tab.complaints if "ERR_ABORTED" not in each]
 
 
+def log_page(subject: str, cursor: str | None) -> dict[str, Any]:
+    """One line of the audit log on a subject."""
+    line = {"at": "2026-01-31T12:00:00Z", "actor": "program", "action": "verify",
+            "subject": subject * 64, "outcome": "accept", "detail": None, "request_id": None,
+            "altered": False, "sequence": None}  # fmt: skip
+    return {"lines": [line], "next_cursor": cursor, "request_id": "0" * 32}
+
+
+def test_a_late_page_of_the_log_is_not_of_another_person(open_tab: OpenTab, demo: Served) -> None:
+    tab = open_tab(demo)
+    page = tab.page
+    pending = PendingRequests(page, "**/v1/audit-log?*")
+    tab.open("Log")
+    pending.wait().fulfill(json=log_page("a", "earlier"))
+    rows, shown = page.locator("tbody tr"), page.get_by_role("button", name="Show", exact=True)
+    expect(rows).to_have_count(1)
+    # Earlier lines of everybody come after those on one person were asked for.
+    pending.routes.clear()
+    page.get_by_role("button", name="Show earlier").click()
+    late = pending.wait()
+    pending.routes.clear()
+    page.get_by_label("Person's id").fill("found-nobody")
+    shown.click()
+    wanted = pending.wait()
+    wanted.fulfill(json=log_page("b", "further"))
+    expect(rows).to_contain_text("b" * 16)
+    late.fulfill(status=429, json=refusal("rate_limited", "too many requests"))
+    expect(rows).to_have_count(1)
+    # What comes next is of the person and the place that are shown, whatever the field says.
+    pending.routes.clear()
+    page.get_by_label("Person's id").fill("found-else")
+    page.get_by_role("button", name="Show earlier").click()
+    asked = pending.wait()
+    assert asked.request.url.endswith("?limit=50&subject_id=found-nobody&cursor=further")
+    altered = dict.fromkeys(log_page("c", None)["lines"][0]) | {"altered": True, "sequence": 7}
+    asked.fulfill(json={**log_page("c", None), "lines": [altered]})
+    expect(rows).to_have_count(2)
+    expect(rows.last).to_contain_text("Line 7")
+    expect(page.get_by_role("alert")).to_have_count(0)
+
+
+ADDRESSES = """
+window.addresses = new Set();
+const [make, forget] = [URL.createObjectURL, URL.revokeObjectURL];
+URL.createObjectURL = (blob) => {
+  const address = make.call(URL, blob);
+  addresses.add(address);
+  return address;
+};
+URL.revokeObjectURL = (address) => (addresses.delete(address), forget.call(URL, address));
+const decode = window.createImageBitmap;
+window.createImageBitmap = async (...given) => {
+  window.decoding = true;
+  await new Promise((resolve) => (window.decoded = resolve));
+  const bitmap = await decode(...given);
+  window.ended = true;
+  return bitmap;
+};
+"""
+
+
+def test_a_photo_that_is_decoded_late_keeps_no_memory(open_tab: OpenTab, demo: Served) -> None:
+    tab = open_tab(demo)
+    page = tab.page
+    page.add_init_script(ADDRESSES)
+    page.reload()
+    tab.sign_in(demo.token)
+    page.get_by_role("button", name="Choose photo 1 of person-1", exact=True).click()
+    page.wait_for_function("window.decoding")
+    tab.open("Log")
+    page.evaluate("decoded()")
+    page.wait_for_function("window.ended")
+    assert page.evaluate("addresses.size") == 0
+
+
 def people(page: Page, *names: str) -> PendingRequests:
     """Show these people, whose erasures wait for the test."""
     described = [

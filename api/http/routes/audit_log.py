@@ -9,7 +9,7 @@ from api.http.answers import answer
 from api.http.auth import note_subject
 from api.http.deps import Administers, GateDep, RuntimeDep
 from api.http.openapi import EVERY_CALL, error_responses
-from api.http.schemas import AuditLogAnswer
+from api.http.schemas import AuditLine, AuditLogAnswer
 from api.http.values import iso_time
 from templates.store.audit_chain import Line
 from templates.store.cursors import close_cursor, open_cursor
@@ -37,9 +37,9 @@ async def get_audit_log(
 ) -> Response:
     """Right: `admin`. The latest line first; subjects are named by their pseudonyms.
 
-    Nothing is verified here: that takes the whole log, and `veilface audit-log verify`. A page may
-    be short, or empty, where other tenants have most of the lines: only `next_cursor` says whether
-    there are earlier ones.
+    A line that was altered is told by its number alone. That lines were removed or moved takes the
+    whole log to see, and `veilface audit-log verify`. A page may be short, or empty, where other
+    tenants have most of the lines: only `next_cursor` says whether there are earlier ones.
     """
     store, tenant = runtime.store, caller.tenant
     pseudonyms: tuple[str, ...] = ()
@@ -56,7 +56,7 @@ async def get_audit_log(
             tenant, limit=limit, before=before, pseudonyms=pseudonyms
         )
         return {
-            "lines": [_told(line) for line in lines],
+            "lines": [_told(number, line) for number, line in lines],
             "next_cursor": None
             if earlier is None
             else close_cursor(
@@ -67,7 +67,10 @@ async def get_audit_log(
     return answer(request, await gate.query(work))
 
 
-def _told(line: Line) -> dict[str, Any]:
+def _told(number: int, line: Line | None) -> dict[str, Any]:
+    # Other numbers would tell how much the other tenants do.
+    if line is None:
+        return {**dict.fromkeys(AuditLine.model_fields), "altered": True, "sequence": number}
     return {
         "at": iso_time(line.at),
         "actor": line.actor,
@@ -76,4 +79,6 @@ def _told(line: Line) -> dict[str, Any]:
         "outcome": line.outcome,
         "detail": line.detail,
         "request_id": line.request_id,
+        "altered": False,
+        "sequence": None,
     }

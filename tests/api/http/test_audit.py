@@ -131,6 +131,8 @@ def test_refusals_are_written_with_their_code(service: tuple[Client, Deployment]
         ("erase", "forbidden", lambda: client.delete(path, headers=bearer(verifier))),
         ("export", "forbidden", lambda: client.get(f"{path}/export", headers=bearer(verifier))),
         ("unlock", "forbidden", lambda: client.delete(f"{path}/lockout", headers=bearer(verifier))),
+        ("audit-log", "forbidden", lambda: client.get("/v1/audit-log", headers=bearer(verifier))),
+        ("audit-log", "validation_failed", lambda: client.get("/v1/audit-log?cursor=1")),
         ("verify", "unsupported_image", lambda: send(files=images(b"no picture", name="image"))),
         ("verify", "unauthorized", lambda: send(json={**body, "hmac": "0" * 64})),
         ("verify", "accept", lambda: send(json=body)),
@@ -154,6 +156,8 @@ def test_strangers_and_readers_write_nothing(service: tuple[Client, Deployment])
     for call in (
         lambda: client.get("/v1/subjects/alice"),
         lambda: client.get("/v1/subjects"),
+        lambda: client.get("/v1/audit-log"),
+        lambda: client.get("/v1/audit-log?subject_id=alice"),
         lambda: client.get("/v1/contract"),
         lambda: client.get("/health/ready"),
         lambda: client.delete("/v1/subjects/alice", headers=nobody),

@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 import sqlalchemy as sa
 
+from api.http.schemas import AuditLogAnswer
 from api.process.opening import open_keyring, open_store
 from templates.contract.liveness_policy import LivenessPolicy
 from templates.errors import StoreError
@@ -34,7 +35,7 @@ from templates.store.tenants import AlteredTenant
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, images, photo
 from tests.api.http.test_lockout import AFTER, attempt, enroll, fail
-from tests.api.shapes import assert_error
+from tests.api.shapes import assert_answer, assert_error
 
 TRIGGERS = (
     "audit_log_no_update",
@@ -509,3 +510,23 @@ def test_the_operator_is_warned_without_a_secret(
     assert any("failed attempts" in text for text in texts)
     assert any(prefix_of(token) in text for text in texts)
     assert not any("alice" in text or token in text for text in texts)
+
+
+# --- the log as a tenant reads it ----------------------------------------------------------
+
+
+def test_an_altered_line_is_told_as_such(attacked: Attacked) -> None:
+    enroll(attacked.client)
+    attacked.attacker.drop_triggers()
+    line = list(attacked.store.audit_log.lines())[-1]
+    whole = attacked.client.get("/v1/audit-log").json()
+    assert [told["altered"] for told in whole["lines"]] == [False] * len(whole["lines"])
+    assert {told["sequence"] for told in whole["lines"]} == {None}
+    for change in ("outcome = 'replaced'", "hash = previous_hash || hash"):
+        attacked.attacker.run(f"UPDATE audit_log SET {change} WHERE sequence = {line.sequence}")
+        told = assert_answer(attacked.client.get("/v1/audit-log"), 200, AuditLogAnswer)
+        fields = dict.fromkeys(whole["lines"][0])
+        assert told["lines"] == [
+            {**fields, "altered": True, "sequence": line.sequence},
+            *whole["lines"][1:],
+        ]

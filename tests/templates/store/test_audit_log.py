@@ -168,24 +168,64 @@ def test_the_latest_lines_of_a_tenant_come_first(
     log.record(entry(1))
     expected = [line for line in log.lines() if line.tenant == "default"][::-1]
 
-    def pages(limit: int, pseudonyms: tuple[str, ...] = ()) -> list[list[Line]]:
+    def pages(limit: int, pseudonyms: tuple[str, ...] = ()) -> list[list[Line | None]]:
         lines, before = log.page("default", limit=limit, pseudonyms=pseudonyms)
         read = [lines]
         while before is not None:
             lines, before = log.page("default", limit=limit, before=before, pseudonyms=pseudonyms)
             read.append(lines)
-        return read
+        return [[line for _, line in page] for page in read]
 
     for limit in (1, 4, 1000):
         assert list(chain.from_iterable(pages(limit))) == expected
         assert {len(page) for page in pages(limit)[:-1]} <= {limit}
     (about_one,) = pages(1000, (f"{1:064x}",))
-    assert [line.pseudonym for line in about_one] == [f"{1:064x}"] * 2
+    assert [line and line.pseudonym for line in about_one] == [f"{1:064x}"] * 2
     # However many lines are others', a page looks through a few, and the next ones go on.
     monkeypatch.setattr("templates.store.audit_log.SCANNED", 2)
     assert list(chain.from_iterable(pages(1000))) == expected
     assert [] in pages(1000)
     assert log.page("nobody", limit=5, before=2) == ([], None)
+
+
+def test_a_tenant_does_not_read_the_lines_of_an_erased_one_of_its_name(
+    filled: TemplateStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = filled.audit_log
+    _, before = log.page("default", limit=2)
+    filled.tenant_erasures.erase("default")
+    filled.tenants.create("default")
+    log.record(entry(9))
+    for scanned in (50_000, 2):
+        monkeypatch.setattr("templates.store.audit_log.SCANNED", scanned)
+        lines, earlier = log.page("default", limit=100)
+        assert [line and line.pseudonym for _, line in lines] == [f"{9:064x}"]
+        assert earlier is None
+        assert log.page("default", limit=100, before=before) == ([], None)
+    assert log.page("default", limit=100, pseudonyms=(f"{1:064x}",)) == ([], None)
+
+
+@pytest.mark.parametrize("number", [10**12, 2**63 - 1])
+def test_a_page_begins_at_the_head_and_shows_altered_lines_as_such(
+    filled: TemplateStore, attacker: Callable[..., None], number: int
+) -> None:
+    log = filled.audit_log
+    expected: list[tuple[int, Line | None]] = [
+        (line.sequence, line) for line in reversed(list(log.lines())) if line.tenant == "default"
+    ]
+    attacker(COPY.format(number, "hash", "previous_hash"))
+    assert log.page("default", limit=100) == (expected, None)
+    # One that cannot be read, one that can, and one that would hide those before it.
+    attacker(
+        "UPDATE audit_log SET hash = previous_hash || hash WHERE sequence = 4",
+        "UPDATE audit_log SET outcome = 'accept' WHERE sequence = 5",
+        "UPDATE audit_log SET action = 'tenant-erase', outcome = 'erased' WHERE sequence = 6",
+    )
+    told = [(number, None if number in (4, 5, 6) else line) for number, line in expected]
+    assert log.page("default", limit=100) == (told, None)
+    attacker("UPDATE audit_head SET sequence = 1")
+    with pytest.raises(BrokenAuditLog):
+        log.page("default", limit=100)
 
 
 def test_an_intact_log_verifies_in_batches(filled: TemplateStore) -> None:
