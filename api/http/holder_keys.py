@@ -1,18 +1,20 @@
 """The key that the holder of an enrollment keeps, as a request carries it."""
 
 import hashlib
-from collections.abc import Mapping
-from typing import Annotated, Any
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, TypeVar
 
 from fastapi import Depends, Header, Request
 
 from api.http.errors import ApiError
 from api.http.schemas import HOLDER_KEY
 from templates.errors import SealError
-from templates.keys.holder_key import decode_holder_key
+from templates.keys.holder_key import decode_holder_key, wipe
 
 HEADER = "Veilface-Holder-Key"
 FIELD = "holder_key"
+
+T = TypeVar("T")
 
 
 async def holder_key_header_of(
@@ -64,6 +66,21 @@ def holder_key_of(header: str | None, fields: Mapping[str, Any]) -> bytearray | 
 def digest(key: bytearray | None) -> list[bytes]:
     """Return what tells two requests with different keys apart; nothing where there is no key."""
     return [] if key is None else [hashlib.sha256(key).digest()]
+
+
+def then_wiped(key: bytearray | None, work: Callable[[], T]) -> Callable[[], T]:
+    """Return `work` that forgets the key in the end, whatever comes of it.
+
+    In its own thread, because nobody waits for a cancelled one, which may need the key still.
+    """
+
+    def whole() -> T:
+        try:
+            return work()
+        finally:
+            wipe(key)
+
+    return whole
 
 
 def _refused(message: str) -> ApiError:

@@ -1,7 +1,6 @@
 """Enrollment: photos, or a client's template."""
 
 import base64
-from functools import partial
 from typing import Any
 
 from fastapi import APIRouter, Request
@@ -27,17 +26,17 @@ from api.http.deps import (
     query_of,
 )
 from api.http.errors import ApiError
-from api.http.holder_keys import FIELD, HolderKeyHeaderDep, digest, holder_key_of
+from api.http.holder_keys import FIELD, HolderKeyHeaderDep, digest, holder_key_of, then_wiped
 from api.http.idempotency import Outcome, kept_with, once, written
 from api.http.openapi import BODY, ENROLLMENT_BODY, EVERY_CALL, IDEMPOTENT, PHOTO, error_responses
 from api.http.preconditions import PreconditionDep, asked
 from api.http.schemas import EnrollmentAnswer
 from api.http.values import face_policy, one_of, storage_of
+from api.limits.admission import Gate
 from api.process.runtime import Runtime
 from enroll import Enrollment, Holder
 from models.quality import Quality
 from templates.decoys import Attributes
-from templates.keys.holder_key import wipe
 from templates.store.audit_log import By
 from templates.store.idempotency import Claim
 from templates.store.lockout import Nonce
@@ -127,14 +126,11 @@ async def enroll(
         holder_key = holder_key_of(holder_key_header, body)
 
         def work(claim: Claim | None) -> Outcome:
-            try:
-                nonce = _unused_nonce(runtime, caller)
-                epoch = runtime.epoch(caller.tenant)
-                enrollment = runtime.enroller(caller.tenant, epoch).from_template(
-                    template, holder=_holder(holder_key, caller, subject)
-                )
-            finally:
-                wipe(holder_key)
+            nonce = _unused_nonce(runtime, caller)
+            epoch = runtime.epoch(caller.tenant)
+            enrollment = runtime.enroller(caller.tenant, epoch).from_template(
+                template, holder=_holder(holder_key, caller, subject)
+            )
             return _stored(
                 runtime,
                 caller.tenant,
@@ -163,7 +159,7 @@ async def enroll(
             ],
             subject=subject,
             work=work,
-            run=partial(gate.compute, key=caller.prefix),
+            run=lambda guarded: gate.compute(then_wiped(holder_key, guarded), key=caller.prefix),
         )
         return written(request, outcome)
 
@@ -179,6 +175,7 @@ async def _enroll_photos(
     precondition: Precondition | None,
 ) -> Response:
     runtime: Runtime = request.app.state.runtime
+    gate: Gate = request.app.state.gate
     pack, photos = runtime.required_pack(), form.images("images")
     reject_unknown(form.fields, ("attributes", "face", "storage", FIELD))
     storage = storage_of(form.fields)
@@ -187,19 +184,16 @@ async def _enroll_photos(
     holder_key = holder_key_of(holder_key_header, form.fields)
 
     def work(claim: Claim | None) -> Outcome:
-        try:
-            nonce = _unused_nonce(runtime, caller)
-            epoch = runtime.epoch(caller.tenant)
-            enrollment = runtime.enroller(caller.tenant, epoch).from_photos(
-                pack,
-                photos,
-                attributes=attributes,
-                holder=_holder(holder_key, caller, subject),
-                policy=policy,
-                limits=runtime.image_limits,
-            )
-        finally:
-            wipe(holder_key)
+        nonce = _unused_nonce(runtime, caller)
+        epoch = runtime.epoch(caller.tenant)
+        enrollment = runtime.enroller(caller.tenant, epoch).from_photos(
+            pack,
+            photos,
+            attributes=attributes,
+            holder=_holder(holder_key, caller, subject),
+            policy=policy,
+            limits=runtime.image_limits,
+        )
         return _stored(
             runtime,
             caller.tenant,
@@ -231,7 +225,7 @@ async def _enroll_photos(
         ],
         subject=subject,
         work=work,
-        run=partial(request.app.state.gate.compute, key=caller.prefix),
+        run=lambda guarded: gate.compute(then_wiped(holder_key, guarded), key=caller.prefix),
     )
     return written(request, outcome)
 
