@@ -93,10 +93,18 @@ def decoys_of_these_people(setup: AttackSetup, *, strategy: Strategy, m: int) ->
 
 
 def _halves(setup: AttackSetup) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Part the faces by person, at random, into a half for the thief and one for decoys."""
-    people, owner = np.unique(setup.owners, return_inverse=True)
-    place = np.random.default_rng([setup.seed, 4]).permutation(len(people))[owner]
-    order = np.argsort(place, kind="stable")
-    # The person in the middle is the thief's, with all photos.
-    thief = place <= place[order[(len(order) - 1) // 2]]
-    return setup.faces[thief], setup.faces[order[~thief[order]]]
+    """Part the faces by person into a half for the thief and one for decoys, each shuffled.
+
+    At random among people with as many photos; whoever has most is given first, each to the half
+    that has fewer yet, so that one person with many photos does not make the halves uneven.
+    """
+    people, owner, photos = np.unique(setup.owners, return_inverse=True, return_counts=True)
+    place = np.random.default_rng([setup.seed, 4]).permutation(len(people))
+    is_thief = np.zeros(len(people), dtype=np.bool_)
+    left = 0
+    for person in np.lexsort((place, -photos)):
+        is_thief[person] = left <= 0
+        left += photos[person] if is_thief[person] else -photos[person]
+    order = np.argsort(place[owner], kind="stable")
+    thief = is_thief[owner[order]]
+    return setup.faces[order[thief]], setup.faces[order[~thief]]

@@ -2,8 +2,8 @@
 
 The service draws the decoys of the same photos under a secret: enrolled again, they give the same
 template in another rotation, and who opens both has one. Two secrets give two lifts, which come
-near each other in the descriptor: the control, and what two tenants have of a person who keeps a
-key and gave both the same photos. Photos that overlap those of an earlier enrollment give two lifts
+near each other in the descriptor: what two tenants, or two names, have of a person who keeps a key
+and gave both the same photos. Photos that overlap those of an earlier enrollment give two lifts
 of nearly one descriptor, and different photos come near each other in the person. A thief without
 the holder's key opens none of them.
 """
@@ -62,7 +62,7 @@ def several_templates(
     list of AttackOutcome
         Named ``several-templates``: for each T the mean of the guesses from all and, from two on,
         the point that is nearest to all; with the key kept, the largest T only. T = 1 is not
-        judged: it is what the others are held against; and neither are two lift secrets.
+        judged: it is what the others are held against.
     """
     first, again = (enrolled(system, "the deployment's secret") for _ in range(2))
     other = enrolled(system, "another secret")
@@ -174,7 +174,6 @@ def _of_theft(
     if count > 1:
         guesses["nearest to all"] = nearest_common_points(seen)
     enough = len(people) >= JUDGED_PEOPLE
-    control = count == 1 or photos == TWO_SECRETS
     return [
         recovery_outcome(
             system,
@@ -190,8 +189,12 @@ def _of_theft(
                 if enough
                 else f" (not judged: fewer than {JUDGED_PEOPLE} people have the photos)"
             )
-            + (" (a control: no service draws so)" if photos == TWO_SECRETS else ""),
-            judged=enough and not control,
+            + (
+                " (what two tenants, or two names, have of who keeps a key)"
+                if photos == TWO_SECRETS
+                else ""
+            ),
+            judged=enough and count > 1,
             people=None if people is system.victims else people,
             details={"templates": count, "people": len(people)},
         )

@@ -154,7 +154,7 @@ class Cell:
 
     @property
     def reason(self) -> str | None:
-        """Why a cell cannot hold: by design, where nobody set a limit; or by its level alone."""
+        """Why a cell cannot hold: by design, if nobody set a limit; or if its level explains it."""
         if self.status is Status.FAIL and self._fails_by_chance:
             return (
                 f"the false match rate of {self.outcome.level} alone gives "
@@ -168,9 +168,10 @@ class Cell:
 
     @property
     def _fails_by_chance(self) -> bool:
-        """Whether an attack that learns nothing exceeds the limit too."""
-        compared_with_chance = (Property.CONFIDENTIALITY, Property.UNLINKABILITY)
-        return self.outcome.breaks not in compared_with_chance and self.outcome.chance > self.most
+        """Whether an attack that learns nothing exceeds the limit too, and this may be one."""
+        if self.outcome.breaks in (Property.CONFIDENTIALITY, Property.UNLINKABILITY):
+            return False  # compared with chance
+        return self.low <= self.outcome.chance and self.outcome.chance > self.most
 
     @property
     def rank(self) -> tuple[int, float]:

@@ -24,6 +24,7 @@ from attacks.report import document
 from templates.contract.document import Binding, Contract
 from templates.decoys import DecoySource
 from templates.distances import on_device
+from templates.errors import VeilfaceError
 from templates.keys.sealing import Sealer
 from templates.space.lifting import Strategy
 from verify import labelled_folder
@@ -204,11 +205,19 @@ def templates(
     )
     if loaded is not None and source is not None:
         loaded.binding.require_source(source_id=source.source_id, made_with=source.made_with)
-    served = _served(settings, sealer, source) if dim is None and loaded is None else None
-    if dim is None:
-        dim = str(DEFAULT_DIM if served is None else served.m)
-    if strategy is None:
-        strategy = Strategy.ADVERSARIAL if served is None else served.strategy
+    if loaded is None and (dim is None or strategy is None):
+        served = _served(settings, sealer, source)
+        if dim is None:
+            dim = str(DEFAULT_DIM if served is None else served.m)
+        if strategy is None:
+            strategy = Strategy.ADVERSARIAL if served is None else served.strategy
+        if served is not None:
+            path = settings.resolved_contract_file
+            message(
+                f"note: auditing {strategy} templates of m = {dim}: what is not set is {path}'s"
+            )
+    # Of a contract both are its own.
+    dim, strategy = dim or str(DEFAULT_DIM), strategy or Strategy.ADVERSARIAL
     plan = AuditPlan(
         strategy=strategy,
         dims=listed_dims(dim, "--dim", n=pack.info.n, example="16,32"),
@@ -262,12 +271,16 @@ def templates(
 
 
 def _served(settings: Settings, sealer: Sealer, source: DecoySource | None) -> Binding | None:
-    """Return the scheme of the contract in ``data_dir``, where it lifts with this source."""
+    """Return the scheme of the contract in ``data_dir``, where it lifts with this source.
+
+    None, and a note, where it cannot be read: the audit does not need it.
+    """
     path = settings.resolved_contract_file
     if source is None or not path.is_file():
         return None
-    binding = Contract.load(path, sealer).binding
-    if binding.decoy_source_id != source.source_id:
+    try:
+        binding = Contract.load(path, sealer).binding
+    except VeilfaceError as error:
+        message(f"note: not auditing as the contract in `data_dir` has it: {error}")
         return None
-    message(f"note: auditing {binding.strategy} templates of m = {binding.m}, as {path} has them")
-    return binding
+    return binding if binding.decoy_source_id == source.source_id else None

@@ -69,6 +69,7 @@ def _pooled(system: System, pool: DecoyPool) -> AttackOutcome:
 
 def _generated(system: System, faces: NDArray[np.float32]) -> AttackOutcome:
     half = len(faces) // 2
+    enough = half >= FACES_PER_DIMENSION * faces.shape[1]
     fitted, strangers = faces[:half], faces[half:]
     noise = 0.0 if system.source is None else system.source.noise
     generator = DecoyGenerator.fit(fitted, noise=noise)
@@ -91,8 +92,14 @@ def _generated(system: System, faces: NDArray[np.float32]) -> AttackOutcome:
             "of the fit to every template that was lifted with it; success is acceptance, and "
             "chance is how often the other half is accepted there: "
             "the contract was calibrated with the scheme's own generator."
+            + (
+                ""
+                if enough
+                else f" Not judged: the attacker's generator was fitted to {half} faces for "
+                f"{generator.n} numbers, a service's to {FACES_PER_DIMENSION} or more for each."
+            )
         ),
-        judged=half >= FACES_PER_DIMENSION * generator.n,
+        judged=enough,
         details={"strangers": control.to_json(), "fitted_to": half},
     )
 

@@ -175,7 +175,9 @@ class Attempts:
         Superseded
             If the subject's template is another one now. Nothing is written.
         IdempotencyConflict
-            If another run of the same request has taken over. Nothing is written.
+            If another run of the same request has taken over, or the subject was erased. Nothing is
+            written: a decision that is not counted is told to nobody either, so whoever provokes it
+            learns nothing, and the nonce is used up by the run whose decision is told.
         UnknownTenant, StoreError, StoreUnavailable
         """
 

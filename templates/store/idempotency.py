@@ -35,7 +35,7 @@ MAX_BODY_BYTES = 64 * 1024
 
 
 class IdempotencyConflict(StoreError):
-    """The key was used for another request, or its first request is still running."""
+    """The key is another request's, its first still runs, or this one was given up meanwhile."""
 
 
 @dataclass(frozen=True)
@@ -110,8 +110,11 @@ class Idempotency:
                 IdempotencyRow.expires_at <= now,
                 sa.and_(IdempotencyRow.status.is_(None), IdempotencyRow.claimed_until <= now),
             )
-            claim = replace(claim, written=self._written(connection, claim))
-            connection.execute(sa.delete(IdempotencyRow).where(*_is(claim), lapsed))
+            # Of the very row that goes: a run that stood still may leave its note meanwhile.
+            gone = sa.delete(IdempotencyRow).where(*_is(claim), lapsed).returning(*_COLUMNS)
+            claim = replace(
+                claim, written=self._written(connection.execute(gone).one_or_none(), claim)
+            )
             if self._insert(connection, claim, pseudonym, now):
                 return claim
             row = connection.execute(_RECORD.where(*_is(claim))).one()
@@ -128,9 +131,8 @@ class Idempotency:
 
         return context.write(work, lock=f"idempotency {tenant} {actor} {lock}")
 
-    def _written(self, connection: Connection, claim: Claim) -> str | None:
+    def _written(self, row: Any, claim: Claim) -> str | None:
         """Return what an earlier run of the request wrote whose answer was not kept."""
-        row = connection.execute(_RECORD.where(*_is(claim))).one_or_none()
         if row is None or row.status is not None or row.body is None:
             return None
         same = hmac.compare_digest(row.request_hash, claim.request_hash)
@@ -167,31 +169,50 @@ class Idempotency:
     def finish(self, connection: Connection, claim: Claim, answer: Answer) -> None:
         """Leave the answer, in the transaction of the write.
 
-        Nothing is left where the subject was erased since the claim.
-
         Raises
         ------
         IdempotencyConflict
-            If the claim lapsed, and another run of the request has it: the write is taken back.
+            If the record is not the claim's any more, so that the answer would be left nowhere: the
+            claim lapsed, and another run of the request has or had it, or the subject was erased.
+            The write is taken back.
         """
         if len(answer.body) > MAX_BODY_BYTES:
             raise StoreError(f"an answer of more than {MAX_BODY_BYTES} bytes is not kept")
-        self._leave(connection, claim, self._noted(claim, answer.status, answer.body))
+        self._leave(connection, claim, answer.status, answer.body)
 
     def note_written(self, connection: Connection, claim: Claim, template_id: str) -> None:
         """Leave what was written in place of an answer that must not be kept; see ``finish``.
 
         The next run of the same request may begin at once.
         """
-        noted = self._noted(claim, None, template_id.encode())
-        self._leave(connection, claim, {**noted, "claimed_until": self._context.clock()})
+        until = self._context.clock()
+        self._leave(connection, claim, None, template_id.encode(), claimed_until=until)
 
-    def _leave(self, connection: Connection, claim: Claim, noted: dict[str, Any]) -> None:
-        ours = sa.update(IdempotencyRow).where(*_is(claim), IdempotencyRow.claim == claim.token)
-        if connection.execute(ours.values(**noted)).rowcount == 1:
+    def _leave(
+        self, connection: Connection, claim: Claim, status: int | None, body: bytes, **more: Any
+    ) -> None:
+        def is_left(ours: Claim) -> bool:
+            record = sa.update(IdempotencyRow).where(*_is(ours), IdempotencyRow.claim == ours.token)
+            noted = self._noted(ours, status, body)
+            return connection.execute(record.values(**noted, **more)).rowcount == 1
+
+        if is_left(claim):
             return
-        if connection.execute(_RECORD.where(*_is(claim))).one_or_none() is not None:
-            raise IdempotencyConflict("another run of this request has taken over meanwhile")
+        # A renewal of the secrets makes other hashes of key and request, and leaves the token.
+        row = connection.execute(
+            _RECORD.where(
+                IdempotencyRow.tenant_id == claim.tenant_id,
+                IdempotencyRow.actor == claim.actor,
+                IdempotencyRow.claim == claim.token,
+            )
+        ).one_or_none()
+        if row is not None and is_left(
+            replace(claim, key_hash=row.key_hash, request_hash=row.request_hash)
+        ):
+            return
+        raise IdempotencyConflict(
+            "another run of this request has taken over, or its subject was erased meanwhile"
+        )
 
     def release(self, claim: Claim) -> None:
         """Give the key back, because the write failed and may be tried again.
@@ -219,7 +240,8 @@ class Idempotency:
         return self._context.database.remove(IdempotencyRow, expired, batch=BATCH)
 
 
-_RECORD: Any = sa.select(*columns_of(IdempotencyRow))
+_COLUMNS = columns_of(IdempotencyRow)
+_RECORD: Any = sa.select(*_COLUMNS)
 
 
 def _is(claim: Claim) -> tuple[sa.ColumnElement[bool], ...]:

@@ -60,6 +60,23 @@ def test_a_person_with_many_photos_is_the_thiefs_or_the_decoys() -> None:
     assert [len(part) for part in people] == [15, 15]
 
 
+def test_a_person_with_most_photos_leaves_the_halves_even() -> None:
+    enrolled, faces = rows(20, FACES, 1), rows(300, FACES, 3)
+    owners = np.concatenate([np.zeros(140, dtype=int), np.arange(1, 161)])
+    for seed in range(5):
+        setup = AttackSetup.of(
+            enrolled,
+            enrolled,
+            faces,
+            generator(tuple(OTHER)),
+            match_cosine=COSINE,
+            owners=owners,
+            seed=seed,
+        )
+        thief, others = _halves(setup)
+        assert (len(thief), len(others)) == (150, 150)
+
+
 def test_too_few_faces_for_a_fit_say_nothing() -> None:
     enrolled = rows(20, FACES, 1)
     fresh = unit(enrolled + 0.6 * rows(20, FACES, 2))

@@ -33,6 +33,7 @@ from api.http.openapi import BODY, ENROLLMENT_BODY, EVERY_CALL, IDEMPOTENT, PHOT
 from api.http.preconditions import PreconditionDep, asked
 from api.http.schemas import EnrollmentAnswer
 from api.http.values import face_policy, one_of, storage_of
+from api.limits.admission import Gate
 from api.process.runtime import Runtime
 from enroll import Enrollment, Holder
 from models.quality import Quality
@@ -178,6 +179,7 @@ async def _enroll_photos(
     precondition: Precondition | None,
 ) -> Response:
     runtime: Runtime = request.app.state.runtime
+    gate: Gate = request.app.state.gate
     pack, photos = runtime.required_pack(), form.images("images")
     reject_unknown(form.fields, ("attributes", "face", "storage", FIELD))
     storage = storage_of(form.fields)

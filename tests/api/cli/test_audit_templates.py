@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ import attacks.population
 import attacks.system
 from api.cli import audit_templates
 from api.process.opening import file_sealer, open_keyring
+from api.process.preparation import DEFAULT_DIM
 from api.settings import Settings
 from attacks.audit import AuditPlan, AuditResult
 from attacks.databases import link_databases
@@ -191,6 +193,66 @@ def test_what_two_attacks_found_becomes_report_verdict_and_status(
     kept = run(*asked, *most, "--out", tmp_path / "kept")
     assert kept.status == 0, kept.stderr
     assert kept.stdout.strip().endswith("PASSED")
+
+
+@pytest.mark.parametrize(
+    ("given", "plan", "said"),
+    [
+        (["--dim", "3"], ((3,), "hybrid"), "auditing hybrid templates of m = 3"),
+        (["--strategy", "random"], ((DIM,), "random"), f"auditing random templates of m = {DIM}"),
+        ([], ((DIM,), "hybrid"), f"auditing hybrid templates of m = {DIM}"),
+        (["--dim", "3", "--strategy", "random"], ((3,), "random"), None),
+    ],
+)
+def test_what_is_not_set_is_the_contracts(
+    world: World,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    given: list[str],
+    plan: tuple[tuple[int, ...], str],
+    said: str | None,
+) -> None:
+    def served(*_: Any) -> Any:
+        return SimpleNamespace(m=DIM, strategy=Strategy.HYBRID)
+
+    monkeypatch.setattr(audit_templates, "_served", served)
+    assert planned(world, tmp_path, monkeypatch, *given) == (plan, said)
+
+
+def test_a_contract_that_cannot_be_read_stops_no_audit(
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    broken = tmp_path / "contract.json"
+    broken.write_text("{", encoding="utf-8")
+    monkeypatch.setenv("VEILFACE_CONTRACT_FILE", str(broken))
+    found, said = planned(world, tmp_path, monkeypatch)
+    assert found == ((DEFAULT_DIM,), "adversarial")
+    assert said is not None
+    assert said.startswith("not auditing as the contract")
+    # Where nothing of it is needed, nothing is said of it.
+    every = ("--dim", "3", "--strategy", "random")
+    assert planned(world, tmp_path, monkeypatch, *every) == (((3,), "random"), None)
+
+
+def planned(
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *given: str | Path
+) -> tuple[tuple[tuple[int, ...], str], str | None]:
+    """What the command asks for, and the beginning of what it says of it."""
+    plans: list[AuditPlan] = []
+
+    def recorded(plan: AuditPlan, *_: Any, **__: Any) -> AuditResult:
+        plans.append(plan)
+        return AuditResult(list(foot_point_attack(system_of("pool"))), [], [], {})
+
+    monkeypatch.setattr(audit_templates, "run_audit", recorded)
+    ran = run(
+        *("audit", "templates", world.people, "--pack", world.pack, "--data-dir", world.data),
+        *("--aligned", "--no-learned", "--out", tmp_path / "out", *given),
+    )
+    (plan,) = plans
+    lines = [line.removeprefix("note: ") for line in ran.stderr.splitlines() if "auditing" in line]
+    said = lines[0].split(": ")[0] if lines else None
+    return (plan.dims, str(plan.strategy)), said
 
 
 def test_a_contract_of_other_decoys_says_no_dimension(world: World) -> None:

@@ -10,6 +10,9 @@ from typing import Any
 import pytest
 
 from api.http.app import environment_of
+from api.http.holder_keys import holder_key_of
+from api.http.routes import enrollment
+from api.http.schemas import HOLDER_KEY
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, images, photo
 from tests.api.shapes import assert_error
@@ -119,12 +122,18 @@ ROOT = Path(__file__).resolve().parents[3]
 KILLED_AFTER_THE_COMMIT = """
 import json, os, signal, sys
 
-import api.http.idempotency
 from api.http.app import app_from_environment
+from templates.store.subjects import Subjects
 from tests.api.client import Client
 from tests.api.deployment import images, photo
 
-api.http.idempotency.answer = lambda *_, **__: os.kill(os.getpid(), signal.SIGKILL)
+put = Subjects.put
+
+def put_and_end(*given, **named):
+    put(*given, **named)
+    os.kill(os.getpid(), signal.SIGKILL)
+
+Subjects.put = put_and_end
 path, headers, fields = json.loads(sys.argv[1])
 with Client(app_from_environment()) as client:
     client.put(path, files=images(photo(1)), headers=headers, data=fields)
@@ -174,6 +183,31 @@ def test_a_retry_does_not_meet_its_own_write_of_a_service_that_was_killed(
         409,
         "enrollment_conflict",
     )
+
+
+def test_the_holders_key_is_wiped_of_a_request_that_is_not_done_too(
+    client: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keys: list[bytearray] = []
+
+    def seen(*given: Any) -> bytearray | None:
+        if (key := holder_key_of(*given)) is not None:
+            assert any(key)
+            keys.append(key)
+        return key
+
+    monkeypatch.setattr(enrollment, "holder_key_of", seen)
+    sent = {"subject": "keyed", "data": {"holder_key": HOLDER_KEY}}
+    done, replayed, refused = (
+        put(client, key, photo(1), headers=more, **sent)
+        for key, more in (("keyed", {}), ("keyed", {}), ("refused", {"If-None-Match": "*"}))
+    )
+    conflict = put(client, "keyed", photo(2), **sent)
+    assert (done.status_code, done.json()["holder_key"]) == (201, True)
+    assert replayed.headers["Idempotency-Replayed"] == "true"
+    assert_error(refused, 409, "enrollment_conflict")
+    assert_error(conflict, 409, "idempotency_conflict")
+    assert [any(key) for key in keys] == [False] * 4
 
 
 def test_records_hold_no_subject_and_no_token(client: Client, deployment: Deployment) -> None:

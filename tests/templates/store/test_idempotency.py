@@ -1,8 +1,10 @@
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import pytest
 import sqlalchemy as sa
+from sqlalchemy.engine import Connection
 
 from templates.errors import StoreError
 from templates.store import (
@@ -15,8 +17,10 @@ from templates.store import (
     idempotency,
 )
 from templates.store.database import Database
+from templates.store.idempotency import Idempotency
 from templates.store.schema import IdempotencyRow
 from templates.store.subjects import EnrollmentConflict, Once, Precondition, StoredTemplate
+from tests.patience import PATIENCE_S, wait_until
 from tests.templates.store.conftest import Clock, finish, put, template_id
 
 
@@ -89,7 +93,8 @@ def test_erasing_the_subject_takes_its_records_and_late_answers(store: TemplateS
     running = claim(store, key="running", subject_id="ada")
     finish(store, claim(store, key="eve", subject_id="eve"), status=201, body=b"eve")
     store.erasures.erase("default", "ada")
-    finish(store, running, status=201, body=b"about ada")
+    with pytest.raises(IdempotencyConflict, match="erased meanwhile"):
+        finish(store, running, status=201, body=b"about ada")
     for key in ("done", "running"):
         claim(store, key=key)
     assert answer(store, key="eve").body == b"eve"
@@ -207,6 +212,63 @@ def test_a_run_that_was_taken_over_writes_nothing(store: TemplateStore, clock: C
         put(store, "ada", b"wire", once=once(late))
     assert template_id(store, "ada") == first.template_id
     assert answer(store).body == first.template_id.encode()
+
+
+@pytest.mark.parametrize("storage", Storage)
+def test_a_run_whose_record_is_gone_writes_nothing(
+    store: TemplateStore, clock: Clock, storage: Storage
+) -> None:
+    """Or the next try would meet its own enrollment, or somebody stay enrolled who was erased."""
+    late = claim(store)
+    clock.pass_by(minutes=1)
+    store.idempotency.release(claim(store))  # the next try failed
+    erased = claim(store, key="erased", subject_id="ada")
+    store.erasures.erase("default", "ada")
+    for gone in (late, erased):
+        with pytest.raises(IdempotencyConflict, match="meanwhile"):
+            put(store, "ada", b"wire", storage=storage, once=once(gone))
+    assert template_id(store, "ada") is None
+    assert put(store, "ada", b"wire", precondition=NEVER, once=once(claim(store))).created
+
+
+def test_a_note_that_is_left_while_its_record_is_claimed_is_found(
+    store: TemplateStore, clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first run stood still for a minute, and commits while the next one claims."""
+    if store.database.is_sqlite:
+        pytest.skip("writes wait for each other")
+    running = claim(store)
+    clock.pass_by(minutes=1)
+    noted, go_on = threading.Event(), threading.Event()
+    note_written = Idempotency.note_written
+
+    def held(*given: Any) -> None:
+        note_written(*given)
+        noted.set()
+        go_on.wait(PATIENCE_S)
+
+    monkeypatch.setattr(Idempotency, "note_written", held)
+    more = {"storage": Storage.HOLDER, "precondition": NEVER}
+    with ThreadPoolExecutor(2) as threads:
+        first = threads.submit(put, store, "ada", b"wire", once=once(running), **more)
+        try:
+            assert noted.wait(PATIENCE_S)
+            again = threads.submit(claim, store)
+            wait_until(lambda: store.database.read(_waits))
+        finally:
+            go_on.set()
+        next_run = again.result()
+    assert next_run.written == first.result().template_id
+    assert not put(store, "ada", b"wire", once=once(next_run), **more).created
+
+
+def _waits(connection: Connection) -> bool:
+    """Whether a transaction of this database waits for another one's row."""
+    waiting = sa.text(
+        "SELECT count(*) FROM pg_stat_activity WHERE datname = current_database() "
+        "AND wait_event_type = 'Lock'"
+    )
+    return connection.execute(waiting).scalar_one() > 0
 
 
 def test_the_next_run_may_replace_a_held_template_that_an_earlier_one_wrote(
