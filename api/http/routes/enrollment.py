@@ -229,7 +229,7 @@ async def _enroll_photos(
         ],
         subject=subject,
         work=work,
-        run=partial(request.app.state.gate.compute, key=caller.prefix),
+        run=partial(gate.compute, key=caller.prefix),
         holder_key=holder_key,
     )
     return written(request, outcome)
