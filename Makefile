@@ -10,7 +10,7 @@ PYTEST = OMP_NUM_THREADS=1 $(VENV)/pytest --numprocesses=logical --maxprocesses=
 # Bytecode is kept: without it, every process that a test starts compiles all that it imports.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo install extras docs test test-all lint types javascript javascript-package audit sbom wheels lock clean
+.PHONY: demo install extras docs test test-all lint types javascript javascript-package audit sbom wheels image lock clean
 
 demo: .venv/core
 	$(VENV)/veilface demo
@@ -80,6 +80,10 @@ wheels: | $(UV)
 	$(UV) pip install --quiet --python .bootstrap/alone/bin/python --constraint requirements.lock dist/wheels/veilface_client-*.whl
 	.bootstrap/alone/bin/python -I -W error -c "import veilface_client, sys; sys.exit('api' in sys.modules)"
 	.bootstrap/alone/bin/veilface-client --version
+
+# The container's image, without a registry; as root.
+image:
+	.ci/image
 
 .venv/core: requirements.lock pyproject.toml | $(UV)
 	test -x $(VENV)/python || $(UV) venv --quiet --python '>=3.11' .venv

@@ -20,6 +20,7 @@ def test_few_people_get_a_quarter_of_the_numbers_and_are_told(asked: int | None)
         strategy=Strategy.ADVERSARIAL,
         m=asked,
         options=CalibrationOptions(),
+        progress=lambda _what, _share: None,
     )
     assert point.dim == (asked or N // 4)
     privacy = point.tried[point.dim]
