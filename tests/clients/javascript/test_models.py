@@ -128,4 +128,5 @@ def test_photos_of_people(
     answers = embedded(node, pack, folder, images)
     for image, ours in zip(images, answers, strict=True):
         compare(pack, image, ours)
-    assert sum("code" not in answer for answer in answers) > 20
+    # Most of them show one usable face; the others must be refused alike.
+    assert sum("code" not in answer for answer in answers) > len(images) // 2
