@@ -318,7 +318,7 @@ def test_the_seed_gives_the_outcomes_and_kept_limits_are_status_0(
     found = [row for row in compared_report["outcomes"] if row["decoys"] == "generator"]
 
     def drawn_by_seed(rows: list[Any]) -> list[Any]:
-        # The enroller's templates have random ids, by which they are turned before they are rounded.
+        # The enroller's templates have random ids, which turn them before they are rounded.
         return [row for row in rows if row["attack"] != "several-templates"]
 
     assert drawn_by_seed(found) == drawn_by_seed(expected)
