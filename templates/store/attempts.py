@@ -81,10 +81,16 @@ D = TypeVar("D", bound=Decided)
 class Attempts:
     """Repository of failed attempts and used nonces."""
 
-    def __init__(self, context: StoreContext, nonces: Nonces, policy: LockoutPolicy) -> None:
+    def __init__(
+        self,
+        context: StoreContext,
+        nonces: Nonces,
+        idempotency: Idempotency,
+        policy: LockoutPolicy,
+    ) -> None:
         self._context = context
         self._nonces = nonces
-        self._idempotency = Idempotency(context)
+        self._idempotency = idempotency
         self._standing = Standing(context, policy)
 
     def begin(

@@ -131,9 +131,9 @@ class SubjectPage:
 class Subjects:
     """Repository of subjects."""
 
-    def __init__(self, context: StoreContext, nonces: Nonces) -> None:
+    def __init__(self, context: StoreContext, nonces: Nonces, idempotency: Idempotency) -> None:
         self._context = context
-        self._idempotency = Idempotency(context)
+        self._idempotency = idempotency
         self._nonces = nonces
 
     def put(
