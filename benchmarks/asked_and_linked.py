@@ -106,6 +106,32 @@ def adapted_deployment(
     return population, source, np.concatenate([rest[kept], population.attacker])
 
 
+def enrolled_deployment(
+    population: Population,
+    source: DecoyGenerator,
+    attacker: NDArray[np.float32],
+    *,
+    data: Path,
+    dim: int,
+    level: str,
+    seed: int,
+) -> System:
+    """Enroll the victims of :func:`adapted_deployment`; the service decides at this level."""
+    info = ModelPack.load(data / "packs" / "w600k_mbf").info
+    system = enroll_victims(
+        population,
+        Scheme("adversarial", GENERATED, dim),
+        source,
+        embedder_sha256=info.embedder_sha256,
+        preprocessing=info.preprocessing,
+        pool_of_owners=False,
+        lifted_probes=False,
+        seed=seed,
+    )
+    contract = replace(system.contract, default_level=level)
+    return replace(system, attacker=attacker, contract=contract)
+
+
 def main() -> None:
     """Embed, split, lift, attack, print."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -122,23 +148,19 @@ def main() -> None:
     population, source, attacker = adapted_deployment(
         args.data, args.descriptors, victims=args.victims, seed=args.seed
     )
-    info = ModelPack.load(args.data / "packs" / "w600k_mbf").info
     print(
         f"{len(population.victims)} victims; {len(attacker)} faces, {len(population.mates)} mates"
     )
     for dim in args.dims:
-        system = enroll_victims(
+        system = enrolled_deployment(
             population,
-            Scheme("adversarial", GENERATED, dim),
             source,
-            embedder_sha256=info.embedder_sha256,
-            preprocessing=info.preprocessing,
-            pool_of_owners=False,
-            lifted_probes=False,
+            attacker,
+            data=args.data,
+            dim=dim,
+            level=args.level,
             seed=args.seed,
         )
-        contract = replace(system.contract, default_level=args.level)
-        system = replace(system, attacker=attacker, contract=contract)
         attacks_on(system, population.mates, args)
 
 

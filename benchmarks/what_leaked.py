@@ -29,13 +29,12 @@ from attacks.holder_keys import (
 from attacks.learned import invert
 from attacks.likelihood import likeliest_guess
 from attacks.linkage import foot_lengths, holder_rotations_of, link, linkage_outcome, turned
-from attacks.outcomes import GENERATED, AttackOutcome, Leaked, Scheme
+from attacks.outcomes import AttackOutcome, Leaked
 from attacks.several_templates import enrolled, several_templates
 from attacks.stored.foot_point import foot_points
-from attacks.system import System, enroll_victims
+from attacks.system import System
 from attacks.unlinkability import unlinkability
-from benchmarks.asked_and_linked import adapted_deployment
-from models.pack import ModelPack
+from benchmarks.asked_and_linked import adapted_deployment, enrolled_deployment
 from verify.comparisons import through_wire
 
 
@@ -126,24 +125,20 @@ def main() -> None:
     population, source, attacker = adapted_deployment(
         args.data, args.descriptors, victims=args.victims, seed=args.seed
     )
-    info = ModelPack.load(args.data / "packs" / "w600k_mbf").info
     calibrating = slice(0, args.calibrating)
-    system = enroll_victims(
+    system = enrolled_deployment(
         replace(
             population,
             calibration=population.calibration[calibrating],
             names=population.names[calibrating],
         ),
-        Scheme("adversarial", GENERATED, args.dim),
         source,
-        embedder_sha256=info.embedder_sha256,
-        preprocessing=info.preprocessing,
-        pool_of_owners=False,
-        lifted_probes=False,
+        attacker,
+        data=args.data,
+        dim=args.dim,
+        level=args.level,
         seed=args.seed,
     )
-    contract = replace(system.contract, default_level=args.level)
-    system = replace(system, attacker=attacker, contract=contract)
     print(f"{len(population.victims)} victims; {len(attacker)} faces of the attacker", flush=True)
     attacks = attacks_on(system, population.albums, args)
     for name in args.attacks:
