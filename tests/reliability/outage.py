@@ -155,6 +155,10 @@ def _stop_and_start(
         lambda: len(refused()) >= LEAST_REFUSED and {each.kind for each in refused()} == KINDS,
         what="refusals of every kind while the database is away",
     )
+    wait_until(
+        lambda: bool(watch.between(stopped, time.monotonic())),
+        what="a sign of health while the database is away",
+    )
     starting = time.monotonic()
     cluster.start()
     started = time.monotonic()
@@ -189,7 +193,7 @@ def _wait_until_well(clients: Clients, watch: _Watch, started: float) -> float |
         later = [each for each in list(clients.history) if started <= each.answered <= now]
         refused = [each.answered for each in later if not each.answered_well]
         last = max(refused, default=started)
-        health = watch.between(max(last, now - 1), now)
-        if now - last > 1 and len(later) > 20 and set(health) == {(200, 200)}:
+        newest = watch.between(last, now)[-1:]
+        if now - last > 1 and len(later) > 20 and newest == [(200, 200)]:
             return last
     return None
