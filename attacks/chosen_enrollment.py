@@ -21,7 +21,7 @@ from scipy.linalg import svd
 from attacks.decisions import decide
 from attacks.errors import AuditError
 from attacks.linkage import holder_rotations_of, rotations_of, turned, turned_back
-from attacks.outcomes import AttackOutcome, Knowledge, Leaked, Property
+from attacks.outcomes import CONTROL, AttackOutcome, Knowledge, Leaked, Property
 from attacks.recovery import fmr_of
 from attacks.stored.honest_probes import honest_embedding, points_inside
 from attacks.stored.nearest_neighbour import nearest_points
@@ -222,7 +222,7 @@ def chosen_enrollment(
                 f"stolen database, {setting.stolen}; it estimates a rotation from the "
                 "templates that it sent and what became of them, and sends a unit point of every "
                 f"victim's template, turned back, as an embedding; success is {setting.success}",
-                judged=setting is not _COMMON,
+                unjudged=CONTROL if setting is _COMMON else None,
                 details={"accounts": number, "alignment": _alignment(estimate, rotations)},
             )
         )
@@ -237,7 +237,7 @@ def chosen_enrollment(
             assumption="The right to send embeddings, the tenant's whole stolen database, and its "
             "key, which gives every template's rotation; success is acceptance of a unit point of "
             "the template (a control)",
-            judged=False,
+            unjudged=CONTROL,
             details={},
         ),
     ]
@@ -270,7 +270,7 @@ def _outcome(
     variant: str,
     leaked: Leaked,
     assumption: str,
-    judged: bool,
+    unjudged: str | None,
     details: Mapping[str, Json],
 ) -> AttackOutcome:
     """Send one point for each victim; report acceptance."""
@@ -290,7 +290,7 @@ def _outcome(
         level=system.level.name,
         measured=rate(int(np.count_nonzero(accepted)), len(accepted)),
         chance=fmr_of(system.level),
-        judged=judged,
+        unjudged=unjudged,
         details=details,
     )
 

@@ -29,7 +29,7 @@ from attacks.holder_keys import (
 from attacks.learned import invert
 from attacks.likelihood import likeliest_guess
 from attacks.linkage import foot_lengths, holder_rotations_of, link, linkage_outcome, turned
-from attacks.outcomes import AttackOutcome, Leaked
+from attacks.outcomes import CONTROL, AttackOutcome, Leaked
 from attacks.several_templates import enrolled, several_templates
 from attacks.stored.foot_point import foot_points
 from attacks.system import System
@@ -70,7 +70,7 @@ def lengths(system: System) -> list[AttackOutcome]:
                 variant=f"{name}, nearest for {measured.first_rank:.1%} of {count}",
                 leaked=Leaked.MASTER_KEY,
                 assumption="Two enrollments of the same photos under kept keys",
-                judged=False,
+                unjudged=CONTROL,
             )
         )
     return outcomes
