@@ -36,8 +36,9 @@ from verify.metrics import rate
 
 ACCOUNTS = (5, 50, 500)
 """Accounts that the attacker enrolls: n / (m + 1) fix a common rotation, half of them nearly."""
-ALIGNMENTS = 30
-"""Most steps of the estimate; with enough accounts it is settled after two."""
+ALIGNMENTS, FEW_ALIGNMENTS = 30, 6
+"""Most steps of the estimate; the fewer with twice the accounts that fix a common rotation, with
+which two settle it. What is no common rotation never settles."""
 _ENOUGH_PAIRS = 2
 """Pairs for each dimension, where longer products of projections are left out."""
 _LEAST = 1e-3
@@ -56,7 +57,7 @@ class Sides(NamedTuple):
     stolen: SubspaceBatch
 
 
-def estimate_from_sets(sides: Sides, *, steps: int = ALIGNMENTS) -> Array64:
+def estimate_from_sets(sides: Sides, *, steps: int | None = None) -> Array64:
     """Estimate R from S sets and their images under R.
 
     Parameters
@@ -64,7 +65,7 @@ def estimate_from_sets(sides: Sides, *, steps: int = ALIGNMENTS) -> Array64:
     sides
         Template i of ``stolen`` is the image of template i of ``sent``, in another basis.
     steps
-        Most steps of the refinement.
+        Most steps of the refinement; None: by the number of accounts.
 
     Returns
     -------
@@ -82,6 +83,9 @@ def estimate_from_sets(sides: Sides, *, steps: int = ALIGNMENTS) -> Array64:
     sent, stolen = (_Stacked.of(side) for side in sides)
     estimate = polar_factor(_product_pairs(sent, stolen))
     settled = 0.0
+    enough = sent.bases.shape[0] * (sent.bases.shape[1] + 1) >= 2 * sent.feet.shape[1]
+    if steps is None:
+        steps = FEW_ALIGNMENTS if enough else ALIGNMENTS
     for _ in range(steps):
         turned = sent.bases @ estimate.T
         left, values, right = np.linalg.svd(stolen.bases @ turned.transpose(0, 2, 1))
@@ -157,8 +161,9 @@ def best_known_points(stolen: SubspaceBatch, accounts: SubspaceBatch, *, seed: i
     going to the unit point nearest P x never lowers it.
     """
     rows = np.concatenate([_Stacked.of(accounts).feet, *accounts.bases.astype(np.float64)])
-    _left, values, right = np.linalg.svd(rows, full_matrices=False)
-    span = right[values > _SPANNED * values[0]]
+    # Squares of the singular values, of a matrix of size n instead of thousands of rows.
+    values, axes = np.linalg.eigh(rows.T @ rows)
+    span = axes[:, values > _SPANNED**2 * values[-1]].T
     points = points_inside(stolen, seed=seed).astype(np.float64)
     if len(span) < stolen.n:
         for _ in range(_CLIMB):

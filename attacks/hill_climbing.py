@@ -342,7 +342,9 @@ def climb_service(
             replace(
                 outcome,
                 variant=f"{outcome.variant}, over REST",
-                unjudged="it is judged on all victims, not on these few" if decisions_only else None,
+                unjudged="it is judged on all victims, not on these few"
+                if decisions_only
+                else None,
             )
             for outcome in climbing_outcomes(
                 climbs, system.scheme, system.level, most_attempts=most

@@ -366,6 +366,7 @@ def _sentence(cell: Cell) -> str:
     why = "By design" if cell.status is Status.UNLIMITED else "It cannot hold"
     reason = "" if cell.reason is None else f" {why}: {cell.reason}."
     return (
-        f"{outcome.breaks} {_SAID[cell.status]}: {outcome.name}, leaked {outcome.leaked}, attacker with "
-        f"{outcome.knowledge}: {cell.excess:.3g} [{cell.low:.3g}, {cell.high:.3g}]{bound}.{reason}"
+        f"{outcome.breaks} {_SAID[cell.status]}: {outcome.name}, leaked {outcome.leaked}, "
+        f"attacker with {outcome.knowledge}: "
+        f"{cell.excess:.3g} [{cell.low:.3g}, {cell.high:.3g}]{bound}.{reason}"
     )

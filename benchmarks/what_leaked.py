@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attacks.chosen_enrollment import chosen_enrollment
-from attacks.databases import link_databases
+from attacks.databases import ACCOUNTS, link_databases
 from attacks.holder_keys import (
     Guess,
     guess_from_few_decoys,
@@ -97,7 +97,7 @@ def attacks_on(
         "lengths": lambda: lengths(system),
         "linkage": lambda: link(system, liftings=1, most_people=args.linked),
         "databases": lambda: link_databases(
-            system, accounts=(args.accounts,), most_people=args.linked
+            system, accounts=tuple(args.accounts), most_people=args.linked
         ),
         "chosen": lambda: chosen_enrollment(system),
     }
@@ -114,7 +114,9 @@ def main() -> None:
     parser.add_argument("--dim", type=int, default=160)
     parser.add_argument("--level", default="fmr-1e-3", help="that a match is judged at")
     parser.add_argument("--calibrating", type=int, default=1200, help="photos to calibrate on")
-    parser.add_argument("--accounts", type=int, default=100, help="in both databases")
+    parser.add_argument(
+        "--accounts", type=int, nargs="+", default=list(ACCOUNTS), help="in both databases"
+    )
     parser.add_argument(
         "--attacks",
         nargs="+",

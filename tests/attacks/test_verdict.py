@@ -2,7 +2,16 @@ import math
 
 import pytest
 
-from attacks.outcomes import CONTROL, AttackOutcome, Estimate, Knowledge, Leaked, Measured, Property, Scheme
+from attacks.outcomes import (
+    CONTROL,
+    AttackOutcome,
+    Estimate,
+    Knowledge,
+    Leaked,
+    Measured,
+    Property,
+    Scheme,
+)
 from attacks.verdict import LIMITS, Cell, Status, headlines, judge
 from verify.metrics import rate, wilson
 
@@ -57,7 +66,9 @@ def test_a_recovery_is_compared_with_its_limit(hits: int, trials: int, status: S
 def test_the_strongest_attack_fills_the_cell_and_unjudged_ones_do_not() -> None:
     weak = outcome(Property.IRREVERSIBILITY, rate(1, 100), attack="weak")
     strong = outcome(Property.IRREVERSIBILITY, rate(5, 100), attack="strong")
-    oracle = outcome(Property.IRREVERSIBILITY, rate(99, 100), attack="oracle", unjudged="nobody has it")
+    oracle = outcome(
+        Property.IRREVERSIBILITY, rate(99, 100), attack="oracle", unjudged="nobody has it"
+    )
     assert only_cell(weak, strong, oracle).outcome.attack == "strong"
     assert only_cell(oracle, strong, weak).outcome.attack == "strong"
 
