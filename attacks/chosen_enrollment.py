@@ -1,8 +1,8 @@
 """A tenant's rotations from accounts whose templates the attacker sent itself.
 
 Who may send templates knows what it enrolled: not the descriptor only, as of an account that was
-enrolled from photos (``attacks.databases``), but the whole set. The service stores the set's image
-under R in a basis of its own drawing, so no row of it is known to be the image of another. What no
+enrolled from photos, but the whole set. The service stores the set's image under R in a basis of
+its own drawing, so no row of it is known to be the image of another. What no
 basis changes is the foot point, and the orthogonal projection on the directions: so every product
 of projections, applied to a foot point, gives a pair (x, R x), and some N² pairs of N accounts fix
 an R that they have in common. Templates of version 1 did, and it was the victims' too: a control
@@ -39,8 +39,9 @@ ACCOUNTS = (5, 50, 500)
 ALIGNMENTS, FEW_ALIGNMENTS = 30, 6
 """Most steps of the estimate; the fewer with twice the accounts that fix a common rotation, with
 which two settle it. What is no common rotation never settles."""
-_ENOUGH_PAIRS = 2
-"""Pairs for each dimension, where longer products of projections are left out."""
+_ENOUGH_PAIRS, _MOST_PAIRS = 2, 64
+"""Pairs for each dimension, where longer products of projections are left out, and where all others
+are: the refinement, which takes every account, is the exacter anyhow."""
 _LEAST = 1e-3
 """Of a unit vector, how much a projection must leave, and take, to count."""
 _SPANNED = 0.02
@@ -131,15 +132,17 @@ def _product_pairs(sent: _Stacked, stolen: _Stacked) -> Array64:
             break
         products: tuple[list[Array64], list[Array64]] = [], []
         for number in range(count):
+            if pairs >= _MOST_PAIRS * n:
+                break
             here, there = sent.project(number, points), stolen.project(number, images)
             # A foot point is orthogonal to its own directions, and P P = P: both give no new pair.
             lengths = np.linalg.norm(here, axis=1)
             new = (lengths > _LEAST) & (lengths < 1 - _LEAST)
             products[0].append(normalised(here[new]))
             products[1].append(there[new] / lengths[new, None])
+            moment += products[1][-1].T @ products[0][-1]
+            pairs += len(products[0][-1])
         points, images = np.concatenate(products[0]), np.concatenate(products[1])
-        moment += images.T @ points
-        pairs += len(points)
     return np.asarray(moment)
 
 

@@ -263,7 +263,7 @@ def link_databases(
     asked = {m: [fixing]} if m <= CONTROL_DIM else {CONTROL_DIM: numbers, m: [fixing]}
     outcomes = []
     for dim, some in asked.items():
-        tenants, lifted = _enrolled(system, dim, max(some), strangers, most_people)
+        tenants, lifted = _enrolled(system, dim, some, strangers, most_people)
         beside = {"strangers": strangers, "m": dim}
         controls: dict[tuple[int, str], Unlinkability] = {}
         for setting in reversed(_settings(system, tenants, some)):
@@ -302,9 +302,12 @@ def _unjudged(measured: Unlinkability, control: Unlinkability) -> str | None:
 
 
 def _enrolled(
-    system: System, dim: int, accounts: int, strangers: int, most_people: int
+    system: System, dim: int, accounts: Sequence[int], strangers: int, most_people: int
 ) -> tuple[list[_Tenant], Moments]:
-    """Both tenants' templates of this dimension, and the moments of the attacker's own ones."""
+    """Both tenants' templates of this dimension, and the moments of the attacker's own ones.
+
+    Strangers are among them only where something is estimated from moments.
+    """
     source = client_source(system.lifter.source)
 
     def others(name: str) -> NDArray[np.float32]:
@@ -315,12 +318,12 @@ def _enrolled(
         members = np.ascontiguousarray(np.concatenate(people), dtype=np.float32)
         return system.lift(members, f"database {name}, m = {dim}", m=dim)
 
-    own = system.attacker[:accounts]
+    own = system.attacker[: max(accounts)]
     tenants = []
     for name, photos in (("first", system.victims.enrolled), ("second", system.victims.fresh)):
         people = photos[:most_people]
-        members = lifted([people, own, others(name)], name)
-        tenants.append(_Tenant(name, members, len(people)))
+        strange = [others(name)] if 0 in accounts else []
+        tenants.append(_Tenant(name, lifted([people, own, *strange], name), len(people)))
     return tenants, Moments.of(lifted([others("attacker")], "lifted by the attacker"))
 
 

@@ -127,7 +127,7 @@ def conclude(
     as_json: bool,
     evaluation: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write the report, say first how it ended, and leave with status 1 where a limit is exceeded."""
+    """Write the report, say first how it ended; leave with status 1 where a limit is exceeded."""
     notice = demo_notice(pack.info.embedder_sha256, n=pack.info.n)
     files = write_report(report, out, evaluation=evaluation)
     if as_json:
