@@ -1,8 +1,8 @@
 """A tenant's rotations from accounts whose templates the attacker sent itself.
 
 Who may send templates knows what it enrolled: not the descriptor only, as of an account that was
-enrolled from photos (``attacks.databases``), but the whole set. The service stores the set's image
-under R in a basis of its own drawing, so no row of it is known to be the image of another. What no
+enrolled from photos, but the whole set. The service stores the set's image under R in a basis of
+its own drawing, so no row of it is known to be the image of another. What no
 basis changes is the foot point, and the orthogonal projection on the directions: so every product
 of projections, applied to a foot point, gives a pair (x, R x), and some N² pairs of N accounts fix
 an R that they have in common. Templates of version 1 did, and it was the victims' too: a control
@@ -21,7 +21,7 @@ from scipy.linalg import svd
 from attacks.decisions import decide
 from attacks.errors import AuditError
 from attacks.linkage import holder_rotations_of, rotations_of, turned, turned_back
-from attacks.outcomes import AttackOutcome, Knowledge, Leaked, Property
+from attacks.outcomes import CONTROL, AttackOutcome, Knowledge, Leaked, Property
 from attacks.recovery import fmr_of
 from attacks.stored.honest_probes import honest_embedding, points_inside
 from attacks.stored.nearest_neighbour import nearest_points
@@ -36,10 +36,12 @@ from verify.metrics import rate
 
 ACCOUNTS = (5, 50, 500)
 """Accounts that the attacker enrolls: n / (m + 1) fix a common rotation, half of them nearly."""
-ALIGNMENTS = 30
-"""Most steps of the estimate; with enough accounts it is settled after two."""
-_ENOUGH_PAIRS = 2
-"""Pairs for each dimension, where longer products of projections are left out."""
+ALIGNMENTS, FEW_ALIGNMENTS = 30, 6
+"""Most steps of the estimate; the fewer with twice the accounts that fix a common rotation, with
+which two settle it. What is no common rotation never settles."""
+_ENOUGH_PAIRS, _MOST_PAIRS = 2, 64
+"""Pairs for each dimension, where longer products of projections are left out, and where all others
+are: the refinement, which takes every account, is the exacter anyhow."""
 _LEAST = 1e-3
 """Of a unit vector, how much a projection must leave, and take, to count."""
 _SPANNED = 0.02
@@ -56,7 +58,7 @@ class Sides(NamedTuple):
     stolen: SubspaceBatch
 
 
-def estimate_from_sets(sides: Sides, *, steps: int = ALIGNMENTS) -> Array64:
+def estimate_from_sets(sides: Sides, *, steps: int | None = None) -> Array64:
     """Estimate R from S sets and their images under R.
 
     Parameters
@@ -64,7 +66,7 @@ def estimate_from_sets(sides: Sides, *, steps: int = ALIGNMENTS) -> Array64:
     sides
         Template i of ``stolen`` is the image of template i of ``sent``, in another basis.
     steps
-        Most steps of the refinement.
+        Most steps of the refinement; None: by the number of accounts.
 
     Returns
     -------
@@ -82,6 +84,9 @@ def estimate_from_sets(sides: Sides, *, steps: int = ALIGNMENTS) -> Array64:
     sent, stolen = (_Stacked.of(side) for side in sides)
     estimate = polar_factor(_product_pairs(sent, stolen))
     settled = 0.0
+    enough = sent.bases.shape[0] * (sent.bases.shape[1] + 1) >= 2 * sent.feet.shape[1]
+    if steps is None:
+        steps = FEW_ALIGNMENTS if enough else ALIGNMENTS
     for _ in range(steps):
         turned = sent.bases @ estimate.T
         left, values, right = np.linalg.svd(stolen.bases @ turned.transpose(0, 2, 1))
@@ -127,15 +132,17 @@ def _product_pairs(sent: _Stacked, stolen: _Stacked) -> Array64:
             break
         products: tuple[list[Array64], list[Array64]] = [], []
         for number in range(count):
+            if pairs >= _MOST_PAIRS * n:
+                break
             here, there = sent.project(number, points), stolen.project(number, images)
             # A foot point is orthogonal to its own directions, and P P = P: both give no new pair.
             lengths = np.linalg.norm(here, axis=1)
             new = (lengths > _LEAST) & (lengths < 1 - _LEAST)
             products[0].append(normalised(here[new]))
             products[1].append(there[new] / lengths[new, None])
+            moment += products[1][-1].T @ products[0][-1]
+            pairs += len(products[0][-1])
         points, images = np.concatenate(products[0]), np.concatenate(products[1])
-        moment += images.T @ points
-        pairs += len(points)
     return np.asarray(moment)
 
 
@@ -157,8 +164,9 @@ def best_known_points(stolen: SubspaceBatch, accounts: SubspaceBatch, *, seed: i
     going to the unit point nearest P x never lowers it.
     """
     rows = np.concatenate([_Stacked.of(accounts).feet, *accounts.bases.astype(np.float64)])
-    _left, values, right = np.linalg.svd(rows, full_matrices=False)
-    span = right[values > _SPANNED * values[0]]
+    # Squares of the singular values, of a matrix of size n instead of thousands of rows.
+    values, axes = np.linalg.eigh(rows.T @ rows)
+    span = axes[:, values > _SPANNED**2 * values[-1]].T
     points = points_inside(stolen, seed=seed).astype(np.float64)
     if len(span) < stolen.n:
         for _ in range(_CLIMB):
@@ -222,7 +230,7 @@ def chosen_enrollment(
                 f"stolen database, {setting.stolen}; it estimates a rotation from the "
                 "templates that it sent and what became of them, and sends a unit point of every "
                 f"victim's template, turned back, as an embedding; success is {setting.success}",
-                judged=setting is not _COMMON,
+                unjudged=CONTROL if setting is _COMMON else None,
                 details={"accounts": number, "alignment": _alignment(estimate, rotations)},
             )
         )
@@ -237,7 +245,7 @@ def chosen_enrollment(
             assumption="The right to send embeddings, the tenant's whole stolen database, and its "
             "key, which gives every template's rotation; success is acceptance of a unit point of "
             "the template (a control)",
-            judged=False,
+            unjudged=CONTROL,
             details={},
         ),
     ]
@@ -270,7 +278,7 @@ def _outcome(
     variant: str,
     leaked: Leaked,
     assumption: str,
-    judged: bool,
+    unjudged: str | None,
     details: Mapping[str, Json],
 ) -> AttackOutcome:
     """Send one point for each victim; report acceptance."""
@@ -290,7 +298,7 @@ def _outcome(
         level=system.level.name,
         measured=rate(int(np.count_nonzero(accepted)), len(accepted)),
         chance=fmr_of(system.level),
-        judged=judged,
+        unjudged=unjudged,
         details=details,
     )
 

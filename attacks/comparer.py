@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from attacks.likelihood import attacker_moments
 from attacks.linkage import foot_cosines, linkage_outcome, nearest_similarities
-from attacks.outcomes import AttackOutcome, Leaked
+from attacks.outcomes import CONTROL, AttackOutcome, Leaked
 from attacks.population import Subjects
 from attacks.second_order import likeliest_descriptors
 from attacks.stored.recording import decoy_count
@@ -199,7 +199,7 @@ def _outcome(
             if control
             else "of the same people"
         ),
-        judged=not control,
+        unjudged=CONTROL if control else None,
         details={**beside, **separation(scores)},
     )
 

@@ -17,7 +17,7 @@ from scipy.linalg import cho_factor, cho_solve
 from attacks.decisions import decide
 from attacks.hill_climbing import LOCKOUTS
 from attacks.likelihood import attacker_moments
-from attacks.outcomes import AttackOutcome, Knowledge, Leaked
+from attacks.outcomes import CONTROL, AttackOutcome, Knowledge, Leaked
 from attacks.population import Subjects
 from attacks.prior import Prior, attacker_prior
 from attacks.recovery import recovery_outcome
@@ -377,7 +377,7 @@ def _outcome(
         "the guess with a fresh photo"
         + (" of another victim (a control)" if people is not None else ""),
         people=people,
-        judged=people is None,
+        unjudged=None if people is None else CONTROL,
         details={
             "questions": count,
             "lockout": limit,

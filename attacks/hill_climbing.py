@@ -339,8 +339,13 @@ def climb_service(
         most = min(most_attempts, len(prior.faces)) if decisions_only else most_attempts
         climbs = climb(dict(enumerate(asks)), prior, climber, most_attempts=most, seed=seed)
         outcomes += [
-            # Decisions alone are judged on all victims, and not on these few.
-            replace(outcome, variant=f"{outcome.variant}, over REST", judged=not decisions_only)
+            replace(
+                outcome,
+                variant=f"{outcome.variant}, over REST",
+                unjudged="it is judged on all victims, not on these few"
+                if decisions_only
+                else None,
+            )
             for outcome in climbing_outcomes(
                 climbs, system.scheme, system.level, most_attempts=most
             )

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from attacks.likelihood import likeliest_guess
 from attacks.linkage import holder_rotations_of, turned, turned_back
-from attacks.outcomes import AttackOutcome, Knowledge, Leaked
+from attacks.outcomes import CONTROL, AttackOutcome, Knowledge, Leaked
 from attacks.recovery import recovery_outcome
 from attacks.stored.foot_point import foot_points
 from attacks.system import System
@@ -97,7 +97,7 @@ def guess_with_and_without_holder_keys(
                 assumption=f"{theft.assumption}; the attack is the one on an un-rotated template; "
                 "success is a match of the guess with a fresh photo"
                 + (" (a control)" if control else ""),
-                judged=not control,
+                unjudged=CONTROL if control else None,
             )
             for attack, guess in guesses.items()
         ]
@@ -139,7 +139,7 @@ def guess_from_few_decoys(
             assumption=f"{theft.assumption}; the template is of m = {CONTROL_DIM}, at which the "
             "attack must succeed with the key; success is a match of the guess with a fresh photo "
             "(a control)",
-            judged=False,
+            unjudged=CONTROL,
         )
         for theft in THEFTS
         for attack, guess in guesses.items()

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attacks.errors import AuditError
-from attacks.outcomes import GENERATED, AttackOutcome, Knowledge, Leaked, Property
+from attacks.outcomes import CONTROL, GENERATED, AttackOutcome, Knowledge, Leaked, Property
 from attacks.population import Subjects
 from attacks.privacy import DRAWS, SimulatedPeople, decoy_moments, extrapolate, face_counts
 from attacks.recovery import fmr_of, recovery_outcome
@@ -171,7 +171,7 @@ def find_least_decoy_like(
             + "; success is a match of the guess with a fresh photo"
             + (" of another victim (a control)" if control else ""),
             people=people,
-            judged=not control,
+            unjudged=CONTROL if control else None,
             details={"draws": draws, "faces": number, "faces_from": kind},
         )
 
@@ -280,7 +280,9 @@ def simulate_unlimited(
             level=level.name,
             measured=theft.found,
             chance=fmr_of(level),
-            judged=fitted_to is not None,
+            unjudged=None
+            if fitted_to is not None
+            else "an estimate, for nobody knows how far decoys and people differ",
             details={
                 "faces": "unlimited",
                 "photos_of_other_people": theft.control.to_json(),

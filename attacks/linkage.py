@@ -61,7 +61,6 @@ SCORES: Mapping[str, Score] = {
 class _Setting:
     name: str
     leaked: Leaked
-    judged: bool
     assumption: str
 
 
@@ -70,28 +69,24 @@ _SETTINGS = (
     _Setting(
         "secret rotations",
         Leaked.MASTER_KEY,
-        judged=True,
         assumption="One rotated template of each of two tenants, and how templates are lifted, "
         "but not the tenants' keys" + _SUCCESS,
     ),
     _Setting(
         "one tenant",
         Leaked.MASTER_KEY,
-        judged=True,
         assumption="Two rotated templates of one tenant, and how templates are lifted, but not the "
         "tenant's key" + _SUCCESS,
     ),
     _Setting(
         "holder's key kept",
         Leaked.MASTER_KEY,
-        judged=True,
         assumption="Two templates that each person has enrolled under one key of their own, and "
         "every secret of the deployment, but not that key" + _SUCCESS,
     ),
     _Setting(
         "keys leaked",
         Leaked.HOLDER_KEYS,
-        judged=True,
         assumption="One rotated template of each of two tenants, and the rotation keys of both"
         + _SUCCESS,
     ),
@@ -145,7 +140,7 @@ def linkage_outcome(
     leaked: Leaked,
     knowledge: Knowledge = Knowledge.ALGORITHM,
     assumption: str,
-    judged: bool,
+    unjudged: str | None = None,
     details: Mapping[str, Json] | None = None,
 ) -> AttackOutcome:
     """Report D_sys, with the mean of its null as chance."""
@@ -159,7 +154,7 @@ def linkage_outcome(
         scheme=system.scheme,
         measured=measured.d_sys,
         chance=measured.null_mean,
-        judged=judged,
+        unjudged=unjudged,
         details={**measured.details(), **(details or {})},
     )
 
@@ -223,7 +218,6 @@ def link(
             variant=f"{setting.name}, {name}",
             leaked=setting.leaked,
             assumption=setting.assumption,
-            judged=setting.judged,
             details={"liftings": liftings},
         )
         for setting in _SETTINGS

@@ -57,6 +57,7 @@ class Knowledge(StrEnum):
 
 
 GENERATED, POOLED = "generator", "pool"
+CONTROL = "a control"
 RAW = "raw"
 
 
@@ -160,9 +161,9 @@ class AttackOutcome:
         How often it succeeded.
     chance
         How often guessing would have: the level's FMR, or the majority class.
-    judged
-        Whether the verdict counts it. An attack on what a service refuses in any case, or a
-        control, is reported and not judged; ``assumption`` says why.
+    unjudged
+        Why the verdict does not count it, as the end of a sentence that begins "not judged:";
+        None where it does. ``CONTROL`` for a control.
     details
         Further figures, JSON values. Never a number of a descriptor or a template.
     """
@@ -177,8 +178,18 @@ class AttackOutcome:
     level: str | None = None
     measured: Measured
     chance: float
-    judged: bool = True
+    unjudged: str | None = None
     details: Mapping[str, Json] = field(default_factory=dict)
+
+    @property
+    def judged(self) -> bool:
+        """Whether the verdict counts it."""
+        return self.unjudged is None
+
+    @property
+    def name(self) -> str:
+        """The attack, with its variant."""
+        return self.attack + (f" ({self.variant})" if self.variant else "")
 
     def to_json(self) -> dict[str, Json]:
         """Return a row of ``outcomes`` of the report."""
@@ -196,5 +207,6 @@ class AttackOutcome:
             "measured": rate,
             "chance": self.chance,
             "judged": self.judged,
+            "unjudged": self.unjudged,
             "details": dict(self.details),
         }

@@ -105,7 +105,7 @@ def recovery_outcome(
     assumption: str,
     variant: str = "",
     breaks: Property = Property.IRREVERSIBILITY,
-    judged: bool = True,
+    unjudged: str | None = None,
     people: Subjects | None = None,
     details: Mapping[str, Json] | None = None,
 ) -> AttackOutcome:
@@ -122,6 +122,6 @@ def recovery_outcome(
         level=system.level.name,
         measured=recovery.matched[system.level.name],
         chance=fmr_of(system.level),
-        judged=judged,
+        unjudged=unjudged,
         details={**recovery.details(), **(details or {})},
     )

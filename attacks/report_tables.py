@@ -246,8 +246,7 @@ def _outcomes(outcomes: Sequence[Row]) -> Iterable[str]:
     yield "## Attacks on templates"
     yield (
         "Success in % with its interval and counts, at the level named; D_sys is no share, and is "
-        "given as it is. Attacks that are not judged assume what no attacker has, or what the "
-        "service refuses beforehand."
+        "given as it is."
     )
     for scheme in dict.fromkeys(Scheme.of(row) for row in shown):
         yield f"### {plain(str(scheme))}: attacks"
@@ -271,7 +270,7 @@ def _outcomes(outcomes: Sequence[Row]) -> Iterable[str]:
                     _measured(row),
                     significant(row["chance"]),
                     fixed(row["details"].get("cosine_to_truth_mean"), 3),
-                    "yes" if row["judged"] else "no",
+                    "yes" if row["judged"] else f"no: {plain(row['unjudged'])}",
                 ]
                 for row in shown
                 if Scheme.of(row) == scheme

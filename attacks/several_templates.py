@@ -185,16 +185,15 @@ def _of_theft(
             assumption=f"{theft.assumption}: {count} templates of each person, of {photos}; "
             "success is a match of the guess with a photo of none of them"
             + (
-                ""
-                if enough
-                else f" (not judged: fewer than {JUDGED_PEOPLE} people have the photos)"
-            )
-            + (
                 " (what two tenants, or two names, have of who keeps a key)"
                 if photos == TWO_SECRETS
                 else ""
             ),
-            judged=enough and count > 1,
+            unjudged=f"fewer than {JUDGED_PEOPLE} people have the photos"
+            if not enough
+            else None
+            if count > 1
+            else "one template is judged by the attacks on one",
             people=None if people is system.victims else people,
             details={"templates": count, "people": len(people)},
         )

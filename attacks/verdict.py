@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
-from attacks.outcomes import AttackOutcome, Knowledge, Leaked, Property, Scheme
+from attacks.outcomes import CONTROL, AttackOutcome, Knowledge, Leaked, Property, Scheme
 from templates.contract.canonical import Json
 
 
@@ -202,10 +202,14 @@ class Cell:
 
 @dataclass(frozen=True)
 class Verdict:
-    """The cells of one scheme, in the order of properties, thefts and knowledge."""
+    """The cells of one scheme, in the order of properties, thefts and knowledge.
+
+    ``unjudged`` are the outcomes that the verdict does not count.
+    """
 
     scheme: Scheme
     cells: tuple[Cell, ...]
+    unjudged: tuple[AttackOutcome, ...] = ()
 
     @property
     def failed(self) -> tuple[Cell, ...]:
@@ -223,6 +227,10 @@ class Verdict:
             **self.scheme.to_json(),
             "passed": self.passed,
             "cells": [cell.to_json() for cell in self.cells],
+            "not_judged": [
+                {"attack": each.attack, "variant": each.variant, "reason": each.unjudged}
+                for each in self.unjudged
+            ],
         }
 
 
@@ -234,7 +242,7 @@ def judge(
     Parameters
     ----------
     outcomes
-        Of any number of schemes; those that are not ``judged`` are passed over.
+        Of any number of schemes; those that are not ``judged`` fill no cell.
     limits
         By name; the defaults of :data:`LIMITS` where absent.
 
@@ -245,8 +253,10 @@ def judge(
     """
     most = {limit.name: limit.default for limit in LIMITS} | dict(limits or {})
     by_scheme: dict[Scheme, dict[tuple[Property, Leaked, Knowledge, str], Cell]] = {}
+    unjudged: dict[Scheme, list[AttackOutcome]] = {}
     for outcome in outcomes:
         if not outcome.judged:
+            unjudged.setdefault(outcome.scheme, []).append(outcome)
             continue
         cell = cell_of(outcome, most)
         cells = by_scheme.setdefault(outcome.scheme, {})
@@ -269,6 +279,7 @@ def judge(
                     ),
                 )
             ),
+            tuple(unjudged.get(scheme, ())),
         )
         for scheme, cells in by_scheme.items()
     ]
@@ -312,7 +323,7 @@ def _distance(chance: float, value: float, low: float, high: float) -> tuple[flo
 
 
 def headlines(verdicts: Sequence[Verdict]) -> list[str]:
-    """Say first what fails, then what succeeds without a limit, then what is not resolved."""
+    """Say what fails, what is not judged, what succeeds without a limit, what is not resolved."""
     lines: list[str] = []
     for verdict in verdicts:
         for status in (Status.FAIL, Status.UNLIMITED, Status.UNRESOLVED):
@@ -320,9 +331,26 @@ def headlines(verdicts: Sequence[Verdict]) -> list[str]:
             if status is Status.UNLIMITED:
                 chosen = [cell for cell in chosen if cell.excess > 0.1]
             lines += [f"{verdict.scheme}: {_sentence(cell)}" for cell in chosen]
+            if status is Status.FAIL:
+                lines += [f"{verdict.scheme}: {line}" for line in _not_judged(verdict)]
         if all(cell.status in (Status.PASS, Status.UNLIMITED) for cell in verdict.cells):
             lines.append(f"{verdict.scheme}: no attack that was made exceeds its limit.")
     return lines
+
+
+def _not_judged(verdict: Verdict) -> list[str]:
+    """Name the rows that are not judged, a line for each reason; of controls the attacks only."""
+    rows: dict[str, list[str]] = {}
+    for outcome in verdict.unjudged:
+        measured = outcome.measured
+        reached = f": {measured.value:.3g} [{measured.ci_low:.3g}, {measured.ci_high:.3g}]"
+        control = outcome.unjudged == CONTROL
+        row = outcome.attack if control else outcome.name + reached
+        rows.setdefault(str(outcome.unjudged), []).append(row)
+    return [
+        f"not judged ({reason}): {'; '.join(dict.fromkeys(rows[reason]))}."
+        for reason in sorted(rows, key=lambda reason: reason == CONTROL)
+    ]
 
 
 _SAID = {
@@ -334,11 +362,11 @@ _SAID = {
 
 def _sentence(cell: Cell) -> str:
     outcome = cell.outcome
-    name = outcome.attack + (f" ({outcome.variant})" if outcome.variant else "")
     bound = "" if cell.status is Status.UNLIMITED else f", limit {cell.most:.3g}"
     why = "By design" if cell.status is Status.UNLIMITED else "It cannot hold"
     reason = "" if cell.reason is None else f" {why}: {cell.reason}."
     return (
-        f"{outcome.breaks} {_SAID[cell.status]}: {name}, leaked {outcome.leaked}, attacker with "
-        f"{outcome.knowledge}: {cell.excess:.3g} [{cell.low:.3g}, {cell.high:.3g}]{bound}.{reason}"
+        f"{outcome.breaks} {_SAID[cell.status]}: {outcome.name}, leaked {outcome.leaked}, "
+        f"attacker with {outcome.knowledge}: "
+        f"{cell.excess:.3g} [{cell.low:.3g}, {cell.high:.3g}]{bound}.{reason}"
     )

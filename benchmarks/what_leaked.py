@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attacks.chosen_enrollment import chosen_enrollment
-from attacks.databases import link_databases
+from attacks.databases import ACCOUNTS, link_databases
 from attacks.holder_keys import (
     Guess,
     guess_from_few_decoys,
@@ -29,7 +29,7 @@ from attacks.holder_keys import (
 from attacks.learned import invert
 from attacks.likelihood import likeliest_guess
 from attacks.linkage import foot_lengths, holder_rotations_of, link, linkage_outcome, turned
-from attacks.outcomes import AttackOutcome, Leaked
+from attacks.outcomes import CONTROL, AttackOutcome, Leaked
 from attacks.several_templates import enrolled, several_templates
 from attacks.stored.foot_point import foot_points
 from attacks.system import System
@@ -70,7 +70,7 @@ def lengths(system: System) -> list[AttackOutcome]:
                 variant=f"{name}, nearest for {measured.first_rank:.1%} of {count}",
                 leaked=Leaked.MASTER_KEY,
                 assumption="Two enrollments of the same photos under kept keys",
-                judged=False,
+                unjudged=CONTROL,
             )
         )
     return outcomes
@@ -97,7 +97,7 @@ def attacks_on(
         "lengths": lambda: lengths(system),
         "linkage": lambda: link(system, liftings=1, most_people=args.linked),
         "databases": lambda: link_databases(
-            system, accounts=(args.accounts,), most_people=args.linked
+            system, accounts=tuple(args.accounts), most_people=args.linked
         ),
         "chosen": lambda: chosen_enrollment(system),
     }
@@ -114,7 +114,9 @@ def main() -> None:
     parser.add_argument("--dim", type=int, default=160)
     parser.add_argument("--level", default="fmr-1e-3", help="that a match is judged at")
     parser.add_argument("--calibrating", type=int, default=1200, help="photos to calibrate on")
-    parser.add_argument("--accounts", type=int, default=100, help="in both databases")
+    parser.add_argument(
+        "--accounts", type=int, nargs="+", default=list(ACCOUNTS), help="in both databases"
+    )
     parser.add_argument(
         "--attacks",
         nargs="+",

@@ -127,20 +127,20 @@ def conclude(
     as_json: bool,
     evaluation: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write the report, say how it ended, and leave with status 1 where a limit is exceeded."""
+    """Write the report, say first how it ended; leave with status 1 where a limit is exceeded."""
     notice = demo_notice(pack.info.embedder_sha256, n=pack.info.n)
     files = write_report(report, out, evaluation=evaluation)
     if as_json:
         emit({**notice, "out": str(out), "files": [path.name for path in files], **report})
     else:
-        show(*verdict_tables(report))
+        say("PASSED" if report["passed"] else "FAILED: a limit is exceeded.")
         for sentence in report["headlines"]:
             say(sentence)
         for sentence in report["comparison_headlines"]:
             say(f"For comparison: {sentence}")
+        show(*verdict_tables(report))
         say(f"{out}: {', '.join(path.name for path in files)}.")
         say(f"To read it: {out / 'report.html'}")
-        say("PASSED" if report["passed"] else "FAILED: a limit is exceeded.")
     if not report["passed"]:
         raise typer.Exit(FAILED)
 

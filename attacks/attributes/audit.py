@@ -199,7 +199,7 @@ def attribute_outcomes(rows: Sequence[AttributeRow], *, audited: Scheme) -> list
             scheme=scheme,
             measured=row.measures.accuracy,
             chance=row.chance_of_predictions,
-            judged=scheme == audited,
+            unjudged=None if scheme == audited else "the scheme is there to compare with",
             details={
                 "majority": row.chance,
                 "balanced_accuracy": row.measures.balanced_accuracy,

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from attacks.errors import AuditError
 from attacks.learned.decoder import SECONDS, SIZE, Images, resized, train_decoder
 from attacks.learned.extra import need
-from attacks.outcomes import RAW_SCHEME, AttackOutcome, Knowledge, Leaked, Property
+from attacks.outcomes import CONTROL, RAW_SCHEME, AttackOutcome, Knowledge, Leaked, Property
 from attacks.recovery import fmr_of
 from attacks.system import System
 from templates.contract.canonical import Json
@@ -157,7 +157,7 @@ def reconstruct(
                 level=system.level.name,
                 measured=rate(int(np.count_nonzero(hits)), count),
                 chance=fmr_of(system.level),
-                judged=not control,
+                unjudged=CONTROL if control else None,
                 details={
                     **scored.details(),
                     "epochs": decoder.epochs,

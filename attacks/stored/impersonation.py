@@ -62,7 +62,7 @@ def _pooled(system: System, pool: DecoyPool) -> AttackOutcome:
             f"The owner of a decoy comes with {same} to a template that holds their decoy; "
             "success is acceptance."
         ),
-        judged=True,
+        unjudged=None,
         details={"with_the_photo_of_the_pool": _rate(system, entries, lift.templates, pairs)},
     )
 
@@ -92,14 +92,11 @@ def _generated(system: System, faces: NDArray[np.float32]) -> AttackOutcome:
             "of the fit to every template that was lifted with it; success is acceptance, and "
             "chance is how often the other half is accepted there: "
             "the contract was calibrated with the scheme's own generator."
-            + (
-                ""
-                if enough
-                else f" Not judged: the attacker's generator was fitted to {half} faces for "
-                f"{generator.n} numbers, a service's to {FACES_PER_DIMENSION} or more for each."
-            )
         ),
-        judged=enough,
+        unjudged=None
+        if enough
+        else f"the attacker's generator was fitted to {half} faces for {generator.n} numbers, a "
+        f"service's to {FACES_PER_DIMENSION} or more for each",
         details={"strangers": control.to_json(), "fitted_to": half},
     )
 
@@ -113,7 +110,7 @@ def _outcome(
     variant: str,
     chance: float,
     assumption: str,
-    judged: bool,
+    unjudged: str | None,
     details: dict[str, Json],
 ) -> AttackOutcome:
     by_level: dict[str, Json] = {}
@@ -134,7 +131,7 @@ def _outcome(
         level=system.level.name,
         measured=_counted(accepted, pairs, len(photos), len(templates)),
         chance=chance,
-        judged=judged,
+        unjudged=unjudged,
         details={"people": len(np.unique(pairs[:, 0])), "by_level": by_level, **details},
     )
 

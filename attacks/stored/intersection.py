@@ -141,10 +141,10 @@ def same_descriptor(system: System, *, lifts: Sequence[int] = LIFTS) -> list[Att
                     assumption=(
                         f"The attacker has {count} templates of one embedding ({form}) and takes "
                         "the point where they meet; success is a match with a fresh photo of the "
-                        "victim. Not judged: the service draws the same decoys for the same "
-                        "photos, and clients may not."
+                        "victim."
                     ),
-                    judged=False,
+                    unjudged="the service draws the same decoys for the same photos; clients that "
+                    "lift may not",
                     details={
                         "lifts": count,
                         "templates_that_share_a_decoy": int(np.count_nonzero(~unique)),

@@ -183,11 +183,11 @@ def known_database_attack(system: System) -> list[AttackOutcome]:
                     "decoys, removes them and takes the likeliest face that is left; success is a "
                     "match with a fresh photo of the victim."
                     if not noise
-                    else "The decoys were perturbed before lifting, which Veilface does not do "
-                    "(not judged); the attacker holds the unperturbed pool and takes the nearest "
+                    else "The decoys were perturbed before lifting, which Veilface does not do"
+                    "; the attacker holds the unperturbed pool and takes the nearest "
                     "entries."
                 ),
-                judged=not noise,
+                unjudged="Veilface does not perturb decoys" if noise else None,
                 details={
                     **_search_details(matches, lift, database),
                     **_remainder_details(system, lift, database, matches),
@@ -220,10 +220,9 @@ def attack_with_draws(
         assumption=(
             f"The attacker has the decoy generator, as all clients do, draws {len(drawn):,} "
             "decoys, and takes those at distance 0 for the template's, and makes no guess where "
-            "there is none; success is a match with a fresh photo of the victim. Not judged: no "
-            "draw comes twice, so it fails by construction."
+            "there is none; success is a match with a fresh photo of the victim."
         ),
-        judged=False,
+        unjudged="no draw comes twice, so it fails by construction",
         details={"drawn": len(drawn), **_search_details(matches, lift, drawn)},
     )
 
@@ -243,11 +242,10 @@ def _told(system: System, lift: RecordedLift) -> AttackOutcome:
         knowledge=Knowledge.DECOYS,
         assumption=(
             "The attacker is told the decoys of every template, removes them and takes the "
-            "likeliest face that is left; success is a match with a fresh photo of the victim. "
-            "Not judged: generated decoys are kept nowhere, so nobody is such an attacker; it "
-            "bounds what any knowledge of decoys gives."
+            "likeliest face that is left; success is a match with a fresh photo of the victim, "
+            "which bounds what any knowledge of decoys gives."
         ),
-        judged=False,
+        unjudged="generated decoys are kept nowhere, so nobody is such an attacker",
         details={"decoys": k},
     )
 

@@ -99,13 +99,12 @@ def _identify(system: System, others: NDArray[np.float32]) -> AttackOutcome:
         knowledge=Knowledge.ALGORITHM,
         assumption=(
             "The attacker has the template without its rotation and a gallery with another photo "
-            "of the victim; success is the victim at rank 1. Not judged: whoever can match a "
-            "template against photos can do this, in any system."
+            "of the victim; success is the victim at rank 1."
         ),
         scheme=system.scheme,
         measured=rate(identified(Metric.SPHERICAL, skip), len(truth)),
         chance=1 / len(gallery),
-        judged=False,
+        unjudged="whoever can match a template against photos can do this, in any system",
         details=details,
     )
 

@@ -69,7 +69,7 @@ def oracle_attack(
                 knowledge=Knowledge.ALGORITHM,
                 assumption=(
                     f"An oracle, which no attacker has, names the best of the {counts[-1]} "
-                    "gallery faces nearest to the template (not judged); success is a match of "
+                    "gallery faces nearest to the template; success is a match of "
                     + (
                         "the template's unit-length point nearest to it"
                         if projected
@@ -81,7 +81,7 @@ def oracle_attack(
                 level=system.level.name,
                 measured=recovery.matched[system.level.name],
                 chance=fmr_of(system.level),
-                judged=False,
+                unjudged="no attacker has an oracle",
                 details={**recovery.details(), "curve": curve},
             )
         )

@@ -2,7 +2,16 @@ import math
 
 import pytest
 
-from attacks.outcomes import AttackOutcome, Estimate, Knowledge, Leaked, Measured, Property, Scheme
+from attacks.outcomes import (
+    CONTROL,
+    AttackOutcome,
+    Estimate,
+    Knowledge,
+    Leaked,
+    Measured,
+    Property,
+    Scheme,
+)
 from attacks.verdict import LIMITS, Cell, Status, headlines, judge
 from verify.metrics import rate, wilson
 
@@ -17,7 +26,7 @@ def outcome(
     knowledge: Knowledge = Knowledge.ALGORITHM,
     chance: float = 0.001,
     attack: str = "some attack",
-    judged: bool = True,
+    unjudged: str | None = None,
     scheme: Scheme = SCHEME,
     lockout: int | None = None,
 ) -> AttackOutcome:
@@ -30,7 +39,7 @@ def outcome(
         scheme=scheme,
         measured=measured,
         chance=chance,
-        judged=judged,
+        unjudged=unjudged,
         details={} if lockout is None else {"lockout": lockout},
     )
 
@@ -57,7 +66,9 @@ def test_a_recovery_is_compared_with_its_limit(hits: int, trials: int, status: S
 def test_the_strongest_attack_fills_the_cell_and_unjudged_ones_do_not() -> None:
     weak = outcome(Property.IRREVERSIBILITY, rate(1, 100), attack="weak")
     strong = outcome(Property.IRREVERSIBILITY, rate(5, 100), attack="strong")
-    oracle = outcome(Property.IRREVERSIBILITY, rate(99, 100), attack="oracle", judged=False)
+    oracle = outcome(
+        Property.IRREVERSIBILITY, rate(99, 100), attack="oracle", unjudged="nobody has it"
+    )
     assert only_cell(weak, strong, oracle).outcome.attack == "strong"
     assert only_cell(oracle, strong, weak).outcome.attack == "strong"
 
@@ -236,6 +247,29 @@ def test_what_fails_is_said_first() -> None:
     assert headlines(judge([outcome(Property.IRREVERSIBILITY, rate(0, 1000))])) == [
         "adversarial, m = 16, generated decoys: no attack that was made exceeds its limit."
     ]
+
+
+def test_what_is_not_judged_is_named_with_its_reason_right_after_what_fails() -> None:
+    rows = [
+        outcome(Property.IRREVERSIBILITY, rate(50, 100), attack="recovers"),
+        outcome(Property.IMPERSONATION, rate(100, 100), attack="key"),
+        outcome(Property.IRREVERSIBILITY, rate(60, 100), attack="estimate", unjudged="drawn"),
+        *(
+            outcome(Property.IRREVERSIBILITY, rate(9, 100), attack="few decoys", unjudged=CONTROL)
+            for _ in range(2)
+        ),
+        outcome(Property.IRREVERSIBILITY, rate(1, 100), attack="oracle", unjudged="nobody has it"),
+    ]
+    (verdict,) = judge(rows)
+    fails, drawn, nobody, controls, broken = headlines([verdict])
+    assert "irreversibility fails: recovers" in fails
+    assert drawn.endswith("generated decoys: not judged (drawn): estimate: 0.6 [0.502, 0.691].")
+    assert "not judged (nobody has it): oracle: 0.01" in nobody
+    assert controls.endswith("not judged (a control): few decoys.")
+    assert "is broken" in broken
+    assert [row["reason"] for row in verdict.to_json()["not_judged"]] == [
+        "drawn", CONTROL, CONTROL, "nobody has it",
+    ]  # fmt: skip
 
 
 def test_every_limit_is_a_share_and_named_once() -> None:
