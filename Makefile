@@ -10,7 +10,7 @@ PYTEST = OMP_NUM_THREADS=1 $(VENV)/pytest --numprocesses=logical --maxprocesses=
 # Bytecode is kept: without it, every process that a test starts compiles all that it imports.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo install extras docs test test-all lint types javascript javascript-package audit sbom wheels image lock clean
+.PHONY: demo install extras docs test test-all lint types javascript javascript-package audit sbom wheels image release workflows lock clean
 
 demo: .venv/core
 	$(VENV)/veilface demo
@@ -53,18 +53,18 @@ javascript-package: javascript
 		&& test -f node_modules/veilface-client/dist/element/login.d.ts
 	rm -rf dist/npm/alone
 
-# What the release depends on: known vulnerabilities, and a bill of materials (CycloneDX). Without
+# What the image depends on, and the wheel's core with it: known vulnerabilities, and a bill of materials (CycloneDX). Without
 # an advisory service nothing is audited, which fails with status 3 of the script, and is said.
 audit: | $(UV)
 	mkdir -p dist
 	rm -f dist/audit.json
-	-$(UV) tool run --quiet --from pip-audit==2.10.1 pip-audit --requirement requirements.lock \
+	-$(UV) tool run --quiet --from pip-audit==2.10.1 pip-audit --requirement deploy/requirements.lock \
 		--disable-pip --progress-spinner off --format json --output dist/audit.json >/dev/null 2>&1
 	$(PYTHON) .ci/audit_report.py dist/audit.json
 
 sbom: | $(UV)
 	mkdir -p dist
-	$(UV) tool run --quiet --from cyclonedx-bom==7.5.0 cyclonedx-py requirements requirements.lock \
+	$(UV) tool run --quiet --from cyclonedx-bom==7.5.0 cyclonedx-py requirements deploy/requirements.lock \
 		--output-reproducible --output-file dist/sbom.json
 
 # The site of docs/, in dist/docs; a link that leads nowhere fails.
@@ -84,6 +84,22 @@ wheels: | $(UV)
 # The container's image, without a registry; as root.
 image:
 	.ci/image
+
+# What is published of the version in pyproject.toml, in dist/release; refused before anything is built.
+release:
+	rm -rf dist/release && mkdir -p dist
+	$(PYTHON) .ci/release_notes.py > dist/NOTES.md
+	$(MAKE) wheels javascript-package sbom
+	mkdir dist/release
+	cp dist/NOTES.md dist/wheels/*.whl dist/npm/*.tgz dist/sbom.json dist/release
+	if [ "$$(id -u)" = 0 ] && command -v podman >/dev/null; then \
+		.ci/image "dist/release/$$(basename dist/wheels/veilface-*.whl -py3-none-any.whl)-image.tar.gz"; \
+	else echo "no image is in this release: it needs podman, and to be root"; fi
+	cd dist/release && sha256sum * > SHA256SUMS
+
+# The workflows of a forge, without asking it.
+workflows: | $(UV)
+	$(UV) tool run --quiet --from zizmor==1.32.0 zizmor --quiet --offline --persona=pedantic .github/workflows
 
 .venv/core: requirements.lock pyproject.toml | $(UV)
 	test -x $(VENV)/python || $(UV) venv --quiet --python '>=3.11' .venv
