@@ -17,11 +17,15 @@ async function show(photo) {
   body.append("images", photo);
   // The same key for each sending: an attempt whose answer is lost is not lost with it.
   const headers = { Authorization: `Bearer ${token}`, "Idempotency-Key": crypto.randomUUID() };
-  const send = () => fetch(url, { method, body, headers });
-  const { error } = await send().catch(send).then((answer) => answer.json());
-  // An earlier sending may have arrived, and only its answer be lost: the server asks what came of it.
-  const arrived = ["replayed", "idempotency_conflict"].includes(error?.code);
-  if (error && !arrived) throw new Error(error.message);
+  const send = () => fetch(url, { method, body, headers }).then((answer) => answer.json());
+  let told = await send().catch(send);
+  // An earlier sending is still at work: before it is done, nobody knows what comes of it.
+  while (told.error?.code === "idempotency_conflict") {
+    await new Promise((resolve) => setTimeout(resolve, 1000));
+    told = await send().catch(send);
+  }
+  // Of one whose answer was lost the token is used up: the server asks what came of it.
+  if (told.error && told.error.code !== "replayed") throw new Error(told.error.message);
 }
 
 form.addEventListener("submit", async (event) => {

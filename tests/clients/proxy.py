@@ -23,6 +23,7 @@ class Proxy:
         self.url = f"http://127.0.0.1:{self._listener.getsockname()[1]}"
         self.lose = 0
         self._connections: list[bytearray] = []
+        self._sockets: list[socket.socket] = []
         self._threads = [threading.Thread(target=self._accept, daemon=True)]
         self._ups: list[threading.Thread] = []
 
@@ -61,6 +62,8 @@ class Proxy:
         with contextlib.suppress(OSError):
             self._listener.shutdown(socket.SHUT_RDWR)
         self._listener.close()
+        # A browser keeps connections open that it has no use for yet.
+        _close(*self._sockets)
         for thread in self._threads:
             thread.join(timeout=10)
 
@@ -73,6 +76,7 @@ class Proxy:
             kept = bytearray()
             self._connections.append(kept)
             service = socket.create_connection(("127.0.0.1", self._target))
+            self._sockets += (client, service)
             up = threading.Thread(target=self._up, args=(client, service, kept), daemon=True)
             down = threading.Thread(target=self._down, args=(service, client), daemon=True)
             for pump in (up, down):

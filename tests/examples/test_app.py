@@ -213,3 +213,43 @@ def test_a_browser_shows_a_photo_to_the_service_alone(
     assert max(len(body) for _, body in own) < 100
     assert not any(service.token.encode() in body for _, _, body in sent)
     context.close()
+
+
+@pytest.mark.long
+def test_the_page_waits_for_a_sending_that_is_still_at_work(
+    app: str, service: Service, browser: Any
+) -> None:
+    """The first sending is lost on its way, the second is told that an earlier one still runs."""
+    context = browser.new_context()
+    page = context.new_page()
+    asked: list[str] = []
+    page.on("request", lambda seen: asked.append(seen.url.split("/")[-1]))
+    sendings = []
+
+    def at_work(route: Any) -> None:
+        sendings.append(route.request.headers["idempotency-key"])
+        if len(sendings) == 1:
+            route.abort()
+        elif len(sendings) == 2:
+            route.fulfill(
+                status=409,
+                headers={"Access-Control-Allow-Origin": app.rstrip("/")},
+                json={"error": {"code": "idempotency_conflict", "message": "", "details": {}}},
+            )
+        else:
+            route.continue_()
+
+    page.route("**/enrollment", at_work)
+    page.goto(app)
+    page.get_by_label("Name").fill("ida")
+    page.get_by_label("Password").fill(PASSWORD)
+    file = {"name": "me.png", "mimeType": "image/png", "buffer": service.photo(1, 0)}
+    page.get_by_label("Photo").set_input_files(file)
+    page.get_by_role("button", name="Register").click()
+    page.locator("output").get_by_text("ida").wait_for(timeout=600_000)
+    assert page.locator("output").text_content() == "Welcome, ida"
+    assert len(sendings) == 3
+    assert len(set(sendings)) == 1, "one attempt"
+    assert [name for name in asked if name in ("enrollment", "face")][-2:] == ["enrollment", "face"]
+    assert asked.count("face") == 1
+    context.close()

@@ -1,8 +1,10 @@
 """An application's own server: its page, the JavaScript client, and the service behind ``/v1/``."""
 
+import functools
+import gzip
 import json
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -11,7 +13,7 @@ from typing import Any
 
 import httpx
 
-from models.pack import ModelPack
+from tests.clients.proxy import Proxy
 from tests.patience import PATIENCE_S
 
 PACKAGE = Path(__file__).resolve().parents[2] / "clients" / "javascript"
@@ -25,50 +27,49 @@ POLICY = (
     "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; connect-src 'self'; img-src data:; "
     "frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
 )
+KEPT = {"Cache-Control": "private, max-age=31536000, immutable"}
 PAGE = """<!doctype html><html lang="en"><title>Log in</title>
 <link rel="icon" href="data:,">
 <input type="file" multiple><output></output><veilface-login></veilface-login>
 <script type="module" src="/page.js"></script></html>"""
+# Of a connection, and not of what goes over it.
+_HOP = frozenset({"connection", "content-encoding", "content-length", "date", "server"})
+
+Authorize = Callable[[Mapping[str, str]], dict[str, str]]
 
 
 @dataclass
 class Application:
-    """Where it is, the program of its page, and what browsers sent to the service through it."""
+    """Where it is, the program of its page, and every byte that browsers sent to it."""
 
     url: str
+    recording: Proxy
     program: str = ""
     photos: dict[str, bytes] = field(default_factory=dict)
-    sent: list[bytes] = field(default_factory=list)
 
 
 @contextmanager
-def application(
-    service: str, folder: Path, pack: ModelPack, authorize: Callable[[], dict[str, str]]
-) -> Iterator[Application]:
-    """Serve a page that logs in by the service at this URL; the graphs are hosted here.
+def application(service: str, authorize: Authorize) -> Iterator[Application]:
+    """Serve a page that logs in by the service at this URL, which gives it the graphs too.
 
-    The list of graphs is as ``GET /v1/pack`` has it.
+    ``authorize`` makes the answer of ``POST /login/token`` of its body, a JSON object or nothing.
     """
-    assert pack.info.detector is not None
-    graphs = {
-        pack.info.detector.sha256: ("detector", folder / pack.info.detector.file),
-        pack.info.embedder_sha256: ("embedder", folder / pack.info.embedder_file),
-    }
 
     class Handler(BaseHTTPRequestHandler):
         def log_message(self, *_: Any) -> None:
             pass
 
-        def answer(self, data: bytes, kind: str, status: int = 200) -> None:
+        def answer(
+            self, data: bytes, kind: str, status: int = 200, headers: Mapping[str, str] = {}
+        ) -> None:
             self.send_response(status)
             self.send_header("Content-Type", kind)
             self.send_header("Content-Length", str(len(data)))
             self.send_header("Content-Security-Policy", POLICY)
+            for name, value in headers.items():
+                self.send_header(name, value)
             self.end_headers()
             self.wfile.write(data)
-
-        def json(self, value: object) -> None:
-            self.answer(json.dumps(value).encode(), "application/json")
 
         def do_GET(self) -> None:
             path = Path(self.path)
@@ -80,45 +81,60 @@ def application(
                 root = PACKAGE / "dist"
                 if self.path.startswith("/ort/"):
                     root = PACKAGE / "node_modules" / "onnxruntime-web" / "dist"
-                self.answer((root / Path(*path.parts[2:])).read_bytes(), TYPES[path.suffix])
+                headers = {**KEPT, "Content-Encoding": "gzip"}
+                self.answer(
+                    _compressed(root / Path(*path.parts[2:])), TYPES[path.suffix], headers=headers
+                )
             elif self.path.startswith("/photos/"):
                 self.answer(served.photos[path.name], "image/jpeg")
-            elif self.path == "/v1/pack":
-                files = [{"role": role, "sha256": name} for name, (role, _) in graphs.items()]
-                self.json({"name": "test", "licence": None, "files": files, "request_id": "-"})
-            elif self.path.startswith("/v1/pack/"):
-                self.answer(graphs[path.name][1].read_bytes(), "application/octet-stream")
             else:
                 self.passed_on()
 
         def do_POST(self) -> None:
             if self.path == "/login/token":
-                self.json(authorize())
+                told = authorize(json.loads(self.body() or b"{}"))
+                self.answer(json.dumps(told).encode(), "application/json")
             else:
                 self.passed_on()
 
         do_PUT = do_POST
 
+        def body(self) -> bytes:
+            return self.rfile.read(int(self.headers.get("Content-Length", 0)))
+
         def passed_on(self) -> None:
-            body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
-            served.sent.append(body)
-            names = ("Authorization", "Content-Type", "Idempotency-Key")
+            names = ("Authorization", "Content-Type", "Idempotency-Key", "If-None-Match")
             headers = {name: self.headers[name] for name in names if name in self.headers}
-            response = httpx.request(
-                self.command, service + self.path, content=body, headers=headers, timeout=PATIENCE_S
+            response = upstream.request(
+                self.command, self.path, content=self.body(), headers=headers
             )
-            self.answer(response.content, response.headers["Content-Type"], response.status_code)
+            told = {
+                name: value
+                for name, value in response.headers.items()
+                if name not in _HOP | {"content-type", "content-security-policy"}
+            }
+            kind = response.headers.get("Content-Type", "application/octet-stream")
+            self.answer(response.content, kind, response.status_code, told)
 
     server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    served = Application(f"http://127.0.0.1:{server.server_address[1]}")
     thread = threading.Thread(target=server.serve_forever, daemon=True)
     thread.start()
     try:
-        yield served
+        with (
+            httpx.Client(base_url=service, timeout=PATIENCE_S) as upstream,
+            Proxy(server.server_address[1]) as recording,
+        ):
+            served = Application(recording.url, recording)
+            yield served
     finally:
         server.shutdown()
         server.server_close()
         thread.join()
+
+
+@functools.cache
+def _compressed(file: Path) -> bytes:
+    return gzip.compress(file.read_bytes())
 
 
 def for_browsers(program: str) -> str:

@@ -1,6 +1,7 @@
 """The JavaScript client in Chromium: decoding, WebAssembly, the page of its README, the element."""
 
 import base64
+import contextlib
 import io
 from collections.abc import Iterator
 from dataclasses import replace
@@ -14,6 +15,17 @@ from playwright.sync_api import Browser, expect
 
 from api.process.opening import file_sealer, open_keyring
 from api.process.preparation import recorded_of
+from benchmarks.browser_client import (
+    DESCRIPTOR_FORMS,
+    PHOTO_FORMS,
+    browser_outcome,
+    faces_of,
+    page_of,
+    planted_and_missed,
+    requests_in,
+)
+from benchmarks.browser_client import visit as open_page
+from benchmarks.end_to_end import Person
 from models.pack import FacePolicy, ModelPack
 from tests.api.deployment import deploy
 from tests.clients.conftest import Running, started
@@ -24,21 +36,19 @@ from tests.web.browser_tab import BrowserTab
 from tests.web.camera import FakeCamera
 from tests.web.client_page import Application, application, for_browsers
 from tests.web.conftest import OTHER, WHO
-from veilface_client import Client
+from veilface_client import Client, NotEnrolled
 
 pytestmark = pytest.mark.long
 
+LEVEL = "fmr-1e-3"
 EMBEDDING = """
 import * as ort from "onnxruntime-web";
-import { decodeImage, ModelPack } from "veilface-client";
+import { Client, decodeImage, ModelPack } from "veilface-client";
 
-window.embedded = async (names, contract, graphs) => {
-  const bytes = async (path) => new Uint8Array(await (await fetch(path)).arrayBuffer());
-  const { detector, embedder } = graphs;
-  const pack = await ModelPack.load(ort, contract, {
-    detector: await bytes(detector),
-    embedder: await bytes(embedder),
-  });
+window.embedded = async (names) => {
+  const { token } = await (await fetch("/login/token", { method: "POST" })).json();
+  const client = new Client(location.origin, token);
+  const pack = await ModelPack.load(ort, await client.contract(), await client.pack());
   const samples = [];
   for (const name of names) {
     const image = await decodeImage(await (await fetch(`/photos/${name}`)).blob());
@@ -54,9 +64,9 @@ window.embedded = async (names, contract, graphs) => {
 def running(
     tmp_path_factory: pytest.TempPathFactory, mbf_pack_dir: Path, pack: ModelPack
 ) -> Iterator[Running]:
-    """A service with the real pack, whose thresholds are made up."""
+    """A service that serves the real pack, and whose thresholds are made up."""
     folder = tmp_path_factory.mktemp("javascript")
-    deployment = deploy(folder, pack=mbf_pack_dir)
+    deployment = deploy(folder, pack=mbf_pack_dir, serve_pack=True)
     deployment.allow_templates()
     settings = deployment.settings
     contract = replace(deployment.contract, recorded=recorded_of(pack))
@@ -71,15 +81,22 @@ def pack(mbf_pack_dir: Path) -> ModelPack:
 
 
 @pytest.fixture(scope="module")
-def page(running: Running, pack: ModelPack, mbf_pack_dir: Path) -> Iterator[Application]:
-    """The application; its tokens are the service's key, which no real one would give away."""
+def page(running: Running) -> Iterator[Application]:
+    """The application: anna is enrolled if she is not, and else verified."""
     require_client()
+    with Client(running.url, running.deployment.token) as client:
 
-    def authorize() -> dict[str, str]:
-        return {"subject": "anna", "token": running.deployment.token}
+        def authorize(_: object) -> dict[str, str]:
+            try:
+                client.describe("anna")
+            except NotEnrolled:
+                issued = client.create_token("anna", "enroll")
+            else:
+                issued = client.create_token("anna", "verify", level=LEVEL)
+            return {"subject": "anna", "token": issued.token}
 
-    with application(running.url, mbf_pack_dir, pack, authorize) as served:
-        yield served
+        with application(running.url, authorize) as served:
+            yield served
 
 
 @pytest.fixture
@@ -97,7 +114,7 @@ def tab(browser: Browser, page: Application) -> Iterator[BrowserTab]:
 
 def visit(tab: BrowserTab, page: Application, program: str) -> None:
     page.program = for_browsers(program.replace(EXAMPLE, page.url))
-    page.sent.clear()
+    page.recording.forget()
     tab.page.goto(tab.url)
 
 
@@ -115,23 +132,8 @@ def test_the_browser_sees_what_python_sees(
     page.photos = photos
     visit(tab, page, EMBEDDING)
     tab.page.wait_for_function("() => window.embedded !== undefined")
-    info = pack.info
-    assert info.detector is not None
-    contract = {
-        "binding": {
-            "embedder_sha256": info.embedder_sha256,
-            "preprocessing": info.preprocessing,
-            "n": info.n,
-        },
-        "recorded": recorded_of(pack),
-    }
-    graphs = {
-        "detector": f"/v1/pack/{info.detector.sha256}",
-        "embedder": f"/v1/pack/{info.embedder_sha256}",
-    }
     samples: list[dict[str, Any]] = tab.page.evaluate(
-        "([names, contract, graphs]) => window.embedded(names, contract, graphs)",
-        [list(photos), contract, graphs],
+        "(names) => window.embedded(names)", list(photos)
     )
     for data, sample in zip(photos.values(), samples, strict=True):
         taken = pack.crop_photo(data, policy=FacePolicy.LARGEST)
@@ -158,7 +160,7 @@ def test_the_page_of_the_documentation(
     expect(tab.page.locator("body > output")).to_have_text("welcome")
     tab.page.set_input_files("input", other)
     expect(tab.page.locator("body > output")).to_have_text("try again")
-    sent = b"\n".join(page.sent)
+    sent = page.recording.sent
     assert sent.count(b'"hmac"') == 2
     data = own.read_bytes()
     embedding = pack.embed_photo(data, policy=FacePolicy.LARGEST).embedding
@@ -179,6 +181,8 @@ def test_the_element(
     said: list[str] = []
     tab.page.on("console", lambda message: said.append(message.text))
     camera.shows(people[WHO][0])
+    with Client(running.url, running.deployment.token) as client, contextlib.suppress(NotEnrolled):
+        client.erase("anna")
     visit(tab, page, FOR_PAGES[1])
     tab.page.evaluate("document.querySelector('veilface-login').setAttribute('action', 'enroll')")
     tab.page.get_by_role("button", name="Start camera").click()
@@ -195,3 +199,38 @@ def test_the_element(
     tab.page.get_by_role("button", name="Log in").click()
     expect(tab.page.locator("veilface-login output")).to_contain_text("No face was found")
     assert said == ["undefined", "true", "false", "no_face"], "an enrollment is no decision"
+
+
+def test_people_enrolled_and_verified_by_tokens_leave_no_face(
+    browser: Browser, running: Running, pack: ModelPack, people: dict[str, list[Path]]
+) -> None:
+    """The measurement of ``benchmarks/browser_client.py``, of two people."""
+    require_client()
+    pair = [Person(name, photos[:3], photos[3:4]) for name, photos in people.items()]
+    search = faces_of(pack, pair)
+    context = browser.new_context()
+    try:
+        with page_of(running.url, running.deployment.token, level=LEVEL) as served:
+            opened = open_page(context, served)
+            assert opened.call("prepare")["bytes"] > 0
+            counts, seconds = browser_outcome(opened, pair, impostors=1)
+            sent = served.recording.sent
+            assert (counts.genuine_rejected, counts.genuine) == (0, 2)
+            assert (counts.impostor_accepted, counts.impostor) == (0, 2)
+            assert (counts.refused_enrollments, dict(counts.other_answers)) == ({}, {})
+            assert len(seconds) == 2
+            assert search.find(sent) == []
+            calls = requests_in(sent)
+            assert calls["PUT /v1/subjects/*/enrollment"]["members"] == ["template"]
+            verified = calls["POST /v1/subjects/*/verify"]
+            assert verified["times"] == 4
+            assert verified["members"] == ["hmac", "nonce", "template", "timestamp"]
+            assert {call for call in calls if not call.startswith("GET ")} == {
+                "PUT /v1/subjects/*/enrollment",
+                "POST /v1/subjects/*/verify",
+                "POST /login/token",
+            }
+            assert len(PHOTO_FORMS) + len(DESCRIPTOR_FORMS) == 9
+            assert planted_and_missed(opened, pair[0].probes[0], search) == []
+    finally:
+        context.close()
