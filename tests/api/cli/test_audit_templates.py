@@ -152,7 +152,7 @@ def is_as_documented(report: Any) -> None:
     values = {*map(str, Property), *map(str, Knowledge), *map(str, Status)}
     cell_names = named_in("A cell of a verdict is") - values
     for verdict in report["verdicts"]:
-        assert verdict.keys() == scheme | {"passed", "comparison", "cells"}
+        assert verdict.keys() == scheme | {"passed", "comparison", "cells", "not_judged"}
         for cell in verdict["cells"]:
             assert cell.keys() >= cell_names
             assert cell["status"] in set(map(str, Status))
