@@ -251,7 +251,8 @@ def test_the_verdict_is_a_table_on_the_terminal(faces: FaceAudit) -> None:
         *("--out", faces.root / "table"),
     )
     lines = ran.stdout.splitlines()
-    assert "Verdict on adversarial, m = 4, generated decoys" in lines[0]
+    assert lines[0] == "FAILED: a limit is exceeded."
+    assert any("Verdict on adversarial, m = 4, generated decoys" in line for line in lines)
     (verdict,) = json.loads((faces.root / "table" / "report.json").read_text())["verdicts"]
     (cell,) = verdict["cells"]
     (row,) = [line for line in lines if "confidentiality" in line and "│" in line]
