@@ -6,15 +6,22 @@ from typing import Any
 
 import httpx
 import pytest
+from playwright.sync_api import Browser
 
 from tests.examples.conftest import EXAMPLES, PYTHON, Service, clean_environment, node, running
 from tests.ports import free_port
-from tests.web.conftest import browser, camera, chromium
+from tests.web.conftest import chromium, running_browser
 from veilface_client import Client
 
-__all__ = ["browser", "camera", "chromium"]
+__all__ = ["chromium"]
 
 PASSWORD = "correct horse"
+
+
+@pytest.fixture(scope="module")
+def browser(chromium: Path) -> Iterator[Browser]:
+    with running_browser(chromium) as opened:
+        yield opened
 
 
 @pytest.fixture(params=["app.py", "app.mjs"], scope="module")

@@ -7,6 +7,7 @@ event loop in its thread, and other tests want one of their own.
 import os
 import shutil
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -42,16 +43,23 @@ def camera(tmp_path_factory: pytest.TempPathFactory) -> FakeCamera:
     return FakeCamera(tmp_path_factory.mktemp("camera") / "camera.mjpeg")
 
 
-@pytest.fixture(scope="package")
-def browser(chromium: Path, camera: FakeCamera) -> Iterator[Browser]:
+@contextmanager
+def running_browser(chromium: Path, *flags: str) -> Iterator[Browser]:
+    """Run a browser. Playwright runs no second one in the same process."""
     expect.set_options(timeout=1000 * PATIENCE_S)
     with sync_playwright() as playwright:
         # Chromium refuses to be root inside its own sandbox; the page it visits is ours.
         running = playwright.chromium.launch(
-            executable_path=chromium, args=["--no-sandbox", *camera.flags]
+            executable_path=chromium, args=["--no-sandbox", *flags]
         )
         yield running
         running.close()
+
+
+@pytest.fixture(scope="package")
+def browser(chromium: Path, camera: FakeCamera) -> Iterator[Browser]:
+    with running_browser(chromium, *camera.flags) as running:
+        yield running
 
 
 @pytest.fixture

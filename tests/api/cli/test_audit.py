@@ -210,7 +210,7 @@ def test_the_seed_gives_the_rows_and_a_kept_limit_is_status_0(
     (faces.root / "again" / "frontier.png").write_bytes(b"of an earlier run")
     again = run(*faces.asked, *more)
     assert (again.status, again.stderr.count("error")) == (0, 0)
-    assert again.stdout.strip().endswith("PASSED")
+    assert again.stdout.splitlines()[0] == "PASSED"
     assert "no attack that was made exceeds its limit" in again.stdout
     report = json.loads((faces.root / "again" / "report.json").read_text())
     assert untimed(report["rows"]) == untimed(face_report["rows"])
