@@ -40,8 +40,8 @@ ALIGNMENTS, FEW_ALIGNMENTS = 30, 6
 """Most steps of the estimate; the fewer with twice the accounts that fix a common rotation, with
 which two settle it. What is no common rotation never settles."""
 _ENOUGH_PAIRS, _MOST_PAIRS = 2, 64
-"""Pairs for each dimension, where longer products of projections are left out, and where all others
-are: the refinement, which takes every account, is the exacter anyhow."""
+"""Pairs for each dimension, from which on longer products of projections are left out, and from
+which on every other pair is: the refinement, which takes every account, is more exact anyhow."""
 _LEAST = 1e-3
 """Of a unit vector, how much a projection must leave, and take, to count."""
 _SPANNED = 0.02

@@ -266,7 +266,7 @@ def link_databases(
         tenants, lifted = _enrolled(system, dim, some, strangers, most_people)
         beside = {"strangers": strangers, "m": dim}
         controls: dict[tuple[int, str], Unlinkability] = {}
-        for setting in reversed(_settings(system, tenants, some)):
+        for setting in _settings(system, tenants, some):
             for name, score in setting.scores(lifted).items():
                 measured = unlinkability(score[None], permutations=permutations, seed=system.seed)
                 control = controls.setdefault((setting.accounts, name), measured)
@@ -329,7 +329,7 @@ def _enrolled(
 
 
 def _settings(system: System, tenants: Sequence[_Tenant], numbers: Sequence[int]) -> list[_Setting]:
-    """What is stolen, with how many accounts; the last for a number of accounts is its control."""
+    """What is stolen, with how many accounts; the first for a number of accounts is its control."""
     most = max(numbers)
     rotated = [tenant.own_rotations(system) for tenant in tenants]
     held = [tenant.holders_rotations(system) for tenant in tenants]
@@ -338,9 +338,12 @@ def _settings(system: System, tenants: Sequence[_Tenant], numbers: Sequence[int]
         [_Side.of(tenant, turns, most) for tenant, turns in zip(tenants, side, strict=True)]
         for side in (rotated, held, alike)
     )
+    downwards = sorted(numbers, reverse=True)
     return [
-        *(_Setting(number, stolen, _TENANTS_KEYS) for number in numbers),
-        _Setting(most, kept, _HOLDERS_KEYS, "holders' keys kept, "),
+        *(
+            _Setting(number, control, _TENANTS_KEYS, "one rotation a tenant, ")
+            for number in downwards
+        ),
         _Setting(
             most,
             kept,
@@ -348,8 +351,6 @@ def _settings(system: System, tenants: Sequence[_Tenant], numbers: Sequence[int]
             "two halves of one tenant, holders' keys kept, ",
             one_tenant=True,
         ),
-        *(
-            _Setting(number, control, _TENANTS_KEYS, "one rotation a tenant, ")
-            for number in numbers
-        ),
+        _Setting(most, kept, _HOLDERS_KEYS, "holders' keys kept, "),
+        *(_Setting(number, stolen, _TENANTS_KEYS) for number in downwards),
     ]

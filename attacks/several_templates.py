@@ -173,7 +173,11 @@ def _of_theft(
     }
     if count > 1:
         guesses["nearest to all"] = nearest_common_points(seen)
-    enough = len(people) >= JUDGED_PEOPLE
+    unjudged = None
+    if len(people) < JUDGED_PEOPLE:
+        unjudged = f"fewer than {JUDGED_PEOPLE} people have the photos"
+    elif count == 1:
+        unjudged = "one template is judged by the attacks on one"
     return [
         recovery_outcome(
             system,
@@ -189,11 +193,7 @@ def _of_theft(
                 if photos == TWO_SECRETS
                 else ""
             ),
-            unjudged=f"fewer than {JUDGED_PEOPLE} people have the photos"
-            if not enough
-            else None
-            if count > 1
-            else "one template is judged by the attacks on one",
+            unjudged=unjudged,
             people=None if people is system.victims else people,
             details={"templates": count, "people": len(people)},
         )

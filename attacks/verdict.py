@@ -326,15 +326,19 @@ def headlines(verdicts: Sequence[Verdict]) -> list[str]:
     """Say what fails, what is not judged, what succeeds without a limit, what is not resolved."""
     lines: list[str] = []
     for verdict in verdicts:
-        for status in (Status.FAIL, Status.UNLIMITED, Status.UNRESOLVED):
-            chosen = [cell for cell in verdict.cells if cell.status is status]
-            if status is Status.UNLIMITED:
-                chosen = [cell for cell in chosen if cell.excess > 0.1]
-            lines += [f"{verdict.scheme}: {_sentence(cell)}" for cell in chosen]
-            if status is Status.FAIL:
-                lines += [f"{verdict.scheme}: {line}" for line in _not_judged(verdict)]
-        if all(cell.status in (Status.PASS, Status.UNLIMITED) for cell in verdict.cells):
-            lines.append(f"{verdict.scheme}: no attack that was made exceeds its limit.")
+        unresolved = [cell for cell in verdict.cells if cell.status is Status.UNRESOLVED]
+        broken = [
+            cell for cell in verdict.cells if cell.status is Status.UNLIMITED and cell.excess > 0.1
+        ]
+        sentences = [
+            *map(_sentence, verdict.failed),
+            *_not_judged(verdict),
+            *map(_sentence, broken),
+            *map(_sentence, unresolved),
+        ]
+        if not verdict.failed and not unresolved:
+            sentences.append("no attack that was made exceeds its limit.")
+        lines += [f"{verdict.scheme}: {sentence}" for sentence in sentences]
     return lines
 
 

@@ -18,7 +18,6 @@ Example
     python -m benchmarks.browser_client --data ../shared/data --work browser-client-run
 """
 
-import argparse
 import json
 import os
 import re
@@ -35,14 +34,18 @@ from playwright.sync_api import BrowserContext, Page, sync_playwright
 
 from benchmarks.deployment import VEILFACE, service
 from benchmarks.end_to_end import (
-    UNLIMITED,
     AttemptCounts,
     Person,
     impostor_attempts,
     people_of,
-    prepare,
 )
-from benchmarks.private_client import fresh_database, key_of, private_outcome
+from benchmarks.private_client import (
+    command_line,
+    fresh_database,
+    key_of,
+    prepared,
+    private_outcome,
+)
 from models.decoding import decode_image
 from models.errors import FaceError
 from models.pack import FacePolicy, ModelPack
@@ -50,6 +53,7 @@ from tests.leaks import LeakSearch
 from tests.patience import PATIENCE_S
 from tests.web.camera import FakeCamera
 from tests.web.client_page import Application, application, for_browsers
+from tests.web.conftest import installed_browser
 from veilface_client import Client, PrivateClient
 
 PROGRAM = Path(__file__).with_suffix(".js")
@@ -251,7 +255,7 @@ def requests_in(recording: bytes) -> dict[str, dict[str, object]]:
 @contextmanager
 def chromium(folder: Path, camera: FakeCamera) -> Iterator[BrowserContext]:
     """Start the system's browser with a profile of its own, whose cache is on the disk."""
-    executable = os.environ.get("VEILFACE_TEST_BROWSER") or shutil.which("chromium")
+    executable = installed_browser()
     if executable is None:
         raise SystemExit("there is no Chromium: name one in VEILFACE_TEST_BROWSER")
     with sync_playwright() as playwright:
@@ -269,36 +273,10 @@ def chromium(folder: Path, camera: FakeCamera) -> Iterator[BrowserContext]:
 
 def main() -> None:
     """Run both clients and print their figures as JSON."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
-    parser.add_argument("--pack", type=Path, help="default: DATA/packs/w600k_mbf")
-    parser.add_argument("--strategy", default="adversarial")
-    parser.add_argument("--dim", type=int, default=4)
-    parser.add_argument("--probe-dim", type=int, help="default: that of the templates")
-    parser.add_argument("--level", default="fmr-1e-3")
+    parser = command_line(__doc__.splitlines()[0])
     parser.add_argument("--people", type=int, default=20)
-    parser.add_argument(
-        "--work", type=Path, required=True, help="keep everything that is made here"
-    )
-    parser.add_argument("--cache", type=Path, help="sealed embeddings, shared between runs")
     args = parser.parse_args()
-    args.pack = args.pack or args.data / "packs" / "w600k_mbf"
-    args.probe_dim = args.probe_dim or args.dim
-    args.pool = False
-    args.work.mkdir(parents=True, exist_ok=True)
-
-    ours = {name: value for name, value in os.environ.items() if not name.startswith("VEILFACE_")}
-    env = ours | {
-        "VEILFACE_DATA_DIR": str(args.work),
-        "VEILFACE_DECOYS_FILE": str(args.work / "decoys.veil"),
-        "VEILFACE_CONTRACT_FILE": str(args.work / "contract.json"),
-        "VEILFACE_MASTER_KEY_FILE": str(args.work / "master.key"),
-        "VEILFACE_PACK": str(args.pack),
-        "VEILFACE_SERVE_PACK": "true",
-        **UNLIMITED,
-    }
-    if not (args.work / "contract.json").exists():
-        prepare(args, args.work, env)
+    env = prepared(args) | {"VEILFACE_PACK": str(args.pack), "VEILFACE_SERVE_PACK": "true"}
     people = people_of(args.data / "lfw" / "photos")[: args.people]
     impostors = len(people) - 1
     search = faces_of(ModelPack.load(args.pack, threads=1), people)

@@ -105,22 +105,24 @@ def key_of(env: dict[str, str]) -> str:
     return token
 
 
-def main() -> None:
-    """Run both paths and print their figures as JSON."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+def command_line(description: str) -> argparse.ArgumentParser:
+    """Options of a measurement of clients that lift."""
+    parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
     parser.add_argument("--pack", type=Path, help="default: DATA/packs/w600k_mbf")
     parser.add_argument("--strategy", default="adversarial")
     parser.add_argument("--dim", type=int, default=4)
     parser.add_argument("--probe-dim", type=int, help="default: that of the templates")
     parser.add_argument("--level", default="fmr-1e-3")
-    parser.add_argument("--impostors", type=int, default=20, help="other people for each probe")
-    parser.add_argument("--at-once", type=int, default=2, help="lifts at the same time")
     parser.add_argument(
         "--work", type=Path, required=True, help="keep everything that is made here"
     )
     parser.add_argument("--cache", type=Path, help="sealed embeddings, shared between runs")
-    args = parser.parse_args()
+    return parser
+
+
+def prepared(args: argparse.Namespace) -> dict[str, str]:
+    """Fill in what was not asked; make decoys and contract; return the service's environment."""
     args.pack = args.pack or args.data / "packs" / "w600k_mbf"
     args.probe_dim = args.probe_dim or args.dim
     args.pool = False
@@ -136,6 +138,16 @@ def main() -> None:
     }
     if not (args.work / "contract.json").exists():
         prepare(args, args.work, env)
+    return env
+
+
+def main() -> None:
+    """Run both paths and print their figures as JSON."""
+    parser = command_line(__doc__.splitlines()[0])
+    parser.add_argument("--impostors", type=int, default=20, help="other people for each probe")
+    parser.add_argument("--at-once", type=int, default=2, help="lifts at the same time")
+    args = parser.parse_args()
+    env = prepared(args)
     people = people_of(args.data / "lfw" / "photos")
 
     with ExitStack() as stack:

@@ -183,9 +183,8 @@ def known_database_attack(system: System) -> list[AttackOutcome]:
                     "decoys, removes them and takes the likeliest face that is left; success is a "
                     "match with a fresh photo of the victim."
                     if not noise
-                    else "The decoys were perturbed before lifting, which Veilface does not do"
-                    "; the attacker holds the unperturbed pool and takes the nearest "
-                    "entries."
+                    else "The decoys were perturbed before lifting, which Veilface does not do; "
+                    "the attacker holds the unperturbed pool and takes the nearest entries."
                 ),
                 unjudged="Veilface does not perturb decoys" if noise else None,
                 details={

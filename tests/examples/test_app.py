@@ -183,6 +183,14 @@ def test_nobody_gets_in_while_the_service_is_away(tmp_path: Path) -> None:
             assert not visitor.is_in
 
 
+def fill_in(page: Any, name: str, photo: bytes, button: str) -> None:
+    page.get_by_label("Name").fill(name)
+    page.get_by_label("Password").fill(PASSWORD)
+    file = {"name": "me.png", "mimeType": "image/png", "buffer": photo}
+    page.get_by_label("Photo").set_input_files(file)
+    page.get_by_role("button", name=button).click()
+
+
 @pytest.mark.long
 def test_a_browser_shows_a_photo_to_the_service_alone(
     app: str, service: Service, browser: Any
@@ -201,11 +209,7 @@ def test_a_browser_shows_a_photo_to_the_service_alone(
 
     def submit(button: str, person: int, told: str) -> None:
         page.goto(app)
-        page.get_by_label("Name").fill("zoe")
-        page.get_by_label("Password").fill(PASSWORD)
-        file = {"name": "me.png", "mimeType": "image/png", "buffer": photos[person]}
-        page.get_by_label("Photo").set_input_files(file)
-        page.get_by_role("button", name=button).click()
+        fill_in(page, "zoe", photos[person], button)
         page.get_by_text(told).wait_for(timeout=600_000)
 
     submit("Register", 4, "Welcome, zoe")
@@ -248,11 +252,7 @@ def test_the_page_waits_for_a_sending_that_is_still_at_work(
 
     page.route("**/enrollment", at_work)
     page.goto(app)
-    page.get_by_label("Name").fill("ida")
-    page.get_by_label("Password").fill(PASSWORD)
-    file = {"name": "me.png", "mimeType": "image/png", "buffer": service.photo(1, 0)}
-    page.get_by_label("Photo").set_input_files(file)
-    page.get_by_role("button", name="Register").click()
+    fill_in(page, "ida", service.photo(1, 0), "Register")
     page.locator("output").get_by_text("ida").wait_for(timeout=600_000)
     assert page.locator("output").text_content() == "Welcome, ida"
     assert len(sendings) == 3

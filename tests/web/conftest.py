@@ -24,12 +24,17 @@ NAMES = ("chromium", "chromium-browser", "google-chrome")
 OpenTab = Callable[..., BrowserTab]
 
 
-@pytest.fixture(scope="session")
-def chromium() -> Path:
-    """The system's browser; ``VEILFACE_TEST_BROWSER`` names another one."""
-    found = os.environ.get("VEILFACE_TEST_BROWSER") or next(
+def installed_browser() -> str | None:
+    """Find the system's browser; ``VEILFACE_TEST_BROWSER`` names another one."""
+    return os.environ.get("VEILFACE_TEST_BROWSER") or next(
         filter(None, map(shutil.which, NAMES)), None
     )
+
+
+@pytest.fixture(scope="session")
+def chromium() -> Path:
+    """The browser of :func:`installed_browser`."""
+    found = installed_browser()
     if found is None:
         reason = f"no browser is installed: none of {', '.join(NAMES)}"
         if os.environ.get("VEILFACE_REQUIRE_BROWSER") == "1":

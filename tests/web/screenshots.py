@@ -15,7 +15,6 @@ Example
 import argparse
 import io
 import os
-import shutil
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -26,12 +25,12 @@ from pathlib import Path
 from typing import Literal
 
 from PIL import Image
-from playwright.sync_api import Browser, expect, sync_playwright
+from playwright.sync_api import Browser
 
 from tests.conftest import DEFAULT_SHARED_DATA
-from tests.patience import PATIENCE_S
 from tests.web.browser_tab import BrowserTab
 from tests.web.camera import FakeCamera
+from tests.web.conftest import installed_browser, running_browser
 from tests.web.deployments import OTHER, WHO, demo_service, real_service
 from tests.web.served import Served
 from tests.web.walk import walk_demo, walk_real
@@ -90,14 +89,13 @@ def main() -> None:
     parser.add_argument("--docs", action="store_true", help="the picture of the documentation")
     pictures = Pictures(**vars(parser.parse_args()))
     data = Path(os.environ.get("VEILFACE_TEST_DATA", DEFAULT_SHARED_DATA))
-    expect.set_options(timeout=1000 * PATIENCE_S)
+    executable = installed_browser()
+    if executable is None:
+        raise SystemExit("no browser is installed: name one in VEILFACE_TEST_BROWSER")
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         work = Path(folder)
         camera = FakeCamera(work / "camera.mjpeg")
-        browser = stack.enter_context(sync_playwright()).chromium.launch(
-            executable_path=os.environ.get("VEILFACE_TEST_BROWSER") or shutil.which("chromium"),
-            args=["--no-sandbox", *camera.flags],
-        )
+        browser = stack.enter_context(running_browser(Path(executable), *camera.flags))
         demo = stack.enter_context(demo_service(work / "demo"))
         pictures.take(browser, walk_demo, demo)
         if data.exists() and not pictures.docs:
