@@ -6,6 +6,8 @@ from urllib.parse import urlsplit
 
 from playwright.sync_api import BrowserContext, Page, expect
 
+from tests.patience import wait_until
+
 # A refusal of the service is an answer that the page shows; the browser notes it all the same.
 REFUSED = "Failed to load resource: the server responded with a status of 4"
 LISTEN = """
@@ -37,6 +39,14 @@ class BrowserTab:
     def _noted(self, message: Any) -> None:
         if message.type in ("error", "warning") and not message.text.startswith(REFUSED):
             self.complaints.append(message.text)
+
+    def wait_for(self, expression: str, arg: Any = None) -> None:
+        """Wait until an expression of the page holds.
+
+        Playwright's own ``wait_for_function`` evaluates strings inside the page, which the content
+        security policy refuses wherever the expression does not hold at once.
+        """
+        wait_until(lambda: self.page.evaluate(expression, arg), what=expression)
 
     def strays(self) -> list[str]:
         """Requests that left the page's origin."""

@@ -100,7 +100,7 @@ def test_nothing_is_sent_once_the_camera_was_left(open_tab: OpenTab, demo: Serve
         tab.open("Verify")
         page.evaluate("() => { window.playing = new Promise((done) => { window.goOn = done; }); }")
         start(tab)
-        page.wait_for_function("count => window.tracks.length === count", arg=number)
+        tab.wait_for("count => window.tracks.length === count", number)
         leave(tab, how, demo.token)
         page.evaluate("window.goOn()")
         page.wait_for_timeout(100)

@@ -131,7 +131,7 @@ def test_the_browser_sees_what_python_sees(
     photos["turned.jpg"] = out.getvalue()
     page.photos = photos
     visit(tab, page, EMBEDDING)
-    tab.page.wait_for_function("() => window.embedded !== undefined")
+    tab.wait_for("() => window.embedded !== undefined")
     samples: list[dict[str, Any]] = tab.page.evaluate(
         "(names) => window.embedded(names)", list(photos)
     )
@@ -155,7 +155,7 @@ def test_the_page_of_the_documentation(
     with Client(running.url, running.deployment.token) as client:
         client.enroll("anna", own)
     visit(tab, page, FOR_PAGES[0])
-    tab.page.wait_for_function("() => document.querySelector('input').onchange !== null")
+    tab.wait_for("() => document.querySelector('input').onchange !== null")
     tab.page.set_input_files("input", own)
     expect(tab.page.locator("body > output")).to_have_text("welcome")
     tab.page.set_input_files("input", other)

@@ -213,10 +213,10 @@ def test_a_photo_that_is_decoded_late_keeps_no_memory(open_tab: OpenTab, demo: S
     page.reload()
     tab.sign_in(demo.token)
     page.get_by_role("button", name="Choose photo 1 of person-1", exact=True).click()
-    page.wait_for_function("window.decoding")
+    tab.wait_for("window.decoding")
     tab.open("Log")
     page.evaluate("decoded()")
-    page.wait_for_function("window.ended")
+    tab.wait_for("window.ended")
     assert page.evaluate("addresses.size") == 0
 
 

@@ -117,7 +117,7 @@ def test_a_request_elsewhere_would_be_seen(open_tab: OpenTab, demo: Served) -> N
     tab.page.evaluate("fetch('http://elsewhere.invalid/').catch(() => {})")
     tab.page.evaluate("document.body.append(Object.assign(document.createElement('style'), "
                       "{textContent: 'body {color: red}'}))")  # fmt: skip
-    tab.page.wait_for_function("() => window.violations.length >= 2")
+    tab.wait_for("() => window.violations.length >= 2")
     assert {each.split(" ")[0] for each in tab.violations()} == {"connect-src", "style-src-elem"}
     assert tab.complaints
     with pytest.raises(AssertionError):
