@@ -597,6 +597,7 @@ def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
         yield running
 
 
+@pytest.mark.long
 def test_blocks_for_a_running_service(live: Running, tmp_path: Path) -> None:
     """Every block of :data:`LIVE`, by bash, in the order of the list."""
     (tmp_path / "buffalo_l").symlink_to(live.pack)

@@ -31,7 +31,7 @@ from tests.leak_places import (
 from tests.leak_traces import ServiceTraces, exercise
 from tests.leaks import LeakSearch, as_bytes
 
-LONG = pytest.mark.long
+pytestmark = pytest.mark.long
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def material(
     )
 
 
-@pytest.fixture(scope="module", params=["sqlite", pytest.param("postgres", marks=LONG)])
+@pytest.fixture(scope="module", params=["sqlite", "postgres"])
 def traces(
     request: pytest.FixtureRequest,
     material: Material,
@@ -184,10 +184,7 @@ PLACES = {
 }
 
 
-@pytest.mark.parametrize(
-    "encoding",
-    [pytest.param(name, marks=LONG if "-of-" in name else ()) for name in ENCODINGS],
-)
+@pytest.mark.parametrize("encoding", ENCODINGS)
 def test_a_planted_run_of_an_embedding_is_found_in_every_place(
     traces: ServiceTraces, search: LeakSearch, encoding: str, tmp_path: Path
 ) -> None:
@@ -300,9 +297,7 @@ def test_the_scene_took_place(traces: ServiceTraces) -> None:
     assert traces.running["err"].count(b'"event": "request"') > 20
 
 
-@pytest.mark.parametrize(
-    "moment", [*(pytest.param(earlier, marks=LONG) for earlier in ("running", "erased")), "stopped"]
-)
+@pytest.mark.parametrize("moment", ["running", "erased", "stopped"])
 def test_no_number_of_a_face_and_no_picture_is_left_anywhere(
     traces: ServiceTraces, search: LeakSearch, moment: str
 ) -> None:

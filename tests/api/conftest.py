@@ -1,4 +1,7 @@
-"""A running application on SQLite, and on PostgreSQL where a test asks for both."""
+"""A running application on SQLite, and in the long tests on PostgreSQL too.
+
+What differs between the two is the store's, whose own tests run on both.
+"""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,11 +12,11 @@ import pytest
 from api.http.app import create_app
 from tests.api.client import NO_COLLECTION, Client
 from tests.api.deployment import Deployment, bearer, deploy
-from tests.databases import (  # noqa: F401
-    database_url,
+from tests.databases import (
     migrate_ahead,
-    postgres_database,
-    postgres_url,
+    postgres_database,  # noqa: F401
+    postgres_url,  # noqa: F401
+    url_of,
 )
 
 
@@ -41,8 +44,14 @@ def client(deployment: Deployment) -> Iterator[Client]:
         yield running
 
 
+@pytest.fixture(params=["sqlite", pytest.param("postgres", marks=pytest.mark.long)])
+def database_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """URL of an empty database."""
+    return url_of(request, tmp_path)
+
+
 @pytest.fixture
-def both(tmp_path: Path, database_url: str) -> Iterator[tuple[Client, Deployment]]:  # noqa: F811
+def both(tmp_path: Path, database_url: str) -> Iterator[tuple[Client, Deployment]]:
     """A fresh deployment on each database, with a client that has all rights."""
     migrate_ahead(database_url)
     deployment = deploy(tmp_path, database_url=database_url)

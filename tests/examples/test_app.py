@@ -15,6 +15,7 @@ from veilface_client import Client
 
 __all__ = ["chromium"]
 
+pytestmark = pytest.mark.long
 PASSWORD = "correct horse"
 
 
@@ -191,7 +192,6 @@ def fill_in(page: Any, name: str, photo: bytes, button: str) -> None:
     page.get_by_role("button", name=button).click()
 
 
-@pytest.mark.long
 def test_a_browser_shows_a_photo_to_the_service_alone(
     app: str, service: Service, browser: Any
 ) -> None:
@@ -226,7 +226,6 @@ def test_a_browser_shows_a_photo_to_the_service_alone(
     context.close()
 
 
-@pytest.mark.long
 def test_the_page_waits_for_a_sending_that_is_still_at_work(
     app: str, service: Service, browser: Any
 ) -> None:

@@ -25,6 +25,8 @@ from tests.api.cli.audit_bench import (
 from tests.api.cli.conftest import Ran, World, run
 from tests.leaks import LeakSearch
 
+pytestmark = pytest.mark.long
+
 BOTH = {
     *("format", "version", "kind", "passed", "headlines", "comparison_headlines", "limits"),
     *("verdicts", "model", "settings", "rows", "outcomes", "failure_to_acquire"),
@@ -102,7 +104,6 @@ def face_report(faces: FaceAudit) -> Any:
     return json.loads((faces.out / "report.json").read_text(encoding="utf-8"))
 
 
-@pytest.mark.long
 def test_an_audit_of_faces_writes_report_and_figures(faces: FaceAudit, face_report: Any) -> None:
     files = ["report.json", "report.md", *both(["figure", "frontier"]), "report.html"]
     assert sorted(file.name for file in faces.out.iterdir()) == sorted(files)
@@ -200,7 +201,6 @@ def test_an_evaluation_adds_the_frontier(face_report: Any) -> None:
     assert point["leakage"] == max(far)
 
 
-@pytest.mark.long
 def test_the_seed_gives_the_rows_and_a_kept_limit_is_status_0(
     faces: FaceAudit, face_report: Any
 ) -> None:

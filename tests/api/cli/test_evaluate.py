@@ -142,6 +142,7 @@ def test_groups_are_reported(results, bench):
     assert results["options"]["predicted_attributes"] == {"lfw": 0}
 
 
+@pytest.mark.long
 def test_a_second_run_goes_on_and_says_the_same(bench, results, tmp_path):
     out = shutil.copytree(bench.root / "out", tmp_path / "out")
     units = out / "units"
@@ -161,6 +162,7 @@ def test_a_second_run_goes_on_and_says_the_same(bench, results, tmp_path):
     assert set(results) - set(said) == {"timings", "work"}
 
 
+@pytest.mark.long
 def test_more_repeats_only_add_units(bench, tmp_path):
     base = ("evaluate", bench.lfw, *bench.base, "--strategy", "random", "--dim", "2")
     base = (*base, "--mode", "p2s", "--metric", "spherical", "--fmr", "0.2", "--out", tmp_path)
@@ -250,6 +252,7 @@ def test_descriptors_from_a_file_give_the_rows_of_the_pack(bench, results, tmp_p
         assert theirs == wanted
 
 
+@pytest.mark.long
 def test_a_bin_of_the_same_photos_gives_the_same_numbers(bench, results, tmp_path):
     photos = [photo.read_bytes() for a, b, _ in pairs_of(bench.lfw) for photo in (a, b)]
     same = [one for *_, one in pairs_of(bench.lfw)]

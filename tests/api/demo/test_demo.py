@@ -29,6 +29,7 @@ def played(tmp_path_factory):
     return run_demo(folder, scale=SMALL, say=said.append), folder, said
 
 
+@pytest.mark.long
 def test_it_accepts_the_enrolled_and_rejects_the_others(played):
     outcome, _, said = played
     assert outcome.faults == ()
@@ -42,6 +43,7 @@ def test_it_accepts_the_enrolled_and_rejects_the_others(played):
     assert outcome.refused_photos == ()
 
 
+@pytest.mark.long
 def test_what_it_shows_of_the_database_is_ciphertext(played):
     outcome, folder, _ = played
     database = (folder / "veilface.db").read_bytes()
@@ -53,12 +55,14 @@ def test_what_it_shows_of_the_database_is_ciphertext(played):
             assert bytes.fromhex(entry.ciphertext_excerpt) not in database
 
 
+@pytest.mark.long
 def test_the_erased_person_is_gone_and_the_receipt_says_so(played):
     outcome, _, _ = played
     assert outcome.rows_after_erasure == 0
     assert outcome.receipt["held"] is True
 
 
+@pytest.mark.long
 def test_the_folder_is_ready_for_serve(played):
     _, folder, _ = played
     checked = run("serve", "--check", "--config", folder / "veilface.toml")
@@ -73,6 +77,7 @@ def test_the_folder_is_ready_for_serve(played):
     assert sorted(path.name for path in (folder / "people").iterdir())[0] == "person-1"
 
 
+@pytest.mark.long
 def test_it_replaces_its_own_folder_and_no_other(played, tmp_path):
     (tmp_path / "thesis.txt").write_text("precious")
     with pytest.raises(StartError, match="not empty and not a demo"):
@@ -89,6 +94,7 @@ def test_a_pack_without_faces_is_refused(tmp_path):
     assert "both --pack and --faces" in ran.stderr
 
 
+@pytest.mark.long
 def test_the_command_prints_tables_and_the_notice(played, monkeypatch):
     outcome, folder, _ = played
     monkeypatch.setattr("api.cli.demo.run_demo", lambda *_, **__: outcome)

@@ -140,7 +140,8 @@ with Client(app_from_environment()) as client:
 """
 
 
-@pytest.mark.parametrize("storage", ["service", pytest.param("holder", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("storage", ["service", "holder"])
 def test_a_retry_does_not_meet_its_own_write_of_a_service_that_was_killed(
     client: Client, deployment: Deployment, storage: str
 ) -> None:

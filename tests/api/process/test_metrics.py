@@ -265,6 +265,7 @@ print(exposition().decode())
 """
 
 
+@pytest.mark.long
 def test_what_dead_workers_counted_stays_in_one_file() -> None:
     with shared_directory() as folder:
         assert folder.stat().st_mode & 0o077 == 0

@@ -162,6 +162,7 @@ class Largest(TorchDispatchMode):
         return result
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("metric", Metric)
 @pytest.mark.parametrize("lifted", [True, False])
 def test_tiles_bound_the_memory_and_do_not_show(

@@ -152,7 +152,7 @@ def test_the_number_of_rows_is_compared_and_capped_before_anything_is_unpacked(
         read_embeddings(tmp_path / "e.npz")
 
 
-@pytest.mark.parametrize("order", ["C", "F"])
+@pytest.mark.parametrize("order", [pytest.param("C", marks=pytest.mark.long), "F"])
 def test_rows_are_unpacked_a_block_at_a_time(tmp_path: Path, order: str) -> None:
     rows = rows_of(100_000, 128)
     paths = np.arange(len(rows)).astype("U6")

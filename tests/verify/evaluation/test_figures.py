@@ -189,6 +189,7 @@ def test_up_to_four_data_sets_have_a_title_each(number: int) -> None:
     assert len(titles) == 2 * number
 
 
+@pytest.mark.long
 def test_nothing_of_the_largest_figure_lies_outside_it_or_overlaps() -> None:
     results = sample_results(dims=(2, 4, 8, 16, 32, 64), shared=(False, True))
     figure = verification_figure(results)
@@ -330,6 +331,7 @@ def test_an_audit_of_more_attributes_than_a_figure_has_columns_is_refused() -> N
         strongest_attackers({"format": "veilface audit", "rows": rows})
 
 
+@pytest.mark.long
 def test_a_name_is_no_formula(tmp_path: Path) -> None:
     results = sample_results(liftings=PAPER, dims=(2, 16))
     for part in ("rows", "datasets", "curves"):
@@ -345,6 +347,7 @@ def test_a_name_is_no_formula(tmp_path: Path) -> None:
             assert any(word.startswith(r"$\frac{1}{$ & $x$") for word in words)
 
 
+@pytest.mark.long
 def test_files_are_complete_readable_and_the_same_each_time(tmp_path: Path) -> None:
     results = sample_results(liftings=PAPER, dims=(2, 16))
     audit = sample_audit(results)
