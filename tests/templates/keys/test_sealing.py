@@ -625,10 +625,12 @@ def test_no_shell_reads_the_command(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "script",
     [
-        "sleep 100000",
-        "exec >&-; sleep 100000",  # its output is closed, and it does not end
-        "sleep 100000 & exit 0",  # it ended, and a child of it holds its output open
-        'trap "" TERM; while :; do sleep 1; done',
+        # It ended, and a child of it holds its output open.
+        "sleep 100000 & exit 0",
+        # Its output is closed, and it does not end.
+        pytest.param("exec >&-; sleep 100000", marks=pytest.mark.long),
+        pytest.param("sleep 100000", marks=pytest.mark.long),
+        pytest.param('trap "" TERM; while :; do sleep 1; done', marks=pytest.mark.long),
     ],
 )
 def test_a_slow_command_is_killed_with_all_that_it_started(tmp_path: Path, script: str) -> None:
