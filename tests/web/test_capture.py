@@ -103,8 +103,7 @@ def test_nothing_is_sent_once_the_camera_was_left(open_tab: OpenTab, demo: Serve
         tab.wait_for("count => window.tracks.length === count", number)
         leave(tab, how, demo.token)
         page.evaluate("window.goOn()")
-        page.wait_for_timeout(100)
-        assert states(tab) == number * ["ended"]
+        tab.wait_for("() => window.tracks.every((track) => track.readyState === 'ended')")
     page.wait_for_timeout(1200)
     assert checks(tab) == 0
     for how in ("view", "sign-out"):
