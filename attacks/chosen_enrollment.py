@@ -82,7 +82,7 @@ def estimate_from_sets(sides: Sides, *, steps: int | None = None) -> Array64:
     and none ever lowers the fit.
     """
     sent, stolen = (_Stacked.of(side) for side in sides)
-    estimate = polar_factor(_product_pairs(sent, stolen))
+    estimate = polar_factor(product_pairs(sides))
     settled = 0.0
     enough = sent.bases.shape[0] * (sent.bases.shape[1] + 1) >= 2 * sent.feet.shape[1]
     if steps is None:
@@ -117,12 +117,13 @@ class _Stacked(NamedTuple):
         return np.asarray((points @ basis.T) @ basis)
 
 
-def _product_pairs(sent: _Stacked, stolen: _Stacked) -> Array64:
-    """Σ y xᵀ over pairs y = R x of products of projections of foot points, (n, n).
+def product_pairs(sides: Sides) -> Array64:
+    """Σ y xᵀ over unit pairs y = R x of products of projections of foot points, (n, n).
 
     Products of two projections are taken only where those of one are too few: they are shorter,
     and rounding counts more in them.
     """
+    sent, stolen = (_Stacked.of(side) for side in sides)
     count, n = sent.feet.shape
     points, images = sent.feet, stolen.feet
     moment = images.T @ points
