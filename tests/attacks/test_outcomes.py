@@ -33,9 +33,7 @@ def test_a_share_succeeds_where_its_interval_lies_above_chance(hits: int, succee
 
 
 @pytest.mark.parametrize(("low", "succeeds"), [(0.08, False), (0.1, True)])
-def test_a_d_sys_succeeds_where_its_interval_lies_above_the_null(
-    low: float, succeeds: bool
-) -> None:
+def test_a_d_sys_succeeds_where_it_lies_above_the_null(low: float, succeeds: bool) -> None:
     """Above its 95th percentile, and not above its mean."""
     control = replace(
         ROW,
