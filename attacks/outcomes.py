@@ -1,7 +1,7 @@
 """What every attack reports: who was assumed to know what, and how often it succeeded."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Any, TypeAlias
 
@@ -241,3 +241,24 @@ def unproven(control: AttackOutcome, what: str, *, least: float | None = None) -
     """
     shown = control.succeeds if least is None else control.measured.value >= least
     return None if shown else f"it proves nothing, for its control, {what}, does not succeed either"
+
+
+def judged_by_controls(
+    rows: Sequence[AttackOutcome], hidden: str, shown: str
+) -> list[AttackOutcome]:
+    """Judge each row that lacks something by the same one that has it, as :func:`unproven` says.
+
+    Parameters
+    ----------
+    hidden, shown
+        What the names of the two differ in, such as a key that is kept, and stolen.
+    """
+    named = {row.name: row for row in rows}
+    return [
+        replace(
+            row, unjudged=row.unjudged or unproven(named[row.name.replace(hidden, shown)], shown)
+        )
+        if hidden in row.variant
+        else row
+        for row in rows
+    ]

@@ -9,6 +9,7 @@ from attacks.outcomes import (
     Leaked,
     Property,
     Scheme,
+    judged_by_controls,
     unproven,
 )
 from verify.metrics import rate
@@ -43,6 +44,30 @@ def test_a_d_sys_succeeds_where_it_lies_above_the_null(low: float, succeeds: boo
         details={"null_95_percent": 0.09},
     )
     assert control.succeeds == succeeds
+
+
+def test_rows_are_judged_by_the_row_of_their_name_that_has_the_key() -> None:
+    opened, closed = rate(300, 300), rate(0, 300)
+    rows = [
+        replace(ROW, attack=attack, variant=f"the key {key}", measured=measured, unjudged=why)
+        for attack, key, measured, why in (
+            ("works", "kept", closed, None),
+            ("works", "stolen", opened, "a control"),
+            # Its own success does not count: one row in twenty or so has it by chance.
+            ("fails", "kept", opened, None),
+            ("fails", "stolen", closed, "a control"),
+            ("few people", "kept", closed, "few people have the photos"),
+            ("few people", "stolen", closed, "a control"),
+        )
+    ]
+    assert [row.unjudged for row in judged_by_controls(rows, "key kept", "key stolen")] == [
+        None,
+        "a control",
+        "it proves nothing, for its control, key stolen, does not succeed either",
+        "a control",
+        "few people have the photos",
+        "a control",
+    ]
 
 
 def test_a_control_may_have_to_reach_a_share() -> None:
