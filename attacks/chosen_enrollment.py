@@ -12,6 +12,7 @@ docs/method.md §4.9 has the measure without accounts.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +22,7 @@ from scipy.linalg import svd
 from attacks.decisions import decide
 from attacks.errors import AuditError
 from attacks.linkage import holder_rotations_of, rotations_of, turned, turned_back
-from attacks.outcomes import CONTROL, AttackOutcome, Knowledge, Leaked, Property
+from attacks.outcomes import CONTROL, AttackOutcome, Knowledge, Leaked, Property, unproven
 from attacks.recovery import fmr_of
 from attacks.stored.honest_probes import honest_embedding, points_inside
 from attacks.stored.nearest_neighbour import nearest_points
@@ -82,7 +83,7 @@ def estimate_from_sets(sides: Sides, *, steps: int | None = None) -> Array64:
     and none ever lowers the fit.
     """
     sent, stolen = (_Stacked.of(side) for side in sides)
-    estimate = polar_factor(_product_pairs(sent, stolen))
+    estimate = polar_factor(product_pairs(sides))
     settled = 0.0
     enough = sent.bases.shape[0] * (sent.bases.shape[1] + 1) >= 2 * sent.feet.shape[1]
     if steps is None:
@@ -117,12 +118,13 @@ class _Stacked(NamedTuple):
         return np.asarray((points @ basis.T) @ basis)
 
 
-def _product_pairs(sent: _Stacked, stolen: _Stacked) -> Array64:
-    """Σ y xᵀ over pairs y = R x of products of projections of foot points, (n, n).
+def product_pairs(sides: Sides) -> Array64:
+    """Σ y xᵀ over unit pairs y = R x of products of projections of foot points, (n, n).
 
     Products of two projections are taken only where those of one are too few: they are shorter,
     and rounding counts more in them.
     """
+    sent, stolen = (_Stacked.of(side) for side in sides)
     count, n = sent.feet.shape
     points, images = sent.feet, stolen.feet
     moment = images.T @ points
@@ -189,8 +191,9 @@ def chosen_enrollment(
     list of AttackOutcome
         Named ``chosen-enrollment``, one for each number of accounts; ``alignment`` in ``details``
         is the largest tr(R̂ᵀR) / n of a victim's R, 1 where it is known. Then the same against
-        victims who keep keys, with the tenant's stolen. Last two controls that are not judged: the
-        largest number with one rotation for all templates, and the tenant's key.
+        victims who keep keys, with the tenant's stolen. Then the controls, which are not judged:
+        each number with one rotation for all templates, by which both others are judged; and last
+        the tenant's key.
 
     Raises
     ------
@@ -205,7 +208,7 @@ def chosen_enrollment(
     of_accounts = rotations_of(system, tenant, "account", most)
     of_victims = rotations_of(system, tenant, "victim", people)
     sent = system.lift(system.attacker[:most], "templates that the attacker enrolls")
-    outcomes = []
+    outcomes: dict[tuple[str, int], AttackOutcome] = {}
     common = of_accounts[:1]
     # Keys of other people: the attacker's own would open no more than its own templates.
     holders = holder_rotations_of(system, tenant, people + most)
@@ -213,30 +216,35 @@ def chosen_enrollment(
     for number, enrolled, rotations, setting in (
         *((number, of_accounts[:number], of_victims, _SECRET) for number in numbers),
         *((number, own[:number], kept, _KEPT) for number in numbers),
-        (most, common * most, common * people, _COMMON),
+        *((number, common * number, common * people, _COMMON) for number in numbers),
     ):
         sides = Sides(sent[:number], _as_stored(system, sent[:number], enrolled))
         estimate = estimate_from_sets(sides)
         victims = _through_wire(system, turned(system.templates, rotations))
         points = best_known_points(victims, sides.stolen, seed=system.seed) @ estimate
-        outcomes.append(
-            _outcome(
-                system,
-                points,
-                variant=f"{number} accounts" + setting.name,
-                leaked=Leaked.MASTER_KEY,
-                assumption=f"The right to send templates and embeddings, with which the attacker "
-                f"has enrolled {number} templates of its own lifting, and the tenant's whole "
-                f"stolen database, {setting.stolen}; it estimates a rotation from the "
-                "templates that it sent and what became of them, and sends a unit point of every "
-                f"victim's template, turned back, as an embedding; success is {setting.success}",
-                unjudged=CONTROL if setting is _COMMON else None,
-                details={"accounts": number, "alignment": _alignment(estimate, rotations)},
-            )
+        outcomes[setting.name, number] = _outcome(
+            system,
+            points,
+            variant=f"{number} accounts" + setting.name,
+            leaked=Leaked.MASTER_KEY,
+            assumption=f"The right to send templates and embeddings, with which the attacker "
+            f"has enrolled {number} templates of its own lifting, and the tenant's whole "
+            f"stolen database, {setting.stolen}; it estimates a rotation from the "
+            "templates that it sent and what became of them, and sends a unit point of every "
+            f"victim's template, turned back, as an embedding; success is {setting.success}",
+            unjudged=CONTROL if setting is _COMMON else None,
+            details={"accounts": number, "alignment": _alignment(estimate, rotations)},
         )
+    reasons = {
+        number: unproven(outcomes[_COMMON.name, number], "one rotation for all templates")
+        for number in numbers
+    }
     stolen = _through_wire(system, turned(system.templates, of_victims))
     return [
-        *outcomes,
+        *(
+            replace(row, unjudged=row.unjudged or reasons[number])
+            for (_setting, number), row in outcomes.items()
+        ),
         _outcome(
             system,
             points_inside(turned_back(stolen, of_victims), seed=system.seed),

@@ -96,7 +96,13 @@ def linkage_figure(outcomes: Sequence[Row]) -> Figure | None:
             axes.set_xlabel(f"score: {score}")
             axes.set_ylabel("local D(s)")
             axes.grid(color=RULE, linewidth=0.8)
-        _header_legend(figure, grid[0][0].get_legend_handles_labels(), len(settings))
+        # A setting may have some of the scores only.
+        labelled = {
+            label: handle
+            for axes in figure.axes
+            for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
+        }
+        _header_legend(figure, (list(labelled.values()), list(labelled)), len(labelled))
     return figure
 
 

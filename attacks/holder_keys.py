@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from attacks.likelihood import likeliest_guess
 from attacks.linkage import holder_rotations_of, turned, turned_back
-from attacks.outcomes import CONTROL, AttackOutcome, Knowledge, Leaked
+from attacks.outcomes import CONTROL, AttackOutcome, Knowledge, Leaked, judged_by_controls
 from attacks.recovery import recovery_outcome
 from attacks.stored.foot_point import foot_points
 from attacks.system import System
@@ -51,16 +51,17 @@ class Theft:
         return stored if self.leaked is Leaked.MASTER_KEY else turned_back(stored, rotations)
 
 
+KEPT, STOLEN = "holder's key kept", "holder's key stolen"
 THEFTS = (
     Theft(
         Leaked.MASTER_KEY,
-        "holder's key kept",
+        KEPT,
         "The database and every secret of the deployment are stolen, and the key of the holder is "
         "not, whose rotation still turns the template",
     ),
     Theft(
         Leaked.HOLDER_KEYS,
-        "holder's key stolen",
+        STOLEN,
         "The database, every secret of the deployment and the holder's key are stolen",
     ),
 )
@@ -80,9 +81,9 @@ def guess_with_and_without_holder_keys(
     -------
     list of AttackOutcome
         For each attack the key kept, and the key stolen: a control, which is not judged, because
-        the same attack on un-rotated templates is.
+        the same attack on un-rotated templates is. Where it fails too, the key kept is not judged.
     """
-    outcomes = []
+    outcomes: list[AttackOutcome] = []
     for theft in THEFTS:
         seen = theft.of(system, system.templates, "enrollment")
         control = theft.leaked is Leaked.HOLDER_KEYS
@@ -101,7 +102,7 @@ def guess_with_and_without_holder_keys(
             )
             for attack, guess in guesses.items()
         ]
-    return outcomes
+    return judged_by_controls(outcomes, KEPT, STOLEN)
 
 
 def guess_from_few_decoys(

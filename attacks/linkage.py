@@ -4,17 +4,18 @@ Without a secret, templates link by what they are for (docs/method.md §4.9). A 
 drawn by the Haar measure, leaves of a template nothing but its foot point's length: two affine
 subspaces of one dimension are images of each other under a rotation exactly if their feet are
 equally long. Ours are taken to be as good, so that ``foot lengths`` is all that an attacker without
-a tenant's key can compare. With the key every rotation is derived, and undone.
+a tenant's key can compare. With the key every rotation is derived, and undone: the control of
+every other score, which tells nothing of rotations where it links nobody without them.
 ``attacks.databases`` has both whole databases.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from attacks.outcomes import AttackOutcome, Knowledge, Leaked, Property
+from attacks.outcomes import CONTROL, AttackOutcome, Knowledge, Leaked, Property, unproven
 from attacks.system import System
 from attacks.unlinkability import Unlinkability, unlinkability
 from templates.contract.canonical import Json
@@ -50,10 +51,11 @@ def foot_lengths(left: SubspaceBatch, right: SubspaceBatch) -> Array64:
     return -np.abs(left.foot_norms[:, None] - right.foot_norms)
 
 
+LENGTHS = "foot lengths"
 SCORES: Mapping[str, Score] = {
     "nearest points": nearest_similarities,
     "foot points": foot_cosines,
-    "foot lengths": foot_lengths,
+    LENGTHS: foot_lengths,
 }
 
 
@@ -62,9 +64,11 @@ class _Setting:
     name: str
     leaked: Leaked
     assumption: str
+    scores: Sequence[str] = tuple(SCORES)
 
 
 _SUCCESS = "; success is D_sys of the templates of the same people"
+_OPEN, _ONE_SET = "keys leaked", "one set for both"
 _SETTINGS = (
     _Setting(
         "secret rotations",
@@ -85,10 +89,17 @@ _SETTINGS = (
         "every secret of the deployment, but not that key" + _SUCCESS,
     ),
     _Setting(
-        "keys leaked",
+        _OPEN,
         Leaked.HOLDER_KEYS,
         assumption="One rotated template of each of two tenants, and the rotation keys of both"
         + _SUCCESS,
+    ),
+    _Setting(
+        _ONE_SET,
+        Leaked.MASTER_KEY,
+        assumption="One template of each of two tenants, the same set in two rotations, which its "
+        "length must tell (a control)" + _SUCCESS,
+        scores=(LENGTHS,),
     ),
 )
 
@@ -183,33 +194,21 @@ def link(
     Returns
     -------
     list of AttackOutcome
-        A row for each setting and score, named ``linkage``.
+        A row for each setting and score, named ``linkage``. Those in secret rotations are judged
+        where the same score links un-rotated templates; lengths, where they link one set in two
+        rotations, a control that is the last row.
     """
     enrolled = system.victims.enrolled[:most_people]
     fresh = system.victims.fresh[:most_people]
     scores: dict[tuple[str, str], list[Array64]] = {}
     for number in range(liftings):
-        first = system.lift(enrolled, f"linkage, first tenant {number}")
-        second = system.lift(fresh, f"linkage, second tenant {number}")
-        count = len(first)
-        left = rotations_of(system, f"first {number}", "template", count)
-        right = rotations_of(system, f"second {number}", "template", count)
-        again = rotations_of(system, f"first {number}", "another template", count)
-        hidden = turned(first, left), turned(second, right)
-        sides = {
-            "secret rotations": hidden,
-            "one tenant": (hidden[0], turned(second, again)),
-            "holder's key kept": (
-                turned(first, holder_rotations_of(system, f"first {number}", count)),
-                turned(second, holder_rotations_of(system, f"second {number}", count)),
-            ),
-            "keys leaked": (turned_back(hidden[0], left), turned_back(hidden[1], right)),
-        }
+        sides = _sides(system, enrolled, fresh, number)
         for setting in _SETTINGS:
-            for name, score in SCORES.items():
-                scores.setdefault((setting.name, name), []).append(score(*sides[setting.name]))
-    return [
-        linkage_outcome(
+            for name in setting.scores:
+                score = SCORES[name](*sides[setting.name])
+                scores.setdefault((setting.name, name), []).append(score)
+    rows = {
+        (setting.name, name): linkage_outcome(
             system,
             unlinkability(
                 np.stack(scores[setting.name, name]), permutations=permutations, seed=system.seed
@@ -218,8 +217,39 @@ def link(
             variant=f"{setting.name}, {name}",
             leaked=setting.leaked,
             assumption=setting.assumption,
+            unjudged=CONTROL if setting.name == _ONE_SET else None,
             details={"liftings": liftings},
         )
         for setting in _SETTINGS
-        for name in SCORES
+        for name in setting.scores
+    }
+    unproven_by = {name: unproven(rows[_OPEN, name], "un-rotated templates") for name in SCORES} | {
+        LENGTHS: unproven(rows[_ONE_SET, LENGTHS], "one set in two rotations")
+    }
+    return [
+        row if setting in (_OPEN, _ONE_SET) else replace(row, unjudged=unproven_by[name])
+        for (setting, name), row in rows.items()
     ]
+
+
+def _sides(
+    system: System, enrolled: NDArray[np.float32], fresh: NDArray[np.float32], number: int
+) -> dict[str, tuple[SubspaceBatch, SubspaceBatch]]:
+    """Return both templates of every person as each setting has them, in one lifting."""
+    first = system.lift(enrolled, f"linkage, first tenant {number}")
+    second = system.lift(fresh, f"linkage, second tenant {number}")
+    count = len(first)
+    left = rotations_of(system, f"first {number}", "template", count)
+    right = rotations_of(system, f"second {number}", "template", count)
+    again = rotations_of(system, f"first {number}", "another template", count)
+    hidden = turned(first, left), turned(second, right)
+    return {
+        "secret rotations": hidden,
+        "one tenant": (hidden[0], turned(second, again)),
+        "holder's key kept": (
+            turned(first, holder_rotations_of(system, f"first {number}", count)),
+            turned(second, holder_rotations_of(system, f"second {number}", count)),
+        ),
+        _OPEN: (turned_back(hidden[0], left), turned_back(hidden[1], right)),
+        _ONE_SET: (hidden[0], turned(first, right)),
+    }

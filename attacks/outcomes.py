@@ -1,7 +1,7 @@
 """What every attack reports: who was assumed to know what, and how often it succeeded."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Any, TypeAlias
 
@@ -58,6 +58,7 @@ class Knowledge(StrEnum):
 
 GENERATED, POOLED = "generator", "pool"
 CONTROL = "a control"
+COMPARED = "the scheme is there to compare with"
 RAW = "raw"
 
 
@@ -163,7 +164,8 @@ class AttackOutcome:
         How often guessing would have: the level's FMR, or the majority class.
     unjudged
         Why the verdict does not count it, as the end of a sentence that begins "not judged:";
-        None where it does. ``CONTROL`` for a control.
+        None where it does. ``CONTROL`` for a control, ``COMPARED`` where it is none of the audited
+        scheme.
     details
         Further figures, JSON values. Never a number of a descriptor or a template.
     """
@@ -185,6 +187,15 @@ class AttackOutcome:
     def judged(self) -> bool:
         """Whether the verdict counts it."""
         return self.unjudged is None
+
+    @property
+    def succeeds(self) -> bool:
+        """Whether its interval lies above what guessing gives.
+
+        Of a D_sys that is the 95th percentile of its permutation null, of a share its chance.
+        """
+        guessing = self.details.get("null_95_percent", self.chance)
+        return self.measured.ci_low > float(str(guessing))
 
     @property
     def name(self) -> str:
@@ -210,3 +221,44 @@ class AttackOutcome:
             "unjudged": self.unjudged,
             "details": dict(self.details),
         }
+
+
+def unproven(control: AttackOutcome, what: str, *, least: float | None = None) -> str | None:
+    """Return why rows are not judged whose control fails; None where it shows that they may be.
+
+    What an attack does not get proves something only where the same attack gets it if it can. So a
+    row is judged by its control, and never by its own result.
+
+    Parameters
+    ----------
+    control
+        The same attack where it must succeed.
+    what
+        What the control is, as words of the sentence.
+    least
+        Share that the control must reach; None: it must succeed as
+        :attr:`AttackOutcome.succeeds` says.
+    """
+    shown = control.succeeds if least is None else control.measured.value >= least
+    return None if shown else f"it proves nothing, for its control, {what}, does not succeed either"
+
+
+def judged_by_controls(
+    rows: Sequence[AttackOutcome], hidden: str, shown: str
+) -> list[AttackOutcome]:
+    """Judge each row that lacks something by the same one that has it, as :func:`unproven` says.
+
+    Parameters
+    ----------
+    hidden, shown
+        What the names of the two differ in, such as a key that is kept, and stolen.
+    """
+    named = {row.name: row for row in rows}
+    return [
+        replace(
+            row, unjudged=row.unjudged or unproven(named[row.name.replace(hidden, shown)], shown)
+        )
+        if hidden in row.variant
+        else row
+        for row in rows
+    ]

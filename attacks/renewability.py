@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from attacks.decisions import decide
 from attacks.likelihood import likeliest_guesses
 from attacks.linkage import rotations_of, turned, turned_points
-from attacks.outcomes import AttackOutcome, Knowledge, Leaked, Property
+from attacks.outcomes import AttackOutcome, Knowledge, Leaked, Property, judged_by_controls
 from attacks.recovery import fmr_of
 from attacks.stored.foot_point import foot_points
 from attacks.stored.honest_probes import (
@@ -29,6 +29,7 @@ from verify.cohort import Probes
 from verify.metrics import rate
 
 SAME, NEW = "same photos", "new photos"
+_SECRET, _LEAKED = "old rotation secret", "old rotation leaked"
 
 
 def renew(
@@ -46,13 +47,15 @@ def renew(
     -------
     list of AttackOutcome
         Named ``renewal-replay``: acceptance of the old foot point, a point of the old template,
-        the guesses, and the old template as a lifted probe.
+        the guesses, and the old template as a lifted probe. With the old rotation secret a row is
+        judged where the same probe is accepted once that leaked.
     """
     known = likeliest_guesses(system) if guesses is None else guesses
     renewed = {SAME: system.templates, NEW: system.renewed}
-    return [
+    outcomes = [
         outcome for name, new in renewed.items() for outcome in _replays(system, new, known, name)
     ]
+    return judged_by_controls(outcomes, _SECRET, _LEAKED)
 
 
 def _replays(
@@ -73,7 +76,7 @@ def _replays(
     turns = rotations_of(system, "breached", "template", len(old))
     outcomes: list[AttackOutcome] = []
     for leaked in (True, False):
-        setting = f"{photos}, old rotation {'leaked' if leaked else 'secret'}"
+        setting = f"{photos}, {_LEAKED if leaked else _SECRET}"
         for name, rows in (points | likely if leaked else points).items():
             shown = rows if leaked else turned_points(rows, turns)
             probes = np.ascontiguousarray(shown, dtype=np.float32)
@@ -114,8 +117,8 @@ def _replay(
             breaks=Property.RENEWABILITY,
             leaked=Leaked.HOLDER_KEYS if leaked else Leaked.MASTER_KEY,
             knowledge=Knowledge.ALGORITHM,
-            assumption="The template from before the renewal, the old rotation "
-            f"{'leaked' if leaked else 'secret'}, and the right to send embeddings or templates; "
+            assumption="The template from before the renewal, the "
+            f"{_LEAKED if leaked else _SECRET}, and the right to send embeddings or templates; "
             "success is acceptance against the renewed template, after the input checks, which a "
             "new rotation does not change",
             scheme=system.scheme,

@@ -6,6 +6,12 @@ from typing import Any
 from attacks.outcomes import AttackOutcome
 from attacks.verdict import LIMITS, headlines, judge
 
+RESULTS = {
+    True: "PASSED",
+    False: "FAILED: a limit is exceeded.",
+    None: "NEITHER PASSED NOR FAILED: of a scheme no attack was judged.",
+}
+"""The first line of a report, by ``passed``."""
 FORMAT = "veilface audit"
 VERSION = 2
 Document = dict[str, Any]
@@ -51,7 +57,7 @@ def document(
         "format": FORMAT,
         "version": VERSION,
         "kind": kind,
-        "passed": bool(audited) and all(verdict.passed for verdict in audited),
+        "passed": _passed([verdict.passed for verdict in audited]),
         "headlines": headlines(audited),
         "comparison_headlines": headlines(compared),
         "limits": {limit.name: limits.get(limit.name, limit.default) for limit in LIMITS},
@@ -65,3 +71,10 @@ def document(
         "outcomes": [outcome.to_json() for outcome in outcomes],
         **more,
     }
+
+
+def _passed(schemes: Sequence[bool | None]) -> bool | None:
+    """Say how an audit of some schemes ended; None where none failed, and one was not judged."""
+    if False in schemes:
+        return False
+    return None if not schemes or None in schemes else True

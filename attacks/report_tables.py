@@ -4,7 +4,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from attacks.outcomes import Knowledge, Leaked, Property, Scheme
-from attacks.verdict import LIMITS
+from attacks.report import RESULTS
+from attacks.verdict import LIMITS, NOTHING_JUDGED
 from verify.evaluation.markdown_cells import (
     MISSING,
     count,
@@ -48,7 +49,7 @@ def markdown(report: Mapping[str, Any]) -> str:
 
 
 def _result(report: Row) -> str:
-    lines = [f"**{'PASSED' if report['passed'] else 'FAILED'}** by the limits below."]
+    lines = [f"**{RESULTS[report['passed']]}**"]
     lines += [f"- {plain(sentence)}" for sentence in report["headlines"]]
     if report["comparison_headlines"]:
         lines += ["", "For comparison only:", ""]
@@ -88,6 +89,9 @@ def _verdicts(report: Row) -> Iterable[str]:
         if verdict["comparison"]:
             title += " (comparison)"
         yield title
+        if not lines:
+            yield f"On this scheme {NOTHING_JUDGED}."
+            continue
         yield table(
             ["property", "attacker has", *(_LEAKED[leaked] for leaked in Leaked)],
             lines,

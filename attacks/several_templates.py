@@ -13,8 +13,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from attacks.holder_keys import THEFTS, Guess, Theft
-from attacks.outcomes import AttackOutcome, Knowledge, Leaked
+from attacks.holder_keys import KEPT, STOLEN, THEFTS, Guess, Theft
+from attacks.outcomes import AttackOutcome, Knowledge, Leaked, judged_by_controls
 from attacks.population import Subjects
 from attacks.recovery import recovery_outcome
 from attacks.stored.intersection import nearest_common_points
@@ -61,8 +61,9 @@ def several_templates(
     -------
     list of AttackOutcome
         Named ``several-templates``: for each T the mean of the guesses from all and, from two on,
-        the point that is nearest to all; with the key kept, the largest T only. T = 1 is not
-        judged: it is what the others are held against.
+        the point that is nearest to all; with the key kept, the largest T only, judged where the
+        same guess succeeds with the key. T = 1 is not judged: it is what the others are held
+        against.
     """
     first, again = (enrolled(system, "the deployment's secret") for _ in range(2))
     other = enrolled(system, "another secret")
@@ -93,7 +94,7 @@ def several_templates(
         ]
         people = _people(enough, _means(enough, range(count)))
         outcomes += _guessed(system, batches, guess, "different photos", people, max(reached))
-    return outcomes
+    return judged_by_controls(outcomes, KEPT, STOLEN)
 
 
 def enrolled(system: System, secret: str) -> SubspaceBatch:

@@ -54,11 +54,6 @@ class Unlinkability:
     permutations: int
     first_rank: float
 
-    @property
-    def links(self) -> bool:
-        """Whether D_sys lies above the 95th percentile of its null."""
-        return self.d_sys.value > self.null_95
-
     def details(self) -> dict[str, Json]:
         """Return the figures beside D_sys and the null's mean."""
         return {

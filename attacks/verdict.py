@@ -3,13 +3,22 @@
 Every cell of the table holds the strongest attack that was made: the one that exceeds chance most.
 A cell fails where its measure exceeds the limit that the operator set, and is *unresolved* where
 only the upper bound of its interval does: the sample is too small to show that the limit holds.
+A scheme none of whose attacks is judged has no cell, and neither passes nor fails.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
-from attacks.outcomes import CONTROL, AttackOutcome, Knowledge, Leaked, Property, Scheme
+from attacks.outcomes import (
+    COMPARED,
+    CONTROL,
+    AttackOutcome,
+    Knowledge,
+    Leaked,
+    Property,
+    Scheme,
+)
 from templates.contract.canonical import Json
 
 
@@ -217,9 +226,9 @@ class Verdict:
         return tuple(cell for cell in self.cells if cell.status is Status.FAIL)
 
     @property
-    def passed(self) -> bool:
-        """Whether something was judged, and no cell exceeds its limit."""
-        return bool(self.cells) and not self.failed
+    def passed(self) -> bool | None:
+        """Whether no cell exceeds its limit; None where nothing was judged."""
+        return not self.failed if self.cells else None
 
     def to_json(self) -> dict[str, Json]:
         """Return an entry of ``verdicts`` of the report."""
@@ -242,7 +251,8 @@ def judge(
     Parameters
     ----------
     outcomes
-        Of any number of schemes; those that are not ``judged`` fill no cell.
+        Of any number of schemes; those that are not ``judged`` fill no cell. A scheme that has
+        nothing but controls, or is there to compare with, gets no verdict.
     limits
         By name; the defaults of :data:`LIMITS` where absent.
 
@@ -255,11 +265,13 @@ def judge(
     by_scheme: dict[Scheme, dict[tuple[Property, Leaked, Knowledge, str], Cell]] = {}
     unjudged: dict[Scheme, list[AttackOutcome]] = {}
     for outcome in outcomes:
+        if outcome.unjudged not in (CONTROL, COMPARED):
+            by_scheme.setdefault(outcome.scheme, {})
         if not outcome.judged:
             unjudged.setdefault(outcome.scheme, []).append(outcome)
             continue
         cell = cell_of(outcome, most)
-        cells = by_scheme.setdefault(outcome.scheme, {})
+        cells = by_scheme[outcome.scheme]
         key = (outcome.breaks, outcome.leaked, outcome.knowledge, cell.limit)
         if key not in cells or cell.rank > cells[key].rank:
             cells[key] = cell
@@ -322,6 +334,9 @@ def _distance(chance: float, value: float, low: float, high: float) -> tuple[flo
     return abs(value - chance), near, far
 
 
+NOTHING_JUDGED = "no attack was judged, so it neither passed nor failed"
+
+
 def headlines(verdicts: Sequence[Verdict]) -> list[str]:
     """Say what fails, what is not judged, what succeeds without a limit, what is not resolved."""
     lines: list[str] = []
@@ -331,12 +346,13 @@ def headlines(verdicts: Sequence[Verdict]) -> list[str]:
             cell for cell in verdict.cells if cell.status is Status.UNLIMITED and cell.excess > 0.1
         ]
         sentences = [
+            *([] if verdict.cells else [f"{NOTHING_JUDGED}."]),
             *map(_sentence, verdict.failed),
             *_not_judged(verdict),
             *map(_sentence, broken),
             *map(_sentence, unresolved),
         ]
-        if not verdict.failed and not unresolved:
+        if verdict.passed and not unresolved:
             sentences.append("no attack that was made exceeds its limit.")
         lines += [f"{verdict.scheme}: {sentence}" for sentence in sentences]
     return lines

@@ -16,7 +16,7 @@ from api.cli.errors import FAILED
 from api.cli.html_report import write_html
 from api.process.preparation import recorded_of
 from attacks.outcomes import Scheme
-from attacks.report import Document
+from attacks.report import RESULTS, Document
 from attacks.report_tables import markdown
 from attacks.verdict import LIMITS
 from models.pack import ModelPack
@@ -127,13 +127,13 @@ def conclude(
     as_json: bool,
     evaluation: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write the report, say first how it ended; leave with status 1 where a limit is exceeded."""
+    """Write the report, say first how it ended; leave with status 1 where it did not pass."""
     notice = demo_notice(pack.info.embedder_sha256, n=pack.info.n)
     files = write_report(report, out, evaluation=evaluation)
     if as_json:
         emit({**notice, "out": str(out), "files": [path.name for path in files], **report})
     else:
-        say("PASSED" if report["passed"] else "FAILED: a limit is exceeded.")
+        say(RESULTS[report["passed"]])
         for sentence in report["headlines"]:
             say(sentence)
         for sentence in report["comparison_headlines"]:
@@ -149,6 +149,8 @@ def verdict_tables(report: Document) -> list[Table]:
     """Show how the strongest attacks stand against the limits; one table for each scheme."""
     made = []
     for verdict in report["verdicts"]:
+        if not verdict["cells"]:  # a line above says so
+            continue
         title = f"Verdict on {Scheme.of(verdict)}" + (
             ", for comparison" if verdict["comparison"] else ""
         )

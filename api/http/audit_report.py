@@ -5,6 +5,7 @@ import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import UnionType
 from typing import Any
 
 from api.http.errors import StartError
@@ -26,9 +27,9 @@ _TEXTS = ("property", "leaked", "knowledge", "attack")
 _NUMBERS = ("value", "compared", "most")
 _TEXTS_OR_NONE = ("variant", "limit", "status", "reason")
 _NUMBERS_OR_NONE = ("ci_low", "ci_high", "chance", "compared_low", "compared_high")
-_MEMBERS: dict[str, type] = {
+_MEMBERS: dict[str, type | UnionType] = {
     "kind": str,
-    "passed": bool,
+    "passed": bool | None,
     "headlines": list,
     "limits": dict,
     "verdicts": list,
@@ -166,7 +167,7 @@ def read_audit_report(path: Path) -> AuditReport:
 def _is_report(document: Mapping[str, Any]) -> bool:
     if (document.get("format"), document.get("version")) != (FORMAT, VERSION):
         return False
-    if not all(isinstance(document.get(name), kind) for name, kind in _MEMBERS.items()):
+    if not all(isinstance(document.get(name, 0), kind) for name, kind in _MEMBERS.items()):
         return False
     return all(_is_verdict(verdict) for verdict in document["verdicts"]) and all(
         _is_number(value) for value in document["limits"].values()
@@ -179,7 +180,7 @@ def _is_verdict(verdict: object) -> bool:
         and isinstance(verdict.get("strategy"), str)
         and isinstance(verdict.get("dim"), int)
         and _is_text_or_none(verdict.get("decoys", 0))
-        and isinstance(verdict.get("passed"), bool)
+        and isinstance(verdict.get("passed", 0), bool | None)
         and isinstance(verdict.get("cells"), list)
         and all(_is_cell(cell) for cell in verdict["cells"])
     )

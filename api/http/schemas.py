@@ -494,7 +494,10 @@ class AuditAnswer(_Answer):
         "its embedder, strategy, dimension and kind of decoys only; or something else."
     )
     kind: str | None = Field(examples=["templates"])
-    passed: bool | None = Field(description="Of this scheme; null where the report fits nothing.")
+    passed: bool | None = Field(
+        description="Of this scheme; null where no attack on it was judged, so that it neither "
+        "passed nor failed, and where the report fits nothing."
+    )
     headlines: list[str] = Field(description="Those on this scheme.")
     strongest: AuditCell | None
     cells: list[AuditCell]

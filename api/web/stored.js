@@ -100,6 +100,12 @@ const ABOUT = {
     "and thresholds are others. How much a template gives away depends on both.",
 };
 
+const ENDED = new Map([
+  [true, "passed: no limit is exceeded"],
+  [false, "failed: a limit is exceeded"],
+  [null, "neither passed nor failed: no attack was judged"],
+]);
+
 function audited(told) {
   const title = h("h2", {}, "What an attacker gets, by audit");
   if (!told.audited || told.fits === "nothing") {
@@ -144,7 +150,7 @@ function audited(told) {
       "p",
       {},
       "Verdict: ",
-      h("strong", {}, told.passed ? "passed: no limit is exceeded" : "failed: a limit is exceeded"),
+      h("strong", {}, ENDED.get(told.passed)),
       ".",
     ),
     told.headlines.length ? h("ul", {}, told.headlines.map((each) => h("li", {}, each))) : null,

@@ -12,7 +12,7 @@ from attacks.attributes.experiment import run_scheme, work_of
 from attacks.attributes.faces import LabelledFaces, Split, near_duplicates, split
 from attacks.attributes.plan import AttributePlan, prepare
 from attacks.attributes.rows import AttributeRow, strongest
-from attacks.outcomes import AttackOutcome, Knowledge, Leaked, Property, Scheme
+from attacks.outcomes import COMPARED, AttackOutcome, Knowledge, Leaked, Property, Scheme
 from attacks.population import LEAST_FITTED
 from models.extraction import Extraction
 from verify.fairface_labels import CLASSES, Label
@@ -199,7 +199,7 @@ def attribute_outcomes(rows: Sequence[AttributeRow], *, audited: Scheme) -> list
             scheme=scheme,
             measured=row.measures.accuracy,
             chance=row.chance_of_predictions,
-            unjudged=None if scheme == audited else "the scheme is there to compare with",
+            unjudged=None if scheme == audited else COMPARED,
             details={
                 "majority": row.chance,
                 "balanced_accuracy": row.measures.balanced_accuracy,

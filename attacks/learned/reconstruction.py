@@ -9,7 +9,15 @@ from numpy.typing import NDArray
 from attacks.errors import AuditError
 from attacks.learned.decoder import SECONDS, SIZE, Images, resized, train_decoder
 from attacks.learned.extra import need
-from attacks.outcomes import CONTROL, RAW_SCHEME, AttackOutcome, Knowledge, Leaked, Property
+from attacks.outcomes import (
+    CONTROL,
+    RAW_SCHEME,
+    AttackOutcome,
+    Knowledge,
+    Leaked,
+    Property,
+    unproven,
+)
 from attacks.recovery import fmr_of
 from attacks.system import System
 from templates.contract.canonical import Json
@@ -129,13 +137,11 @@ def reconstruct(
         NOISE: noise,
     }
     outcomes = []
-    proves = True
+    reason: str | None = None
     for name, rows in inputs.items():
         scored = score_images(decoder(rows), photos, system.victims.fresh, embed=embed)
         hits = scored.cosines >= system.raw_thresholds[system.level.name]
         control = name in (RAW, NOISE)
-        if name == RAW:  # the first
-            proves = bool(hits.mean() >= LEAST_CONTROL)
         outcomes.append(
             AttackOutcome(
                 attack="reconstruction",
@@ -145,26 +151,21 @@ def reconstruct(
                 knowledge=Knowledge.ALGORITHM,
                 assumption=f"A decoder trained on {len(images)} faces of other people draws the "
                 f"face from the {name}; success is a raw match of the drawn face with a fresh "
-                "photo"
-                + (" (a control)" if control else "")
-                + (
-                    ""
-                    if proves
-                    else ". It proves nothing: the decoder draws fewer than half of the raw "
-                    "embeddings well enough to match"
-                ),
+                "photo" + (" (a control)" if control else ""),
                 scheme=RAW_SCHEME if name == RAW else system.scheme,
                 level=system.level.name,
                 measured=rate(int(np.count_nonzero(hits)), count),
                 chance=fmr_of(system.level),
-                unjudged=CONTROL if control else None,
+                unjudged=CONTROL if control else reason,
                 details={
                     **scored.details(),
                     "epochs": decoder.epochs,
                     "images": len(images),
                     "size": SIZE,
-                    "control_holds": proves,
                 },
             )
         )
+        if name == RAW:  # the first
+            drawn = "half of the raw embeddings drawn well enough to match"
+            reason = unproven(outcomes[0], drawn, least=LEAST_CONTROL)
     return outcomes

@@ -14,7 +14,14 @@ from numpy.typing import NDArray
 
 from attacks.decisions import Scores, score
 from attacks.linkage import rotations_of, turned, turned_points
-from attacks.outcomes import POOLED, AttackOutcome, Knowledge, Leaked, Property
+from attacks.outcomes import (
+    POOLED,
+    AttackOutcome,
+    Knowledge,
+    Leaked,
+    Property,
+    judged_by_controls,
+)
 from attacks.recovery import fmr_of
 from attacks.stored.honest_probes import (
     honest_embedding,
@@ -39,6 +46,7 @@ from verify.point_ascent import ascend_points
 
 TARGETS = 150
 """Templates that the attacker lifts to climb on; as many again to choose among the ends."""
+_WITHOUT, _WITH = "without the key", "with the key"
 COHORT_CLIMBED = 150
 """Of the attacker's cohort, those that the score is normalised by while it climbs; all of them
 decide which end is best."""
@@ -105,7 +113,7 @@ def presentation_attack(system: System) -> list[AttackOutcome]:
     outcomes = _raw(system, own)
     if system.lifted is not None:
         outcomes += _lifted(system, system.lifted, own)
-    return outcomes
+    return judged_by_controls(outcomes, _WITHOUT, _WITH)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -165,14 +173,14 @@ def _raw(system: System, own: OwnTemplates) -> list[AttackOutcome]:
             climbed,
         ),
         Trial(
-            "replay as embedding, with the key",
+            f"replay as embedding, {_WITH}",
             "has stolen the template and the tenant's key, may send embeddings, and sends a "
             "unit vector of the template",
             inside,
             leaked=Leaked.HOLDER_KEYS,
         ),
         Trial(
-            "replay as embedding, without the key",
+            f"replay as embedding, {_WITHOUT}",
             "has stolen the template in its rotation, may send embeddings, and sends a unit vector "
             "of it, which the service turns once more",
             as_stored,
@@ -236,14 +244,14 @@ def _lifted(system: System, calibration: Calibration, own: OwnTemplates) -> list
             climbed,
         ),
         Trial(
-            "replay as lifted probe, with the key",
+            f"replay as lifted probe, {_WITH}",
             "has stolen the template and the tenant's key, may send lifted probes, and sends "
             "a part of the template",
             inside,
             leaked=Leaked.HOLDER_KEYS,
         ),
         Trial(
-            "replay as lifted probe, without the key",
+            f"replay as lifted probe, {_WITHOUT}",
             "has stolen the template in its rotation, may send lifted probes, and sends a part of "
             "it, which the service rotates once more",
             as_stored,

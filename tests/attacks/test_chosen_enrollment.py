@@ -3,19 +3,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import attacks.chosen_enrollment
 from attacks.chosen_enrollment import (
     Sides,
     best_known_points,
     chosen_enrollment,
     estimate_from_sets,
     polar_factor,
+    product_pairs,
 )
 from attacks.errors import AuditError
-from attacks.outcomes import Knowledge, Leaked, Property
+from attacks.outcomes import CONTROL, Knowledge, Leaked, Property
 from attacks.system import System
 from templates.keys.randomness import Keystream
 from templates.space.subspace import SubspaceBatch
 from tests.verify.synthetic import N, random_rotation, unit
+from verify.comparisons import through_wire
 
 
 def in_another_basis(batch: SubspaceBatch) -> SubspaceBatch:
@@ -43,6 +46,24 @@ def test_the_pairs_alone_fix_it_too(system: System) -> None:
     sent = system.lift(system.attacker[:20], "test of chosen enrollment")
     stolen = in_another_basis(sent).rotated(rotation)
     assert alignment(estimate_from_sets(Sides(sent, stolen), steps=0), rotation) > 0.999
+
+
+def test_pairs_beyond_a_number_are_not_needed(
+    system: System, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """80 accounts have 6,400 pairs, of which those after 64 × 64 are left out."""
+    rotation = random_rotation(seed=7)
+    sent = system.lift(system.attacker[:80], "test of chosen enrollment")
+    turned = in_another_basis(sent).rotated(rotation)
+    sides = Sides(sent, through_wire(turned, contract_id=system.contract.contract_id))
+    some, capped = product_pairs(sides), estimate_from_sets(sides)
+    monkeypatch.setattr(attacks.chosen_enrollment, "_MOST_PAIRS", np.inf)
+    everything, uncapped = product_pairs(sides), estimate_from_sets(sides)
+    # Each pair adds 1 to tr(Rᵀ Σ y xᵀ).
+    numbers = [round(np.trace(rotation.T @ moment)) for moment in (some, everything)]
+    assert numbers[0] < 65 * N < 90 * N < numbers[1]
+    np.testing.assert_allclose(capped, uncapped, atol=1e-4)
+    assert alignment(capped, rotation) > 0.9999
 
 
 def test_the_polar_factor_is_found_where_lapack_gives_up(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -81,11 +102,12 @@ def test_best_known_points_lie_in_their_templates_and_in_the_span(system: System
 
 
 def test_no_number_of_accounts_opens_victims_with_rotations_of_their_own(system: System) -> None:
-    *judged, common, opened = chosen_enrollment(system, accounts=(1, 20, 10_000))
-    assert [each.details["accounts"] for each in (*judged, common)] == [1, 20, 1, 20, 20]
-    assert ["holders' keys kept" in each.variant for each in judged] == [False] * 2 + [True] * 2
-    for row in judged:
-        assert row.judged
+    *rows, few, common, opened = chosen_enrollment(system, accounts=(1, 20, 10_000))
+    assert [each.details["accounts"] for each in (*rows, few, common)] == [1, 20] * 3
+    assert ["holders' keys kept" in each.variant for each in rows] == [False] * 2 + [True] * 2
+    for row in rows:
+        control = few if row.details["accounts"] == 1 else common
+        assert row.judged == control.succeeds
         assert (row.leaked, row.knowledge) == (Leaked.MASTER_KEY, Knowledge.TEMPLATES)
         assert row.breaks is Property.IMPERSONATION
         assert abs(float(str(row.details["alignment"]))) < 0.15
@@ -94,9 +116,8 @@ def test_no_number_of_accounts_opens_victims_with_rotations_of_their_own(system:
     assert float(str(common.details["alignment"])) > 0.999
     assert common.measured.value == opened.measured.value == 1.0
     assert opened.leaked is Leaked.HOLDER_KEYS
-    assert not common.judged
-    assert not opened.judged
-    assert judged == chosen_enrollment(system, accounts=(1, 20))[:4]
+    assert {each.unjudged for each in (few, common, opened)} == {CONTROL}
+    assert rows == chosen_enrollment(system, accounts=(1, 20))[:4]
 
 
 def test_an_attacker_without_faces_is_refused(system: System) -> None:

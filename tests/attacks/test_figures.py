@@ -119,6 +119,15 @@ def test_a_line_of_the_linkage_figure_is_the_local_d_of_its_row() -> None:
     assert [text.get_text() for text in legend.get_texts()] == list(SETTINGS)
 
 
+def test_a_setting_of_one_score_is_in_the_legend() -> None:
+    rows = linkage_rows()
+    alone = {**rows[-1], "variant": f"a control, {SCORES[-1]}"}
+    figure = linkage_figure([*rows, alone])
+    assert figure is not None
+    (legend,) = figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == [*SETTINGS, "a control"]
+
+
 def test_a_line_of_the_oracle_figure_is_the_curve_of_its_row() -> None:
     rows = oracle_rows()
     figure = oracle_figure([*rows, OTHER])

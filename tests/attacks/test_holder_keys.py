@@ -44,6 +44,24 @@ def test_without_the_key_a_guess_has_a_limit_of_next_to_nothing(
     assert cell.status is not Status.FAIL
 
 
+def test_where_the_key_gives_nothing_either_nothing_is_judged(
+    system: System, strangers: np.ndarray
+) -> None:
+    foot, truth = guess_with_and_without_holder_keys(
+        system, {"foot-point": lambda _: strangers, "truth": lambda seen: _of(system, seen)}
+    )[:2]
+    assert foot.unjudged == (
+        "it proves nothing, for its control, holder's key stolen, does not succeed either"
+    )
+    assert truth.judged
+
+
+def _of(system: System, seen: SubspaceBatch) -> np.ndarray:
+    """The victims' descriptors, if these are their templates."""
+    near = np.abs(seen.feet - system.templates.feet).max() < 0.01
+    return system.victims.enrolled if near else seen.feet
+
+
 def test_of_few_decoys_the_key_gives_the_person_away_and_nothing_without_it(
     system: System, weak_system: System
 ) -> None:

@@ -16,10 +16,13 @@ from attacks.linkage import (
     turned_back,
     turned_points,
 )
-from attacks.outcomes import POOLED, AttackOutcome, Leaked, Property, Scheme
+from attacks.outcomes import CONTROL, POOLED, AttackOutcome, Leaked, Property, Scheme
 from attacks.system import System
+from enroll import Enroller, Holder
 from models.pack import ModelPack
+from templates.contract import wire
 from templates.decoys import DecoyPool
+from templates.keys.rotation import TenantRotation
 from templates.space.lifting import Strategy
 from tests.verify.synthetic import random_rotation
 from verify import labelled_folder
@@ -41,7 +44,7 @@ def by_variant(outcomes: list[AttackOutcome]) -> dict[str, AttackOutcome]:
 
 def test_templates_link_when_the_keys_leak(system: System) -> None:
     rows = by_variant(link(system, liftings=3))
-    assert len(rows) == 4 * len(SCORES)
+    assert len(rows) == 4 * len(SCORES) + 1
     leaked = rows["keys leaked, nearest points"]
     assert leaked.measured.value > 0.5
     assert leaked.leaked is Leaked.HOLDER_KEYS
@@ -87,8 +90,46 @@ def test_a_holder_has_another_rotation_for_each_enrollment(system: System) -> No
 
 def test_different_people_do_not_link(system: System, strangers: np.ndarray) -> None:
     others = replace(system, victims=replace(system.victims, fresh=strangers))
-    row = by_variant(link(others, liftings=2))["keys leaked, nearest points"]
+    rows = by_variant(link(others, liftings=2))
+    row = rows["keys leaked, nearest points"]
     assert row.measured.value <= float(str(row.details["null_95_percent"]))
+    # So what a rotation hides of it is not shown; lengths have a control of their own.
+    reason = "it proves nothing, for its control, un-rotated templates, does not succeed either"
+    for setting in ("secret rotations", "one tenant", "holder's key kept"):
+        assert rows[f"{setting}, nearest points"].unjudged == reason
+        assert rows[f"{setting}, foot lengths"].judged
+
+
+def test_lengths_know_one_set_again_in_two_rotations(system: System) -> None:
+    control = by_variant(link(system, liftings=1))["one set for both, foot lengths"]
+    assert control.unjudged == CONTROL
+    assert float(str(control.details["identified_at_rank_1"])) > 0.9
+    assert not is_within_null(control)
+
+
+def test_of_who_keeps_a_key_no_length_tells_what_two_tenants_have(system: System) -> None:
+    """By the service's enroller: the very same photos at two tenants, and twice at one."""
+    keys, source = [bytes([i] * 32) for i in range(40)], system.lifter.source
+
+    def lengths(tenant: str, *, kept: bool) -> np.ndarray:
+        rotation = TenantRotation(tenant.encode().ljust(32), source.n)
+        enroller = Enroller(system.contract, source, rotation=rotation, lift_secret=bytes(32))
+        stored = [
+            enroller.from_embeddings(
+                row[None], holder=Holder(key, tenant, f"person {number}") if kept else None
+            )
+            for number, (key, row) in enumerate(zip(keys, system.victims.enrolled, strict=True))
+        ]
+        return np.array([wire.decode(one.wire).subspace.foot_norm for one in stored])
+
+    def linked(first: np.ndarray, second: np.ndarray) -> int:
+        nearest = np.abs(first[:, None] - second).argmin(axis=1)
+        return int(np.count_nonzero(nearest == np.arange(len(first))))
+
+    assert linked(lengths("bank", kept=True), lengths("shop", kept=True)) <= 8  # by chance 1
+    assert linked(lengths("bank", kept=True), lengths("bank", kept=True)) >= 30
+    # Where no key is kept the master key opens both, whatever their lengths.
+    assert linked(lengths("bank", kept=False), lengths("shop", kept=False)) >= 30
 
 
 def test_only_lengths_survive_a_rotation(system: System) -> None:

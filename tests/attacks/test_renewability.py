@@ -59,3 +59,16 @@ def test_the_likeliest_guesses_are_those_of_one_template(
 def test_foot_points_under_a_secret_rotation_open_nothing(rows: dict[str, AttackOutcome]) -> None:
     row = rows["renewal-replay: new photos, old rotation secret, old foot point"]
     assert row.measured.value <= 1 / 40
+
+
+def test_a_secret_rotation_is_judged_by_what_the_leaked_one_opens(
+    rows: dict[str, AttackOutcome],
+) -> None:
+    for name, row in rows.items():
+        if row.leaked is Leaked.MASTER_KEY:
+            assert row.judged == rows[name.replace("secret", "leaked")].succeeds
+        else:
+            assert row.judged
+    assert rows[
+        "renewal-replay: same photos, old rotation secret, a point of the old template"
+    ].judged

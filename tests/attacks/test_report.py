@@ -1,5 +1,8 @@
 import json
+from dataclasses import replace
 from typing import Any
+
+import pytest
 
 from attacks.outcomes import AttackOutcome, Estimate, Knowledge, Leaked, Property, Scheme
 from attacks.report import document
@@ -81,9 +84,36 @@ def test_a_comparison_does_not_decide_and_is_said_apart() -> None:
     assert json.loads(json.dumps(report, allow_nan=False)) == report
 
 
-def test_nothing_judged_is_not_passed() -> None:
-    report = document("fairface", outcomes=[], limits={}, model={}, settings={})
-    assert report["passed"] is False
+def unjudged(scheme: Scheme) -> list[AttackOutcome]:
+    return [replace(row, unjudged="its control fails") for row in outcomes(scheme, 0)]
+
+
+@pytest.mark.parametrize(
+    ("rows", "passed", "result"),
+    [
+        ([], None, "NEITHER PASSED NOR FAILED: of a scheme no attack was judged."),
+        (unjudged(SCHEME), None, "NEITHER PASSED NOR FAILED: of a scheme no attack was judged."),
+        (
+            [*outcomes(OTHER, 0), *unjudged(SCHEME)],
+            None,
+            "NEITHER PASSED NOR FAILED: of a scheme no attack was judged.",
+        ),
+        ([*outcomes(OTHER, 150), *unjudged(SCHEME)], False, "FAILED: a limit is exceeded."),
+        (outcomes(SCHEME, 0), True, "PASSED"),
+    ],
+)
+def test_nothing_judged_is_neither_passed_nor_failed(
+    rows: list[AttackOutcome], passed: bool | None, result: str
+) -> None:
+    report = document("fairface", outcomes=rows, limits={}, model={}, settings={})
+    assert report["passed"] is passed
+    assert json.loads(json.dumps(report))["passed"] is passed
+    text = markdown(report)
+    assert text.splitlines()[2] == f"**{result}**"
+    said = "adversarial, m = 16, generated decoys: no attack was judged, so it neither passed nor"
+    without_verdict = bool(rows) and passed is not True
+    assert any(line.startswith(said) for line in report["headlines"]) == without_verdict
+    assert ("On this scheme no attack was judged" in text) == without_verdict
 
 
 def test_the_limits_of_the_report_are_those_that_judged() -> None:

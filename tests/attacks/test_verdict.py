@@ -3,6 +3,7 @@ import math
 import pytest
 
 from attacks.outcomes import (
+    COMPARED,
     CONTROL,
     AttackOutcome,
     Estimate,
@@ -219,6 +220,18 @@ def test_what_leaked_parts_the_cells() -> None:
         (Leaked.MASTER_KEY, 0.0),
         (Leaked.HOLDER_KEYS, 0.005),
     ]
+
+
+def test_a_scheme_of_which_nothing_is_judged_neither_passes_nor_fails() -> None:
+    row = outcome(Property.IRREVERSIBILITY, rate(0, 1000), unjudged="its control fails")
+    (verdict,) = judge([row])
+    assert (verdict.passed, verdict.cells, verdict.unjudged) == (None, (), (row,))
+    first, *rest = headlines([verdict])
+    assert first.endswith("no attack was judged, so it neither passed nor failed.")
+    assert ["its control fails" in line for line in rest] == [True]
+    # What is there to compare with, and a control of another scheme, are no scheme's verdict.
+    for reason in (COMPARED, CONTROL):
+        assert judge([outcome(Property.IRREVERSIBILITY, rate(0, 9), unjudged=reason)]) == []
 
 
 def test_schemes_are_judged_apart() -> None:

@@ -235,6 +235,15 @@ def test_a_report_for_this_contract(audited: Any) -> None:
     ]
 
 
+def test_a_report_that_judged_nothing_neither_passed_nor_failed(audited: Any) -> None:
+    deployment, answer = audited
+    document = report(settings={"contract_id": deployment.contract.contract_id}, passed=None)
+    document["verdicts"][1] |= {"passed": None, "cells": []}
+    body = answer(document)
+    assert (body["audited"], body["fits"], body["passed"]) == (True, "contract", None)
+    assert (body["cells"], body["strongest"]) == ([], None)
+
+
 def test_a_report_of_the_same_scheme_or_of_another(audited: Any) -> None:
     deployment, answer = audited
     binding = deployment.contract.binding
@@ -311,7 +320,7 @@ def test_nobody_audited(client: Client) -> None:
         *(
             (json.dumps(report(verdicts=[{**report()["verdicts"][1], **part}])), "is not a report")
             for part in (
-                {"passed": None},
+                {"passed": "no"},
                 {"strategy": None},
                 {"decoys": 1},
                 {"cells": [cell(value=float("nan"))]},
