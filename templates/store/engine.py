@@ -21,10 +21,11 @@ _CUT_OFF = {
     "keepalives_count": 2,
     "tcp_user_timeout": 15_000,
 }
-"""When a connection to a PostgreSQL that cannot be reached any more is given up: 15 s after the last
-sign of life, whether it was silent or something that was sent is not acknowledged. In seconds; the
-last in milliseconds. The server does the same: a host that is cut off inside a write holds locks
-that every other host waits for, until the server ends its session, which takes two hours by default.
+"""When a connection to PostgreSQL is given up: 15 s after the last sign of the other end, be it
+silent or does it not acknowledge what was sent. In seconds; the last in milliseconds.
+
+The server does the same. A host that is cut off inside a write has locks for which every other host
+waits, and by default a server ends its session after two hours.
 """
 _STOPPED_S = 60
 """A process that stops inside a write, on a host that can be reached, is ended after this."""

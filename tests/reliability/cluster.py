@@ -33,9 +33,16 @@ def _programs() -> Path:
 
 
 class Cluster:
-    """A throw-away server on a port of its own; it runs from the start of the block to its end."""
+    """A throw-away server on a port of its own; it runs from the start of the block to its end.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    address
+        That it listens on, of a network of 256 addresses, all of which it trusts.
+    """
+
+    def __init__(self, address: str = "127.0.0.1") -> None:
+        self._address = address
         self._bin = _programs()
         # Root may not run the server. A short path: that of a socket has about 100 characters.
         self._account = ACCOUNT if os.geteuid() == 0 else None
@@ -52,6 +59,8 @@ class Cluster:
     def __enter__(self) -> "Cluster":
         try:
             self._call("initdb", "-D", "data", "-A", "trust", "-U", "veilface", "-N", "-E", "UTF8")
+            with (self._folder / "data" / "pg_hba.conf").open("a") as access:
+                access.write(f"host all all {self._address}/24 trust\n")
             self.start()
             with psycopg.connect(self._url("postgres"), autocommit=True) as connection:
                 connection.execute("CREATE DATABASE veilface")
@@ -80,7 +89,7 @@ class Cluster:
         """Start it, and return when it accepts connections."""
         settings = {
             "port": self.port,
-            "listen_addresses": "127.0.0.1",
+            "listen_addresses": self._address,
             "unix_socket_directories": self._folder,
         }
         options = " ".join(f"-c {name}={value}" for name, value in settings.items())
@@ -97,7 +106,7 @@ class Cluster:
             time.sleep(0.02)
 
     def _url(self, database: str) -> str:
-        return f"postgresql://veilface@127.0.0.1:{self.port}/{database}"
+        return f"postgresql://veilface@{self._address}:{self.port}/{database}"
 
     def _call(self, program: str, *arguments: str, check: bool = True) -> int:
         # Into a file: the server inherits the output, and a pipe would be open as long as it runs.

@@ -153,7 +153,7 @@ def test_the_server_gives_up_a_host_that_is_cut_off_or_stopped(
     def settings(url: str) -> dict[str, str]:
         query = sa.text("SELECT name, reset_val FROM pg_settings")
         database = Database(url)
-        seen = database.read(lambda each: {name: value for name, value in each.execute(query)})
+        seen = database.read(lambda each: dict(each.execute(query).all()))
         database.close()
         return seen
 
