@@ -50,6 +50,7 @@ WHOLE_PAGES = {
     ("docs/private-client.md", "sh"): "tests/clients/test_docs.py",
     ("docs/private-client.md", "python"): "tests/clients/test_docs.py",
     ("docs/javascript.md", "js"): "tests/clients/javascript/test_docs.py",
+    ("docs/backups.md", "sh"): "tests/test_backup.py",
     ("docs/webhooks.md", "python"): "tests/api/process/test_webhooks.py",
 }
 # Blocks that another test executes: page and first line.
