@@ -88,15 +88,10 @@ class Cluster:
         """URL of its one database."""
         return f"postgresql://veilface@{self._address}:{self.port}/veilface"
 
-    @property
-    def socket_folder(self) -> Path:
-        """Where whoever is on this machine is trusted."""
-        return self._folder
-
     def connect(self, database: str = "veilface") -> "psycopg.Connection[tuple[Any, ...]]":
-        """Connect on this machine; each statement is a transaction."""
+        """Connect by the socket, which is trusted; each statement is a transaction."""
         return psycopg.connect(
-            host=str(self.socket_folder),
+            host=str(self._folder),
             port=self.port,
             user="veilface",
             dbname=database,

@@ -15,7 +15,7 @@ from tests.api.cli.conftest import run
 from tests.api.deployment import bearer
 from tests.patience import PATIENCE_S, wait_until
 from tests.reliability.cluster import Cluster
-from tests.reliability.hosts import Host, Network, NoNamespaces, two_hosts
+from tests.reliability.hosts import Host, Network, two_hosts
 from tests.reliability.operations import LOST, Clients, Operation, People
 
 pytestmark = pytest.mark.long
@@ -29,11 +29,7 @@ STRANGER = 9
 
 @pytest.fixture
 def network() -> Iterator[Network]:
-    try:
-        made = Network(2)
-    except NoNamespaces as reason:
-        pytest.skip(str(reason))
-    with made:
+    with Network(2) as made:
         yield made
 
 
