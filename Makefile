@@ -85,21 +85,24 @@ wheels: | $(UV)
 image:
 	.ci/image
 
-# What is published of the version in pyproject.toml, in dist/release; refused before anything is built.
+# What is published of the version in pyproject.toml, in dist/release; refused before anything is built. Its image needs
+# root and podman: IMAGE=no leaves it out.
+IMAGE ?= yes
 release:
 	rm -rf dist/release && mkdir -p dist
 	$(PYTHON) .ci/release_notes.py > dist/NOTES.md
+	@test "$(IMAGE)" = no || { test "$$(id -u)" = 0 && command -v podman >/dev/null; } \
+		|| { echo "no release: its image needs root and podman; IMAGE=no leaves it out" >&2; exit 1; }
 	$(MAKE) wheels javascript-package sbom
 	mkdir dist/release
 	cp dist/NOTES.md dist/wheels/*.whl dist/npm/*.tgz dist/sbom.json dist/release
-	if [ "$$(id -u)" = 0 ] && command -v podman >/dev/null; then \
-		.ci/image "dist/release/$$(basename dist/wheels/veilface-*.whl -py3-none-any.whl)-image.tar.gz"; \
-	else echo "no image is in this release: it needs podman, and to be root"; fi
+	test "$(IMAGE)" = no \
+		|| .ci/image "dist/release/$$(basename dist/wheels/veilface-*.whl -py3-none-any.whl)-image.tar.gz"
 	cd dist/release && sha256sum * > SHA256SUMS
 
 # The workflows of a forge, without asking it.
 workflows: | $(UV)
-	$(UV) tool run --quiet --from zizmor==1.32.0 zizmor --quiet --offline --persona=pedantic .github/workflows
+	$(UV) tool run --quiet --from zizmor==1.32.0 zizmor --quiet --offline --persona=pedantic --strict-collection .github/workflows
 
 .venv/core: requirements.lock pyproject.toml | $(UV)
 	test -x $(VENV)/python || $(UV) venv --quiet --python '>=3.11' .venv

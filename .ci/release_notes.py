@@ -1,7 +1,7 @@
 """Print the notes of a release: the section of CHANGELOG.md for the version of pyproject.toml.
 
 One sentence and exit status 1 say why nothing can be released: the working tree is not what was
-committed, the commit is tagged as another version, or CHANGELOG.md does not describe this one.
+committed, the commit has the tag of another version, or CHANGELOG.md does not describe this one.
 """
 
 import re
@@ -33,8 +33,10 @@ def main() -> int:
     if changed := git("status", "--porcelain"):
         return refuse(f"{len(changed)} files are not as they were committed: commit or remove them")
     tags = [tag for tag in git("tag", "--points-at", "HEAD") if re.match(r"v\d", tag)]
-    if tags and f"v{version}" not in tags:
-        return refuse(f"the commit is tagged {', '.join(tags)}, and pyproject.toml says {version}")
+    if others := [tag for tag in tags if tag != f"v{version}"]:
+        return refuse(
+            f"the commit is tagged {', '.join(others)}, and pyproject.toml says {version}"
+        )
     notes = section((ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), version)
     if notes is None:
         return refuse(f"CHANGELOG.md says nothing under a heading '## [{version}] - YYYY-MM-DD'")

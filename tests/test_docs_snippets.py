@@ -50,6 +50,7 @@ WHOLE_PAGES = {
     ("docs/private-client.md", "sh"): "tests/clients/test_docs.py",
     ("docs/private-client.md", "python"): "tests/clients/test_docs.py",
     ("docs/javascript.md", "js"): "tests/clients/javascript/test_docs.py",
+    ("docs/backups.md", "sh"): "tests/test_backup.py",
     ("docs/webhooks.md", "python"): "tests/api/process/test_webhooks.py",
 }
 # Blocks that another test executes: page and first line.
@@ -65,6 +66,7 @@ ELSEWHERE = {
     ): "tests/examples/test_login.py",
     ("docs/evaluation.md", "LFW=~/lfw.bin"): "tests/test_readme.py",
     ("docs/cli.md", "veilface demo"): "tests/test_tutorial.py",
+    ("docs/deployment.md", "DEPLOY=/opt/veilface-deploy"): "tests/test_compose.py",
 }
 # Blocks of commands that are executed here, in this process, on a tiny deployment.
 HERE = {
@@ -161,7 +163,6 @@ PARSED = {
 # Blocks that nothing executes, and why. docs/README.md names these pages.
 NOT_EXECUTED = {
     ("docs/operations.md", "caddyfile", "{"): "Caddy is not installed where the tests run",
-    ("docs/deployment.md", "sh", "DEPLOY=/opt/veilface-deploy"): NEEDS_A_HOST,
     ("docs/deployment.md", "sh", "export VEILFACE_DATA=/opt/veilface-deploy/data "
      "VEILFACE_SECRETS=/opt/veilface-deploy/secrets"): NEEDS_A_HOST,
     ("docs/deployment.md", "sh", "python3 -m venv /opt/veilface"): NEEDS_A_HOST,

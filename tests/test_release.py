@@ -12,6 +12,7 @@ import pytest
 import yaml
 
 ROOT = Path(__file__).resolve().parent.parent
+TEST = ".github/workflows/test.yml"
 WORKFLOWS = sorted((ROOT / ".github" / "workflows").iterdir())
 CHANGELOG = """\
 # Changelog
@@ -74,7 +75,7 @@ def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def release(checkout: Path) -> "subprocess.CompletedProcess[str]":
+def release(checkout: Path, *settings: str) -> "subprocess.CompletedProcess[str]":
     """Run the target; its builders write what they are asked for, and note that they were."""
     builders = checkout.parent / "builders"
     for name, content in BUILT.items():
@@ -83,7 +84,7 @@ def release(checkout: Path) -> "subprocess.CompletedProcess[str]":
         file.write_bytes(content)
     builder = checkout.parent / "tools" / "make-instead"
     put(builder, f'echo "asked: $*"\ncp -R {builders}/dist .')
-    command = ["make", "release", f"MAKE={builder}", f"PYTHON={sys.executable}"]
+    command = ["make", "release", f"MAKE={builder}", f"PYTHON={sys.executable}", *settings]
     return subprocess.run(command, cwd=checkout, capture_output=True, text=True, check=False)
 
 
@@ -109,16 +110,28 @@ def test_a_release_is_what_was_built_with_notes_and_checksums(checkout: Path) ->
 
 
 @pytest.mark.parametrize("without", ["root", "podman"])
-def test_a_release_without_the_image_says_so(checkout: Path, without: str) -> None:
+def test_a_release_has_its_image_unless_it_is_told_not_to(checkout: Path, without: str) -> None:
     tools = checkout.parent / "tools"
     if without == "root":
         put(tools / "id", "echo 1000")
     else:
         (tools / "podman").unlink()
     ran = release(checkout)
+    assert ran.returncode != 0
+    assert ran.stderr.startswith("no release: its image needs root and podman; IMAGE=no leaves it")
+    assert "asked:" not in ran.stdout
+    assert not (checkout / "dist" / "release").exists()
+    ran = release(checkout, "IMAGE=no")
     assert ran.returncode == 0, ran.stderr
-    assert "no image is in this release" in ran.stdout
-    assert IMAGE not in released(checkout)
+    built = {Path(name).name for name in BUILT}
+    assert released(checkout).keys() == {*built, "NOTES.md", "SHA256SUMS"}
+
+
+def test_an_image_that_fails_fails_the_release(checkout: Path) -> None:
+    put(checkout / ".ci" / "image", "exit 1")
+    git(checkout, "commit", "--all", "--message", "No image")
+    assert release(checkout).returncode != 0
+    assert "SHA256SUMS" not in released(checkout)
 
 
 def undescribed(checkout: Path) -> str:
@@ -149,7 +162,14 @@ def tagged_otherwise(checkout: Path) -> str:
     return "the commit is tagged v1.9.0, and pyproject.toml says 1.10.0"
 
 
-@pytest.mark.parametrize("spoil", [undescribed, empty, changed, untracked, tagged_otherwise])
+def tagged_twice(checkout: Path) -> str:
+    git(checkout, "tag", "v1.10.0")
+    return tagged_otherwise(checkout)
+
+
+@pytest.mark.parametrize(
+    "spoil", [undescribed, empty, changed, untracked, tagged_otherwise, tagged_twice]
+)
 def test_nothing_is_built_where_there_is_nothing_to_release(checkout: Path, spoil: Any) -> None:
     reason = spoil(checkout)
     ran = release(checkout)
@@ -168,14 +188,14 @@ def test_the_tag_of_the_version_releases_it(checkout: Path) -> None:
 @pytest.mark.parametrize("file", WORKFLOWS, ids=lambda file: str(file.name))
 def test_workflows_are_pinned_and_may_do_little(file: Path) -> None:
     text = file.read_text(encoding="utf-8")
-    used = re.findall(r"uses: (.*)", text)
+    used = [each for each in re.findall(r"uses: (.*)", text) if each != f"$/{TEST}"]
     assert used
     assert all(re.fullmatch(r"[\w/-]+@[0-9a-f]{40} # v\d+\.\d+\.\d+", each) for each in used)
     workflow = yaml.safe_load(text)
     assert workflow["permissions"] == {}
     for job in workflow["jobs"].values():
-        commands = "\n".join(step.get("run", "") for step in job["steps"])
-        builds = ".ci/run" in commands or "make " in commands
+        commands = "\n".join(step.get("run", "") for step in job.get("steps", []))
+        builds = ".ci/run" in commands or "make " in commands or "uses" in job
         assert job["permissions"] == {"contents": "read" if builds else "write"}
 
 
@@ -184,9 +204,22 @@ def test_workflows_call_what_a_person_calls() -> None:
         step["run"].removeprefix("sudo --preserve-env ")
         for file in WORKFLOWS
         for job in yaml.safe_load(file.read_text(encoding="utf-8"))["jobs"].values()
-        for step in job["steps"]
+        for step in job.get("steps", [])
         if "run" in step
     ]
     assert ".ci/run" in commands
     assert "make release" in commands
     assert re.search(r"^make workflows$", (ROOT / ".ci" / "run").read_text(), re.M)
+
+
+def test_what_is_published_is_a_version_that_was_tested() -> None:
+    workflow = yaml.safe_load((ROOT / ".github" / "workflows" / "release.yml").read_text())
+    jobs = workflow["jobs"]
+    assert jobs["test"]["uses"] == f"$/{TEST}"
+    assert (jobs["build"]["needs"], jobs["publish"]["needs"]) == ("test", "build")
+    # YAML 1.1 reads the key `on` as true.
+    (pattern,) = workflow[True]["push"]["tags"]
+    assert "workflow_call" in yaml.safe_load((ROOT / TEST).read_text())[True]
+    # In a filter of tags, a point is a point, and + and [] are as in an expression.
+    tags = ["v1.2.3", "v0.10.0", "vnext", "v1", "v1.2.3-rc1", "v1.2.3.4", "1.2.3"]
+    assert [tag for tag in tags if re.fullmatch(pattern.replace(".", r"\."), tag)] == tags[:2]

@@ -302,7 +302,12 @@ def _lock_number(name: str) -> int:
 # Made once: building a statement costs more than running it. PostgreSQL takes the columns of one in
 # their order, so the limit, in milliseconds, holds for the locks.
 _LIMIT = sa.func.set_config("lock_timeout", sa.bindparam("limit", type_=sa.String), True)
-_ALONE = sa.select(_LIMIT, sa.func.pg_advisory_xact_lock(_lock_number(_WRITING)))
+# What runs alone may compute for long between two statements, over all receipts for example.
+_ALONE = sa.select(
+    _LIMIT,
+    sa.func.set_config("idle_in_transaction_session_timeout", "0", True),
+    sa.func.pg_advisory_xact_lock(_lock_number(_WRITING)),
+)
 _BESIDE = sa.select(_LIMIT, sa.func.pg_advisory_xact_lock_shared(_lock_number(_WRITING)))
 _BESIDE_UNDER = _BESIDE.add_columns(
     sa.func.pg_advisory_xact_lock(sa.bindparam("lock", type_=sa.BigInteger))

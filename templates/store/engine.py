@@ -15,6 +15,21 @@ from sqlalchemy.exc import ArgumentError
 from templates.errors import StoreError
 from templates.store.turn import next_in_line
 
+_CUT_OFF = {
+    "keepalives_idle": 5,
+    "keepalives_interval": 5,
+    "keepalives_count": 2,
+    "tcp_user_timeout": 15_000,
+}
+"""When a connection to PostgreSQL is given up: 15 s after the last sign of the other end, be it
+silent or does it not acknowledge what was sent. In seconds; the last in milliseconds.
+
+The server does the same. A host that is cut off inside a write has locks for which every other host
+waits, and by default a server ends its session after two hours.
+"""
+_STOPPED_S = 60
+"""A process that stops inside a write, on a host that can be reached, is ended after this."""
+
 
 def checked_url(text: str) -> URL:
     """Read a database URL, with the driver that is used; nothing is opened.
@@ -71,10 +86,8 @@ def make_engine(url: URL, *, timeout: float, pool_size: int, max_overflow: int) 
             connect_args={
                 "connect_timeout": max(2, round(timeout)),
                 "application_name": "veilface",
-                "keepalives_idle": 30,
-                "keepalives_interval": 10,
-                "keepalives_count": 3,
-                "tcp_user_timeout": 30_000,
+                "options": _session_options(url),
+                **_CUT_OFF,
             },
             **pool,
         )
@@ -89,6 +102,14 @@ def make_engine(url: URL, *, timeout: float, pool_size: int, max_overflow: int) 
     event.listen(engine, "connect", _prepare_sqlite)
     event.listen(engine, "begin", functools.partial(_begin_sqlite, path, timeout))
     return engine
+
+
+def _session_options(url: URL) -> str:
+    settings = {f"tcp_{name.removeprefix('tcp_')}": value for name, value in _CUT_OFF.items()}
+    settings["idle_in_transaction_session_timeout"] = 1000 * _STOPPED_S
+    # Of two values the server takes the last one, so an operator's own prevail.
+    given = url.normalized_query.get("options", (os.environ.get("PGOPTIONS", ""),))
+    return " ".join([*(f"-c {name}={value}" for name, value in settings.items()), *given])
 
 
 def sqlite_file(url: URL) -> Path:

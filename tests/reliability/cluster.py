@@ -7,6 +7,7 @@ import subprocess
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import psycopg
 
@@ -33,9 +34,23 @@ def _programs() -> Path:
 
 
 class Cluster:
-    """A throw-away server on a port of its own; it runs from the start of the block to its end."""
+    """A throw-away server on a port of its own; it runs from the start of the block to its end.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    address
+        That it listens on, of a network of 256 addresses.
+    port
+        One that is free by default.
+    access
+        How whoever comes from the network shows who they are.
+    """
+
+    def __init__(
+        self, address: str = "127.0.0.1", port: int | None = None, access: str = "trust"
+    ) -> None:
+        self._address = address
+        self._access = access
         self._bin = _programs()
         # Root may not run the server. A short path: that of a socket has about 100 characters.
         self._account = ACCOUNT if os.geteuid() == 0 else None
@@ -47,13 +62,15 @@ class Cluster:
         self._folder = Path(tempfile.mkdtemp(prefix="veilface-pg-"))
         if self._account is not None:
             os.chown(self._folder, entry.pw_uid, entry.pw_gid)
-        self.port = free_port()
+        self.port = port or free_port()
 
     def __enter__(self) -> "Cluster":
         try:
             self._call("initdb", "-D", "data", "-A", "trust", "-U", "veilface", "-N", "-E", "UTF8")
+            with (self._folder / "data" / "pg_hba.conf").open("a") as access:
+                access.write(f"host all all {self._address}/24 {self._access}\n")
             self.start()
-            with psycopg.connect(self._url("postgres"), autocommit=True) as connection:
+            with self.connect("postgres") as connection:
                 connection.execute("CREATE DATABASE veilface")
         except BaseException:
             self.__exit__()
@@ -69,7 +86,17 @@ class Cluster:
     @property
     def url(self) -> str:
         """URL of its one database."""
-        return self._url("veilface")
+        return f"postgresql://veilface@{self._address}:{self.port}/veilface"
+
+    def connect(self, database: str = "veilface") -> "psycopg.Connection[tuple[Any, ...]]":
+        """Connect by the socket, which is trusted; each statement is a transaction."""
+        return psycopg.connect(
+            host=str(self._folder),
+            port=self.port,
+            user="veilface",
+            dbname=database,
+            autocommit=True,
+        )
 
     @property
     def runs(self) -> bool:
@@ -80,7 +107,7 @@ class Cluster:
         """Start it, and return when it accepts connections."""
         settings = {
             "port": self.port,
-            "listen_addresses": "127.0.0.1",
+            "listen_addresses": self._address,
             "unix_socket_directories": self._folder,
         }
         options = " ".join(f"-c {name}={value}" for name, value in settings.items())
@@ -95,9 +122,6 @@ class Cluster:
             if time.monotonic() > deadline:
                 raise AssertionError("the PostgreSQL server does not stop")
             time.sleep(0.02)
-
-    def _url(self, database: str) -> str:
-        return f"postgresql://veilface@127.0.0.1:{self.port}/{database}"
 
     def _call(self, program: str, *arguments: str, check: bool = True) -> int:
         # Into a file: the server inherits the output, and a pipe would be open as long as it runs.

@@ -10,10 +10,16 @@ from tests.reliability.cluster import Cluster, NoPostgres
 
 
 @pytest.fixture
-def cluster() -> Iterator[Cluster]:
+def cluster_address() -> str:
+    """That the server of `cluster` listens on; a test that asks for another overrides it."""
+    return "127.0.0.1"
+
+
+@pytest.fixture
+def cluster(cluster_address: str) -> Iterator[Cluster]:
     """A running PostgreSQL server of this test's own."""
     try:
-        made = Cluster()
+        made = Cluster(cluster_address)
     except NoPostgres as reason:
         if os.environ.get("VEILFACE_REQUIRE_POSTGRES") == "1":
             pytest.fail(f"{reason}, and VEILFACE_REQUIRE_POSTGRES=1 asks for one")

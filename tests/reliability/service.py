@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +24,18 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 class Service:
-    """One deployment's service on its port; it may be started as often as it was killed."""
+    """One deployment's service on its port; it may be started as often as it was killed.
 
-    def __init__(self, deployment: Deployment, folder: Path) -> None:
+    Parameters
+    ----------
+    within
+        Program, with its arguments, that runs it somewhere else than here.
+    """
+
+    def __init__(self, deployment: Deployment, folder: Path, within: Sequence[str] = ()) -> None:
         self.deployment = deployment
-        self.url = f"http://127.0.0.1:{deployment.settings.port}"
+        self.url = f"http://{deployment.settings.host}:{deployment.settings.port}"
+        self.within = within
         self.up = threading.Event()
         self.starts = 0
         self.log: list[dict[str, Any]] = []
@@ -49,14 +57,9 @@ class Service:
         """Start it, and return when every worker is ready."""
         self.starts += 1
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "api.cli", "serve"],
+            [*self.within, sys.executable, "-m", "api.cli", "serve"],
             cwd=ROOT,
-            env={
-                **{k: v for k, v in os.environ.items() if not k.startswith("VEILFACE_")},
-                **environment_of(self.deployment.settings),
-                "OMP_NUM_THREADS": "1",
-                "TMPDIR": str(self._folder),
-            },
+            env=self.environment(),
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             start_new_session=True,
@@ -65,6 +68,15 @@ class Service:
         self._reader.start()
         self.wait_for_workers()
         self.up.set()
+
+    def environment(self) -> dict[str, str]:
+        """What its processes are started with."""
+        return {
+            **{k: v for k, v in os.environ.items() if not k.startswith("VEILFACE_")},
+            **environment_of(self.deployment.settings),
+            "OMP_NUM_THREADS": "1",
+            "TMPDIR": str(self._folder),
+        }
 
     def wait_for_workers(self) -> None:
         """Return when as many workers as there should be have opened their runtime."""
@@ -80,7 +92,10 @@ class Service:
         """Whether a worker says that it is ready."""
         try:
             # Asked again: a worker that was killed may have taken the connection.
-            return httpx.get(f"{self.url}/health/ready", timeout=10).status_code == 200
+            return (
+                httpx.get(f"{self.url}/health/ready", timeout=10, trust_env=False).status_code
+                == 200
+            )
         except httpx.TransportError:
             return False
 

@@ -4,14 +4,11 @@ import itertools
 import json
 import os
 import secrets
-import shutil
 import signal
-import subprocess
 import time
 from collections import Counter
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
-from contextlib import asynccontextmanager, suppress
-from pathlib import Path
+from contextlib import asynccontextmanager
 from typing import Any
 
 import anyio
@@ -30,8 +27,7 @@ from api.process.metrics import RATE_LIMITED, RATE_STORAGE_FAILURES
 from api.settings import Settings, load_settings
 from tests.api.deployment import Deployment, bearer, deploy
 from tests.api.shapes import assert_error
-from tests.patience import wait_until
-from tests.ports import free_port
+from tests.redis_server import OwnRedis, own_redis_server
 
 REDIS = os.environ.get("VEILFACE_TEST_REDIS_URL", "redis://127.0.0.1:6379/0")
 Make = Callable[[], Storage]
@@ -226,45 +222,10 @@ def test_old_counters_go(monkeypatch: pytest.MonkeyPatch) -> None:
     anyio.run(scenario)
 
 
-class OwnRedis:
-    """A Redis server of this test's own, which can be killed."""
-
-    def __init__(self, folder: Path) -> None:
-        self.port = free_port()
-        self._folder = folder
-        self.url = f"redis://127.0.0.1:{self.port}/0"
-        self.process: subprocess.Popen[bytes] | None = None
-
-    def start(self) -> None:
-        self.process = subprocess.Popen(
-            ["redis-server", "--port", str(self.port), "--save", "", "--dir", str(self._folder)],
-            stdout=subprocess.DEVNULL,
-        )
-        with redis.Redis.from_url(self.url) as client:
-
-            def answers() -> bool:
-                with suppress(redis.RedisError):
-                    return bool(client.ping())
-                return False
-
-            wait_until(answers, what="the Redis server")
-
-    def kill(self) -> None:
-        if self.process is not None:
-            self.process.kill()
-            self.process.wait()
-            self.process = None
-
-
 @pytest.fixture
-def own_redis(tmp_path: Path) -> Iterator[OwnRedis]:
-    if shutil.which("redis-server") is None:
-        pytest.skip("there is no redis-server to start and kill")
-    server = OwnRedis(tmp_path)
-    try:
+def own_redis() -> Iterator[OwnRedis]:
+    with own_redis_server() as server:
         yield server
-    finally:
-        server.kill()
 
 
 def events(text: str) -> list[str]:

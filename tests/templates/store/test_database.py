@@ -8,6 +8,7 @@ from pathlib import Path
 import psycopg
 import pytest
 import sqlalchemy as sa
+from sqlalchemy.engine import make_url
 
 from templates.errors import StoreError, StoreUnavailable
 from templates.keys.sealing import MasterKeyring
@@ -138,6 +139,60 @@ def test_a_connection_lost_inside_a_write_is_store_unavailable(
         database.write(cut)
     assert [tenant.name for tenant in store.tenants.all()] == ["kept"]
     database.close()
+    store.close()
+
+
+def with_options(url: str, more: str) -> str:
+    made = make_url(url).update_query_dict({"options": f"{make_url(url).query['options']} {more}"})
+    return made.render_as_string(hide_password=False)
+
+
+def test_the_server_gives_up_a_host_that_is_cut_off_or_stopped(
+    postgres_url: str, postgres_database: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def settings(url: str) -> dict[str, str]:
+        query = sa.text("SELECT name, reset_val FROM pg_settings")
+        database = Database(url)
+        seen = database.read(lambda each: dict(each.execute(query).all()))
+        database.close()
+        return seen
+
+    bounds = {
+        "tcp_keepalives_idle": "5",
+        "tcp_keepalives_interval": "5",
+        "tcp_keepalives_count": "2",
+        "tcp_user_timeout": "15000",
+        "idle_in_transaction_session_timeout": "60000",
+    }
+    own = settings(with_options(postgres_url, "-c tcp_user_timeout=9000"))
+    assert own.items() >= {**bounds, "tcp_user_timeout": "9000"}.items()
+    assert own["search_path"].startswith("test_")
+    monkeypatch.setenv("PGOPTIONS", "-c work_mem=5000")
+    assert settings(postgres_database).items() >= {**bounds, "work_mem": "5000"}.items()
+
+
+def test_a_process_that_stops_inside_a_write_lets_go_of_its_locks(
+    postgres_url: str, keyring: MasterKeyring
+) -> None:
+    store = TemplateStore(postgres_url, keyring)
+    store.upgrade()
+    store.tenants.create("kept")
+    stopping = Database(with_options(postgres_url, "-c idle_in_transaction_session_timeout=50"))
+
+    def stop(connection: sa.Connection) -> None:
+        connection.execute(sa.delete(TenantRow))
+        # Waits until the server has ended the session of this write.
+        store.database.write(lambda _: None, lock="a subject's", wait=0)
+        connection.execute(sa.select(1))
+
+    with pytest.raises(StoreUnavailable, match="does not answer"):
+        stopping.write(stop, lock="a subject's")
+    assert [tenant.name for tenant in store.tenants.all()] == ["kept"]
+    limit = sa.text("SELECT current_setting('idle_in_transaction_session_timeout')")
+    assert stopping.write(lambda each: each.execute(limit).scalar()) == "50ms"
+    # What runs alone may compute for long.
+    assert stopping.write_alone(lambda each: each.execute(limit).scalar()) == "0"
+    stopping.close()
     store.close()
 
 
