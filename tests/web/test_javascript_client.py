@@ -16,6 +16,7 @@ from playwright.sync_api import Browser, expect
 from api.process.opening import file_sealer, open_keyring
 from api.process.preparation import recorded_of
 from benchmarks.browser_client import (
+    before_the_camera,
     browser_outcome,
     faces_of,
     page_of,
@@ -200,29 +201,37 @@ def test_the_element(
 
 
 def test_people_enrolled_and_verified_by_tokens_leave_no_face(
-    browser: Browser, running: Running, pack: ModelPack, people: dict[str, list[Path]]
+    browser: Browser,
+    running: Running,
+    pack: ModelPack,
+    camera: FakeCamera,
+    people: dict[str, list[Path]],
 ) -> None:
     """The measurement of ``benchmarks/browser_client.py``, of two people."""
     require_client()
     pair = [Person(name, photos[:3], photos[3:4]) for name, photos in people.items()]
-    search = faces_of(pack, pair)
     context = browser.new_context()
     try:
         with page_of(running.url, running.deployment.token, level=LEVEL) as served:
             opened = open_page(context, served)
             assert opened.call("prepare")["bytes"] > 0
             counts, seconds = browser_outcome(opened, pair, impostors=1)
+            by_camera, shown = before_the_camera(opened, camera, pair)
+            search = faces_of(pack, pair, shown)
             sent = served.recording.sent
             assert (counts.genuine_rejected, counts.genuine) == (0, 2)
             assert (counts.impostor_accepted, counts.impostor) == (0, 2)
             assert (counts.refused_enrollments, dict(counts.other_answers)) == ({}, {})
             assert len(seconds) == 2
+            told = [(each["accepted"], each["error"]) for each in by_camera]
+            assert told == [(True, None), (True, None)]
             assert search.find(sent) == []
             calls, rest = requests_in(sent)
             assert rest == 0
             assert calls["PUT /v1/subjects/*/enrollment"]["members"] == ["template"]
             verified = calls["POST /v1/subjects/*/verify"]
-            assert verified["times"] == 4
+            # Two genuine attempts, two of impostors, and three before the camera: one waited too.
+            assert verified["times"] == 7
             assert verified["members"] == ["hmac", "nonce", "template", "timestamp"]
             assert {call for call in calls if not call.startswith("GET ")} == {
                 "PUT /v1/subjects/*/enrollment",
