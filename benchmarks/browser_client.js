@@ -1,7 +1,7 @@
 // The program of the page that benchmarks/browser_client.py visits: it logs in as any page would,
 // and `window.visit` is called from outside.
 import * as ort from "onnxruntime-web";
-import { decodeImage, ModelPack, PrivateClient } from "veilface-client";
+import { decodeImage, ModelPack, PrivateClient, VeilfaceError } from "veilface-client";
 import { defineLogin } from "veilface-client/login";
 
 const login = document.querySelector("veilface-login");
@@ -29,12 +29,17 @@ async function under(subject, action, call) {
   }
 }
 
-// What came of an attempt: an answer, or the code of the error in its place.
+// Many errors of the client have no code, and all have a name.
+const nameOf = ({ code, name }) => code ?? name;
+
+// What came of an attempt: an answer, or the error of the client in its place.
 const told = (work) =>
   work.catch((error) => {
-    if (error.code === undefined) throw error;
-    return { error: error.code };
+    if (!(error instanceof VeilfaceError)) throw error;
+    return { error: nameOf(error) };
   });
+
+const text = (bytes) => btoa(Array.from(bytes, (byte) => String.fromCharCode(byte)).join(""));
 
 const since = (start) => (performance.now() - start) / 1000;
 
@@ -42,11 +47,12 @@ login.setAttribute("face", face);
 login.options = { runtime: ort };
 login.authorize = () => authorize(subjectOfLogin, "verify");
 login.addEventListener("click", () => (shutter = performance.now()), { capture: true });
-for (const event of ["veilface-result", "veilface-error"]) {
-  login.addEventListener(event, ({ detail }) => {
-    seen.push({ seconds: since(shutter), accepted: detail.accepted === true, error: detail.code ?? null });
-  });
-}
+login.addEventListener("veilface-result", ({ detail: { accepted } }) =>
+  seen.push({ seconds: since(shutter), accepted, error: null }),
+);
+login.addEventListener("veilface-error", ({ detail }) =>
+  seen.push({ seconds: since(shutter), accepted: false, error: nameOf(detail) }),
+);
 defineLogin();
 
 window.visit = {
@@ -81,9 +87,11 @@ window.visit = {
     return { ...answer, seconds: since(start) };
   },
 
-  // The probe of a photo that was verified, lifted once for all its attempts.
-  attempt: (subject, name) =>
-    told(under(subject, "verify", (client) => client.verify(subject, probes.get(name)))),
+  // The probe of a photo, lifted once for all its attempts: for nobody else, if not for its person.
+  attempt: async (subject, name) =>
+    probes.has(name)
+      ? told(under(subject, "verify", (client) => client.verify(subject, probes.get(name))))
+      : { error: "not_lifted" },
 
   // The next logins of the element are this person's.
   meet(subject) {
@@ -96,6 +104,14 @@ window.visit = {
     place.append(login);
   },
 
+  // What the camera of the element shows, as PNG in base64: for the search, not for the network.
+  async frame() {
+    const video = login.shadowRoot.querySelector("video");
+    const canvas = new OffscreenCanvas(video.videoWidth, video.videoHeight);
+    canvas.getContext("2d").drawImage(video, 0, 0);
+    return text(new Uint8Array(await (await canvas.convertToBlob()).arrayBuffer()));
+  },
+
   // Send what no client sends, so that it is found.
   async plant(form, name) {
     const data = await photo(name);
@@ -105,7 +121,6 @@ window.visit = {
     const image = await decodeImage(data);
     const { crop, embedding } = await pack.embedPhoto(image, { policy: face });
     await pack.release();
-    const text = (bytes) => btoa(Array.from(bytes, (byte) => String.fromCharCode(byte)).join(""));
     const floats = new Uint8Array(embedding.buffer, embedding.byteOffset, embedding.byteLength);
     const forms = {
       photo: data,

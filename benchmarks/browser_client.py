@@ -4,10 +4,10 @@ A service serves its pack (``serve_pack``). A page of its own origin holds token
 attempt, and enrolls photos 1-3 of every person by templates that it lifts itself; photos 4-5 are
 lifted once each and verified against the person (genuine) and all others (impostor). The Python
 private client then does the same with the same photos. An enrollment that is refused counts as
-failed genuine attempts. Every byte that the browser sends goes through a recording proxy, no other
-host has an address for it, and the recording is searched for photos and descriptors; those that
-are sent on purpose afterwards must be found. Last, every person stands before a fake camera, and
-``<veilface-login>`` is timed from the click to its answer.
+failed genuine attempts. Then every person stands before a fake camera, and ``<veilface-login>`` is
+timed from the click to its answer. Every byte that the browser sends goes through a recording
+proxy, no other host has an address for it, and the recording is searched for the photos, what the
+camera showed, and their descriptors; those that are sent on purpose afterwards must be found.
 
 Needs Chromium and the built client (``make javascript``).
 
@@ -18,6 +18,7 @@ Example
     python -m benchmarks.browser_client --data ../shared/data --work browser-client-run
 """
 
+import base64
 import json
 import os
 import re
@@ -27,10 +28,11 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from playwright.sync_api import BrowserContext, Page, sync_playwright
+from playwright.sync_api import BrowserContext, sync_playwright
 
 from benchmarks.deployment import VEILFACE, service
 from benchmarks.end_to_end import (
@@ -51,6 +53,7 @@ from models.errors import FaceError
 from models.pack import FacePolicy, ModelPack
 from tests.leaks import LeakSearch
 from tests.patience import PATIENCE_S
+from tests.web.browser_tab import BrowserTab
 from tests.web.camera import FakeCamera
 from tests.web.client_page import Application, application, for_browsers
 from tests.web.conftest import installed_browser
@@ -58,15 +61,19 @@ from veilface_client import Client, PrivateClient
 
 PROGRAM = Path(__file__).with_suffix(".js")
 ONLY_HERE = "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1"
-PHOTO_FORMS = (
-    "photo",
-    "half of a photo",
-    "base64 of a photo",
-    "decoded pixels",
-    "aligned crop",
-)
-DESCRIPTOR_FORMS = ("float32", "float64", "base64 of float32", "decimal text")
-_REQUEST = re.compile(rb"(GET|POST|PUT) (/\S*) HTTP/1\.1\r\n(.*?)\r\n\r\n", re.DOTALL)
+PLANTED = {
+    "photo": ("photo", "bytes"),
+    "half of a photo": ("photo", "bytes"),
+    "base64 of a photo": ("photo", "base64"),
+    "decoded pixels": ("pixels", "bytes"),
+    "aligned crop": ("crop", "bytes"),
+    "float32": ("descriptor", "float32"),
+    "float64": ("descriptor", "float64"),
+    "base64 of float32": ("descriptor", "base64"),
+    "decimal text": ("descriptor", "decimals"),
+}
+"""What is sent on purpose: what must be found of it, and how the form of the leak begins."""
+_REQUEST = re.compile(rb"([A-Z]+) (/\S*) HTTP/1\.1\r\n(.*?)\r\n\r\n", re.DOTALL)
 _NAMED = re.compile(rb"^(/v1/subjects/|/v1/pack/|/photos/)[^/]+|^(/client/|/ort/).+")
 _LENGTH = re.compile(rb"^content-length: (\d+)", re.IGNORECASE | re.MULTILINE)
 
@@ -75,12 +82,12 @@ _LENGTH = re.compile(rb"^content-length: (\d+)", re.IGNORECASE | re.MULTILINE)
 class Visit:
     """A page that is open, whose program is called from here."""
 
-    page: Page
+    tab: BrowserTab
     application: Application
 
     def call(self, name: str, *arguments: object) -> Any:
         """Call a function of the page's program."""
-        return self.page.evaluate(
+        return self.tab.page.evaluate(
             "([name, given]) => window.visit[name](...given)", [name, arguments]
         )
 
@@ -113,11 +120,11 @@ def page_of(url: str, key: str, *, level: str) -> Iterator[Application]:
 
 def visit(context: BrowserContext, served: Application) -> Visit:
     """Open the page in a tab."""
-    page = context.new_page()
-    page.set_default_timeout(1000 * PATIENCE_S)
-    page.goto(served.url + "/")
-    page.wait_for_function("() => window.visit !== undefined")
-    return Visit(page, served)
+    tab = BrowserTab.of(context, served.url + "/")
+    tab.page.set_default_timeout(1000 * PATIENCE_S)
+    tab.page.goto(tab.url)
+    tab.wait_for("() => window.visit !== undefined")
+    return Visit(tab, served)
 
 
 def browser_outcome(
@@ -130,7 +137,6 @@ def browser_outcome(
     """
     counts = AttemptCounts()
     seconds: list[float] = []
-    lifted: set[str] = set()
 
     def accepted(answer: dict[str, Any]) -> bool:
         if "error" in answer:
@@ -149,74 +155,80 @@ def browser_outcome(
             counts.genuine_rejected += not accepted(answer)
             if "accepted" in answer:
                 seconds.append(answer["seconds"])
-                lifted.add(name)
     there = [person for person in people if person.name not in counts.refused_enrollments]
     for person, (photo,) in impostor_attempts(there, impostors):
         counts.impostor += 1
-        # A photo that was not lifted for its own person is lifted for nobody.
-        if photo.name in lifted:
-            counts.impostor_accepted += accepted(opened.call("attempt", person.name, photo.name))
-        else:
-            counts.other_answers["not lifted"] += 1
+        counts.impostor_accepted += accepted(opened.call("attempt", person.name, photo.name))
     return counts, seconds
 
 
 def before_the_camera(
     opened: Visit, camera: FakeCamera, people: Sequence[Person]
-) -> list[dict[str, Any]]:
-    """Log everybody in by the element, one after the other; what it told, and after how long.
+) -> tuple[list[dict[str, Any]], dict[str, bytes]]:
+    """Log everybody in by the element, one after the other.
 
-    Whoever waited for the graphs too logs in once more, and only that counts.
+    Returns what it told each, and after how long; and by names what the browser saw of them, as
+    PNG. Whoever waited for the graphs too logs in once more, and only that counts.
     """
     answers = []
+    shown = {}
     loaded = False
     for person in people:
-        for counts in (True,) if loaded else (False, True):
-            answer = _log_in(opened, camera, person)
-            if counts:
-                answers.append(answer)
-            loaded = answer["error"] is None
-            if not loaded:
-                # The camera stays on after an error: it would show this person for the next.
-                opened.call("leave")
-    return answers
+        camera.shows(person.probes[0])
+        answer, shown[f"camera of {person.name}"] = _log_in(opened, person)
+        if answer["error"] is None and not loaded:
+            answer, _ = _log_in(opened, person)
+        answers.append(answer)
+        loaded = answer["error"] is None
+        if not loaded:
+            # The camera stays on after an error: it would show this person for the next.
+            opened.call("leave")
+    return answers, shown
 
 
-def _log_in(opened: Visit, camera: FakeCamera, person: Person) -> dict[str, Any]:
-    camera.shows(person.probes[0])
+def _log_in(opened: Visit, person: Person) -> tuple[dict[str, Any], bytes]:
     opened.call("meet", person.name)
     before = len(opened.call("seen"))
-    opened.page.get_by_role("button", name="Start camera").click()
-    opened.page.get_by_role("button", name="Log in").click()
-    opened.page.wait_for_function(f"() => window.visit.seen().length > {before}")
+    opened.tab.page.get_by_role("button", name="Start camera").click()
+    button = opened.tab.page.get_by_role("button", name="Log in")
+    button.wait_for()
+    frame = base64.b64decode(opened.call("frame"))
+    button.click()
+    opened.tab.wait_for("(before) => window.visit.seen().length > before", before)
     answer: dict[str, Any] = opened.call("seen")[-1]
-    return answer
+    return answer, frame
 
 
-def faces_of(pack: ModelPack, people: Sequence[Person]) -> LeakSearch:
-    """What must not be found: files, pixels, crops and descriptors of all photos."""
+def faces_of(
+    pack: ModelPack, people: Sequence[Person], shown: Mapping[str, bytes] = MappingProxyType({})
+) -> LeakSearch:
+    """What must not be found: files, pixels, crops and descriptors of all photos, and of more."""
+    photos = {
+        photo.name: photo.read_bytes()
+        for person in people
+        for photo in (*person.enroll, *person.probes)
+    }
     vectors: dict[str, Any] = {}
     strings: dict[str, bytes] = {}
+    for name, data in {**photos, **shown}.items():
+        pixels = decode_image(data)
+        opaque = np.full((*pixels.shape[:2], 1), 255, dtype=np.uint8)
+        strings[f"photo {name}"] = data
+        strings[f"pixels {name}"] = pixels.tobytes()
+        strings[f"pixels with alpha {name}"] = np.dstack([pixels, opaque]).tobytes()
+        try:
+            crop = pack.crop_photo(data, policy=FacePolicy.LARGEST).crop
+        except FaceError:
+            continue
+        strings[f"crop {name}"] = crop.tobytes()
+        vectors[f"descriptor {name}"] = pack.embed(crop[None])[0]
     for person in people:
-        rows = []
-        for photo in (*person.enroll, *person.probes):
-            data = photo.read_bytes()
-            strings[f"photo {photo.name}"] = data
-            pixels = decode_image(data)
-            strings[f"pixels {photo.name}"] = pixels.tobytes()
-            opaque = np.full((*pixels.shape[:2], 1), 255, dtype=np.uint8)
-            strings[f"pixels with alpha {photo.name}"] = np.dstack([pixels, opaque]).tobytes()
-            try:
-                taken = pack.crop_photo(data, policy=FacePolicy.LARGEST)
-            except FaceError:
-                continue
-            strings[f"crop {photo.name}"] = taken.crop.tobytes()
-            row = pack.embed(taken.crop[None])[0]
-            vectors[f"descriptor {photo.name}"] = row
-            rows.append(row)
-        mean = np.mean(rows[: len(person.enroll)], axis=0)
-        vectors[f"mean of {person.name}"] = mean
-        vectors[f"unit mean of {person.name}"] = mean / np.linalg.norm(mean)
+        names = [f"descriptor {photo.name}" for photo in person.enroll]
+        found = [vectors[name] for name in names if name in vectors]
+        if found:
+            mean = np.mean(found, axis=0)
+            vectors[f"mean of {person.name}"] = mean
+            vectors[f"unit mean of {person.name}"] = mean / np.linalg.norm(mean)
     return LeakSearch(vectors=vectors, strings=strings)
 
 
@@ -224,25 +236,32 @@ def planted_and_missed(opened: Visit, photo: Path, search: LeakSearch) -> list[s
     """Send this photo and its descriptor in every form; those that the search did not find."""
     (name,) = opened.show([photo])
     missed = []
-    for form in (*PHOTO_FORMS, *DESCRIPTOR_FORMS):
+    for planted, (kind, form) in PLANTED.items():
         opened.application.recording.forget()
-        opened.call("plant", form, name)
-        kind = "descriptor " if form in DESCRIPTOR_FORMS else ("photo ", "pixels ", "crop ")
+        opened.call("plant", planted, name)
         found = search.find(opened.application.recording.sent)
-        if not any(leak.what.startswith(kind) and leak.what.endswith(name) for leak in found):
-            missed.append(form)
+        if not any(leak.what == f"{kind} {name}" and leak.form.startswith(form) for leak in found):
+            missed.append(planted)
     return missed
 
 
-def requests_in(recording: bytes) -> dict[str, dict[str, object]]:
-    """Count requests by what they ask for, with the members and bytes of their bodies."""
+def requests_in(recording: bytes) -> tuple[dict[str, dict[str, object]], int]:
+    """Count requests by what they ask for, with the members and bytes of their bodies.
+
+    Also returns how many bytes are part of no request; the proxy's line ends between connections
+    are none of the browser's.
+    """
     bodies: dict[str, list[bytes]] = {}
+    rest = end = 0
     for head in _REQUEST.finditer(recording):
         path = _NAMED.sub(rb"\1\2*", head[2])
         length = _LENGTH.search(head[3])
         body = recording[head.end() : head.end() + int(length[1])] if length else b""
         bodies.setdefault(f"{head[1].decode()} {path.decode()}", []).append(body)
-    return {
+        rest += len(recording[end : head.start()].strip(b"\n"))
+        end = head.end() + len(body)
+    rest += len(recording[end:].strip(b"\n"))
+    calls: dict[str, dict[str, object]] = {
         call: {
             "times": len(each),
             "members": sorted({name for body in each if body for name in json.loads(body)}),
@@ -250,6 +269,7 @@ def requests_in(recording: bytes) -> dict[str, dict[str, object]]:
         }
         for call, each in sorted(bodies.items())
     }
+    return calls, rest
 
 
 @contextmanager
@@ -279,7 +299,7 @@ def main() -> None:
     env = prepared(args) | {"VEILFACE_PACK": str(args.pack), "VEILFACE_SERVE_PACK": "true"}
     people = people_of(args.data / "lfw" / "photos")[: args.people]
     impostors = len(people) - 1
-    search = faces_of(ModelPack.load(args.pack, threads=1), people)
+    pack = ModelPack.load(args.pack, threads=1)
 
     with ExitStack() as stack:
         env["VEILFACE_DATABASE_URL"] = fresh_database(stack, args.work / "browser")
@@ -290,23 +310,23 @@ def main() -> None:
         profile = args.work / "profile"
         shutil.rmtree(profile, ignore_errors=True)
         context = stack.enter_context(chromium(profile, camera))
-        asked: set[str] = set()
-        context.on("request", lambda request: asked.add(request.url.split("/", 3)[2]))
         load_before = os.getloadavg()[0]
         first = visit(context, served)
         downloaded = [first.call("prepare")]
-        first.page.close()
+        first.tab.page.close()
         opened = visit(context, served)
         downloaded.append(opened.call("prepare"))
         browser, seconds = browser_outcome(opened, people, impostors=impostors)
-        by_camera = before_the_camera(
+        by_camera, shown = before_the_camera(
             opened, camera, [p for p in people if p.name not in browser.refused_enrollments]
         )
         load_after = os.getloadavg()[0]
         sent = served.recording.sent
+        calls, rest = requests_in(sent)
+        search = faces_of(pack, people, shown)
         leaks = search.find(sent)
         missed = planted_and_missed(opened, people[0].probes[0], search)
-        strangers = sorted(asked - {served.url.removeprefix("http://")})
+        complaints = [*first.tab.complaints, *opened.tab.complaints, *opened.tab.violations()]
         with PrivateClient(
             address, key, pack=args.pack, command=VEILFACE, dim=args.probe_dim
         ) as client:
@@ -335,12 +355,14 @@ def main() -> None:
             "errors": [each["error"] for each in by_camera if each["error"] is not None],
         },
         "load_average_before_and_after": [round(load_before, 1), round(load_after, 1)],
+        "complaints_of_the_browser": complaints,
         "sent": {
             "bytes": len(sent),
-            "requests": requests_in(sent),
-            "other_hosts": strangers,
+            "requests": calls,
+            "bytes_of_no_request": rest,
+            "to_other_hosts": first.tab.strays(),
             "leaks": [f"{leak.what}: {leak.form}" for leak in leaks],
-            "planted_forms": len(PHOTO_FORMS) + len(DESCRIPTOR_FORMS),
+            "planted_forms": len(PLANTED),
             "planted_and_missed": missed,
         },
     }
@@ -350,8 +372,8 @@ def main() -> None:
 def _seconds(seconds: Sequence[float]) -> dict[str, object]:
     return {
         "times": len(seconds),
-        "median_s": round(median(seconds), 2),
-        "longest_s": round(max(seconds), 2),
+        "median_s": round(median(seconds), 2) if seconds else None,
+        "longest_s": round(max(seconds), 2) if seconds else None,
     }
 
 

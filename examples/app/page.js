@@ -20,7 +20,8 @@ async function show(photo) {
   const send = () => fetch(url, { method, body, headers }).then((answer) => answer.json());
   let told = await send().catch(send);
   // An earlier sending is still at work: before it is done, nobody knows what comes of it.
-  while (told.error?.code === "idempotency_conflict") {
+  const end = Date.now() + 120_000; // no token lives longer
+  while (told.error?.code === "idempotency_conflict" && Date.now() < end) {
     await new Promise((resolve) => setTimeout(resolve, 1000));
     told = await send().catch(send);
   }

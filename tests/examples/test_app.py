@@ -9,6 +9,7 @@ import pytest
 from playwright.sync_api import Browser
 
 from tests.examples.conftest import EXAMPLES, PYTHON, Service, clean_environment, node, running
+from tests.patience import wait_until
 from tests.ports import free_port
 from tests.web.conftest import chromium, running_browser
 from veilface_client import Client
@@ -258,4 +259,30 @@ def test_the_page_waits_for_a_sending_that_is_still_at_work(
     assert len(set(sendings)) == 1, "one attempt"
     assert [name for name in asked if name in ("enrollment", "face")][-2:] == ["enrollment", "face"]
     assert asked.count("face") == 1
+    context.close()
+
+
+@pytest.mark.long
+def test_the_page_does_not_wait_for_ever(app: str, service: Service, browser: Any) -> None:
+    """By its clock it is told for two hours that an earlier sending is still at work."""
+    context = browser.new_context()
+    page = context.new_page()
+    page.clock.install()
+    refusal = {
+        "status": 409,
+        "headers": {"Access-Control-Allow-Origin": app.rstrip("/")},
+        "json": {"error": {"code": "idempotency_conflict", "message": "still at work"}},
+    }
+    asked: list[str] = []
+
+    def at_work(route: Any) -> None:
+        asked.append(route.request.url)
+        route.fulfill(**refusal)
+
+    page.route("**/enrollment", at_work)
+    page.goto(app)
+    fill_in(page, "joe", service.photo(1, 0), "Register")
+    wait_until(lambda: page.evaluate("0") or len(asked) > 1, what="a second sending")
+    page.clock.fast_forward("02:00:00")
+    page.locator("output").get_by_text("still at work").wait_for(timeout=600_000)
     context.close()

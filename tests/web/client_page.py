@@ -27,6 +27,11 @@ POLICY = (
     "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; connect-src 'self'; img-src data:; "
     "frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
 )
+RUNTIME = (
+    "ort.wasm.min.mjs",
+    "ort-wasm-simd-threaded.mjs",
+    "ort-wasm-simd-threaded.wasm",
+)
 KEPT = {"Cache-Control": "private, max-age=31536000, immutable"}
 PAGE = """<!doctype html><html lang="en"><title>Log in</title>
 <link rel="icon" href="data:,">
@@ -78,13 +83,8 @@ def application(service: str, authorize: Authorize) -> Iterator[Application]:
             elif self.path == "/page.js":
                 self.answer(served.program.encode(), TYPES[".js"])
             elif self.path.startswith(("/client/", "/ort/")):
-                root = PACKAGE / "dist"
-                if self.path.startswith("/ort/"):
-                    root = PACKAGE / "node_modules" / "onnxruntime-web" / "dist"
                 headers = {**KEPT, "Content-Encoding": "gzip"}
-                self.answer(
-                    _compressed(root / Path(*path.parts[2:])), TYPES[path.suffix], headers=headers
-                )
+                self.answer(modules[self.path], TYPES[path.suffix], headers=headers)
             elif self.path.startswith("/photos/"):
                 self.answer(served.photos[path.name], "image/jpeg")
             else:
@@ -116,6 +116,7 @@ def application(service: str, authorize: Authorize) -> Iterator[Application]:
             kind = response.headers.get("Content-Type", "application/octet-stream")
             self.answer(response.content, kind, response.status_code, told)
 
+    modules = _compressed_modules()
     server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
     thread = threading.Thread(target=server.serve_forever, daemon=True)
     thread.start()
@@ -133,8 +134,14 @@ def application(service: str, authorize: Authorize) -> Iterator[Application]:
 
 
 @functools.cache
-def _compressed(file: Path) -> bytes:
-    return gzip.compress(file.read_bytes())
+def _compressed_modules() -> dict[str, bytes]:
+    """Client and runtime by their paths, compressed before somebody waits for them."""
+    runtime = PACKAGE / "node_modules" / "onnxruntime-web" / "dist"
+    files = {
+        f"/client/{file.relative_to(PACKAGE / 'dist')}": file
+        for file in (PACKAGE / "dist").rglob("*.js")
+    } | {f"/ort/{name}": runtime / name for name in RUNTIME}
+    return {path: gzip.compress(file.read_bytes()) for path, file in files.items()}
 
 
 def for_browsers(program: str) -> str:

@@ -16,7 +16,13 @@ class Part {
 }
 
 class Page extends EventTarget {
+  // What a page has before its element is known becomes it: the constructor returns it.
+  static known;
   #attributes = new Map();
+  constructor() {
+    super();
+    if (Page.known) return Page.known;
+  }
   getAttribute(name) { return this.#attributes.get(name) ?? null; }
   setAttribute(name, value) { this.#attributes.set(name, value); }
   attachShadow() { return { append: (...parts) => ([this.video, this.button, this.status] = parts) }; }
@@ -66,6 +72,20 @@ function element({ authorize, fetch, camera = async () => {} } = {}) {
 
 test("a server that renders pages can import it", () => {
   assert.equal(typeof ForServers, "function");
+});
+
+test("what a page sets before the element is known stays", () => {
+  const early = new Page();
+  const given = { options: { runtime: {} }, authorize: async () => {}, words: { start: "Kamera an" } };
+  Object.assign(early, given);
+  Page.known = early;
+  try {
+    const { options, authorize, words } = new VeilfaceLogin();
+    assert.deepEqual({ options, authorize, words }, given);
+  } finally {
+    Page.known = undefined;
+  }
+  assert.equal(new VeilfaceLogin().words.start, "Start camera");
 });
 
 test("a camera that is granted after the element left is stopped at once", async () => {

@@ -68,14 +68,15 @@ const Base = globalThis.HTMLElement ?? (class {} as typeof HTMLElement);
  * Never believe the event alone: your server asks the service what came of the token.
  */
 export class VeilfaceLogin extends Base {
+  // Declared and not defined: a page may have set them before its element was known.
   /** Of `PrivateClient`: the ONNX Runtime, and where the graphs are. */
-  options: Omit<PrivateOptions, "signal"> | undefined;
+  declare options: Omit<PrivateOptions, "signal"> | undefined;
   /**
    * Asks your server for a token, which is good for one call and for minutes: called once to fetch
    * the graphs, which may take longer than that, and once for each attempt.
    */
-  authorize: (() => Promise<Authorization>) | undefined;
-  words: Words = WORDS;
+  declare authorize: (() => Promise<Authorization>) | undefined;
+  declare words: Words;
 
   readonly #video = document.createElement("video");
   readonly #button = document.createElement("button");
@@ -88,6 +89,7 @@ export class VeilfaceLogin extends Base {
 
   constructor() {
     super();
+    this.words ??= WORDS;
     const root = this.attachShadow({ mode: "open" });
     // A constructed sheet needs no `unsafe-inline` of the page.
     const sheet = new CSSStyleSheet();
