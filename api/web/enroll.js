@@ -18,6 +18,7 @@ export function enrollView(id) {
   let dialog = null;
   const holder = newHolderKey(subject, () => result.replaceChildren());
   const send = h("button", { type: "submit", disabled: true }, "Enroll");
+  const say = (text) => (send.textContent = text);
   const picker = why
     ? null
     : photoPicker({
@@ -70,10 +71,11 @@ export function enrollView(id) {
     const sent = picker.chosen();
     const [photos, face] = [picker.blobs(), picker.face()];
     fields.disabled = true;
-    send.textContent = "Enrolling…";
     result.replaceChildren();
     try {
-      const body = form("images", photos, { face, holder_key: await holder.key(name) });
+      const holder_key = await holder.key(name, say);
+      say("Enrolling…");
+      const body = form("images", photos, { face, holder_key });
       const answer = await put(name, body);
       fields.disabled = false;
       if (answer) {
@@ -88,7 +90,7 @@ export function enrollView(id) {
       if (error.details) picker.blame(error, sent);
       result.replaceChildren(problemBox(error));
     }
-    send.textContent = "Enroll";
+    say("Enroll");
     send.disabled = !picker.ready();
     if (document.activeElement === document.body) send.focus();
   }

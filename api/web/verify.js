@@ -42,6 +42,7 @@ export function verifyView(id) {
   const result = h("div", { class: "result", role: "status" });
   const problem = h("div", {});
   const send = h("button", { type: "submit", disabled: true }, "Verify");
+  const say = (text) => (send.textContent = text);
   // Counts what was asked: an answer to what is no longer on the page is not shown.
   let asked = 0;
   const clear = () => {
@@ -69,7 +70,7 @@ export function verifyView(id) {
     picker.root.hidden = moving();
     if (moving()) picker.pause();
     movements.root.hidden = instead.hidden = !moving();
-    send.textContent = moving() ? "Start head movements" : "Verify";
+    say(moving() ? "Start head movements" : "Verify");
     send.disabled = !(picker.ready() || moving());
   }
   const holder = holderKey(subject, clear);
@@ -85,12 +86,12 @@ export function verifyView(id) {
     const sent = picker.chosen();
     fields.disabled = true;
     try {
-      const holder_key = await holder.key(name);
+      const holder_key = await holder.key(name, say);
       const asksToMove = moving();
       const { photos, ...shown } = asksToMove
         ? await movements.frames(name)
         : { photos: picker.blobs(), face: picker.face() };
-      send.textContent = "Comparing…";
+      say("Comparing…");
       const body = form("images", photos, { level: level.value, ...shown, holder_key });
       const answer = await call("POST", `${subjectPath(name)}/verify`, { body });
       if (asking === asked) {
@@ -105,7 +106,7 @@ export function verifyView(id) {
       }
     }
     fields.disabled = false;
-    send.textContent = moving() ? "Start head movements" : "Verify";
+    say(moving() ? "Start head movements" : "Verify");
     send.disabled = !(picker.ready() || moving());
     // A button that is switched off loses the focus.
     if (document.activeElement === document.body) send.focus();

@@ -39,8 +39,8 @@ class Authenticator:
         made.exchange()
         return made
 
-    def exchange(self, *, prf: bool = True) -> None:
-        """Take it away, and put in one that holds no passkey."""
+    def exchange(self, *, prf: bool = True, answers: bool = True) -> None:
+        """Take it away, and put in one that holds no passkey, and perhaps waits for its visitor."""
         if self.name:
             named = {"authenticatorId": self.name}
             self.session.send("WebAuthn.removeVirtualAuthenticator", named)
@@ -52,10 +52,15 @@ class Authenticator:
             "hasUserVerification": True,
             "isUserVerified": True,
             "hasPrf": prf,
-            "automaticPresenceSimulation": True,
+            "automaticPresenceSimulation": answers,
         }
         answer = self.session.send("WebAuthn.addVirtualAuthenticator", {"options": options})
         self.name = answer["authenticatorId"]
+
+    def answer(self) -> None:
+        """Let the visitor be there, for whom it waits."""
+        here = {"authenticatorId": self.name, "enabled": True}
+        self.session.send("WebAuthn.setAutomaticPresenceSimulation", here)
 
     def refuse(self) -> None:
         """Let the visitor fail the check of who they are, for good: it blocks after a few."""
