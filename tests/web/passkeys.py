@@ -40,7 +40,7 @@ class Authenticator:
         return made
 
     def exchange(self, *, prf: bool = True, answers: bool = True) -> None:
-        """Take it away, and put in one that holds no passkey, and perhaps waits for its visitor."""
+        """Put in another, which holds no passkey; without answers its visitor is away."""
         if self.name:
             named = {"authenticatorId": self.name}
             self.session.send("WebAuthn.removeVirtualAuthenticator", named)
@@ -56,11 +56,6 @@ class Authenticator:
         }
         answer = self.session.send("WebAuthn.addVirtualAuthenticator", {"options": options})
         self.name = answer["authenticatorId"]
-
-    def answer(self) -> None:
-        """Let the visitor be there, for whom it waits."""
-        here = {"authenticatorId": self.name, "enabled": True}
-        self.session.send("WebAuthn.setAutomaticPresenceSimulation", here)
 
     def refuse(self) -> None:
         """Let the visitor fail the check of who they are, for good: it blocks after a few."""
