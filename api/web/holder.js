@@ -84,8 +84,8 @@ export function newHolderKey(subject, onchange) {
   return choice({
     labels: {
       none: "None",
-      passkey: "Lock this enrollment to a passkey",
-      file: "Lock it to a key file",
+      passkey: "Lock to a passkey",
+      file: "Lock to a key file",
     },
     hints: {
       passkey: "Every verification will ask for this passkey. Nobody can restore it: if it is lost, enroll again.",

@@ -25,7 +25,7 @@ LOSE = """
 [...document.querySelectorAll("video")].find((each) => each.srcObject)
   .srcObject.getVideoTracks()[0].dispatchEvent(new Event("ended"));
 """
-TO_PASSKEY, TO_FILE = "Lock this enrollment to a passkey", "Lock it to a key file"
+TO_PASSKEY, TO_FILE = "Lock to a passkey", "Lock to a key file"
 START = "Start head movements"
 
 
