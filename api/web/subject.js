@@ -46,8 +46,6 @@ export function subjectField(id = "", listed = "Type how it begins, or pick from
     required: true,
     maxlength: "128",
     pattern: "[A-Za-z0-9._@:\\-]{1,128}",
-    // What the browser says where the pattern does not fit.
-    title: SPELLING,
     autocomplete: "off",
     autocapitalize: "none",
     spellcheck: "false",
@@ -57,6 +55,7 @@ export function subjectField(id = "", listed = "Type how it begins, or pick from
       : {}),
   });
   const told = h("p", { class: "hint", role: "status" });
+  input.addEventListener("input", () => input.setCustomValidity(input.validity.patternMismatch ? SPELLING : ""));
   const part = field("Person's id", input, searches ? listed : SPELLING);
   if (!searches) return [input, part];
   let running = new AbortController();

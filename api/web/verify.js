@@ -66,7 +66,7 @@ export function verifyView(id) {
   const movements = headMovements();
   const moving = () => why === null && moves(level.value);
   const instead = h("p", { class: "hint" }, "If you cannot turn your head, ask the operator for another way.");
-  const steps = [h("li", {}), h("li", {})];
+  const steps = [h("span", {}), h("span", {})];
 
   function showWhatIsAsked() {
     clear();
