@@ -156,7 +156,7 @@ function signInView(problem = null) {
 }
 
 session.onrefused = (problem) => {
-  problem.title = "You are signed out: the service accepts your API key no longer.";
+  problem.title = "You were signed out: the service no longer accepts this API key.";
   signOut(problem);
 };
 document.querySelector(".skip").addEventListener("click", (event) => {
