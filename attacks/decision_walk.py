@@ -3,7 +3,7 @@
 The attacker may send embeddings, and is told decisions only. A first accepted face is found by
 trying. From an accepted probe the border towards a rejected one is bisected, and there the
 similarity to the template is known: what the public contract expects of the probe, plus the
-threshold in deviations (docs/method.md §6.1). So each border point is worth a score, and the
+threshold in deviations (docs/decision.md §1). So each border point is worth a score, and the
 template follows by regression on them. It tells no more than the template itself does to a thief.
 """
 

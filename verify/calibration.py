@@ -116,7 +116,7 @@ def calibrate(
     passed through the wire format as in the service; of many people, ``most_templates``. Genuine
     probes are the photos that were left out. Impostor trials are all cross-identity pairs or a
     random subset of them, as the contract states. A level's threshold is the smallest score at
-    which the FMR is at most the target (docs/method.md §6.2).
+    which the FMR is at most the target (docs/decision.md §2).
 
     Parameters
     ----------

@@ -2,7 +2,7 @@
 
 A *wolf* probe lies near everybody's template, and so near those of nobody as well. Its similarity
 to one subject must therefore exceed what is expected of it by a calibrated number of deviations
-(docs/method.md §6.1). Of points both are known in closed form; lifted probes are held against a
+(docs/decision.md §1). Of points both are known in closed form; lifted probes are held against a
 cohort (T-norm).
 """
 

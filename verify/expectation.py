@@ -1,4 +1,4 @@
-"""Fits what is expected of a point's similarity to templates of nobody (docs/method.md §6.1)."""
+"""Fits what is expected of a point's similarity to templates of nobody (docs/decision.md §1)."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
@@ -26,7 +26,7 @@ CLIMBED = 300
 """Of those others, templates that wolves climb on: what is found on them is no measurement."""
 CLIMBERS, CLIMBS = 24, 2
 """Probes that climb, and how often the expectation is fitted anew to where they end. Without, they
-end where the fit is a tenth of a deviation too low (docs/thresholds.md). As many others climb when
+end where the fit is a tenth of a deviation too low (docs/decision.md §4). As many others climb when
 all is fitted, and only tell how good the fit is."""
 CLIMB_ROUNDS = 40
 CLIMB_THRESHOLD = 2.7

@@ -59,7 +59,7 @@ class _Rule:
 class Verifier:
     """Decides for one contract and one tenant. Holds no state between calls; threads may share it.
 
-    A probe is accepted where its score reaches the level's threshold (docs/method.md §6). Each
+    A probe is accepted where its score reaches the level's threshold (docs/decision.md §1). Each
     stored template is in a rotation of its own, templates of nobody are in none, so the probe is
     turned for the stored one only. The holder's rotation is derived and applied for every probe,
     whether a key was sent, or is needed, or not: the time tells neither.

@@ -1,10 +1,11 @@
 """How long distances take, beside the matrix products that no distance can do without.
 
-A distance starts from the products of stacked rows (docs/method.md §5). Each of them in one matrix
-of its own, made by the matrix library, is the *bare product*; the products of the descriptors alone
-are the *point-to-point* matrix, which a comparison of raw descriptors costs. All three are timed in
-turn, so that what else the machine does meets them alike, and compared repeat by repeat. Each has
-the machine to itself: neither meets threads that are left over from the other.
+A distance starts from the products of stacked rows (docs/distances.md "The way of a pair"). Each of
+them in one matrix of its own, made by the matrix library, is the *bare product*; the products of
+the descriptors alone are the *point-to-point* matrix, which a comparison of raw descriptors costs.
+All three are timed in turn, so that what else the machine does meets them alike, and compared
+repeat by repeat. Each has the machine to itself: neither meets threads that are left over from the
+other.
 """
 
 import platform

@@ -249,7 +249,8 @@ def _tell_plan(plan: dict[str, Any]) -> None:
 
 
 def _tell_calls(service: str, key_file: Path) -> None:
-    """Show the two calls that a newcomer makes first, ready to paste into another shell."""
+    """Show the page, and the two calls that a newcomer makes first, ready to paste."""
+    say(f"Page:     open {service}/ and sign in with the key in {key_file}")
     key = f'-H "Authorization: Bearer $(cat {shlex.quote(str(key_file))})"'
     person = f"{service}/v1/subjects/anna"
     say(

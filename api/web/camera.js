@@ -91,7 +91,7 @@ export function camera({ onburst, face }) {
       opened = await openCamera(signal, lost);
     } catch (error) {
       start.disabled = false;
-      if (!signal.aborted) say(`${sentence(error.message)} Choose files instead.`, "bad");
+      if (!signal.aborted) say(`${sentence(error.message)} You can also choose files.`, "bad");
       return;
     }
     if (over(signal)) return release(opened);
@@ -203,7 +203,7 @@ export function camera({ onburst, face }) {
     viewfinder.hidden = take.hidden = true;
     start.hidden = start.disabled = false;
     if (focused) start.focus();
-    say("The camera has stopped. Start it again, or upload photos.", "bad");
+    say("The camera has stopped. Start it again, or choose files.", "bad");
   }
 
   function stop() {

@@ -2,7 +2,7 @@ import { facts, h, openDialog, workbench } from "./dom.js";
 import { newHolderKey } from "./holder.js";
 import { photoPicker } from "./photos.js";
 import { call, form, nonce, subjectPath } from "./service.js";
-import { offNote, subjectField, whyOff } from "./subject.js";
+import { SPELLING, offNote, subjectField, whyOff } from "./subject.js";
 import { problemBox } from "./words.js";
 
 const STEPS = [
@@ -13,11 +13,12 @@ const STEPS = [
 
 export function enrollView(id) {
   const why = whyOff("enroll");
-  const [subject, subjectPart] = subjectField(id);
+  const [subject, subjectPart] = subjectField(id, `A new id (${SPELLING}), or whom to enroll again.`);
   const result = h("div", { class: "result" });
   let dialog = null;
   const holder = newHolderKey(subject, () => result.replaceChildren());
   const send = h("button", { type: "submit", disabled: true }, "Enroll");
+  const say = (text) => (send.textContent = text);
   const picker = why
     ? null
     : photoPicker({
@@ -70,10 +71,11 @@ export function enrollView(id) {
     const sent = picker.chosen();
     const [photos, face] = [picker.blobs(), picker.face()];
     fields.disabled = true;
-    send.textContent = "Enrolling…";
     result.replaceChildren();
     try {
-      const body = form("images", photos, { face, holder_key: await holder.key(name) });
+      const holder_key = await holder.key(name, say);
+      say("Enrolling…");
+      const body = form("images", photos, { face, holder_key });
       const answer = await put(name, body);
       fields.disabled = false;
       if (answer) {
@@ -87,8 +89,9 @@ export function enrollView(id) {
       fields.disabled = false;
       if (error.details) picker.blame(error, sent);
       result.replaceChildren(problemBox(error));
+      result.scrollIntoView({ block: "nearest" });
     }
-    send.textContent = "Enroll";
+    say("Enroll");
     send.disabled = !picker.ready();
     if (document.activeElement === document.body) send.focus();
   }
@@ -142,7 +145,6 @@ function enrolled(id, answer, thumbs) {
       ["Photos used", String(answer.images.length)],
       ["Earlier enrollment", answer.replaced ? "replaced" : "none"],
       ["Holder key", answer.holder_key ? "needed at every verification" : null],
-      ["Template", h("code", {}, answer.template_id)],
     ]),
     h(
       "p",
@@ -150,5 +152,6 @@ function enrolled(id, answer, thumbs) {
       h("a", { href: `#/verify/${encodeURIComponent(id)}` }, "Verify this person"),
       h("a", { href: `#/stored/${encodeURIComponent(id)}` }, "See what is stored"),
     ),
+    h("p", { class: "fine" }, "Template ", h("code", {}, answer.template_id)),
   );
 }

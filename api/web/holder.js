@@ -49,9 +49,11 @@ function choice({ labels, hints, fromPasskey, onchange, maker = null }) {
     panel.replaceChildren(...panels[value]);
   }
 
-  async function key(id) {
+  // `say` is told what the visitor is waited for.
+  async function key(id, say) {
     const from = chosen();
     if (from === "none") return null;
+    if (from === "passkey") say("Waiting for the passkey…");
     try {
       return await (from === "file" ? read(file.files[0]) : fromPasskey(id, ended.signal));
     } finally {
@@ -82,8 +84,8 @@ export function newHolderKey(subject, onchange) {
   return choice({
     labels: {
       none: "None",
-      passkey: "Lock this enrollment to a passkey",
-      file: "Lock it to a key file",
+      passkey: "Lock to a passkey",
+      file: "Lock to a key file",
     },
     hints: {
       passkey: "Every verification will ask for this passkey. Nobody can restore it: if it is lost, enroll again.",
@@ -129,9 +131,9 @@ export function holderKey(subject, onchange) {
   start();
   return {
     ...asked,
-    async key(id) {
+    async key(id, say) {
       await known;
-      return asked.key(id);
+      return asked.key(id, say);
     },
   };
 }

@@ -48,7 +48,8 @@ export function logView(id) {
     shown.hidden = count === 0;
     said.textContent = count
       ? `${count} lines shown${cursor ? ", with earlier ones to come" : ""}.`
-      : `No line${person ? ` about ${person}` : ""}${cursor ? " yet: look further back" : ""}.`;
+      : `No line${person ? ` about ${person}` : ""}${cursor ? " yet: look further back" : ""}.` +
+        (person ? " Empty the field and press Show for all lines." : "");
   }
 
   if (!why) load();

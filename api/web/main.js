@@ -155,7 +155,10 @@ function signInView(problem = null) {
   return { root, stop() {} };
 }
 
-session.onrefused = signOut;
+session.onrefused = (problem) => {
+  problem.title = "You were signed out: the service no longer accepts this API key.";
+  signOut(problem);
+};
 document.querySelector(".skip").addEventListener("click", (event) => {
   // Without a change of the address, which names the view.
   event.preventDefault();

@@ -106,7 +106,7 @@ export function serviceView() {
               ? "Levels for one photo"
               : `Levels for ${each.probe_photos} photos of a probe`
             : `Levels for lifted probes, m = ${each.probe_m}`,
-          ["Level", "Target FMR", "Measured FMR", "Measured FNMR"],
+          ["Level", "Strangers accepted: target", "Measured (FMR)", "Right people rejected (FNMR)"],
           each.levels.map((level) => [
             level.name,
             level.target_fmr ? `${percent(level.target_fmr)} (${oneIn(level.target_fmr)})` : "none",

@@ -1,6 +1,6 @@
 import { download, facts, field, h, openDialog, when } from "./dom.js";
 import { call, may, subjectPath } from "./service.js";
-import { about, offNote, people } from "./subject.js";
+import { about, enroller, offNote, people } from "./subject.js";
 import { lacking, problemBox } from "./words.js";
 
 const PAGE = 25;
@@ -57,6 +57,7 @@ export function peopleView() {
         ? "Nobody’s id begins so."
         : "Nobody is enrolled yet.";
     none.hidden = shown > 0 || prefix.value !== "";
+    unknown.replaceChildren(...(!shown && prefix.value ? [enroller(prefix.value)] : []));
   }
 
   function card(person) {
@@ -112,6 +113,7 @@ export function peopleView() {
     h("p", {}, "Three photos by one click are enough. Whoever is enrolled can be verified, and erased, at once."),
     h("p", {}, h("a", { class: "button", href: "#/enroll" }, "Enroll")),
   );
+  const unknown = h("div", {});
   prefix.addEventListener("input", search);
   if (!why) load();
   const stop = () => {
@@ -122,7 +124,7 @@ export function peopleView() {
     "section",
     {},
     title,
-    h("p", { class: "lead" }, "Everyone enrolled for this key's tenant, by id."),
+    h("p", { class: "lead" }, "Everyone who is enrolled, by id."),
     offNote(why),
     may("erase") ? null : offNote(lacking("erase")),
     receipts,
@@ -130,6 +132,7 @@ export function peopleView() {
     why ? null : h("div", { class: "find" }, field("Find people whose id begins with", prefix)),
     said,
     none,
+    unknown,
     list,
     more,
   );
@@ -188,7 +191,7 @@ function receipt(id, answer) {
     h("p", { class: "verdict-word" }, `Erased ${id}`),
     facts([
       ["Erased at", when(claims.erased_at)],
-      ["Removed", claims.erased.map((each) => `${each.count} ${each.item.replaceAll("_", " ")}`).join(", ")],
+      ["Removed", claims.erased.map((each) => `${each.item.replaceAll("_", " ")} (${each.count})`).join(", ")],
       ["Pseudonym on the receipt", h("code", {}, `${claims.subject.slice(0, 16)}…`)],
       ["Signing key", h("code", {}, claims.signing_key)],
     ]),

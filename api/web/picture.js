@@ -14,7 +14,7 @@ const SHOWN = 16;
 export function describe(stored) {
   const x = stored.foot_point_similarity;
   return (
-    `The stored point nearest the origin resembles your face with similarity ${x.toFixed(3)}; ` +
+    `The stored point nearest the origin resembles the face with similarity ${x.toFixed(3)}; ` +
     `every unit vector in the ${stored.m}-dimensional set at that angle ` +
     `(${angle(x).toFixed(1)} degrees) is equally a candidate.`
   );

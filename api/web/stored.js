@@ -1,7 +1,7 @@
 import { bytes, facts, h, percent, table, when } from "./dom.js";
 import { picture } from "./picture.js";
 import { call, may, session, subjectPath } from "./service.js";
-import { offNote, subjectField } from "./subject.js";
+import { enroller, offNote, subjectField } from "./subject.js";
 import { thiefCard } from "./verdict.js";
 import { lacking, problemBox } from "./words.js";
 
@@ -24,6 +24,7 @@ export function storedView(id) {
       shown.replaceChildren(truth(await call("GET", `${subjectPath(name)}/stored`)));
     } catch (error) {
       shown.replaceChildren(problemBox(error));
+      if (error.code === "not_enrolled") shown.append(enroller(name));
     }
   }
 

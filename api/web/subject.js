@@ -7,6 +7,7 @@ import { lacking } from "./words.js";
 
 const SHOWN = 8;
 const PAUSE_MS = 200;
+export const SPELLING = "1 to 128 letters, digits or .\u00a0_\u00a0@\u00a0:\u00a0-";
 
 // A page of people whose ids begin so.
 export const people = (prefix, { limit, cursor, signal }) =>
@@ -31,9 +32,13 @@ export function whyOff(right) {
   return null;
 }
 
+// The next step where nobody is enrolled under an id.
+export const enroller = (id) =>
+  h("p", {}, h("a", { class: "button", href: `#/enroll/${encodeURIComponent(id)}` }, `Enroll ${id}`));
+
 export const offNote = (why) => (why ? h("p", { class: "off", role: "note" }, why) : null);
 
-export function subjectField(id = "") {
+export function subjectField(id = "", listed = "Type how it begins, or pick from the list.") {
   const searches = may("enroll");
   const list = h("ul", { class: "options", role: "listbox", id: newId("people"), "aria-label": "People", hidden: true });
   const input = h("input", {
@@ -50,8 +55,8 @@ export function subjectField(id = "") {
       : {}),
   });
   const told = h("p", { class: "hint", role: "status" });
-  const hint = "1 to 128 letters, digits or .\u00a0_\u00a0@\u00a0:\u00a0-";
-  const part = field("Person's id", input, searches ? `Type how it begins, or pick from the list (click, or ↓). ${hint}` : hint);
+  input.addEventListener("input", () => input.setCustomValidity(input.validity.patternMismatch ? SPELLING : ""));
+  const part = field("Person's id", input, searches ? listed : SPELLING);
   if (!searches) return [input, part];
   let running = new AbortController();
   let timer = 0;

@@ -3,13 +3,13 @@ import { facts, field, h, oneIn, percent, workbench } from "./dom.js";
 import { holderKey } from "./holder.js";
 import { photoPicker } from "./photos.js";
 import { call, form, levels, may, moves, session, subjectPath } from "./service.js";
-import { offNote, subjectField, whyOff } from "./subject.js";
+import { enroller, offNote, subjectField, whyOff } from "./subject.js";
 import { DEMO, livenessWords, problemBox } from "./words.js";
 
 const REASONS = {
   match: "The face matches the enrolled person.",
-  no_match: "No match: a different person, poor photos, an id that nobody is enrolled under, or a holder key that is wrong " +
-    "or missing. If a holder key is lost, enroll the person again.",
+  no_match: "No match: another person, poor photos, an id that nobody is enrolled under, or a holder key that is wrong " +
+    "or missing. Check the id, and try other photos. If a holder key is lost, enroll the person again.",
 };
 
 // What to do differently depends on what was asked for.
@@ -19,11 +19,14 @@ const LIVENESS = {
   photos: NOT_LIVE + "Take new photos with the camera, of the face itself and in good light.",
 };
 
-const STEPS = [
-  "Choose the person. Whoever is enrolled is in the list.",
-  DEMO ? "Choose a photo of a cartoon person." : "Take three photos by one click, or choose up to five files.",
-  "Press Verify. The answer appears here: accepted or rejected, and how often a stranger would be accepted.",
-];
+const ANSWER = "The answer appears here: accepted or rejected, and how often a stranger would be accepted.";
+const STEPS = {
+  movements: ["Press Start head movements. The camera opens.", `Follow each movement for about twelve seconds. ${ANSWER}`],
+  photos: [
+    DEMO ? "Choose a photo of a cartoon person." : "Take three photos by one click, or choose up to five files.",
+    `Press Verify. ${ANSWER}`,
+  ],
+};
 
 export function verifyView(id) {
   const why = whyOff("verify");
@@ -35,13 +38,14 @@ export function verifyView(id) {
       h(
         "option",
         { value: each.name, selected: each.name === session.contract.default_level },
-        `${each.name}${each.target_fmr ? ` (${oneIn(each.target_fmr)})` : ""}`,
+        each.target_fmr ? `${oneIn(each.target_fmr)} (${each.name})` : each.name,
       ),
     ),
   );
   const result = h("div", { class: "result", role: "status" });
   const problem = h("div", {});
   const send = h("button", { type: "submit", disabled: true }, "Verify");
+  const say = (text) => (send.textContent = text);
   // Counts what was asked: an answer to what is no longer on the page is not shown.
   let asked = 0;
   const clear = () => {
@@ -62,14 +66,16 @@ export function verifyView(id) {
   const movements = headMovements();
   const moving = () => why === null && moves(level.value);
   const instead = h("p", { class: "hint" }, "If you cannot turn your head, ask the operator for another way.");
+  const steps = [h("span", {}), h("span", {})];
 
   function showWhatIsAsked() {
     clear();
+    steps.forEach((step, index) => (step.textContent = STEPS[moving() ? "movements" : "photos"][index]));
     if (!picker) return;
     picker.root.hidden = moving();
     if (moving()) picker.pause();
     movements.root.hidden = instead.hidden = !moving();
-    send.textContent = moving() ? "Start head movements" : "Verify";
+    say(moving() ? "Start head movements" : "Verify");
     send.disabled = !(picker.ready() || moving());
   }
   const holder = holderKey(subject, clear);
@@ -85,12 +91,12 @@ export function verifyView(id) {
     const sent = picker.chosen();
     fields.disabled = true;
     try {
-      const holder_key = await holder.key(name);
+      const holder_key = await holder.key(name, say);
       const asksToMove = moving();
       const { photos, ...shown } = asksToMove
         ? await movements.frames(name)
         : { photos: picker.blobs(), face: picker.face() };
-      send.textContent = "Comparing…";
+      say("Comparing…");
       const body = form("images", photos, { level: level.value, ...shown, holder_key });
       const answer = await call("POST", `${subjectPath(name)}/verify`, { body });
       if (asking === asked) {
@@ -102,10 +108,12 @@ export function verifyView(id) {
         if (error.details && !moving()) picker.blame(error, sent);
         problem.replaceChildren(problemBox(error));
         if (error.code === "locked_out" && may("admin")) problem.append(lifter(name));
+        if (error.code === "not_enrolled" && may("enroll")) problem.append(enroller(name));
+        problem.scrollIntoView({ block: "nearest" });
       }
     }
     fields.disabled = false;
-    send.textContent = moving() ? "Start head movements" : "Verify";
+    say(moving() ? "Start head movements" : "Verify");
     send.disabled = !(picker.ready() || moving());
     // A button that is switched off loses the focus.
     if (document.activeElement === document.body) send.focus();
@@ -154,7 +162,7 @@ export function verifyView(id) {
     h("h1", { tabindex: "-1" }, "Verify"),
     h("p", { class: "lead" }, "Check whether photos show the person enrolled under an id. Several are averaged."),
     offNote(why),
-    workbench(entry, "The decision", STEPS, problem, result),
+    workbench(entry, "The decision", ["Choose the person.", ...steps], problem, result),
   );
   picker?.dropOn(entry);
   showWhatIsAsked();
@@ -178,13 +186,12 @@ function decision(id, answer, sent) {
     h("p", {}, REASONS[answer.reason] ?? LIVENESS[sent]),
     facts([
       ["Person", id],
-      ["Reason", h("code", {}, answer.reason)],
       ["Level", answer.level],
       ["False match rate", `${percent(answer.fmr)} (${oneIn(answer.fmr)})`],
       ["Liveness", livenessWords(answer)],
       ["Distance", answer.distance === undefined ? null : answer.distance.toFixed(4)],
-      ["Request", h("code", {}, answer.request_id)],
     ]),
+    h("p", { class: "fine" }, "Reason ", h("code", {}, answer.reason), ", request ", h("code", {}, answer.request_id)),
     answer.notice ? h("p", { class: "fine" }, answer.notice) : null,
   );
 }

@@ -29,11 +29,11 @@ const REMEDIES = {
   idempotency_conflict: "Wait a moment and try again.",
   enrollment_conflict: "This person was enrolled or erased meanwhile. Look them up, and enroll them again if need be.",
   export_superseded: "Export the person again from where they are enrolled.",
-  passkey_refused: "Try again, or use the device that has the passkey. If it is lost, enroll the person again.",
+  passkey_refused: "Try again, on the device that has the passkey. If it is lost, enroll the person again.",
   passkey_unsupported: "Use another device or browser, or a key file. If a passkey was made just now, delete it.",
   passkey_of_another: "Choose the passkey that is named after the id. If it is lost, enroll the person again.",
   replayed: "Start again: the frames must arrive within a minute, and count once.",
-  camera: "Allow this page to use a camera that no other program uses, and try again.",
+  camera: "See that no other program uses the camera, and try again.",
   key_file: "Choose the file that was made for this person. If it is lost, enroll the person again.",
   internal_error: "Report the request id to the operator.",
   unreachable: "Check your connection and that the service is running, then try again.",
@@ -70,7 +70,7 @@ export function livenessWords({ liveness, liveness_failure: why }) {
 
 export function cameraTrouble(error) {
   if (!navigator.mediaDevices) return "browsers allow the camera only over HTTPS or on localhost";
-  if (error?.name === "NotAllowedError") return "camera access was denied";
+  if (error?.name === "NotAllowedError") return "camera access was denied. Allow it in the browser’s settings for this page";
   if (error?.name === "NotFoundError") return "no camera was found";
   return "the camera cannot be used: another program may have it";
 }
@@ -147,16 +147,18 @@ export function problemBox(problem) {
   return h(
     "div",
     { class: "problem", role: "alert" },
-    h("p", { class: "problem-title" }, TITLES[code] ?? sentence(problem.message)),
+    h("p", { class: "problem-title" }, problem.title ?? TITLES[code] ?? sentence(problem.message)),
     remedies.length
       ? h("ul", {}, remedies.map((each) => h("li", {}, `${each}.`)))
-      : h(
-          "p",
-          {},
-          disabled
-            ? "This person is locked out until an operator lifts the lock."
-            : (REMEDIES[code] ?? "Reload the page and try again."),
-        ),
+      : code === "rate_limited" && problem.wait
+        ? null
+        : h(
+            "p",
+            {},
+            disabled
+              ? "This person is locked out until an operator lifts the lock."
+              : (REMEDIES[code] ?? "Reload the page and try again."),
+          ),
     problem.wait && !disabled ? waiting(problem.wait) : null,
     h(
       "p",

@@ -4,7 +4,7 @@ A decision is taken by ``(similarity − mean) / spread``: how far a probe is ne
 than to templates of nobody. Mean and spread are functions of the probe x alone, through H, the mean
 projector of templates of nobody, and p̄, their mean foot point: of √(xᵀHx), xᵀHx, ‖Hx‖, ‖Hx‖² and
 x·p̄. The Euclidean mean is exactly such a function; the others are fitted (``verify.expectation``;
-docs/method.md §6.1). A *wolf*, a probe near everybody's template, has a high mean.
+docs/decision.md §1). A *wolf*, a probe near everybody's template, has a high mean.
 
 Nothing here is secret: whoever knows how templates are lifted can compute it.
 """

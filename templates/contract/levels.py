@@ -152,7 +152,7 @@ class Level:
     """A security level: its threshold, and the errors seen on the calibration data.
 
     A probe is accepted where its score reaches ``threshold``: the similarity less what is expected
-    of this probe against templates of nobody, in units of its spread (docs/method.md §6).
+    of this probe against templates of nobody, in units of its spread (docs/decision.md §1).
 
     Parameters
     ----------

@@ -29,7 +29,7 @@ SIZES = (2, 65_536)
 COHORT_SIZE = 400
 """Templates in a cohort. The score of a lifted wolf rests on the cohort's mean and standard
 deviation as that wolf sees them, and with 150 their sampling error alone let single wolves reach 3
-to 4 % of templates at FMR 1e-2 (docs/thresholds.md); a larger cohort costs time at every
+to 4 % of templates at FMR 1e-2 (docs/decision.md §1); a larger cohort costs time at every
 decision."""
 TILT = 2.0
 """Weight of near strangers in :meth:`Nobody.score`: one 3 standard deviations above the mean counts

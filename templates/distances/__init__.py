@@ -125,7 +125,7 @@ def pairwise_distances(
 
     References
     ----------
-    Paper eq. 1 to 9; docs/method.md §3 and §5.
+    Paper eq. 1 to 9; docs/method.md §3.
     """
     options = _options(metric, steps, threads)
     probes = _checked(probes, templates, dtype)

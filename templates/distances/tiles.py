@@ -1,10 +1,10 @@
 """Distances of all probes to all templates, a tile at a time, on compiled kernels and all cores.
 
-One tile is the product of the stacked rows [p; D] of some probes and some templates (docs/method.md
-§5), made by the matrix library and solved by a kernel while it is in the cache. Memory is bounded
-by the tiles of the threads. A search visits all tiles and keeps something of each: all of it, the
-nearest, or counts. Every thread has a collector of its own; what they hold together does not depend
-on which thread got which tile.
+One tile is the product of the stacked rows [p; D] of some probes and some templates
+(docs/distances.md "The way of a pair"), made by the matrix library and solved by a kernel while it
+is in the cache. Memory is bounded by the tiles of the threads. A search visits all tiles and keeps
+something of each: all of it, the nearest, or counts. Every thread has a collector of its own; what
+they hold together does not depend on which thread got which tile.
 """
 
 import threading

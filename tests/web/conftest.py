@@ -8,6 +8,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from playwright.sync_api import Browser, expect, sync_playwright
 from tests.patience import PATIENCE_S
 from tests.web.browser_tab import BrowserTab
 from tests.web.camera import FakeCamera
-from tests.web.deployments import OTHER, WHO, demo_service, real_service
+from tests.web.deployments import OTHER, WHO, demo_service, moving_service, real_service
 from tests.web.served import Served
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
@@ -94,6 +95,18 @@ def open_tab(browser: Browser) -> Iterator[OpenTab]:
 @pytest.fixture(scope="package")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     with demo_service(tmp_path_factory.mktemp("demo") / "data") as served:
+        yield served
+
+
+@pytest.fixture(scope="package")
+def local(demo: Served) -> Served:
+    """The demo's service under a name: an IP address has no passkeys."""
+    return replace(demo, url=demo.url.replace("127.0.0.1", "localhost"))
+
+
+@pytest.fixture(scope="package")
+def moving(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    with moving_service(tmp_path_factory.mktemp("moving")) as served:
         yield served
 
 

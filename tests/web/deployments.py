@@ -12,8 +12,10 @@ from api.process.opening import file_sealer, open_keyring
 from api.settings import Settings
 from templates.contract.document import Contract
 from templates.distances.blas import single_threaded
+from tests.api.deployment import deploy, images
 from tests.api.http.test_stored import report
 from tests.api.real_people import calibrated_on_lfw
+from tests.marked_heads import frame, write_marked_pack
 from tests.web.served import Served, serving
 
 DECOY_FACES = 110
@@ -22,6 +24,8 @@ SMALL = Scale(
     enrolled=2, strangers=1, decoy_people=110, calibration_people=28, calibration_photos=4
 )
 WHO, OTHER = "Ashanti", "Antonio_Palocci"
+ANNA = 1
+"""The marked head that :func:`moving_service` knows as anna."""
 
 
 @contextmanager
@@ -65,6 +69,20 @@ def real_service(folder: Path, pack: Path, aligned: Path) -> Iterator[Served]:
     options = {"--data-dir": settings.data_dir, "--pack": pack, "--audit-report-file": audit}
     flags = ["--accept-weak-privacy", *(str(part) for option in options.items() for part in option)]
     with serving(folder, settings, *flags) as served:
+        yield served
+
+
+@contextmanager
+def moving_service(folder: Path) -> Iterator[Served]:
+    """Serve a default level that asks for head movements, and another that does not, to anna."""
+    pack = write_marked_pack(folder / "pack")
+    deployment = deploy(folder, pack=pack)
+    flags = ["--data-dir", str(folder / "data"), "--pack", str(pack)]
+    flags += ["--liveness-levels", "fmr-1e-3=active", "--lockout-after", "0"]
+    with serving(folder, deployment.settings, *flags, token=deployment.token) as served:
+        with served.client() as client:
+            files = images(frame(person=ANNA))
+            assert client.put("/v1/subjects/anna/enrollment", files=files).status_code == 201
         yield served
 
 

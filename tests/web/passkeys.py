@@ -39,8 +39,8 @@ class Authenticator:
         made.exchange()
         return made
 
-    def exchange(self, *, prf: bool = True) -> None:
-        """Take it away, and put in one that holds no passkey."""
+    def exchange(self, *, prf: bool = True, answers: bool = True) -> None:
+        """Put in another, which holds no passkey; without answers its visitor is away."""
         if self.name:
             named = {"authenticatorId": self.name}
             self.session.send("WebAuthn.removeVirtualAuthenticator", named)
@@ -52,7 +52,7 @@ class Authenticator:
             "hasUserVerification": True,
             "isUserVerified": True,
             "hasPrf": prf,
-            "automaticPresenceSimulation": True,
+            "automaticPresenceSimulation": answers,
         }
         answer = self.session.send("WebAuthn.addVirtualAuthenticator", {"options": options})
         self.name = answer["authenticatorId"]

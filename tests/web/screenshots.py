@@ -20,26 +20,23 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
-from itertools import product
 from pathlib import Path
-from typing import Literal
 
 from PIL import Image
 from playwright.sync_api import Browser
 
 from tests.conftest import DEFAULT_SHARED_DATA
+from tests.web.access import SIZES, looks
 from tests.web.browser_tab import BrowserTab
 from tests.web.camera import FakeCamera
 from tests.web.conftest import installed_browser, running_browser
-from tests.web.deployments import OTHER, WHO, demo_service, real_service
+from tests.web.deployments import OTHER, WHO, demo_service, moving_service, real_service
 from tests.web.served import Served
 from tests.web.walk import walk_demo, walk_real
+from tests.web.walk_obstacles import walk_challenge, walk_obstacles, walk_passkeys
 
-Scheme = Literal["light", "dark"]
 Walk = Callable[[BrowserTab, Served], Iterator[str]]
 
-SIZES = ((1280, 800), (390, 844))
-SCHEMES: tuple[Scheme, ...] = ("light", "dark")
 SHOWN_IN_DOCS = "verify-accepted"
 COLOURS = 256
 
@@ -53,26 +50,27 @@ class Pictures:
     docs: bool = False
 
     def take(self, browser: Browser, walk: Walk, served: Served) -> None:
-        """Walk at each size and in each scheme, and take a picture of the states that are meant."""
-        for (width, height), scheme in product(SIZES, SCHEMES):
-            folder = self.out / f"{width}-{scheme}"
-            context = browser.new_context(
-                viewport={"width": width, "height": height},
-                color_scheme=scheme,
-                reduced_motion="reduce",
-            )
-            # Passkeys belong to a name.
-            tab = BrowserTab.of(context, served.url.replace("127.0.0.1", "localhost") + "/")
-            for number, name in enumerate(walk(tab, served), start=1):
-                if self.docs and name == SHOWN_IN_DOCS:
-                    taken = Image.open(io.BytesIO(picture_of(tab))).convert("RGB")
-                    # In few colours, so that it is small.
-                    taken.quantize(COLOURS).save(self.out / "web-page.png", optimize=True)
-                    return
-                if name.startswith(self.only) and not self.docs:
+        """Walk, and take a picture of the states that are meant at each size, light and dark."""
+        width, height = SIZES[0]
+        context = browser.new_context(viewport={"width": width, "height": height})
+        # Passkeys belong to a name.
+        tab = BrowserTab.of(context, served.url.replace("127.0.0.1", "localhost") + "/")
+        for number, name in enumerate(walk(tab, served), start=1):
+            if self.docs and name == SHOWN_IN_DOCS:
+                self._take_for_docs(tab)
+                break
+            if name.startswith(self.only) and not self.docs:
+                for look in looks(tab.page):
+                    folder = self.out / look
                     folder.mkdir(parents=True, exist_ok=True)
                     (folder / f"{number:02}-{name}.png").write_bytes(picture_of(tab))
-            context.close()
+        context.close()
+
+    def _take_for_docs(self, tab: BrowserTab) -> None:
+        next(looks(tab.page))
+        taken = Image.open(io.BytesIO(picture_of(tab))).convert("RGB")
+        # In few colours, so that it is small.
+        taken.quantize(COLOURS).save(self.out / "web-page.png", optimize=True)
 
 
 def picture_of(tab: BrowserTab) -> bytes:
@@ -98,7 +96,13 @@ def main() -> None:
         browser = stack.enter_context(running_browser(Path(executable), *camera.flags))
         demo = stack.enter_context(demo_service(work / "demo"))
         pictures.take(browser, walk_demo, demo)
-        if data.exists() and not pictures.docs:
+        if pictures.docs:
+            return
+        pictures.take(browser, walk_obstacles, demo)
+        pictures.take(browser, walk_passkeys, demo)
+        moving = stack.enter_context(moving_service(work / "moving"))
+        pictures.take(browser, walk_challenge, moving)
+        if data.exists():
             lfw, pack = data / "lfw", data / "packs" / "w600k_mbf"
             real = stack.enter_context(real_service(work / "real", pack, lfw / "aligned112"))
             faces = [sorted((lfw / "photos" / name).glob("*.jpg")) for name in (WHO, OTHER)]

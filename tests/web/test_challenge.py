@@ -1,22 +1,22 @@
 """The page asks for head movements where the level does, and takes frames of them by the clock."""
 
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from PIL import Image
 from playwright.sync_api import expect
 
-from tests.api.deployment import deploy, images
+from tests.api.deployment import images
 from tests.api.http.test_passive_liveness import calibrated
-from tests.marked_heads import draw, encoded, frame, head, write_marked_pack
-from tests.web.access import assert_accessible
+from tests.marked_heads import draw, encoded, frame, head
 from tests.web.browser_tab import BrowserTab
 from tests.web.camera import SIZE, FakeCamera
 from tests.web.conftest import OpenTab
+from tests.web.deployments import ANNA
 from tests.web.moving_head import camera_script
 from tests.web.served import Served, serving
+from tests.web.walk_obstacles import DENY, START
 
 pytestmark = pytest.mark.long
 
@@ -33,23 +33,6 @@ window.fetch = (path, options) => {
   return send(path, options);
 };
 """
-ANNA = 1
-START = "Start head movements"
-
-
-@pytest.fixture(scope="module")
-def asking(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    """A service whose default level asks for a challenge, and another level does not."""
-    folder = tmp_path_factory.mktemp("asking")
-    pack = write_marked_pack(folder / "pack")
-    deployment = deploy(folder, pack=pack)
-    flags = ["--data-dir", str(folder / "data"), "--pack", str(pack)]
-    flags += ["--liveness-levels", "fmr-1e-3=active", "--lockout-after", "0"]
-    with serving(folder, deployment.settings, *flags, token=deployment.token) as served:
-        with served.client() as client:
-            files = images(frame(person=ANNA))
-            assert client.put("/v1/subjects/anna/enrollment", files=files).status_code == 201
-        yield served
 
 
 def opened(open_tab: OpenTab, served: Served, shown: str | None = None) -> BrowserTab:
@@ -62,14 +45,13 @@ def opened(open_tab: OpenTab, served: Served, shown: str | None = None) -> Brows
     return tab
 
 
-def test_who_follows_the_movements_is_accepted(open_tab: OpenTab, asking: Served) -> None:
-    tab = opened(open_tab, asking, "(asked) => asked")
+def test_who_follows_the_movements_is_accepted(open_tab: OpenTab, moving: Served) -> None:
+    tab = opened(open_tab, moving, "(asked) => asked")
     page = tab.page
     expect(page.locator(".picker")).to_be_hidden()
     expect(page.get_by_text("cannot turn your head, ask the operator")).to_be_visible()
     # No level is advertised as a way around.
     expect(page.get_by_text("choose a level")).to_have_count(0)
-    assert_accessible(tab, "challenge-before")
     with page.expect_response(re.compile("/v1/challenges$")) as given:
         page.get_by_role("button", name=START).click()
     expect(page.locator(".movement")).to_be_visible()
@@ -90,7 +72,7 @@ def test_who_follows_the_movements_is_accepted(open_tab: OpenTab, asking: Served
 
 
 def test_who_sits_still_or_turns_the_wrong_way_is_rejected(
-    open_tab: OpenTab, asking: Served
+    open_tab: OpenTab, moving: Served
 ) -> None:
     other = '(asked) => ({turn_left: "turn_right", look_up: "look_down"})[asked] ?? '
     wrong = other + '(asked === "front" ? asked : "turn_left")'
@@ -98,7 +80,7 @@ def test_who_sits_still_or_turns_the_wrong_way_is_rejected(
         ('() => "front"', "the head did not turn"),
         (wrong, re.compile("a movement was not seen|another order")),
     ):
-        tab = opened(open_tab, asking, shown)
+        tab = opened(open_tab, moving, shown)
         tab.page.get_by_role("button", name=START).click()
         expect(tab.page.locator(".verdict.reject")).to_contain_text(why)
         expect(tab.page.locator(".verdict")).to_contain_text("a living person")
@@ -106,22 +88,22 @@ def test_who_sits_still_or_turns_the_wrong_way_is_rejected(
 
 
 def test_a_photo_before_the_browsers_own_camera_is_rejected(
-    open_tab: OpenTab, asking: Served, camera: FakeCamera, tmp_path: Path
+    open_tab: OpenTab, moving: Served, camera: FakeCamera, tmp_path: Path
 ) -> None:
     still = tmp_path / "still.png"
     Image.fromarray(draw(head(), ANNA)).resize((SIZE[1], SIZE[1])).save(still)
     camera.shows(still)
-    tab = opened(open_tab, asking)
+    tab = opened(open_tab, moving)
     tab.page.get_by_role("button", name=START).click()
     expect(tab.page.locator(".verdict.reject")).to_contain_text("the head did not turn")
 
 
 def test_a_level_that_asks_for_none_takes_photos(
-    open_tab: OpenTab, asking: Served, tmp_path: Path
+    open_tab: OpenTab, moving: Served, tmp_path: Path
 ) -> None:
     photo = tmp_path / "anna.png"
     photo.write_bytes(frame(person=ANNA))
-    tab = opened(open_tab, asking)
+    tab = opened(open_tab, moving)
     page = tab.page
     page.get_by_label("Level").select_option("fmr-1e-2")
     expect(page.get_by_role("button", name=START)).to_have_count(0)
@@ -151,8 +133,8 @@ def test_who_sends_photos_is_not_told_to_move(
         expect(page.locator(".verdict")).not_to_contain_text("movement")
 
 
-def test_leaving_ends_the_camera_and_sends_nothing(open_tab: OpenTab, asking: Served) -> None:
-    tab = opened(open_tab, asking, "(asked) => asked")
+def test_leaving_ends_the_camera_and_sends_nothing(open_tab: OpenTab, moving: Served) -> None:
+    tab = opened(open_tab, moving, "(asked) => asked")
     page = tab.page
     page.get_by_role("button", name=START).click()
     expect(page.locator(".movement")).to_be_visible()
@@ -162,13 +144,10 @@ def test_leaving_ends_the_camera_and_sends_nothing(open_tab: OpenTab, asking: Se
     assert not any(url.endswith(("/v1/challenges", "/verify")) for url in tab.requests)
 
 
-def test_a_camera_that_is_refused_is_said(open_tab: OpenTab, asking: Served) -> None:
-    tab = open_tab(asking, sign_in=None)
-    tab.page.add_init_script(
-        "navigator.mediaDevices.getUserMedia = async () => "
-        '{ throw new DOMException("no", "NotAllowedError"); };'
-    )
-    tab.sign_in(asking.token)
+def test_a_camera_that_is_refused_is_said(open_tab: OpenTab, moving: Served) -> None:
+    tab = open_tab(moving, sign_in=None)
+    tab.page.add_init_script(DENY)
+    tab.sign_in(moving.token)
     tab.page.get_by_label("Person's id").fill("anna")
     tab.page.get_by_role("button", name=START).click()
     expect(tab.page.get_by_role("alert")).to_contain_text("Camera access was denied.")

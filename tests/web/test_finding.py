@@ -147,7 +147,7 @@ def test_photos_are_dropped_on_the_form(open_tab: OpenTab, demo: Served) -> None
     # text is dragged as ever.
     assert page.evaluate(DROP, ["form", "key file"]) == [True, True, True]
     expect(page.get_by_text("No picture: key.txt.")).to_be_visible()
-    page.get_by_label("Lock it to a key file").check()
+    page.get_by_label("Lock to a key file").check()
     for dropped in ("key file", url):
         field = "input[type=file][required]"
         assert page.evaluate(DROP, [field, dropped]) == [False, False, False]

@@ -1,7 +1,7 @@
 """Enrollments that are locked to a key of their holder's: from a passkey, or from a file."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -14,17 +14,11 @@ from tests.web.passkeys import Authenticator
 from tests.web.served import Served
 from tests.web.test_access import press_until
 from tests.web.walk import choose
+from tests.web.walk_obstacles import TO_FILE, TO_PASSKEY
 
 pytestmark = pytest.mark.long
 
 SUBJECT, PERSON = "locked-person", "person-2"
-TO_PASSKEY, TO_FILE = "Lock this enrollment to a passkey", "Lock it to a key file"
-
-
-@pytest.fixture(scope="module")
-def local(demo: Served) -> Served:
-    """The demo's service under a name: an IP address has no passkeys."""
-    return replace(demo, url=demo.url.replace("127.0.0.1", "localhost"))
 
 
 @pytest.fixture(autouse=True)
@@ -289,36 +283,6 @@ def test_a_face_is_accepted_with_the_key_file_that_it_was_enrolled_with(
     visitor.is_refused("key_file", "That is no key file.")
     assert visitor.sent("/verify") == 2
     assert_kept_nowhere(visitor, own.read_text().strip(), local.log)
-
-
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("width", [390, 1280])
-def test_the_choices_are_of_use_to_everybody(visit: Visit, width: int, scheme: str) -> None:
-    visitor = visit(width=width, color_scheme=scheme, reduced_motion="reduce")
-    tab, page, tag = visitor.tab, visitor.tab.page, f"{width}-{scheme}"
-    visitor.authenticator.exchange(prf=False)
-    visitor.enroll(TO_PASSKEY)
-    visitor.is_refused("passkey_unsupported", "no PRF extension")
-    assert_accessible(tab, f"enroll-no-prf-{tag}")
-    page.get_by_label(TO_FILE).check()
-    assert_accessible(tab, f"enroll-file-{tag}")
-    page.get_by_label(TO_PASSKEY).check()
-    visitor.authenticator.exchange()
-    page.get_by_role("button", name="Enroll", exact=True).click()
-    visitor.is_told("accept")
-    assert_accessible(tab, f"enrolled-passkey-{tag}")
-    visitor.verify()
-    visitor.is_told("accept")
-    assert_accessible(tab, f"verify-passkey-{tag}")
-    page.get_by_role("radio", name="Key file").check()
-    assert_accessible(tab, f"verify-file-{tag}")
-    page.get_by_label("None", exact=True).check()
-    visitor.send()
-    visitor.is_told("reject")
-    assert_accessible(tab, f"verify-no-key-{tag}")
-    tab.open("People")
-    expect(page.locator("li.person").filter(has_text=SUBJECT)).to_be_visible()
-    assert_accessible(tab, f"people-locked-{tag}")
 
 
 def test_the_keyboard_alone_locks_an_enrollment(visit: Visit) -> None:

@@ -1,13 +1,12 @@
 """What comes late: answers after the visitor went on, and a key that was changed meanwhile."""
 
 import contextlib
-import time
 from typing import Any
 
 import pytest
-from playwright.sync_api import Error, Page, Route, expect
+from playwright.sync_api import Error, Page, expect
 
-from tests.patience import PATIENCE_S
+from tests.web.answers import PendingRequests, refused
 from tests.web.conftest import OpenTab
 from tests.web.served import Served
 from tests.web.walk import choose
@@ -23,30 +22,6 @@ Object.defineProperty(window, "sessionStorage", {
   get() { throw new DOMException("blocked", "SecurityError"); },
 });
 """
-
-
-class PendingRequests:
-    """Requests that match a pattern, answered when the test says so."""
-
-    def __init__(self, page: Page, pattern: str) -> None:
-        self.page = page
-        self.routes: list[Route] = []
-        page.route(pattern, lambda route: self.routes.append(route))
-
-    def wait(self) -> Route:
-        """Wait for the first one."""
-        end = time.monotonic() + PATIENCE_S
-        while not self.routes:  # it comes only while the page's own loop runs
-            assert time.monotonic() < end, "no such request came"
-            self.page.wait_for_timeout(25)
-        return self.routes[0]
-
-
-def refusal(code: str, message: str, **details: Any) -> dict[str, Any]:
-    return {
-        "error": {"code": code, "message": message, "details": details},
-        "request_id": "0" * 32,
-    }
 
 
 def test_a_late_decision_names_whom_it_is_about(open_tab: OpenTab, demo: Served) -> None:
@@ -100,8 +75,7 @@ def test_a_late_enrollment_is_of_the_photos_that_were_sent(open_tab: OpenTab, de
     expect(page.locator(".tray .seen[data-state=good]")).to_have_count(3)
     subject.evaluate("(input) => { input.value = 'bob'; input.form.requestSubmit(); }")
     # The first photo was sent, the third one was not.
-    refused = refusal("inconsistent_images", "they differ", photos=[0, 2])
-    waiting.fulfill(status=422, json=refused)
+    waiting.fulfill(**refused(422, "inconsistent_images", "they differ", photos=[0, 2]))
     expect(page.locator(".tray .seen[data-state=bad]")).to_have_count(1)
     assert len(enrollment.routes) == 1
 
@@ -139,7 +113,7 @@ def test_a_late_refusal_of_another_key_does_not_sign_out(open_tab: OpenTab, demo
     expect(page.get_by_role("button", name="Sign out")).to_be_visible()
     # It was ended with the key it was made with, so it may be too late to answer it.
     with contextlib.suppress(Error):
-        waiting.fulfill(status=401, json=refusal("unauthorized", "send a valid API key"))
+        waiting.fulfill(**refused(401, "unauthorized", "send a valid API key"))
     page.wait_for_timeout(200)
     expect(page.get_by_role("button", name="Sign out")).to_be_visible()
     tab.complaints[:] = [each for each in tab.complaints if "ERR_ABORTED" not in each]
@@ -171,7 +145,7 @@ def test_a_late_page_of_the_log_is_not_of_another_person(open_tab: OpenTab, demo
     wanted = pending.wait()
     wanted.fulfill(json=log_page("b", "further"))
     expect(rows).to_contain_text("b" * 16)
-    late.fulfill(status=429, json=refusal("rate_limited", "too many requests"))
+    late.fulfill(**refused(429, "rate_limited", "too many requests"))
     expect(rows).to_have_count(1)
     # What comes next is of the person and the place that are shown, whatever the field says.
     pending.routes.clear()
@@ -263,7 +237,7 @@ def test_every_receipt_stays_and_no_failure_is_lost(open_tab: OpenTab, demo: Ser
     page.keyboard.press("Escape")
     expect(page.get_by_role("dialog")).to_be_visible()
     page.keyboard.press("Escape")
-    waiting.fulfill(status=429, json=refusal("rate_limited", "too many requests"))
+    waiting.fulfill(**refused(429, "rate_limited", "too many requests"))
     expect(page.get_by_role("alert")).to_contain_text("rate_limited")
     expect(page.get_by_role("alert")).to_be_visible()
 
@@ -275,7 +249,7 @@ def test_a_key_that_ends_during_an_erasure_leaves_no_dialog(
     pending = people(tab.page, "ada")
     tab.open("People")
     erase(tab.page, "ada")
-    pending.wait().fulfill(status=401, json=refusal("unauthorized", "send a valid API key"))
+    pending.wait().fulfill(**refused(401, "unauthorized", "send a valid API key"))
     expect(tab.page.get_by_role("heading", level=1, name="Sign in")).to_be_visible()
     expect(tab.page.locator("dialog")).to_have_count(0)
     tab.page.get_by_label("API key").click()

@@ -186,7 +186,7 @@ def test_what_is_stored_is_shown_with_its_true_numbers(
     tab.page.get_by_role("button", name="Show").click()
     similarity = stored["foot_point_similarity"]
     words = (
-        f"resembles your face with similarity {similarity:.3f}; every unit vector in the "
+        f"resembles the face with similarity {similarity:.3f}; every unit vector in the "
         "16-dimensional set at that angle"
     )
     expect(tab.page.locator("figcaption")).to_contain_text(words)

@@ -1,8 +1,9 @@
 """The key and what it may do; and that the record of a tab sees what it is there to see."""
 
 import pytest
-from playwright.sync_api import expect
+from playwright.sync_api import Route, expect
 
+from tests.web.answers import refused
 from tests.web.conftest import OpenTab
 from tests.web.served import Served
 
@@ -61,16 +62,8 @@ def test_who_may_not_erase_sees_why(open_tab: OpenTab, demo: Served) -> None:
 
 def test_a_key_that_is_revoked_meanwhile_signs_out(open_tab: OpenTab, demo: Served) -> None:
     tab = open_tab(demo)
-    tab.page.route(
-        "**/v1/subjects?*",
-        lambda route: route.fulfill(
-            status=401,
-            json={
-                "error": {"code": "unauthorized", "message": "send a valid API key", "details": {}},
-                "request_id": "0" * 32,
-            },
-        ),
-    )
+    answer = refused(401, "unauthorized", "send a valid API key")
+    tab.page.route("**/v1/subjects?*", lambda route: route.fulfill(**answer))
     tab.page.get_by_role("link", name="People").click()
     expect(tab.page.get_by_role("heading", level=1, name="Sign in")).to_be_visible()
     expect(tab.page.get_by_role("alert")).to_contain_text("unauthorized")
@@ -91,16 +84,9 @@ def test_guidance_waits_as_long_as_it_is_told(open_tab: OpenTab, demo: Served) -
     tab = open_tab(demo)
     asked: list[str] = []
 
-    def too_many(route: object) -> None:
+    def too_many(route: Route) -> None:
         asked.append("check")
-        route.fulfill(  # type: ignore[attr-defined]
-            status=429,
-            headers={"Retry-After": "30"},
-            json={
-                "error": {"code": "rate_limited", "message": "too many requests", "details": {}},
-                "request_id": "0" * 32,
-            },
-        )
+        route.fulfill(**refused(429, "rate_limited", "too many requests", wait=30))
 
     tab.page.route("**/v1/photos/check", too_many)
     tab.page.get_by_label("Camera", exact=True).check()

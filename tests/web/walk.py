@@ -64,7 +64,7 @@ def _demo_states(tab: BrowserTab, demo: Served) -> Iterator[str]:
     expect(alert).to_contain_text("no_face")
     yield "enroll-photo-refused"
     button("button", name="Remove photo from empty.png").click()
-    page.get_by_label("Lock it to a key file").check()
+    page.get_by_label("Lock to a key file").check()
     yield "enroll-key-file"
     page.get_by_label("None", exact=True).check()
     button("button", name="Enroll", exact=True).click()

@@ -160,10 +160,11 @@ def test_what_is_there_is_kept_and_the_rest_is_made(
     assert again.status == 0, again.stderr
     assert again.stderr.count("is there and kept") == 4
     assert "These are promises of a contract made anew." in again.stdout
-    privacy, accuracy, _key, start, enroll, verify = again.stdout.splitlines()[-6:]
+    privacy, accuracy, _key, start, page, enroll, verify = again.stdout.splitlines()[-7:]
     assert privacy.startswith("Privacy:  FAIL.")
     assert accuracy.startswith("Accuracy: ")
     assert start == "Start it: veilface serve"
+    assert page.endswith(f"open http://127.0.0.1:8421/ and sign in with the key in {token}")
     for call, rest in (
         (enroll, "PUT http://127.0.0.1:8421/v1/subjects/anna/enrollment"),
         (verify, "POST http://127.0.0.1:8421/v1/subjects/anna/verify"),
