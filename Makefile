@@ -5,7 +5,7 @@ VENV := .venv/bin
 
 # A worker for each core, so one thread for each matrix library: several, with more threads than
 # cores between them, mostly wait for each other. And one worker more, for a fifth of their time is waiting.
-WORKERS := $(shell expr $$(getconf _NPROCESSORS_ONLN) + 1)
+WORKERS = $$(($$(getconf _NPROCESSORS_ONLN) + 1))
 PYTEST = OMP_NUM_THREADS=1 $(VENV)/pytest --numprocesses=$(WORKERS) --maxprocesses=8 --dist=worksteal $(PYTEST_ARGS)
 
 # Bytecode is kept: without it, every process that a test starts compiles all that it imports.
