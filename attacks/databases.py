@@ -13,10 +13,10 @@ sent the template knows that and the set around it, and so whatever the other co
 
 Of as many decoys as a service uses, un-rotated templates of one person are as unlike as those of
 two by every number that is compared here, so nothing follows from not linking them. The same is
-done with templates of few decoys, which link once they are un-rotated: a check of the method, and
-no figure of the scheme. A row proves something only where its control links, in which each tenant
-has one rotation. What no rotation changes, the lengths of foot points, ``attacks.linkage``
-compares. Neither is in the paper.
+done with templates of few decoys, which link once they are un-rotated: a check of the method and
+of the rotations; where these hold, it is no figure of the scheme. A row proves something only where
+its control links, in which each tenant has one rotation. What no rotation changes, the lengths of
+foot points, ``attacks.linkage`` compares. Neither is in the paper.
 """
 
 from collections.abc import Sequence
@@ -271,8 +271,8 @@ def link_databases(
         tenants, and, where there are accounts, one that is split in two, whose halves have no
         rotation to undo between them (without accounts that is a row of ``attacks.linkage``). Of
         the scheme's own, the same for the least number that fixes a common rotation. Beside each
-        number, as a control, one rotation for all templates of a tenant. Judged are the scheme's
-        own whose control links.
+        number, as a control, one rotation for all templates of a tenant. Judged are, where the
+        control links, the scheme's own and those of few decoys that link as well.
 
     Raises
     ------
@@ -316,11 +316,14 @@ def link_databases(
 
 
 def _judged_by(control: AttackOutcome, row: AttackOutcome, *, of_scheme: bool) -> AttackOutcome:
-    """Say why a row is not judged, where it is not."""
+    """Say why a row is not judged, where it is not.
+
+    A row of few decoys that links is: what failed is the rotation, which is the scheme's at any m.
+    """
     if row is control:
         return replace(row, assumption=row.assumption + " (a control)", unjudged=CONTROL)
     reason = unproven(control, "one rotation for each tenant")
-    return replace(row, unjudged=reason or (None if of_scheme else FEW_DECOYS))
+    return replace(row, unjudged=reason or (None if of_scheme or row.succeeds else FEW_DECOYS))
 
 
 def _enrolled(

@@ -7,13 +7,24 @@ from attacks.chosen_enrollment import Sides, estimate_from_sets, product_pairs
 from attacks.databases import (
     FEW_DECOYS,
     Moments,
+    _judged_by,
     estimate_rotation,
     link_databases,
     whitened_cosines,
 )
 from attacks.errors import AuditError
-from attacks.outcomes import CONTROL
+from attacks.outcomes import (
+    CONTROL,
+    GENERATED,
+    AttackOutcome,
+    Estimate,
+    Knowledge,
+    Leaked,
+    Property,
+    Scheme,
+)
 from attacks.system import System
+from attacks.verdict import judge
 from templates.decoys import DecoyGenerator
 from templates.keys.randomness import Keystream
 from templates.space.subspace import SubspaceBatch
@@ -112,6 +123,27 @@ def test_rows_are_of_few_decoys_and_of_the_scheme_s_own(system: System) -> None:
     assert len(kept) == 8
     assert all("keys that people keep" in row.assumption for row in kept)
     assert sum("two halves of one tenant" in row.variant for row in kept) == 4
+
+
+@pytest.mark.parametrize(("links", "judged"), [(0.9, True), (0.02, False)])
+def test_few_decoys_are_judged_only_where_they_link(links: float, judged: bool) -> None:
+    def row(d_sys: float) -> AttackOutcome:
+        return AttackOutcome(
+            attack="database-linkage",
+            breaks=Property.UNLINKABILITY,
+            leaked=Leaked.MASTER_KEY,
+            knowledge=Knowledge.TEMPLATES,
+            assumption="",
+            scheme=Scheme("adversarial", GENERATED, 160),
+            measured=Estimate(d_sys, d_sys - 0.02, d_sys + 0.02, 100, "bootstrap"),
+            chance=0.05,
+            details={"null_95_percent": 0.08},
+        )
+
+    few = _judged_by(row(0.97), row(links), of_scheme=False)
+    assert few.judged == judged
+    (verdict,) = judge([few, replace(row(0.97), unjudged=CONTROL)])
+    assert verdict.passed is (False if judged else None)
 
 
 def of_axes(system: System, spread: np.ndarray, seed: int) -> System:
