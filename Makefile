@@ -39,9 +39,10 @@ lint: .venv/dev
 types: .venv/dev
 	$(VENV)/mypy
 
-# The client for browsers and Node, by Node's own tools: needs Node 20 or newer, and npm.
+# The client for browsers and Node, by Node's own tools: needs Node 20 or newer, and npm. What the page runs of it in
+# private mode is put into api/web/client.
 javascript:
-	cd clients/javascript && npm ci --no-audit --no-fund && npm run build && npm test
+	cd clients/javascript && npm ci --no-audit --no-fund && npm run build && npm run page && npm test
 
 # The package as a registry would get it, in dist/npm: installed alone, both of its exports load.
 javascript-package: javascript
@@ -127,4 +128,4 @@ lock: | $(UV)
 	echo hatchling | $(UV) pip compile --quiet --upgrade - --universal --generate-hashes --python-version 3.11 -o deploy/build.lock
 
 clean:
-	rm -rf .venv .bootstrap dist clients/javascript/dist clients/javascript/node_modules .schemathesis templates/distances/kernels/__pycache__ .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf .venv .bootstrap dist clients/javascript/dist clients/javascript/node_modules api/web/client .schemathesis templates/distances/kernels/__pycache__ .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -4,7 +4,6 @@ import base64
 import contextlib
 import io
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +12,6 @@ import pytest
 from PIL import Image
 from playwright.sync_api import Browser, expect
 
-from api.process.opening import file_sealer, open_keyring
-from api.process.preparation import recorded_of
 from benchmarks.browser_client import (
     before_the_camera,
     browser_outcome,
@@ -26,8 +23,7 @@ from benchmarks.browser_client import (
 from benchmarks.browser_client import visit as open_page
 from benchmarks.end_to_end import Person
 from models.pack import FacePolicy, ModelPack
-from tests.api.deployment import deploy
-from tests.clients.conftest import Running, started
+from tests.clients.conftest import Running
 from tests.clients.javascript.conftest import require_client
 from tests.clients.javascript.test_docs import EXAMPLE, FOR_PAGES
 from tests.leaks import LeakSearch, as_bytes
@@ -57,27 +53,6 @@ window.embedded = async (names) => {
   return samples;
 };
 """
-
-
-@pytest.fixture(scope="module")
-def running(
-    tmp_path_factory: pytest.TempPathFactory, mbf_pack_dir: Path, pack: ModelPack
-) -> Iterator[Running]:
-    """A service that serves the real pack, and whose threshold decides by no chance."""
-    folder = tmp_path_factory.mktemp("javascript")
-    # Lifted here, their own probes score above 15.4, each other's below 5.0 (2,000 lifts each).
-    deployment = deploy(folder, pack=mbf_pack_dir, serve_pack=True, threshold=10.0)
-    deployment.allow_templates()
-    settings = deployment.settings
-    contract = replace(deployment.contract, recorded=recorded_of(pack))
-    contract.save(settings.resolved_contract_file, file_sealer(open_keyring(settings)))
-    with started(deployment, folder) as service:
-        yield service
-
-
-@pytest.fixture(scope="module")
-def pack(mbf_pack_dir: Path) -> ModelPack:
-    return ModelPack.load(mbf_pack_dir, threads=1)
 
 
 @pytest.fixture(scope="module")
