@@ -16,7 +16,7 @@ from starlette.responses import Response
 from starlette.routing import BaseRoute, Route
 
 from api.demo.people import ENROLLED_PHOTOS, PROBE_PHOTOS, Scale
-from api.http.answers import answer
+from api.http.answers import answer, has_copy
 from api.http.errors import ApiError
 from api.limits.rates import address_of
 from models.synthetic import draw_face, encode_photo
@@ -79,9 +79,7 @@ class Served:
         if request.app.state.settings.serve_pack:
             # The page runs the graphs, and a runtime of theirs is WebAssembly.
             headers["Content-Security-Policy"] = WITH_GRAPHS
-        tags = request.headers.get("if-none-match", "").split(",")
-        copies = {tag.strip().removeprefix("W/") for tag in tags}
-        if copies & {self.etag, "*"}:
+        if has_copy(request, self.etag):
             return Response(status_code=304, headers=headers)
         return Response(self.body, media_type=self.media_type, headers=headers)
 
