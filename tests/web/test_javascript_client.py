@@ -31,6 +31,7 @@ from tests.web.browser_tab import BrowserTab
 from tests.web.camera import FakeCamera
 from tests.web.client_page import Application, application, for_browsers
 from tests.web.conftest import OTHER, WHO
+from tests.web.passkeys import Authenticator
 from veilface_client import Client, NotEnrolled
 
 pytestmark = pytest.mark.long
@@ -174,6 +175,67 @@ def test_the_element(
     tab.page.get_by_role("button", name="Log in").click()
     expect(tab.page.locator("veilface-login output")).to_contain_text("No face was found")
     assert said == ["undefined", "true", "false", "no_face"], "an enrollment is no decision"
+
+
+def test_the_element_locks_an_enrollment_to_a_passkey(
+    browser: Browser,
+    page: Application,
+    running: Running,
+    camera: FakeCamera,
+    people: dict[str, list[Path]],
+) -> None:
+    """As the service's page does, by the key that the documentation derives; nothing without it."""
+    own = people[WHO][0]
+    camera.shows(own)
+    with Client(running.url, running.deployment.token) as client, contextlib.suppress(NotEnrolled):
+        client.erase("anna")
+    context = browser.new_context()
+    try:
+        # Under a name: an IP address has no passkeys.
+        tab = BrowserTab.of(context, page.url.replace("127.0.0.1", "localhost") + "/")
+        authenticator = Authenticator.of(tab.page)
+        says = tab.page.locator("veilface-login output")
+        page.program = for_browsers(FOR_PAGES[1].replace(f'"{EXAMPLE}"', "location.origin"))
+        tab.page.goto(tab.url)
+        login = "document.querySelector('veilface-login')"
+        tab.page.evaluate(f"{login}.setAttribute('passkey', '')")
+        tab.page.evaluate(f"{login}.setAttribute('action', 'enroll')")
+        tab.page.get_by_role("button", name="Start camera").click()
+        # The visitor says no, and then yes: the second attempt makes the passkey.
+        authenticator.refuse()
+        tab.page.get_by_role("button", name="Enroll").click()
+        expect(says).to_contain_text("No passkey was used")
+        authenticator.exchange()
+        tab.page.get_by_role("button", name="Enroll").click()
+        expect(says).to_have_text("You are enrolled.")
+        assert authenticator.passkeys() == 1
+
+        tab.page.evaluate(f"{login}.removeAttribute('action')")
+        tab.page.get_by_role("button", name="Start camera").click()
+        tab.page.get_by_role("button", name="Log in").click()
+        expect(says).to_have_text("Welcome.")
+
+        key = authenticator.holder_key("anna")
+        with Client(running.url, running.deployment.token) as client:
+            assert client.describe("anna").holder_key
+            assert client.verify("anna", own, level=LEVEL, holder_key=decoded(key))
+            assert not client.verify("anna", own, level=LEVEL)
+        assert key.encode() in page.recording.sent, "the one that was sent is the documented one"
+
+        # Another authenticator has no such passkey: no attempt is made.
+        authenticator.exchange()
+        before = page.recording.sent.count(b"/verify HTTP")
+        tab.page.get_by_role("button", name="Start camera").click()
+        tab.page.get_by_role("button", name="Log in").click()
+        expect(says).to_contain_text("No passkey was used")
+        assert page.recording.sent.count(b"/verify HTTP") == before
+        assert tab.complaints == []
+    finally:
+        context.close()
+
+
+def decoded(key: str) -> bytes:
+    return base64.urlsafe_b64decode(key + "=")
 
 
 def test_people_enrolled_and_verified_by_tokens_leave_no_face(
