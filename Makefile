@@ -39,9 +39,10 @@ lint: .venv/dev
 types: .venv/dev
 	$(VENV)/mypy
 
-# The client for browsers and Node, by Node's own tools: needs Node 20 or newer, and npm.
+# The client for browsers and Node, by Node's own tools: needs Node 20 or newer, and npm. What the page runs of it in
+# private mode is put into api/web/client.
 javascript:
-	cd clients/javascript && npm ci --no-audit --no-fund && npm run build && npm test
+	cd clients/javascript && npm ci --no-audit --no-fund && npm run build && npm run page && npm test
 
 # The package as a registry would get it, in dist/npm: installed alone, both of its exports load.
 javascript-package: javascript
@@ -72,11 +73,13 @@ sbom: | $(UV)
 docs: | $(UV)
 	$(UV) tool run --quiet --from zensical==0.0.73 zensical build --strict
 
-# The wheels of both distributions; that of the client must do alone, in an environment of its own.
+# The wheels of both distributions, with what private mode runs where `make javascript` built it; that of the client must do
+# alone, in an environment of its own.
 wheels: | $(UV)
 	rm -rf dist/wheels .bootstrap/alone
 	for folder in . clients/python; do $(UV) build --quiet --wheel --out-dir dist/wheels \
 		--build-constraints deploy/build.lock --require-hashes $$folder || exit 1; done
+	test ! -d api/web/client || $(PYTHON) -m zipfile -l dist/wheels/veilface-*.whl | grep -F api/web/client/client.js.gz >/dev/null
 	$(UV) venv --quiet --python '>=3.11' .bootstrap/alone
 	$(UV) pip install --quiet --python .bootstrap/alone/bin/python --constraint requirements.lock dist/wheels/veilface_client-*.whl
 	.bootstrap/alone/bin/python -I -W error -c "import veilface_client, sys; sys.exit('api' in sys.modules)"
@@ -94,7 +97,7 @@ release:
 	$(PYTHON) .ci/release_notes.py > dist/NOTES.md
 	@test "$(IMAGE)" = no || { test "$$(id -u)" = 0 && command -v podman >/dev/null; } \
 		|| { echo "no release: its image needs root and podman; IMAGE=no leaves it out" >&2; exit 1; }
-	$(MAKE) wheels javascript-package sbom
+	$(MAKE) javascript-package wheels sbom
 	mkdir dist/release
 	cp dist/NOTES.md dist/wheels/*.whl dist/npm/*.tgz dist/sbom.json dist/release
 	test "$(IMAGE)" = no \
@@ -127,4 +130,4 @@ lock: | $(UV)
 	echo hatchling | $(UV) pip compile --quiet --upgrade - --universal --generate-hashes --python-version 3.11 -o deploy/build.lock
 
 clean:
-	rm -rf .venv .bootstrap dist clients/javascript/dist clients/javascript/node_modules .schemathesis templates/distances/kernels/__pycache__ .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf .venv .bootstrap dist clients/javascript/dist clients/javascript/node_modules api/web/client .schemathesis templates/distances/kernels/__pycache__ .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -98,7 +98,7 @@ def test_a_release_is_what_was_built_with_notes_and_checksums(checkout: Path) ->
     old.touch()
     ran = release(checkout)
     assert ran.returncode == 0, ran.stderr
-    assert "asked: wheels javascript-package sbom\n" in ran.stdout
+    assert "asked: javascript-package wheels sbom\n" in ran.stdout
     files = released(checkout)
     sums = files.pop("SHA256SUMS").decode().splitlines()
     assert sorted(sums) == sorted(

@@ -35,6 +35,12 @@ def answer(
     return JsonAnswer(content, status_code=status, headers=dict(headers or {}))
 
 
+def has_copy(request: Request, etag: str) -> bool:
+    """Whether `If-None-Match` says that the client has what this `ETag` names."""
+    tags = request.headers.get("if-none-match", "").split(",")
+    return bool({tag.strip().removeprefix("W/") for tag in tags} & {etag, "*"})
+
+
 def error_answer(error: ApiError, request_id: str) -> JsonAnswer:
     """Return an error in the one shape."""
     body = {

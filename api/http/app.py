@@ -125,7 +125,7 @@ def create_app(
     ):
         app.include_router(routes.router)
     if settings.web_page:
-        app.router.routes.extend(page_routes(demo=settings.demo))
+        app.router.routes.extend(page_routes(demo=settings.demo, serve_pack=settings.serve_pack))
     if settings.operations_port is None:
         app.include_router(health.router)
         _add_middleware(app, settings, operations_paths=OPERATIONS_PATHS)

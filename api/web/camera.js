@@ -3,7 +3,7 @@
 // visitor says so, and each is asked about itself before it is handed on.
 
 import { faceBox, h } from "./dom.js";
-import { Problem, call, crops, form } from "./service.js";
+import { Problem, call, crops, form, session } from "./service.js";
 import { cameraTrouble, guidance, sentence } from "./words.js";
 
 const EVERY_MS = 1000;
@@ -31,7 +31,9 @@ export async function picture(source, width, height, { side, quality = QUALITY, 
 }
 
 export const check = (blob, face, signal) =>
-  call("POST", "/v1/photos/check", { body: form("image", [blob], { face }), signal });
+  session.mode?.active()
+    ? session.mode.check(blob, face, signal)
+    : call("POST", "/v1/photos/check", { body: form("image", [blob], { face }), signal });
 
 // The service could not be asked; that says nothing of the photo.
 export const unasked = ({ status, code }) =>

@@ -1,7 +1,7 @@
 import { facts, h, openDialog, workbench } from "./dom.js";
 import { newHolderKey } from "./holder.js";
 import { photoPicker } from "./photos.js";
-import { call, form, nonce, subjectPath } from "./service.js";
+import { call, form, nonce, session, subjectPath } from "./service.js";
 import { SPELLING, offNote, subjectField, whyOff } from "./subject.js";
 import { problemBox } from "./words.js";
 
@@ -29,21 +29,33 @@ export function enrollView(id) {
         },
       });
 
+  const mode = why === null ? session.mode?.offer("enroll", showSteps) : null;
+  function showSteps() {
+    mode?.at();
+    const words = session.mode?.active() ? session.mode.STEPS : STEPS;
+    steps.forEach((step, index) => (step.textContent = words[index]));
+  }
+
   // The service says whom it would replace, and replaces nobody else: so nothing is replaced unasked.
-  async function put(name, body) {
-    const send = (condition) =>
-      call("PUT", `${subjectPath(name)}/enrollment`, {
-        body,
-        headers: { "Idempotency-Key": nonce(), ...condition },
-      });
+  async function put(name, send) {
     try {
-      return await send({ "If-None-Match": "*" });
+      return await send(null);
     } catch (error) {
       const known = error.code === "enrollment_conflict" && error.details.template_id;
       if (!known) throw error;
-      return (await mayReplace(name)) ? await send({ "If-Match": `"${known}"` }) : null;
+      return (await mayReplace(name)) ? await send(known) : null;
     }
   }
+
+  // `replaces` is the template that may be replaced, or null.
+  const sender = (name, photos, given) => (replaces) =>
+    call("PUT", `${subjectPath(name)}/enrollment`, {
+      body: form("images", photos, given),
+      headers: {
+        "Idempotency-Key": nonce(),
+        ...(replaces ? { "If-Match": `"${replaces}"` } : { "If-None-Match": "*" }),
+      },
+    });
 
   function mayReplace(name) {
     const close = (value) => () => dialog.close(value);
@@ -69,26 +81,32 @@ export function enrollView(id) {
     // The answer is about this person and these photos, whatever else is chosen when it comes.
     const name = subject.value;
     const sent = picker.chosen();
-    const [photos, face] = [picker.blobs(), picker.face()];
+    const [photos, face, lifts] = [picker.blobs(), picker.face(), session.mode?.active()];
     fields.disabled = true;
     result.replaceChildren();
     try {
       const holder_key = await holder.key(name, say);
       say("Enrolling…");
-      const body = form("images", photos, { face, holder_key });
-      const answer = await put(name, body);
+      const answer = await put(
+        name,
+        lifts
+          ? (replaces) => session.mode.enroll(name, { photos, face, holder_key }, replaces)
+          : sender(name, photos, { face, holder_key }),
+      );
       fields.disabled = false;
       if (answer) {
         const shown = enrolled(name, answer, picker.drop(sent));
         // The field says who is enrolled.
         subject.dispatchEvent(new Event("input"));
         result.replaceChildren(shown);
+        if (lifts) result.append(session.mode.whatLeft());
         shown.focus();
       }
     } catch (error) {
       fields.disabled = false;
       if (error.details) picker.blame(error, sent);
       result.replaceChildren(problemBox(error));
+      if (lifts) result.append(session.mode.whatLeft());
       result.scrollIntoView({ block: "nearest" });
     }
     say("Enroll");
@@ -100,12 +118,15 @@ export function enrollView(id) {
     "fieldset",
     { class: "plain", disabled: why !== null },
     subjectPart,
+    mode?.root,
     picker?.root ?? null,
     holder.parts,
     send,
   );
 
   const entry = h("form", { class: "card", onsubmit: submit }, fields);
+  const steps = STEPS.map(() => h("span", {}));
+  showSteps();
   const root = h(
     "section",
     {},
@@ -117,7 +138,7 @@ export function enrollView(id) {
       "Whoever is enrolled already is replaced only if you confirm it.",
     ),
     offNote(why),
-    workbench(entry, "What happens to the photos", STEPS, result),
+    workbench(entry, "What happens to the photos", steps, result),
   );
   picker?.dropOn(entry);
   return {

@@ -6,7 +6,8 @@ let key = kept((storage) => storage.getItem(KEPT)) ?? null;
 // Ends what still runs for a key that is forgotten.
 let running = new AbortController();
 
-export const session = { own: null, contract: null, onrefused: () => {} };
+// `mode` is the module of private mode, where the service serves its pack.
+export const session = { own: null, contract: null, mode: null, onrefused: () => {} };
 
 export const hasKey = () => key !== null;
 
@@ -22,6 +23,8 @@ export function forgetKey() {
   running.abort();
   running = new AbortController();
 }
+
+export const untilSignedOut = () => running.signal;
 
 // Some browsers are set to block the storage: then the key is not kept, and all else works.
 function kept(use) {
@@ -96,6 +99,7 @@ export async function learn() {
     call("GET", "/v1/key"),
     call("GET", "/v1/contract"),
   ]);
+  if (document.documentElement.dataset.private !== "no") session.mode = await import("./private.js");
 }
 
 // Levels that a photo can be verified at with this key.

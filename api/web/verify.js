@@ -63,6 +63,7 @@ export function verifyView(id) {
           clear();
         },
       });
+  const mode = why === null ? session.mode?.offer("verify", showWhatIsAsked) : null;
   const movements = headMovements();
   const moving = () => why === null && moves(level.value);
   const instead = h("p", { class: "hint" }, "If you cannot turn your head, ask the operator for another way.");
@@ -70,6 +71,7 @@ export function verifyView(id) {
 
   function showWhatIsAsked() {
     clear();
+    mode?.at(level.value);
     steps.forEach((step, index) => (step.textContent = STEPS[moving() ? "movements" : "photos"][index]));
     if (!picker) return;
     picker.root.hidden = moving();
@@ -89,6 +91,7 @@ export function verifyView(id) {
     const asking = asked;
     const name = subject.value;
     const sent = picker.chosen();
+    const lifts = session.mode?.active();
     fields.disabled = true;
     try {
       const holder_key = await holder.key(name, say);
@@ -97,10 +100,13 @@ export function verifyView(id) {
         ? await movements.frames(name)
         : { photos: picker.blobs(), face: picker.face() };
       say("Comparing…");
-      const body = form("images", photos, { level: level.value, ...shown, holder_key });
-      const answer = await call("POST", `${subjectPath(name)}/verify`, { body });
+      const given = { level: level.value, ...shown, holder_key };
+      const answer = await (lifts
+        ? session.mode.verify(name, { photos, ...given })
+        : call("POST", `${subjectPath(name)}/verify`, { body: form("images", photos, given) }));
       if (asking === asked) {
         result.replaceChildren(decision(name, answer, asksToMove ? "movements" : "photos"));
+        if (lifts) result.append(session.mode.whatLeft());
         result.scrollIntoView({ block: "nearest" });
       }
     } catch (error) {
@@ -109,6 +115,7 @@ export function verifyView(id) {
         problem.replaceChildren(problemBox(error));
         if (error.code === "locked_out" && may("admin")) problem.append(lifter(name));
         if (error.code === "not_enrolled" && may("enroll")) problem.append(enroller(name));
+        if (lifts) problem.append(session.mode.whatLeft());
         problem.scrollIntoView({ block: "nearest" });
       }
     }
@@ -148,6 +155,7 @@ export function verifyView(id) {
       subjectPart,
       field("Level", level, "How often a stranger is accepted. Stricter levels reject the right person more often."),
     ),
+    mode?.root,
     picker?.root ?? null,
     why ? null : movements.root,
     instead,

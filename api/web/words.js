@@ -33,6 +33,7 @@ const REMEDIES = {
   passkey_unsupported: "Use another device or browser, or a key file. If a passkey was made just now, delete it.",
   passkey_of_another: "Choose the passkey that is named after the id. If it is lost, enroll the person again.",
   replayed: "Start again: the frames must arrive within a minute, and count once.",
+  private_mode: "Try again, or switch private mode off: photos then go to the service.",
   camera: "See that no other program uses the camera, and try again.",
   key_file: "Choose the file that was made for this person. If it is lost, enroll the person again.",
   internal_error: "Report the request id to the operator.",

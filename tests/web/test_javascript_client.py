@@ -4,7 +4,6 @@ import base64
 import contextlib
 import io
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +12,6 @@ import pytest
 from PIL import Image
 from playwright.sync_api import Browser, expect
 
-from api.process.opening import file_sealer, open_keyring
-from api.process.preparation import recorded_of
 from benchmarks.browser_client import (
     before_the_camera,
     browser_outcome,
@@ -26,8 +23,7 @@ from benchmarks.browser_client import (
 from benchmarks.browser_client import visit as open_page
 from benchmarks.end_to_end import Person
 from models.pack import FacePolicy, ModelPack
-from tests.api.deployment import deploy
-from tests.clients.conftest import Running, started
+from tests.clients.conftest import Running
 from tests.clients.javascript.conftest import require_client
 from tests.clients.javascript.test_docs import EXAMPLE, FOR_PAGES
 from tests.leaks import LeakSearch, as_bytes
@@ -35,6 +31,7 @@ from tests.web.browser_tab import BrowserTab
 from tests.web.camera import FakeCamera
 from tests.web.client_page import Application, application, for_browsers
 from tests.web.conftest import OTHER, WHO
+from tests.web.passkeys import Authenticator
 from veilface_client import Client, NotEnrolled
 
 pytestmark = pytest.mark.long
@@ -57,27 +54,6 @@ window.embedded = async (names) => {
   return samples;
 };
 """
-
-
-@pytest.fixture(scope="module")
-def running(
-    tmp_path_factory: pytest.TempPathFactory, mbf_pack_dir: Path, pack: ModelPack
-) -> Iterator[Running]:
-    """A service that serves the real pack, and whose threshold decides by no chance."""
-    folder = tmp_path_factory.mktemp("javascript")
-    # Lifted here, their own probes score above 15.4, each other's below 5.0 (2,000 lifts each).
-    deployment = deploy(folder, pack=mbf_pack_dir, serve_pack=True, threshold=10.0)
-    deployment.allow_templates()
-    settings = deployment.settings
-    contract = replace(deployment.contract, recorded=recorded_of(pack))
-    contract.save(settings.resolved_contract_file, file_sealer(open_keyring(settings)))
-    with started(deployment, folder) as service:
-        yield service
-
-
-@pytest.fixture(scope="module")
-def pack(mbf_pack_dir: Path) -> ModelPack:
-    return ModelPack.load(mbf_pack_dir, threads=1)
 
 
 @pytest.fixture(scope="module")
@@ -199,6 +175,67 @@ def test_the_element(
     tab.page.get_by_role("button", name="Log in").click()
     expect(tab.page.locator("veilface-login output")).to_contain_text("No face was found")
     assert said == ["undefined", "true", "false", "no_face"], "an enrollment is no decision"
+
+
+def test_the_element_locks_an_enrollment_to_a_passkey(
+    browser: Browser,
+    page: Application,
+    running: Running,
+    camera: FakeCamera,
+    people: dict[str, list[Path]],
+) -> None:
+    """As the service's page does, by the key that the documentation derives; nothing without it."""
+    own = people[WHO][0]
+    camera.shows(own)
+    with Client(running.url, running.deployment.token) as client, contextlib.suppress(NotEnrolled):
+        client.erase("anna")
+    context = browser.new_context()
+    try:
+        # Under a name: an IP address has no passkeys.
+        tab = BrowserTab.of(context, page.url.replace("127.0.0.1", "localhost") + "/")
+        authenticator = Authenticator.of(tab.page)
+        says = tab.page.locator("veilface-login output")
+        page.program = for_browsers(FOR_PAGES[1].replace(f'"{EXAMPLE}"', "location.origin"))
+        tab.page.goto(tab.url)
+        login = "document.querySelector('veilface-login')"
+        tab.page.evaluate(f"{login}.setAttribute('passkey', '')")
+        tab.page.evaluate(f"{login}.setAttribute('action', 'enroll')")
+        tab.page.get_by_role("button", name="Start camera").click()
+        # The visitor says no, and then yes: the second attempt makes the passkey.
+        authenticator.refuse()
+        tab.page.get_by_role("button", name="Enroll").click()
+        expect(says).to_contain_text("No passkey was used")
+        authenticator.exchange()
+        tab.page.get_by_role("button", name="Enroll").click()
+        expect(says).to_have_text("You are enrolled.")
+        assert authenticator.passkeys() == 1
+
+        tab.page.evaluate(f"{login}.removeAttribute('action')")
+        tab.page.get_by_role("button", name="Start camera").click()
+        tab.page.get_by_role("button", name="Log in").click()
+        expect(says).to_have_text("Welcome.")
+
+        key = authenticator.holder_key("anna")
+        with Client(running.url, running.deployment.token) as client:
+            assert client.describe("anna").holder_key
+            assert client.verify("anna", own, level=LEVEL, holder_key=decoded(key))
+            assert not client.verify("anna", own, level=LEVEL)
+        assert key.encode() in page.recording.sent, "the one that was sent is the documented one"
+
+        # Another authenticator has no such passkey: no attempt is made.
+        authenticator.exchange()
+        before = page.recording.sent.count(b"/verify HTTP")
+        tab.page.get_by_role("button", name="Start camera").click()
+        tab.page.get_by_role("button", name="Log in").click()
+        expect(says).to_contain_text("No passkey was used")
+        assert page.recording.sent.count(b"/verify HTTP") == before
+        assert tab.complaints == []
+    finally:
+        context.close()
+
+
+def decoded(key: str) -> bytes:
+    return base64.urlsafe_b64decode(key + "=")
 
 
 def test_people_enrolled_and_verified_by_tokens_leave_no_face(

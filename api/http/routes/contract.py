@@ -3,7 +3,7 @@
 from fastapi import APIRouter, Depends, Request
 from starlette.responses import Response
 
-from api.http.answers import answer
+from api.http.answers import answer, has_copy
 from api.http.auth import CallerDep, holding
 from api.http.deps import GateDep, RuntimeDep
 from api.http.errors import ApiError
@@ -45,25 +45,36 @@ async def get_contract(
     response_class=Response,
     responses={
         200: {
-            "description": "The generator's file: safetensors. `X-Decoy-Source-ID` names it.",
+            "description": "The generator's file: safetensors. `X-Decoy-Source-ID` names it, and "
+            "so does `ETag`.",
             "content": {
                 "application/octet-stream": {"schema": {"type": "string", "format": "binary"}}
             },
         },
+        304: {"description": "The client's copy is the same."},
         **error_responses(*EVERY_CALL, "forbidden", "not_found", "replayed"),
     },
     summary="The decoy generator, for clients that lift",
 )
-async def get_generator(runtime: RuntimeDep, gate: GateDep) -> Response:
-    """Right: `embeddings`. A pool of real descriptors is never given away."""
+async def get_generator(request: Request, runtime: RuntimeDep, gate: GateDep) -> Response:
+    """Right: `embeddings`. A pool of real descriptors is never given away.
+
+    A client may keep it, and asks each time whether it still holds.
+    """
     source = runtime.source
     if not isinstance(source, DecoyGenerator):
         raise ApiError(
             "not_found",
             "this deployment has no decoy generator to give; a decoy pool stays secret",
         )
+    headers = {
+        "X-Decoy-Source-ID": source.source_id,
+        "ETag": f'"{source.source_id}"',
+        # The path does not name the content. And whoever uses a copy must still have the right.
+        "Cache-Control": "private, no-cache",
+    }
+    if has_copy(request, headers["ETag"]):
+        return Response(status_code=304, headers=headers)
     return Response(
-        await gate.query(source.to_bytes),
-        media_type="application/octet-stream",
-        headers={"X-Decoy-Source-ID": source.source_id},
+        await gate.query(source.to_bytes), media_type="application/octet-stream", headers=headers
     )

@@ -10,7 +10,7 @@ from starlette.requests import ClientDisconnect
 from starlette.responses import FileResponse, Response
 from starlette.types import Receive, Scope, Send
 
-from api.http.answers import answer
+from api.http.answers import answer, has_copy
 from api.http.auth import Caller, CallerDep
 from api.http.deps import RuntimeDep
 from api.http.errors import ApiError
@@ -143,8 +143,7 @@ async def get_pack_file(
     if graph is None:
         raise _not_served()
     headers = {"ETag": f'"{graph.sha256}"', "Cache-Control": KEPT}
-    tags = request.headers.get("if-none-match", "").split(",")
-    if {tag.strip().removeprefix("W/") for tag in tags} & {headers["ETag"], "*"}:
+    if has_copy(request, headers["ETag"]):
         return Response(status_code=304, headers=headers)
     graph.require_unchanged()
     downloads: Downloads = request.app.state.downloads

@@ -16,17 +16,21 @@ from starlette.responses import Response
 from starlette.routing import BaseRoute, Route
 
 from api.demo.people import ENROLLED_PHOTOS, PROBE_PHOTOS, Scale
-from api.http.answers import answer
+from api.http.answers import answer, has_copy
 from api.http.errors import ApiError
 from api.limits.rates import address_of
 from models.synthetic import draw_face, encode_photo
 
 WEB = Path(__file__).resolve().parents[2] / "web"
+CLIENT = WEB / "client"
+"""What private mode runs in the browser, compressed; there after `make javascript`."""
 TYPES = {
     ".html": "text/html; charset=utf-8",
     ".css": "text/css; charset=utf-8",
     ".js": "text/javascript; charset=utf-8",
     ".svg": "image/svg+xml",
+    ".mjs": "text/javascript; charset=utf-8",
+    ".wasm": "application/wasm",
 }
 HEADERS = {
     # Asked for again each time, and answered 304 while it is the same: after an update of the
@@ -43,6 +47,7 @@ WITH_GRAPHS = HEADERS["Content-Security-Policy"].replace(
     "script-src 'self'", "script-src 'self' 'wasm-unsafe-eval'"
 )
 DEMO_MARK = ('data-demo="no"', 'data-demo="yes"')
+PRIVATE_MARK = 'data-private="no"'
 
 FIRST_STRANGER = 101
 SHOTS = ENROLLED_PHOTOS + PROBE_PHOTOS
@@ -59,34 +64,42 @@ class Served:
     body: bytes = field(repr=False)
     media_type: str
     etag: str
+    encoding: str | None = None
 
     @classmethod
-    def of(cls, body: bytes, suffix: str) -> "Served":
+    def of(cls, body: bytes, suffix: str, encoding: str | None = None) -> "Served":
         """Name a file by its content."""
-        return cls(body, TYPES[suffix], f'"{hashlib.sha256(body).hexdigest()[:32]}"')
+        return cls(body, TYPES[suffix], f'"{hashlib.sha256(body).hexdigest()[:32]}"', encoding)
 
     def answer(self, request: Request) -> Response:
         """Return the file, or that the browser's copy is still the same."""
         headers = {**HEADERS, "ETag": self.etag}
+        if self.encoding is not None:
+            headers["Content-Encoding"] = self.encoding
         if request.app.state.settings.serve_pack:
             # The page runs the graphs, and a runtime of theirs is WebAssembly.
             headers["Content-Security-Policy"] = WITH_GRAPHS
-        tags = request.headers.get("if-none-match", "").split(",")
-        copies = {tag.strip().removeprefix("W/") for tag in tags}
-        if copies & {self.etag, "*"}:
+        if has_copy(request, self.etag):
             return Response(status_code=304, headers=headers)
         return Response(self.body, media_type=self.media_type, headers=headers)
 
 
-def page_routes(*, demo: bool) -> list[BaseRoute]:
+def page_routes(*, demo: bool, serve_pack: bool) -> list[BaseRoute]:
     """Return the routes of the page; those of the drawn people only with the demo model."""
     html = (WEB / "index.html").read_text(encoding="utf-8")
-    index = Served.of((html.replace(*DEMO_MARK) if demo else html).encode(), ".html")
     assets = {
         path.name: Served.of(path.read_bytes(), path.suffix)
         for path in sorted(WEB.iterdir())
         if path.suffix in TYPES and path.name != "index.html"
     }
+    if demo:
+        html = html.replace(*DEMO_MARK)
+    elif serve_pack:
+        # Not in the demo, whose model knows a cartoon face by a check that no graph holds.
+        client = _private_client()
+        assets |= client
+        html = html.replace(PRIVATE_MARK, f'data-private="{"yes" if client else "not-built"}"')
+    index = Served.of(html.encode(), ".html")
 
     async def page(request: Request) -> Response:
         return index.answer(request)
@@ -97,13 +110,22 @@ def page_routes(*, demo: bool) -> list[BaseRoute]:
             raise ApiError("not_found", "there is no such path")
         return file.answer(request)
 
-    routes: list[BaseRoute] = [route_of("/", page), route_of("/assets/{name}", asset)]
+    routes: list[BaseRoute] = [route_of("/", page), route_of("/assets/{name:path}", asset)]
     if demo:
         routes += [
             route_of("/demo/people", demo_people),
             route_of("/demo/people/{person}/{shot}", demo_photo),
         ]
     return routes
+
+
+def _private_client() -> dict[str, Served]:
+    """Return what private mode runs, by its names below ``/assets/``; nothing if not built."""
+    named = {path: Path(path.stem) for path in sorted(CLIENT.glob("*.gz"))}
+    return {
+        f"{CLIENT.name}/{name}": Served.of(path.read_bytes(), name.suffix, "gzip")
+        for path, name in named.items()
+    }
 
 
 def route_of(path: str, endpoint: Endpoint) -> Route:

@@ -159,3 +159,20 @@ test("what ONNX Runtime and the browser throw has this package's classes", async
   await assert.rejects(decodeImage(new Blob(["text"])), (error) =>
     error instanceof ImageError && error.code === "unsupported_image");
 });
+
+test("a check says what a refusal would, and embeds nothing", async () => {
+  const { runtime } = runtimeOf(1, async () => assert.fail("it was embedded"));
+  const bytes = new Uint8Array(3);
+  const binding = { embedder_sha256: await sha256(bytes), preprocessing: sizes, n: 4 };
+  const pack = await ModelPack.load(runtime, { binding, recorded: {} }, { embedder: bytes });
+  const noise = Uint8Array.from({ length: 3 * 112 * 112 }, (_, i) => (i * 7919) % 251);
+  const good = await pack.checkPhoto(rgbImage(noise, 112, 112));
+  assert.deepEqual([good.usable, good.code, good.box], [true, null, null]);
+  const dark = await pack.checkPhoto(flat(112, 112, 3));
+  await assert.rejects(pack.cropPhoto(flat(112, 112, 3)), ({ code, message, details }) => {
+    assert.deepEqual([dark.usable, dark.code, dark.message, dark.details], [false, code, message, details]);
+    return code === "low_quality";
+  });
+  // What is no photo of a face at all stays an error.
+  await assert.rejects(pack.checkPhoto(flat(112, 100, 3)), /square/);
+});

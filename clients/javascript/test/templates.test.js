@@ -96,6 +96,16 @@ test("photos that part into two people are named", () => {
   assert.throws(() => meanEmbedding([one, one.map((value) => -value)], -1), InconsistentImages);
 });
 
+test("photos of two people are named as the service names them", () => {
+  const told = (apart, others) => {
+    const { message, photos } = new InconsistentImages(apart, others);
+    return [message.split(";")[0], [...photos]];
+  };
+  assert.deepEqual(told([1], [0]), ["photos 1 and 2 do not look like the same person", [0, 1]]);
+  assert.deepEqual(told([1], [0, 2]), ["photo 2 does not look like the person on photos 1 and 3", [1]]);
+  assert.deepEqual(told([1, 2], [0, 3]), ["photos 2 and 3 do not look like the person on photos 1 and 4", [0, 1, 2, 3]]);
+});
+
 test("bytes that are no generator are refused without being repeated", async () => {
   const text = new TextEncoder().encode('{"secret": 1}');
   const bytes = Uint8Array.from([text.length, 0, 0, 0, 0, 0, 0, 0, ...text]);

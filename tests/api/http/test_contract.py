@@ -1,3 +1,4 @@
+import hashlib
 import json
 from pathlib import Path
 
@@ -36,6 +37,22 @@ def test_the_generator_is_the_contracts(client: Client, deployment: Deployment) 
     assert answer.headers["x-decoy-source-id"] == loaded.source_id
     drawn = loaded.draw(1, 2, stream=Keystream.seeded("x"))
     assert np.array_equal(drawn, deployment.source.draw(1, 2, stream=Keystream.seeded("x")))
+
+
+def test_a_copy_of_the_generator_is_asked_for_again_and_not_sent_again(
+    client: Client, deployment: Deployment
+) -> None:
+    path = "/v1/contract/generator"
+    answer = client.get(path)
+    etag = answer.headers["etag"]
+    assert etag == f'"{hashlib.sha256(answer.content).hexdigest()}"'
+    assert answer.headers["cache-control"] == "private, no-cache"
+    again = client.get(path, headers={"If-None-Match": f'"other", W/{etag}'})
+    assert (again.status_code, again.content, again.headers["etag"]) == (304, b"", etag)
+    assert client.get(path, headers={"If-None-Match": '"other"'}).content == answer.content
+    # A copy is of no use without the right.
+    without = bearer(deployment.key("verify")) | {"If-None-Match": etag}
+    assert_error(client.get(path, headers=without), 403, "forbidden")
 
 
 def test_a_pool_is_never_given_away(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """The page's files: where they are served, with which headers, and where they are not."""
 
+import gzip
 import re
 from pathlib import Path
 from typing import Any
@@ -7,6 +8,7 @@ from typing import Any
 import pytest
 
 from api.http.app import create_app
+from api.http.routes import page
 from api.http.routes.page import WEB
 from api.settings import Settings
 from tests.api.client import Client
@@ -26,6 +28,8 @@ POLICY = {
     "trusted-types": "'none'",
 }
 MOST_BYTES = 120 * 1024
+MOST_BYTES_OF_PRIVATE_MODE = 12 * 1024
+"""Of the module that is fetched only where the service serves its pack."""
 MARKUP = re.compile(
     r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|eval\(|new Function|style="
 )
@@ -58,16 +62,26 @@ def test_everything_that_the_page_names_is_served(client: Client) -> None:
                 ".svg": "image/svg+xml"}.get(Path(path).suffix)  # fmt: skip
         assert kind is None or answer.headers["content-type"] == kind
         named = set(re.findall(r'(?:href|src)="(/[^"]*)"', answer.text) if path == "/" else ())
-        named |= {f"/assets/{name}" for name in re.findall(r'from "\./([^"]+)"', answer.text)}
+        imported = re.findall(r'(?:from |import\()"\./([^"]+)"', answer.text)
+        named |= {f"/assets/{name}" for name in imported}
         waiting += sorted(named - seen)
     assert seen == {"/"} | {
-        f"/assets/{file.name}" for file in WEB.iterdir() if file.name != "index.html"
+        f"/assets/{file.name}" for file in _files() if file.name != "index.html"
     }
 
 
+def _files() -> list[Path]:
+    """The page's own files, without what `make javascript` builds."""
+    return [path for path in WEB.iterdir() if path.is_file()]
+
+
 def test_the_files_are_small_and_name_nobody_else() -> None:
-    texts = {file.name: file.read_text(encoding="utf-8") for file in WEB.iterdir()}
-    assert sum(len(text.encode()) for text in texts.values()) <= MOST_BYTES
+    texts = {file.name: file.read_text(encoding="utf-8") for file in _files()}
+    sizes = {name: len(text.encode()) for name, text in texts.items()}
+    assert sizes["private.js"] <= MOST_BYTES_OF_PRIVATE_MODE
+    assert sum(sizes.values()) - sizes["private.js"] <= MOST_BYTES
+    # By one import, which is not made unless the pack is served.
+    assert [name for name, text in texts.items() if "private.js" in text] == ["service.js"]
     for name, text in texts.items():
         foreign = re.findall(r"https?://[^\s\"')]+", text)
         assert [url for url in foreign if not url.startswith("http://www.w3.org/")] == [], name
@@ -140,6 +154,70 @@ def test_the_page_takes_no_other_method(client: Client) -> None:
     answer = client.post("/")
     assert_error(answer, 405, "method_not_allowed")
     assert set(answer.headers["allow"].split(", ")) == {"GET", "HEAD"}
+
+
+def _serving_its_pack(folder: Path, **changes: Any) -> Client:
+    deployment = deploy(folder, serve_pack=True, **changes)
+    return Client(create_app(deployment.settings), headers=bearer(deployment.token))
+
+
+def _put_client(folder: Path) -> None:
+    """As `make javascript` does: compressed, and beside it a text that is not served."""
+    folder.mkdir()
+    (folder / "client.js.gz").write_bytes(gzip.compress(b"export const client = 1;"))
+    (folder / "runtime.mjs.gz").write_bytes(gzip.compress(b"export const runtime = 1;"))
+    (folder / "runtime.wasm.gz").write_bytes(gzip.compress(b"\0asm"))
+    (folder / "runtime.LICENSE").write_text("MIT")
+
+
+def test_private_mode_is_offered_where_the_pack_is_served(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _put_client(tmp_path / "client")
+    monkeypatch.setattr(page, "CLIENT", tmp_path / "client")
+    with _serving_its_pack(tmp_path / "served") as client:
+        answer = client.get("/")
+        assert 'data-private="yes"' in answer.text
+        stated = dict(
+            part.strip().split(" ", 1)
+            for part in answer.headers["content-security-policy"].split(";")
+        )
+        assert stated == POLICY | {"script-src": "'self' 'wasm-unsafe-eval'"}
+        for name, kind, content in (
+            ("client.js", "text/javascript; charset=utf-8", b"export const client = 1;"),
+            ("runtime.mjs", "text/javascript; charset=utf-8", b"export const runtime = 1;"),
+            ("runtime.wasm", "application/wasm", b"\0asm"),
+        ):
+            file = client.get(f"/assets/client/{name}")
+            assert (file.status_code, file.content) == (200, content)
+            assert file.headers["content-type"] == kind
+            again = client.get(
+                f"/assets/client/{name}", headers={"If-None-Match": file.headers["etag"]}
+            )
+            assert again.status_code == 304
+        for absent in ("runtime.LICENSE", "client.js.gz", "../main.js", "none.js"):
+            assert raw(client, f"/assets/client/{absent}") == 404
+
+
+def test_without_the_built_client_the_page_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(page, "CLIENT", tmp_path / "absent")
+    with _serving_its_pack(tmp_path / "served") as client:
+        assert 'data-private="not-built"' in client.get("/").text
+        assert_error(client.get("/assets/client/client.js"), 404, "not_found")
+
+
+def test_private_mode_is_not_offered_elsewhere(
+    client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert 'data-private="no"' in client.get("/").text
+    _put_client(tmp_path / "client")
+    monkeypatch.setattr(page, "CLIENT", tmp_path / "client")
+    # Nor in the demo: what tells a cartoon face from another picture is in no graph.
+    with _serving_its_pack(tmp_path / "demo", demo=True) as demo:
+        assert 'data-private="no"' in demo.get("/").text
+        assert_error(demo.get("/assets/client/client.js"), 404, "not_found")
 
 
 def test_the_page_can_be_switched_off(tmp_path: Path) -> None:

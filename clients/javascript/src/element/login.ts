@@ -3,11 +3,15 @@
 import { fromImageData, type RgbImage } from "../models/image.js";
 import type { Decision, Enrollment } from "../service/answers.js";
 import { PrivateClient, type PrivateOptions } from "../service/private-client.js";
+import { createPasskey, passkeyHolderKey, type Passkey } from "./passkey.js";
+
+export { PasskeyError } from "./passkey.js";
 
 /** What the page's server says when a person wants to log in: whose token it is, and the token. */
 export interface Authorization {
   readonly subject: string;
   readonly token: string;
+  /** In the place of a key from a passkey. */
   readonly holderKey?: Uint8Array;
 }
 
@@ -18,6 +22,7 @@ export interface Words {
   readonly enroll: string;
   readonly waiting: string;
   readonly working: string;
+  readonly passkey: string;
   readonly accept: string;
   readonly reject: string;
   readonly enrolled: string;
@@ -33,6 +38,7 @@ export const WORDS: Words = {
   enroll: "Enroll",
   waiting: "Look into the camera.",
   working: "One moment …",
+  passkey: "Use your passkey.",
   accept: "Welcome.",
   reject: "That did not match. Try again.",
   enrolled: "You are enrolled.",
@@ -61,7 +67,8 @@ const Base = globalThis.HTMLElement ?? (class {} as typeof HTMLElement);
  *
  * The attribute `service` is the service's URL, by default the page's own origin; `action` is
  * `verify` (by default) or `enroll`; `face` is `single` (by default: a second face is an error) or
- * `largest`. Parts for styling: `video`, `button`, `status`.
+ * `largest`. With the attribute `passkey` an enrollment makes one and is locked to the key that it gives,
+ * and a verification asks for it. Parts for styling: `video`, `button`, `status`.
  *
  * Taken out of the page it stops the camera and ends the attempt: nothing more is sent or told.
  *
@@ -84,6 +91,8 @@ export class VeilfaceLogin extends Base {
   #camera: MediaStream | undefined;
   // Graphs stay loaded from one attempt to the next.
   #client: Promise<PrivateClient> | undefined;
+  // Another attempt to enroll takes the same passkey.
+  #passkey: Passkey | undefined;
   // Aborted when the element leaves the page; another one when it comes back.
   #stay = new AbortController();
 
@@ -125,7 +134,9 @@ export class VeilfaceLogin extends Base {
     const photos = await this.#burst(signal);
     const prepared = await this.#prepared(signal);
     signal.throwIfAborted();
-    const { subject, token, holderKey } = await authorize();
+    const { subject, token, ...given } = await authorize();
+    signal.throwIfAborted();
+    const holderKey = given.holderKey ?? (await this.#holderKey(subject, signal));
     signal.throwIfAborted();
     const client = prepared.as(token);
     try {
@@ -139,6 +150,17 @@ export class VeilfaceLogin extends Base {
     } finally {
       await client.close();
     }
+  }
+
+  /** The key of the person's passkey, where one is to be asked for. */
+  async #holderKey(subject: string, signal: AbortSignal): Promise<Uint8Array | undefined> {
+    if (this.getAttribute("passkey") === null) return undefined;
+    this.#say(this.words.passkey);
+    if (this.getAttribute("action") !== "enroll") return passkeyHolderKey(subject, signal);
+    if (this.#passkey?.subject !== subject) {
+      this.#passkey = await createPasskey(subject, signal);
+    }
+    return passkeyHolderKey(subject, signal, this.#passkey);
   }
 
   #given(): { options: Omit<PrivateOptions, "signal">; authorize: () => Promise<Authorization> } {

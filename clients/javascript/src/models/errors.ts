@@ -20,6 +20,9 @@ import { VeilfaceError } from "../errors.js";
 /** Base of all errors between a photo and its embedding. */
 export class ModelError extends VeilfaceError {
   override name = "ModelError";
+
+  /** Position from 0 of the photo that it is about, where several were lifted together. */
+  image: number | undefined = undefined;
 }
 
 /** A pack that is not that of the contract, or does not run. */

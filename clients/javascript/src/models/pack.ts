@@ -1,10 +1,10 @@
 /** The graphs of a contract, which together turn a photo into an embedding. */
 
 import { align, TEMPLATE_NAME } from "./alignment.js";
-import { centreRank, type Face } from "./boxes.js";
+import { centreRank, type Box, type Face } from "./boxes.js";
 import { DEFAULT_SIZE, findFaces, type Detector, type Size } from "./detection.js";
 import { Embedder, PREPROCESSING_VERSION, type Preprocessing } from "./embedding.js";
-import { ModelError, PackError } from "./errors.js";
+import { FaceError, ModelError, PackError } from "./errors.js";
 import { resizeArea, resizeLinear, type RgbImage } from "./image.js";
 import {
   check,
@@ -39,6 +39,19 @@ export interface PackGraphs {
   readonly embedder: Uint8Array;
   /** Absent where the contract names none: photos are then aligned crops. */
   readonly detector?: Uint8Array;
+}
+
+/** Whether a photo would do: what `POST /v1/photos/check` answers of one. */
+export interface PhotoCheck {
+  readonly usable: boolean;
+  /** Why not, as in the REST contract; null if it is usable. */
+  readonly code: FaceError["code"] | null;
+  readonly message: string;
+  readonly details: Readonly<Record<string, unknown>>;
+  /** Of the face, in pixels of the upright photo; null if it is not usable, or came aligned. */
+  readonly box: Box | null;
+  /** What was measured; null if it is not usable. */
+  readonly quality: Quality | null;
 }
 
 /** One face of a photo, before it is embedded. Printing it shows no pixel. */
@@ -150,6 +163,22 @@ export class ModelPack {
     const quality = measure(crop, face);
     check(quality, limits, this.detector?.recommendedScore ?? 0);
     return new FaceCrop(crop, quality, face);
+  }
+
+  /** Whether a photo would do, and where its face is: {@link cropPhoto} without its refusals. */
+  async checkPhoto(image: RgbImage, options: CropOptions = {}): Promise<PhotoCheck> {
+    try {
+      const { face, quality } = await this.cropPhoto(image, options);
+      const message =
+        face === undefined
+          ? "an aligned crop of a face, clear enough"
+          : "one face, large and clear enough";
+      return { usable: true, code: null, message, details: {}, box: face?.box ?? null, quality };
+    } catch (error) {
+      if (!(error instanceof FaceError)) throw error;
+      const { code, message, details } = error;
+      return { usable: false, code, message, details, box: null, quality: null };
+    }
   }
 
   /**

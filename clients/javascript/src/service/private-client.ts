@@ -1,8 +1,9 @@
 /** The client that never sends a face: it embeds and lifts here, and sends private templates. */
 
 import { VeilfaceError } from "../errors.js";
+import { ModelError } from "../models/errors.js";
 import { decodeImage, type RgbImage } from "../models/image.js";
-import { ModelPack, type FacePolicy, type PackGraphs } from "../models/pack.js";
+import { ModelPack, type FacePolicy, type PackGraphs, type PhotoCheck } from "../models/pack.js";
 import type { Runtime } from "../models/runtime.js";
 import { liftTemplate, requireContract, type PublicContract } from "../templates/contract.js";
 import { DecoyGenerator } from "../templates/generator.js";
@@ -76,6 +77,11 @@ export class PrivateClient extends Session {
   /** Fetch contract, generator and graphs now, so that the first lift need not wait for them. */
   async prepare(): Promise<void> {
     await this.#with(async () => undefined);
+  }
+
+  /** Whether a photo would do, for guidance before a camera; nothing is embedded or sent of it. */
+  async check(photo: Photo, { face }: { face?: FacePolicy } = {}): Promise<PhotoCheck> {
+    return this.#with(async ({ pack }) => pack.checkPhoto(await imageOf(photo), { policy: face }));
   }
 
   /** Lift a probe; nothing is sent of it. */
@@ -178,10 +184,15 @@ export class PrivateClient extends Session {
     probe: boolean,
   ): Promise<Uint8Array> {
     const embeddings: Float32Array[] = [];
-    for (const photo of photos) {
+    for (const [index, photo] of photos.entries()) {
       this.#options.signal?.throwIfAborted();
-      const image = photo instanceof Blob ? await decodeImage(photo) : photo;
-      embeddings.push((await pack.embedPhoto(image, { policy: face })).embedding);
+      try {
+        const image = await imageOf(photo);
+        embeddings.push((await pack.embedPhoto(image, { policy: face })).embedding);
+      } catch (error) {
+        if (error instanceof ModelError) error.image = index;
+        throw error;
+      }
     }
     return liftTemplate(contract, generator, embeddings, { probe, dim: this.#options.dim });
   }
@@ -247,3 +258,6 @@ export class PrivateClient extends Session {
     }
   }
 }
+
+const imageOf = async (photo: Photo): Promise<RgbImage> =>
+  photo instanceof Blob ? decodeImage(photo) : photo;

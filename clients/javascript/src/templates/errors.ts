@@ -47,11 +47,22 @@ export class InconsistentImages extends TemplateError {
     readonly apart: readonly number[],
     readonly others: readonly number[],
   ) {
-    const numbers = (positions: readonly number[]): string =>
-      `photo${positions.length > 1 ? "s" : ""} ${positions.map((at) => at + 1).join(", ")}`;
-    super(
-      `${numbers(apart)} and ${numbers(others)} do not look like the same person; ` +
-        "send photos of one person only, or clearer ones",
-    );
+    const differing =
+      apart.length === 1 && others.length === 1
+        ? `${listed([0, 1])} do not look like the same person`
+        : `${listed(apart)} ${apart.length === 1 ? "does" : "do"} not look like the person on ${listed(others)}`;
+    super(`${differing}; send photos of one person only, or clearer ones`);
   }
+
+  /** The photos that differ, ascending: all of them where either half may. */
+  get photos(): readonly number[] {
+    if (this.apart.length < this.others.length) return this.apart;
+    return [...this.apart, ...this.others].sort((a, b) => a - b);
+  }
+}
+
+function listed(positions: readonly number[]): string {
+  const numbers = positions.map((at) => String(at + 1));
+  const last = numbers.pop();
+  return numbers.length > 0 ? `photos ${numbers.join(", ")} and ${last}` : `photo ${last}`;
 }

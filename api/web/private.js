@@ -1,0 +1,262 @@
+// Private mode: this page finds, aligns and embeds the face, and sends a lifted template alone. It is
+// fetched only where the service serves its pack.
+
+import { bytes, h, newId, table } from "./dom.js";
+import { Problem, call, may, session, untilSignedOut } from "./service.js";
+import { lacking } from "./words.js";
+
+const CLIENT = "/assets/client/client.js";
+const RUNTIME = "/assets/client/ort.wasm.min.mjs";
+const BUILT = document.documentElement.dataset.private === "yes";
+// The graphs are fetched before anybody is named: their token is of a subject that nobody is.
+const NOBODY = "private-mode";
+const TRIES = 3;
+
+const ON = "This browser finds the face, embeds and lifts it. It sends only the private template: no photo, no embedding.";
+const OFF = "Photos are sent to the service, which keeps none.";
+const LOADING = "Loading the model into this browser, which keeps it for the next visit…";
+// Of an enrollment.
+export const STEPS = [
+  "This browser finds the face in each photo and says at once whether the photo will do.",
+  "The model runs here: the faces become one embedding, which is hidden in a set that holds decoys as well.",
+  "Only that set is sent, and stored, encrypted. Photos and embedding never leave this browser.",
+];
+
+// One state for the tab.
+let on = true;
+// The switch of the view that is open.
+let current = null;
+let prepared = null;
+// What the photos on the page were lifted to: two lifts of the same photos would give their embedding away.
+let kept = null;
+let left = [];
+
+// Why private mode cannot serve this, or null.
+function whyNot(action, level) {
+  const { contract, own } = session;
+  if (!BUILT) {
+    return "Private mode is not offered: this service was installed without the client that it needs (make javascript).";
+  }
+  if (!isSecureContext) return "Private mode needs HTTPS or localhost.";
+  if (!may("embeddings")) return lacking("embeddings");
+  if (!contract.generator) return "Private mode is not possible here: the decoys are faces that stay secret.";
+  if (action === "enroll") {
+    return contract.template_enrollment ? null : "Private mode is off: this tenant may not enroll lifted templates.";
+  }
+  if ((own.liveness[level] ?? "off") !== "off") {
+    return "Private mode cannot serve this level, which checks liveness: that takes photos.";
+  }
+  const lifted = contract.calibrations.some(
+    (each) => each.mode === "s2s" && each.levels.some(({ name }) => name === level),
+  );
+  return lifted ? null : "Private mode cannot serve this level: it is not calibrated for lifted probes.";
+}
+
+// The switch for a view. `at(level)` says what the visitor is about to do; `onchange` that it is switched.
+export function offer(action, onchange) {
+  const told = h("p", { class: "hint", id: newId("private-hint"), role: "status" });
+  const box = h("input", {
+    type: "checkbox",
+    role: "switch",
+    id: newId("private"),
+    "aria-describedby": told.id,
+    onchange: () => {
+      on = box.checked;
+      onchange();
+    },
+  });
+  const offered = { action, why: null, root: null, at, say };
+
+  function at(level) {
+    offered.why = whyNot(action, level);
+    box.checked = active();
+    box.disabled = offered.why !== null;
+    told.className = offered.why ? "off" : "hint";
+    say();
+  }
+
+  function say(text = null) {
+    const words = text ?? (offered.why ? `${offered.why} ${OFF}` : on ? ON : OFF);
+    if (told.textContent !== words) told.textContent = words;
+  }
+
+  const check = h("p", { class: "check", hidden: !BUILT }, box, h("label", { for: box.id }, "Private mode"));
+  offered.root = h("div", { class: "private" }, check, told);
+  current = offered;
+  return offered;
+}
+
+export const active = () => on && current?.why === null;
+
+function note(method, path, body) {
+  // What is no JSON object is not sent: it could not be shown.
+  const fields = body === undefined ? [] : Object.entries(JSON.parse(body));
+  left.push([`${method} ${path.replace(/([0-9a-f]{8})[0-9a-f]{56}/, "$1…")}`, fields]);
+}
+
+async function noted(url, options) {
+  note(options.method, new URL(url).pathname, options.body);
+  return fetch(url, options);
+}
+
+async function token(asked) {
+  const body = JSON.stringify(asked);
+  note("POST", "/v1/tokens", body);
+  return (await call("POST", "/v1/tokens", { body, headers: { "Content-Type": "application/json" } })).token;
+}
+
+// The client whose graphs are loaded; a client that fails is made anew the next time.
+function ready() {
+  const until = untilSignedOut();
+  if (prepared?.until === until) return prepared.client;
+  const offered = current;
+  offered.say(LOADING);
+  const loading = { until, client: load(until, offered.action) };
+  prepared = loading;
+  loading.client.then(
+    () => offered.say(),
+    () => {
+      offered.say();
+      if (prepared === loading) prepared = null;
+    },
+  );
+  return loading.client;
+}
+
+async function load(signal, action) {
+  const [{ PrivateClient }, runtime] = await Promise.all([import(CLIENT), import(RUNTIME)]).catch(() => {
+    throw new Problem({ code: "unreachable", message: "the service does not respond" });
+  });
+  // More need a page that is isolated.
+  runtime.env.wasm.numThreads = 1;
+  for (let tries = 1; ; tries++) {
+    const bearer = await token({ subject_id: NOBODY, action });
+    const client = new PrivateClient(location.origin, bearer, { runtime, fetch: noted, signal });
+    try {
+      await client.prepare();
+      signal.addEventListener("abort", () => void client.close());
+      return client;
+    } catch (error) {
+      await client.close();
+      // A slow download outlives its token; what has come is in the browser's cache.
+      if (error.code !== "replayed" || tries === TRIES) throw error;
+    }
+  }
+}
+
+// The errors of the client, as those of a call.
+function problemOf(error, photos = 1) {
+  const { name, code, status, details = {}, image, requestId = null, retryAfter = null } = error;
+  if (error instanceof Problem || name === "AbortError") return error;
+  const message = error.message.charAt(0).toLowerCase() + error.message.slice(1);
+  if (name === "ConnectionFailed") return new Problem({ code: "unreachable", message: "the service does not respond" });
+  if (status) {
+    const foreign = code.startsWith("http_");
+    return new Problem({
+      status,
+      code: foreign ? "unreachable" : code,
+      message: foreign ? `status ${status}, and not from this service` : message,
+      details,
+      requestId,
+      wait: retryAfter,
+    });
+  }
+  // What the page finds out by itself has the status that the service would have given it.
+  if (code === "inconsistent_images") {
+    return new Problem({ status: 422, code, message, details: { photos: error.photos } });
+  }
+  if (code) {
+    const which = image !== undefined && photos > 1 ? `photo ${image + 1} of ${photos}: ` : "";
+    return new Problem({ status: 422, code, message: which + message, details: { ...details, image } });
+  }
+  return new Problem({ code: "private_mode", message: `private mode does not work here: ${message}` });
+}
+
+// What the service's check would answer; nothing is sent of the photo.
+export async function check(photo, face, signal) {
+  try {
+    const client = await ready();
+    signal?.throwIfAborted();
+    return await client.check(photo, { face: face || "single" });
+  } catch (error) {
+    throw problemOf(error);
+  }
+}
+
+async function lifted(client, action, photos, face) {
+  const same =
+    kept?.action === action &&
+    kept.face === face &&
+    kept.photos.length === photos.length &&
+    kept.photos.every((each, index) => each === photos[index]);
+  if (!same) {
+    const given = { face: face || "single" };
+    const lift = await (action === "enroll" ? client.liftEnrollment(photos, given) : client.lift(photos, given));
+    kept = { action, photos, face, lift };
+  }
+  return kept.lift;
+}
+
+async function attempt({ photos, face, ...asked }, send) {
+  try {
+    for (let first = true; ; first = false) {
+      const client = await ready();
+      const lift = await lifted(client, asked.action, photos, face);
+      const one = client.as(await token(asked));
+      try {
+        return await send(one, lift);
+      } catch (error) {
+        if (error.code !== "contract_mismatch" || !first || !(await contractChanged(client, lift))) throw error;
+      } finally {
+        await one.close();
+      }
+    }
+  } catch (error) {
+    throw problemOf(error, photos.length);
+  }
+}
+
+// Else it is the person's template that is of another contract.
+async function contractChanged(client, lift) {
+  session.contract = await call("GET", "/v1/contract");
+  if (session.contract.contract_id === lift.contractId) return false;
+  kept = prepared = null;
+  await client.close();
+  return true;
+}
+
+const holder = (key) =>
+  key && { holderKey: Uint8Array.from(atob(key.replaceAll("-", "+").replaceAll("_", "/")), (each) => each.charCodeAt(0)) };
+
+export const verify = (name, { photos, face, level, holder_key }) =>
+  attempt({ subject_id: name, action: "verify", level, photos, face }, (client, lift) =>
+    client.verify(name, lift, { ...holder(holder_key) }),
+  );
+
+// `replaces` is the template that may be replaced, or null.
+export const enroll = (name, { photos, face, holder_key }, replaces) =>
+  attempt({ subject_id: name, action: "enroll", photos, face }, async (client, lift) => {
+    const answer = await client.enroll(name, lift, { replace: replaces ?? false, ...holder(holder_key) });
+    return { ...answer, images: photos.map(() => ({ status: "lifted in this browser" })) };
+  });
+
+const size = (value) => new TextEncoder().encode(typeof value === "string" ? value : JSON.stringify(value)).length;
+
+// Every field of every request since this was last told.
+export function whatLeft() {
+  const rows = left.flatMap(([request, fields]) =>
+    (fields.length ? fields : [["no body", ""]]).map(([field, value]) => [
+      h("code", {}, request),
+      field,
+      bytes(size(value)),
+    ]),
+  );
+  left = [];
+  return h(
+    "section",
+    { class: "card", "data-left": "" },
+    h("h2", {}, "What left this browser"),
+    h("p", {}, "No photo and no embedding was sent. ", "Beside these fields, requests had their headers, with the API key or a token."),
+    table("Fields that were sent", ["Request", "Field", "Size"], rows),
+  );
+}

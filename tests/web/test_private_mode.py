@@ -1,0 +1,314 @@
+"""Private mode of the page: no face leaves the browser, and where one must, that is said."""
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Page, Route, expect
+
+from benchmarks.browser_client import faces_of, requests_in
+from benchmarks.end_to_end import Person
+from models.pack import ModelPack
+from tests.clients.conftest import Running
+from tests.clients.javascript.conftest import require_client
+from tests.clients.proxy import Proxy
+from tests.leaks import as_bytes
+from tests.web.access import assert_accessible
+from tests.web.camera import FakeCamera
+from tests.web.conftest import OpenTab
+from tests.web.deployments import OTHER, WHO
+from tests.web.passkeys import Authenticator
+from tests.web.served import Served
+from tests.web.walk_obstacles import TO_PASSKEY
+
+pytestmark = pytest.mark.long
+
+
+@pytest.fixture
+def recording(running: Running) -> Iterator[Proxy]:
+    require_client()
+    with Proxy(running.port) as proxy:
+        yield proxy
+
+
+@pytest.fixture
+def served(running: Running, recording: Proxy) -> Iterator[Served]:
+    """The service behind the recording proxy, under a name, as passkeys need one."""
+    settings = running.deployment.settings
+    there = Served(
+        recording.url.replace("127.0.0.1", "localhost"),
+        running.deployment.token,
+        settings,
+        settings.data_dir / "absent.log",
+    )
+    yield there
+    with there.client() as client:
+        client.delete("/v1/subjects/anna")
+
+
+def choose(page: Page, *photos: Path) -> None:
+    page.get_by_label("Files", exact=True).check()
+    page.get_by_label("Photos: JPEG").set_input_files(photos)
+    expect(page.locator(".tray .seen[data-state=good]")).to_have_count(len(photos))
+
+
+def press(page: Page, name: str) -> None:
+    page.get_by_role("button", name=name, exact=True).click()
+
+
+def told_of(page: Page) -> list[list[str]]:
+    """What the page says that left it: request, field, size."""
+    rows = page.locator("[data-left] tbody tr")
+    expect(rows.first).to_be_visible()
+    return [row.locator("th, td").all_inner_texts() for row in rows.all()]
+
+
+def test_a_face_never_leaves_the_browser(
+    recording: Proxy,
+    served: Served,
+    open_tab: OpenTab,
+    camera: FakeCamera,
+    pack: ModelPack,
+    people: dict[str, list[Path]],
+) -> None:
+    own, other = people[WHO], people[OTHER]
+    camera.shows(own[0])
+    tab = open_tab(served)
+    page = tab.page
+    Authenticator.of(page)
+    tab.open("Enroll")
+    expect(page.get_by_role("switch", name="Private mode")).to_be_checked()
+    page.get_by_label("Person's id").fill("anna")
+    tab.take_photos()
+    tab.guided("Good: one face")
+    expect(page.locator(".tray .found:not([hidden])")).to_have_count(3)
+    page.get_by_label("Files", exact=True).check()
+    page.get_by_label("Photos: JPEG").set_input_files(own[1])
+    expect(page.locator(".tray .seen[data-state=good]")).to_have_count(4)
+    page.get_by_label(TO_PASSKEY).check()
+    press(page, "Enroll")
+    expect(page.locator(".verdict")).to_contain_text("Enrolled")
+    expect(page.locator(".verdict")).to_contain_text("Holder keyneeded at every verification")
+    enrolled = told_of(page)
+    assert_accessible(tab, "enrolled-privately")
+
+    page.get_by_role("link", name="Verify this person").click()
+    choose(page, own[2])
+    expect(page.get_by_label("Passkey", exact=True)).to_be_checked()
+    press(page, "Verify")
+    expect(page.locator(".verdict.accept")).to_contain_text("Accepted")
+    told_of(page)
+    choose(page, other[0])
+    press(page, "Verify")
+    expect(page.locator(".verdict.reject")).to_contain_text("Rejected")
+    verified = told_of(page)
+
+    sent = recording.sent
+    calls, rest = requests_in(sent)
+    assert rest == 0
+    assert {call for call in calls if not call.startswith("GET ")} == {
+        "POST /v1/tokens",
+        "PUT /v1/subjects/*/enrollment",
+        "POST /v1/subjects/*/verify",
+    }
+    probe = calls["POST /v1/subjects/*/verify"]
+    assert probe["members"] == ["hmac", "holder_key", "nonce", "template", "timestamp"]
+    assert calls["PUT /v1/subjects/*/enrollment"]["members"] == ["holder_key", "template"]
+    # The page told the same, field by field.
+    assert fields(enrolled, "PUT /v1/subjects/anna/enrollment") == ["holder_key", "template"]
+    assert fields(verified, "POST /v1/subjects/anna/verify") == probe["members"]
+    (body,) = bodies_of(sent, "PUT /v1/subjects/anna/enrollment")
+    template = body["template"]
+    (size,) = (each[2] for each in enrolled if each[1] == "template")
+    assert size == f"{len(template):,} bytes"
+
+    persons = [Person(WHO, own[:3], []), Person(OTHER, other[:1], [])]
+    search = faces_of(pack, persons)
+    assert search.find(sent) == []
+    embedding = pack.embed_photo(own[1].read_bytes()).embedding
+    for planted in (as_bytes(embedding, "float32", little=True), own[1].read_bytes()):
+        assert search.find(sent + planted), "it would have been found"
+
+
+def fields(told: list[list[str]], request: str) -> list[str]:
+    return sorted(field for each, field, _ in told if each == request)
+
+
+def bodies_of(sent: bytes, request: str) -> list[dict[str, str]]:
+    """The JSON bodies of a request, each time that it was sent."""
+    bodies = []
+    for head in re.finditer(rb"%s HTTP/1\.1\r\n(.*?)\r\n\r\n" % request.encode(), sent, re.DOTALL):
+        (length,) = re.findall(rb"(?i)content-length: (\d+)", head[1])
+        bodies.append(json.loads(sent[head.end() : head.end() + int(length)]))
+    return bodies
+
+
+def test_the_same_photos_are_lifted_once(
+    recording: Proxy, served: Served, open_tab: OpenTab, people: dict[str, list[Path]]
+) -> None:
+    """Two lifts of them would give the embedding away: to replace, and to ask again."""
+    own = people[WHO]
+    tab = open_tab(served)
+    page = tab.page
+    tab.open("Enroll")
+    page.get_by_label("Person's id").fill("anna")
+    for photos in (own[:1], own[1:3]):
+        choose(page, *photos)
+        press(page, "Enroll")
+        if photos == own[:1]:
+            expect(page.locator(".verdict")).to_contain_text("Earlier enrollmentnone")
+    dialog = page.get_by_role("dialog", name="Replace anna’s enrollment?")
+    dialog.get_by_role("button", name="Keep").click()
+    press(page, "Enroll")
+    dialog.get_by_role("button", name="Replace").click()
+    expect(page.locator(".verdict")).to_contain_text("Earlier enrollmentreplaced")
+    first, *again = [
+        each["template"] for each in bodies_of(recording.sent, "PUT /v1/subjects/anna/enrollment")
+    ]
+    assert len(again) == 3
+    assert len(set(again)) == 1
+    assert first not in again
+
+    page.get_by_role("link", name="Verify this person").click()
+    choose(page, own[3])
+    press(page, "Verify")
+    told_of(page)
+    press(page, "Verify")
+    told_of(page)
+    choose(page, own[4])
+    press(page, "Verify")
+    told_of(page)
+    probes = [
+        each["template"] for each in bodies_of(recording.sent, "POST /v1/subjects/anna/verify")
+    ]
+    assert probes[0] == probes[1] != probes[2]
+
+
+def test_refusals_have_the_words_of_the_service(
+    served: Served, open_tab: OpenTab, people: dict[str, list[Path]], tmp_path: Path
+) -> None:
+    text = tmp_path / "text.png"
+    text.write_text("no picture")
+    tab = open_tab(served)
+    page = tab.page
+    alert = page.get_by_role("alert")
+    bad = page.locator(".tray .seen[data-state=bad]")
+    tab.open("Enroll")
+    page.get_by_label("Person's id").fill("anna")
+    choose(page, people[WHO][0], people[OTHER][0])
+    press(page, "Enroll")
+    expect(alert).to_contain_text("Photos 1 and 2 do not look like the same person")
+    expect(alert).to_contain_text("inconsistent_images")
+    expect(bad).to_have_count(2)
+    page.get_by_label("Photos: JPEG").set_input_files(text)
+    expect(bad.last).to_contain_text("not a picture")
+    press(page, "Enroll")
+    expect(alert).to_contain_text("Photo 3 of 3: the file is not a picture")
+    expect(alert).to_contain_text("unsupported_image")
+    expect(alert).to_contain_text("Send a JPEG, PNG or WebP photo.")
+    assert all("/enrollment" not in url for url in tab.requests)
+
+
+def test_what_private_mode_cannot_serve_goes_to_the_service_and_that_is_said(
+    recording: Proxy, served: Served, open_tab: OpenTab, people: dict[str, list[Path]]
+) -> None:
+    """A level that asks for liveness: switched off, with the reason; and on again at another."""
+    with served.client() as client:
+        photo = {"images": people[WHO][0].read_bytes()}
+        assert client.put("/v1/subjects/anna/enrollment", files=photo).is_success
+    tab = open_tab(served, sign_in=None)
+    page = tab.page
+
+    def passive(route: Route) -> None:
+        answer = route.fetch()
+        told = answer.json()
+        told["liveness"]["fmr-1e-3"] = "passive"
+        route.fulfill(response=answer, json=told)
+
+    page.route("**/v1/key", passive)
+    tab.sign_in(served.token)
+    switch = page.get_by_role("switch", name="Private mode")
+    page.get_by_label("Person's id").fill("anna")
+    level = page.get_by_label("Level")
+    level.select_option("fmr-1e-3")
+    expect(switch).to_be_disabled()
+    expect(switch).not_to_be_checked()
+    said = page.locator(".private [role=status]")
+    expect(said).to_contain_text("cannot serve this level, which checks liveness")
+    expect(said).to_contain_text("Photos are sent to the service")
+    assert_accessible(tab, "private-mode-with-liveness")
+    choose(page, people[WHO][1])
+    recording.forget()
+    press(page, "Verify")
+    expect(page.locator(".verdict.accept")).to_be_visible()
+    expect(page.locator("[data-left]")).to_have_count(0)
+    assert people[WHO][1].read_bytes() in recording.sent
+
+    level.select_option("fmr-1e-2")
+    expect(switch).to_be_checked()
+    recording.forget()
+    press(page, "Verify")
+    told_of(page)
+    assert people[WHO][1].read_bytes() not in recording.sent
+    # One state for the tab: what is switched off here is off in the other view.
+    switch.uncheck()
+    expect(said).to_contain_text("Photos are sent to the service")
+    tab.open("Enroll")
+    expect(switch).not_to_be_checked()
+    expect(switch).to_be_enabled()
+
+
+def test_a_key_without_embeddings_is_told_why(
+    running: Running, served: Served, open_tab: OpenTab
+) -> None:
+    tab = open_tab(served, sign_in=running.deployment.key("verify", "enroll"))
+    switch = tab.page.get_by_role("switch", name="Private mode")
+    for view in ("Verify", "Enroll"):
+        tab.page.get_by_role("link", name=view).first.click()
+        expect(switch).to_be_disabled()
+        expect(tab.page.locator(".private")).to_contain_text("“embeddings”")
+    assert all("/assets/client/" not in url for url in tab.requests)
+
+
+def test_a_page_without_the_built_client_says_so(served: Served, open_tab: OpenTab) -> None:
+    tab = open_tab(served, sign_in=None)
+    page = tab.page
+
+    def not_built(route: Route) -> None:
+        answer = route.fetch()
+        route.fulfill(
+            response=answer,
+            body=answer.text().replace('data-private="yes"', 'data-private="not-built"'),
+        )
+
+    page.route(tab.url, not_built)
+    tab.sign_in(served.token)
+    expect(page.locator(".private")).to_contain_text("installed without the client that it needs")
+    expect(page.get_by_role("switch", name="Private mode")).to_be_hidden()
+
+
+def test_what_keeps_private_mode_from_working_is_said_and_nothing_else_is_sent(
+    recording: Proxy, served: Served, open_tab: OpenTab, people: dict[str, list[Path]]
+) -> None:
+    """A graph that is not the contract's: no photo goes to the service in its place."""
+    tab = open_tab(served)
+    page = tab.page
+
+    def altered(route: Route) -> None:
+        answer = route.fetch()
+        route.fulfill(response=answer, body=answer.body()[:-1] + b"?")
+
+    page.route(re.compile(r"/v1/pack/[0-9a-f]{64}$"), altered)
+    page.get_by_label("Person's id").fill("anna")
+    page.get_by_label("Files", exact=True).check()
+    page.get_by_label("Photos: JPEG").set_input_files(people[WHO][0])
+    press(page, "Verify")
+    alert = page.get_by_role("alert")
+    expect(alert).to_contain_text("is not the one that was asked for")
+    expect(alert).to_contain_text("private_mode")
+    calls, rest = requests_in(recording.sent)
+    assert rest == 0
+    assert {call for call in calls if not call.startswith("GET ")} == {"POST /v1/tokens"}
+    page.unroute(re.compile(r"/v1/pack/[0-9a-f]{64}$"))
