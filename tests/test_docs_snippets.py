@@ -161,7 +161,7 @@ PARSED = {
      "--out pool.veil"): OWN_DATA,
     ("docs/operations.md", "veilface serve --host 0.0.0.0 --tls-certificate chain.pem "
      "--tls-key key.pem"): "tests/api/process/test_operations.py starts a service with TLS",
-    ("docs/privacy.md", "veilface audit fairface fairface --pack $PACK --lifting 1500 "
+    ("docs/privacy-measurement.md", "veilface audit fairface fairface --pack $PACK --lifting 1500 "
      "--attack 3500 --attacked 1500"): OWN_DATA,
 }  # fmt: skip
 # Blocks that nothing executes, and why. docs/README.md names these pages.
