@@ -2,7 +2,8 @@
 
 People of LFW are enrolled, half of them calibrate. Decoys come from a generator fitted to FairFace
 (another kind of photos), from one fitted to other people of LFW, or from a pool of other people of
-LFW that stays secret. The rows of docs/privacy.md "The operating point" are what this prints.
+LFW that stays secret. The rows of docs/privacy-templates.md "The operating point" are what this
+prints.
 
 Example
 -------

@@ -1,8 +1,8 @@
 """What attackers with 1,000, 5,000, all and unlimited faces get from one stolen template.
 
 People of LFW are enrolled on up to three photos; decoys are fitted to other people of LFW, or to
-FairFace; every other photo of LFW is the attacker's. The rows of docs/privacy.md "The strongest
-attacker" are what this prints. With ``--like`` decoys are fitted to FairFace, UTKFace and
+FairFace; every other photo of LFW is the attacker's. The rows of docs/privacy-templates.md "The
+strongest attacker" are what this prints. With ``--like`` decoys are fitted to FairFace, UTKFace and
 All-Age-Faces, adapted to so many photos of further people of LFW, and have noise, as ``veilface
 decoys build --like`` makes them.
 

@@ -1,7 +1,7 @@
 """What a thief with and without the holders' keys gets from one template, and from several.
 
 People, decoys and the attacker's faces are those of ``benchmarks.asked_and_linked``. The tables of
-docs/privacy.md "What leaked" are what this prints.
+docs/privacy-leaks.md "What leaked" are what this prints.
 
 Example
 -------

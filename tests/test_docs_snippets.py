@@ -49,6 +49,7 @@ WHOLE_PAGES = {
     ("docs/client.md", "python"): "tests/clients/test_docs.py",
     ("docs/private-client.md", "sh"): "tests/clients/test_docs.py",
     ("docs/private-client.md", "python"): "tests/clients/test_docs.py",
+    ("docs/login.md", "js"): "tests/examples/test_login.py",
     ("docs/javascript.md", "js"): "tests/clients/javascript/test_docs.py",
     ("docs/backups.md", "sh"): "tests/test_backup.py",
     ("docs/webhooks.md", "python"): "tests/api/process/test_webhooks.py",
@@ -59,6 +60,9 @@ ELSEWHERE = {
     ("README.md", "make demo"): "tests/test_readme.py",
     ("README.md", "PACK=~/.insightface/models/buffalo_l"): "tests/test_readme.py",
     ("README.md", ". .venv/bin/activate"): "tests/test_readme.py",
+    ("README.md", 'curl -X DELETE $URL/anna -H "Authorization: Bearer $KEY" -o receipt.json'): (
+        "tests/test_readme.py"
+    ),
     (
         "README.md",
         "export VEILFACE_URL=http://127.0.0.1:8421 "
@@ -157,7 +161,7 @@ PARSED = {
      "--out pool.veil"): OWN_DATA,
     ("docs/operations.md", "veilface serve --host 0.0.0.0 --tls-certificate chain.pem "
      "--tls-key key.pem"): "tests/api/process/test_operations.py starts a service with TLS",
-    ("docs/privacy.md", "veilface audit fairface fairface --pack $PACK --lifting 1500 "
+    ("docs/privacy-measurement.md", "veilface audit fairface fairface --pack $PACK --lifting 1500 "
      "--attack 3500 --attacked 1500"): OWN_DATA,
 }  # fmt: skip
 # Blocks that nothing executes, and why. docs/README.md names these pages.

@@ -115,7 +115,8 @@ def test_the_real_path_from_weights_to_a_receipt(
     )
     try:
         wait_until_ready(server)
-        script = BLOCKS[2].replace("curl ", "curl --silent --show-error --fail-with-body ")
+        calls = BLOCKS[2] + BLOCKS[4]
+        script = calls.replace("curl ", "curl --silent --show-error --fail-with-body ")
         assert not shutil.which("veilface", path=new_shell["PATH"])
         answers = shell(script, folder, new_shell)
     finally:

@@ -38,8 +38,8 @@ PEOPLE, WOLVES, BETWEEN = 900, 500, 300
 TESTED = 4
 """One probe in so many is not fitted, but tells how good the fit is."""
 MOST_OFF = 0.1
-"""Largest root mean square error of the mean, in deviations, for people; twice that for wolves. On
-faces it is 0.02 (docs/thresholds.md)."""
+"""Largest root mean square error of the mean, in deviations, for people; twice that for wolves.
+docs/decision.md §1 has what it is on faces."""
 MOST_SPREAD = 0.4
 """Largest root mean square relative error of the spread."""
 AXES = 64

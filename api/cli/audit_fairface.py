@@ -150,7 +150,7 @@ def fairface(
 
     Writes report.json, report.md, figures, the paper's among them, and report.html, which has all
     to read in one file, to --out. Exit status 1: the strongest attacker exceeds the limit.
-    docs/privacy.md explains every figure.
+    docs/privacy-templates.md explains every figure.
 
     Example: `veilface audit fairface fairface --pack buffalo_l --out audit`
     """

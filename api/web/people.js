@@ -1,4 +1,4 @@
-import { download, facts, field, h, openDialog, when } from "./dom.js";
+import { command, download, facts, field, h, openDialog, when } from "./dom.js";
 import { call, may, subjectPath } from "./service.js";
 import { about, enroller, offNote, people } from "./subject.js";
 import { lacking, problemBox } from "./words.js";
@@ -212,7 +212,7 @@ function receipt(id, answer) {
       "p",
       { class: "fine" },
       "Check it with ",
-      h("code", {}, "veilface keys verify-receipt receipt.json --public-key contract.json"),
+      command("veilface keys verify-receipt receipt.json --public-key contract.json"),
       "; download the contract under Service.",
     ),
   );

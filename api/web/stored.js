@@ -1,4 +1,4 @@
-import { bytes, facts, h, percent, table, when } from "./dom.js";
+import { bytes, command, facts, h, percent, table, when } from "./dom.js";
 import { picture } from "./picture.js";
 import { call, may, session, subjectPath } from "./service.js";
 import { enroller, offNote, subjectField } from "./subject.js";
@@ -123,7 +123,7 @@ function audited(told) {
           : "So it is not known how much a stolen and decrypted template gives away here. ",
         "An operator can measure it:",
       ),
-      h("p", {}, h("code", {}, told.command)),
+      h("p", {}, command(told.command)),
       h("p", { class: "fine" }, "and name the report.json in the setting audit_report_file."),
     );
   }

@@ -1,7 +1,7 @@
 // The field for a person's id. People are searched by how their ids begin, and picked from a list, with
 // a key that may list them; with any other, and where the search fails, the id is typed.
 
-import { field, h, newId, when } from "./dom.js";
+import { command, field, h, newId, when } from "./dom.js";
 import { call, may, session } from "./service.js";
 import { lacking } from "./words.js";
 
@@ -36,7 +36,11 @@ export function whyOff(right) {
 export const enroller = (id) =>
   h("p", {}, h("a", { class: "button", href: `#/enroll/${encodeURIComponent(id)}` }, `Enroll ${id}`));
 
-export const offNote = (why) => (why ? h("p", { class: "off", role: "note" }, why) : null);
+export function offNote(why) {
+  if (!why) return null;
+  const [said, typed] = why.split(/(?=veilface )/);
+  return h("p", { class: "off", role: "note" }, said, typed ? command(typed) : null);
+}
 
 export function subjectField(id = "", listed = "Type how it begins, or pick from the list.") {
   const searches = may("enroll");

@@ -88,7 +88,8 @@ def lift_stream(
 
     Only a template that its holder's key turns is told apart by tenant and subject: nobody sees two
     of those meet without the keys, and one set would show by the length of its foot point, which
-    no rotation hides, that two enrollments are of the same photos (docs/privacy.md "What leaked").
+    no rotation hides, that two enrollments are of the same photos (docs/privacy-leaks.md "What
+    leaked").
 
     Parameters
     ----------

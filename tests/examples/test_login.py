@@ -87,6 +87,32 @@ def test_the_readme_logs_in_by_the_example(service: Service, tmp_path: Path) -> 
     assert "\nSet-Cookie: session=" in done.stdout
 
 
+def test_the_page_enrolls_whom_the_readme_logs_in(service: Service, tmp_path: Path) -> None:
+    text = (EXAMPLES.parent / "docs" / "login.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"^```js\n(.*?)^```", text, flags=re.M | re.S)
+    (tmp_path / "enroll.mjs").write_text(block, encoding="utf-8")
+    for number in range(3):
+        (tmp_path / f"anna{number + 1}.jpg").write_bytes(service.photo(1, number))
+    env = clean_environment(VEILFACE_URL=service.url, VEILFACE_API_KEY=service.token)
+    with Client(service.url, service.token) as client:
+        told = [
+            subprocess.run(
+                [node(), "enroll.mjs"],
+                cwd=tmp_path,
+                env=env,
+                capture_output=True,
+                text=True,
+                timeout=PATIENCE_S,
+                check=True,
+            ).stdout
+            for _ in range(2)
+        ]
+        assert client.verify("anna", service.photo(1, 4))
+        client.erase("anna")
+    assert told[0] == "201 enrolled\n"
+    assert told[1].startswith("409 ")
+
+
 def test_an_example_without_its_service_opens_nothing(tmp_path: Path) -> None:
     port, nobody = free_port(), free_port()
     env = clean_environment(
