@@ -60,7 +60,7 @@ def test_everything_that_the_page_names_is_served(client: Client) -> None:
         named = set(re.findall(r'(?:href|src)="(/[^"]*)"', answer.text) if path == "/" else ())
         named |= {f"/assets/{name}" for name in re.findall(r'from "\./([^"]+)"', answer.text)}
         waiting += sorted(named - seen)
-    assert seen == {"/"} | {
+    assert seen == {"/", "/docs"} | {
         f"/assets/{file.name}" for file in WEB.iterdir() if file.name != "index.html"
     }
 
