@@ -65,7 +65,7 @@ def test_everything_that_the_page_names_is_served(client: Client) -> None:
         imported = re.findall(r'(?:from |import\()"\./([^"]+)"', answer.text)
         named |= {f"/assets/{name}" for name in imported}
         waiting += sorted(named - seen)
-    assert seen == {"/"} | {
+    assert seen == {"/", "/docs"} | {
         f"/assets/{file.name}" for file in _files() if file.name != "index.html"
     }
 
