@@ -15,6 +15,7 @@ Example
 import argparse
 import json
 import time
+from collections.abc import Callable
 
 import numpy as np
 
@@ -27,7 +28,7 @@ from templates.keys.randomness import KEY_BYTES, Keystream
 from templates.keys.rotation import ROTATION_VERSION, HolderKey, TenantRotation
 from templates.space.embedding import normalised
 from templates.space.lifting import Strategy
-from templates.space.subspace import AffineSubspace, SubspaceBatch, Turn
+from templates.space.subspace import SubspaceBatch, Turn
 from verify import CalibrationOptions, Verifier, calibrate
 from verify.expectation import fit_expectation
 from verify.verifier import OpenedTemplate
@@ -38,21 +39,28 @@ BOTH, TENANT, NONE = "both rotations", "the tenant's", "no rotation"
 class TenantOnly(Verifier):
     """A verifier that derives and applies no holder's rotation."""
 
-    def _opened(self, stored: OpenedTemplate, _key: HolderKey | None) -> tuple[SubspaceBatch, Turn]:
+    def _opened(
+        self,
+        stored: OpenedTemplate,
+        _key: HolderKey | None,
+        *,
+        read: Callable[[bytes], wire.WireTemplate],
+    ) -> tuple[SubspaceBatch, Turn]:
         by_tenant = self._rotation.of(stored.template_id)
-        return SubspaceBatch.of([decoded(stored)]), by_tenant.turned
+        return SubspaceBatch.of([read(stored.wire).subspace]), by_tenant.turned
 
 
 class Unrotated(Verifier):
     """A verifier of templates that are in no rotation."""
 
-    def _opened(self, stored: OpenedTemplate, _key: HolderKey | None) -> tuple[SubspaceBatch, Turn]:
-        return SubspaceBatch.of([decoded(stored)]), lambda points: points
-
-
-def decoded(stored: OpenedTemplate) -> AffineSubspace:
-    """Decode a stored template."""
-    return wire.decode(stored.wire).subspace
+    def _opened(
+        self,
+        stored: OpenedTemplate,
+        _key: HolderKey | None,
+        *,
+        read: Callable[[bytes], wire.WireTemplate],
+    ) -> tuple[SubspaceBatch, Turn]:
+        return SubspaceBatch.of([read(stored.wire).subspace]), lambda points: points
 
 
 def main() -> None:

@@ -1,7 +1,7 @@
 """A probe against a stored template becomes a decision."""
 
 import secrets
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -219,7 +219,7 @@ class Verifier:
         calibration = self._contract.calibration("p2s", metric, probe_photos=photos, level=name)
         rule = _Rule(calibration, calibration.level(name))
         probe = unit_rows(embedding, n=self._contract.binding.n, most=1)
-        template, turn = self._opened(stored, holder_key)
+        template, turn = self._opened(stored, holder_key, read=wire.decode_as_stored)
         turned = turn(probe.astype(np.float64)).astype(np.float32)
         return self._decide(rule, probe, turned, template, stored, has_key=holder_key is not None)
 
@@ -255,7 +255,7 @@ class Verifier:
         rule = _Rule(calibration, calibration.level(level or self._contract.default_level))
         self._require_honest_foot(subspace, calibration)
         lifted = SubspaceBatch.of([subspace])
-        template, turn = self._opened(stored, holder_key)
+        template, turn = self._opened(stored, holder_key, read=wire.decode)
         turned = lifted.turned_by(turn)
         return self._decide(rule, lifted, turned, template, stored, has_key=holder_key is not None)
 
@@ -270,11 +270,15 @@ class Verifier:
             )
 
     def _opened(
-        self, stored: OpenedTemplate, holder_key: HolderKey | None
+        self,
+        stored: OpenedTemplate,
+        holder_key: HolderKey | None,
+        *,
+        read: Callable[[bytes], wire.WireTemplate],
     ) -> tuple[SubspaceBatch, Turn]:
         """Decode a template; returns it with what probes are turned by, a stand-in's too."""
         binding = self._contract.binding
-        received = wire.decode(stored.wire)
+        received = read(stored.wire)
         version = binding.require_contract(received.contract_id, what="the stored template")
         subspace = received.subspace
         if (subspace.n, subspace.m) != (binding.n, binding.m):

@@ -46,7 +46,7 @@ from api.http.routes.page import page_routes
 from api.http.routes.reference import reference_routes
 from api.limits.admission import Downloads, Gate
 from api.limits.rates import RateLimits
-from api.process.allocator import keep_few_arenas
+from api.process.allocator import give_back, keep_few_arenas
 from api.process.housekeeping import purge_regularly
 from api.process.logging import configure, log, uvicorn_log_config
 from api.process.metrics import count_lockout, join_shared_directory, set_build
@@ -206,11 +206,14 @@ async def _open(
             contract_id=runtime.contract.contract_id,
         )
     await anyio.to_thread.run_sync(runtime.note_calibrations)
-    # No request is answered before this is done, so none waits for the compiler.
-    await anyio.to_thread.run_sync(warm_up)
+    if runtime.contract.takes_lifted_probes:
+        # No request is answered before this is done, so none waits for the compiler. Points are
+        # compared without it, and it takes 130 MB.
+        await anyio.to_thread.run_sync(warm_up)
     # What was made so far stays: looking through it for garbage would stop requests for 0.1 s.
     gc.collect()
     gc.freeze()
+    give_back()
     running.callback(gc.unfreeze)
     tasks = await running.enter_async_context(anyio.create_task_group())
     running.callback(tasks.cancel_scope.cancel)

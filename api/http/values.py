@@ -98,7 +98,7 @@ def embedding_of(value: Any) -> NDArray[np.float64]:
     """
     if not isinstance(value, list) or not 0 < len(value) <= MAX_EMBEDDING:
         raise InvalidEmbedding(f"an embedding is a list of 1 to {MAX_EMBEDDING} numbers")
-    if not all(type(number) in (int, float) for number in value):
+    if not {*map(type, value)} <= {int, float}:
         raise InvalidEmbedding("an embedding holds something that is not a number")
     try:
         return np.array(value, dtype=np.float64)

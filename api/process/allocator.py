@@ -12,6 +12,13 @@ def keep_few_arenas(most: int) -> bool:
     glibc gives a new thread an arena of its own, up to eight for each processor. Threads of a
     server come and go, and what each has once used stays resident in its arena.
     """
-    if platform.libc_ver()[0] != "glibc":
-        return False
-    return bool(ctypes.CDLL(None).mallopt(_M_ARENA_MAX, max(2, most)))
+    return _is_glibc() and bool(ctypes.CDLL(None).mallopt(_M_ARENA_MAX, max(2, most)))
+
+
+def give_back() -> bool:
+    """Give free memory back to the system; return whether the C library could."""
+    return _is_glibc() and bool(ctypes.CDLL(None).malloc_trim(0))
+
+
+def _is_glibc() -> bool:
+    return platform.libc_ver()[0] == "glibc"

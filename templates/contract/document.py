@@ -174,6 +174,11 @@ class Contract:
         """SHA-256 over all that scores are computed from: the expectation and the strangers."""
         return hashlib.sha256(self.expectation.digest + self.nobody.digest).hexdigest()
 
+    @property
+    def takes_lifted_probes(self) -> bool:
+        """Whether it has a calibration for them."""
+        return any(entry.mode == "s2s" for entry in self.calibrations)
+
     @cached_property
     def cohort(self) -> SubspaceBatch:
         """Templates of nobody that lifted probes are normalised by; lifted at the first use."""

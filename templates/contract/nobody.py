@@ -183,7 +183,10 @@ class Nobody:
             far above the mean, by Chernoff's bound: P(z > a) < exp(2 (score − a)).
         """
         means, spreads = (part[rows, None] for part in self._statistics(expectation))
-        distances = pairwise_distances(self.people[rows], templates, metric=expectation.metric)
+        # A service scores one template at a time; in float64 it needs no compiled kernels for it.
+        dtype = np.float64 if len(templates) == 1 else np.float32
+        people = self.people[rows]
+        distances = pairwise_distances(people, templates, metric=expectation.metric, dtype=dtype)
         near = np.asarray(similarity(distances), dtype=np.float64)
         tilted = TILT * (near - means) / spreads
         largest = tilted.max(axis=0)
