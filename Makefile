@@ -11,7 +11,7 @@ PYTEST = OMP_NUM_THREADS=1 $(VENV)/pytest --numprocesses=$(WORKERS) --maxprocess
 # Bytecode is kept: without it, every process that a test starts compiles all that it imports.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo install extras docs test test-all lint types javascript javascript-package audit sbom wheels image release workflows lock clean
+.PHONY: demo install extras docs test test-all lint types javascript javascript-package audit sbom platforms wheels image release workflows lock clean
 
 demo: .venv/core
 	$(VENV)/veilface demo
@@ -68,6 +68,12 @@ sbom: | $(UV)
 	mkdir -p dist
 	$(UV) tool run --quiet --from cyclonedx-bom==7.5.0 cyclonedx-py requirements deploy/requirements.lock \
 		--output-reproducible --output-file dist/sbom.json
+
+# A wheel of every package that the image depends on, for both of its processors and each Python: nothing is compiled.
+platforms: | $(UV)
+	for python in 3.11 3.12 3.13 3.14; do for processor in x86_64 aarch64; do \
+		$(UV) pip compile --quiet --no-deps --only-binary :all: --python-version $$python \
+		--python-platform $$processor-unknown-linux-gnu deploy/requirements.lock >/dev/null || exit 1; done; done
 
 # The site of docs/, in dist/docs; a link that leads nowhere fails.
 docs: | $(UV)

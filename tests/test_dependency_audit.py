@@ -107,6 +107,8 @@ def test_ci_shows_a_skipped_audit_and_fails_on_a_vulnerability(
         ),
         "chromium": "exit 1",
         "systemd-analyze": "exit 1",
+        "unshare": 'test "$1" = --net',
+        "ip": "exit 1",
     }.items():
         (tools / name).write_text(f"#!/bin/sh\n{text}\n")
         (tools / name).chmod(0o755)

@@ -32,7 +32,8 @@ def upgrade(*, settings: Settings, as_json: AsJson = False) -> None:
     """Migrate the database to the schema of this version.
 
     `serve` does this when it starts; run it first if several machines start at once.
-    Safe to run again. Stop every process of an earlier version first, and make a backup.
+    Safe to run again. Make a backup, and stop every process of an earlier version first, unless
+    the new schema serves it (docs/deployment.md "An upgrade without a pause").
 
     A database from before rows were authenticated is authenticated once, as it is: look through
     `veilface keys list` first. API keys that the audit log does not know stay out, and are named.

@@ -13,7 +13,11 @@ from sqlalchemy.engine import URL, Connection, Engine, make_url
 from sqlalchemy.exc import ArgumentError
 
 from templates.errors import StoreError
+from templates.store.migrations import NEWEST
 from templates.store.turn import next_in_line
+
+APPLICATION = "veilface"
+"""What sessions of PostgreSQL are named by, before the number of the schema that they need."""
 
 _CUT_OFF = {
     "keepalives_idle": 5,
@@ -85,7 +89,7 @@ def make_engine(url: URL, *, timeout: float, pool_size: int, max_overflow: int) 
             pool_pre_ping=True,
             connect_args={
                 "connect_timeout": max(2, round(timeout)),
-                "application_name": "veilface",
+                "application_name": f"{APPLICATION} {NEWEST}",
                 "options": _session_options(url),
                 **_CUT_OFF,
             },

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+import sqlalchemy as sa
 from alembic import command
 from alembic.autogenerate import compare_metadata
 from alembic.config import Config
@@ -12,16 +13,37 @@ from sqlalchemy.engine import Connection
 
 from templates.errors import StoreError
 from templates.store.database import Database
+from templates.store.engine import APPLICATION
+from templates.store.migrations import NEWEST, oldest_served
 from templates.store.schema import Base
 
 _LOCK = "veilface schema"
 
 
 def upgrade(database: Database, revision: str = "head") -> None:
-    """Migrate upwards. Of several workers that start at once, one migrates and the rest wait."""
-    database.write(
-        lambda connection: command.upgrade(_config(connection), revision), lock=_LOCK, wait=0
-    )
+    """Migrate upwards. Of several workers that start at once, one migrates and the rest wait.
+
+    Nothing is done to the schema of a later version, where it serves this one too.
+
+    Raises
+    ------
+    StoreError
+        If the schema is of a later version and does not serve this one, or if processes of an
+        earlier version are connected that the new schema would not serve. (PostgreSQL only; on
+        SQLite they are not seen.)
+    """
+
+    def work(connection: Connection) -> None:
+        present = _revision_of(connection)
+        if present is not None and not _is_known(present):
+            _require_served(present)
+            return
+        target = head_revision() if revision == "head" else revision
+        if not database.is_sqlite and present not in (None, target):
+            _require_nobody_before(connection, target)
+        command.upgrade(_config(connection), revision)
+
+    database.write(work, lock=_LOCK, wait=0)
 
 
 def downgrade(database: Database, revision: str) -> None:
@@ -33,9 +55,7 @@ def downgrade(database: Database, revision: str) -> None:
 
 def current_revision(database: Database) -> str | None:
     """Revision the database is at; None for an empty one."""
-    return database.read(
-        lambda connection: MigrationContext.configure(connection).get_current_revision()
-    )
+    return database.read(_revision_of)
 
 
 def head_revision() -> str:
@@ -46,18 +66,15 @@ def head_revision() -> str:
 
 
 def check(database: Database) -> None:
-    """Raise :class:`StoreError`, naming the remedy, unless the schema is the one needed."""
+    """Raise :class:`StoreError`, naming the remedy, unless the schema serves this program."""
     present, needed = current_revision(database), head_revision()
     if present == needed:
         return
     if present is None:
         raise StoreError("the database is empty: run `veilface db upgrade`")
-    scripts = ScriptDirectory.from_config(_config(None)).walk_revisions()
-    if present not in {script.revision for script in scripts}:
-        raise StoreError(
-            f"the database is at schema {present}, which this program does not know: "
-            "it was migrated by a newer version, install that one"
-        )
+    if not _is_known(present):
+        _require_served(present)
+        return
     raise StoreError(
         f"the database is at schema {present}, this program needs {needed}: "
         "run `veilface db upgrade`"
@@ -72,6 +89,38 @@ def differences(database: Database) -> list[Any]:
             Base.metadata,
         )
     )
+
+
+def _revision_of(connection: Connection) -> str | None:
+    return MigrationContext.configure(connection).get_current_revision()
+
+
+def _is_known(revision: str) -> bool:
+    scripts = ScriptDirectory.from_config(_config(None)).walk_revisions()
+    return revision in {script.revision for script in scripts}
+
+
+def _require_served(later: str) -> None:
+    """Refuse the schema of a later version, unless it says that it serves this one."""
+    if oldest_served(later) > NEWEST:
+        raise StoreError(
+            f"the database is at schema {later}, which this program does not know: "
+            "it was migrated by a newer version, install that one"
+        )
+
+
+def _require_nobody_before(connection: Connection, target: str) -> None:
+    """Refuse to migrate under the sessions of programs that the new schema would not serve."""
+    query = sa.text(
+        "SELECT DISTINCT application_name FROM pg_stat_activity WHERE datname = current_database()"
+    )
+    names = (str(name).split() for name in connection.execute(query).scalars())
+    connected = {words[1] for words in names if len(words) == 2 and words[0] == APPLICATION}
+    if refused := sorted(number for number in connected if number < oldest_served(target)):
+        raise StoreError(
+            f"processes of the version with schema {', '.join(refused)} use the database, and "
+            f"could not on schema {target}: stop them, then run `veilface db upgrade`"
+        )
 
 
 def _config(connection: Connection | None) -> Config:

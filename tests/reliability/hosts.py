@@ -13,10 +13,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 from tests.api.deployment import Deployment, deploy
 from tests.ports import free_port
+from tests.privileges import not_permitted
 from tests.redis_server import own_redis_server
 from tests.reliability.cluster import Cluster
 from tests.reliability.kill import QUIET
@@ -31,7 +30,7 @@ class Network:
 
     def __init__(self, hosts: int) -> None:
         if os.geteuid() != 0 or shutil.which("ip") is None:
-            pytest.skip("network namespaces need root, and the program ip")
+            not_permitted("network namespaces need root, and the program ip")
         number = os.getpid()
         # For measurements between networks (RFC 2544): nobody's network has them.
         self._prefix = f"198.18.{number % 256}"
@@ -49,7 +48,7 @@ class Network:
         except BaseException as error:
             self.__exit__()
             if isinstance(error, subprocess.CalledProcessError):
-                pytest.skip(f"no network namespaces: {error.stderr.strip()}")
+                not_permitted(f"no network namespaces: {error.stderr.strip()}")
             raise
         return self
 

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.privileges import not_permitted
 from tests.reliability.full_disk import (
     FileSizeLimit,
     FullDiskReport,
@@ -25,7 +26,7 @@ def assert_sound(report: FullDiskReport) -> None:
 
 def test_a_full_file_system(tmp_path: Path) -> None:
     if not may_mount():
-        pytest.skip("this process may not mount a small file system; see the test of file sizes")
+        not_permitted("this process may not mount a small file system")
     with small_file_system() as small:
         database = small / "veilface.db"
         assert_sound(

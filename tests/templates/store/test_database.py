@@ -115,7 +115,7 @@ def test_a_lost_connection_is_replaced(
     with psycopg.connect(postgres_database, autocommit=True) as connection:
         killed = connection.execute(
             "SELECT pg_terminate_backend(pid) FROM pg_stat_activity "
-            "WHERE application_name = 'veilface' AND datname = current_database()"
+            "WHERE application_name LIKE 'veilface %' AND datname = current_database()"
         ).fetchall()
     assert killed
     store.ping()

@@ -1,8 +1,11 @@
 import logging
+import operator
+import re
 import threading
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
+import psycopg
 import pytest
 import sqlalchemy as sa
 
@@ -10,6 +13,7 @@ from templates.errors import SealError, StoreError
 from templates.keys.sealing import MasterKeyring
 from templates.store import Retention, TemplateStore, migrate
 from templates.store.database import Database
+from templates.store.migrations import NEWEST, number_of, oldest_served
 from templates.store.schema import Base, SubjectRow, TenantRow
 from templates.store.secret import SecretName
 from tests.templates.store.conftest import put
@@ -165,6 +169,64 @@ def test_check_names_the_remedy(database_url: str, keyring: MasterKeyring) -> No
         store.check()
     database.close()
     store.close()
+
+
+def of_schema(database_url: str, revision: str) -> Database:
+    """A database that says that it is at a revision, without its changes."""
+    database = Database(database_url)
+    statement = sa.text("UPDATE alembic_version SET version_num = :revision")
+    database.write(lambda connection: connection.execute(statement, {"revision": revision}))
+    return database
+
+
+def test_a_later_schema_is_used_where_it_says_that_it_serves_this_version(
+    database_url: str, keyring: MasterKeyring
+) -> None:
+    store = TemplateStore(database_url, keyring)
+    store.upgrade()
+    after, later = f"{int(NEWEST) + 1:04}", f"{int(NEWEST) + 2:04}"
+    for served in (f"{after}_serves_{NEWEST}", f"{later}_serves_0001"):
+        database = of_schema(database_url, served)
+        store.check()
+        store.upgrade()
+        assert migrate.current_revision(database) == served
+        database.close()
+    for other in (after, f"{later}_serves_{after}", f"{after}_serves_", "9"):
+        database = of_schema(database_url, other)
+        for call in (store.check, store.upgrade):
+            with pytest.raises(StoreError, match="newer version"):
+                call()
+        database.close()
+    store.close()
+
+
+def test_no_migration_under_a_version_that_it_does_not_serve(
+    postgres_url: str, keyring: MasterKeyring
+) -> None:
+    database = Database(postgres_url)
+    migrate.upgrade(database, "0007")
+    store = TemplateStore(postgres_url, keyring)
+    for name in ("veilface 0007", "psql", f"veilface {NEWEST}"):
+        with psycopg.connect(postgres_url, application_name=name):
+            if name == "veilface 0007":
+                with pytest.raises(StoreError, match="schema 0007 use the database"):
+                    store.upgrade()
+                assert migrate.current_revision(database) == "0007"
+            else:
+                store.upgrade()
+                assert migrate.current_revision(database) == migrate.head_revision()
+    store.close()
+    database.close()
+
+
+def test_no_revision_serves_a_version_that_one_before_does_not() -> None:
+    files = Path(migrate.__file__).parent.glob("migrations/versions/[0-9]*.py")
+    texts = [path.read_text(encoding="utf-8") for path in sorted(files)]
+    revisions = [re.findall(r'^revision = "(\w+)"$', text, re.M)[0] for text in texts]
+    oldest = [oldest_served(revision) for revision in revisions]
+    assert oldest == sorted(oldest)
+    assert all(map(operator.le, oldest, map(number_of, revisions)))
+    assert number_of(migrate.head_revision()) == NEWEST == number_of(revisions[-1])
 
 
 def test_a_query_before_the_upgrade_names_the_remedy(
