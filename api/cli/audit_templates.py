@@ -178,7 +178,7 @@ def templates(
 
     Writes report.json, report.md, figures and report.html, which has all to read in one file, to
     --out. Every attack says what the attacker is assumed to have. Exit status 1: an attack exceeds
-    its limit, or none was judged. docs/privacy-measurement.md explains them.
+    its limit, or none was judged. docs/privacy.md leads to what each attack is.
 
     Example: `veilface audit templates lfw --pack buffalo_l --decoys decoys.veil --out audit`
     """
