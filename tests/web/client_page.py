@@ -61,6 +61,9 @@ def application(service: str, authorize: Authorize) -> Iterator[Application]:
     """
 
     class Handler(BaseHTTPRequestHandler):
+        # A browser asks again by an ETag only where it came by this version or a later one.
+        protocol_version = "HTTP/1.1"
+
         def log_message(self, *_: Any) -> None:
             pass
 
