@@ -83,6 +83,8 @@ export function offer(action, onchange) {
   const check = h("p", { class: "check", hidden: !BUILT }, box, h("label", { for: box.id }, "Private mode"));
   offered.root = h("div", { class: "private" }, check, told);
   current = offered;
+  // The photos of another view are gone.
+  kept = null;
   return offered;
 }
 
@@ -105,22 +107,24 @@ async function token(asked) {
   return (await call("POST", "/v1/tokens", { body, headers: { "Content-Type": "application/json" } })).token;
 }
 
-// The client whose graphs are loaded; a client that fails is made anew the next time.
-function ready() {
+// The client whose graphs are loaded. One that failed is made anew for an attempt, and not for every look of a camera.
+function ready({ again = false } = {}) {
   const until = untilSignedOut();
-  if (prepared?.until === until) return prepared.client;
+  if (prepared?.until === until && !(again && prepared.failed)) return prepared.client;
   const offered = current;
   offered.say(LOADING);
-  const loading = { until, client: load(until, offered.action) };
+  const loading = { until, failed: false, client: load(until, offered.action) };
   prepared = loading;
-  loading.client.then(
-    () => offered.say(),
-    () => {
-      offered.say();
-      if (prepared === loading) prepared = null;
-    },
-  );
+  until.addEventListener("abort", forget);
+  loading.client
+    .catch(() => (loading.failed = true))
+    .then(() => offered.say());
   return loading.client;
+}
+
+function forget() {
+  kept = null;
+  left = [];
 }
 
 async function load(signal, action) {
@@ -200,7 +204,7 @@ async function lifted(client, action, photos, face) {
 async function attempt({ photos, face, ...asked }, send) {
   try {
     for (let first = true; ; first = false) {
-      const client = await ready();
+      const client = await ready({ again: true });
       const lift = await lifted(client, asked.action, photos, face);
       const one = client.as(await token(asked));
       try {

@@ -290,7 +290,11 @@ def test_a_page_without_the_built_client_says_so(served: Served, open_tab: OpenT
 
 
 def test_what_keeps_private_mode_from_working_is_said_and_nothing_else_is_sent(
-    recording: Proxy, served: Served, open_tab: OpenTab, people: dict[str, list[Path]]
+    recording: Proxy,
+    served: Served,
+    open_tab: OpenTab,
+    camera: FakeCamera,
+    people: dict[str, list[Path]],
 ) -> None:
     """A graph that is not the contract's: no photo goes to the service in its place."""
     tab = open_tab(served)
@@ -301,6 +305,10 @@ def test_what_keeps_private_mode_from_working_is_said_and_nothing_else_is_sent(
         route.fulfill(response=answer, body=answer.body()[:-1] + b"?")
 
     page.route(re.compile(r"/v1/pack/[0-9a-f]{64}$"), altered)
+    camera.shows(people[WHO][0])
+    page.get_by_role("button", name="Start camera").click()
+    tab.guided("Guidance is unavailable right now")
+    page.wait_for_timeout(5000)  # two more looks, which do not try again
     page.get_by_label("Person's id").fill("anna")
     page.get_by_label("Files", exact=True).check()
     page.get_by_label("Photos: JPEG").set_input_files(people[WHO][0])
@@ -311,4 +319,5 @@ def test_what_keeps_private_mode_from_working_is_said_and_nothing_else_is_sent(
     calls, rest = requests_in(recording.sent)
     assert rest == 0
     assert {call for call in calls if not call.startswith("GET ")} == {"POST /v1/tokens"}
+    assert calls["POST /v1/tokens"]["times"] == 2, "one for the looks, one for the attempt"
     page.unroute(re.compile(r"/v1/pack/[0-9a-f]{64}$"))
