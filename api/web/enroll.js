@@ -99,14 +99,14 @@ export function enrollView(id) {
         // The field says who is enrolled.
         subject.dispatchEvent(new Event("input"));
         result.replaceChildren(shown);
-        if (lifts) result.append(session.mode.whatLeft());
+        if (lifts && root.isConnected) result.append(session.mode.whatLeft());
         shown.focus();
       }
     } catch (error) {
       fields.disabled = false;
       if (error.details) picker.blame(error, sent);
       result.replaceChildren(problemBox(error));
-      if (lifts) result.append(session.mode.whatLeft());
+      if (lifts && root.isConnected) result.append(session.mode.whatLeft());
       result.scrollIntoView({ block: "nearest" });
     }
     say("Enroll");

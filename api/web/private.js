@@ -29,7 +29,8 @@ let current = null;
 let prepared = null;
 // What the photos on the page were lifted to: two lifts of the same photos would give their embedding away.
 let kept = null;
-let left = [];
+// What left the browser since that was last told: how often and how many bytes, by request and field.
+let left = new Map();
 
 // Why private mode cannot serve this, or null.
 function whyNot(action, level) {
@@ -90,20 +91,29 @@ export function offer(action, onchange) {
 
 export const active = () => on && current?.why === null;
 
-function note(method, path, body) {
-  // What is no JSON object is not sent: it could not be shown.
-  const fields = body === undefined ? [] : Object.entries(JSON.parse(body));
-  left.push([`${method} ${path.replace(/([0-9a-f]{8})[0-9a-f]{56}/, "$1…")}`, fields]);
+// Every call of the page, in private mode or not.
+export function note(method, target, body) {
+  const { pathname, searchParams } = new URL(target, location);
+  const request = `${method} ${pathname.replace(/([0-9a-f]{8})[0-9a-f]{56}/, "$1…")}`;
+  const sent = typeof body === "string" ? Object.entries(JSON.parse(body)) : [...(body ?? [])];
+  const fields = [...searchParams, ...sent];
+  for (const [field, value] of fields.length ? fields : [["no body", ""]]) {
+    const name = JSON.stringify([request, field]);
+    const row = left.get(name) ?? { request, field, times: 0, size: 0, photo: false };
+    left.set(name, row);
+    row.times += 1;
+    row.size += size(value);
+    row.photo ||= value instanceof Blob;
+  }
 }
 
 async function noted(url, options) {
-  note(options.method, new URL(url).pathname, options.body);
+  note(options.method, url, options.body);
   return fetch(url, options);
 }
 
 async function token(asked) {
   const body = JSON.stringify(asked);
-  note("POST", "/v1/tokens", body);
   return (await call("POST", "/v1/tokens", { body, headers: { "Content-Type": "application/json" } })).token;
 }
 
@@ -124,7 +134,7 @@ function ready({ again = false } = {}) {
 
 function forget() {
   kept = null;
-  left = [];
+  left = new Map();
 }
 
 async function load(signal, action) {
@@ -244,23 +254,36 @@ export const enroll = (name, { photos, face, holder_key }, replaces) =>
     return { ...answer, images: photos.map(() => ({ status: "lifted in this browser" })) };
   });
 
-const size = (value) => new TextEncoder().encode(typeof value === "string" ? value : JSON.stringify(value)).length;
+const size = (value) =>
+  value instanceof Blob
+    ? value.size
+    : new TextEncoder().encode(typeof value === "string" ? value : JSON.stringify(value)).length;
 
 // Every field of every request since this was last told.
 export function whatLeft() {
-  const rows = left.flatMap(([request, fields]) =>
-    (fields.length ? fields : [["no body", ""]]).map(([field, value]) => [
-      h("code", {}, request),
-      field,
-      bytes(size(value)),
-    ]),
-  );
-  left = [];
+  const rows = [...left.values()];
+  left = new Map();
   return h(
     "section",
     { class: "card", "data-left": "" },
     h("h2", {}, "What left this browser"),
-    h("p", {}, "No photo and no embedding was sent. ", "Beside these fields, requests had their headers, with the API key or a token."),
-    table("Fields that were sent", ["Request", "Field", "Size"], rows),
+    h(
+      "p",
+      {},
+      rows.some(({ photo }) => photo)
+        ? "Photos were sent while private mode was off. "
+        : "No photo and no embedding was sent. ",
+      "These are the calls since you signed in, or since this was last shown. ",
+      "Beside these fields, they had their headers, with the API key or a token.",
+    ),
+    table(
+      "Fields that were sent",
+      ["Request", "Field", "Size"],
+      rows.map(({ request, field, times, size, photo }) => [
+        h("code", {}, request),
+        [field, photo ? ", a photo" : "", times > 1 ? `, ${times} times` : ""].join(""),
+        bytes(size),
+      ]),
+    ),
   );
 }

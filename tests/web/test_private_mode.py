@@ -24,6 +24,14 @@ from tests.web.served import Served
 from tests.web.walk_obstacles import TO_PASSKEY
 
 pytestmark = pytest.mark.long
+COUNT_LOOKS = """() => {
+  window.looks = 0;
+  const { toBlob } = HTMLCanvasElement.prototype;
+  HTMLCanvasElement.prototype.toBlob = function (...given) {
+    window.looks += 1;
+    return toBlob.apply(this, given);
+  };
+}"""
 
 
 @pytest.fixture
@@ -60,6 +68,8 @@ def press(page: Page, name: str) -> None:
 
 def told_of(page: Page) -> list[list[str]]:
     """What the page says that left it: request, field, size."""
+    # After an error, what left is told as well.
+    expect(page.locator(".verdict")).to_be_visible()
     rows = page.locator("[data-left] tbody tr")
     expect(rows.first).to_be_visible()
     return [row.locator("th, td").all_inner_texts() for row in rows.all()]
@@ -119,6 +129,8 @@ def test_a_face_never_leaves_the_browser(
     # The page told the same, field by field.
     assert fields(enrolled, "PUT /v1/subjects/anna/enrollment") == ["holder_key", "template"]
     assert fields(verified, "POST /v1/subjects/anna/verify") == probe["members"]
+    assert {"GET /v1/key", "GET /v1/subjects"} <= {request for request, *_ in enrolled}
+    expect(page.locator("[data-left]")).to_contain_text("No photo and no embedding was sent.")
     (body,) = bodies_of(sent, "PUT /v1/subjects/anna/enrollment")
     template = body["template"]
     (size,) = (each[2] for each in enrolled if each[1] == "template")
@@ -250,8 +262,15 @@ def test_what_private_mode_cannot_serve_goes_to_the_service_and_that_is_said(
     expect(switch).to_be_checked()
     recording.forget()
     press(page, "Verify")
-    told_of(page)
+    told = told_of(page)
     assert people[WHO][1].read_bytes() not in recording.sent
+    # The photo had been sent before, to be checked and to be verified, and that is not denied.
+    expect(page.locator("[data-left]")).to_contain_text("Photos were sent")
+    photo = f"{people[WHO][1].stat().st_size:,} bytes"
+    assert ["POST /v1/photos/check", "image, a photo", photo] in told
+    assert ["POST /v1/subjects/anna/verify", "images, a photo", photo] in told
+    press(page, "Verify")
+    expect(page.locator("[data-left]")).to_contain_text("No photo and no embedding was sent.")
     # One state for the tab: what is switched off here is off in the other view.
     switch.uncheck()
     expect(said).to_contain_text("Photos are sent to the service")
@@ -308,7 +327,8 @@ def test_what_keeps_private_mode_from_working_is_said_and_nothing_else_is_sent(
     camera.shows(people[WHO][0])
     page.get_by_role("button", name="Start camera").click()
     tab.guided("Guidance is unavailable right now")
-    page.wait_for_timeout(5000)  # two more looks, which do not try again
+    page.evaluate(COUNT_LOOKS)
+    tab.wait_for("window.looks >= 2")  # and they do not try again
     page.get_by_label("Person's id").fill("anna")
     page.get_by_label("Files", exact=True).check()
     page.get_by_label("Photos: JPEG").set_input_files(people[WHO][0])
