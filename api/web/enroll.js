@@ -2,7 +2,7 @@ import { facts, h, openDialog, workbench } from "./dom.js";
 import { newHolderKey } from "./holder.js";
 import { photoPicker } from "./photos.js";
 import { call, form, nonce, session, subjectPath } from "./service.js";
-import { SPELLING, offNote, subjectField, whyOff } from "./subject.js";
+import { SPELLING, offNote, subjectField, switchOf, whyOff } from "./subject.js";
 import { problemBox } from "./words.js";
 
 const STEPS = [
@@ -118,7 +118,7 @@ export function enrollView(id) {
     "fieldset",
     { class: "plain", disabled: why !== null },
     subjectPart,
-    mode?.root,
+    switchOf(mode),
     picker?.root ?? null,
     holder.parts,
     send,

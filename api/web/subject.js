@@ -2,7 +2,7 @@
 // a key that may list them; with any other, and where the search fails, the id is typed.
 
 import { field, h, newId, when } from "./dom.js";
-import { call, may, session } from "./service.js";
+import { LIFTS, call, may, session } from "./service.js";
 import { lacking } from "./words.js";
 
 const SHOWN = 8;
@@ -37,6 +37,11 @@ export const enroller = (id) =>
   h("p", {}, h("a", { class: "button", href: `#/enroll/${encodeURIComponent(id)}` }, `Enroll ${id}`));
 
 export const offNote = (why) => (why ? h("p", { class: "off", role: "note" }, why) : null);
+
+// The switch of private mode. Where it is missing, photos are not sent in silence.
+export const switchOf = (mode) =>
+  mode?.root ??
+  offNote(LIFTS && !session.mode && "Private mode could not be loaded: photos are sent to the service. Reload the page to try again.");
 
 export function subjectField(id = "", listed = "Type how it begins, or pick from the list.") {
   const searches = may("enroll");
