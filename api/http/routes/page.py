@@ -75,7 +75,7 @@ class Served:
         """Name a file by its content."""
         return cls(body, TYPES[suffix], f'"{hashlib.sha256(body).hexdigest()[:32]}"', encoding)
 
-    def answer(self, request: Request, headers: Mapping[str, str]) -> Response:
+    def answer(self, request: Request, headers: Mapping[str, str] = HEADERS) -> Response:
         """Return the file, or that the browser's copy is still the same."""
         headers = {**headers, "ETag": self.etag}
         if self.encoding is not None:
