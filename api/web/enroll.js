@@ -2,7 +2,7 @@ import { facts, h, openDialog, workbench } from "./dom.js";
 import { newHolderKey } from "./holder.js";
 import { photoPicker } from "./photos.js";
 import { call, form, nonce, session, subjectPath } from "./service.js";
-import { SPELLING, offNote, subjectField, whyOff } from "./subject.js";
+import { SPELLING, offNote, subjectField, switchOf, whyOff } from "./subject.js";
 import { problemBox } from "./words.js";
 
 const STEPS = [
@@ -99,14 +99,14 @@ export function enrollView(id) {
         // The field says who is enrolled.
         subject.dispatchEvent(new Event("input"));
         result.replaceChildren(shown);
-        if (lifts) result.append(session.mode.whatLeft());
+        if (lifts && root.isConnected) result.append(session.mode.whatLeft());
         shown.focus();
       }
     } catch (error) {
       fields.disabled = false;
       if (error.details) picker.blame(error, sent);
       result.replaceChildren(problemBox(error));
-      if (lifts) result.append(session.mode.whatLeft());
+      if (lifts && root.isConnected) result.append(session.mode.whatLeft());
       result.scrollIntoView({ block: "nearest" });
     }
     say("Enroll");
@@ -118,7 +118,7 @@ export function enrollView(id) {
     "fieldset",
     { class: "plain", disabled: why !== null },
     subjectPart,
-    mode?.root,
+    switchOf(mode),
     picker?.root ?? null,
     holder.parts,
     send,

@@ -14,6 +14,7 @@ const TRIES = 3;
 
 const ON = "This browser finds the face, embeds and lifts it. It sends only the private template: no photo, no embedding.";
 const OFF = "Photos are sent to the service, which keeps none.";
+const DROPPED = "The photos that were chosen in private mode are removed. ";
 const LOADING = "Loading the model into this browser, which keeps it for the next visit…";
 // Of an enrollment.
 export const STEPS = [
@@ -27,9 +28,12 @@ let on = true;
 // The switch of the view that is open.
 let current = null;
 let prepared = null;
-// What the photos on the page were lifted to: two lifts of the same photos would give their embedding away.
-let kept = null;
-let left = [];
+// Until sign-out: two lifts of one embedding give it away. Lifts by action and photos, whatever they are
+// chosen by and in what order, and what each photo was lifted for.
+let kept = new Map();
+let used = new Map();
+// What left the browser since that was last told: how often and how many bytes, by request and field.
+let left = new Map();
 
 // Why private mode cannot serve this, or null.
 function whyNot(action, level) {
@@ -46,13 +50,16 @@ function whyNot(action, level) {
   if ((own.liveness[level] ?? "off") !== "off") {
     return "Private mode cannot serve this level, which checks liveness: that takes photos.";
   }
-  const lifted = contract.calibrations.some(
-    (each) => each.mode === "s2s" && each.levels.some(({ name }) => name === level),
+  // The client lifts to the largest dimension that is calibrated.
+  const calibrated = contract.calibrations.filter(({ mode }) => mode === "s2s");
+  const most = Math.max(...calibrated.map(({ probe_m }) => probe_m));
+  const served = calibrated.some(
+    ({ probe_m, levels }) => probe_m === most && levels.some(({ name }) => name === level),
   );
-  return lifted ? null : "Private mode cannot serve this level: it is not calibrated for lifted probes.";
+  return served ? null : "Private mode cannot serve this level: it is not calibrated for lifted probes.";
 }
 
-// The switch for a view. `at(level)` says what the visitor is about to do; `onchange` that it is switched.
+// The switch for a view. `at(level, picker)` says what the visitor is about to do; `onchange` that it is switched.
 export function offer(action, onchange) {
   const told = h("p", { class: "hint", id: newId("private-hint"), role: "status" });
   const box = h("input", {
@@ -62,13 +69,22 @@ export function offer(action, onchange) {
     "aria-describedby": told.id,
     onchange: () => {
       on = box.checked;
+      dropFailed();
       onchange();
     },
   });
   const offered = { action, why: null, root: null, at, say };
+  let dropped = "";
 
-  function at(level) {
+  function at(level, picker) {
+    const before = active();
     offered.why = whyNot(action, level);
+    dropped = "";
+    if (before && !active() && picker) {
+      // Nothing that was taken under the promise is sent without it.
+      picker.pause();
+      if (picker.drop(picker.chosen()).length) dropped = DROPPED;
+    }
     box.checked = active();
     box.disabled = offered.why !== null;
     told.className = offered.why ? "off" : "hint";
@@ -76,51 +92,71 @@ export function offer(action, onchange) {
   }
 
   function say(text = null) {
-    const words = text ?? (offered.why ? `${offered.why} ${OFF}` : on ? ON : OFF);
+    const words = text ?? (offered.why ? `${offered.why} ${dropped}${OFF}` : on ? ON : OFF);
     if (told.textContent !== words) told.textContent = words;
   }
 
   const check = h("p", { class: "check", hidden: !BUILT }, box, h("label", { for: box.id }, "Private mode"));
   offered.root = h("div", { class: "private" }, check, told);
   current = offered;
+  dropFailed();
   return offered;
 }
 
 export const active = () => on && current?.why === null;
 
-function note(method, path, body) {
-  // What is no JSON object is not sent: it could not be shown.
-  const fields = body === undefined ? [] : Object.entries(JSON.parse(body));
-  left.push([`${method} ${path.replace(/([0-9a-f]{8})[0-9a-f]{56}/, "$1…")}`, fields]);
+// Every call of the page, in private mode or not.
+export function note(method, target, body) {
+  const { pathname, searchParams } = new URL(target, location);
+  const request = `${method} ${pathname.replace(/([0-9a-f]{8})[0-9a-f]{56}/, "$1…")}`;
+  const sent = typeof body === "string" ? Object.entries(JSON.parse(body)) : [...(body ?? [])];
+  const fields = [...searchParams, ...sent];
+  for (const [field, value] of fields.length ? fields : [["no body", ""]]) {
+    const name = JSON.stringify([request, field]);
+    const row = left.get(name) ?? { request, field, times: 0, size: 0, photo: false };
+    left.set(name, row);
+    row.times += 1;
+    row.size += size(value);
+    row.photo ||= value instanceof Blob;
+  }
 }
 
 async function noted(url, options) {
-  note(options.method, new URL(url).pathname, options.body);
+  note(options.method, url, options.body);
   return fetch(url, options);
 }
 
-async function token(asked) {
+async function token(asked, signal) {
   const body = JSON.stringify(asked);
-  note("POST", "/v1/tokens", body);
-  return (await call("POST", "/v1/tokens", { body, headers: { "Content-Type": "application/json" } })).token;
+  return (await call("POST", "/v1/tokens", { body, signal, headers: { "Content-Type": "application/json" } })).token;
 }
 
-// The client whose graphs are loaded; a client that fails is made anew the next time.
-function ready() {
+// The client whose graphs are loaded. One that failed is made anew for an attempt, and not for every look of a camera.
+function ready({ again = false } = {}) {
   const until = untilSignedOut();
-  if (prepared?.until === until) return prepared.client;
+  if (prepared?.until === until && !(again && prepared.failed)) return prepared.client;
   const offered = current;
   offered.say(LOADING);
-  const loading = { until, client: load(until, offered.action) };
+  const loading = { until, failed: false, client: load(until, offered.action) };
   prepared = loading;
-  loading.client.then(
-    () => offered.say(),
-    () => {
-      offered.say();
-      if (prepared === loading) prepared = null;
-    },
-  );
+  loading.client
+    .catch(() => (loading.failed = true))
+    .then(() => offered.say());
   return loading.client;
+}
+
+// At sign-out: the next one to sign in begins anew.
+export function forget() {
+  on = true;
+  prepared = null;
+  kept = new Map();
+  used = new Map();
+  left = new Map();
+}
+
+// Whoever opens a view or switches has it tried again, the looks of a camera do not.
+function dropFailed() {
+  if (prepared?.failed) prepared = null;
 }
 
 async function load(signal, action) {
@@ -130,7 +166,8 @@ async function load(signal, action) {
   // More need a page that is isolated.
   runtime.env.wasm.numThreads = 1;
   for (let tries = 1; ; tries++) {
-    const bearer = await token({ subject_id: NOBODY, action });
+    signal.throwIfAborted();
+    const bearer = await token({ subject_id: NOBODY, action }, signal);
     const client = new PrivateClient(location.origin, bearer, { runtime, fetch: noted, signal });
     try {
       await client.prepare();
@@ -146,7 +183,9 @@ async function load(signal, action) {
 
 // The errors of the client, as those of a call.
 function problemOf(error, photos = 1) {
-  const { name, code, status, details = {}, image, requestId = null, retryAfter = null } = error;
+  const { name, status, details = {}, image, requestId = null, retryAfter = null } = error;
+  // That of a DOMException is a number.
+  const code = typeof error.code === "string" ? error.code : null;
   if (error instanceof Problem || name === "AbortError") return error;
   const message = error.message.charAt(0).toLowerCase() + error.message.slice(1);
   if (name === "ConnectionFailed") return new Problem({ code: "unreachable", message: "the service does not respond" });
@@ -183,44 +222,59 @@ export async function check(photo, face, signal) {
   }
 }
 
-async function lifted(client, action, photos, face) {
-  const same =
-    kept?.action === action &&
-    kept.face === face &&
-    kept.photos.length === photos.length &&
-    kept.photos.every((each, index) => each === photos[index]);
-  if (!same) {
+async function nameOf(photo) {
+  const hash = await crypto.subtle.digest("SHA-256", await photo.arrayBuffer());
+  return String(new Uint8Array(hash));
+}
+
+async function lifted(client, action, photos, face, until) {
+  const names = await Promise.all(photos.map(nameOf));
+  until.throwIfAborted();
+  const image = names.findIndex((name) => (used.get(name) ?? action) !== action);
+  if (image >= 0) {
+    const before = action === "verify" ? "to enroll" : "to verify";
+    const message = `this photo was used ${before} already, and a second lift of it would give its embedding away`;
+    throw Object.assign(new Error(message), { code: "lifted_before", image });
+  }
+  const all = JSON.stringify([action, ...[...new Set(names)].sort()]);
+  if (!kept.has(all)) {
     const given = { face: face || "single" };
     const lift = await (action === "enroll" ? client.liftEnrollment(photos, given) : client.lift(photos, given));
-    kept = { action, photos, face, lift };
+    until.throwIfAborted();
+    kept.set(all, lift);
+    for (const name of names) used.set(name, action);
   }
-  return kept.lift;
+  return kept.get(all);
 }
 
 async function attempt({ photos, face, ...asked }, send) {
+  const until = untilSignedOut();
   try {
     for (let first = true; ; first = false) {
-      const client = await ready();
-      const lift = await lifted(client, asked.action, photos, face);
-      const one = client.as(await token(asked));
+      const client = await ready({ again: true });
+      until.throwIfAborted();
+      const lift = await lifted(client, asked.action, photos, face, until);
+      const one = client.as(await token(asked, until));
       try {
         return await send(one, lift);
       } catch (error) {
-        if (error.code !== "contract_mismatch" || !first || !(await contractChanged(client, lift))) throw error;
+        if (error.code !== "contract_mismatch" || !first || !(await contractChanged(client, lift, until))) throw error;
       } finally {
         await one.close();
       }
     }
   } catch (error) {
+    until.throwIfAborted();
     throw problemOf(error, photos.length);
   }
 }
 
 // Else it is the person's template that is of another contract.
-async function contractChanged(client, lift) {
-  session.contract = await call("GET", "/v1/contract");
+async function contractChanged(client, lift, signal) {
+  session.contract = await call("GET", "/v1/contract", { signal });
   if (session.contract.contract_id === lift.contractId) return false;
-  kept = prepared = null;
+  kept.clear();
+  prepared = null;
   await client.close();
   return true;
 }
@@ -240,23 +294,36 @@ export const enroll = (name, { photos, face, holder_key }, replaces) =>
     return { ...answer, images: photos.map(() => ({ status: "lifted in this browser" })) };
   });
 
-const size = (value) => new TextEncoder().encode(typeof value === "string" ? value : JSON.stringify(value)).length;
+const size = (value) =>
+  value instanceof Blob
+    ? value.size
+    : new TextEncoder().encode(typeof value === "string" ? value : JSON.stringify(value)).length;
 
 // Every field of every request since this was last told.
 export function whatLeft() {
-  const rows = left.flatMap(([request, fields]) =>
-    (fields.length ? fields : [["no body", ""]]).map(([field, value]) => [
-      h("code", {}, request),
-      field,
-      bytes(size(value)),
-    ]),
-  );
-  left = [];
+  const rows = [...left.values()];
+  left = new Map();
   return h(
     "section",
     { class: "card", "data-left": "" },
     h("h2", {}, "What left this browser"),
-    h("p", {}, "No photo and no embedding was sent. ", "Beside these fields, requests had their headers, with the API key or a token."),
-    table("Fields that were sent", ["Request", "Field", "Size"], rows),
+    h(
+      "p",
+      {},
+      rows.some(({ photo }) => photo)
+        ? "Photos were sent while private mode was off. "
+        : "No photo and no embedding was sent. ",
+      "These are the calls since you signed in, or since this was last shown. ",
+      "Beside these fields, they had their headers, with the API key or a token.",
+    ),
+    table(
+      "Fields that were sent",
+      ["Request", "Field", "Size"],
+      rows.map(({ request, field, times, size, photo }) => [
+        h("code", {}, request),
+        [field, photo ? ", a photo" : "", times > 1 ? `, ${times} times` : ""].join(""),
+        bytes(size),
+      ]),
+    ),
   );
 }

@@ -6,8 +6,9 @@ let key = kept((storage) => storage.getItem(KEPT)) ?? null;
 // Ends what still runs for a key that is forgotten.
 let running = new AbortController();
 
-// `mode` is the module of private mode, where the service serves its pack.
+// `mode` is the module of private mode, where the service serves its pack and the module could be loaded.
 export const session = { own: null, contract: null, mode: null, onrefused: () => {} };
+export const LIFTS = document.documentElement.dataset.private !== "no";
 
 export const hasKey = () => key !== null;
 
@@ -22,6 +23,7 @@ export function forgetKey() {
   kept((storage) => storage.removeItem(KEPT));
   running.abort();
   running = new AbortController();
+  session.mode?.forget();
 }
 
 export const untilSignedOut = () => running.signal;
@@ -49,6 +51,7 @@ export async function call(method, path, { body, headers, signal } = {}) {
   const used = key;
   const ended = AbortSignal.any([running.signal, ...(signal ? [signal] : [])]);
   let answer;
+  session.mode?.note(method, path, body);
   try {
     answer = await fetch(path, {
       method,
@@ -95,11 +98,11 @@ export const nonce = () =>
   ).join("");
 
 export async function learn() {
+  if (LIFTS) session.mode ??= await import("./private.js").catch(() => null);
   [session.own, session.contract] = await Promise.all([
     call("GET", "/v1/key"),
     call("GET", "/v1/contract"),
   ]);
-  if (document.documentElement.dataset.private !== "no") session.mode = await import("./private.js");
 }
 
 // Levels that a photo can be verified at with this key.

@@ -2,7 +2,7 @@
 // a key that may list them; with any other, and where the search fails, the id is typed.
 
 import { command, field, h, newId, when } from "./dom.js";
-import { call, may, session } from "./service.js";
+import { LIFTS, call, may, session } from "./service.js";
 import { lacking } from "./words.js";
 
 const SHOWN = 8;
@@ -41,6 +41,11 @@ export function offNote(why) {
   const [said, typed] = why.split(/(?=veilface )/);
   return h("p", { class: "off", role: "note" }, said, typed ? command(typed) : null);
 }
+
+// The switch of private mode. Where it is missing, photos are not sent in silence.
+export const switchOf = (mode) =>
+  mode?.root ??
+  offNote(LIFTS && !session.mode && "Private mode could not be loaded: photos are sent to the service. Reload the page to try again.");
 
 export function subjectField(id = "", listed = "Type how it begins, or pick from the list.") {
   const searches = may("enroll");

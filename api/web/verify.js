@@ -3,7 +3,7 @@ import { facts, field, h, oneIn, percent, workbench } from "./dom.js";
 import { holderKey } from "./holder.js";
 import { photoPicker } from "./photos.js";
 import { call, form, levels, may, moves, session, subjectPath } from "./service.js";
-import { enroller, offNote, subjectField, whyOff } from "./subject.js";
+import { enroller, offNote, subjectField, switchOf, whyOff } from "./subject.js";
 import { DEMO, livenessWords, problemBox } from "./words.js";
 
 const REASONS = {
@@ -71,7 +71,7 @@ export function verifyView(id) {
 
   function showWhatIsAsked() {
     clear();
-    mode?.at(level.value);
+    mode?.at(level.value, picker);
     steps.forEach((step, index) => (step.textContent = STEPS[moving() ? "movements" : "photos"][index]));
     if (!picker) return;
     picker.root.hidden = moving();
@@ -155,7 +155,7 @@ export function verifyView(id) {
       subjectPart,
       field("Level", level, "How often a stranger is accepted. Stricter levels reject the right person more often."),
     ),
-    mode?.root,
+    switchOf(mode),
     picker?.root ?? null,
     why ? null : movements.root,
     instead,

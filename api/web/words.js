@@ -34,6 +34,7 @@ const REMEDIES = {
   passkey_of_another: "Choose the passkey that is named after the id. If it is lost, enroll the person again.",
   replayed: "Start again: the frames must arrive within a minute, and count once.",
   private_mode: "Try again, or switch private mode off: photos then go to the service.",
+  lifted_before: "Choose another photo.",
   camera: "See that no other program uses the camera, and try again.",
   key_file: "Choose the file that was made for this person. If it is lost, enroll the person again.",
   internal_error: "Report the request id to the operator.",

@@ -37,6 +37,17 @@ from veilface_client import Client, NotEnrolled
 pytestmark = pytest.mark.long
 
 LEVEL = "fmr-1e-3"
+# Put back into the page, its camera is off.
+NOTE_WORDS = """() => {
+  const login = document.querySelector("veilface-login");
+  login.replaceWith(login.cloneNode());
+  document.querySelector("veilface-login").replaceWith(login);
+  const output = login.shadowRoot.querySelector("output");
+  window.said = [];
+  new MutationObserver(() => window.said.push(output.textContent)).observe(output, {
+    childList: true, characterData: true, subtree: true,
+  });
+}"""
 EMBEDDING = """
 import * as ort from "onnxruntime-web";
 import { Client, decodeImage, ModelPack } from "veilface-client";
@@ -229,6 +240,14 @@ def test_the_element_locks_an_enrollment_to_a_passkey(
         tab.page.get_by_role("button", name="Log in").click()
         expect(says).to_contain_text("No passkey was used")
         assert page.recording.sent.count(b"/verify HTTP") == before
+        # Nor is a passkey asked for before the photos will do.
+        camera.shows()
+        tab.page.evaluate(NOTE_WORDS)
+        tab.page.get_by_role("button", name="Start camera").click()
+        tab.page.get_by_role("button", name="Log in").click()
+        expect(says).to_contain_text("No face was found")
+        assert tab.page.evaluate("window.said")[-1:] == [says.text_content()]
+        assert "Use your passkey." not in tab.page.evaluate("window.said")
         assert tab.complaints == []
     finally:
         context.close()

@@ -15,6 +15,7 @@ from tests.clients.conftest import Running
 from tests.clients.javascript.conftest import require_client
 from tests.clients.proxy import Proxy
 from tests.leaks import as_bytes
+from tests.patience import wait_until
 from tests.web.access import assert_accessible
 from tests.web.camera import FakeCamera
 from tests.web.conftest import OpenTab
@@ -24,6 +25,26 @@ from tests.web.served import Served
 from tests.web.walk_obstacles import TO_PASSKEY
 
 pytestmark = pytest.mark.long
+CHECK_WHAT_FAILS = """async () => {
+  const mode = await import("/assets/private.js");
+  const photo = { get width() { throw new DOMException("too large", "QuotaExceededError"); } };
+  return mode.check(photo, "").catch(({ code }) => code);
+}"""
+HOLD_PICTURES = """() => {
+  const { createImageBitmap } = window;
+  window.createImageBitmap = async (...given) => {
+    await new Promise((done) => (window.release = done));
+    return createImageBitmap(...given);
+  };
+}"""
+COUNT_LOOKS = """() => {
+  window.looks = 0;
+  const { toBlob } = HTMLCanvasElement.prototype;
+  HTMLCanvasElement.prototype.toBlob = function (...given) {
+    window.looks += 1;
+    return toBlob.apply(this, given);
+  };
+}"""
 
 
 @pytest.fixture
@@ -60,6 +81,8 @@ def press(page: Page, name: str) -> None:
 
 def told_of(page: Page) -> list[list[str]]:
     """What the page says that left it: request, field, size."""
+    # After an error, what left is told as well.
+    expect(page.locator(".verdict")).to_be_visible()
     rows = page.locator("[data-left] tbody tr")
     expect(rows.first).to_be_visible()
     return [row.locator("th, td").all_inner_texts() for row in rows.all()]
@@ -119,6 +142,8 @@ def test_a_face_never_leaves_the_browser(
     # The page told the same, field by field.
     assert fields(enrolled, "PUT /v1/subjects/anna/enrollment") == ["holder_key", "template"]
     assert fields(verified, "POST /v1/subjects/anna/verify") == probe["members"]
+    assert {"GET /v1/key", "GET /v1/subjects"} <= {request for request, *_ in enrolled}
+    expect(page.locator("[data-left]")).to_contain_text("No photo and no embedding was sent.")
     (body,) = bodies_of(sent, "PUT /v1/subjects/anna/enrollment")
     template = body["template"]
     (size,) = (each[2] for each in enrolled if each[1] == "template")
@@ -164,26 +189,70 @@ def test_the_same_photos_are_lifted_once(
     press(page, "Enroll")
     dialog.get_by_role("button", name="Replace").click()
     expect(page.locator(".verdict")).to_contain_text("Earlier enrollmentreplaced")
+    # Chosen anew, in another order, and by another policy for faces.
+    page.get_by_label("Others may be in the picture").check()
+    choose(page, own[2], own[1])
+    press(page, "Enroll")
+    dialog.get_by_role("button", name="Replace").click()
+    expect(page.locator(".verdict")).to_contain_text("Earlier enrollmentreplaced")
     first, *again = [
         each["template"] for each in bodies_of(recording.sent, "PUT /v1/subjects/anna/enrollment")
     ]
-    assert len(again) == 3
+    assert len(again) == 5
     assert len(set(again)) == 1
     assert first not in again
 
     page.get_by_role("link", name="Verify this person").click()
-    choose(page, own[3])
+    choose(page, own[1])
     press(page, "Verify")
-    told_of(page)
-    press(page, "Verify")
-    told_of(page)
-    choose(page, own[4])
-    press(page, "Verify")
-    told_of(page)
+    alert = page.get_by_role("alert")
+    expect(alert).to_contain_text("This photo was used to enroll already")
+    expect(alert).to_contain_text("Choose another photo.")
+    expect(page.locator(".tray .seen[data-state=bad]")).to_contain_text("used to enroll")
+    for photo in (own[3], own[4], own[3]):
+        choose(page, photo)
+        press(page, "Verify")
+        told_of(page)
     probes = [
         each["template"] for each in bodies_of(recording.sent, "POST /v1/subjects/anna/verify")
     ]
-    assert probes[0] == probes[1] != probes[2]
+    assert probes[0] == probes[2] != probes[1]
+
+
+def test_signing_out_ends_an_attempt_and_forgets_the_switch(
+    recording: Proxy, served: Served, open_tab: OpenTab, people: dict[str, list[Path]]
+) -> None:
+    """A lift that ends afterwards is neither kept nor sent, nor is a token asked for."""
+    tab = open_tab(served)
+    page = tab.page
+    switch = page.get_by_role("switch", name="Private mode")
+    tab.open("Enroll")
+    page.get_by_label("Person's id").fill("a-person-who-signs-out")
+    choose(page, people[WHO][0])
+    page.evaluate(HOLD_PICTURES)
+    button = page.locator("form button[type=submit]").element_handle()
+    press(page, "Enroll")
+    tab.wait_for("window.release !== undefined")
+    page.get_by_role("button", name="Sign out").click()
+    expect(page.get_by_label("API key")).to_be_visible()
+    recording.forget()
+    page.evaluate("window.release()")
+    wait_until(lambda: button.text_content() == "Enroll", what="the attempt has ended")
+    assert b"/v1/tokens" not in recording.sent
+    assert b"a-person-who-signs-out" not in recording.sent
+
+    sign_in_again(page, served)
+    expect(switch).to_be_checked()
+    switch.uncheck()
+    page.get_by_role("button", name="Sign out").click()
+    sign_in_again(page, served)
+    expect(switch).to_be_checked()
+
+
+def sign_in_again(page: Page, served: Served) -> None:
+    page.get_by_label("API key").fill(served.token)
+    press(page, "Sign in")
+    expect(page.get_by_role("navigation", name="Views")).to_be_visible()
 
 
 def test_refusals_have_the_words_of_the_service(
@@ -209,10 +278,16 @@ def test_refusals_have_the_words_of_the_service(
     expect(alert).to_contain_text("unsupported_image")
     expect(alert).to_contain_text("Send a JPEG, PNG or WebP photo.")
     assert all("/enrollment" not in url for url in tab.requests)
+    # The code of a DOMException is a number, and no code of the service.
+    assert page.evaluate(CHECK_WHAT_FAILS) == "private_mode"
 
 
 def test_what_private_mode_cannot_serve_goes_to_the_service_and_that_is_said(
-    recording: Proxy, served: Served, open_tab: OpenTab, people: dict[str, list[Path]]
+    recording: Proxy,
+    served: Served,
+    open_tab: OpenTab,
+    camera: FakeCamera,
+    people: dict[str, list[Path]],
 ) -> None:
     """A level that asks for liveness: switched off, with the reason; and on again at another."""
     with served.client() as client:
@@ -250,8 +325,28 @@ def test_what_private_mode_cannot_serve_goes_to_the_service_and_that_is_said(
     expect(switch).to_be_checked()
     recording.forget()
     press(page, "Verify")
-    told_of(page)
+    told = told_of(page)
     assert people[WHO][1].read_bytes() not in recording.sent
+    # The photo had been sent before, to be checked and to be verified, and that is not denied.
+    expect(page.locator("[data-left]")).to_contain_text("Photos were sent")
+    photo = f"{people[WHO][1].stat().st_size:,} bytes"
+    assert ["POST /v1/photos/check", "image, a photo", photo] in told
+    assert ["POST /v1/subjects/anna/verify", "images, a photo", photo] in told
+    press(page, "Verify")
+    expect(page.locator("[data-left]")).to_contain_text("No photo and no embedding was sent.")
+    # What the promise was given for is not sent without it, by a change of the level alone.
+    camera.shows(people[WHO][0])
+    page.get_by_label("Camera", exact=True).check()
+    page.get_by_role("button", name="Start camera").click()
+    tab.guided("Good: one face")
+    recording.forget()
+    level.select_option("fmr-1e-3")
+    tab.guided("The camera is off.")
+    expect(page.locator(".tray li")).to_have_count(0)
+    expect(said).to_contain_text("photos that were chosen in private mode are removed")
+    level.select_option("fmr-1e-2")
+    expect(switch).to_be_checked()
+    assert b"/v1/photos/check" not in recording.sent
     # One state for the tab: what is switched off here is off in the other view.
     switch.uncheck()
     expect(said).to_contain_text("Photos are sent to the service")
@@ -289,8 +384,42 @@ def test_a_page_without_the_built_client_says_so(served: Served, open_tab: OpenT
     expect(page.get_by_role("switch", name="Private mode")).to_be_hidden()
 
 
+def test_a_level_of_a_smaller_dimension_than_the_browser_lifts_to_is_not_offered(
+    served: Served, open_tab: OpenTab
+) -> None:
+    tab = open_tab(served, sign_in=None)
+
+    def with_a_larger_dimension(route: Route) -> None:
+        answer = route.fetch()
+        told = answer.json()
+        (lifted, *_) = (each for each in told["calibrations"] if each["mode"] == "s2s")
+        larger = {**lifted, "probe_m": lifted["probe_m"] + 1, "levels": []}
+        told["calibrations"].append(larger)
+        route.fulfill(response=answer, json=told)
+
+    tab.page.route("**/v1/contract", with_a_larger_dimension)
+    tab.sign_in(served.token)
+    expect(tab.page.locator(".private")).to_contain_text("not calibrated for lifted probes")
+
+
+def test_a_module_that_cannot_be_loaded_is_said_and_keeps_nobody_out(
+    served: Served, open_tab: OpenTab
+) -> None:
+    tab = open_tab(served, sign_in=None)
+    tab.page.route("**/assets/private.js", lambda route: route.fulfill(status=404))
+    tab.sign_in(served.token)
+    note = tab.page.get_by_text("Private mode could not be loaded")
+    for view in ("Verify", "Enroll"):
+        tab.page.get_by_role("link", name=view).first.click()
+        expect(note).to_contain_text("photos are sent to the service")
+
+
 def test_what_keeps_private_mode_from_working_is_said_and_nothing_else_is_sent(
-    recording: Proxy, served: Served, open_tab: OpenTab, people: dict[str, list[Path]]
+    recording: Proxy,
+    served: Served,
+    open_tab: OpenTab,
+    camera: FakeCamera,
+    people: dict[str, list[Path]],
 ) -> None:
     """A graph that is not the contract's: no photo goes to the service in its place."""
     tab = open_tab(served)
@@ -301,6 +430,11 @@ def test_what_keeps_private_mode_from_working_is_said_and_nothing_else_is_sent(
         route.fulfill(response=answer, body=answer.body()[:-1] + b"?")
 
     page.route(re.compile(r"/v1/pack/[0-9a-f]{64}$"), altered)
+    camera.shows(people[WHO][0])
+    page.get_by_role("button", name="Start camera").click()
+    tab.guided("Guidance is unavailable right now")
+    page.evaluate(COUNT_LOOKS)
+    tab.wait_for("window.looks >= 2")  # and they do not try again
     page.get_by_label("Person's id").fill("anna")
     page.get_by_label("Files", exact=True).check()
     page.get_by_label("Photos: JPEG").set_input_files(people[WHO][0])
@@ -311,4 +445,5 @@ def test_what_keeps_private_mode_from_working_is_said_and_nothing_else_is_sent(
     calls, rest = requests_in(recording.sent)
     assert rest == 0
     assert {call for call in calls if not call.startswith("GET ")} == {"POST /v1/tokens"}
+    assert calls["POST /v1/tokens"]["times"] == 2, "one for the looks, one for the attempt"
     page.unroute(re.compile(r"/v1/pack/[0-9a-f]{64}$"))

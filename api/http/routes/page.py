@@ -7,7 +7,7 @@ are: whoever has a key may do the same without it.
 import functools
 import hashlib
 import re
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -43,9 +43,13 @@ HEADERS = {
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Resource-Policy": "same-origin",
 }
-WITH_GRAPHS = HEADERS["Content-Security-Policy"].replace(
-    "script-src 'self'", "script-src 'self' 'wasm-unsafe-eval'"
-)
+WITH_GRAPHS = {
+    **HEADERS,
+    # In private mode the page runs the graphs, and a runtime of theirs is WebAssembly.
+    "Content-Security-Policy": HEADERS["Content-Security-Policy"].replace(
+        "script-src 'self'", "script-src 'self' 'wasm-unsafe-eval'"
+    ),
+}
 DEMO_MARK = ('data-demo="no"', 'data-demo="yes"')
 PRIVATE_MARK = 'data-private="no"'
 
@@ -71,14 +75,11 @@ class Served:
         """Name a file by its content."""
         return cls(body, TYPES[suffix], f'"{hashlib.sha256(body).hexdigest()[:32]}"', encoding)
 
-    def answer(self, request: Request) -> Response:
+    def answer(self, request: Request, headers: Mapping[str, str] = HEADERS) -> Response:
         """Return the file, or that the browser's copy is still the same."""
-        headers = {**HEADERS, "ETag": self.etag}
+        headers = {**headers, "ETag": self.etag}
         if self.encoding is not None:
             headers["Content-Encoding"] = self.encoding
-        if request.app.state.settings.serve_pack:
-            # The page runs the graphs, and a runtime of theirs is WebAssembly.
-            headers["Content-Security-Policy"] = WITH_GRAPHS
         if has_copy(request, self.etag):
             return Response(status_code=304, headers=headers)
         return Response(self.body, media_type=self.media_type, headers=headers)
@@ -92,23 +93,25 @@ def page_routes(*, demo: bool, serve_pack: bool) -> list[BaseRoute]:
         for path in sorted(WEB.iterdir())
         if path.suffix in TYPES and path.name != "index.html"
     }
+    headers = HEADERS
     if demo:
         html = html.replace(*DEMO_MARK)
     elif serve_pack:
         # Not in the demo, whose model knows a cartoon face by a check that no graph holds.
         client = _private_client()
         assets |= client
+        headers = WITH_GRAPHS if client else HEADERS
         html = html.replace(PRIVATE_MARK, f'data-private="{"yes" if client else "not-built"}"')
     index = Served.of(html.encode(), ".html")
 
     async def page(request: Request) -> Response:
-        return index.answer(request)
+        return index.answer(request, headers)
 
     async def asset(request: Request) -> Response:
         file = assets.get(request.path_params["name"])
         if file is None:
             raise ApiError("not_found", "there is no such path")
-        return file.answer(request)
+        return file.answer(request, headers)
 
     routes: list[BaseRoute] = [route_of("/", page), route_of("/assets/{name:path}", asset)]
     if demo:

@@ -114,19 +114,6 @@ def test_it_is_off_by_default(client: Client) -> None:
         assert_error(client.get(path, headers=with_token(client)), 404, "not_found")
 
 
-def test_webassembly_is_allowed_only_where_the_pack_is_served(
-    serving: tuple[Client, Deployment], client: Client
-) -> None:
-    on = serving[0].get("/").headers["content-security-policy"]
-    off = client.get("/").headers["content-security-policy"]
-    assert "wasm-unsafe-eval" not in off
-    assert on == off.replace("script-src 'self'", "script-src 'self' 'wasm-unsafe-eval'") != off
-    for policy in (on, off):
-        assert "unsafe-inline" not in policy
-        assert "'unsafe-eval'" not in policy
-        assert " data:" not in policy
-
-
 def test_a_file_that_was_changed_is_not_given_under_the_old_hash(tmp_path: Path) -> None:
     deployment = deploy(tmp_path, serve_pack=True)
     with Client(create_app(deployment.settings)) as client:

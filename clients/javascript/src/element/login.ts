@@ -2,6 +2,8 @@
 
 import { fromImageData, type RgbImage } from "../models/image.js";
 import type { Decision, Enrollment } from "../service/answers.js";
+import { ContractMismatch } from "../service/errors.js";
+import { Enrollable, type Probe } from "../service/lifts.js";
 import { PrivateClient, type PrivateOptions } from "../service/private-client.js";
 import { createPasskey, passkeyHolderKey, type Passkey } from "./passkey.js";
 
@@ -123,28 +125,59 @@ export class VeilfaceLogin extends Base {
     this.#stay.abort();
     this.#stop();
     this.#say("");
-    void this.#client?.then((client) => client.close()).catch(() => undefined);
+    void this.#forgetClient();
+  }
+
+  async #forgetClient(): Promise<void> {
+    const client = this.#client;
     this.#client = undefined;
+    await client?.then((each) => each.close()).catch(() => undefined);
   }
 
   /** Take a burst, lift and send it; the decision (or enrollment) also comes as an event. */
   async attempt(): Promise<Decision | Enrollment> {
     const { signal } = this.#stay;
-    const { authorize } = this.#given();
+    this.#given();
     const photos = await this.#burst(signal);
+    const lift = await this.#lifted(photos, signal);
+    try {
+      return await this.#send(lift, signal);
+    } catch (error) {
+      if (!(error instanceof ContractMismatch)) throw error;
+      signal.throwIfAborted();
+      await this.#forgetClient();
+      const again = await this.#lifted(photos, signal);
+      // Else it is the person's stored template that is of another contract.
+      if (again.contractId === lift.contractId) throw error;
+      return this.#send(again, signal);
+    }
+  }
+
+  /** Before a token or a passkey is asked for: the photos may not do. */
+  async #lifted(photos: RgbImage[], signal: AbortSignal): Promise<Enrollable | Probe> {
+    const client = await this.#prepared(signal);
+    signal.throwIfAborted();
+    const face = this.getAttribute("face") === "largest" ? "largest" : "single";
+    return this.getAttribute("action") === "enroll"
+      ? client.liftEnrollment(photos, { face })
+      : client.lift(photos, { face });
+  }
+
+  async #send(lift: Enrollable | Probe, signal: AbortSignal): Promise<Decision | Enrollment> {
+    const { authorize } = this.#given();
     const prepared = await this.#prepared(signal);
     signal.throwIfAborted();
     const { subject, token, ...given } = await authorize();
     signal.throwIfAborted();
-    const holderKey = given.holderKey ?? (await this.#holderKey(subject, signal));
+    const holderKey =
+      given.holderKey ?? (await this.#holderKey(subject, lift instanceof Enrollable, signal));
     signal.throwIfAborted();
     const client = prepared.as(token);
     try {
-      const face = this.getAttribute("face") === "largest" ? "largest" : "single";
-      const more = { face, ...(holderKey && { holderKey }) } as const;
-      const result = await (this.getAttribute("action") === "enroll"
-        ? client.enroll(subject, photos, more)
-        : client.verify(subject, photos, more));
+      const more = holderKey && { holderKey };
+      const result = await (lift instanceof Enrollable
+        ? client.enroll(subject, lift, more)
+        : client.verify(subject, lift, more));
       signal.throwIfAborted();
       return result;
     } finally {
@@ -153,14 +186,19 @@ export class VeilfaceLogin extends Base {
   }
 
   /** The key of the person's passkey, where one is to be asked for. */
-  async #holderKey(subject: string, signal: AbortSignal): Promise<Uint8Array | undefined> {
+  async #holderKey(
+    subject: string,
+    enrolls: boolean,
+    signal: AbortSignal,
+  ): Promise<Uint8Array | undefined> {
     if (this.getAttribute("passkey") === null) return undefined;
     this.#say(this.words.passkey);
-    if (this.getAttribute("action") !== "enroll") return passkeyHolderKey(subject, signal);
-    if (this.#passkey?.subject !== subject) {
+    if (enrolls && this.#passkey?.subject !== subject) {
       this.#passkey = await createPasskey(subject, signal);
     }
-    return passkeyHolderKey(subject, signal, this.#passkey);
+    const key = await passkeyHolderKey(subject, signal, enrolls ? this.#passkey : undefined);
+    this.#say(this.words.working);
+    return key;
   }
 
   #given(): { options: Omit<PrivateOptions, "signal">; authorize: () => Promise<Authorization> } {
