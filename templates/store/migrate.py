@@ -14,7 +14,7 @@ from sqlalchemy.engine import Connection
 from templates.errors import StoreError
 from templates.store.database import Database
 from templates.store.engine import APPLICATION
-from templates.store.migrations import NEWEST, oldest_served
+from templates.store.migrations import NEWEST, number_of, oldest_served
 from templates.store.schema import Base
 
 _LOCK = "veilface schema"
@@ -101,7 +101,12 @@ def _is_known(revision: str) -> bool:
 
 
 def _require_served(later: str) -> None:
-    """Refuse the schema of a later version, unless it says that it serves this one."""
+    """Refuse an unknown schema, unless it is a later one and says that it serves this program."""
+    if number_of(later) <= NEWEST:
+        raise StoreError(
+            f"the database is at schema {later}, which this program does not know and which is no "
+            "later one: it was migrated by another program, install that one"
+        )
     if oldest_served(later) > NEWEST:
         raise StoreError(
             f"the database is at schema {later}, which this program does not know: "

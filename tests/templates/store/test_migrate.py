@@ -200,6 +200,20 @@ def test_a_later_schema_is_used_where_it_says_that_it_serves_this_version(
     store.close()
 
 
+def test_an_unknown_schema_that_is_not_later_is_refused(
+    database_url: str, keyring: MasterKeyring
+) -> None:
+    store = TemplateStore(database_url, keyring)
+    store.upgrade()
+    for other in (f"{NEWEST}_other", f"{NEWEST}_serves_0001", "0003x", "0007_b"):
+        database = of_schema(database_url, other)
+        for call in (store.check, store.upgrade):
+            with pytest.raises(StoreError, match=f"{other}, .* migrated by another program"):
+                call()
+        database.close()
+    store.close()
+
+
 def test_no_migration_under_a_version_that_it_does_not_serve(
     postgres_url: str, keyring: MasterKeyring
 ) -> None:
