@@ -9,7 +9,7 @@ import psycopg
 import pytest
 import sqlalchemy as sa
 
-from templates.errors import SealError, StoreError
+from templates.errors import SealError, StoreBusy, StoreError
 from templates.keys.sealing import MasterKeyring
 from templates.store import Retention, TemplateStore, migrate
 from templates.store.database import Database
@@ -230,6 +230,28 @@ def test_no_migration_under_a_version_that_it_does_not_serve(
                 store.upgrade()
                 assert migrate.current_revision(database) == migrate.head_revision()
     store.close()
+    database.close()
+
+
+def test_a_migration_gives_up_on_a_table_that_is_held(
+    postgres_url: str, keyring: MasterKeyring, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Behind it would wait everybody else who reads or writes the table."""
+    database = Database(postgres_url)
+    migrate.upgrade(database, "0006")
+    monkeypatch.setattr(migrate, "_TABLE_WAIT_S", 0.1)
+    with psycopg.connect(postgres_url) as backup:
+        backup.execute("LOCK TABLE api_keys IN ACCESS SHARE MODE")
+        for call in (migrate.upgrade, lambda each: migrate.downgrade(each, "0001")):
+            with pytest.raises(StoreBusy, match=r"such as a backup .* then try again"):
+                call(database)
+            assert migrate.current_revision(database) == "0006"
+        keys = sa.text("SELECT count(*) FROM api_keys")
+        assert database.read(lambda each: each.execute(keys).scalar_one()) == 0
+        columns = {each["name"] for each in sa.inspect(database.engine).get_columns("api_keys")}
+        assert "liveness" not in columns
+    migrate.upgrade(database)
+    assert migrate.current_revision(database) == migrate.head_revision()
     database.close()
 
 
