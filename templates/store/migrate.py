@@ -138,11 +138,12 @@ def _require_nobody_before(connection: Connection, target: str) -> None:
         "SELECT DISTINCT application_name FROM pg_stat_activity WHERE datname = current_database()"
     )
     names = (str(name).split() for name in connection.execute(query).scalars())
-    connected = {words[1] for words in names if len(words) == 2 and words[0] == APPLICATION}
+    # A pooler may add words of its own, and the first programs named no number.
+    connected = {(words[1:] or [""])[0] for words in names if words[:1] == [APPLICATION]}
     if refused := sorted(number for number in connected if number < oldest_served(target)):
         raise StoreError(
-            f"processes of the version with schema {', '.join(refused)} use the database, and "
-            f"could not on schema {target}: stop them, then run `veilface db upgrade`"
+            f"processes of an earlier version (schema {refused[0] or 'unnamed'}) use the "
+            f"database, and could not on schema {target}: stop them, then run `veilface db upgrade`"
         )
 
 

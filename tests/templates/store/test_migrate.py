@@ -214,22 +214,44 @@ def test_an_unknown_schema_that_is_not_later_is_refused(
     store.close()
 
 
+@pytest.mark.parametrize("name", ["veilface 0007", "veilface 0007 - 10.0.0.9:5432", "veilface"])
 def test_no_migration_under_a_version_that_it_does_not_serve(
-    postgres_url: str, keyring: MasterKeyring
+    postgres_url: str, keyring: MasterKeyring, name: str
 ) -> None:
     database = Database(postgres_url)
     migrate.upgrade(database, "0007")
     store = TemplateStore(postgres_url, keyring)
-    for name in ("veilface 0007", "psql", f"veilface {NEWEST}"):
-        with psycopg.connect(postgres_url, application_name=name):
-            if name == "veilface 0007":
-                with pytest.raises(StoreError, match="schema 0007 use the database"):
-                    store.upgrade()
-                assert migrate.current_revision(database) == "0007"
-            else:
-                store.upgrade()
-                assert migrate.current_revision(database) == migrate.head_revision()
+    with psycopg.connect(postgres_url, application_name=name):
+        with pytest.raises(StoreError, match=r"\(schema (0007|unnamed)\) use the database"):
+            store.upgrade()
+        assert migrate.current_revision(database) == "0007"
     store.close()
+    database.close()
+
+
+@pytest.mark.parametrize("name", [f"veilface {NEWEST}", "psql", "veilfaceish 0007", ""])
+def test_a_migration_beside_whom_it_serves_or_does_not_concern(
+    postgres_url: str, keyring: MasterKeyring, name: str
+) -> None:
+    database = Database(postgres_url)
+    migrate.upgrade(database, "0007")
+    store = TemplateStore(postgres_url, keyring)
+    with psycopg.connect(postgres_url, application_name=name):
+        store.upgrade()
+        assert migrate.current_revision(database) == migrate.head_revision()
+    store.close()
+    database.close()
+
+
+def test_a_migration_beside_an_earlier_version_that_it_serves(
+    postgres_url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    database = Database(postgres_url)
+    migrate.upgrade(database, "0007")
+    monkeypatch.setattr(migrate, "oldest_served", lambda revision: "0007")
+    with psycopg.connect(postgres_url, application_name="veilface 0007"):
+        migrate.upgrade(database)
+        assert migrate.current_revision(database) == migrate.head_revision()
     database.close()
 
 
