@@ -1,8 +1,11 @@
 """Bringing a database to the schema of this program, and finding out whether it is there."""
 
+import contextlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import psycopg
 import sqlalchemy as sa
 from alembic import command
 from alembic.autogenerate import compare_metadata
@@ -10,14 +13,16 @@ from alembic.config import Config
 from alembic.runtime.migration import MigrationContext
 from alembic.script import ScriptDirectory
 from sqlalchemy.engine import Connection
+from sqlalchemy.exc import OperationalError
 
-from templates.errors import StoreError
+from templates.errors import StoreBusy, StoreError
 from templates.store.database import Database
 from templates.store.engine import APPLICATION
-from templates.store.migrations import NEWEST, oldest_served
+from templates.store.migrations import NEWEST, number_of, oldest_served
 from templates.store.schema import Base
 
 _LOCK = "veilface schema"
+_TABLE_WAIT_S = 5.0
 
 
 def upgrade(database: Database, revision: str = "head") -> None:
@@ -31,6 +36,9 @@ def upgrade(database: Database, revision: str = "head") -> None:
         If the schema is of a later version and does not serve this one, or if processes of an
         earlier version are connected that the new schema would not serve. (PostgreSQL only; on
         SQLite they are not seen.)
+    StoreBusy
+        If another session, such as a backup, holds a table for more than five seconds. Nothing
+        was changed. (PostgreSQL only.)
     """
 
     def work(connection: Connection) -> None:
@@ -41,16 +49,26 @@ def upgrade(database: Database, revision: str = "head") -> None:
         target = head_revision() if revision == "head" else revision
         if not database.is_sqlite and present not in (None, target):
             _require_nobody_before(connection, target)
-        command.upgrade(_config(connection), revision)
+        with _short_waits(database, connection):
+            command.upgrade(_config(connection), revision)
 
     database.write(work, lock=_LOCK, wait=0)
 
 
 def downgrade(database: Database, revision: str) -> None:
-    """Migrate downwards, to ``"base"`` for an empty database; data of dropped tables goes."""
-    database.write(
-        lambda connection: command.downgrade(_config(connection), revision), lock=_LOCK, wait=0
-    )
+    """Migrate downwards, to ``"base"`` for an empty database; data of dropped tables goes.
+
+    Raises
+    ------
+    StoreBusy
+        As :func:`upgrade`.
+    """
+
+    def work(connection: Connection) -> None:
+        with _short_waits(database, connection):
+            command.downgrade(_config(connection), revision)
+
+    database.write(work, lock=_LOCK, wait=0)
 
 
 def current_revision(database: Database) -> str | None:
@@ -101,7 +119,12 @@ def _is_known(revision: str) -> bool:
 
 
 def _require_served(later: str) -> None:
-    """Refuse the schema of a later version, unless it says that it serves this one."""
+    """Refuse an unknown schema, unless it is a later one and says that it serves this program."""
+    if number_of(later) <= NEWEST:
+        raise StoreError(
+            f"the database is at schema {later}, which this program does not know and which is no "
+            "later one: it was migrated by another program, install that one"
+        )
     if oldest_served(later) > NEWEST:
         raise StoreError(
             f"the database is at schema {later}, which this program does not know: "
@@ -115,12 +138,33 @@ def _require_nobody_before(connection: Connection, target: str) -> None:
         "SELECT DISTINCT application_name FROM pg_stat_activity WHERE datname = current_database()"
     )
     names = (str(name).split() for name in connection.execute(query).scalars())
-    connected = {words[1] for words in names if len(words) == 2 and words[0] == APPLICATION}
+    # A pooler may add words of its own, and the first programs named no number.
+    connected = {(words[1:] or [""])[0] for words in names if words[:1] == [APPLICATION]}
     if refused := sorted(number for number in connected if number < oldest_served(target)):
         raise StoreError(
-            f"processes of the version with schema {', '.join(refused)} use the database, and "
-            f"could not on schema {target}: stop them, then run `veilface db upgrade`"
+            f"processes of an earlier version (schema {refused[0] or 'unnamed'}) use the "
+            f"database, and could not on schema {target}: stop them, then run `veilface db upgrade`"
         )
+
+
+@contextlib.contextmanager
+def _short_waits(database: Database, connection: Connection) -> Iterator[None]:
+    """Give up on a table that another session holds: whoever comes for it waits behind us."""
+    if database.is_sqlite:
+        yield
+        return
+    limit = f"{round(1000 * _TABLE_WAIT_S)}"
+    connection.execute(sa.select(sa.func.set_config("lock_timeout", limit, True)))
+    try:
+        yield
+    except OperationalError as error:
+        if not isinstance(error.orig, psycopg.errors.LockNotAvailable):
+            raise
+        raise StoreBusy(
+            f"another session holds a table that the migration changes for more than "
+            f"{_TABLE_WAIT_S:g} s, such as a backup or a long query (pg_stat_activity names it), "
+            "and nothing was changed: let it end, then try again"
+        ) from None
 
 
 def _config(connection: Connection | None) -> Config:

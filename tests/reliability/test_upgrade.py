@@ -30,8 +30,6 @@ from tests.reliability.operations import Clients, Operation, People
 from tests.reliability.service import ROOT, Service
 from tests.reliability.switch import Switch
 
-pytestmark = pytest.mark.long
-
 PAGE = (ROOT / "docs" / "deployment.md").read_text(encoding="utf-8")
 PACKAGES = ("api", "attacks", "enroll", "models", "templates", "verify")
 PEOPLE = {"ann": 1, "ben": 2, "cas": 3}
@@ -73,7 +71,7 @@ class Front:
 @pytest.fixture
 def next_version(tmp_path: Path) -> Path:
     """Where the next version is installed: bin/veilface and bin/python."""
-    folder = tmp_path / "next"
+    folder = tmp_path / "veilface-next"
     for package in PACKAGES:
         # With the compiled kernels, which take long to make.
         shutil.copytree(ROOT / package, folder / package)
@@ -157,37 +155,141 @@ def told(switch: Switch, folder: Path, old: int) -> Iterator[None]:
         thread.join()
 
 
-def drill(new_version: Path, old: Service, port: int, folder: Path) -> str:
+UNIT = (ROOT / "deploy" / "veilface.service").read_text(encoding="utf-8")
+SYSTEMCTL = r"""#!/bin/sh
+echo "$@" >> {folder}/systemctl.log
+unit={folder}/veilface-next.service
+case "$1" in
+start)
+    ports=$(sed -n 's/^Environment=\(VEILFACE_PORT=.*\)/\1/p' $unit)
+    env $ports sh -c "exec $(sed -n 's/^ExecStart=//p' $unit)" > {folder}/next.log 2>&1 &
+    echo $! > {folder}/next.pid ;;
+is-active) grep -Eq '^State:\s+[^Z]' /proc/$(cat {folder}/next.pid)/status ;;
+disable) kill -TERM {pid} ;;
+esac
+"""
+NGINX = r"""#!/bin/sh
+[ "$1" = -t ] && exit
+# In one step: a file that is there is whole.
+sed -n 's/.*server 127.0.0.1:\([0-9]*\) .*/\1/p' {folder}/veilface-upstream.conf > {folder}/moved
+mv {folder}/moved {folder}/target
+"""
+
+
+@dataclass
+class Drill:
     """The page's block, with what is of this machine in the places of what is of another one."""
-    (block,) = re.findall(r"^```sh\n(NEXT=.*?)^```\n", PAGE, flags=re.M | re.S)
-    first, rest = block.split("\n", 1)
-    assert first.startswith("NEXT=/opt/veilface-next OLD=$(systemctl show")
-    # In one step: a file that is there is whole.
-    moved = f"echo {port} > {folder}/moved\nmv {folder}/moved {folder}/target"
-    names = {
-        r"8422": str(port),
-        r"serve &$": f"serve >{folder}/next.log 2>&1 & echo $! > {folder}/next.pid",
-        r"^sed .*nginx -s reload$": moved,
-        r"^sleep 5\b.*$": f"until [ -e {folder}/drained ]; do sleep 0.1; done",
-    }
-    for ours, theirs in names.items():
-        rest, count = re.subn(ours, theirs, rest, flags=re.M)
-        assert count, ours
-    return f"NEXT={new_version} OLD={old.process.pid}\n{rest}"
+
+    folder: Path
+    old_port: int
+    new_port: int
+
+    def run(self, old: int, environment: dict[str, str]) -> "subprocess.CompletedProcess[str]":
+        """Run it as the page says, where the service to replace is a process."""
+        stand_ins = self.folder / "stand-ins"
+        stand_ins.mkdir()
+        for name, text in {"systemctl": SYSTEMCTL, "nginx": NGINX}.items():
+            script = stand_ins / name
+            script.write_text(text.replace("{folder}", str(self.folder)).replace("{pid}", str(old)))
+            script.chmod(0o755)
+        (upstream,) = re.findall(r"^upstream veilface \{\n.*?^\}\n", PAGE, flags=re.M | re.S)
+        self.upstream.write_text(self._here(upstream))
+        (block,) = re.findall(r"^```sh\n(set -e\n.*?)^```\n", PAGE, flags=re.M | re.S)
+        return subprocess.run(
+            ["sh", "-c", self._here(block)],
+            cwd=ROOT,
+            env={**os.environ, **environment, "PATH": f"{stand_ins}:{os.environ['PATH']}"},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            timeout=PATIENCE_S,
+        )
+
+    @property
+    def upstream(self) -> Path:
+        """What nginx is told."""
+        return self.folder / "veilface-upstream.conf"
+
+    def asked(self) -> list[str]:
+        """What systemctl was asked for, in turn."""
+        log = self.folder / "systemctl.log"
+        return log.read_text().splitlines() if log.exists() else []
+
+    def _here(self, text: str) -> str:
+        names = {
+            "/opt/$NEW": f"{self.folder}/$NEW",
+            "/etc/systemd/system": str(self.folder),
+            "/etc/nginx/conf.d": str(self.folder),
+            "10.0.0.11": "127.0.0.1",
+            "8421": str(self.old_port),
+            "8422": str(self.new_port),
+        }
+        for there, here in names.items():
+            text = text.replace(there, here)
+        drained = f"until [ -e {self.folder}/drained ]; do sleep 0.1; done"
+        return re.sub(r"^sleep 5\b.*$", drained, text, flags=re.M)
+
+
+def install(folder: Path, *, ready: str, serve: str) -> None:
+    """Programs in the place of the next version's."""
+    (folder / "veilface-next" / "bin").mkdir(parents=True)
+    for name, line in {"python": ready, "veilface": serve}.items():
+        script = folder / "veilface-next" / "bin" / name
+        script.write_text(f"#!/bin/sh\n{line}\n")
+        script.chmod(0o755)
+
+
+@pytest.mark.parametrize(
+    ("ready", "serve", "asked"),
+    [
+        # Another service answers on the port that is asked, and the new one could not have it.
+        ("exit 0", "exec sleep 600", []),
+        # The new service ends before it is ready.
+        (
+            "exit 1",
+            "exit 1",
+            ["daemon-reload", "start veilface-next", "is-active --quiet veilface-next"],
+        ),
+    ],
+)
+def test_nothing_is_switched_to_a_service_that_does_not_serve(
+    tmp_path: Path, ready: str, serve: str, asked: list[str]
+) -> None:
+    install(tmp_path, ready=ready, serve=serve)
+    drill = Drill(tmp_path, old_port=8421, new_port=8422)
+    with subprocess.Popen(["sleep", "600"]) as old:
+        try:
+            assert drill.run(old.pid, {}).returncode != 0
+            assert old.poll() is None
+        finally:
+            old.kill()
+    assert list(dict.fromkeys(drill.asked())) == asked
+    assert "127.0.0.1:8421 " in drill.upstream.read_text()
+    assert not (tmp_path / "target").exists()
 
 
 def end(folder: Path) -> None:
     pid = folder / "next.pid"
-    if pid.exists() and psutil.pid_exists(int(pid.read_text())):
+    if pid.exists() and runs(int(pid.read_text())):
         os.kill(int(pid.read_text()), signal.SIGTERM)
-        wait_until(lambda: not psutil.pid_exists(int(pid.read_text())))
+        wait_until(lambda: not runs(int(pid.read_text())))
 
 
+def runs(pid: int) -> bool:
+    """Whether a process is there that has not ended, be it collected or not."""
+    try:
+        return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
+
+
+@pytest.mark.long
 def test_no_request_fails_during_an_upgrade(
     next_version: Path, postgres_url: str, tmp_path: Path
 ) -> None:
     deployment = deploy(tmp_path, database_url=postgres_url, port=free_port(), **QUIET)
     old_port, new_port = deployment.settings.port, free_port()
+    drill = Drill(tmp_path, old_port, new_port)
     people = People(deployment, list(PEOPLE.values()))
     with Switch(old_port) as switch, Service(deployment, tmp_path) as old:
         clients = Clients(Front(switch.url, deployment), people)
@@ -195,24 +297,21 @@ def test_no_request_fails_during_an_upgrade(
         try:
             with Requests(clients) as requests, told(switch, tmp_path, old_port):
                 requests.wait_for_more()
-                done = subprocess.run(
-                    [
-                        "bash",
-                        "-euo",
-                        "pipefail",
-                        "-c",
-                        drill(next_version, old, new_port, tmp_path),
-                    ],
-                    env={**os.environ, **old.environment()},
-                    stdout=subprocess.PIPE,
-                    stderr=subprocess.STDOUT,
-                    text=True,
-                    timeout=PATIENCE_S,
-                )
+                done = drill.run(old.process.pid, old.environment())
                 assert done.returncode == 0, done.stdout
                 assert old.process.wait(timeout=PATIENCE_S) == 0, old.tail()
                 requests.wait_for_more()
             assert [str(each) for each in requests.failures()] == []
+            assert drill.asked()[-2:] == ["enable veilface-next", "disable --now veilface"]
+            # The other host's line is as it was.
+            servers = re.findall(r"server (\S+) ", drill.upstream.read_text())
+            assert servers == [f"127.0.0.1:{new_port}", f"10.0.0.12:{old_port}"]
+            unit = (tmp_path / "veilface-next.service").read_text().splitlines()
+            new_lines = [line for line in unit if line not in UNIT.splitlines()]
+            assert new_lines == [
+                f"Environment=VEILFACE_PORT={new_port}",
+                f"ExecStart={next_version}/bin/veilface serve --workers 2",
+            ]
             store = open_store(deployment.settings, open_keyring(deployment.settings))
             assert current_revision(store.database) == AFTER
             # What a start of the earlier version does: it may go back, should the new one not do.

@@ -9,7 +9,7 @@ import psycopg
 import pytest
 import sqlalchemy as sa
 
-from templates.errors import SealError, StoreError
+from templates.errors import SealError, StoreBusy, StoreError
 from templates.keys.sealing import MasterKeyring
 from templates.store import Retention, TemplateStore, migrate
 from templates.store.database import Database
@@ -200,22 +200,80 @@ def test_a_later_schema_is_used_where_it_says_that_it_serves_this_version(
     store.close()
 
 
+def test_an_unknown_schema_that_is_not_later_is_refused(
+    database_url: str, keyring: MasterKeyring
+) -> None:
+    store = TemplateStore(database_url, keyring)
+    store.upgrade()
+    for other in (f"{NEWEST}_other", f"{NEWEST}_serves_0001", "0003x", "0007_b"):
+        database = of_schema(database_url, other)
+        for call in (store.check, store.upgrade):
+            with pytest.raises(StoreError, match=f"{other}, .* migrated by another program"):
+                call()
+        database.close()
+    store.close()
+
+
+@pytest.mark.parametrize("name", ["veilface 0007", "veilface 0007 - 10.0.0.9:5432", "veilface"])
 def test_no_migration_under_a_version_that_it_does_not_serve(
-    postgres_url: str, keyring: MasterKeyring
+    postgres_url: str, keyring: MasterKeyring, name: str
 ) -> None:
     database = Database(postgres_url)
     migrate.upgrade(database, "0007")
     store = TemplateStore(postgres_url, keyring)
-    for name in ("veilface 0007", "psql", f"veilface {NEWEST}"):
-        with psycopg.connect(postgres_url, application_name=name):
-            if name == "veilface 0007":
-                with pytest.raises(StoreError, match="schema 0007 use the database"):
-                    store.upgrade()
-                assert migrate.current_revision(database) == "0007"
-            else:
-                store.upgrade()
-                assert migrate.current_revision(database) == migrate.head_revision()
+    with psycopg.connect(postgres_url, application_name=name):
+        with pytest.raises(StoreError, match=r"\(schema (0007|unnamed)\) use the database"):
+            store.upgrade()
+        assert migrate.current_revision(database) == "0007"
     store.close()
+    database.close()
+
+
+@pytest.mark.parametrize("name", [f"veilface {NEWEST}", "psql", "veilfaceish 0007", ""])
+def test_a_migration_beside_whom_it_serves_or_does_not_concern(
+    postgres_url: str, keyring: MasterKeyring, name: str
+) -> None:
+    database = Database(postgres_url)
+    migrate.upgrade(database, "0007")
+    store = TemplateStore(postgres_url, keyring)
+    with psycopg.connect(postgres_url, application_name=name):
+        store.upgrade()
+        assert migrate.current_revision(database) == migrate.head_revision()
+    store.close()
+    database.close()
+
+
+def test_a_migration_beside_an_earlier_version_that_it_serves(
+    postgres_url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    database = Database(postgres_url)
+    migrate.upgrade(database, "0007")
+    monkeypatch.setattr(migrate, "oldest_served", lambda revision: "0007")
+    with psycopg.connect(postgres_url, application_name="veilface 0007"):
+        migrate.upgrade(database)
+        assert migrate.current_revision(database) == migrate.head_revision()
+    database.close()
+
+
+def test_a_migration_gives_up_on_a_table_that_is_held(
+    postgres_url: str, keyring: MasterKeyring, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Behind it would wait everybody else who reads or writes the table."""
+    database = Database(postgres_url)
+    migrate.upgrade(database, "0006")
+    monkeypatch.setattr(migrate, "_TABLE_WAIT_S", 0.1)
+    with psycopg.connect(postgres_url) as backup:
+        backup.execute("LOCK TABLE api_keys IN ACCESS SHARE MODE")
+        for call in (migrate.upgrade, lambda each: migrate.downgrade(each, "0001")):
+            with pytest.raises(StoreBusy, match=r"such as a backup .* then try again"):
+                call(database)
+            assert migrate.current_revision(database) == "0006"
+        keys = sa.text("SELECT count(*) FROM api_keys")
+        assert database.read(lambda each: each.execute(keys).scalar_one()) == 0
+        columns = {each["name"] for each in sa.inspect(database.engine).get_columns("api_keys")}
+        assert "liveness" not in columns
+    migrate.upgrade(database)
+    assert migrate.current_revision(database) == migrate.head_revision()
     database.close()
 
 
