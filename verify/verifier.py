@@ -316,6 +316,7 @@ class Verifier:
             template,
             metric=calibration.metric,
             steps=calibration.steps,
+            as_stored=not isinstance(probe, SubspaceBatch),
         )
         distance = float(distances[0])
         close = float(np.asarray(similarity(distances), dtype=np.float64)[0])

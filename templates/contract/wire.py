@@ -125,7 +125,8 @@ def decode_as_stored(
     """Read the bytes of a template that ``encode`` made and a seal has kept since.
 
     A tenth of the work of :func:`decode`. The numbers stay as they were rounded, which
-    ``paired_distances`` of points allows for, and are not looked at: the seal vouches for them.
+    ``paired_distances`` allows for with ``as_stored``, and are not looked at: the seal vouches
+    for them.
 
     Raises
     ------

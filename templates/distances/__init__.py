@@ -253,8 +253,15 @@ def paired_distances(
     metric: Metric | str,
     steps: int = DEFAULT_STEPS,
     dtype: DTypeLike = np.float32,
+    as_stored: bool = False,
 ) -> Floats:
     """Distances of probe i to template i; parameters and errors as in `pairwise_distances`.
+
+    Parameters
+    ----------
+    as_stored
+        Points are compared with templates whose bases are orthonormal to float16 only, as
+        ``decode_as_stored`` reads them. Lifted probes need templates of ``decode``.
 
     Returns
     -------
@@ -274,7 +281,9 @@ def paired_distances(
             distances = _tiles().paired(probes, templates, **options)
         return distances
     every = np.arange(len(probes))
-    return exact.pairs(probes, templates, every, every, **options).astype(dtype)
+    return exact.pairs(probes, templates, every, every, as_stored=as_stored, **options).astype(
+        dtype
+    )
 
 
 def warm_up() -> None:

@@ -61,7 +61,13 @@ def test_a_point_is_as_far_from_a_template_as_it_was_stored(dtype: WireDtype, me
         if dtype == "float16":
             assert np.abs(stored.basis @ stored.basis.T - np.eye(160)).max() > 3e-5
         near, far = (
-            paired_distances(point, SubspaceBatch.of([side]), metric=metric, dtype=np.float64)
+            paired_distances(
+                point,
+                SubspaceBatch.of([side]),
+                metric=metric,
+                dtype=np.float64,
+                as_stored=side is stored,
+            )
             for side in (stored, read)
         )
         np.testing.assert_allclose(near, far, atol=2e-8)
