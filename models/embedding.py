@@ -10,8 +10,8 @@ from models.errors import ModelError
 from models.pack_file import Triple
 from models.sessions import Session
 
-# Activations of one batch are alive at once. Those of 8 crops stay in the cache: a crop costs an
-# eighth less of the processor than in batches of 32.
+# Activations of one batch are alive at once. Those of 8 crops stay in the cache: a crop costs less
+# of the processor than in batches of 32 (docs/models.md has the measurement).
 MAX_BATCH = 8
 # Counts the ways from a photo to its crop. 2: the letterbox and the two canvases of
 # `models.detection`; 1, without a number in the contract, was one canvas, its sides rounded.

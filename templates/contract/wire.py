@@ -124,7 +124,7 @@ def decode_as_stored(
 ) -> WireTemplate:
     """Read the bytes of a template that ``encode`` made and a seal has kept since.
 
-    A tenth of the work of :func:`decode`. The numbers stay as they were rounded, which
+    A seventh of the work of :func:`decode`. The numbers stay as they were rounded, which
     ``paired_distances`` allows for with ``as_stored``, and are not looked at: the seal vouches
     for them.
 

@@ -18,3 +18,4 @@ def test_it_decides_with_both_rotations_with_one_and_with_none(
     for label in ("median", "quickest tenth"):
         assert set(printed[label]["ms"]) == {"both rotations", "the tenant's", "no rotation"}
         assert min(printed[label]["ms"].values()) > 0
+        assert set(printed[label]["reading_ms"]) == {"by the rules", "as sealed"}
