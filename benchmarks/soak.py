@@ -7,7 +7,8 @@ a service that falls behind shows it in the latencies. At every full minute the 
 the service's processes is read.
 
 The test, chosen before the first run: the mean resident memory of the last ten minutes is at most
-2 % above that of the ten minutes after the first ten.
+2 % above that of the ten minutes after the first ten, and every answer is a decision, or what was
+asked for. Else the exit status is 1.
 
 Example
 -------
@@ -23,7 +24,7 @@ import random
 import threading
 import time
 from collections import Counter, defaultdict, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
@@ -164,6 +165,12 @@ def growth(rows: Sequence[dict[str, Any]]) -> float | None:
     return float(np.mean(mib[-WARM_UP_MINUTES:])) / base - 1
 
 
+def failures(outcomes: Mapping[str, int]) -> dict[str, int]:
+    """Answers that are neither a decision nor what was asked for."""
+    expected = ("accept", "reject", "done")
+    return {name: n for name, n in outcomes.items() if name.split(": ")[1] not in expected}
+
+
 def figure(rows: Sequence[dict[str, Any]]) -> Figure:
     """Memory above, latencies of every kind below, by minute."""
     with house_style():
@@ -251,6 +258,9 @@ def main() -> None:
     if args.figure:
         write(figure(rows), args.figure, "soak")
     print(json.dumps(report, indent=2))
+    grown = report["growth"]
+    if failures(load.outcomes) or (grown is not None and grown > GROWTH_LIMIT):
+        raise SystemExit(1)
 
 
 if __name__ == "__main__":

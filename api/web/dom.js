@@ -19,7 +19,7 @@ export const h = (tag, attributes, ...children) =>
 export const s = (tag, attributes, ...children) =>
   fill(document.createElementNS(SVG, tag), attributes, children);
 
-// A command to type, which is not broken within an option.
+// A command, not broken within an option.
 export const command = (text) =>
   h("code", {}, text.split(" ").map((word) => [h("span", {}, word), " "]).flat().slice(0, -1));
 

@@ -95,7 +95,10 @@ export function newHolderKey(subject, onchange) {
     onchange,
     async fromPasskey(id, signal) {
       if (made?.id !== id) made = { id, passkey: await create(id, signal) };
-      return derive(id, signal, made.passkey);
+      return derive(id, signal, made.passkey).catch((error) => {
+        if (error.code === "passkey_unsupported") made = null;
+        throw error;
+      });
     },
   });
 }

@@ -78,6 +78,7 @@ export function offer(action, onchange) {
 
   function at(level, picker) {
     const before = active();
+    offered.level = level;
     offered.why = whyNot(action, level);
     dropped = "";
     if (before && !active() && picker) {
@@ -161,7 +162,7 @@ function dropFailed() {
 
 async function load(signal, action) {
   const [{ PrivateClient }, runtime] = await Promise.all([import(CLIENT), import(RUNTIME)]).catch(() => {
-    throw new Problem({ code: "unreachable", message: "the service does not respond" });
+    throw new Problem({ code: "private_mode", message: "what private mode runs could not be loaded" });
   });
   // More need a page that is isolated.
   runtime.env.wasm.numThreads = 1;
@@ -238,13 +239,21 @@ async function lifted(client, action, photos, face, until) {
   }
   const all = JSON.stringify([action, ...[...new Set(names)].sort()]);
   if (!kept.has(all)) {
-    const given = { face: face || "single" };
-    const lift = await (action === "enroll" ? client.liftEnrollment(photos, given) : client.lift(photos, given));
-    until.throwIfAborted();
-    kept.set(all, lift);
+    // Before it is waited for: another view may have the same photos meanwhile.
     for (const name of names) used.set(name, action);
+    const given = { face: face || "single" };
+    const lift = action === "enroll" ? client.liftEnrollment(photos, given) : client.lift(photos, given);
+    kept.set(all, lift);
+    lift.catch(() => {
+      if (until.aborted || kept.get(all) !== lift) return;
+      kept.delete(all);
+      const rest = new Set([...kept.keys()].flatMap((key) => JSON.parse(key)));
+      for (const name of names) if (!rest.has(name)) used.delete(name);
+    });
   }
-  return kept.get(all);
+  const lift = await kept.get(all);
+  until.throwIfAborted();
+  return lift;
 }
 
 async function attempt({ photos, face, ...asked }, send) {
@@ -276,6 +285,7 @@ async function contractChanged(client, lift, signal) {
   kept.clear();
   prepared = null;
   await client.close();
+  current.at(current.level);
   return true;
 }
 

@@ -42,10 +42,10 @@ export function offNote(why) {
   return h("p", { class: "off", role: "note" }, said, typed ? command(typed) : null);
 }
 
-// The switch of private mode. Where it is missing, photos are not sent in silence.
+// Where private mode is missing, photos are not sent in silence.
 export const switchOf = (mode) =>
   mode?.root ??
-  offNote(LIFTS && !session.mode && "Private mode could not be loaded: photos are sent to the service. Reload the page to try again.");
+  offNote(LIFTS && !session.mode && "Private mode could not be loaded: photos are sent to the service. Reload the page.");
 
 export function subjectField(id = "", listed = "Type how it begins, or pick from the list.") {
   const searches = may("enroll");

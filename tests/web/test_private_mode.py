@@ -1,5 +1,6 @@
 """Private mode of the page: no face leaves the browser, and where one must, that is said."""
 
+import base64
 import json
 import re
 from collections.abc import Iterator
@@ -217,6 +218,22 @@ def test_the_same_photos_are_lifted_once(
         each["template"] for each in bodies_of(recording.sent, "POST /v1/subjects/anna/verify")
     ]
     assert probes[0] == probes[2] != probes[1]
+
+    # Two attempts at once, as two views make them while the graphs load: one of them lifts.
+    other = next(photos for name, photos in people.items() if name != WHO)[0]
+    refused = page.evaluate(
+        """async (text) => {
+          const { enroll, verify } = await import("/assets/private.js");
+          const photo = new Blob([Uint8Array.from(atob(text), (each) => each.charCodeAt(0))]);
+          const attempts = [
+            verify("anna", { photos: [photo], face: "largest", level: "fmr-1e-2" }),
+            enroll("emil", { photos: [photo], face: "largest" }, null),
+          ];
+          return (await Promise.allSettled(attempts)).map(({ reason }) => reason?.code ?? null);
+        }""",
+        base64.b64encode(other.read_bytes()).decode(),
+    )
+    assert refused == [None, "lifted_before"]
 
 
 def test_signing_out_ends_an_attempt_and_forgets_the_switch(

@@ -5,7 +5,7 @@ import type { Decision, Enrollment } from "../service/answers.js";
 import { ContractMismatch } from "../service/errors.js";
 import { Enrollable, type Probe } from "../service/lifts.js";
 import { PrivateClient, type PrivateOptions } from "../service/private-client.js";
-import { createPasskey, passkeyHolderKey, type Passkey } from "./passkey.js";
+import { createPasskey, passkeyHolderKey, PasskeyError, type Passkey } from "./passkey.js";
 
 export { PasskeyError } from "./passkey.js";
 
@@ -196,9 +196,17 @@ export class VeilfaceLogin extends Base {
     if (enrolls && this.#passkey?.subject !== subject) {
       this.#passkey = await createPasskey(subject, signal);
     }
-    const key = await passkeyHolderKey(subject, signal, enrolls ? this.#passkey : undefined);
-    this.#say(this.words.working);
-    return key;
+    try {
+      const key = await passkeyHolderKey(subject, signal, enrolls ? this.#passkey : undefined);
+      this.#say(this.words.working);
+      return key;
+    } catch (error) {
+      // It will not do the next time either.
+      if (error instanceof PasskeyError && error.code === "passkey_unsupported") {
+        this.#passkey = undefined;
+      }
+      throw error;
+    }
   }
 
   #given(): { options: Omit<PrivateOptions, "signal">; authorize: () => Promise<Authorization> } {

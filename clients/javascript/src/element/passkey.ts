@@ -96,6 +96,13 @@ export async function passkeyHolderKey(
 
 async function prompted(ask: () => Promise<Credential | null>): Promise<PublicKeyCredential> {
   let given: Credential | null = null;
+  // In a page that is not isolated from others on its way, or of a number as a host, there are none.
+  if (!isSecureContext || /^[\d.]+$|:/.test(location.hostname)) {
+    throw new PasskeyError(
+      "passkey_unsupported",
+      "Passkeys need HTTPS or localhost, and an address with a host name.",
+    );
+  }
   try {
     given = await ask();
   } catch (error) {
