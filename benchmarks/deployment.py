@@ -30,6 +30,21 @@ def veilface(*arguments: str | Path, env: dict[str, str]) -> str:
     return done.stdout
 
 
+def settings_of(
+    work: Path, pack: Path, url: str, *, made: Path | None = None, master_key: Path | None = None
+) -> dict[str, str]:
+    """Settings of a deployment in ``work``; decoys, contract and master key are in ``made``."""
+    made = made or work
+    return {
+        "VEILFACE_DATA_DIR": str(work),
+        "VEILFACE_DATABASE_URL": url,
+        "VEILFACE_PACK": str(pack),
+        "VEILFACE_DECOYS_FILE": str(made / "decoys.veil"),
+        "VEILFACE_CONTRACT_FILE": str(made / "contract.json"),
+        "VEILFACE_MASTER_KEY_FILE": str(master_key or made / "master.key"),
+    }
+
+
 def free_port() -> int:
     """A local port that nobody listens on now."""
     with socket.socket() as listener:

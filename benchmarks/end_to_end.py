@@ -32,7 +32,7 @@ import httpx
 import numpy as np
 import numpy.typing as npt
 
-from benchmarks.deployment import database, service, veilface
+from benchmarks.deployment import database, service, settings_of, veilface
 from models.cache import EmbeddingCache
 from models.extraction import Extractor
 from models.pack import FacePolicy, ModelPack
@@ -364,15 +364,8 @@ def main() -> None:
         work.mkdir(parents=True, exist_ok=True)
         made = args.prepared or work
         url = stack.enter_context(database(args.database, work))
-        env = os.environ | {
-            "VEILFACE_DATA_DIR": str(work),
-            "VEILFACE_DATABASE_URL": url,
-            "VEILFACE_PACK": str(args.pack),
-            "VEILFACE_DECOYS_FILE": str(made / "decoys.veil"),
-            "VEILFACE_CONTRACT_FILE": str(made / "contract.json"),
-            "VEILFACE_MASTER_KEY_FILE": str(args.master_key or made / "master.key"),
-            **UNLIMITED,
-        }
+        settings = settings_of(work, args.pack, url, made=made, master_key=args.master_key)
+        env = os.environ | settings | UNLIMITED
         started = time.perf_counter()
         if not args.prepared:
             prepare(args, work, env)

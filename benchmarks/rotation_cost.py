@@ -39,20 +39,6 @@ BOTH, TENANT, NONE = "both rotations", "the tenant's", "no rotation"
 READ, AS_STORED = "by the rules", "as sealed"
 
 
-class TenantOnly(Verifier):
-    """A verifier that derives and applies no holder's rotation."""
-
-    def _opened(
-        self,
-        stored: OpenedTemplate,
-        _key: HolderKey | None,
-        *,
-        read: Callable[[bytes], wire.WireTemplate],
-    ) -> tuple[SubspaceBatch, Turn]:
-        by_tenant = self._rotation.of(stored.template_id)
-        return SubspaceBatch.of([read(stored.wire).subspace]), by_tenant.turned
-
-
 class Unrotated(Verifier):
     """A verifier of templates that are in no rotation."""
 
@@ -63,7 +49,17 @@ class Unrotated(Verifier):
         *,
         read: Callable[[bytes], wire.WireTemplate],
     ) -> tuple[SubspaceBatch, Turn]:
-        return SubspaceBatch.of([read(stored.wire).subspace]), lambda points: points
+        return SubspaceBatch.of([read(stored.wire).subspace]), self._turn(stored)
+
+    def _turn(self, _stored: OpenedTemplate) -> Turn:
+        return lambda points: points
+
+
+class TenantOnly(Unrotated):
+    """A verifier that derives and applies no holder's rotation."""
+
+    def _turn(self, stored: OpenedTemplate) -> Turn:
+        return self._rotation.of(stored.template_id).turned
 
 
 def main() -> None:

@@ -36,7 +36,7 @@ import httpx
 import numpy as np
 import psutil
 
-from benchmarks.deployment import database, service, veilface
+from benchmarks.deployment import database, service, settings_of, veilface
 from benchmarks.end_to_end import LiftingClient, Person, enroll_photos, people_of, prepare
 from benchmarks.request_overhead import bare_inference
 from models.decoding import decode_image
@@ -241,18 +241,7 @@ def main() -> None:
     }
     with ExitStack() as stack:
         url = stack.enter_context(database(args.database, args.work))
-        env = (
-            os.environ
-            | limits
-            | {
-                "VEILFACE_DATA_DIR": str(args.work),
-                "VEILFACE_DATABASE_URL": url,
-                "VEILFACE_PACK": str(args.pack),
-                "VEILFACE_DECOYS_FILE": str(args.work / "decoys.veil"),
-                "VEILFACE_CONTRACT_FILE": str(args.work / "contract.json"),
-                "VEILFACE_MASTER_KEY_FILE": str(args.work / "master.key"),
-            }
-        )
+        env = os.environ | limits | settings_of(args.work, args.pack, url)
         if not (args.work / "contract.json").exists():
             prepare(args, args.work, env)
         rights = [x for r in ("enroll", "verify", "embeddings") for x in ("--right", r)]

@@ -35,7 +35,7 @@ import numpy as np
 import psutil
 from matplotlib.figure import Figure
 
-from benchmarks.deployment import database, service, veilface
+from benchmarks.deployment import database, service, settings_of, veilface
 from benchmarks.end_to_end import (
     UNLIMITED,
     Person,
@@ -211,18 +211,8 @@ def main() -> None:
     args.cache, args.pool, args.strategy = None, False, "adversarial"
     args.work.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
-        env = (
-            os.environ
-            | UNLIMITED
-            | {
-                "VEILFACE_DATA_DIR": str(args.work),
-                "VEILFACE_DATABASE_URL": stack.enter_context(database(args.database, args.work)),
-                "VEILFACE_PACK": str(args.pack),
-                "VEILFACE_DECOYS_FILE": str(args.work / "decoys.veil"),
-                "VEILFACE_CONTRACT_FILE": str(args.work / "contract.json"),
-                "VEILFACE_MASTER_KEY_FILE": str(args.work / "master.key"),
-            }
-        )
+        url = stack.enter_context(database(args.database, args.work))
+        env = os.environ | UNLIMITED | settings_of(args.work, args.pack, url)
         if not (args.work / "contract.json").exists():
             prepare(args, args.work, env)
         rights = [x for r in ("enroll", "verify", "erase", "embeddings") for x in ("--right", r)]

@@ -33,7 +33,7 @@ import httpx
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.deployment import database, service, veilface
+from benchmarks.deployment import database, service, settings_of, veilface
 from benchmarks.end_to_end import UNLIMITED, enroll_photos, people_of, prepare
 from benchmarks.service_load import Prepared, prepared_probes
 from models.pack import ModelPack
@@ -123,15 +123,7 @@ def main() -> None:
     args.work.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
         url = stack.enter_context(database(args.database, args.work))
-        settings = {
-            "VEILFACE_DATA_DIR": str(args.work),
-            "VEILFACE_DATABASE_URL": url,
-            "VEILFACE_PACK": str(args.pack),
-            "VEILFACE_DECOYS_FILE": str(args.work / "decoys.veil"),
-            "VEILFACE_CONTRACT_FILE": str(args.work / "contract.json"),
-            "VEILFACE_MASTER_KEY_FILE": str(args.work / "master.key"),
-        }
-        env = os.environ | settings | UNLIMITED
+        env = os.environ | settings_of(args.work, args.pack, url) | UNLIMITED
         if not (args.work / "contract.json").exists():
             prepare(args, args.work, env)
         rights = [x for r in ("enroll", "verify", "embeddings") for x in ("--right", r)]
