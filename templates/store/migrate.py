@@ -1,6 +1,7 @@
 """Bringing a database to the schema of this program, and finding out whether it is there."""
 
 import contextlib
+import functools
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -47,7 +48,9 @@ def upgrade(database: Database, revision: str = "head") -> None:
             _require_served(present)
             return
         target = head_revision() if revision == "head" else revision
-        if not database.is_sqlite and present not in (None, target):
+        if present == target:
+            return
+        if not database.is_sqlite and present is not None:
             _require_nobody_before(connection, target)
         with _short_waits(database, connection):
             command.upgrade(_config(connection), revision)
@@ -78,7 +81,7 @@ def current_revision(database: Database) -> str | None:
 
 def head_revision() -> str:
     """Revision this program needs."""
-    head = ScriptDirectory.from_config(_config(None)).get_current_head()
+    head = _scripts().get_current_head()
     assert head is not None, "the package holds at least one migration"  # noqa: S101
     return head
 
@@ -114,8 +117,13 @@ def _revision_of(connection: Connection) -> str | None:
 
 
 def _is_known(revision: str) -> bool:
-    scripts = ScriptDirectory.from_config(_config(None)).walk_revisions()
-    return revision in {script.revision for script in scripts}
+    return revision in {script.revision for script in _scripts().walk_revisions()}
+
+
+@functools.cache
+def _scripts() -> ScriptDirectory:
+    """The migrations of this program; each is compiled when they are read."""
+    return ScriptDirectory.from_config(_config(None))
 
 
 def _require_served(later: str) -> None:
