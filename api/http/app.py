@@ -6,16 +6,19 @@ import os
 import threading
 from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
-from functools import partial
+from functools import cache, partial
 from importlib.metadata import version
+from types import ModuleType
 from typing import Any
 
 import anyio
 import anyio.to_thread
-from fastapi import FastAPI, Request
+from fastapi import APIRouter, FastAPI, Request
 from fastapi.exceptions import RequestValidationError
+from fastapi.routing import iter_route_contexts
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
+from starlette.routing import BaseRoute
 
 from api.http.answers import error_answer
 from api.http.audit import note_refusal
@@ -69,6 +72,21 @@ from templates.errors import VeilfaceError
 from templates.keys.webhook_secret import read_webhook_secrets
 
 VERSION = version("veilface")
+API = (
+    own_key,
+    contract,
+    pack,
+    tokens,
+    enrollment,
+    photo_check,
+    subjects,
+    stored,
+    challenges,
+    verification,
+    lockout,
+    audit_log,
+    transfer,
+)
 GRACE_S = 20
 IMPORT_S = 60
 """Seconds in which a worker must show that it lives. It cannot before it has imported everything,
@@ -105,29 +123,13 @@ def create_app(
         redoc_url=None,
         openapi_url="/v1/openapi.json",
         redirect_slashes=False,
-        generate_unique_id_function=operation_id,
     )
     app.state.settings = settings
-    for routes in (
-        own_key,
-        contract,
-        pack,
-        tokens,
-        enrollment,
-        photo_check,
-        subjects,
-        stored,
-        challenges,
-        verification,
-        lockout,
-        audit_log,
-        transfer,
-    ):
-        app.include_router(routes.router)
+    app.router.routes.extend(_built(*API))
     if settings.web_page:
         app.router.routes.extend(page_routes(demo=settings.demo, serve_pack=settings.serve_pack))
     if settings.operations_port is None:
-        app.include_router(health.router)
+        app.router.routes.extend(_built(health))
         _add_middleware(app, settings, operations_paths=OPERATIONS_PATHS)
     else:
         _add_middleware(app, settings, operations_paths=frozenset())
@@ -136,13 +138,28 @@ def create_app(
     return app
 
 
+@cache
+def _built(*modules: ModuleType) -> list[BaseRoute]:
+    """The routes of modules, built now, and once for a process.
+
+    By itself the framework builds them for the first request to any, under filters of its own for
+    warnings. Those are the process's: a photo that is decoded meanwhile would change them.
+    """
+    router = APIRouter(generate_unique_id_function=operation_id)
+    for module in modules:
+        router.include_router(module.router)
+    for _ in iter_route_contexts(router.routes):
+        pass
+    return router.routes
+
+
 def _operations_app(app: FastAPI) -> FastAPI:
     """Make the application of the operations port: the state of ``app``, and no other routes."""
     operations_app = FastAPI(
         openapi_url=None, docs_url=None, redoc_url=None, redirect_slashes=False
     )
     operations_app.state = app.state
-    operations_app.include_router(health.router)
+    operations_app.router.routes.extend(_built(health))
     _add_middleware(operations_app, app.state.settings, operations_paths=OPERATIONS_PATHS)
     return operations_app
 
