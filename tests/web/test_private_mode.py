@@ -56,7 +56,7 @@ def recording(running: Running) -> Iterator[Proxy]:
 
 
 @pytest.fixture
-def served(running: Running, recording: Proxy) -> Iterator[Served]:
+def served(running: Running, recording: Proxy) -> Served:
     """The service behind the recording proxy, under a name, as passkeys need one."""
     settings = running.deployment.settings
     there = Served(
@@ -65,9 +65,10 @@ def served(running: Running, recording: Proxy) -> Iterator[Served]:
         settings,
         settings.data_dir / "absent.log",
     )
-    yield there
+    # Other modules of this package enroll her as well.
     with there.client() as client:
         client.delete("/v1/subjects/anna")
+    return there
 
 
 def choose(page: Page, *photos: Path) -> None:
