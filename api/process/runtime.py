@@ -169,7 +169,10 @@ class Runtime:
             store.secrets.get(name)
         file = settings.export_key_file
         export_key = None if file is None else ExportKey.from_file(file)
-        return cls(settings, keyring, store, contract, source, pack, export_key)
+        runtime = cls(settings, keyring, store, contract, source, pack, export_key)
+        (current, *_) = contract.binding.contract_ids
+        store.attempts.keep_stand_in(current, runtime.stand_ins.sealed_bytes)
+        return runtime
 
     @property
     def export_key(self) -> ExportKey:

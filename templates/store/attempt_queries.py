@@ -20,6 +20,7 @@ from templates.store.schema import (
     AuditHeadRow,
     AuditRow,
     FailedAttemptsRow,
+    StandInRow,
     SubjectRow,
     TemplateRow,
     TenantRow,
@@ -111,12 +112,19 @@ def before(count: int) -> Any:
 
     Of `tenant`, :func:`named` for so many pseudonyms, `subject_id`, `contract_id`,
     `earlier_contract_id`, `key_prefix`, `nonce_hash` and `nonce_digest`. The columns of the
-    template are NULL where the subject has none of either contract.
+    template are NULL where the subject has none of either contract; `stand_in` has as many bytes
+    where no ciphertext is stored, for the time that they take.
     """
     last = _last_attempt(count)
+    stand_in = sa.select(StandInRow.ciphertext).where(
+        StandInRow.contract_id == sa.bindparam("contract_id")
+    )
     return (
         sa.select(
             *TEMPLATE_COLUMNS,
+            sa.case((TemplateRow.ciphertext.is_(None), stand_in.scalar_subquery())).label(
+                "stand_in"
+            ),
             TenantRow.rotation_epoch.label("current_epoch"),
             sa.or_(sa.exists(_USED_NONCE), sa.exists(_LOGGED_NONCE)).label("used"),
             *COUNTS,

@@ -8,6 +8,7 @@ from its table changes nothing.
 """
 
 import contextlib
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from datetime import timedelta
@@ -26,7 +27,7 @@ from templates.store.identifiers import UnknownTenant, checked_subject_id
 from templates.store.lockout import LockedOut, LockoutPolicy, Nonce, Replayed, Superseded
 from templates.store.nonces import Nonces, spend
 from templates.store.outbox import EventType
-from templates.store.schema import FailedAttemptsRow, UsedNonceRow
+from templates.store.schema import FailedAttemptsRow, StandInRow, UsedNonceRow
 from templates.store.standing import UNKNOWN_RETENTION, AttemptsStatus, Standing
 from templates.store.subject_rows import (
     SubjectTemplate,
@@ -37,6 +38,9 @@ from templates.store.subject_rows import (
 
 NONCE_GRACE = timedelta(minutes=5)
 BATCH = 500
+_STAND_IN_SIZE: Any = sa.select(sa.func.length(StandInRow.ciphertext)).where(
+    StandInRow.contract_id == sa.bindparam("contract_id")
+)
 
 
 @dataclass(frozen=True)
@@ -93,6 +97,21 @@ class Attempts:
         self._idempotency = idempotency
         self._standing = Standing(context, policy)
 
+    def keep_stand_in(self, contract_id: str, size: int) -> None:
+        """Keep what :meth:`begin` reads where no template is stored: `size` random bytes.
+
+        The time that a template's bytes take would tell who is enrolled.
+        """
+
+        def work(connection: Connection) -> None:
+            if connection.execute(_STAND_IN_SIZE, {"contract_id": contract_id}).scalar() == size:
+                return
+            row = {"contract_id": contract_id, "ciphertext": os.urandom(size)}
+            connection.execute(sa.delete(StandInRow).where(StandInRow.contract_id == contract_id))
+            connection.execute(sa.insert(StandInRow).values(**row))
+
+        self._context.write(work, lock="stand-ins")
+
     def begin(
         self,
         tenant: str,
@@ -104,8 +123,8 @@ class Attempts:
     ) -> Attempt:
         """Read all that a decision needs, and refuse early what :meth:`conclude` would refuse.
 
-        One query, whether the subject is enrolled or not; nothing is written. It saves the work of
-        a decision, and decides nothing itself: others may fail meanwhile.
+        One query, and as many bytes, whether the subject is enrolled or not; nothing is written. It
+        saves the work of a decision, and decides nothing itself: others may fail meanwhile.
 
         Parameters
         ----------

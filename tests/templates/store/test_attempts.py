@@ -24,10 +24,12 @@ from templates.store import (
     LockoutPolicy,
     Nonce,
     Replayed,
+    Storage,
     Superseded,
     TemplateStore,
     UnknownTenant,
 )
+from templates.store.attempt_queries import before
 from templates.store.schema import FailedAttemptsRow, SubjectRow, UsedNonceRow
 from tests.templates.store.conftest import CONTRACT, Clock, put, template_id
 from tests.templates.store.test_concurrency import fork
@@ -65,6 +67,28 @@ def attempt(
     except Superseded:
         return "superseded"
     return "accept" if accepted else "reject"
+
+
+def test_as_many_bytes_are_read_of_whom_no_template_is_stored(store: TemplateStore) -> None:
+    """Else the time tells who is enrolled; in one query, and anew where templates grow."""
+    put(store, "ada", bytes(5000))
+    put(store, "bob", bytes(5000), storage=Storage.HOLDER)
+    rows: list[Any] = []
+    for subject in ("ada", "bob", "nobody"):
+        asked = store.attempts._asked("default", subject, None, [CONTRACT])
+        query = before(len(asked["pseudonyms"]))
+        rows.append(lambda query=query, asked=asked: read_of(store, query, asked))
+    (stored,) = rows[0]()
+    for size in (stored, stored + 100):
+        store.attempts.keep_stand_in(CONTRACT, size)
+        store.attempts.keep_stand_in("d" * 64, 7)
+        assert [row() for row in rows] == [[stored], [size], [size]]
+
+
+def read_of(store: TemplateStore, query: Any, asked: dict[str, Any]) -> list[int]:
+    """Sizes of the long values of the one row that a query reads."""
+    row = store.database.read(lambda connection: connection.execute(query, asked).one())
+    return [len(value) for value in row if isinstance(value, bytes) and len(value) > 1000]
 
 
 def conclude(
