@@ -71,13 +71,14 @@ class Database:
         return self._process().engine
 
     def read(self, work: Callable[[Connection], T]) -> T:
-        """Run `work` on a connection; what it sees is committed."""
+        """Run `work` on a connection; what it sees is committed. It may run several times."""
         process = self._process()
-        try:
+
+        def once() -> T:
             with process.readers.connect() as connection:
                 return work(connection)
-        except _DATABASE_ERRORS as error:
-            raise _translated(error) from None
+
+        return _again(once)
 
     def write(
         self, work: Callable[[Connection], T], *, lock: str | None = None, wait: float | None = None
@@ -138,23 +139,17 @@ class Database:
         self, work: Callable[[Connection], T], locks: sa.Executable, names: dict[str, Any]
     ) -> T:
         process = self._process()
-        for attempt in range(1, _ATTEMPTS + 1):
-            try:
-                if self.is_sqlite:
-                    # Threads queue here in turn; SQLite's own lock is polled and knows no order.
-                    with process.writing, process.writers.begin() as connection:
-                        return work(connection)
-                with process.writers.begin() as connection:
-                    connection.execute(locks, names)
+
+        def once() -> T:
+            if self.is_sqlite:
+                # Threads queue here in turn; SQLite's own lock is polled and knows no order.
+                with process.writing, process.writers.begin() as connection:
                     return work(connection)
-            except DBAPIError as error:
-                if attempt < _ATTEMPTS and _state(error.orig) in _RETRIED_STATES:
-                    time.sleep(random.uniform(0, 0.02 * 2**attempt))
-                    continue
-                raise _translated(error) from None
-            except _DATABASE_ERRORS as error:
-                raise _translated(error) from None
-        raise AssertionError("the last attempt returns or raises")
+            with process.writers.begin() as connection:
+                connection.execute(locks, names)
+                return work(connection)
+
+        return _again(once)
 
     def purge_log(self, *, wait: float | None = None) -> bool:
         """Move SQLite's write-ahead log into the database file and empty it.
@@ -316,6 +311,23 @@ _BESIDE_UNDER = _BESIDE.add_columns(
 
 def _state(error: BaseException | None) -> str:
     return getattr(error, "sqlstate", None) or ""
+
+
+def _again(once: Callable[[], T]) -> T:
+    """Run a transaction again where the server ended it for another one's sake.
+
+    Reads too: a migration holds one table while it waits for the next, and a query does as well.
+    """
+    for attempt in range(1, _ATTEMPTS + 1):
+        try:
+            return once()
+        except DBAPIError as error:
+            if attempt == _ATTEMPTS or _state(error.orig) not in _RETRIED_STATES:
+                raise _translated(error) from None
+            time.sleep(random.uniform(0, 0.02 * 2**attempt))
+        except _DATABASE_ERRORS as error:
+            raise _translated(error) from None
+    raise AssertionError("the last attempt returns or raises")
 
 
 def _translated(error: Exception) -> StoreError:

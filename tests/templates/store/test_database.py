@@ -1,3 +1,4 @@
+import contextlib
 import os
 import socket
 import sqlite3
@@ -15,7 +16,7 @@ from templates.keys.sealing import MasterKeyring
 from templates.store import TemplateStore
 from templates.store.database import Database
 from templates.store.schema import TenantRow
-from tests.patience import PATIENCE_S
+from tests.patience import PATIENCE_S, wait_until
 from tests.templates.store.conftest import put
 
 
@@ -335,3 +336,31 @@ def test_a_deadlock_is_tried_again(postgres_url: str, keyring: MasterKeyring) ->
     assert list(epochs) == [3, 3]
     database.close()
     store.close()
+
+
+def test_a_query_that_a_migration_ends_is_asked_again(postgres_url: str) -> None:
+    """Each holds the table that the other waits for; the server ends the query."""
+    database = Database(postgres_url)
+    tables = ("CREATE TABLE a AS SELECT 1 AS x", "CREATE TABLE b AS SELECT 2 AS x")
+    for table in tables:
+        database.write(lambda each, table=table: each.exec_driver_sql(table))
+    runs, answers = list[int](), list[int]()
+
+    def query(connection: sa.Connection) -> int:
+        runs.append(1)
+        return int(connection.exec_driver_sql("SELECT a.x + b.x FROM a, b").scalar_one())
+
+    waits = "SELECT count(*) FROM pg_locks WHERE NOT granted AND relation = 'b'::regclass"
+    with psycopg.connect(postgres_url) as migration, psycopg.connect(postgres_url) as observer:
+        with contextlib.suppress(psycopg.errors.InsufficientPrivilege), migration.transaction():
+            migration.execute("SET deadlock_timeout = '1min'")  # so that the query is ended
+        migration.execute("LOCK TABLE b IN ACCESS EXCLUSIVE MODE")
+        thread = threading.Thread(target=lambda: answers.append(database.read(query)))
+        thread.start()
+        wait_until(lambda: (observer.execute(waits).fetchone() or (0,))[0] == 1)
+        migration.execute("LOCK TABLE a IN ACCESS EXCLUSIVE MODE")
+        migration.commit()
+    thread.join()
+    assert answers == [3]
+    assert len(runs) == 2
+    database.close()
