@@ -156,6 +156,7 @@ def full_disk_run(
         service.kill()
         examined = examine(clients, list(subjects))
     report.violations += [*unexpected(clients.history, _is_unavailable), *examined.violations]
+    report.violations += service.defects()
     report.audit_lines = examined.lines
     for each in clients.history:
         report.refused += each.outcome == 503

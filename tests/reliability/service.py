@@ -143,6 +143,11 @@ class Service:
         """The end of its log."""
         return "\n".join(json.dumps(line) for line in self.log[-20:])
 
+    def defects(self) -> list[str]:
+        """What it logged of requests that no code of its own answers."""
+        failed = (line for line in self.log if line.get("code") == "internal_error")
+        return [f"{line['method']} {line['route']}: {line['error_type']}" for line in failed]
+
     def _collect(self, process: "subprocess.Popen[bytes]") -> None:
         assert process.stderr is not None
         with process.stderr as lines:
