@@ -7,7 +7,7 @@ import { createServer } from "node:http";
 import { extname } from "node:path";
 import { json } from "node:stream/consumers";
 import { promisify } from "node:util";
-// In a project of yours: "veilface-client", from node_modules.
+// In a project of yours: "veilface-client"; its files, and those of the runtime, are in node_modules.
 import { Client, NotEnrolled } from "../../clients/javascript/dist/index.js";
 
 const { VEILFACE_URL, VEILFACE_API_KEY, PORT = "3000" } = process.env;

@@ -23,7 +23,7 @@ from veilface_client import Client, NotEnrolled, VeilfaceError
 URL = os.environ["VEILFACE_URL"].rstrip("/")
 CLIENT = Client(URL, os.environ["VEILFACE_API_KEY"])
 HERE = Path(__file__).parent
-PACKAGE = HERE.parents[1] / "clients" / "javascript"  # of yours: node_modules/veilface-client
+PACKAGE = HERE.parents[1] / "clients" / "javascript"  # in a project of yours: node_modules
 POLICY = (
     "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; "
     f"connect-src 'self' {URL}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
