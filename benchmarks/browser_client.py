@@ -5,9 +5,11 @@ attempt, and enrolls photos 1-3 of every person by templates that it lifts itsel
 lifted once each and verified against the person (genuine) and all others (impostor). The Python
 private client then does the same with the same photos. An enrollment that is refused counts as
 failed genuine attempts. Then every person stands before a fake camera, and ``<veilface-login>`` is
-timed from the click to its answer. Every byte that the browser sends goes through a recording
-proxy, no other host has an address for it, and the recording is searched for the photos, what the
-camera showed, and their descriptors; those that are sent on purpose afterwards must be found.
+timed from the click to its answer; and so is the service's own page in private mode, from the
+shutter, with *Verify* pressed as soon as it can be. Every byte that the browser sends goes through
+a recording proxy, no other host has an address for it, and the recording is searched for the
+photos, what the camera showed, and their descriptors; those that are sent on purpose afterwards
+must be found.
 
 Needs Chromium and the built client (``make javascript``).
 
@@ -32,7 +34,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from playwright.sync_api import BrowserContext, sync_playwright
+from playwright.sync_api import BrowserContext, Locator, expect, sync_playwright
 
 from benchmarks.deployment import VEILFACE, service
 from benchmarks.end_to_end import (
@@ -51,6 +53,7 @@ from benchmarks.private_client import (
 from models.decoding import decode_image
 from models.errors import FaceError
 from models.pack import FacePolicy, ModelPack
+from tests.clients.proxy import Proxy
 from tests.leaks import LeakSearch
 from tests.patience import PATIENCE_S
 from tests.web.browser_tab import BrowserTab
@@ -73,6 +76,30 @@ PLANTED = {
     "decimal text": ("descriptor", "decimals"),
 }
 """What is sent on purpose: what must be found of it, and how the form of the leak begins."""
+SHUTTER = """async () => {
+  const there = (find) =>
+    new Promise((resolve) => {
+      const look = () => {
+        const found = find();
+        if (found) resolve(found);
+        return Boolean(found);
+      };
+      if (look()) return;
+      const observer = new MutationObserver(() => look() && observer.disconnect());
+      observer.observe(document.body, { subtree: true, childList: true, attributes: true });
+    });
+  const since = (start) => (performance.now() - start) / 1000;
+  const start = performance.now();
+  const buttons = [...document.querySelectorAll("form button")];
+  buttons.find(({ textContent }) => textContent === "Take 3 photos").click();
+  (await there(() => document.querySelector("form button[type=submit]:enabled"))).click();
+  const taken = since(start);
+  const answer = await there(() => document.querySelector(".verdict, [role=alert]"));
+  const accepted = answer.matches(".accept");
+  const error = answer.matches(".verdict") ? null : answer.textContent;
+  return { seconds: since(start), taken, accepted, error };
+}"""
+"""Takes a burst and verifies it; when the photos were taken, and when the answer was there."""
 _REQUEST = re.compile(rb"([A-Z]+) (/\S*) HTTP/1\.1\r\n(.*?)\r\n\r\n", re.DOTALL)
 _NAMED = re.compile(rb"^(/v1/subjects/|/v1/pack/|/photos/)[^/]+|^(/client/|/ort/).+")
 _LENGTH = re.compile(rb"^content-length: (\d+)", re.IGNORECASE | re.MULTILINE)
@@ -199,6 +226,51 @@ def _log_in(opened: Visit, person: Person) -> tuple[dict[str, Any], bytes]:
     return answer, frame
 
 
+def first_look(context: BrowserContext, url: str, key: str, subject: str) -> tuple[BrowserTab, int]:
+    """Open the service's page at its camera, until it has judged a frame in private mode.
+
+    Also returns the bytes that were downloaded for that.
+    """
+    tab = BrowserTab.of(context, url + "/")
+    tab.page.set_default_timeout(1000 * PATIENCE_S)
+    tab.sign_in(key)
+    _step_before(tab, subject)
+    size: int = tab.page.evaluate(
+        "performance.getEntries().reduce((sum, { transferSize }) => sum + (transferSize ?? 0), 0)"
+    )
+    return tab, size
+
+
+def by_the_shutter(
+    tab: BrowserTab, camera: FakeCamera, people: Sequence[Person], *, level: str
+) -> list[dict[str, Any]]:
+    """Verify everybody on the service's page; what it told each, and after how long."""
+    answers = []
+    for person in people:
+        camera.shows(person.probes[0])
+        guidance = _step_before(tab, person.name)
+        tab.page.get_by_label("Level").select_option(level)
+        if guidance.get_attribute("data-state") == "good":
+            answers.append(tab.page.evaluate(SHUTTER))
+        else:
+            answers.append({"accepted": False, "error": guidance.text_content()})
+    return answers
+
+
+def _step_before(tab: BrowserTab, subject: str) -> Locator:
+    # Leaving the view stops the camera.
+    tab.open("Service")
+    tab.open("Verify")
+    expect(tab.page.get_by_role("switch", name="Private mode")).to_be_checked()
+    tab.page.get_by_label("Person's id").fill(subject)
+    # Some of these photos have others in their background.
+    tab.page.get_by_label("Others may be in the picture").check()
+    tab.page.get_by_role("button", name="Start camera").click()
+    guidance = tab.page.locator(".guidance")
+    expect(guidance).to_have_attribute("data-state", re.compile("good|bad"))
+    return guidance
+
+
 def faces_of(
     pack: ModelPack, people: Sequence[Person], shown: Mapping[str, bytes] = MappingProxyType({})
 ) -> LeakSearch:
@@ -298,6 +370,7 @@ def main() -> None:
     args = parser.parse_args()
     env = prepared(args) | {"VEILFACE_PACK": str(args.pack), "VEILFACE_SERVE_PACK": "true"}
     people = people_of(args.data / "lfw" / "photos")[: args.people]
+    expect.set_options(timeout=1000 * PATIENCE_S)
     impostors = len(people) - 1
     pack = ModelPack.load(args.pack, threads=1)
 
@@ -317,16 +390,26 @@ def main() -> None:
         opened = visit(context, served)
         downloaded.append(opened.call("prepare"))
         browser, seconds = browser_outcome(opened, people, impostors=impostors)
-        by_camera, shown = before_the_camera(
-            opened, camera, [p for p in people if p.name not in browser.refused_enrollments]
-        )
+        there = [each for each in people if each.name not in browser.refused_enrollments]
+        by_camera, shown = before_the_camera(opened, camera, there)
+        recording = stack.enter_context(Proxy(int(address.rsplit(":", 1)[1])))
+        camera.shows(there[0].probes[0])
+        looked, page_bytes = first_look(context, recording.url, key, there[0].name)
+        looked.page.close()
+        again, page_bytes_again = first_look(context, recording.url, key, there[0].name)
+        by_page = by_the_shutter(again, camera, there, level=args.level)
         load_after = os.getloadavg()[0]
-        sent = served.recording.sent
+        sent = served.recording.sent + recording.sent
         calls, rest = requests_in(sent)
         search = faces_of(pack, people, shown)
         leaks = search.find(sent)
         missed = planted_and_missed(opened, people[0].probes[0], search)
-        complaints = [*first.tab.complaints, *opened.tab.complaints, *opened.tab.violations()]
+        tabs = [first.tab, opened.tab, looked, again]
+        complaints = [complaint for tab in tabs for complaint in tab.complaints]
+        complaints += [*opened.tab.violations(), *again.violations()]
+        # Each tab has noted every request of the browser.
+        here = (served.url, recording.url, "blob:", "data:")
+        strays = sorted({each for each in first.tab.requests if not each.startswith(here)})
         with PrivateClient(
             address, key, pack=args.pack, command=VEILFACE, dim=args.probe_dim
         ) as client:
@@ -334,7 +417,6 @@ def main() -> None:
                 client, people, level=args.level, impostors=impostors, at_once=1
             )
 
-    answered = [each for each in by_camera if each["error"] is None]
     report = {
         "pack": args.pack.name,
         "strategy": args.strategy,
@@ -349,10 +431,13 @@ def main() -> None:
             for each in downloaded
         ],
         "photo_to_answer": _seconds(seconds),
-        "click_to_answer_by_the_element": {
-            **_seconds([each["seconds"] for each in answered]),
-            "accepted": sum(each["accepted"] for each in answered),
-            "errors": [each["error"] for each in by_camera if each["error"] is not None],
+        "click_to_answer_by_the_element": _answered(by_camera),
+        "own_page_in_private_mode": {
+            "bytes_downloaded": [page_bytes, page_bytes_again],
+            "shutter_to_answer": _answered(by_page),
+            "of_which_until_the_photos_are_taken": _seconds(
+                [each["taken"] for each in by_page if each["error"] is None]
+            ),
         },
         "load_average_before_and_after": [round(load_before, 1), round(load_after, 1)],
         "complaints_of_the_browser": complaints,
@@ -360,13 +445,22 @@ def main() -> None:
             "bytes": len(sent),
             "requests": calls,
             "bytes_of_no_request": rest,
-            "to_other_hosts": first.tab.strays(),
+            "to_other_hosts": strays,
             "leaks": [f"{leak.what}: {leak.form}" for leak in leaks],
             "planted_forms": len(PLANTED),
             "planted_and_missed": missed,
         },
     }
     print(json.dumps(report, indent=2))
+
+
+def _answered(answers: Sequence[Mapping[str, Any]]) -> dict[str, object]:
+    answered = [each for each in answers if each["error"] is None]
+    return {
+        **_seconds([each["seconds"] for each in answered]),
+        "accepted": sum(each["accepted"] for each in answered),
+        "errors": [each["error"] for each in answers if each["error"] is not None],
+    }
 
 
 def _seconds(seconds: Sequence[float]) -> dict[str, object]:

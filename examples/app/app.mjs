@@ -1,19 +1,23 @@
-// Accounts with a password first and a face second; the page sends its photos to Veilface itself.
-// Node 18 or newer, no packages; an API key with the rights enroll and verify, and the address of
-// this program in the service's setting cors_origins.
+// Accounts with a password first and a face second; of the face, the page sends a private template.
+// Node 20 or newer, the JavaScript client (make javascript), and what docs/login.md says of the
+// service.
 import { randomBytes, scrypt, timingSafeEqual } from "node:crypto";
-import { readFileSync } from "node:fs";
+import { readFile } from "node:fs/promises";
 import { createServer } from "node:http";
+import { extname } from "node:path";
 import { json } from "node:stream/consumers";
 import { promisify } from "node:util";
+// In a project of yours: "veilface-client"; its files, and those of the runtime, are in node_modules.
+import { Client, NotEnrolled } from "../../clients/javascript/dist/index.js";
 
 const { VEILFACE_URL, VEILFACE_API_KEY, PORT = "3000" } = process.env;
 const service = VEILFACE_URL.replace(/\/+$/, "");
+const veilface = new Client(service, VEILFACE_API_KEY);
 const policy =
-  `default-src 'none'; script-src 'self'; connect-src 'self' ${service}; frame-ancestors 'none'`;
+  "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; " +
+  `connect-src 'self' ${service}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'`;
 const accounts = new Map(); // name to account; yours live in a database
 const sessions = new Map(); // id to { account, face, tokenId }: who knew the password
-const file = (name) => readFileSync(new URL(name, import.meta.url));
 
 class Refused extends Error {
   constructor(status, message) {
@@ -41,16 +45,13 @@ async function credentials(request) {
   return { name, password };
 }
 
-async function veilface(path, body) {
-  const answer = await fetch(`${service}/v1${path}`, {
-    method: body ? "POST" : "GET",
-    body: body && JSON.stringify(body),
-    headers: { Authorization: `Bearer ${VEILFACE_API_KEY}`, "Content-Type": "application/json" },
-  });
-  const told = await answer.json();
-  if (told.error?.code === "not_enrolled") return null;
-  if (!answer.ok) throw new Error(told.error.message);
-  return told;
+async function enrolled(subject) {
+  try {
+    return await veilface.describe(subject);
+  } catch (error) {
+    if (error instanceof NotEnrolled) return null;
+    throw error;
+  }
 }
 
 const routes = {
@@ -77,24 +78,21 @@ const routes = {
   // To enroll where there is no face yet, and else to verify.
   async "POST /token"(request, response, session) {
     const { subject } = session.account;
-    const enrolled = await veilface(`/subjects/${subject}`);
-    const action = enrolled ? "verify" : "enroll";
     // The first face only: who holds an older token must not replace it.
-    const first = enrolled ? {} : { replace: false };
-    const { token, token_id } = await veilface("/tokens", { subject_id: subject, action, ...first });
+    const asked = (await enrolled(subject)) ? { action: "verify" } : { action: "enroll", replace: false };
+    const { token, token_id } = await veilface.token(subject, asked);
     session.tokenId = token_id; // it stays here: the page could name another one
-    const [method, path] = enrolled ? ["POST", "verify"] : ["PUT", "enrollment"];
-    return [200, { action, method, url: `${service}/v1/subjects/${subject}/${path}`, token }];
+    return [200, { service, action: asked.action, subject, token }];
   },
   // Ask the service what the page did with its token, and let in who is accepted.
   async "POST /face"(request, response, session) {
     const { tokenId } = session;
     session.tokenId = undefined;
-    if (!tokenId) throw new Refused(409, "ask for a token first");
-    const { outcome } = await veilface(`/subjects/${session.account.subject}/tokens/${tokenId}`);
+    const { subject, name } = session.account;
+    const { outcome } = tokenId ? await veilface.tokenOutcome(subject, tokenId) : {};
     const accepted = ["accept", "created"].includes(outcome);
     if (accepted) open(response, { account: session.account, face: true });
-    return [200, { accepted }];
+    return [200, { accepted, name }];
   },
   async "GET /account"(request, response, session) {
     if (!session.face) throw new Refused(401, "show your face");
@@ -102,17 +100,31 @@ const routes = {
   },
 };
 const unsigned = new Set(["POST /register", "POST /login"]);
-const files = {
-  "/": [file("index.html"), { "Content-Type": "text/html", "Content-Security-Policy": policy }],
-  "/page.js": [file("page.js"), { "Content-Type": "text/javascript" }],
+const types = { ".html": "text/html", ".js": "text/javascript", ".mjs": "text/javascript", ".wasm": "application/wasm" };
+const folders = {
+  "/client/": "../../clients/javascript/dist/",
+  "/ort/": "../../clients/javascript/node_modules/onnxruntime-web/dist/",
 };
+
+// The page, and what it runs: the name of a file has no dot in front, so none leaves its folder.
+function fileOf(path) {
+  if (path === "/") return "index.html";
+  if (path === "/page.js") return "page.js";
+  const [, folder, file] = /^(\/\w+\/)((?:\w+\/)*\w[\w.-]*\.(?:m?js|wasm))$/.exec(path) ?? [];
+  return folder in folders ? folders[folder] + file : null;
+}
+
+async function sendFile(name, response) {
+  const body = await readFile(new URL(name, import.meta.url)).catch(() => null);
+  if (body === null) throw new Refused(404, "there is no such file");
+  const headers = { "Content-Type": types[extname(name)], "Content-Security-Policy": policy };
+  response.writeHead(200, headers).end(body);
+}
 
 createServer(async (request, response) => {
   try {
-    if (request.method === "GET" && Object.hasOwn(files, request.url)) {
-      const [body, headers] = files[request.url];
-      return response.writeHead(200, headers).end(body);
-    }
+    const name = request.method === "GET" && fileOf(request.url);
+    if (name) return await sendFile(name, response);
     const call = `${request.method} ${request.url}`;
     if (!Object.hasOwn(routes, call)) throw new Refused(404, "there is no such page");
     const [, id] = /(?:^|; )session=([\w-]+)/.exec(request.headers.cookie ?? "") ?? [];

@@ -1,7 +1,7 @@
-"""Accounts with a password first and a face second; the page sends its photos to Veilface itself.
+"""Accounts with a password first and a face second; of the face, the page sends a private template.
 
-Needs fastapi, uvicorn and veilface-client, an API key with the rights enroll and verify, and the
-address of this program in the service's setting cors_origins.
+Needs fastapi, uvicorn, both clients (``make javascript``), and what docs/login.md says of the
+service.
 """
 
 import hashlib
@@ -15,6 +15,7 @@ from typing import Annotated
 import uvicorn
 from fastapi import Cookie, Depends, FastAPI, HTTPException, Request, Response
 from fastapi.responses import FileResponse, JSONResponse
+from fastapi.staticfiles import StaticFiles
 from pydantic import BaseModel, Field
 
 from veilface_client import Client, NotEnrolled, VeilfaceError
@@ -22,7 +23,11 @@ from veilface_client import Client, NotEnrolled, VeilfaceError
 URL = os.environ["VEILFACE_URL"].rstrip("/")
 CLIENT = Client(URL, os.environ["VEILFACE_API_KEY"])
 HERE = Path(__file__).parent
-POLICY = f"default-src 'none'; script-src 'self'; connect-src 'self' {URL}; frame-ancestors 'none'"
+PACKAGE = HERE.parents[1] / "clients" / "javascript"  # in a project of yours: node_modules
+POLICY = (
+    "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; "
+    f"connect-src 'self' {URL}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
 app = FastAPI(openapi_url=None)
 
 
@@ -112,27 +117,23 @@ def token(session: HasPassword) -> dict[str, str]:
         CLIENT.describe(subject)
     except NotEnrolled:
         # The first face only: who holds an older token must not replace it.
-        action, method, path = "enroll", "PUT", "enrollment"
         issued = CLIENT.create_token(subject, "enroll", replace=False)
     else:
-        action, method, path = "verify", "POST", "verify"
         issued = CLIENT.create_token(subject, "verify")
     session.token_id = issued.token_id  # it stays here: the page could name another one
-    url = f"{URL}/v1/subjects/{subject}/{path}"
-    return {"action": action, "method": method, "url": url, "token": issued.token}
+    return {"service": URL, "action": issued.action, "subject": subject, "token": issued.token}
 
 
 @app.post("/face")
-def face(session: HasPassword, response: Response) -> dict[str, bool]:
+def face(session: HasPassword, response: Response) -> dict[str, bool | str]:
     """Ask the service what the page did with its token, and let in who is accepted."""
     token_id, session.token_id = session.token_id, None
-    if token_id is None:
-        raise HTTPException(409, "ask for a token first")
-    outcome = CLIENT.token_outcome(session.account.subject, token_id).outcome
+    subject = session.account.subject
+    outcome = CLIENT.token_outcome(subject, token_id).outcome if token_id else None
     accepted = outcome in ("accept", "created")
     if accepted:
         open_session(response, Session(session.account, face=True))
-    return {"accepted": accepted}
+    return {"accepted": accepted, "name": session.account.name}
 
 
 @app.get("/account")
@@ -153,6 +154,10 @@ def page() -> FileResponse:
 def script() -> FileResponse:
     """Its script."""
     return FileResponse(HERE / "page.js")
+
+
+app.mount("/client", StaticFiles(directory=PACKAGE / "dist"))
+app.mount("/ort", StaticFiles(directory=PACKAGE / "node_modules" / "onnxruntime-web" / "dist"))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,8 @@
-// The password goes to our own server, the photo to Veilface alone, with a token for one attempt.
+// The password goes to our own server, and to Veilface a private template alone: the element embeds
+// and lifts here. Neither gets a photo.
+import { defineLogin } from "/client/element/login.js";
+import * as ort from "/ort/ort.wasm.min.mjs";
+
 const form = document.querySelector("form");
 const output = document.querySelector("output");
 
@@ -11,33 +15,33 @@ async function own(path, body) {
   return told;
 }
 
-async function show(photo) {
-  const { method, url, token } = await own("/token");
-  const body = new FormData();
-  body.append("images", photo);
-  // The same key for each sending: an attempt whose answer is lost is not lost with it.
-  const headers = { Authorization: `Bearer ${token}`, "Idempotency-Key": crypto.randomUUID() };
-  const send = () => fetch(url, { method, body, headers }).then((answer) => answer.json());
-  let told = await send().catch(send);
-  // An earlier sending is still at work: before it is done, nobody knows what comes of it.
-  const end = Date.now() + 120_000; // no token lives longer
-  while (told.error?.code === "idempotency_conflict" && Date.now() < end) {
-    await new Promise((resolve) => setTimeout(resolve, 1000));
-    told = await send().catch(send);
-  }
-  // Of one whose answer was lost the token is used up: the server asks what came of it.
-  if (told.error && told.error.code !== "replayed") throw new Error(told.error.message);
+defineLogin();
+const login = document.createElement("veilface-login");
+login.options = { runtime: ort };
+login.authorize = () => own("/token");
+
+// What counts is what the server learned itself, after an error too: an answer may have been lost.
+async function ended() {
+  const { accepted, name } = await own("/face").catch(({ message }) => ((output.value = message), {}));
+  if (!accepted) return;
+  login.remove();
+  output.value = `Welcome, ${name}`;
 }
+login.addEventListener("veilface-result", ended);
+login.addEventListener("veilface-error", ended);
 
 form.addEventListener("submit", async (event) => {
   event.preventDefault();
-  const { name, password, photo } = Object.fromEntries(new FormData(form));
+  const { name, password } = Object.fromEntries(new FormData(form));
+  login.remove();
   output.value = "…";
   try {
     await own(event.submitter.value, { name, password });
-    await show(photo);
-    const { accepted } = await own("/face"); // what the server learned itself
-    output.value = accepted ? `Welcome, ${name}` : "This is somebody else";
+    const { service, action } = await own("/token");
+    login.setAttribute("service", service);
+    login.setAttribute("action", action);
+    form.after(login);
+    output.value = action === "enroll" ? "Now enroll your face" : "Now show your face";
   } catch (error) {
     output.value = error.message;
   }

@@ -170,12 +170,12 @@ class Deployment:
     contract: Contract
     source: DecoySource
 
-    def key(self, *rights: str, tenant: str = "default") -> str:
+    def key(self, *rights: str, tenant: str = "default", **options: Any) -> str:
         """Make another API key; return its token."""
         store = open_store(self.settings, open_keyring(self.settings))
         try:
             store.tenants.create(tenant)
-            return store.api_keys.create(tenant, rights).token
+            return store.api_keys.create(tenant, rights, **options).token
         finally:
             store.close()
 

@@ -27,16 +27,12 @@ ENROLLED = 3
 
 @dataclass(frozen=True)
 class Service:
-    """Where it is, two of its keys, and photos of people who do not exist; `ann` is person 1.
-
-    Pages on the ports `pages` may call it.
-    """
+    """Where it is, two of its keys, and photos of people who do not exist; `ann` is person 1."""
 
     url: str
     token: str
     verifying: str
     world: World
-    pages: tuple[int, int]
 
     def photo(self, person: int, number: int) -> bytes:
         (path,) = self.world.photos(person, range(number, number + 1))
@@ -80,9 +76,8 @@ def service(world: World, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
         for rights in (("--right", "verify"), ("--right", "verify", "--right", "enroll",
                        "--right", "erase", "--right", "admin"))
     ]  # fmt: skip
-    port, pages = free_port(), (free_port(), free_port())
+    port = free_port()
     env = clean_environment(
-        VEILFACE_CORS_ORIGINS=",".join(f"http://127.0.0.1:{page}" for page in pages),
         VEILFACE_PACK=str(world.pack),
         VEILFACE_DATA_DIR=str(data),
         VEILFACE_ACCEPT_WEAK_PRIVACY="true",
@@ -93,7 +88,7 @@ def service(world: World, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
     with running(serve, url + "/health/ready", env, folder / "serve.log"):
         with Client(url, made[0]) as client:
             client.verify("ann", photos[0])
-        yield Service(url, made[1], made[0], world, pages)
+        yield Service(url, made[1], made[0], world)
 
 
 def node() -> str:

@@ -1,55 +1,116 @@
-"""The application examples: a password first, then a face, with a token that the page holds."""
+"""The application in both backends: a password first, then a face, of which a template is sent."""
 
+import base64
 from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
-from playwright.sync_api import Browser
+from playwright.sync_api import Browser, Page, Route, expect
 
-from tests.examples.conftest import EXAMPLES, PYTHON, Service, clean_environment, node, running
-from tests.patience import wait_until
+from benchmarks.browser_client import faces_of, requests_in
+from benchmarks.end_to_end import Person
+from models.pack import ModelPack
+from templates.contract.liveness_policy import LivenessPolicy
+from tests.clients.conftest import Running
+from tests.clients.javascript.conftest import PACKAGE, require_client
+from tests.clients.proxy import Proxy
+from tests.examples.conftest import EXAMPLES, PYTHON, clean_environment, node, running
+from tests.leaks import as_bytes
 from tests.ports import free_port
-from tests.web.conftest import chromium, running_browser
-from veilface_client import Client
+from tests.web.browser_tab import BrowserTab
+from tests.web.camera import FakeCamera
+from tests.web.conftest import camera, chromium, pack, people, running_browser
+from tests.web.deployments import OTHER, WHO, private_service
 
-__all__ = ["chromium"]
+__all__ = ["camera", "chromium", "pack", "people"]
 
 pytestmark = pytest.mark.long
 PASSWORD = "correct horse"
+BACKENDS = ("app.py", "app.mjs")
+FRAME = """async (login) => {
+  const video = login.shadowRoot.querySelector("video");
+  const canvas = new OffscreenCanvas(video.videoWidth, video.videoHeight);
+  canvas.getContext("2d").drawImage(video, 0, 0);
+  const bytes = new Uint8Array(await (await canvas.convertToBlob()).arrayBuffer());
+  return btoa(Array.from(bytes, (byte) => String.fromCharCode(byte)).join(""));
+}"""
+PLANT = """async ([url, text]) => {
+  const body = Uint8Array.from(atob(text), (each) => each.charCodeAt(0));
+  await fetch(url, { method: "POST", body }).catch(() => {});
+}"""
+
+
+@dataclass(frozen=True)
+class Place:
+    """The service, and the application of each backend; proxies keep what comes to them."""
+
+    running: Running
+    service: Proxy
+    apps: dict[str, Proxy]
+    ports: dict[str, int]
+
+    def key(self, **options: Any) -> str:
+        """What docs/login.md says that the application needs, and no more."""
+        return self.running.deployment.key("enroll", "verify", "embeddings", **options)
+
+    def environment(self, key: str, backend: str) -> dict[str, str]:
+        return clean_environment(
+            VEILFACE_URL=self.service.url, VEILFACE_API_KEY=key, PORT=str(self.ports[backend])
+        )
 
 
 @pytest.fixture(scope="module")
-def browser(chromium: Path) -> Iterator[Browser]:
-    with running_browser(chromium) as opened:
+def browser(chromium: Path, camera: FakeCamera) -> Iterator[Browser]:
+    with running_browser(chromium, *camera.flags) as opened:
         yield opened
 
 
-@pytest.fixture(params=["app.py", "app.mjs"], scope="module")
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory, mbf_pack_dir: Path) -> Iterator[Place]:
+    require_client()
+    ports = {backend: free_port() for backend in (*BACKENDS, "strict")}
+    with ExitStack() as stack:
+        apps = {name: stack.enter_context(Proxy(port)) for name, port in ports.items()}
+        origins = ",".join(proxy.url for proxy in apps.values())
+        folder = tmp_path_factory.mktemp("private")
+        service = stack.enter_context(private_service(folder, mbf_pack_dir, cors_origins=origins))
+        recording = stack.enter_context(Proxy(service.port))
+        yield Place(service, recording, apps, ports)
+
+
+@pytest.fixture(params=BACKENDS, scope="module")
 def app(
-    request: pytest.FixtureRequest, service: Service, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[str]:
-    python = request.param.endswith(".py")
-    port = service.pages[0 if python else 1]
-    env = clean_environment(
-        VEILFACE_URL=service.url, VEILFACE_API_KEY=service.token, PORT=str(port)
-    )
+    request: pytest.FixtureRequest, place: Place, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Proxy]:
+    name = request.param
     log = tmp_path_factory.mktemp("app") / "app.log"
-    arguments = [PYTHON if python else node(), str(EXAMPLES / "app" / request.param)]
-    with running(arguments, f"http://127.0.0.1:{port}/", env, log) as url:
-        yield url
+    with running(command(name), direct(place, name), place.environment(place.key(), name), log):
+        yield place.apps[name]
+
+
+def command(backend: str) -> list[str]:
+    return [PYTHON if backend == "app.py" else node(), str(EXAMPLES / "app" / backend)]
+
+
+def direct(place: Place, backend: str) -> str:
+    return f"http://127.0.0.1:{place.ports[backend]}/"
 
 
 class Visitor:
-    """A browser: it keeps the session that it was given last."""
+    """A program in the place of the page: it keeps the session that it was given last."""
 
     def __init__(self, url: str) -> None:
         self._url, self.session = url, ""
 
     def send(self, method: str, path: str, **options: Any) -> httpx.Response:
         headers = {"Cookie": f"session={self.session}"} if self.session else {}
-        answer = httpx.request(method, self._url + path, headers=headers, timeout=60, **options)
+        answer = httpx.request(
+            method, f"{self._url}/{path}", headers=headers, timeout=60, **options
+        )
         if cookie := answer.headers.get("Set-Cookie"):
             assert {part.strip().lower() for part in cookie.split(";")} >= {
                 "httponly", "secure", "samesite=strict",
@@ -60,16 +121,14 @@ class Visitor:
     def sign(self, path: str, name: str, password: str = PASSWORD) -> int:
         return self.send("POST", path, json={"name": name, "password": password}).status_code
 
-    def show(self, photo: bytes) -> dict[str, Any]:
-        """Do what the page does; return what it was given."""
-        given: dict[str, Any] = self.send("POST", "token").json()
-        answer = httpx.request(
-            given["method"],
-            given["url"],
-            files={"images": photo},
-            headers={"Authorization": f"Bearer {given['token']}"},
-            timeout=60,
-        )
+    def token(self) -> dict[str, str]:
+        given: dict[str, str] = self.send("POST", "token").json()
+        return given
+
+    def show(self, photo: Path) -> dict[str, str]:
+        """Use a token as whoever holds it can; return what it was given."""
+        given = self.token()
+        answer = use(given, given["action"], photo)
         assert answer.is_success, answer.text
         return given
 
@@ -77,212 +136,322 @@ class Visitor:
     def is_in(self) -> bool:
         return self.send("GET", "account").status_code == 200
 
+    @property
+    def accepted(self) -> bool:
+        answer = self.send("POST", "face").json()
+        return answer["accepted"] is True
 
-def test_password_and_face_together_open_an_account(app: str, service: Service) -> None:
-    visitor = Visitor(app)
+
+def use(given: dict[str, str], action: str, photo: Path) -> httpx.Response:
+    method, path = {"enroll": ("PUT", "enrollment"), "verify": ("POST", "verify")}[action]
+    return httpx.request(
+        method,
+        f"{given['service']}/v1/subjects/{given['subject']}/{path}",
+        files={"images": photo.read_bytes()},
+        headers={"Authorization": f"Bearer {given['token']}"},
+        timeout=60,
+    )
+
+
+def test_password_and_face_together_open_an_account(
+    app: Proxy, people: dict[str, list[Path]]
+) -> None:
+    own = people[WHO]
+    visitor = Visitor(app.url)
     assert visitor.send("POST", "token").status_code == 401
     assert visitor.sign("register", "ann") == 201
-    assert Visitor(app).sign("register", "ann") == 409
+    assert Visitor(app.url).sign("register", "ann") == 409
     assert not visitor.is_in
-    given = visitor.show(service.photo(1, 0))
-    assert given["action"] == "enroll"
+    assert visitor.show(own[0])["action"] == "enroll"
     before = visitor.session
-    assert visitor.send("POST", "face").json() == {"accepted": True}
+    assert visitor.accepted
     assert visitor.is_in
     assert visitor.session != before
 
-    again = Visitor(app)
+    again = Visitor(app.url)
     assert again.sign("login", "ann", "wrong password") == 401
     assert again.sign("login", "nobody") == 401
     assert again.sign("login", "ann") == 204
     assert not again.is_in
-    assert again.show(service.photo(1, 4))["action"] == "verify"
-    assert again.send("POST", "face").json() == {"accepted": True}
+    assert again.show(own[1])["action"] == "verify"
+    assert again.accepted
     assert again.is_in
+    assert not again.accepted, "what came of a token counts once"
 
 
-def test_who_knows_the_password_alone_stays_out(app: str, service: Service) -> None:
-    owner = Visitor(app)
+def test_who_knows_the_password_alone_stays_out(app: Proxy, people: dict[str, list[Path]]) -> None:
+    owner = Visitor(app.url)
     assert owner.sign("register", "eve") == 201
-    owner.show(service.photo(2, 0))
-    assert owner.send("POST", "face").json() == {"accepted": True}
-    thief = Visitor(app)
+    owner.show(people[WHO][0])
+    assert owner.accepted
+    thief = Visitor(app.url)
     assert thief.sign("login", "eve") == 204
     # Without a token, with one that was not used, and with another face.
-    assert thief.send("POST", "face").status_code == 409
-    given = thief.send("POST", "token").json()
-    assert thief.send("POST", "face").json() == {"accepted": False}
+    assert not thief.accepted
+    given = thief.token()
+    assert not thief.accepted
     assert given["action"] == "verify"
-    thief.show(service.photo(3, 0))
-    assert thief.send("POST", "face").json() == {"accepted": False}
+    thief.show(people[OTHER][0])
+    assert not thief.accepted
     assert not thief.is_in
-    # The token enrolls nobody, and the session of the thief learns nothing of the owner's.
-    refused = httpx.put(
-        given["url"].replace("/verify", "/enrollment"),
-        files={"images": service.photo(3, 0)},
-        headers={"Authorization": f"Bearer {given['token']}"},
-        timeout=60,
-    )
+    # The token enrolls nobody.
+    refused = use(given, "enroll", people[OTHER][0])
     assert (refused.status_code, refused.json()["error"]["code"]) == (403, "forbidden")
-    subject = given["url"].split("/")[-2]
-    with Client(service.url, service.token) as client:
-        client.reset_lockout(subject)
 
 
-def test_an_older_token_replaces_no_face(app: str, service: Service) -> None:
+def test_an_older_token_replaces_no_face(app: Proxy, people: dict[str, list[Path]]) -> None:
     """Who knew the password before the first face came holds a token that enrolls."""
-    owner, thief = Visitor(app), Visitor(app)
+    owner, thief = Visitor(app.url), Visitor(app.url)
     assert owner.sign("register", "fay") == 201
     assert thief.sign("login", "fay") == 204
-    given = thief.send("POST", "token").json()
-    owner.show(service.photo(1, 0))
+    given = thief.token()
+    owner.show(people[WHO][0])
     assert given["action"] == "enroll"
-    refused = httpx.put(
-        given["url"],
-        files={"images": service.photo(3, 0)},
-        headers={"Authorization": f"Bearer {given['token']}"},
-        timeout=60,
-    )
+    refused = use(given, "enroll", people[OTHER][0])
     assert refused.json()["error"]["code"] == "enrollment_conflict"
-    assert thief.send("POST", "face").json() == {"accepted": False}
-    assert owner.send("POST", "face").json() == {"accepted": True}
+    assert not thief.accepted
+    assert owner.accepted
 
 
-def test_only_texts_are_a_name_and_a_password(app: str) -> None:
+def test_only_texts_are_a_name_and_a_password(app: Proxy) -> None:
     for name, password in (
         (["gus"], PASSWORD),
         ("gus", [PASSWORD]),
         ("gus", 1234567890),
         (7, None),
     ):
-        answer = Visitor(app).send("POST", "register", json={"name": name, "password": password})
+        answer = Visitor(app.url).send(
+            "POST", "register", json={"name": name, "password": password}
+        )
         assert answer.status_code == 422
-    assert Visitor(app).send("POST", "register", json=None).status_code in (400, 422)
+    assert Visitor(app.url).send("POST", "register", json=None).status_code in (400, 422)
 
 
-def test_the_page_is_served_with_its_policy(app: str, service: Service) -> None:
-    page, script = httpx.get(app), httpx.get(f"{app}page.js")
-    policy = page.headers["Content-Security-Policy"]
-    assert f"connect-src 'self' {service.url}" in policy
-    assert "unsafe" not in policy
-    assert "javascript" in script.headers["Content-Type"]
+def test_the_page_is_served_with_its_policy_and_what_it_runs(app: Proxy, place: Place) -> None:
+    page = httpx.get(app.url)
+    policy = page.headers["Content-Security-Policy"].split("; ")
+    assert "default-src 'none'" in policy
+    assert "script-src 'self' 'wasm-unsafe-eval'" in policy
+    assert f"connect-src 'self' {place.service.url}" in policy
+    assert sum("unsafe" in directive for directive in policy) == 1
     assert page.text == (EXAMPLES / "app" / "index.html").read_text()
+    runtime = PACKAGE / "node_modules" / "onnxruntime-web" / "dist"
+    for path, kind, file in (
+        ("page.js", "javascript", EXAMPLES / "app" / "page.js"),
+        ("client/element/login.js", "javascript", PACKAGE / "dist" / "element" / "login.js"),
+        ("ort/ort.wasm.min.mjs", "javascript", runtime / "ort.wasm.min.mjs"),
+        (
+            "ort/ort-wasm-simd-threaded.wasm",
+            "application/wasm",
+            runtime / "ort-wasm-simd-threaded.wasm",
+        ),
+    ):
+        answer = httpx.get(f"{app.url}/{path}")
+        assert kind in answer.headers["Content-Type"]
+        assert answer.content == file.read_bytes()
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/app.mjs", "/app.py", "/client/", "/client/../package.json", "/client/..%2fpackage.json",
+        "/client/%2e%2e/package.json", "/ort/../package.json", "/ort/../../../package.json",
+        "/client//etc/passwd",
+    ],
+)  # fmt: skip
+def test_nothing_else_is_served(app: Proxy, path: str) -> None:
+    url = httpx.URL(app.url).copy_with(raw_path=path.encode())
+    assert httpx.get(url).status_code in (404, 405)
 
 
 def test_nobody_gets_in_while_the_service_is_away(tmp_path: Path) -> None:
+    require_client()
     port, nobody = free_port(), free_port()
-    for name, program in (("app.py", PYTHON), ("app.mjs", node())):
+    for backend in BACKENDS:
         env = clean_environment(
             VEILFACE_URL=f"http://127.0.0.1:{nobody}",
             VEILFACE_API_KEY="vf_000000000000_" + "0" * 64,
             PORT=str(port),
         )
-        arguments = [program, str(EXAMPLES / "app" / name)]
-        with running(arguments, f"http://127.0.0.1:{port}/", env, tmp_path / "log") as url:
+        url = f"http://127.0.0.1:{port}"
+        with running(command(backend), url, env, tmp_path / "log"):
             visitor = Visitor(url)
             assert visitor.sign("register", "ann") == 201
             assert visitor.send("POST", "token").status_code == 502
             assert not visitor.is_in
 
 
-def fill_in(page: Any, name: str, photo: bytes, button: str) -> None:
+def sign(page: Page, name: str, button: str, password: str = PASSWORD) -> None:
     page.get_by_label("Name").fill(name)
-    page.get_by_label("Password").fill(PASSWORD)
-    file = {"name": "me.png", "mimeType": "image/png", "buffer": photo}
-    page.get_by_label("Photo").set_input_files(file)
+    page.get_by_label("Password").fill(password)
     page.get_by_role("button", name=button).click()
 
 
-def test_a_browser_shows_a_photo_to_the_service_alone(
-    app: str, service: Service, browser: Any
+def stand_before(page: Page, button: str) -> bytes:
+    """Start the camera and press the button; what the camera showed, as PNG."""
+    page.get_by_role("button", name="Start camera").click()
+    take = page.get_by_role("button", name=button)
+    take.wait_for()
+    frame = page.locator("veilface-login").evaluate(FRAME)
+    take.click()
+    return base64.b64decode(frame)
+
+
+def told(page: Page) -> Any:
+    return expect(page.locator("body > p output"))
+
+
+def said(page: Page) -> Any:
+    return expect(page.locator("veilface-login output"))
+
+
+def status_of_account(page: Page) -> int:
+    status: int = page.evaluate("fetch('/account').then(({ status }) => status)")
+    return status
+
+
+def test_a_browser_sends_a_private_template_and_nothing_else_of_a_face(
+    app: Proxy,
+    place: Place,
+    browser: Browser,
+    camera: FakeCamera,
+    pack: ModelPack,
+    people: dict[str, list[Path]],
 ) -> None:
-    """The page's own server never gets the photo, and the browser never the server's key."""
+    own, other = people[WHO], people[OTHER]
     context = browser.new_context()
-    page = context.new_page()
-    sent: list[tuple[str, str, bytes]] = []
-    page.on(
-        "request",
-        lambda seen: sent.append(
-            (seen.url, seen.headers.get("content-type", ""), seen.post_data_buffer or b"")
-        ),
-    )
-    photos = {person: service.photo(person, 0) for person in (4, 1)}
+    try:
+        tab = BrowserTab.of(context, app.url + "/")
+        page = tab.page
+        bearers: list[tuple[str, str]] = []
+        attempts: list[Any] = []
 
-    def submit(button: str, person: int, told: str) -> None:
-        page.goto(app)
-        fill_in(page, "zoe", photos[person], button)
-        page.get_by_text(told).wait_for(timeout=600_000)
+        def noted(request: Any) -> None:
+            if "authorization" in request.headers:
+                bearers.append((request.url, request.headers["authorization"]))
+            if request.method == "POST" and request.url.endswith("/verify"):
+                attempts.append((request.url, request.headers, request.post_data_buffer))
 
-    submit("Register", 4, "Welcome, zoe")
-    submit("Sign in", 4, "Welcome, zoe")
-    submit("Sign in", 1, "This is somebody else")
-    own = [(kind, body) for url, kind, body in sent if url.startswith(app)]
-    others = [url for url, _, _ in sent if url.startswith(service.url)]
-    assert [url.split("/")[-1] for url in others] == ["enrollment", "verify", "verify"]
-    assert len(own) + len(others) == len(sent)
-    # Names and passwords, and nothing that could hold a file.
-    assert {kind for kind, _ in own} == {"", "application/json"}
-    assert max(len(body) for _, body in own) < 100
-    assert not any(service.token.encode() in body for _, _, body in sent)
-    context.close()
+        page.on("request", noted)
+        app.forget()
+        place.service.forget()
+        page.goto(tab.url)
+        camera.shows(own[0])
+        sign(page, "zoe", "Register")
+        told(page).to_have_text("Now enroll your face")
+        shown = {"camera at enrollment": stand_before(page, "Enroll")}
+        told(page).to_have_text("Welcome, zoe")
+        assert status_of_account(page) == 200
 
+        sign(page, "zoe", "Sign in", "wrong password")
+        told(page).to_have_text("wrong name or password")
+        expect(page.locator("veilface-login")).to_have_count(0)
 
-def test_the_page_waits_for_a_sending_that_is_still_at_work(
-    app: str, service: Service, browser: Any
-) -> None:
-    """The first sending is lost on its way, the second is told that an earlier one still runs."""
-    context = browser.new_context()
-    page = context.new_page()
-    asked: list[str] = []
-    page.on("request", lambda seen: asked.append(seen.url.split("/")[-1]))
-    sendings = []
+        sign(page, "zoe", "Sign in")
+        told(page).to_have_text("Now show your face")
+        assert status_of_account(page) == 401
+        shown["camera at login"] = stand_before(page, "Log in")
+        told(page).to_have_text("Welcome, zoe")
+        assert status_of_account(page) == 200
 
-    def at_work(route: Any) -> None:
-        sendings.append(route.request.headers["idempotency-key"])
-        if len(sendings) == 1:
-            route.abort()
-        elif len(sendings) == 2:
-            route.fulfill(
-                status=409,
-                headers={"Access-Control-Allow-Origin": app.rstrip("/")},
-                json={"error": {"code": "idempotency_conflict", "message": "", "details": {}}},
+        camera.shows(other[0])
+        sign(page, "zoe", "Sign in")
+        shown["camera of another"] = stand_before(page, "Log in")
+        said(page).to_have_text("That did not match. Try again.")
+        told(page).to_have_text("Now show your face")
+        assert status_of_account(page) == 401
+
+        # The answer of a repeated request is that of the first; a new one needs a new token.
+        (url, headers, body), _ = attempts
+        sent_again = {name: headers[name] for name in ("authorization", "content-type")}
+        key = headers["idempotency-key"]
+        for again, status in ((key, 200), ("another", 401)):
+            answer = httpx.post(
+                url, content=body, headers={**sent_again, "Idempotency-Key": again}, timeout=60
             )
-        else:
-            route.continue_()
+            assert answer.status_code == status, answer.text
+        assert answer.json()["error"]["code"] == "replayed"
 
-    page.route("**/enrollment", at_work)
-    page.goto(app)
-    fill_in(page, "ida", service.photo(1, 0), "Register")
-    page.locator("output").get_by_text("ida").wait_for(timeout=600_000)
-    assert page.locator("output").text_content() == "Welcome, ida"
-    assert len(sendings) == 3
-    assert len(set(sendings)) == 1, "one attempt"
-    assert [name for name in asked if name in ("enrollment", "face")][-2:] == ["enrollment", "face"]
-    assert asked.count("face") == 1
-    context.close()
+        to_app, to_service = app.sent, place.service.sent
+        own_calls, rest = requests_in(to_app)
+        assert rest == 0
+        assert {call: each["members"] for call, each in own_calls.items() if "POST" in call} == {
+            "POST /register": ["name", "password"],
+            "POST /login": ["name", "password"],
+            "POST /token": [],
+            "POST /face": [],
+        }
+        calls, rest = requests_in(to_service)
+        assert rest == 0
+        assert calls["PUT /v1/subjects/*/enrollment"]["members"] == ["template"]
+        assert calls["PUT /v1/subjects/*/enrollment"]["times"] == 1
+        probes = calls["POST /v1/subjects/*/verify"]
+        assert probes["members"] == ["hmac", "nonce", "template", "timestamp"]
+        assert {bearer.split("_")[0] for _, bearer in bearers} == {"Bearer vft"}
+        assert all(url.startswith(place.service.url) for url in tab.strays())
+        assert tab.violations() == tab.complaints == []
+
+        persons = [Person(WHO, own[:1], []), Person(OTHER, other[:1], [])]
+        search = faces_of(pack, persons, shown)
+        assert search.find(to_app + to_service) == []
+        embedding = pack.embed_photo(shown["camera at login"]).embedding
+        for recording, data, what in (
+            (app, own[0].read_bytes(), f"photo {own[0].name}"),
+            (place.service, as_bytes(embedding, "float32", little=True), "camera at login"),
+        ):
+            page.evaluate(PLANT, [recording.url + "/planted", base64.b64encode(data).decode()])
+            assert any(what in leak.what for leak in search.find(recording.sent)), what
+    finally:
+        context.close()
 
 
-@pytest.mark.long
-def test_the_page_does_not_wait_for_ever(app: str, service: Service, browser: Any) -> None:
-    """By its clock it is told for two hours that an earlier sending is still at work."""
+def test_an_answer_that_is_lost_lets_in_all_the_same(
+    app: Proxy, browser: Browser, camera: FakeCamera, people: dict[str, list[Path]]
+) -> None:
+    """The server asks what came of the token, and the page asks the server."""
     context = browser.new_context()
-    page = context.new_page()
-    page.clock.install()
-    refusal = {
-        "status": 409,
-        "headers": {"Access-Control-Allow-Origin": app.rstrip("/")},
-        "json": {"error": {"code": "idempotency_conflict", "message": "still at work"}},
-    }
-    asked: list[str] = []
+    try:
+        page = context.new_page()
+        lost = []
 
-    def at_work(route: Any) -> None:
-        asked.append(route.request.url)
-        route.fulfill(**refusal)
+        def lose(route: Route) -> None:
+            lost.append(route.fetch().status)
+            route.abort()
 
-    page.route("**/enrollment", at_work)
-    page.goto(app)
-    fill_in(page, "joe", service.photo(1, 0), "Register")
-    wait_until(lambda: page.evaluate("0") or len(asked) > 1, what="a second sending")
-    page.clock.fast_forward("02:00:00")
-    page.locator("output").get_by_text("still at work").wait_for(timeout=600_000)
-    context.close()
+        page.route("**/enrollment", lose)
+        page.goto(app.url)
+        camera.shows(people[WHO][0])
+        sign(page, "ida", "Register")
+        stand_before(page, "Enroll")
+        told(page).to_have_text("Welcome, ida")
+        assert len(lost) > 1
+        assert set(lost) == {201}
+        assert status_of_account(page) == 200
+    finally:
+        context.close()
+
+
+def test_where_liveness_is_asked_for_the_page_says_that_it_sends_no_photo(
+    place: Place,
+    browser: Browser,
+    camera: FakeCamera,
+    people: dict[str, list[Path]],
+    tmp_path: Path,
+) -> None:
+    key = place.key(liveness=LivenessPolicy.ACTIVE)
+    env = place.environment(key, "strict")
+    context = browser.new_context()
+    try:
+        with running(command("app.py"), direct(place, "strict"), env, tmp_path / "app.log"):
+            page = context.new_page()
+            page.goto(place.apps["strict"].url)
+            camera.shows(people[WHO][0])
+            sign(page, "mia", "Register")
+            stand_before(page, "Enroll")
+            told(page).to_have_text("Welcome, mia")
+            sign(page, "mia", "Sign in")
+            stand_before(page, "Log in")
+            said(page).to_contain_text("This page sends none.")
+            assert status_of_account(page) == 401
+    finally:
+        context.close()

@@ -15,15 +15,19 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, expect, sync_playwright
 
-from api.process.opening import file_sealer, open_keyring
-from api.process.preparation import recorded_of
 from models.pack import ModelPack
-from tests.api.deployment import deploy
-from tests.clients.conftest import Running, started
+from tests.clients.conftest import Running
 from tests.patience import PATIENCE_S
 from tests.web.browser_tab import BrowserTab
 from tests.web.camera import FakeCamera
-from tests.web.deployments import OTHER, WHO, demo_service, moving_service, real_service
+from tests.web.deployments import (
+    OTHER,
+    WHO,
+    demo_service,
+    moving_service,
+    private_service,
+    real_service,
+)
 from tests.web.served import Served
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
@@ -135,18 +139,6 @@ def pack(mbf_pack_dir: Path) -> ModelPack:
 
 
 @pytest.fixture(scope="package")
-def running(
-    tmp_path_factory: pytest.TempPathFactory, mbf_pack_dir: Path, pack: ModelPack
-) -> Iterator[Running]:
-    """A service that serves the real pack, and whose threshold decides by no chance."""
-    folder = tmp_path_factory.mktemp("javascript")
-    # Lifted here, their own probes score above 15.4, each other's below 5.0 (2,000 lifts each).
-    deployment = deploy(
-        folder, pack=mbf_pack_dir, serve_pack=True, threshold=10.0, rate_limit_address="off"
-    )
-    deployment.allow_templates()
-    settings = deployment.settings
-    contract = replace(deployment.contract, recorded=recorded_of(pack))
-    contract.save(settings.resolved_contract_file, file_sealer(open_keyring(settings)))
-    with started(deployment, folder) as service:
+def running(tmp_path_factory: pytest.TempPathFactory, mbf_pack_dir: Path) -> Iterator[Running]:
+    with private_service(tmp_path_factory.mktemp("javascript"), mbf_pack_dir) as service:
         yield service

@@ -24,8 +24,8 @@ _SCRIPT = """
       await Promise.all(Object.entries(bitmaps).map(async ([name, each]) => [name, await each])),
     );
     const drawOne = () => {
-      const asked = document.querySelector(".movement")?.dataset.movement ?? "front";
-      const pose = shown(asked === "move_back" ? "front" : asked);
+      const asked = %s;
+      const pose = shown(asked in ready ? asked : "front");
       if (window.shownPoses.at(-1) !== pose) window.shownPoses.push(pose);
       context.drawImage(ready[pose], 0, 0);
     };
@@ -42,10 +42,18 @@ _SCRIPT = """
 """
 
 
-def camera_script(shown: str = "(asked) => asked", *, person: int = 1) -> str:
-    """A script for a page: its camera shows what `shown` makes of the movement that is asked."""
+ON_THE_PAGE = 'document.querySelector(".movement")?.dataset.movement'
+
+
+def camera_script(
+    shown: str = "(asked) => asked", *, person: int = 1, asked: str = ON_THE_PAGE
+) -> str:
+    """A script for a page: its camera shows what `shown` makes of the movement that is `asked`.
+
+    What is no pose, as moving back is none, is to look straight ahead.
+    """
     heads = {
         name: base64.b64encode(encoded(draw(head(**pose), person))).decode("ascii")
         for name, pose in POSES.items()
     }
-    return _SCRIPT % (json.dumps(heads), shown)
+    return _SCRIPT % (json.dumps(heads), shown, asked)

@@ -1,22 +1,26 @@
 """The page asks for head movements where the level does, and takes frames of them by the clock."""
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
 from PIL import Image
-from playwright.sync_api import expect
+from playwright.sync_api import Browser, expect
 
 from tests.api.deployment import images
 from tests.api.http.test_passive_liveness import calibrated
+from tests.clients.javascript.conftest import require_client
 from tests.marked_heads import draw, encoded, frame, head
 from tests.web.browser_tab import BrowserTab
 from tests.web.camera import SIZE, FakeCamera
+from tests.web.client_page import application, for_browsers
 from tests.web.conftest import OpenTab
 from tests.web.deployments import ANNA
 from tests.web.moving_head import camera_script
 from tests.web.served import Served, serving
 from tests.web.walk_obstacles import DENY, START
+from veilface_client import Client
 
 pytestmark = pytest.mark.long
 
@@ -33,6 +37,21 @@ window.fetch = (path, options) => {
   return send(path, options);
 };
 """
+
+# In a language in which a movement is called by its name.
+LOGIN = """
+import * as ort from "onnxruntime-web";
+import { defineLogin, WORDS } from "veilface-client/login";
+
+defineLogin();
+const login = document.querySelector("veilface-login");
+login.options = { runtime: ort };
+login.authorize = async () => (await fetch("/login/token", { method: "POST" })).json();
+const names = Object.keys(WORDS.movements).map((name) => [name, name]);
+login.words = { ...WORDS, movements: Object.fromEntries(names) };
+login.setAttribute("liveness", "head-movements");
+"""
+SAID = 'document.querySelector("veilface-login")?.shadowRoot?.querySelector("output").textContent'
 
 
 def opened(open_tab: OpenTab, served: Served, shown: str | None = None) -> BrowserTab:
@@ -152,3 +171,38 @@ def test_a_camera_that_is_refused_is_said(open_tab: OpenTab, moving: Served) -> 
     tab.page.get_by_role("button", name=START).click()
     expect(tab.page.get_by_role("alert")).to_contain_text("Camera access was denied.")
     expect(tab.page.get_by_role("button", name=START)).to_be_enabled()
+
+
+@pytest.mark.parametrize(
+    ("shown", "says"),
+    [("(asked) => asked", "Welcome."), ('() => "front"', "The movements were not seen.")],
+)
+def test_the_element_asks_for_movements_and_says_that_photos_are_sent(
+    browser: Browser, moving: Served, shown: str, says: str
+) -> None:
+    require_client()
+    context = browser.new_context()
+    with Client(moving.url, moving.token) as client:
+
+        def authorize(_: Mapping[str, str]) -> dict[str, str]:
+            return {"subject": "anna", "token": client.create_token("anna", "verify").token}
+
+        try:
+            with application(moving.url, authorize) as served:
+                served.program = for_browsers(LOGIN)
+                tab = BrowserTab.of(context, served.url + "/")
+                tab.page.add_init_script(camera_script(shown, person=ANNA, asked=SAID))
+                tab.page.goto(tab.url)
+                told = tab.page.locator("veilface-login p")
+                expect(told).to_contain_text("Photos of that are sent to the service")
+                tab.page.get_by_role("button", name="Start camera").click()
+                tab.page.get_by_role("button", name="Log in").click()
+                expect(tab.page.locator("veilface-login output")).to_contain_text(says)
+                sent = served.recording.sent
+                assert sent.count(b"POST /v1/challenges ") == 1
+                assert sent.count(b'filename="photo"') == 10
+                assert b"/v1/pack" not in sent
+                assert b"/v1/contract" not in sent
+                assert tab.complaints == tab.violations() == []
+        finally:
+            context.close()

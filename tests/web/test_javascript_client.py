@@ -15,7 +15,9 @@ from playwright.sync_api import Browser, expect
 from benchmarks.browser_client import (
     before_the_camera,
     browser_outcome,
+    by_the_shutter,
     faces_of,
+    first_look,
     page_of,
     planted_and_missed,
     requests_in,
@@ -26,6 +28,7 @@ from models.pack import FacePolicy, ModelPack
 from tests.clients.conftest import Running
 from tests.clients.javascript.conftest import require_client
 from tests.clients.javascript.test_docs import EXAMPLE, FOR_PAGES
+from tests.clients.proxy import Proxy
 from tests.leaks import LeakSearch, as_bytes
 from tests.web.browser_tab import BrowserTab
 from tests.web.camera import FakeCamera
@@ -296,5 +299,37 @@ def test_people_enrolled_and_verified_by_tokens_leave_no_face(
                 "POST /login/token",
             }
             assert planted_and_missed(opened, pair[0].probes[0], search) == []
+    finally:
+        context.close()
+
+
+def test_the_page_is_measured_from_the_shutter_to_the_answer(
+    browser: Browser, running: Running, camera: FakeCamera, people: dict[str, list[Path]]
+) -> None:
+    """The other measurement of ``benchmarks/browser_client.py``: of the person, and of another."""
+    require_client()
+    own, other = people[WHO], people[OTHER]
+    key = running.deployment.token
+    with Client(running.url, key) as client:
+        client.enroll("anna", own[:2])
+    context = browser.new_context()
+    try:
+        with Proxy(running.port) as recording:
+            camera.shows(own[3])
+            tab, first = first_look(context, recording.url, key, "anna")
+            tab.page.close()
+            tab, second = first_look(context, recording.url, key, "anna")
+            # Without a profile on the disk, Chromium keeps all but the largest graph.
+            assert first > second > 0
+            attempts = [Person("anna", [], own[3:4]), Person("anna", [], other[:1])]
+            mine, theirs = by_the_shutter(tab, camera, attempts, level=LEVEL)
+            assert (mine["accepted"], mine["error"]) == (True, None)
+            assert (theirs["accepted"], theirs["error"]) == (False, None)
+            assert 0 < mine["taken"] < mine["seconds"]
+            calls, _ = requests_in(recording.sent)
+            probes = calls["POST /v1/subjects/*/verify"]
+            assert (probes["times"], probes["members"]) == (
+                2, ["hmac", "nonce", "template", "timestamp"],
+            )  # fmt: skip
     finally:
         context.close()

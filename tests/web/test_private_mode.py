@@ -68,6 +68,7 @@ def served(running: Running, recording: Proxy) -> Served:
     # Other modules of this package enroll her as well.
     with there.client() as client:
         client.delete("/v1/subjects/anna")
+    recording.forget()
     return there
 
 

@@ -24,8 +24,13 @@ class Page extends EventTarget {
     if (Page.known) return Page.known;
   }
   getAttribute(name) { return this.#attributes.get(name) ?? null; }
-  setAttribute(name, value) { this.#attributes.set(name, value); }
-  attachShadow() { return { append: (...parts) => ([this.video, this.button, this.status] = parts) }; }
+  setAttribute(name, value) {
+    this.#attributes.set(name, value);
+    if (this.constructor.observedAttributes?.includes(name)) this.attributeChangedCallback();
+  }
+  attachShadow() {
+    return { append: (...parts) => ([this.notice, this.video, this.button, this.status] = parts) };
+  }
 }
 
 Object.assign(globalThis, {
@@ -33,8 +38,11 @@ Object.assign(globalThis, {
   document: { createElement: () => new Part() },
   CSSStyleSheet: class { replaceSync() {} },
   OffscreenCanvas: class {
+    constructor(width, height) { Object.assign(this, { width, height }); }
     getContext() {
-      return { drawImage() {}, getImageData: () => ({ data: new Uint8Array(64), width: 4, height: 4 }) };
+      const [width, height] = [this.width, this.height];
+      const data = new Uint8Array(4 * width * height);
+      return { canvas: this, drawImage() {}, getImageData: () => ({ data, width, height }) };
     }
   },
 });
@@ -141,4 +149,43 @@ test("graphs are fetched while the person looks, and what failed is tried again 
   login.button.click();
   while (told.length === 0) await settled();
   assert.equal(login.status.value, "Später.");
+});
+
+test("that photos will be sent is said before the camera starts, and a running one stops for it", async () => {
+  const asked = [];
+  const fetch = async (url) => {
+    asked.push(new URL(url).pathname);
+    return new Response("", { status: 503 });
+  };
+  const authorize = async () => ({ subject: "anna", token: `vft_${"a".repeat(20)}` });
+  const { login, tracks } = element({ authorize, fetch });
+  assert.equal(login.notice.textContent, "");
+  login.button.click();
+  await settled();
+  asked.length = 0;
+  login.setAttribute("liveness", "head-movements");
+  assert.match(login.notice.textContent, /Photos .* are sent to the service/);
+  assert.deepEqual([tracks.map(({ stopped }) => stopped), login.button.textContent], [[true], "Start camera"]);
+  login.button.click();
+  await settled();
+  assert.deepEqual([tracks.length, login.button.textContent], [2, "Log in"]);
+  assert.deepEqual(asked, [], "no graph is fetched for it");
+  login.setAttribute("liveness", "off");
+  assert.deepEqual([login.notice.textContent, tracks[1].stopped], ["", true]);
+});
+
+test("where the service checks liveness, private mode says that it cannot serve", async () => {
+  const refusal = { error: { code: "forbidden", message: "liveness is asked for", details: { liveness: "active" } } };
+  const fetch = async () => Response.json(refusal, { status: 403 });
+  const authorize = async () => ({ subject: "anna", token: `vft_${"a".repeat(20)}` });
+  const { login, told } = element({ authorize, fetch });
+  for (const [mode, says] of [["off", /This page sends none/], ["head-movements", /^liveness is asked for$/]]) {
+    told.length = 0;
+    login.setAttribute("liveness", mode);
+    login.button.click();
+    await settled();
+    login.button.click();
+    while (told.length === 0) await settled();
+    assert.match(login.status.value, says);
+  }
 });

@@ -1,7 +1,9 @@
-/** `<veilface-login>`: camera, burst, private template, decision, for any page. */
+/** `<veilface-login>`: camera, burst or head movements, decision, for any page. */
 
 import { fromImageData, type RgbImage } from "../models/image.js";
+import type { FacePolicy } from "../models/pack.js";
 import type { Decision, Enrollment } from "../service/answers.js";
+import { Client } from "../service/client.js";
 import { ContractMismatch } from "../service/errors.js";
 import { Enrollable, type Probe } from "../service/lifts.js";
 import { PrivateClient, type PrivateOptions } from "../service/private-client.js";
@@ -29,6 +31,13 @@ export interface Words {
   readonly reject: string;
   readonly enrolled: string;
   readonly camera: string;
+  /** Shown as long as verifications send photos, so before the camera starts. */
+  readonly frames: string;
+  /** By their names in a challenge, and `front` and `move_back`. */
+  readonly movements: Readonly<Record<string, string>>;
+  readonly notLive: string;
+  /** The service asks for liveness, and the page for none. */
+  readonly liveness: string;
   /** By an error's `code`, or its `name` where it has none; the error's message for all others. */
   readonly errors: Readonly<Record<string, string>>;
 }
@@ -45,6 +54,18 @@ export const WORDS: Words = {
   reject: "That did not match. Try again.",
   enrolled: "You are enrolled.",
   camera: "The camera cannot be used.",
+  frames: "To log in, move your head as you are asked to. Photos of that are sent to the service.",
+  movements: {
+    front: "Look straight ahead.",
+    move_back: "Move back and look straight ahead.",
+    turn_left: "Turn your head to the left.",
+    turn_right: "Turn your head to the right.",
+    look_up: "Look up.",
+    look_down: "Look down.",
+    come_closer: "Come closer.",
+  },
+  notLive: "The movements were not seen. Follow each of them, in good light.",
+  liveness: "This service checks that a face is live, which takes photos. This page sends none.",
   errors: {},
 };
 
@@ -54,10 +75,19 @@ video { display: block; width: var(--veilface-width, 20rem); max-width: 100%; as
   background: var(--veilface-background, #222); object-fit: cover; transform: scaleX(-1); }
 button { font: inherit; margin: 0.5rem 0; }
 output { display: block; min-height: 1.5em; }
+p { margin: 0.5rem 0; }
+p:empty { display: none; }
 `;
 
 const BURST = 3;
 const BETWEEN_FRAMES = 150; // milliseconds, so that the frames are not one picture three times
+// Of a movement, as on the service's own page: two frames on the way out, one back at the front.
+const READY = 2500;
+const OUT = [1200, 600];
+const BACK = 1300;
+
+const after = (milliseconds: number): Promise<void> =>
+  new Promise((resolve) => setTimeout(resolve, milliseconds));
 
 // A server that renders pages imports this module too, and has no elements.
 const Base = globalThis.HTMLElement ?? (class {} as typeof HTMLElement);
@@ -70,13 +100,18 @@ const Base = globalThis.HTMLElement ?? (class {} as typeof HTMLElement);
  * The attribute `service` is the service's URL, by default the page's own origin; `action` is
  * `verify` (by default) or `enroll`; `face` is `single` (by default: a second face is an error) or
  * `largest`. With the attribute `passkey` an enrollment makes one and is locked to the key that it gives,
- * and a verification asks for it. Parts for styling: `video`, `button`, `status`.
+ * and a verification asks for it. Parts for styling: `notice`, `video`, `button`, `status`.
+ *
+ * With `liveness="head-movements"` a verification is none of a private template: it answers a challenge, by
+ * frames that are sent as photos, and `words.frames` says so. An enrollment stays private.
  *
  * Taken out of the page it stops the camera and ends the attempt: nothing more is sent or told.
  *
  * Never believe the event alone: your server asks the service what came of the token.
  */
 export class VeilfaceLogin extends Base {
+  static readonly observedAttributes = ["liveness"];
+
   // Declared and not defined: a page may have set them before its element was known.
   /** Of `PrivateClient`: the ONNX Runtime, and where the graphs are. */
   declare options: Omit<PrivateOptions, "signal"> | undefined;
@@ -87,6 +122,7 @@ export class VeilfaceLogin extends Base {
   declare authorize: (() => Promise<Authorization>) | undefined;
   declare words: Words;
 
+  readonly #notice = document.createElement("p");
   readonly #video = document.createElement("video");
   readonly #button = document.createElement("button");
   readonly #status = document.createElement("output");
@@ -108,17 +144,25 @@ export class VeilfaceLogin extends Base {
     root.adoptedStyleSheets = [sheet];
     this.#video.muted = true;
     this.#video.playsInline = true;
+    this.#notice.part.add("notice");
     this.#video.part.add("video");
     this.#button.type = "button";
     this.#button.part.add("button");
     this.#status.part.add("status");
-    root.append(this.#video, this.#button, this.#status);
+    root.append(this.#notice, this.#video, this.#button, this.#status);
     this.#button.addEventListener("click", () => void this.#clicked());
   }
 
   connectedCallback(): void {
     if (this.#stay.signal.aborted) this.#stay = new AbortController();
     this.#button.textContent = this.words.start;
+    this.#notice.textContent = this.#asksToMove ? this.words.frames : "";
+  }
+
+  /** Another thing would be sent: the camera starts again once the person has read it. */
+  attributeChangedCallback(): void {
+    this.disconnectedCallback();
+    this.connectedCallback();
   }
 
   disconnectedCallback(): void {
@@ -134,10 +178,26 @@ export class VeilfaceLogin extends Base {
     await client?.then((each) => each.close()).catch(() => undefined);
   }
 
-  /** Take a burst, lift and send it; the decision (or enrollment) also comes as an event. */
+  get #asksToMove(): boolean {
+    return this.getAttribute("liveness") === "head-movements";
+  }
+
+  get #enrolls(): boolean {
+    return this.getAttribute("action") === "enroll";
+  }
+
+  get #face(): FacePolicy {
+    return this.getAttribute("face") === "largest" ? "largest" : "single";
+  }
+
+  /**
+   * Take a burst, lift and send it, or answer a challenge; the decision (or enrollment) also comes
+   * as an event.
+   */
   async attempt(): Promise<Decision | Enrollment> {
     const { signal } = this.#stay;
     this.#given();
+    if (this.#asksToMove && !this.#enrolls) return this.#challenged(signal);
     const photos = await this.#burst(signal);
     const lift = await this.#lifted(photos, signal);
     try {
@@ -157,10 +217,44 @@ export class VeilfaceLogin extends Base {
   async #lifted(photos: RgbImage[], signal: AbortSignal): Promise<Enrollable | Probe> {
     const client = await this.#prepared(signal);
     signal.throwIfAborted();
-    const face = this.getAttribute("face") === "largest" ? "largest" : "single";
-    return this.getAttribute("action") === "enroll"
-      ? client.liftEnrollment(photos, { face })
-      : client.lift(photos, { face });
+    const face = this.#face;
+    return this.#enrolls ? client.liftEnrollment(photos, { face }) : client.lift(photos, { face });
+  }
+
+  /**
+   * Say the movements by the clock, and send the frames that were taken meanwhile.
+   *
+   * It does not wait until it sees one: a recording that shows all in turn would be waited for, too.
+   */
+  async #challenged(signal: AbortSignal): Promise<Decision> {
+    const { options, authorize } = this.#given();
+    const { subject, token, ...given } = await authorize();
+    signal.throwIfAborted();
+    const holderKey = given.holderKey ?? (await this.#holderKey(subject, false, signal));
+    const client = new Client(this.#url, token, { ...options, signal });
+    const ask = (movement: string): void => {
+      signal.throwIfAborted();
+      this.#say(this.words.movements[movement] ?? movement);
+    };
+    const snap = async (wait = 0): Promise<Blob> => {
+      await after(wait);
+      return this.#drawn(signal).canvas.convertToBlob({ type: "image/jpeg", quality: 0.92 });
+    };
+    ask("front");
+    await after(READY);
+    // Asked for now: its minute begins.
+    const challenge = await client.challenge(subject);
+    const frames = [await snap()];
+    for (const movement of challenge.movements) {
+      ask(movement);
+      for (const wait of OUT) frames.push(await snap(wait));
+      ask(movement === "come_closer" ? "move_back" : "front");
+      frames.push(await snap(BACK));
+    }
+    signal.throwIfAborted();
+    this.#say(this.words.working);
+    const more = { challenge, face: this.#face };
+    return client.verify(subject, frames, holderKey ? { ...more, holderKey } : more);
   }
 
   async #send(lift: Enrollable | Probe, signal: AbortSignal): Promise<Decision | Enrollment> {
@@ -209,6 +303,10 @@ export class VeilfaceLogin extends Base {
     }
   }
 
+  get #url(): string {
+    return this.getAttribute("service") ?? location.origin;
+  }
+
   #given(): { options: Omit<PrivateOptions, "signal">; authorize: () => Promise<Authorization> } {
     const { options, authorize } = this;
     if (options === undefined || authorize === undefined) {
@@ -233,8 +331,7 @@ export class VeilfaceLogin extends Base {
     const { options, authorize } = this.#given();
     const { token } = await authorize();
     signal.throwIfAborted();
-    const url = this.getAttribute("service") ?? location.origin;
-    const client = new PrivateClient(url, token, { ...options, signal });
+    const client = new PrivateClient(this.#url, token, { ...options, signal });
     try {
       await client.prepare();
       signal.throwIfAborted();
@@ -277,9 +374,9 @@ export class VeilfaceLogin extends Base {
       this.#tell("veilface-error", error);
       return;
     }
-    const enrolls = this.getAttribute("action") === "enroll";
-    this.#button.textContent = enrolls ? this.words.enroll : this.words.take;
+    this.#button.textContent = this.#enrolls ? this.words.enroll : this.words.take;
     this.#say(this.words.waiting);
+    if (this.#asksToMove && !this.#enrolls) return;
     // While the person looks; the attempt waits for it, and tells what went wrong.
     this.#prepared(signal).catch(() => undefined);
   }
@@ -291,8 +388,10 @@ export class VeilfaceLogin extends Base {
       const result = await this.attempt();
       if (signal.aborted) return;
       this.#stop();
-      if ("accepted" in result) this.#say(result.accepted ? this.words.accept : this.words.reject);
-      else this.#say(this.words.enrolled);
+      const { accept, reject, notLive, enrolled } = this.words;
+      if (!("accepted" in result)) this.#say(enrolled);
+      else if (result.accepted) this.#say(accept);
+      else this.#say(result.reason === "liveness" ? notLive : reject);
       this.#tell("veilface-result", result);
     } catch (error) {
       if (signal.aborted) return;
@@ -303,19 +402,26 @@ export class VeilfaceLogin extends Base {
 
   /** The frames of a moment, as the camera gives them, not mirrored. */
   async #burst(signal: AbortSignal): Promise<RgbImage[]> {
+    const photos: RgbImage[] = [];
+    for (let frame = 0; frame < BURST; frame++) {
+      if (frame > 0) await after(BETWEEN_FRAMES);
+      const context = this.#drawn(signal);
+      const { width, height } = context.canvas;
+      photos.push(fromImageData(context.getImageData(0, 0, width, height)));
+    }
+    return photos;
+  }
+
+  /** What the camera shows now. */
+  #drawn(signal: AbortSignal): OffscreenCanvasRenderingContext2D {
+    signal.throwIfAborted();
     const { videoWidth: width, videoHeight: height } = this.#video;
     const context = new OffscreenCanvas(width, height).getContext("2d", {
       willReadFrequently: true,
     });
     if (context === null) throw new Error("this browser gives no canvas to take photos with");
-    const photos: RgbImage[] = [];
-    for (let frame = 0; frame < BURST; frame++) {
-      if (frame > 0) await new Promise((resolve) => setTimeout(resolve, BETWEEN_FRAMES));
-      signal.throwIfAborted();
-      context.drawImage(this.#video, 0, 0);
-      photos.push(fromImageData(context.getImageData(0, 0, width, height)));
-    }
-    return photos;
+    context.drawImage(this.#video, 0, 0);
+    return context;
   }
 
   #stop(): void {
@@ -327,7 +433,8 @@ export class VeilfaceLogin extends Base {
 
   #wordsOf(error: unknown): string {
     if (!(error instanceof Error)) return String(error);
-    const { code, name } = error as Error & { code?: unknown };
+    const { code, details, name } = error as Error & { code?: unknown; details?: { liveness?: string } };
+    if (details?.liveness !== undefined && !this.#asksToMove) return this.words.liveness;
     const key = typeof code === "string" ? code : name;
     return Object.hasOwn(this.words.errors, key) ? this.words.errors[key] : error.message;
   }
