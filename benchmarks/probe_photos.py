@@ -4,16 +4,19 @@ The 80 people of LFW with five photos. All ways to enroll two of a person's phot
 other three; each probe meets all 80 templates. The score is the similarity less its mean over the
 templates of the 79 others, in their standard deviations; thresholds are the quantiles of those
 others. Decoys are drawn from a generator of 1,000 other people. One run compares the mean of the
-three photos with weighted ones, and with one of the three.
+three photos with weighted ones, and with one of the three; or, with ``--probe-dims``, the mean and
+the one as photos and lifted, as the private clients send them.
 
 Example
 -------
 ::
 
     python -m benchmarks.probe_photos --data ../shared/data --pack w600k_mbf --dim 64
+    python -m benchmarks.probe_photos --data ../shared/data --dim 192 --probe-dims 2,4
 """
 
 import argparse
+from functools import partial
 from itertools import combinations
 from pathlib import Path
 
@@ -27,6 +30,7 @@ from templates.decoys import DecoyGenerator
 from templates.distances import Metric, pairwise_distances, similarity
 from templates.keys.randomness import Keystream
 from templates.space.lifting import Strategy, lift
+from templates.space.subspace import SubspaceBatch
 
 PHOTOS = 5
 ENROLLED = 2
@@ -73,7 +77,9 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--pack", default="w600k_mbf")
     parser.add_argument("--dim", type=int, default=64)
+    parser.add_argument("--probe-dims", default="", help="of lifted probes, such as 2,4")
     options = parser.parse_args()
+    probe_dims = [int(each) for each in options.probe_dims.split(",") if each]
     pack = ModelPack.load(options.data / "packs" / options.pack, threads=1)
     folders = sorted(path for path in (options.data / "lfw" / "photos").iterdir() if path.is_dir())
     samples = [
@@ -88,17 +94,21 @@ def main() -> None:
     others = sorted(crop for crop in crops if crop.parent.name not in names)[:DECOY_FACES]
     source = DecoyGenerator.fit(Extractor(pack, aligned=True).extract(others).descriptors)
     weights = weights_of([sample.quality for sample in samples])
+    if probe_dims:
+        weights = {"plain mean": weights["plain mean"]}
 
     found: dict[str, list[tuple[NDArray[np.float64], NDArray[np.float64]]]] = {}
     for split in combinations(range(PHOTOS), ENROLLED):
         rest = [place for place in range(PHOTOS) if place not in split]
         enrolled = mean_of(rows, people[:, list(split)], weights["plain mean"])
         with Keystream.seeded("probe photos", str(split)) as stream:
-            templates = lift(
-                enrolled, strategy=Strategy.ADVERSARIAL, m=options.dim, source=source, stream=stream
-            )
-        probes = {name: mean_of(rows, people[:, rest], each) for name, each in weights.items()}
-        probes["one photo"] = rows[people[:, rest[0]]]
+            lifted = partial(lift, strategy=Strategy.ADVERSARIAL, source=source, stream=stream)
+            templates = lifted(enrolled, m=options.dim)
+            points = {name: mean_of(rows, people[:, rest], each) for name, each in weights.items()}
+            points["one photo"] = rows[people[:, rest[0]]]
+            probes: dict[str, NDArray[np.float32] | SubspaceBatch] = {**points}
+            for m in probe_dims:
+                probes |= {f"{name}, m = {m}": lifted(each, m=m) for name, each in points.items()}
         for name, probe in probes.items():
             distances = pairwise_distances(probe, templates, metric=Metric.SPHERICAL)
             similarities = np.asarray(similarity(distances), dtype=np.float64)
