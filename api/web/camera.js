@@ -119,7 +119,8 @@ export function camera({ onburst, face }) {
     while (!over(signal)) {
       const begun = Date.now();
       let pause = EVERY_MS;
-      if (!document.hidden && video.videoWidth) {
+      // Nor while photos are taken or sent: it would keep them waiting.
+      if (!document.hidden && video.videoWidth && !take.matches(":disabled")) {
         try {
           const small = await snap(FRAME, 0.8);
           if (over(signal)) return;
@@ -148,16 +149,6 @@ export function camera({ onburst, face }) {
   const snap = (side, quality) =>
     picture(video, video.videoWidth, video.videoHeight, { side, quality, square: crops() });
 
-  async function shots(signal) {
-    const taken = [];
-    while (taken.length < BURST) {
-      if (taken.length) await after(APART_MS);
-      if (over(signal)) break;
-      taken.push((await snap(PHOTO, QUALITY)).blob);
-    }
-    return taken;
-  }
-
   // Why a photo would not do, or null.
   async function judge(photo, signal) {
     try {
@@ -176,14 +167,23 @@ export function camera({ onburst, face }) {
     refused.textContent = "";
     const good = [];
     let why = null;
+    let judged = Promise.resolve();
+    const look = async (photo) => {
+      if (over(signal)) return;
+      const not = await judge(photo, signal);
+      if (not) why ??= not;
+      else good.push(photo);
+    };
     try {
-      for (const blob of await shots(signal)) {
+      for (let shot = 0; shot < BURST; shot++) {
+        if (shot) await after(APART_MS);
         if (over(signal)) return;
-        const photo = { blob, name: "camera", seen: null };
-        const not = await judge(photo, signal);
-        if (not) why ??= not;
-        else good.push(photo);
+        const photo = { blob: (await snap(PHOTO, QUALITY)).blob, name: "camera", seen: null };
+        // One after the other, while the next photos are taken.
+        judged = judged.then(() => look(photo));
+        judged.catch(() => {});
       }
+      await judged;
     } catch (error) {
       if (over(signal)) return;
       if (!(error instanceof Problem)) throw error;
