@@ -1,6 +1,6 @@
 // The camera, with live guidance: about one small frame a second is asked about, and slower where
 // the service says so. The photos that count are taken at full size, a burst of three when the
-// visitor says so, and each is asked about itself before it is handed on.
+// visitor says so, and each is asked about meanwhile.
 
 import { faceBox, h } from "./dom.js";
 import { Problem, call, crops, form, session } from "./service.js";
@@ -10,7 +10,7 @@ const EVERY_MS = 1000;
 const FRAME = 480;
 const PHOTO = 1280;
 const QUALITY = 0.92;
-// Apart enough for another moment of the face, and over before anybody moves.
+// Apart enough for another moment of the face, and over before anyone moves.
 const BURST = 3;
 const APART_MS = 300;
 const TAKE = `Take ${BURST} photos`;
@@ -61,7 +61,7 @@ export const after = (ms) => new Promise((done) => setTimeout(done, ms));
 
 export const release = (stream) => stream?.getTracks().forEach((each) => each.stop());
 
-// `onburst(photos)` is called with the photos of a burst that would do, as {blob, name, seen}: `seen`
+// `onburst(photos)` gets the photos of a burst that would do, as {blob, name, seen}: `seen`
 // is what the service saw, or null where it could not be asked; `face()` says which face counts.
 export function camera({ onburst, face }) {
   const video = h("video", { playsinline: true, muted: true, "aria-label": "Your camera" });
@@ -119,7 +119,7 @@ export function camera({ onburst, face }) {
     while (!over(signal)) {
       const begun = Date.now();
       let pause = EVERY_MS;
-      // Nor while photos are taken or sent: it would keep them waiting.
+      // Photos go first.
       if (!document.hidden && video.videoWidth && !take.matches(":disabled")) {
         try {
           const small = await snap(FRAME, 0.8);
@@ -168,19 +168,16 @@ export function camera({ onburst, face }) {
     const good = [];
     let why = null;
     let judged = Promise.resolve();
-    const look = async (photo) => {
-      if (over(signal)) return;
-      const not = await judge(photo, signal);
-      if (not) why ??= not;
-      else good.push(photo);
-    };
     try {
       for (let shot = 0; shot < BURST; shot++) {
         if (shot) await after(APART_MS);
         if (over(signal)) return;
         const photo = { blob: (await snap(PHOTO, QUALITY)).blob, name: "camera", seen: null };
-        // One after the other, while the next photos are taken.
-        judged = judged.then(() => look(photo));
+        judged = judged.then(async () => {
+          const not = await judge(photo, signal);
+          if (not) why ??= not;
+          else good.push(photo);
+        });
         judged.catch(() => {});
       }
       await judged;
