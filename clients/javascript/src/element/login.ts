@@ -119,7 +119,7 @@ const Base = globalThis.HTMLElement ?? (class {} as typeof HTMLElement);
  * `largest`. With the attribute `passkey` an enrollment makes one and is locked to the key that it gives,
  * and a verification asks for it. Parts for styling: `notice`, `video`, `button`, `status`.
  *
- * With `liveness="head-movements"` a verification is none of a private template: it answers a challenge, by
+ * With `liveness="head-movements"` a verification sends no private template: it answers a challenge, by
  * frames that are sent as photos, and `words.frames` says so. An enrollment stays private.
  *
  * Taken out of the page it stops the camera and ends the attempt: nothing more is sent or told.
@@ -194,7 +194,7 @@ export class VeilfaceLogin extends Base {
     this.#show();
   }
 
-  /** Another thing would be sent: the camera starts again once the person has read it. */
+  /** What is sent changes: the camera starts again once the person has read it. */
   attributeChangedCallback(_: string, old: string | null, now: string | null): void {
     if (old !== now && this.isConnected) this.#restart();
   }
