@@ -1,6 +1,6 @@
 // The camera, with live guidance: about one small frame a second is asked about, and slower where
 // the service says so. The photos that count are taken at full size, a burst of three when the
-// visitor says so, and each is asked about itself before it is handed on.
+// visitor says so, and each is asked about meanwhile.
 
 import { faceBox, h } from "./dom.js";
 import { Problem, call, crops, form, session } from "./service.js";
@@ -10,7 +10,7 @@ const EVERY_MS = 1000;
 const FRAME = 480;
 const PHOTO = 1280;
 const QUALITY = 0.92;
-// Apart enough for another moment of the face, and over before anybody moves.
+// Apart enough for another moment of the face, and over before anyone moves.
 const BURST = 3;
 const APART_MS = 300;
 const TAKE = `Take ${BURST} photos`;
@@ -61,7 +61,7 @@ export const after = (ms) => new Promise((done) => setTimeout(done, ms));
 
 export const release = (stream) => stream?.getTracks().forEach((each) => each.stop());
 
-// `onburst(photos)` is called with the photos of a burst that would do, as {blob, name, seen}: `seen`
+// `onburst(photos)` gets the photos of a burst that would do, as {blob, name, seen}: `seen`
 // is what the service saw, or null where it could not be asked; `face()` says which face counts.
 export function camera({ onburst, face }) {
   const video = h("video", { playsinline: true, muted: true, "aria-label": "Your camera" });
@@ -119,7 +119,8 @@ export function camera({ onburst, face }) {
     while (!over(signal)) {
       const begun = Date.now();
       let pause = EVERY_MS;
-      if (!document.hidden && video.videoWidth) {
+      // Photos go first.
+      if (!document.hidden && video.videoWidth && !take.matches(":disabled")) {
         try {
           const small = await snap(FRAME, 0.8);
           if (over(signal)) return;
@@ -148,16 +149,6 @@ export function camera({ onburst, face }) {
   const snap = (side, quality) =>
     picture(video, video.videoWidth, video.videoHeight, { side, quality, square: crops() });
 
-  async function shots(signal) {
-    const taken = [];
-    while (taken.length < BURST) {
-      if (taken.length) await after(APART_MS);
-      if (over(signal)) break;
-      taken.push((await snap(PHOTO, QUALITY)).blob);
-    }
-    return taken;
-  }
-
   // Why a photo would not do, or null.
   async function judge(photo, signal) {
     try {
@@ -176,14 +167,20 @@ export function camera({ onburst, face }) {
     refused.textContent = "";
     const good = [];
     let why = null;
+    let judged = Promise.resolve();
     try {
-      for (const blob of await shots(signal)) {
+      for (let shot = 0; shot < BURST; shot++) {
+        if (shot) await after(APART_MS);
         if (over(signal)) return;
-        const photo = { blob, name: "camera", seen: null };
-        const not = await judge(photo, signal);
-        if (not) why ??= not;
-        else good.push(photo);
+        const photo = { blob: (await snap(PHOTO, QUALITY)).blob, name: "camera", seen: null };
+        judged = judged.then(async () => {
+          const not = await judge(photo, signal);
+          if (not) why ??= not;
+          else good.push(photo);
+        });
+        judged.catch(() => {});
       }
+      await judged;
     } catch (error) {
       if (over(signal)) return;
       if (!(error instanceof Problem)) throw error;

@@ -13,9 +13,10 @@ import { Client, NotEnrolled } from "../../clients/javascript/dist/index.js";
 const { VEILFACE_URL, VEILFACE_API_KEY, PORT = "3000" } = process.env;
 const service = VEILFACE_URL.replace(/\/+$/, "");
 const veilface = new Client(service, VEILFACE_API_KEY);
+// Of a connection, not of a path: a browser takes a path without a slash at its end for one file.
 const policy =
   "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; " +
-  `connect-src 'self' ${service}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'`;
+  `connect-src 'self' ${new URL(service).origin}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'`;
 const accounts = new Map(); // name to account; yours live in a database
 const sessions = new Map(); // id to { account, face, tokenId }: who knew the password
 
@@ -36,6 +37,8 @@ function open(response, session) {
 }
 
 async function credentials(request) {
+  // A form of another site can send this text too, but not with this type.
+  if (!/^application\/json *(;|$)/i.test(request.headers["content-type"] ?? "")) throw new Refused(415, "not JSON");
   if (!(Number(request.headers["content-length"]) <= 1000)) throw new Refused(400, "too large");
   const { name, password } = (await json(request).catch(() => null)) ?? {};
   const texts = typeof name === "string" && typeof password === "string";
@@ -45,11 +48,13 @@ async function credentials(request) {
   return { name, password };
 }
 
-async function enrolled(subject) {
+// What the page is to do next, and where: to enroll where there is no face yet, and else to verify.
+async function next(subject) {
   try {
-    return await veilface.describe(subject);
+    await veilface.describe(subject);
+    return { service, action: "verify" };
   } catch (error) {
-    if (error instanceof NotEnrolled) return null;
+    if (error instanceof NotEnrolled) return { service, action: "enroll" };
     throw error;
   }
 }
@@ -63,7 +68,7 @@ const routes = {
     if (accounts.has(name)) throw new Refused(409, "this name is taken");
     accounts.set(name, account);
     open(response, { account });
-    return [201];
+    return [201, { service, action: "enroll" }];
   },
   // In a program of yours, limit the guesses too.
   async "POST /login"(request, response) {
@@ -72,27 +77,28 @@ const routes = {
     const { salt, password: expected } = account ?? { salt: Buffer.alloc(16), password: Buffer.alloc(64) };
     const right = timingSafeEqual(await hash(password, salt), expected);
     if (!account || !right) throw new Refused(401, "wrong name or password");
+    const asked = await next(account.subject);
     open(response, { account });
-    return [204];
+    return [200, asked];
   },
-  // To enroll where there is no face yet, and else to verify.
   async "POST /token"(request, response, session) {
     const { subject } = session.account;
+    const asked = await next(subject);
     // The first face only: who holds an older token must not replace it.
-    const asked = (await enrolled(subject)) ? { action: "verify" } : { action: "enroll", replace: false };
-    const { token, token_id } = await veilface.token(subject, asked);
+    const more = asked.action === "enroll" ? { replace: false } : {};
+    const { token, token_id } = await veilface.token(subject, { action: asked.action, ...more });
     session.tokenId = token_id; // it stays here: the page could name another one
-    return [200, { service, action: asked.action, subject, token }];
+    return [200, { ...asked, subject, token }];
   },
   // Ask the service what the page did with its token, and let in who is accepted.
   async "POST /face"(request, response, session) {
     const { tokenId } = session;
-    session.tokenId = undefined;
     const { subject, name } = session.account;
     const { outcome } = tokenId ? await veilface.tokenOutcome(subject, tokenId) : {};
-    const accepted = ["accept", "created"].includes(outcome);
-    if (accepted) open(response, { account: session.account, face: true });
-    return [200, { accepted, name }];
+    session.tokenId = undefined; // it counts once, and stays where the service did not answer
+    if (!["accept", "created"].includes(outcome)) return [200, { accepted: false, ...(await next(subject)) }];
+    open(response, { account: session.account, face: true });
+    return [200, { accepted: true, name }];
   },
   async "GET /account"(request, response, session) {
     if (!session.face) throw new Refused(401, "show your face");

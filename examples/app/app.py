@@ -11,6 +11,7 @@ import secrets
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
+from urllib.parse import urlsplit
 
 import uvicorn
 from fastapi import Cookie, Depends, FastAPI, HTTPException, Request, Response
@@ -24,9 +25,11 @@ URL = os.environ["VEILFACE_URL"].rstrip("/")
 CLIENT = Client(URL, os.environ["VEILFACE_API_KEY"])
 HERE = Path(__file__).parent
 PACKAGE = HERE.parents[1] / "clients" / "javascript"  # in a project of yours: node_modules
+# Of a connection, not of a path: a browser takes a path without a slash at its end for one file.
+ORIGIN = "{0.scheme}://{0.netloc}".format(urlsplit(URL))
 POLICY = (
     "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; "
-    f"connect-src 'self' {URL}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    f"connect-src 'self' {ORIGIN}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
 app = FastAPI(openapi_url=None)
 
@@ -79,6 +82,15 @@ def session_of(session: Annotated[str, Cookie()] = "") -> Session:
     return SESSIONS[session]
 
 
+def next_call(subject: str) -> dict[str, str]:
+    """Tell the page what to do, and where: enroll where there is no face yet, and else verify."""
+    try:
+        CLIENT.describe(subject)
+    except NotEnrolled:
+        return {"service": URL, "action": "enroll"}
+    return {"service": URL, "action": "verify"}
+
+
 HasPassword = Annotated[Session, Depends(session_of)]
 
 
@@ -89,51 +101,53 @@ async def away(request: Request, error: Exception) -> JSONResponse:  # noqa: ARG
 
 
 @app.post("/register", status_code=201)
-def register(sent: Credentials, response: Response) -> None:
+def register(sent: Credentials, response: Response) -> dict[str, str]:
     """Make an account."""
     salt = os.urandom(16)
     account = Account(sent.name, secrets.token_hex(16), salt, scrypt(sent.password, salt))
     if ACCOUNTS.setdefault(sent.name, account) is not account:
         raise HTTPException(409, "this name is taken")
     open_session(response, Session(account))
+    return {"service": URL, "action": "enroll"}
 
 
-@app.post("/login", status_code=204)
-def login(sent: Credentials, response: Response) -> None:
+@app.post("/login")
+def login(sent: Credentials, response: Response) -> dict[str, str]:
     """Check a password; in a program of yours, limit the guesses too."""
     account = ACCOUNTS.get(sent.name)
     salt, expected = (bytes(16), bytes(64)) if account is None else (account.salt, account.password)
     right = hmac.compare_digest(scrypt(sent.password, salt), expected)
     if account is None or not right:
         raise HTTPException(401, "wrong name or password")
+    asked = next_call(account.subject)
     open_session(response, Session(account))
+    return asked
 
 
 @app.post("/token")
 def token(session: HasPassword) -> dict[str, str]:
-    """Ask for a token, to enroll where there is no face yet, and else to verify."""
+    """Ask for a token for what is next."""
     subject = session.account.subject
-    try:
-        CLIENT.describe(subject)
-    except NotEnrolled:
+    asked = next_call(subject)
+    if asked["action"] == "enroll":
         # The first face only: who holds an older token must not replace it.
         issued = CLIENT.create_token(subject, "enroll", replace=False)
     else:
         issued = CLIENT.create_token(subject, "verify")
     session.token_id = issued.token_id  # it stays here: the page could name another one
-    return {"service": URL, "action": issued.action, "subject": subject, "token": issued.token}
+    return {**asked, "subject": subject, "token": issued.token}
 
 
 @app.post("/face")
 def face(session: HasPassword, response: Response) -> dict[str, bool | str]:
     """Ask the service what the page did with its token, and let in who is accepted."""
-    token_id, session.token_id = session.token_id, None
-    subject = session.account.subject
+    token_id, subject = session.token_id, session.account.subject
     outcome = CLIENT.token_outcome(subject, token_id).outcome if token_id else None
-    accepted = outcome in ("accept", "created")
-    if accepted:
-        open_session(response, Session(session.account, face=True))
-    return {"accepted": accepted, "name": session.account.name}
+    session.token_id = None  # it counts once, and stays where the service did not answer
+    if outcome not in ("accept", "created"):
+        return {"accepted": False, **next_call(subject)}
+    open_session(response, Session(session.account, face=True))
+    return {"accepted": True, "name": session.account.name}
 
 
 @app.get("/account")

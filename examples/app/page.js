@@ -1,5 +1,5 @@
-// The password goes to our own server, and to Veilface a private template alone: the element embeds
-// and lifts here. Neither gets a photo.
+// The password goes to our own server, and to Veilface only a private template of the face: the
+// element embeds and lifts here. Neither gets a photo.
 import { defineLogin } from "/client/element/login.js";
 import * as ort from "/ort/ort.wasm.min.mjs";
 
@@ -18,14 +18,29 @@ async function own(path, body) {
 defineLogin();
 const login = document.createElement("veilface-login");
 login.options = { runtime: ort };
+// Who is let in says the server.
+login.words = { accept: "", enrolled: "" };
 login.authorize = () => own("/token");
+
+const after = (milliseconds) => new Promise((resolve) => setTimeout(resolve, milliseconds));
+
+function ask({ service, action }) {
+  login.setAttribute("service", service);
+  login.setAttribute("action", action);
+  output.value = action === "enroll" ? "Now enroll your face" : "Now show your face";
+}
 
 // What counts is what the server learned itself, after an error too: an answer may have been lost.
 async function ended() {
-  const { accepted, name } = await own("/face").catch(({ message }) => ((output.value = message), {}));
-  if (!accepted) return;
-  login.remove();
-  output.value = `Welcome, ${name}`;
+  try {
+    // The server keeps what it could not ask the service yet.
+    const told = await own("/face").catch(() => after(2000).then(() => own("/face")));
+    if (!told.accepted) return ask(told);
+    login.remove();
+    output.value = `Welcome, ${told.name}`;
+  } catch (error) {
+    output.value = error.message;
+  }
 }
 login.addEventListener("veilface-result", ended);
 login.addEventListener("veilface-error", ended);
@@ -36,12 +51,8 @@ form.addEventListener("submit", async (event) => {
   login.remove();
   output.value = "…";
   try {
-    await own(event.submitter.value, { name, password });
-    const { service, action } = await own("/token");
-    login.setAttribute("service", service);
-    login.setAttribute("action", action);
+    ask(await own(event.submitter.value, { name, password }));
     form.after(login);
-    output.value = action === "enroll" ? "Now enroll your face" : "Now show your face";
   } catch (error) {
     output.value = error.message;
   }

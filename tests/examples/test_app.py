@@ -1,6 +1,7 @@
 """The application in both backends: a password first, then a face, of which a template is sent."""
 
 import base64
+import json
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -30,6 +31,7 @@ __all__ = ["camera", "chromium", "pack", "people"]
 
 pytestmark = pytest.mark.long
 PASSWORD = "correct horse"
+JSON = {"Content-Type": "application/json"}
 BACKENDS = ("app.py", "app.mjs")
 FRAME = """async (login) => {
   const video = login.shadowRoot.querySelector("video");
@@ -55,7 +57,10 @@ class Place:
 
     def key(self, **options: Any) -> str:
         """What docs/login.md says that the application needs, and no more."""
-        return self.running.deployment.key("enroll", "verify", "embeddings", **options)
+        deployment = self.running.deployment
+        key = deployment.key("enroll", "verify", "embeddings", tenant="app", **options)
+        deployment.allow_templates("app")
+        return key
 
     def environment(self, key: str, backend: str) -> dict[str, str]:
         return clean_environment(
@@ -107,7 +112,9 @@ class Visitor:
         self._url, self.session = url, ""
 
     def send(self, method: str, path: str, **options: Any) -> httpx.Response:
-        headers = {"Cookie": f"session={self.session}"} if self.session else {}
+        headers = options.pop("headers", {})
+        if self.session:
+            headers = {**headers, "Cookie": f"session={self.session}"}
         answer = httpx.request(
             method, f"{self._url}/{path}", headers=headers, timeout=60, **options
         )
@@ -171,7 +178,7 @@ def test_password_and_face_together_open_an_account(
     again = Visitor(app.url)
     assert again.sign("login", "ann", "wrong password") == 401
     assert again.sign("login", "nobody") == 401
-    assert again.sign("login", "ann") == 204
+    assert again.sign("login", "ann") == 200
     assert not again.is_in
     assert again.show(own[1])["action"] == "verify"
     assert again.accepted
@@ -185,7 +192,7 @@ def test_who_knows_the_password_alone_stays_out(app: Proxy, people: dict[str, li
     owner.show(people[WHO][0])
     assert owner.accepted
     thief = Visitor(app.url)
-    assert thief.sign("login", "eve") == 204
+    assert thief.sign("login", "eve") == 200
     # Without a token, with one that was not used, and with another face.
     assert not thief.accepted
     given = thief.token()
@@ -203,7 +210,7 @@ def test_an_older_token_replaces_no_face(app: Proxy, people: dict[str, list[Path
     """Who knew the password before the first face came holds a token that enrolls."""
     owner, thief = Visitor(app.url), Visitor(app.url)
     assert owner.sign("register", "fay") == 201
-    assert thief.sign("login", "fay") == 204
+    assert thief.sign("login", "fay") == 200
     given = thief.token()
     owner.show(people[WHO][0])
     assert given["action"] == "enroll"
@@ -224,7 +231,22 @@ def test_only_texts_are_a_name_and_a_password(app: Proxy) -> None:
             "POST", "register", json={"name": name, "password": password}
         )
         assert answer.status_code == 422
-    assert Visitor(app.url).send("POST", "register", json=None).status_code in (400, 422)
+    for data in (b"", b"null", b"{"):
+        answer = Visitor(app.url).send("POST", "register", content=data, headers=JSON)
+        assert answer.status_code in (400, 422)
+
+
+def test_a_form_of_another_site_signs_nobody_in(app: Proxy) -> None:
+    """A browser sends it as text, or without a type, and asks nobody before."""
+    assert Visitor(app.url).sign("register", "hal") == 201
+    data = json.dumps({"name": "hal", "password": PASSWORD}).encode()
+    for path in ("login", "register"):
+        for headers in ({"Content-Type": "text/plain"}, {}):
+            visitor = Visitor(app.url)
+            answer = visitor.send("POST", path, content=data, headers=headers)
+            assert answer.status_code in (415, 422)
+            assert visitor.session == ""
+    assert Visitor(app.url).send("POST", "login", content=data, headers=JSON).is_success
 
 
 def test_the_page_is_served_with_its_policy_and_what_it_runs(app: Proxy, place: Place) -> None:
@@ -264,21 +286,42 @@ def test_nothing_else_is_served(app: Proxy, path: str) -> None:
     assert httpx.get(url).status_code in (404, 405)
 
 
-def test_nobody_gets_in_while_the_service_is_away(tmp_path: Path) -> None:
+def test_nobody_gets_in_while_the_service_is_away(
+    app: Proxy, place: Place, people: dict[str, list[Path]]
+) -> None:
+    """Who has shown the right face is let in once the service says so, by the same attempt."""
+    visitor = Visitor(app.url)
+    assert visitor.sign("register", "joe") == 201
+    visitor.show(people[WHO][0])
+    place.service.lose = 1000
+    try:
+        assert visitor.send("POST", "face").status_code == 502
+        assert not visitor.is_in
+        assert visitor.send("POST", "token").status_code == 502
+        assert Visitor(app.url).sign("login", "joe") == 502
+    finally:
+        place.service.lose = 0
+    assert not visitor.is_in
+    assert visitor.accepted
+    assert visitor.is_in
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_the_page_may_call_a_service_under_a_path(backend: str, tmp_path: Path) -> None:
+    """By its origin: a path without a slash at its end would let the page call that path alone."""
     require_client()
-    port, nobody = free_port(), free_port()
-    for backend in BACKENDS:
-        env = clean_environment(
-            VEILFACE_URL=f"http://127.0.0.1:{nobody}",
-            VEILFACE_API_KEY="vf_000000000000_" + "0" * 64,
-            PORT=str(port),
-        )
-        url = f"http://127.0.0.1:{port}"
-        with running(command(backend), url, env, tmp_path / "log"):
-            visitor = Visitor(url)
-            assert visitor.sign("register", "ann") == 201
-            assert visitor.send("POST", "token").status_code == 502
-            assert not visitor.is_in
+    port = free_port()
+    env = clean_environment(
+        VEILFACE_URL="https://login.example.org/veilface/",
+        VEILFACE_API_KEY="vf_000000000000_" + "0" * 64,
+        PORT=str(port),
+    )
+    url = f"http://127.0.0.1:{port}"
+    with running(command(backend), url, env, tmp_path / "log"):
+        policy = httpx.get(url).headers["Content-Security-Policy"].split("; ")
+        assert "connect-src 'self' https://login.example.org" in policy
+        answer = Visitor(url).send("POST", "register", json={"name": "ann", "password": PASSWORD})
+        assert answer.json()["service"] == "https://login.example.org/veilface"
 
 
 def sign(page: Page, name: str, button: str, password: str = PASSWORD) -> None:
@@ -431,13 +474,48 @@ def test_an_answer_that_is_lost_lets_in_all_the_same(
         context.close()
 
 
+def test_the_page_follows_what_the_server_learned(
+    app: Proxy, browser: Browser, camera: FakeCamera, people: dict[str, list[Path]]
+) -> None:
+    """That there is a face by now, and what came of the token, if not at once."""
+    context = browser.new_context()
+    try:
+        page = context.new_page()
+        page.goto(app.url)
+        camera.shows(people[WHO][0])
+        sign(page, "kim", "Register")
+        told(page).to_have_text("Now enroll your face")
+        elsewhere = Visitor(app.url)
+        assert elsewhere.sign("login", "kim") == 200
+        elsewhere.show(people[WHO][1])
+        stand_before(page, "Enroll")
+        told(page).to_have_text("Now show your face")
+        assert status_of_account(page) == 401
+
+        seen = []
+
+        def lose(route: Route) -> None:
+            seen.append(page.locator("veilface-login output").text_content())
+            route.fulfill(status=502, json={"detail": "away"})
+
+        page.route("**/face", lose, times=1)
+        stand_before(page, "Log in")
+        told(page).to_have_text("Welcome, kim")
+        assert seen == [""], "nobody is welcome before the server says so"
+    finally:
+        context.close()
+
+
 def test_where_liveness_is_asked_for_the_page_says_that_it_sends_no_photo(
     place: Place,
     browser: Browser,
     camera: FakeCamera,
+    pack: ModelPack,
     people: dict[str, list[Path]],
     tmp_path: Path,
 ) -> None:
+    own = people[WHO][:1]
+    place.service.forget()
     key = place.key(liveness=LivenessPolicy.ACTIVE)
     env = place.environment(key, "strict")
     context = browser.new_context()
@@ -445,13 +523,17 @@ def test_where_liveness_is_asked_for_the_page_says_that_it_sends_no_photo(
         with running(command("app.py"), direct(place, "strict"), env, tmp_path / "app.log"):
             page = context.new_page()
             page.goto(place.apps["strict"].url)
-            camera.shows(people[WHO][0])
+            camera.shows(own[0])
             sign(page, "mia", "Register")
-            stand_before(page, "Enroll")
+            shown = {"camera at enrollment": stand_before(page, "Enroll")}
             told(page).to_have_text("Welcome, mia")
             sign(page, "mia", "Sign in")
-            stand_before(page, "Log in")
+            shown["camera at login"] = stand_before(page, "Log in")
             said(page).to_contain_text("This page sends none.")
             assert status_of_account(page) == 401
+            search = faces_of(pack, [Person(WHO, own, [])], shown)
+            assert requests_in(place.service.sent)[0]["POST /v1/subjects/*/verify"]["times"] == 1
+            assert search.find(place.service.sent) == []
+            assert search.find(place.service.sent + own[0].read_bytes())
     finally:
         context.close()

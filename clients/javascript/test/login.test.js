@@ -7,9 +7,11 @@ const { VeilfaceLogin: ForServers } = await import("../dist/element/login.js?ren
 
 class Part {
   part = { add() {} };
+  attributes = {};
   #clicked = () => {};
   addEventListener(_, listener) { this.#clicked = listener; }
   click() { this.#clicked(); }
+  setAttribute(name, value) { this.attributes[name] = value; }
   play() { return Promise.resolve(); }
   videoWidth = 4;
   videoHeight = 4;
@@ -18,15 +20,25 @@ class Part {
 class Page extends EventTarget {
   // What a page has before its element is known becomes it: the constructor returns it.
   static known;
+  isConnected = false;
   #attributes = new Map();
   constructor() {
     super();
-    if (Page.known) return Page.known;
+    if (Page.known) return Object.setPrototypeOf(Page.known, new.target.prototype);
   }
   getAttribute(name) { return this.#attributes.get(name) ?? null; }
   setAttribute(name, value) {
+    const old = this.getAttribute(name);
     this.#attributes.set(name, value);
-    if (this.constructor.observedAttributes?.includes(name)) this.attributeChangedCallback();
+    if (this.constructor.observedAttributes?.includes(name)) this.attributeChangedCallback(name, old, value);
+  }
+  enter() {
+    this.isConnected = true;
+    this.connectedCallback();
+  }
+  leave() {
+    this.isConnected = false;
+    this.disconnectedCallback();
   }
   attachShadow() {
     return { append: (...parts) => ([this.notice, this.video, this.button, this.status] = parts) };
@@ -46,7 +58,10 @@ Object.assign(globalThis, {
     }
   },
 });
-const { VeilfaceLogin } = await import("../dist/element/login.js");
+const { VeilfaceLogin, PasskeyError, WORDS } = await import("../dist/element/login.js");
+const { FAMILIES } = await import("../dist/service/errors.js");
+const { InconsistentImages } = await import("../dist/templates/errors.js");
+const { NoFace, PackError } = await import("../dist/models/errors.js");
 
 const settled = () => new Promise((resolve) => setTimeout(resolve));
 
@@ -59,7 +74,7 @@ function element({ authorize, fetch, camera = async () => {} } = {}) {
       mediaDevices: {
         getUserMedia: async () => {
           await camera();
-          const track = { stopped: false, stop() { this.stopped = true; } };
+          const track = Object.assign(new EventTarget(), { stopped: false, stop() { this.stopped = true; } });
           tracks.push(track);
           return { getTracks: () => [track] };
         },
@@ -74,7 +89,7 @@ function element({ authorize, fetch, camera = async () => {} } = {}) {
   login.setAttribute("service", "http://127.0.0.1:1");
   login.options = { runtime: {}, fetch, retries: { sendings: 1 } };
   login.authorize = authorize;
-  login.connectedCallback();
+  login.enter();
   return { login, tracks, told };
 }
 
@@ -89,7 +104,8 @@ test("what a page sets before the element is known stays", () => {
   Page.known = early;
   try {
     const { options, authorize, words } = new VeilfaceLogin();
-    assert.deepEqual({ options, authorize, words }, given);
+    assert.deepEqual([options, authorize, words.start], [given.options, given.authorize, "Kamera an"]);
+    assert.deepEqual(words, { ...WORDS, start: "Kamera an" });
   } finally {
     Page.known = undefined;
   }
@@ -101,7 +117,7 @@ test("a camera that is granted after the element left is stopped at once", async
   const { login, tracks, told } = element({ camera: () => new Promise((resolve) => (grant = resolve)) });
   login.button.click();
   await settled();
-  login.disconnectedCallback();
+  login.leave();
   grant();
   await settled();
   assert.deepEqual([tracks.map(({ stopped }) => stopped), told], [[true], []]);
@@ -125,7 +141,7 @@ test("an attempt ends with the element: no token is asked for, and nothing told"
   await settled();
   const attempt = assert.rejects(login.attempt(), { name: "AbortError" });
   await settled();
-  login.disconnectedCallback();
+  login.leave();
   await Promise.all([aborted, attempt]);
   await settled();
   assert.deepEqual([tokens, tracks.map(({ stopped }) => stopped), told], [1, [true], []]);
@@ -172,6 +188,101 @@ test("that photos will be sent is said before the camera starts, and a running o
   assert.deepEqual(asked, [], "no graph is fetched for it");
   login.setAttribute("liveness", "off");
   assert.deepEqual([login.notice.textContent, tracks[1].stopped], ["", true]);
+  login.setAttribute("liveness", "head-movements");
+  login.setAttribute("action", "enroll");
+  assert.equal(login.notice.textContent, "", "an enrollment sends none");
+  assert.equal(login.button.attributes["aria-describedby"], login.notice.id);
+});
+
+test("words that are given late are shown, and those that are not stay in English", () => {
+  const { login } = element();
+  login.setAttribute("liveness", "head-movements");
+  login.words = { start: "Kamera an", movements: { front: "Geradeaus." } };
+  assert.equal(login.button.textContent, "Kamera an");
+  assert.match(login.notice.textContent, /Photos .* are sent to the service/);
+  const { front, look_up } = login.words.movements;
+  assert.deepEqual([front, look_up], ["Geradeaus.", "Look up."]);
+  login.words = { frames: "Fotos gehen an den Dienst." };
+  assert.equal(login.notice.textContent, "Fotos gehen an den Dienst.");
+});
+
+test("no challenge is answered where nothing says that photos are sent", async () => {
+  let tokens = 0;
+  const { login } = element({ authorize: async () => ({ subject: "anna", token: `vft_${tokens++}` }) });
+  login.setAttribute("liveness", "head-movements");
+  for (const frames of ["", " ", undefined]) {
+    login.words = { frames };
+    await assert.rejects(login.attempt(), /words\.frames/);
+  }
+  assert.equal(tokens, 0);
+});
+
+test("an attribute that stays as it is ends nothing, and none starts an element that left", async () => {
+  const { login, tracks } = element({ authorize: () => new Promise(() => {}) });
+  login.setAttribute("action", "enroll");
+  login.button.click();
+  await settled();
+  login.setAttribute("action", "enroll");
+  assert.deepEqual([tracks[0].stopped, login.button.textContent], [false, "Enroll"]);
+  login.leave();
+  login.setAttribute("liveness", "head-movements");
+  await assert.rejects(login.attempt(), { name: "AbortError" });
+});
+
+test("a camera that ends is said and told, and ends the attempt", async () => {
+  let signal;
+  const fetch = (_, options) => {
+    ({ signal } = options);
+    return new Promise((_resolve, reject) => signal.addEventListener("abort", () => reject(signal.reason)));
+  };
+  const authorize = async () => ({ subject: "anna", token: `vft_${"a".repeat(20)}` });
+  const { login, tracks, told } = element({ authorize, fetch });
+  login.button.click();
+  await settled();
+  tracks[0].dispatchEvent(new Event("ended"));
+  assert.deepEqual([signal.aborted, login.status.value], [true, login.words.camera]);
+  assert.deepEqual([login.button.textContent, told.map(({ name }) => name)], ["Start camera", ["NotReadableError"]]);
+  login.button.click();
+  await settled();
+  tracks[0].dispatchEvent(new Event("ended"));
+  assert.deepEqual([tracks[1].stopped, told.length], [false, 1], "the one before");
+});
+
+test("the camera stays on only where another photo, or the passkey, may help", async () => {
+  const { login, tracks, told } = element();
+  const refused = (code, status) => new (FAMILIES[code])({ code, status, message: code });
+  for (const [error, stopped] of [
+    [new NoFace(), false],
+    [refused("low_quality", 422), false],
+    [new InconsistentImages([1], [0, 2]), false],
+    [new PasskeyError("passkey_refused", ""), false],
+    [new PasskeyError("passkey_unsupported", ""), true],
+    [refused("forbidden", 403), true],
+    [refused("locked_out", 423), true],
+    [new PackError("not that of the contract"), true],
+    [new TypeError("a defect"), true],
+  ]) {
+    login.attempt = async () => { throw error; };
+    if (login.button.textContent === "Start camera") login.button.click();
+    await settled();
+    login.button.click();
+    while (told.at(-1) !== error) await settled();
+    assert.equal(tracks.at(-1).stopped, stopped, error.name);
+  }
+});
+
+test("who sends frames needs no runtime, and who lifts is told that one is missing", async () => {
+  const { login } = element({ authorize: async () => ({ subject: "anna", token: `vft_${"a".repeat(20)}` }) });
+  const asked = [];
+  login.options = { retries: { sendings: 1 }, fetch: async (url) => {
+    asked.push(new URL(url).pathname);
+    return new Response("", { status: 503 });
+  } };
+  await assert.rejects(login.attempt(), /needs the runtime/);
+  login.setAttribute("liveness", "head-movements");
+  await assert.rejects(login.attempt(), { name: "Unavailable" });
+  assert.deepEqual(asked, ["/v1/challenges"]);
+  assert.equal(login.status.attributes["aria-live"], "polite");
 });
 
 test("where the service checks liveness, private mode says that it cannot serve", async () => {

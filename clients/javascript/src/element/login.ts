@@ -1,12 +1,14 @@
 /** `<veilface-login>`: camera, burst or head movements, decision, for any page. */
 
+import { FaceError } from "../models/errors.js";
 import { fromImageData, type RgbImage } from "../models/image.js";
 import type { FacePolicy } from "../models/pack.js";
 import type { Decision, Enrollment } from "../service/answers.js";
 import { Client } from "../service/client.js";
-import { ContractMismatch } from "../service/errors.js";
+import { ContractMismatch, PhotoRefused } from "../service/errors.js";
 import { Enrollable, type Probe } from "../service/lifts.js";
 import { PrivateClient, type PrivateOptions } from "../service/private-client.js";
+import { InconsistentImages } from "../templates/errors.js";
 import { createPasskey, passkeyHolderKey, PasskeyError, type Passkey } from "./passkey.js";
 
 export { PasskeyError } from "./passkey.js";
@@ -18,6 +20,10 @@ export interface Authorization {
   /** In the place of a key from a passkey. */
   readonly holderKey?: Uint8Array;
 }
+
+/** Of `PrivateClient`; a verification that sends frames needs no runtime. */
+export type LoginOptions = Omit<PrivateOptions, "signal" | "runtime"> &
+  Partial<Pick<PrivateOptions, "runtime">>;
 
 /** What the element says to the person. */
 export interface Words {
@@ -31,6 +37,8 @@ export interface Words {
   readonly reject: string;
   readonly enrolled: string;
   readonly camera: string;
+  /** What a screen reader calls the picture of the camera. */
+  readonly video: string;
   /** Shown as long as verifications send photos, so before the camera starts. */
   readonly frames: string;
   /** By their names in a challenge, and `front` and `move_back`. */
@@ -54,7 +62,9 @@ export const WORDS: Words = {
   reject: "That did not match. Try again.",
   enrolled: "You are enrolled.",
   camera: "The camera cannot be used.",
-  frames: "To log in, move your head as you are asked to. Photos of that are sent to the service.",
+  video: "Your camera",
+  frames:
+    "To log in, move your head as you are asked to, for about 12 seconds. Photos of that are sent to the service.",
   movements: {
     front: "Look straight ahead.",
     move_back: "Move back and look straight ahead.",
@@ -89,11 +99,18 @@ const BACK = 1300;
 const after = (milliseconds: number): Promise<void> =>
   new Promise((resolve) => setTimeout(resolve, milliseconds));
 
+/** Another photo may help, or the passkey after all; for all else no camera is needed. */
+const mendable = (error: unknown): boolean =>
+  error instanceof FaceError ||
+  error instanceof InconsistentImages ||
+  error instanceof PhotoRefused ||
+  (error instanceof PasskeyError && error.code === "passkey_refused");
+
 // A server that renders pages imports this module too, and has no elements.
 const Base = globalThis.HTMLElement ?? (class {} as typeof HTMLElement);
 
 /**
- * The element. Set `runtime` and `authorize`; then it asks for the camera when it is told to, takes
+ * The element. Set `options` and `authorize`; then it asks for the camera when it is told to, takes
  * a burst, lifts it in the page, sends the template alone, and tells the page by an event:
  * `veilface-result` with the decision (or enrollment) as its detail, `veilface-error` with the error.
  *
@@ -102,7 +119,7 @@ const Base = globalThis.HTMLElement ?? (class {} as typeof HTMLElement);
  * `largest`. With the attribute `passkey` an enrollment makes one and is locked to the key that it gives,
  * and a verification asks for it. Parts for styling: `notice`, `video`, `button`, `status`.
  *
- * With `liveness="head-movements"` a verification is none of a private template: it answers a challenge, by
+ * With `liveness="head-movements"` a verification sends no private template: it answers a challenge, by
  * frames that are sent as photos, and `words.frames` says so. An enrollment stays private.
  *
  * Taken out of the page it stops the camera and ends the attempt: nothing more is sent or told.
@@ -110,18 +127,19 @@ const Base = globalThis.HTMLElement ?? (class {} as typeof HTMLElement);
  * Never believe the event alone: your server asks the service what came of the token.
  */
 export class VeilfaceLogin extends Base {
-  static readonly observedAttributes = ["liveness"];
+  static readonly observedAttributes = ["liveness", "action"];
 
   // Declared and not defined: a page may have set them before its element was known.
   /** Of `PrivateClient`: the ONNX Runtime, and where the graphs are. */
-  declare options: Omit<PrivateOptions, "signal"> | undefined;
+  declare options: LoginOptions | undefined;
   /**
    * Asks your server for a token, which is good for one call and for minutes: called once to fetch
-   * the graphs, which may take longer than that, and once for each attempt.
+   * the graphs, which may take longer than that, and once for each attempt. Where frames are sent, it is
+   * called once, before the movements.
    */
   declare authorize: (() => Promise<Authorization>) | undefined;
-  declare words: Words;
 
+  #words = WORDS;
   readonly #notice = document.createElement("p");
   readonly #video = document.createElement("video");
   readonly #button = document.createElement("button");
@@ -136,7 +154,6 @@ export class VeilfaceLogin extends Base {
 
   constructor() {
     super();
-    this.words ??= WORDS;
     const root = this.attachShadow({ mode: "open" });
     // A constructed sheet needs no `unsafe-inline` of the page.
     const sheet = new CSSStyleSheet();
@@ -145,24 +162,55 @@ export class VeilfaceLogin extends Base {
     this.#video.muted = true;
     this.#video.playsInline = true;
     this.#notice.part.add("notice");
+    this.#notice.id = "notice";
     this.#video.part.add("video");
     this.#button.type = "button";
+    this.#button.setAttribute("aria-describedby", this.#notice.id);
     this.#button.part.add("button");
     this.#status.part.add("status");
     root.append(this.#notice, this.#video, this.#button, this.#status);
     this.#button.addEventListener("click", () => void this.#clicked());
+    if (Object.hasOwn(this, "words")) {
+      const { words } = this;
+      // It hides the accessor.
+      Reflect.deleteProperty(this, "words");
+      this.words = words;
+    }
+  }
+
+  /** What the element says; of what is set, what is missing is in English. */
+  get words(): Words {
+    return this.#words;
+  }
+
+  set words(given: Partial<Words>) {
+    const movements = { ...WORDS.movements, ...given.movements };
+    this.#words = { ...WORDS, ...given, movements };
+    this.#show();
   }
 
   connectedCallback(): void {
     if (this.#stay.signal.aborted) this.#stay = new AbortController();
-    this.#button.textContent = this.words.start;
-    this.#notice.textContent = this.#asksToMove ? this.words.frames : "";
+    this.#show();
   }
 
-  /** Another thing would be sent: the camera starts again once the person has read it. */
-  attributeChangedCallback(): void {
+  /** What is sent changes: the camera starts again once the person has read it. */
+  attributeChangedCallback(_: string, old: string | null, now: string | null): void {
+    if (old !== now && this.isConnected) this.#restart();
+  }
+
+  #restart(): void {
     this.disconnectedCallback();
     this.connectedCallback();
+  }
+
+  /** What is on the page whatever the person does: the button's text, what is sent, the video's name. */
+  #show(): void {
+    const { start, take, enroll, frames, video } = this.words;
+    this.#button.textContent =
+      this.#camera === undefined ? start : this.#enrolls ? enroll : take;
+    this.#notice.textContent = this.#sendsFrames ? frames : "";
+    this.#video.setAttribute("aria-label", video);
   }
 
   disconnectedCallback(): void {
@@ -178,8 +226,8 @@ export class VeilfaceLogin extends Base {
     await client?.then((each) => each.close()).catch(() => undefined);
   }
 
-  get #asksToMove(): boolean {
-    return this.getAttribute("liveness") === "head-movements";
+  get #sendsFrames(): boolean {
+    return this.getAttribute("liveness") === "head-movements" && !this.#enrolls;
   }
 
   get #enrolls(): boolean {
@@ -197,7 +245,8 @@ export class VeilfaceLogin extends Base {
   async attempt(): Promise<Decision | Enrollment> {
     const { signal } = this.#stay;
     this.#given();
-    if (this.#asksToMove && !this.#enrolls) return this.#challenged(signal);
+    signal.throwIfAborted();
+    if (this.#sendsFrames) return this.#challenged(signal);
     const photos = await this.#burst(signal);
     const lift = await this.#lifted(photos, signal);
     try {
@@ -228,6 +277,9 @@ export class VeilfaceLogin extends Base {
    */
   async #challenged(signal: AbortSignal): Promise<Decision> {
     const { options, authorize } = this.#given();
+    if (!this.words.frames?.trim()) {
+      throw new Error("<veilface-login> sends no photo where words.frames does not say so");
+    }
     const { subject, token, ...given } = await authorize();
     signal.throwIfAborted();
     const holderKey = given.holderKey ?? (await this.#holderKey(subject, false, signal));
@@ -240,21 +292,27 @@ export class VeilfaceLogin extends Base {
       await after(wait);
       return this.#drawn(signal).canvas.convertToBlob({ type: "image/jpeg", quality: 0.92 });
     };
-    ask("front");
-    await after(READY);
-    // Asked for now: its minute begins.
-    const challenge = await client.challenge(subject);
-    const frames = [await snap()];
-    for (const movement of challenge.movements) {
-      ask(movement);
-      for (const wait of OUT) frames.push(await snap(wait));
-      ask(movement === "come_closer" ? "move_back" : "front");
-      frames.push(await snap(BACK));
+    // A screen reader says each at once, for the clock does not wait.
+    this.#status.setAttribute("aria-live", "assertive");
+    try {
+      ask("front");
+      await after(READY);
+      // Asked for now: its minute begins.
+      const challenge = await client.challenge(subject);
+      const frames = [await snap()];
+      for (const movement of challenge.movements) {
+        ask(movement);
+        for (const wait of OUT) frames.push(await snap(wait));
+        ask(movement === "come_closer" ? "move_back" : "front");
+        frames.push(await snap(BACK));
+      }
+      signal.throwIfAborted();
+      this.#say(this.words.working);
+      const more = { challenge, face: this.#face };
+      return await client.verify(subject, frames, holderKey ? { ...more, holderKey } : more);
+    } finally {
+      this.#status.setAttribute("aria-live", "polite");
     }
-    signal.throwIfAborted();
-    this.#say(this.words.working);
-    const more = { challenge, face: this.#face };
-    return client.verify(subject, frames, holderKey ? { ...more, holderKey } : more);
   }
 
   async #send(lift: Enrollable | Probe, signal: AbortSignal): Promise<Decision | Enrollment> {
@@ -307,11 +365,9 @@ export class VeilfaceLogin extends Base {
     return this.getAttribute("service") ?? location.origin;
   }
 
-  #given(): { options: Omit<PrivateOptions, "signal">; authorize: () => Promise<Authorization> } {
-    const { options, authorize } = this;
-    if (options === undefined || authorize === undefined) {
-      throw new Error("<veilface-login> needs its properties options and authorize");
-    }
+  #given(): { options: LoginOptions; authorize: () => Promise<Authorization> } {
+    const { options = {}, authorize } = this;
+    if (authorize === undefined) throw new Error("<veilface-login> needs its property authorize");
     return { options, authorize };
   }
 
@@ -329,9 +385,11 @@ export class VeilfaceLogin extends Base {
 
   async #prepare(signal: AbortSignal): Promise<PrivateClient> {
     const { options, authorize } = this.#given();
+    const { runtime } = options;
+    if (runtime === undefined) throw new Error("<veilface-login> needs the runtime in its options");
     const { token } = await authorize();
     signal.throwIfAborted();
-    const client = new PrivateClient(this.#url, token, { ...options, signal });
+    const client = new PrivateClient(this.#url, token, { ...options, runtime, signal });
     try {
       await client.prepare();
       signal.throwIfAborted();
@@ -364,6 +422,9 @@ export class VeilfaceLogin extends Base {
         return;
       }
       this.#camera = camera;
+      for (const track of camera.getTracks()) {
+        track.addEventListener("ended", () => this.#ended(camera));
+      }
       this.#video.srcObject = camera;
       await this.#video.play();
       if (signal.aborted) return;
@@ -374,9 +435,9 @@ export class VeilfaceLogin extends Base {
       this.#tell("veilface-error", error);
       return;
     }
-    this.#button.textContent = this.#enrolls ? this.words.enroll : this.words.take;
+    this.#show();
     this.#say(this.words.waiting);
-    if (this.#asksToMove && !this.#enrolls) return;
+    if (this.#sendsFrames) return;
     // While the person looks; the attempt waits for it, and tells what went wrong.
     this.#prepared(signal).catch(() => undefined);
   }
@@ -395,6 +456,7 @@ export class VeilfaceLogin extends Base {
       this.#tell("veilface-result", result);
     } catch (error) {
       if (signal.aborted) return;
+      if (!mendable(error)) this.#stop();
       this.#say(this.#wordsOf(error));
       this.#tell("veilface-error", error);
     }
@@ -424,17 +486,25 @@ export class VeilfaceLogin extends Base {
     return context;
   }
 
+  /** It was unplugged, forbidden, or taken by another program. */
+  #ended(camera: MediaStream): void {
+    if (this.#camera !== camera) return;
+    this.#restart();
+    this.#say(this.words.camera);
+    this.#tell("veilface-error", new DOMException("the camera has stopped", "NotReadableError"));
+  }
+
   #stop(): void {
     this.#camera?.getTracks().forEach((track) => track.stop());
     this.#camera = undefined;
     this.#video.srcObject = null;
-    this.#button.textContent = this.words.start;
+    this.#show();
   }
 
   #wordsOf(error: unknown): string {
     if (!(error instanceof Error)) return String(error);
     const { code, details, name } = error as Error & { code?: unknown; details?: { liveness?: string } };
-    if (details?.liveness !== undefined && !this.#asksToMove) return this.words.liveness;
+    if (details?.liveness !== undefined && !this.#sendsFrames) return this.words.liveness;
     const key = typeof code === "string" ? code : name;
     return Object.hasOwn(this.words.errors, key) ? this.words.errors[key] : error.message;
   }
