@@ -139,7 +139,7 @@ def create_app(
 
 
 @cache
-def _built(*modules: ModuleType) -> list[BaseRoute]:
+def _built(*modules: ModuleType) -> tuple[BaseRoute, ...]:
     """The routes of modules, built now, and once for a process.
 
     By itself the framework builds them for the first request to any, under filters of its own for
@@ -150,7 +150,7 @@ def _built(*modules: ModuleType) -> list[BaseRoute]:
         router.include_router(module.router)
     for _ in iter_route_contexts(router.routes):
         pass
-    return router.routes
+    return tuple(router.routes)
 
 
 def _operations_app(app: FastAPI) -> FastAPI:

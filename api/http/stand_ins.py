@@ -39,11 +39,6 @@ class StandIns:
         self._nobody = Owner("", "stand-in", "", contract.contract_id, "", 0)
         self._sealed = self._seal()
 
-    @property
-    def sealed_bytes(self) -> int:
-        """How many bytes the store reads of a template."""
-        return len(self._sealed.ciphertext)
-
     def lift(self, tenant: str, subject: str) -> AffineSubspace:
         """Lift the template that an unknown subject's distances are told of."""
         digest = hmac.digest(self._key(), encode_parts(tenant, subject), hashlib.sha256)

@@ -169,10 +169,7 @@ class Runtime:
             store.secrets.get(name)
         file = settings.export_key_file
         export_key = None if file is None else ExportKey.from_file(file)
-        runtime = cls(settings, keyring, store, contract, source, pack, export_key)
-        (current, *_) = contract.binding.contract_ids
-        store.attempts.keep_stand_in(current, runtime.stand_ins.sealed_bytes)
-        return runtime
+        return cls(settings, keyring, store, contract, source, pack, export_key)
 
     @property
     def export_key(self) -> ExportKey:

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import Any, cast
 
 import sqlalchemy as sa
+from sqlalchemy.orm import aliased
 
 from templates.store.audit_chain import Line
 from templates.store.authenticity import AUTHENTICATED, last_line
@@ -20,7 +21,6 @@ from templates.store.schema import (
     AuditHeadRow,
     AuditRow,
     FailedAttemptsRow,
-    StandInRow,
     SubjectRow,
     TemplateRow,
     TenantRow,
@@ -38,6 +38,7 @@ _SUBJECT = sa.and_(
     SubjectRow.subject_id == sa.bindparam("subject_id"),
 )
 _TEMPLATE = TemplateRow.subject_pk == SubjectRow.id
+_OTHER = aliased(TemplateRow)
 
 COUNTS = tuple(
     getattr(FailedAttemptsRow, name).label(f"counted_{name}")
@@ -111,20 +112,26 @@ def before(count: int) -> Any:
     """All that is looked at before a decision; one row where there is the tenant.
 
     Of `tenant`, :func:`named` for so many pseudonyms, `subject_id`, `contract_id`,
-    `earlier_contract_id`, `key_prefix`, `nonce_hash` and `nonce_digest`. The columns of the
-    template are NULL where the subject has none of either contract; `stand_in` has as many bytes
-    where no ciphertext is stored, for the time that they take.
+    `earlier_contract_id`, `key_prefix`, `nonce_hash`, `nonce_digest` and `place`. The columns of
+    the template are NULL where the subject has none of either contract.
+
+    Where no ciphertext of the subject is stored, `stand_in` is that of whoever comes next after
+    `place`: a template's bytes take a time that would tell who is enrolled, and one row for all
+    who are not would always be warm. It is opened by nobody.
     """
     last = _last_attempt(count)
-    stand_in = sa.select(StandInRow.ciphertext).where(
-        StandInRow.contract_id == sa.bindparam("contract_id")
+    stored = (
+        sa.select(_OTHER.ciphertext)
+        .where(_OTHER.ciphertext.is_not(None))
+        .order_by(_OTHER.subject_pk)
+        .limit(1)
     )
+    following = stored.where(_OTHER.subject_pk >= sa.bindparam("place"))
+    stand_in = sa.func.coalesce(following.scalar_subquery(), stored.scalar_subquery())
     return (
         sa.select(
             *TEMPLATE_COLUMNS,
-            sa.case((TemplateRow.ciphertext.is_(None), stand_in.scalar_subquery())).label(
-                "stand_in"
-            ),
+            sa.case((TemplateRow.ciphertext.is_(None), stand_in)).label("stand_in"),
             TenantRow.rotation_epoch.label("current_epoch"),
             sa.or_(sa.exists(_USED_NONCE), sa.exists(_LOGGED_NONCE)).label("used"),
             *COUNTS,

@@ -8,7 +8,6 @@ from its table changes nothing.
 """
 
 import contextlib
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from datetime import timedelta
@@ -27,7 +26,7 @@ from templates.store.identifiers import UnknownTenant, checked_subject_id
 from templates.store.lockout import LockedOut, LockoutPolicy, Nonce, Replayed, Superseded
 from templates.store.nonces import Nonces, spend
 from templates.store.outbox import EventType
-from templates.store.schema import FailedAttemptsRow, StandInRow, UsedNonceRow
+from templates.store.schema import FailedAttemptsRow, UsedNonceRow
 from templates.store.standing import UNKNOWN_RETENTION, AttemptsStatus, Standing
 from templates.store.subject_rows import (
     SubjectTemplate,
@@ -38,9 +37,6 @@ from templates.store.subject_rows import (
 
 NONCE_GRACE = timedelta(minutes=5)
 BATCH = 500
-_STAND_IN_SIZE: Any = sa.select(sa.func.length(StandInRow.ciphertext)).where(
-    StandInRow.contract_id == sa.bindparam("contract_id")
-)
 
 
 @dataclass(frozen=True)
@@ -96,21 +92,6 @@ class Attempts:
         self._nonces = nonces
         self._idempotency = idempotency
         self._standing = Standing(context, policy)
-
-    def keep_stand_in(self, contract_id: str, size: int) -> None:
-        """Keep what :meth:`begin` reads where no template is stored: `size` random bytes.
-
-        The time that a template's bytes take would tell who is enrolled.
-        """
-
-        def work(connection: Connection) -> None:
-            if connection.execute(_STAND_IN_SIZE, {"contract_id": contract_id}).scalar() == size:
-                return
-            row = {"contract_id": contract_id, "ciphertext": os.urandom(size)}
-            connection.execute(sa.delete(StandInRow).where(StandInRow.contract_id == contract_id))
-            connection.execute(sa.insert(StandInRow).values(**row))
-
-        self._context.write(work, lock="stand-ins")
 
     def begin(
         self,
@@ -332,6 +313,7 @@ class Attempts:
             "subject_id": subject_id,
             "pseudonyms": pseudonyms,
             **named(pseudonyms),
+            "place": pseudonyms[0][:32],
             "contract_id": None if contract_ids is None else contract_ids[0],
             "earlier_contract_id": None if contract_ids is None else contract_ids[-1],
             "key_prefix": None if nonce is None else nonce.key_prefix,

@@ -71,7 +71,10 @@ class Database:
         return self._process().engine
 
     def read(self, work: Callable[[Connection], T]) -> T:
-        """Run `work` on a connection; what it sees is committed. It may run several times."""
+        """Run `work` on a connection; what it sees is committed.
+
+        It must do nothing but database work: after a deadlock it runs again.
+        """
         process = self._process()
 
         def once() -> T:
@@ -316,7 +319,7 @@ def _state(error: BaseException | None) -> str:
 def _again(once: Callable[[], T]) -> T:
     """Run a transaction again where the server ended it for another one's sake.
 
-    Reads too: a migration holds one table while it waits for the next, and a query does as well.
+    Reads too: a migration and a query may each hold a table that the other waits for.
     """
     for attempt in range(1, _ATTEMPTS + 1):
         try:

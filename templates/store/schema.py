@@ -212,15 +212,6 @@ class TemplateRow(Base):
     created_at: Mapped[datetime] = mapped_column(UtcDateTime)
 
 
-class StandInRow(Base):
-    """Random bytes, as many as a template of the contract takes: read of who has none stored."""
-
-    __tablename__ = "stand_ins"
-
-    contract_id: Mapped[str] = mapped_column(String(64), primary_key=True)
-    ciphertext: Mapped[bytes] = mapped_column(LargeBinary)
-
-
 class FailedAttemptsRow(Base):
     """Failed verifications of a subject, enrolled or not, and until when it is locked.
 

@@ -69,26 +69,27 @@ def attempt(
     return "accept" if accepted else "reject"
 
 
-def test_as_many_bytes_are_read_of_whom_no_template_is_stored(store: TemplateStore) -> None:
-    """Else the time tells who is enrolled; in one query, and anew where templates grow."""
-    put(store, "ada", bytes(5000))
-    put(store, "bob", bytes(5000), storage=Storage.HOLDER)
-    rows: list[Any] = []
-    for subject in ("ada", "bob", "nobody"):
+def test_a_subject_without_a_template_costs_as_many_bytes(store: TemplateStore) -> None:
+    """Else the time tells who is enrolled. Of several, not always the same; none where none is."""
+
+    def read(subject: str) -> list[bytes]:
+        """The long values of the one row that an attempt reads."""
         asked = store.attempts._asked("default", subject, None, [CONTRACT])
         query = before(len(asked["pseudonyms"]))
-        rows.append(lambda query=query, asked=asked: read_of(store, query, asked))
-    (stored,) = rows[0]()
-    for size in (stored, stored + 100):
-        store.attempts.keep_stand_in(CONTRACT, size)
-        store.attempts.keep_stand_in("d" * 64, 7)
-        assert [row() for row in rows] == [[stored], [size], [size]]
+        row = store.database.read(lambda connection: connection.execute(query, asked).one())
+        return [bytes(value) for value in row if isinstance(value, bytes) and len(value) > 1000]
 
-
-def read_of(store: TemplateStore, query: Any, asked: dict[str, Any]) -> list[int]:
-    """Sizes of the long values of the one row that a query reads."""
-    row = store.database.read(lambda connection: connection.execute(query, asked).one())
-    return [len(value) for value in row if isinstance(value, bytes) and len(value) > 1000]
+    put(store, "bob", bytes(5000), storage=Storage.HOLDER)
+    assert read("bob") == read("nobody") == []
+    enrolled = [f"person-{number}" for number in range(8)]
+    for subject in enrolled:
+        put(store, subject, bytes(5000))
+    own = {ciphertext for subject in enrolled for ciphertext in read(subject)}
+    assert len(own) == len(enrolled)
+    others = [read(subject) for subject in ("bob", *(f"nobody-{number}" for number in range(40)))]
+    assert {len(each) for each in others} == {1}
+    assert len({ciphertext for (ciphertext,) in others} & own) > 1
+    assert read("nobody-1") == read("nobody-1")
 
 
 def conclude(
