@@ -38,7 +38,9 @@ _SUBJECT = sa.and_(
     SubjectRow.subject_id == sa.bindparam("subject_id"),
 )
 _TEMPLATE = TemplateRow.subject_pk == SubjectRow.id
-_OTHER = aliased(TemplateRow)
+_OTHER, _NEAR = aliased(TemplateRow), aliased(TemplateRow)
+_PASSED = 100
+"""Templates that are passed over, as their holders keep them, before none is taken."""
 
 COUNTS = tuple(
     getattr(FailedAttemptsRow, name).label(f"counted_{name}")
@@ -90,6 +92,19 @@ def _last_line(last: sa.Subquery) -> tuple[Any, Any]:
     return last.c.sequence.label("last_sequence"), last.c.outcome.label("last_outcome")
 
 
+def _first_stored(*conditions: Any) -> Any:
+    """Row of the first template, by its id, whose ciphertext is stored; NULL where none is near."""
+    near = (
+        sa.select(_NEAR.subject_pk, _NEAR.ciphertext.is_not(None).label("is_stored"))
+        .where(*conditions)
+        .order_by(_NEAR.subject_pk)
+        .limit(_PASSED)
+        .subquery()
+    )
+    stored = sa.select(near.c.subject_pk).where(near.c.is_stored).order_by(near.c.subject_pk)
+    return stored.limit(1).scalar_subquery()
+
+
 TENANT_ERASED: Any = last_line(
     AuditRow.tenant == sa.bindparam("tenant"), AuditRow.outcome == "erased", TENANT_LINES
 )
@@ -116,18 +131,14 @@ def before(count: int) -> Any:
     the template are NULL where the subject has none of either contract.
 
     Where no ciphertext of the subject is stored, `stand_in` is that of whoever comes next after
-    `place`: a template's bytes take a time that would tell who is enrolled, and one row for all
-    who are not would always be warm. It is opened by nobody.
+    `place`, by the ids of their rows: a template's bytes take a time that would tell who is
+    enrolled, and one row for all who are not would always be warm. It is opened by nobody.
     """
     last = _last_attempt(count)
-    stored = (
-        sa.select(_OTHER.ciphertext)
-        .where(_OTHER.ciphertext.is_not(None))
-        .order_by(_OTHER.subject_pk)
-        .limit(1)
+    place = sa.func.coalesce(
+        _first_stored(_NEAR.subject_pk >= sa.bindparam("place")), _first_stored()
     )
-    following = stored.where(_OTHER.subject_pk >= sa.bindparam("place"))
-    stand_in = sa.func.coalesce(following.scalar_subquery(), stored.scalar_subquery())
+    stand_in = sa.select(_OTHER.ciphertext).where(_OTHER.subject_pk == place).scalar_subquery()
     return (
         sa.select(
             *TEMPLATE_COLUMNS,
