@@ -39,8 +39,9 @@ _SUBJECT = sa.and_(
 )
 _TEMPLATE = TemplateRow.subject_pk == SubjectRow.id
 _OTHER, _NEAR = aliased(TemplateRow), aliased(TemplateRow)
-_PASSED = 100
+_PASSED = 16
 """Templates that are passed over, as their holders keep them, before none is taken."""
+_BEYOND_ALL = "g"  # after every id in hexadecimal digits
 
 COUNTS = tuple(
     getattr(FailedAttemptsRow, name).label(f"counted_{name}")
@@ -93,16 +94,25 @@ def _last_line(last: sa.Subquery) -> tuple[Any, Any]:
 
 
 def _first_stored(*conditions: Any) -> Any:
-    """Row of the first template, by its id, whose ciphertext is stored; NULL where none is near."""
-    near = (
-        sa.select(_NEAR.subject_pk, _NEAR.ciphertext.is_not(None).label("is_stored"))
-        .where(*conditions)
+    """First ciphertext that is stored, by the ids of its row; NULL where none is near."""
+    beyond = (
+        sa.select(_NEAR.subject_pk)
+        .where(*(condition(_NEAR) for condition in conditions))
         .order_by(_NEAR.subject_pk)
-        .limit(_PASSED)
-        .subquery()
+        .limit(1)
+        .offset(_PASSED)
     )
-    stored = sa.select(near.c.subject_pk).where(near.c.is_stored).order_by(near.c.subject_pk)
-    return stored.limit(1).scalar_subquery()
+    return (
+        sa.select(_OTHER.ciphertext)
+        .where(
+            *(condition(_OTHER) for condition in conditions),
+            _OTHER.subject_pk < sa.func.coalesce(beyond.scalar_subquery(), _BEYOND_ALL),
+            _OTHER.ciphertext.is_not(None),
+        )
+        .order_by(_OTHER.subject_pk)
+        .limit(1)
+        .scalar_subquery()
+    )
 
 
 TENANT_ERASED: Any = last_line(
@@ -135,10 +145,9 @@ def before(count: int) -> Any:
     enrolled, and one row for all who are not would always be warm. It is opened by nobody.
     """
     last = _last_attempt(count)
-    place = sa.func.coalesce(
-        _first_stored(_NEAR.subject_pk >= sa.bindparam("place")), _first_stored()
+    stand_in = sa.func.coalesce(
+        _first_stored(lambda row: row.subject_pk >= sa.bindparam("place")), _first_stored()
     )
-    stand_in = sa.select(_OTHER.ciphertext).where(_OTHER.subject_pk == place).scalar_subquery()
     return (
         sa.select(
             *TEMPLATE_COLUMNS,
