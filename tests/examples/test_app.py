@@ -21,6 +21,7 @@ from tests.clients.javascript.conftest import PACKAGE, require_client
 from tests.clients.proxy import Proxy
 from tests.examples.conftest import EXAMPLES, PYTHON, clean_environment, node, running
 from tests.leaks import as_bytes
+from tests.patience import wait_until
 from tests.ports import free_port
 from tests.web.browser_tab import BrowserTab
 from tests.web.camera import FakeCamera
@@ -325,6 +326,9 @@ def test_the_page_may_call_a_service_under_a_path(backend: str, tmp_path: Path) 
 
 
 def sign(page: Page, name: str, button: str, password: str = PASSWORD) -> None:
+    # A form that is sent before the page's program listens goes nowhere.
+    program_ran = "() => customElements.get('veilface-login') !== undefined"
+    wait_until(lambda: page.evaluate(program_ran), what="the page's program ran")
     page.get_by_label("Name").fill(name)
     page.get_by_label("Password").fill(password)
     page.get_by_role("button", name=button).click()
