@@ -93,11 +93,11 @@ def _last_line(last: sa.Subquery) -> tuple[Any, Any]:
     return last.c.sequence.label("last_sequence"), last.c.outcome.label("last_outcome")
 
 
-def _first_stored(*conditions: Any) -> Any:
-    """First ciphertext that is stored, by the ids of its row; NULL where none is near."""
+def _first_stored(least: Any) -> Any:
+    """First ciphertext that is stored, by the ids of rows from `least` on; NULL if none is near."""
     beyond = (
         sa.select(_NEAR.subject_pk)
-        .where(*(condition(_NEAR) for condition in conditions))
+        .where(_NEAR.subject_pk >= least)
         .order_by(_NEAR.subject_pk)
         .limit(1)
         .offset(_PASSED)
@@ -105,7 +105,7 @@ def _first_stored(*conditions: Any) -> Any:
     return (
         sa.select(_OTHER.ciphertext)
         .where(
-            *(condition(_OTHER) for condition in conditions),
+            _OTHER.subject_pk >= least,
             _OTHER.subject_pk < sa.func.coalesce(beyond.scalar_subquery(), _BEYOND_ALL),
             _OTHER.ciphertext.is_not(None),
         )
@@ -145,9 +145,7 @@ def before(count: int) -> Any:
     enrolled, and one row for all who are not would always be warm. It is opened by nobody.
     """
     last = _last_attempt(count)
-    stand_in = sa.func.coalesce(
-        _first_stored(lambda row: row.subject_pk >= sa.bindparam("place")), _first_stored()
-    )
+    stand_in = sa.func.coalesce(_first_stored(sa.bindparam("place")), _first_stored(sa.literal("")))
     return (
         sa.select(
             *TEMPLATE_COLUMNS,
