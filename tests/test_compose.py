@@ -9,7 +9,6 @@ import json
 import os
 import re
 import shutil
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
@@ -147,11 +146,6 @@ def database(network: Network) -> Iterator[Cluster]:
     """PostgreSQL as its image makes it: the password of the file is asked for, from the network."""
     environment = SERVICES["database"]["environment"]
     assert environment["POSTGRES_USER"] == environment["POSTGRES_DB"] == "veilface"
-    with socket.socket() as listener:
-        try:
-            listener.bind((network.address, POSTGRES_PORT))
-        except OSError:
-            pytest.skip(f"port {POSTGRES_PORT} of every address of this machine is taken")
     try:
         made = Cluster(network.address, POSTGRES_PORT, "scram-sha-256")
     except NoPostgres as reason:

@@ -3,6 +3,7 @@
 PostgreSQL and Redis answer at the bridge's address, and the tests' own requests come from there.
 """
 
+import ctypes
 import os
 import shutil
 import subprocess
@@ -21,70 +22,97 @@ from tests.reliability.cluster import Cluster
 from tests.reliability.kill import QUIET
 from tests.reliability.service import ROOT, Service
 
+BRIDGE = "bridge"
+PREFIX = "198.18.0"
+"""Of its addresses: for measurements between networks (RFC 2544)."""
+
 
 class Network:
     """A bridge, with a namespace and a link for each host; gone at the end of the block.
 
-    Where this machine does not permit them, the test is skipped.
+    The bridge has a namespace too, and the calling thread is in it during the block, with what it
+    starts: a browser of another test gives up what it is loading whenever the machine's own network
+    changes. Where this machine does not permit them, the test is skipped.
     """
+
+    address = f"{PREFIX}.1"
 
     def __init__(self, hosts: int) -> None:
         if os.geteuid() != 0 or shutil.which("ip") is None:
             not_permitted("network namespaces need root, and the program ip")
-        number = os.getpid()
-        # For measurements between networks (RFC 2544): nobody's network has them.
-        self._prefix = f"198.18.{number % 256}"
-        self._bridge = f"vf{number}"
+        self._name = f"veilface{os.getpid()}"
         self._hosts = range(hosts)
-        self.address = f"{self._prefix}.1"
+        self._left = ExitStack()
 
     def __enter__(self) -> "Network":
-        try:
-            self._ip("link", "add", self._bridge, "type", "bridge")
-            self._ip("address", "add", f"{self.address}/24", "dev", self._bridge)
-            self._ip("link", "set", self._bridge, "up")
-            for host in self._hosts:
-                self._add(host)
-        except BaseException as error:
-            self.__exit__()
-            if isinstance(error, subprocess.CalledProcessError):
+        with ExitStack() as entered:
+            try:
+                self._enter_namespace(entered)
+                _ip("link", "add", BRIDGE, "type", "bridge")
+                _ip("address", "add", f"{self.address}/24", "dev", BRIDGE)
+                for device in ("lo", BRIDGE):
+                    _ip("link", "set", device, "up")
+                for host in self._hosts:
+                    self._add(host, entered)
+            except subprocess.CalledProcessError as error:
                 not_permitted(f"no network namespaces: {error.stderr.strip()}")
-            raise
+            self._left = entered.pop_all()
         return self
 
     def __exit__(self, *_: object) -> None:
-        for host in self._hosts:
-            self._ip("netns", "delete", self._name(host), check=False)
-        self._ip("link", "delete", self._bridge, check=False)
+        self._left.close()
 
     def address_of(self, host: int) -> str:
-        return f"{self._prefix}.{host + 2}"
+        return f"{PREFIX}.{host + 2}"
 
     def within(self, host: int) -> list[str]:
         """What runs a program on a host."""
-        return ["ip", "netns", "exec", self._name(host)]
+        return ["ip", "netns", "exec", self._name_of(host)]
 
     def cut_off(self, host: int) -> None:
         """Let nothing reach a host or leave it, without a word to either side."""
-        self._ip("link", "set", self._name(host), "down")
+        _ip("link", "set", f"host{host}", "down")
 
     def reconnect(self, host: int) -> None:
-        self._ip("link", "set", self._name(host), "up")
+        _ip("link", "set", f"host{host}", "up")
 
-    def _name(self, host: int) -> str:
-        return f"{self._bridge}h{host}"
+    def _name_of(self, host: int) -> str:
+        return f"{self._name}-{host}"
 
-    def _add(self, host: int) -> None:
-        name = self._name(host)
-        self._ip("netns", "add", name)
-        self._ip("link", "add", name, "type", "veth", "peer", "name", "eth0", "netns", name)
-        self._ip("link", "set", name, "master", self._bridge, "up")
-        self._ip("-n", name, "address", "add", f"{self.address_of(host)}/24", "dev", "eth0")
-        for device in ("lo", "eth0"):
-            self._ip("-n", name, "link", "set", device, "up")
+    def _enter_namespace(self, entered: ExitStack) -> None:
+        _add_namespace(self._name, entered)
+        before = os.open("/proc/thread-self/ns/net", os.O_RDONLY)
+        entered.callback(os.close, before)
+        inside = os.open(f"/run/netns/{self._name}", os.O_RDONLY)
+        try:
+            _enter(inside)
+        finally:
+            os.close(inside)
+        entered.callback(_enter, before)
 
-    def _ip(self, *arguments: str, check: bool = True) -> None:
-        subprocess.run(["ip", *arguments], check=check, capture_output=True, text=True)
+    def _add(self, host: int, entered: ExitStack) -> None:
+        name, device = self._name_of(host), f"host{host}"
+        _add_namespace(name, entered)
+        _ip("link", "add", device, "type", "veth", "peer", "name", "eth0", "netns", name)
+        _ip("link", "set", device, "master", BRIDGE, "up")
+        _ip("-n", name, "address", "add", f"{self.address_of(host)}/24", "dev", "eth0")
+        for each in ("lo", "eth0"):
+            _ip("-n", name, "link", "set", each, "up")
+
+
+def _ip(*arguments: str) -> None:
+    subprocess.run(["ip", *arguments], check=True, capture_output=True, text=True)
+
+
+def _add_namespace(name: str, entered: ExitStack) -> None:
+    _ip("netns", "add", name)
+    entered.callback(_ip, "netns", "delete", name)
+
+
+def _enter(namespace: int) -> None:
+    """Move the calling thread into a namespace (``os.setns`` from Python 3.12 on)."""
+    if ctypes.CDLL(None, use_errno=True).setns(namespace, 0):
+        raise OSError(ctypes.get_errno(), "setns")
 
 
 class Host:

@@ -64,9 +64,10 @@ class BrowserTab:
 
     def assert_clean(self) -> None:
         """Nothing left the origin, and the browser had nothing to complain of."""
-        assert self.strays() == []
-        assert self.violations() == []
-        assert self.complaints == []
+        strays, violations = self.strays(), self.violations()
+        assert not strays, strays
+        assert not violations, violations
+        assert not self.complaints, self.complaints
         assert any(url.endswith("/assets/main.js") for url in self.requests)
 
     def sign_in(self, token: str, *, keep: bool = False) -> None:
