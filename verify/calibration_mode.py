@@ -15,6 +15,7 @@ from templates.contract.nobody import Nobody
 from templates.distances import DEFAULT_STEPS, Metric
 from templates.errors import ContractError
 from templates.keys.randomness import Keystream
+from templates.space.rounded import RoundedBatch
 from templates.space.subspace import SubspaceBatch
 from verify.cohort import cohort_statistics
 from verify.comparisons import (
@@ -160,7 +161,7 @@ class CalibrationRun:
     progress: Progress
 
     @cached_property
-    def cohort(self) -> SubspaceBatch:
+    def cohort(self) -> RoundedBatch:
         """The cohort of the contract that is being made."""
         return self.nobody.cohort(strategy=self.client.strategy, m=self.templates.m)
 

@@ -14,6 +14,7 @@ from templates.contract.expectation import LEAST_SPREAD
 from templates.decoys import DecoyGenerator, DecoyPool, DecoySource
 from templates.decoys.fitting import MIN_DESCRIPTORS
 from templates.distances import Metric, pairwise_distances, similarity
+from templates.space.rounded import RoundedBatch
 from templates.space.subspace import SubspaceBatch
 
 Probes = NDArray[np.float32] | SubspaceBatch
@@ -41,7 +42,7 @@ def people_like(source: DecoySource, people: NDArray[np.float32] | None) -> Deco
 
 
 def cohort_statistics(
-    probes: SubspaceBatch, cohort: SubspaceBatch, *, metric: Metric, steps: int
+    probes: SubspaceBatch, cohort: SubspaceBatch | RoundedBatch, *, metric: Metric, steps: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Mean and standard deviation of every lifted probe's similarities to the cohort, each (P,)."""
     distances = pairwise_distances(probes, cohort, metric=metric, steps=steps)

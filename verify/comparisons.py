@@ -23,6 +23,7 @@ from templates.distances import (
 )
 from templates.keys.randomness import Keystream
 from templates.space.lifting import Strategy, lift
+from templates.space.rounded import RoundedBatch
 from templates.space.subspace import SubspaceBatch
 from verify.cohort import Probes, cohort_statistics
 from verify.thresholds import Genuine, Impostors
@@ -178,7 +179,7 @@ def lifted_trials(
     descriptors: NDArray[np.float32],
     plan: TrialPlan,
     templates: SubspaceBatch,
-    cohort: SubspaceBatch,
+    cohort: SubspaceBatch | RoundedBatch,
     lifter: Lifter,
     *,
     probe_m: int,

@@ -47,7 +47,7 @@ from templates.keys.bounded_file import read_at_most
 from templates.keys.private_file import replace_private
 from templates.keys.sealing import Sealer
 from templates.space.lifting import plain_strategy
-from templates.space.subspace import SubspaceBatch
+from templates.space.rounded import RoundedBatch
 
 __all__ = [
     "Binding",
@@ -180,7 +180,7 @@ class Contract:
         return any(entry.mode == "s2s" for entry in self.calibrations)
 
     @cached_property
-    def cohort(self) -> SubspaceBatch:
+    def cohort(self) -> RoundedBatch:
         """Templates of nobody that lifted probes are normalised by; lifted at the first use."""
         strategy = plain_strategy(self.binding.strategy)
         return self.nobody.cohort(strategy=strategy, m=self.binding.m)

@@ -23,6 +23,7 @@ from templates.errors import ContractError
 from templates.keys.randomness import KEY_BYTES, Keystream
 from templates.space.embedding import UNIT_TOLERANCE
 from templates.space.lifting import Strategy, lift, lift_of_nobody
+from templates.space.rounded import RoundedBatch
 from templates.space.subspace import AffineSubspace, SubspaceBatch
 
 SIZES = (2, 65_536)
@@ -211,14 +212,15 @@ class Nobody:
         )
         return AffineSubspace(foot=feet[0].astype(np.float32), basis=bases[0].astype(np.float32))
 
-    def cohort(self, *, strategy: Strategy, m: int) -> SubspaceBatch:
+    def cohort(self, *, strategy: Strategy, m: int) -> RoundedBatch:
         """Lift the cohort: ``COHORT_SIZE`` of the strangers at most, with the seed's randomness."""
         rows = np.linspace(0, len(self.people), min(COHORT_SIZE, len(self.people)), endpoint=False)
         with Keystream(self.seed) as stream:
-            return lift(
+            lifted = lift(
                 self.people[rows.astype(np.int64)],
                 strategy=strategy,
                 m=m,
                 source=self.generator,
                 stream=stream,
             )
+        return RoundedBatch.of(lifted)

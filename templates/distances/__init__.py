@@ -27,6 +27,7 @@ from templates.distances.metric import (
     similarity,
 )
 from templates.errors import InvalidEmbedding, InvalidTemplate, TemplateError
+from templates.space.rounded import RoundedBatch
 from templates.space.subspace import SubspaceBatch, is_finite
 
 __all__ = [
@@ -45,6 +46,8 @@ __all__ = [
 ]
 
 Probes = NDArray[np.float32] | NDArray[np.float64] | SubspaceBatch
+_FEW = 16
+"""Probes that read a `RoundedBatch` sooner as it is than restored."""
 _DEVICE: ContextVar[str | None] = ContextVar("device", default=None)
 
 
@@ -86,7 +89,7 @@ def require_device(device: str) -> None:
 
 def pairwise_distances(
     probes: Probes,
-    templates: SubspaceBatch,
+    templates: SubspaceBatch | RoundedBatch,
     *,
     metric: Metric | str,
     steps: int = DEFAULT_STEPS,
@@ -100,7 +103,7 @@ def pairwise_distances(
     probes : ndarray of float, shape (P, n), or SubspaceBatch of P
         Raw descriptors or lifted probes. The spherical metric sees only the direction of a raw
         descriptor; a zero vector has similarity 0.
-    templates : SubspaceBatch of T
+    templates : SubspaceBatch or RoundedBatch of T
     metric : Metric
     steps : int
         Of the spherical subspace-to-subspace iteration; unused otherwise.
@@ -131,6 +134,12 @@ def pairwise_distances(
     probes = _checked(probes, templates, dtype)
     distances: Floats
     device = _DEVICE.get()
+    if isinstance(templates, RoundedBatch):
+        bulk = device is not None or np.dtype(dtype) == np.float64
+        if isinstance(probes, SubspaceBatch) and len(probes) <= _FEW and not bulk:
+            distances = _tiles().to_rounded(probes, templates, **options)
+            return distances
+        templates = templates[:]
     if np.dtype(dtype) == np.float64:
         distances = exact.pairwise(probes, templates, **options)
     elif device is not None:
@@ -327,7 +336,7 @@ def _options(metric: Metric | str, steps: int, threads: int | None = None) -> di
     return {"metric": Metric(metric), "steps": steps}
 
 
-def _checked(probes: Any, templates: SubspaceBatch, dtype: DTypeLike) -> Probes:
+def _checked(probes: Any, templates: SubspaceBatch | RoundedBatch, dtype: DTypeLike) -> Probes:
     kind = np.dtype(dtype)
     if kind not in (np.float32, np.float64):
         raise TemplateError(f"distances are computed in float32 or float64, not {kind}")
@@ -351,7 +360,7 @@ def _checked(probes: Any, templates: SubspaceBatch, dtype: DTypeLike) -> Probes:
     return points
 
 
-def _check_finite(batch: SubspaceBatch) -> None:
+def _check_finite(batch: SubspaceBatch | RoundedBatch) -> None:
     if not batch.is_finite:
         raise InvalidTemplate("a template holds a number that is not finite")
 

@@ -20,6 +20,7 @@ from templates.distances.blas import single_threaded
 from templates.distances.kernels.arguments import Array32, Options, Result, Tile
 from templates.distances.kernels.euclidean import scratch_size as euclidean_scratch
 from templates.distances.kernels.lanes import LANES
+from templates.distances.kernels.rounded import rounded_products
 from templates.distances.kernels.selection import count_within, keep_nearest
 from templates.distances.kernels.spherical import scratch_size as spherical_scratch
 from templates.distances.kernels.tiles import Grid, Sides, Space, compute, pack, solve, square
@@ -35,6 +36,7 @@ from templates.distances.metric import (
     parts,
 )
 from templates.distances.threads import share
+from templates.space.rounded import RoundedBatch
 from templates.space.subspace import SubspaceBatch
 
 Probes = Array32 | SubspaceBatch
@@ -56,6 +58,7 @@ _TINY = np.float32(np.finfo(np.float32).tiny)
 _NO_LABELS = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
 
 _Kept = TypeVar("_Kept", bound="_Nearest | _Counts")
+_Array = TypeVar("_Array", Array32, NDArray[np.int8])
 
 
 # --- what is asked for ---------------------------------------------------------------------------
@@ -143,6 +146,14 @@ def paired(
     return out
 
 
+def to_rounded(
+    probes: SubspaceBatch, templates: RoundedBatch, *, metric: Metric, steps: int
+) -> Array32:
+    """Distances of a few probes to all templates, (P, T)."""
+    solver = _Solver(probes, templates, metric, steps)
+    return np.stack([solver.to_rounded(i) for i in range(len(probes))])
+
+
 def warm_up() -> None:
     """Compile every kernel, or load it from its cache."""
     rng = np.random.default_rng(0)
@@ -151,6 +162,7 @@ def warm_up() -> None:
     options: dict[str, Any] = {"metric": Metric.EUCLIDEAN, "steps": DEFAULT_STEPS}
     pairwise(batch.feet, batch, threads=1, **options)
     paired(batch, batch, **options)
+    to_rounded(batch[:1], RoundedBatch.of(batch), **options)
     nearest(batch, batch, 1, of_templates=False, labels=None, threads=1, **options)
     counts_within(batch, batch, np.ones(1), labels=None, threads=1, **options)
 
@@ -311,7 +323,11 @@ class _Solver:
     """One problem: its tiles, and a tile's distances."""
 
     def __init__(
-        self, probes: Probes, templates: SubspaceBatch, metric: Metric, steps: int
+        self,
+        probes: Probes,
+        templates: SubspaceBatch | RoundedBatch,
+        metric: Metric,
+        steps: int,
     ) -> None:
         self._probes, self._templates, self._metric = probes, templates, metric
         self._options = Options(
@@ -367,6 +383,7 @@ class _Solver:
             else:
                 rows, terms = self._take_points(self._probes[part])
             batch = self._templates
+            assert isinstance(batch, SubspaceBatch)  # noqa: S101
             sides = Sides(_locked(rows), terms, self._m, batch.feet, batch.bases)
             yield _Block(part.start, sides, self._grid(len(terms)))
 
@@ -420,6 +437,7 @@ class _Solver:
         """Distances of probes to the templates of the same positions."""
         probes, batch = self._probes[part], self._templates
         assert isinstance(probes, SubspaceBatch)  # noqa: S101
+        assert isinstance(batch, SubspaceBatch)  # noqa: S101
         count, m_d, m_e, n = len(probes), self._m, batch.m, batch.n
         wide = _whole(count)
         left = np.empty((count, m_d + 1, n), dtype=np.float32)
@@ -440,9 +458,37 @@ class _Solver:
             out[again] = self._exact(again + part.start, again + part.start)
         return out[:count]
 
+    def to_rounded(self, i: int) -> Array32:
+        """Distances of a probe to all templates."""
+        probes, batch = self._probes, self._templates
+        assert isinstance(probes, SubspaceBatch)  # noqa: S101
+        assert isinstance(batch, RoundedBatch)  # noqa: S101
+        count, m_d, m_e = len(batch), self._m, batch.m
+        wide = _whole(count)
+        stacked = np.empty((1, m_d + 1, batch.n), dtype=np.float32)
+        self._stack(probes[i : i + 1], stacked)
+        feet, steps = batch.feet, batch.steps
+        if self._options.spherical:
+            scales, radii = (part.astype(np.float32) for part in exact.spheres(feet))
+            feet, steps = feet * scales[:, None], steps * radii[:, None]
+        product = np.zeros((m_d + 1, m_e + 1, wide), dtype=np.float32)
+        squares, out = np.zeros(wide, dtype=np.float32), np.empty(wide, dtype=np.float32)
+        squares[:count] = _squares(batch.feet)
+        sides = _locked(feet), _locked(batch.numbers), _locked(steps)
+        rounded_products(stacked[0], *sides, product)
+        tile = Tile(product.reshape(-1), _squares(probes.feet[i : i + 1]), squares, m_d, m_e)
+        work = np.zeros(self._scratch, dtype=np.float32)
+        if solve(tile, self._options, work, Result(out, wide, count)):
+            again = np.flatnonzero(out[:count] < 0)
+            out[again] = self._exact(np.full(len(again), i), again)
+        return out[:count]
+
     def _exact(self, i: Indices, j: Indices) -> NDArray[np.float64]:
         options: dict[str, Any] = {"metric": self._metric, "steps": self._options.steps}
-        return exact.pairs(self._probes, self._templates, i, j, **options)
+        templates = self._templates
+        if isinstance(templates, RoundedBatch):
+            templates, j = templates[j], np.arange(len(j))
+        return exact.pairs(self._probes, templates, i, j, **options)
 
 
 def _squares(rows: Array32) -> Array32:
@@ -451,7 +497,7 @@ def _squares(rows: Array32) -> Array32:
     return squares
 
 
-def _locked(array: Array32) -> Array32:
+def _locked(array: _Array) -> _Array:
     """View that cannot be written, as those of a batch: kernels are compiled for one kind."""
     view = array.view()
     view.flags.writeable = False

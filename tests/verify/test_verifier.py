@@ -13,6 +13,7 @@ from templates.contract import wire
 from templates.contract.document import Contract
 from templates.decoys import DecoyGenerator
 from templates.errors import ContractMismatch, InvalidEmbedding, InvalidTemplate, Uncalibrated
+from templates.keys.randomness import Keystream
 from templates.keys.rotation import HAAR_VERSION, Rotation, TenantRotation
 from templates.space.agreement import InconsistentImages
 from templates.space.lifting import lift
@@ -68,7 +69,11 @@ def lifted(
 def nobody(contract: Contract, number: int) -> StandIn:
     """The stand-in of one unknown subject."""
     digest = hashlib.sha256(f"unknown {number}".encode()).digest()
-    plain = wire.encode(contract.cohort[0], contract_id=contract.contract_id, dtype="float16")
+    with Keystream.seeded("nobody") as stream:
+        template = contract.nobody.lift(
+            strategy=contract.binding.strategy, m=contract.binding.m, stream=stream
+        )
+    plain = wire.encode(template, contract_id=contract.contract_id, dtype="float16")
     return StandIn(plain, lift_stand_in(contract, digest))
 
 
@@ -95,7 +100,7 @@ def test_decision_agrees_with_brute_force(
     assert decision.distance == pytest.approx(np.sqrt(2 - 2 * similarity), abs=1e-4)
     assert decision.score == pytest.approx(z, abs=1e-3)
     # What is expected is what templates of nobody give, whoever drew them.
-    crowd = [spherical(probe, template) for template in contract.cohort]
+    crowd = [spherical(probe, template) for template in contract.cohort[:]]
     assert means[0] == pytest.approx(np.mean(crowd), abs=4 * np.std(crowd) / np.sqrt(len(crowd)))
     assert spreads[0] == pytest.approx(np.std(crowd, ddof=1), rel=0.3)
     calibration = contract.calibration("p2s")

@@ -30,6 +30,7 @@ from templates.distances.kernels import lanes
 from templates.errors import InvalidEmbedding, TemplateError
 from templates.keys.randomness import Keystream
 from templates.space.lifting import lift
+from templates.space.rounded import RoundedBatch
 from templates.space.subspace import SubspaceBatch
 from tests.patience import PATIENCE_S
 
@@ -134,6 +135,41 @@ def test_spherical_agrees_with_the_reference(n: int, shape: tuple[int, int]) -> 
         above = (seen**2 - expected**2) / 2
         assert above.max() < 2e-5, name
         assert np.quantile(-above, 0.9) < 1e-5, name
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("metric", METRICS)
+def test_a_few_probes_see_rounded_templates_as_many_do(
+    metric: Metric, shape: tuple[int, int]
+) -> None:
+    for name, (a, b) in relations(200, *shape).items():
+        rounded = RoundedBatch.of(b)
+        # Parallel sets that were rounded are a problem that 50 steps do not finish.
+        few = pairwise_distances(a, rounded, metric=metric, steps=400)
+        many = pairwise_distances(a, rounded[:], metric=metric, steps=400)
+        # What is computed in float64 on one way and not on the other is at the limit of both.
+        np.testing.assert_allclose(few, many, rtol=1e-4, atol=1e-5, err_msg=name)
+        points = a.feet
+        assert (
+            pairwise_distances(points, rounded, metric=metric)
+            == pairwise_distances(points, rounded[:], metric=metric)
+        ).all()
+
+
+def test_rounding_moves_a_similarity_by_far_less_than_templates_differ() -> None:
+    probes = lifted(faces(40, 512), 4, "probes")
+    cohort = lifted(faces(100, 512, "cohort"), 64, "cohort")
+    rounded = RoundedBatch.of(cohort)
+    steps = np.abs(cohort.bases).max(axis=2) / 127
+    assert (np.abs(rounded[:].bases - cohort.bases).max(axis=2) <= 0.51 * steps).all()
+    exact, seen = (
+        similarity(pairwise_distances(probes, side, metric="spherical").astype(np.float64))
+        for side in (cohort, rounded)
+    )
+    spread = exact.std(axis=1)
+    assert np.abs(seen - exact).max() < 0.2 * spread.min()
+    np.testing.assert_allclose(seen.mean(axis=1), exact.mean(axis=1), atol=0.02 * spread.min())
+    np.testing.assert_allclose(seen.std(axis=1), spread, rtol=0.02)
 
 
 def test_a_large_dimension() -> None:
@@ -466,6 +502,7 @@ import numpy as np
 from numba.core import event
 from templates.distances import nearest, paired_distances, pairwise_distances, count_within, warm_up
 from templates.space.lifting import lift
+from templates.space.rounded import RoundedBatch
 
 warm_up()
 compiled = []
@@ -492,6 +529,7 @@ for m, k in ((1, 1), (2, 9), (16, 16), (20, 7)):
             nearest(probes, b, k=3, metric=metric, of_templates=True, labels=labels)
             count_within(probes, b, [0.5], metric=metric)
         paired_distances(a, b, metric=metric)
+        pairwise_distances(a[:1], RoundedBatch.of(b), metric=metric)
 print(compiled)
 """
 
