@@ -55,8 +55,9 @@ javascript-package: javascript
 		&& test -f node_modules/veilface-client/dist/element/login.d.ts
 	rm -rf dist/npm/alone
 
-# What the image depends on, and the wheel's core with it: known vulnerabilities, and a bill of materials (CycloneDX). Without
-# an advisory service nothing is audited, which fails with status 3 of the script, and is said.
+# What the image depends on, and the wheel's core with it: known vulnerabilities, and a bill of materials (CycloneDX), which
+# names what private mode runs too. Without an advisory service nothing is audited, which fails with status 3 of the script,
+# and is said.
 audit: | $(UV)
 	mkdir -p dist
 	rm -f dist/audit.json
@@ -68,6 +69,7 @@ sbom: | $(UV)
 	mkdir -p dist
 	$(UV) tool run --quiet --from cyclonedx-bom==7.5.0 cyclonedx-py requirements deploy/requirements.lock \
 		--output-reproducible --output-file dist/sbom.json
+	$(PYTHON) .ci/sbom_of_page.py dist/sbom.json
 
 # A wheel of every package that the image depends on, for both of its processors and each Python: nothing is compiled.
 platforms: | $(UV)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 from attacks.privacy import Privacy
 from templates.contract.document import Contract
+from templates.contract.levels import Level, Rate
 from templates.contract.verdict import Judgement
 
 DIMS = (32, 48, 64, 96, 128, 160, 192)
@@ -124,10 +125,9 @@ def judge_accuracy(contract: Contract, *, photos: int, not_acquired: int) -> Jud
     shortfall = None
     if level.target_fmr is None or level.target_fmr > LAXEST_JUDGED:
         shortfall = f"so few people resolve no level stricter than {name}"
-    rates = level.frr_by_photos or level.fnmr_by_photos
-    enrolled = max((p for p in rates if p <= ADVISED_PHOTOS), default=min(rates, default=None))
+    enrolled, rate = rejected_as_advised(level)
     return Judgement(
-        level.fnmr if enrolled is None else rates[enrolled],
+        rate,
         ACCURACY_LIMIT,
         {
             "level": name,
@@ -138,6 +138,20 @@ def judge_accuracy(contract: Contract, *, photos: int, not_acquired: int) -> Jud
         },
         shortfall,
     )
+
+
+def rejected_as_advised(level: Level) -> tuple[int | None, Rate]:
+    """Return the FRR of templates of the advised number of photos, or the next below it.
+
+    Returns
+    -------
+    enrolled : int or None
+        The number of photos; None where the level counts all templates together.
+    rate : Rate
+    """
+    rates = level.frr_by_photos or level.fnmr_by_photos
+    enrolled = max((p for p in rates if p <= ADVISED_PHOTOS), default=min(rates, default=None))
+    return enrolled, level.fnmr if enrolled is None else rates[enrolled]
 
 
 def judge_groups(contract: Contract) -> Judgement | None:

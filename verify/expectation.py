@@ -168,8 +168,8 @@ def fit_expectation(
         return lift_nobody(count)
 
     compared, climbed = (
-        _kept(mean_template.add(half, lift_told, templates, tile=tile), kept)
-        for half, kept in enumerate((templates, CLIMBED))
+        _kept(mean_template.add(half, lift_told, templates, tile=tile), kept, m=m, n=source.n)
+        for half, kept in enumerate((templates, min(CLIMBED, templates)))
     )
     projector, foot = mean_template.estimate([source, hidden])
     progress(_LIFTED)
@@ -213,14 +213,19 @@ def _ascended(
     )
 
 
-def _kept(tiles: Iterator[Templates], count: int) -> SubspaceBatch:
-    """Run through tiles of templates, and keep the first so many of them, in float32."""
-    feet, bases, room = [], [], count
+def _kept(tiles: Iterator[Templates], count: int, *, m: int, n: int) -> SubspaceBatch:
+    """Run through tiles of templates, and keep the first so many of them, in float32.
+
+    They are written where they stay: to join them at the end would hold them all twice.
+    """
+    feet, bases = np.empty((count, n), np.float32), np.empty((count, m, n), np.float32)
+    first = 0
     for tile_feet, tile_bases in tiles:
-        feet.append(tile_feet[:room].astype(np.float32))
-        bases.append(tile_bases[:room].astype(np.float32))
-        room -= len(feet[-1])
-    return SubspaceBatch(np.concatenate(feet), np.concatenate(bases))
+        rows = slice(first, min(first + len(tile_feet), count))
+        room = rows.stop - rows.start
+        feet[rows], bases[rows] = tile_feet[:room], tile_bases[:room]
+        first = rows.stop
+    return SubspaceBatch(feet, bases)
 
 
 class _Fit:

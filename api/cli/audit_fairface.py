@@ -194,6 +194,7 @@ def fairface(
         drop_duplicates=drop_duplicates,
         seed=seed,
     )
+    plan.require_faces(labels[0])
     photos, faces = [], []
     for part in plan.sample(*labels):
         extraction = extract(pack, list(part), aligned=aligned, settings=settings, cache=cache)

@@ -10,7 +10,7 @@ import typer
 from api.cli.console import demo_notice, message, say
 from api.cli.errors import CommandError
 from api.cli.options import takes_settings
-from api.cli.verdict import verdict_lines
+from api.cli.verdict import private_mode_weakness, verdict_lines
 from api.http.audit_report import open_audit_report
 from api.limits.rates import RateLimits
 from api.process.metrics import shared_directory
@@ -19,6 +19,7 @@ from api.process.operations import tls_options
 from api.process.runtime import Runtime, bootstrap_token
 from api.process.supervisor import run_server
 from api.settings import Settings
+from templates.decoys import DecoyGenerator
 
 
 def register(app: typer.Typer) -> None:
@@ -116,6 +117,9 @@ def _opened_once(settings: Settings, *, check: bool) -> tuple[str | None, bool]:
             message(line)
         if (weakness := require_privacy(runtime.contract, settings)) is not None:
             message(f"warning: weak privacy is accepted: {weakness}")
+        browsers_lift = settings.serve_pack and isinstance(runtime.source, DecoyGenerator)
+        if browsers_lift and (weakness := private_mode_weakness(runtime.contract)) is not None:
+            message(f"warning: private mode: {weakness}")
         binding = runtime.contract.binding
         token = None if check else bootstrap_token(runtime.store, settings)
         if check and (warning := runtime.superseded_calibrations()) is not None:

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from attacks.operating_point import OperatingPoint
+from attacks.operating_point import ACCURACY_LIMIT, OperatingPoint, rejected_as_advised
 from templates.contract.document import Contract, Rate
 from templates.contract.verdict import Judgement, Verdict
 
@@ -48,6 +48,27 @@ def _groups_line(groups: Judgement | None) -> str:
         f"match at {basis['level']}; limit {100 * groups.limit:.3g} %. "
         f"Groups by {basis['groups_from']}; lifted probes are not in it."
     )
+
+
+def private_mode_weakness(contract: Contract) -> str | None:
+    """Say that too many single photos are rejected where browsers lift them, or None.
+
+    Browsers lift to the largest dimension that is calibrated; the limit is the one on accuracy.
+    """
+    lifted = [entry for entry in contract.calibrations if entry.mode == "s2s"]
+    calibration = max(lifted, key=lambda entry: entry.probe_m, default=None)
+    levels = () if calibration is None else calibration.levels
+    for level in levels:
+        enrolled, rate = rejected_as_advised(level)
+        if level.name == contract.default_level and rate.value > ACCURACY_LIMIT:
+            return (
+                f"{shown_rate(rate)} of genuine probes of one photo, lifted in the browser, are "
+                f"rejected at {level.name}, with {enrolled or 'any number of'} photos enrolled; "
+                f"the limit is {100 * ACCURACY_LIMIT:.3g} %. Have three photos shown, not one (of "
+                "those the contract has no figure), or build decoys that are like your people "
+                "(`veilface decoys build --like`) and calibrate again"
+            )
+    return None
 
 
 def improvements(contract: Contract, point: OperatingPoint) -> list[str]:

@@ -26,9 +26,9 @@ from api.http.audit_report import open_audit_report
 from api.http.context import RequestContext
 from api.http.cors import Cors
 from api.http.errors import ApiError, StartError, api_error
-from api.http.openapi import DESCRIPTION, allowed_methods
+from api.http.openapi import allowed_methods
 from api.http.protocol import Protocol
-from api.http.reference import DescribedApi, operation_id
+from api.http.reference import DescribedApi, describe, operation_id
 from api.http.routes import (
     audit_log,
     challenges,
@@ -115,9 +115,7 @@ def create_app(
                     app.state.readiness.stopping = True
 
     app = DescribedApi(
-        title="Veilface",
-        version=VERSION,
-        description=DESCRIPTION,
+        _document(with_health=settings.operations_port is None),
         lifespan=lifespan,
         docs_url=None,
         redoc_url=None,
@@ -151,6 +149,13 @@ def _built(*modules: ModuleType) -> tuple[BaseRoute, ...]:
     for _ in iter_route_contexts(router.routes):
         pass
     return tuple(router.routes)
+
+
+@cache
+def _document(*, with_health: bool) -> dict[str, Any]:
+    """The OpenAPI document, made now and once for a process, for the reason of :func:`_built`."""
+    health_routes = _built(health) if with_health else ()
+    return describe([*_built(*API), *health_routes], version=VERSION)
 
 
 def _operations_app(app: FastAPI) -> FastAPI:

@@ -1,12 +1,16 @@
 """The API reference: one HTML page, written from the OpenAPI document, without a script."""
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from html import escape
 from typing import Any
 
 from fastapi import FastAPI
+from fastapi.openapi.utils import get_openapi
 from fastapi.routing import APIRoute
+from starlette.routing import BaseRoute
+
+from api.http.openapi import DESCRIPTION
 
 SAMPLES = "x-codeSamples"
 CURL: Mapping[str, str] = {
@@ -44,16 +48,27 @@ def operation_id(route: APIRoute) -> str:
 
 
 class DescribedApi(FastAPI):
-    """An application whose document has the calls of :data:`CURL`."""
+    """An application whose OpenAPI document is there before a request asks for it."""
+
+    def __init__(self, document: dict[str, Any], **options: Any) -> None:
+        super().__init__(**options)
+        self._document = document
 
     def openapi(self) -> dict[str, Any]:
         """Return the OpenAPI document."""
-        document = super().openapi()
-        for entry in document["paths"].values():
-            for operation in entry.values():
-                if source := CURL.get(operation["operationId"]):
-                    operation[SAMPLES] = [{"lang": "Shell", "source": source}]
-        return document
+        return self._document
+
+
+def describe(routes: Sequence[BaseRoute], *, version: str) -> dict[str, Any]:
+    """Make the OpenAPI document of routes, with the calls of :data:`CURL`."""
+    document = get_openapi(
+        title="Veilface", version=version, description=DESCRIPTION, routes=routes
+    )
+    for entry in document["paths"].values():
+        for operation in entry.values():
+            if source := CURL.get(operation["operationId"]):
+                operation[SAMPLES] = [{"lang": "Shell", "source": source}]
+    return document
 
 
 def render(document: Mapping[str, Any]) -> str:

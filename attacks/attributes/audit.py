@@ -9,8 +9,19 @@ import numpy as np
 
 from attacks.attributes.cost import measure_cost
 from attacks.attributes.experiment import run_scheme, work_of
-from attacks.attributes.faces import LabelledFaces, Split, near_duplicates, split
-from attacks.attributes.plan import AttributePlan, prepare
+from attacks.attributes.faces import (
+    LabelledFaces,
+    Split,
+    attacker_faces,
+    near_duplicates,
+    split,
+)
+from attacks.attributes.plan import (
+    AttributePlan,
+    prepare,
+    require_decoys,
+    require_folds,
+)
 from attacks.attributes.rows import AttributeRow, strongest
 from attacks.outcomes import COMPARED, AttackOutcome, Knowledge, Leaked, Property, Scheme
 from attacks.population import LEAST_FITTED
@@ -94,6 +105,35 @@ class AttributeAuditPlan:
         most = None if self.attack is None else self.lifting + self.attack
         return _sample(train, most, self.seed), _sample(validation, self.attacked, self.seed)
 
+    def attacker_faces(self, training: int) -> int:
+        """Return how many of so many training faces are the attacker's.
+
+        Raises
+        ------
+        AuditError
+            There are too few training faces.
+        """
+        # Which photos give no embedding is not known beforehand.
+        most = None if self.attack is None else min(self.attack, max(1, training - self.lifting))
+        return attacker_faces(training, lifting=self.lifting, attack=most)
+
+    def require_faces(self, train: Mapping[Path, Label]) -> None:
+        """Refuse, before anything is embedded, what would fail even if every photo had a face.
+
+        Raises
+        ------
+        AuditError
+            There are too few training faces for the plan.
+        """
+        attack = self.attacker_faces(len(train))
+        require_folds(attack, self.attackers)
+        require_decoys(
+            self.schemes,
+            list(train.values()),
+            lifting=self.lifting,
+            fold=attack // self.attackers.folds,
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class AttributeAudit:
@@ -135,21 +175,18 @@ def run_attribute_audit(
     AuditError
         There are too few faces for the plan.
     """
-    attack, duplicates = plan.attack, 0
+    duplicates = 0
     if plan.drop_duplicates is not None:
         dropped = near_duplicates(
             validation.descriptors, train.descriptors, cosine=plan.drop_duplicates
         )
         validation = validation.take(np.setdiff1d(np.arange(len(validation)), dropped))
         duplicates = len(dropped)
-    if attack is not None:
-        # Which photos give no embedding is not known beforehand.
-        attack = min(attack, max(1, len(train) - plan.lifting))
     parts = split(
         train,
         validation,
         lifting=plan.lifting,
-        attack=attack,
+        attack=plan.attacker_faces(len(train)),
         attacked_most=plan.attacked,
         seed=plan.seed,
     )

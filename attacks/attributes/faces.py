@@ -174,14 +174,7 @@ def split(
             "the faces to train with and those to attack differ in the dimension of their "
             "embeddings or in their classes"
         )
-    left = len(train) - lifting
-    wanted = left if attack is None else attack
-    if lifting < 1 or wanted < 1 or wanted > left:
-        raise AuditError(
-            f"{lifting} lifting faces and {'the others' if attack is None else attack} for the "
-            f"attacker cannot be taken from {len(train)} training faces: both must be 1 or more; "
-            "choose smaller sizes"
-        )
+    wanted = attacker_faces(len(train), lifting=lifting, attack=attack)
     if not len(attacked) or (attacked_most is not None and attacked_most < 1):
         raise AuditError("at least one face must be attacked")
     generator = np.random.default_rng([seed, 0])
@@ -192,6 +185,25 @@ def split(
         train.take(order[lifting : lifting + wanted]),
         attacked.take(np.sort(victims)),
     )
+
+
+def attacker_faces(training: int, *, lifting: int, attack: int | None) -> int:
+    """Return how many of so many training faces are the attacker's; see :func:`split`.
+
+    Raises
+    ------
+    AuditError
+        There are too few training faces.
+    """
+    left = training - lifting
+    wanted = left if attack is None else attack
+    if lifting < 1 or wanted < 1 or wanted > left:
+        raise AuditError(
+            f"{lifting} lifting faces and {'the others' if attack is None else attack} for the "
+            f"attacker cannot be taken from {training} training faces: both must be 1 or more; "
+            "choose smaller sizes"
+        )
+    return wanted
 
 
 def near_duplicates(attacked: Array32, training: Array32, *, cosine: float) -> NDArray[np.int64]:

@@ -1,5 +1,6 @@
 """What an attribute audit runs: its settings, the schemes, and what all of them share."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -17,6 +18,7 @@ from attacks.population import LEAST_FITTED
 from templates.decoys import NOISE_ENERGY, DecoyGenerator, DecoyPool
 from templates.decoys.source import DecoySource
 from templates.space.lifting import Strategy
+from verify.fairface_labels import Label
 
 Codes = NDArray[np.int64]
 
@@ -234,19 +236,13 @@ def prepare(
         generator = DecoyGenerator.fit(rows, noise=NOISE_ENERGY / rows.shape[1])
     against = None if generator is None else decoy_precision(generator, seed=seed)
     side_of = partial(Side.of, nearby=plan.gallery_most, against=against)
+    require_folds(len(parts.attack), plan)
     rng = np.random.default_rng([seed, 1])
     order = rng.permutation(len(parts.attack))
     number = np.empty(len(order), dtype=np.int64)
     number[order] = np.arange(len(order)) % plan.folds
     chosen = np.zeros(len(order), dtype=np.bool_)
     chosen[order[: plan.training_most]] = True
-    least = len(order) - int(np.bincount(number, minlength=plan.folds).max())
-    wanted = plan.neighbours
-    if least < wanted:
-        raise AuditError(
-            f"the attacker's {len(order)} faces leave {least} in the gallery of a fold, and "
-            f"{wanted} neighbours are asked for: give the attacker more faces"
-        )
     folds = []
     for fold in range(plan.folds):
         part = parts.attack.take(np.flatnonzero(number == fold))
@@ -255,14 +251,84 @@ def prepare(
         own = part.take(entries)
         held_out = np.zeros(len(own), dtype=np.bool_)
         held_out[rng.permutation(len(own))[: round(plan.held_out * len(own))]] = True
-        if not held_out.any() or held_out.all():
-            raise AuditError(
-                f"a fold of {len(own)} faces is too small to hold some of them out: give the "
-                "attacker more faces"
-            )
         folds.append(Fold(own, entries, held_out, side_of(part, gallery)))
     side = side_of(parts.lifting, parts.attack.take(order))
     return Setup(parts, plan, seed, side, generator, tuple(folds))
+
+
+def require_folds(faces: int, plan: AttributePlan) -> None:
+    """Check that so many faces of the attacker's can be dealt into the plan's folds.
+
+    Raises
+    ------
+    AuditError
+        Too few are in the gallery of a fold for the neighbours that are asked for, or in a fold to
+        hold some of them out.
+    """
+    least = faces - -(-faces // plan.folds)
+    if least < plan.neighbours:
+        raise AuditError(
+            f"the attacker's {faces} faces leave {least} in the gallery of a fold, and "
+            f"{plan.neighbours} neighbours are asked for: give the attacker more faces"
+        )
+    own = min(faces, plan.training_most) // plan.folds
+    if not 0 < round(plan.held_out * own) < own:
+        raise AuditError(
+            f"a fold of {own} faces is too small to hold some of them out: give the attacker more "
+            "faces"
+        )
+
+
+def require_decoys(
+    schemes: Sequence[Scheme], labels: Sequence[Label], *, lifting: int, fold: int
+) -> None:
+    """Check that pools of so many faces give the decoys that the schemes take.
+
+    Of a fold, which is the pool of its own faces, half: where a face is drawn for itself, all its
+    decoys are drawn again, and of more than half that would hardly end.
+
+    Parameters
+    ----------
+    labels
+        Of the faces that the pools are drawn from; hybrid+ takes decoys of another gender and race.
+    lifting, fold
+        Faces of the lifting database, and of the attacker's smallest fold.
+
+    Raises
+    ------
+    AuditError
+        They do not; for hybrid+, which lifts a face with none like it, on average.
+    """
+    unlike = _least_unlike(labels)
+    for scheme in schemes:
+        if scheme.decoys != POOLED:
+            continue
+        strategy = Strategy(scheme.strategy)
+        plus = strategy is Strategy.HYBRID_PLUS
+        for pool, faces, share in (
+            ("the lifting database", lifting, unlike if plus else 1.0),
+            ("a fold of the attacker's", fold, unlike if plus else 0.5),
+        ):
+            if (k := strategy.decoys(scheme.dim)) > share * faces:
+                raise AuditError(
+                    f"{strategy} lifting at m = {scheme.dim} takes {k} decoys, and {pool}, "
+                    f"{faces} faces, gives {int(share * faces)}"
+                    f"{' of another gender and race' if plus else ''}: give more faces, or ask for "
+                    "smaller dimensions of the strategies with a pool"
+                )
+
+
+def _least_unlike(labels: Sequence[Label]) -> float:
+    """Share of faces of another gender and race than a face has, where they are fewest."""
+    both = Counter((label.gender, label.race) for label in labels)
+    genders, races = (
+        Counter(label.gender for label in labels),
+        Counter(label.race for label in labels),
+    )
+    return min(
+        1 - (genders[gender] + races[race] - count) / len(labels)
+        for (gender, race), count in both.items()
+    )
 
 
 def schemes_of(

@@ -20,7 +20,11 @@ const login = document.createElement("veilface-login");
 login.options = { runtime: ort };
 // Who is let in says the server.
 login.words = { accept: "", enrolled: "" };
-login.authorize = () => own("/token");
+let attempts = 0;
+login.authorize = () => {
+  attempts++;
+  return own("/token");
+};
 
 const after = (milliseconds) => new Promise((resolve) => setTimeout(resolve, milliseconds));
 
@@ -32,14 +36,20 @@ function ask({ service, action }) {
 
 // What counts is what the server learned itself, after an error too: an answer may have been lost.
 async function ended() {
-  try {
-    // The server keeps what it could not ask the service yet.
-    const told = await own("/face").catch(() => after(2000).then(() => own("/face")));
-    if (!told.accepted) return ask(told);
-    login.remove();
-    output.value = `Welcome, ${told.name}`;
-  } catch (error) {
-    output.value = error.message;
+  const attempt = attempts;
+  // The server keeps what it could not ask the service yet, until there is another attempt.
+  for (let wait = 2000; wait < 60000; wait *= 2) {
+    try {
+      const told = await own("/face");
+      if (!told.accepted) return ask(told);
+      login.remove();
+      output.value = `Welcome, ${told.name}`;
+      return;
+    } catch (error) {
+      output.value = error.message;
+      await after(wait);
+    }
+    if (attempts > attempt) return;
   }
 }
 login.addEventListener("veilface-result", ended);
@@ -49,6 +59,7 @@ form.addEventListener("submit", async (event) => {
   event.preventDefault();
   const { name, password } = Object.fromEntries(new FormData(form));
   login.remove();
+  attempts++;
   output.value = "…";
   try {
     ask(await own(event.submitter.value, { name, password }));

@@ -21,7 +21,7 @@ from tests.clients.javascript.conftest import PACKAGE, require_client
 from tests.clients.proxy import Proxy
 from tests.examples.conftest import EXAMPLES, PYTHON, clean_environment, node, running
 from tests.leaks import as_bytes
-from tests.patience import wait_until
+from tests.patience import PATIENCE_S, wait_until
 from tests.ports import free_port
 from tests.web.browser_tab import BrowserTab
 from tests.web.camera import FakeCamera
@@ -502,10 +502,11 @@ def test_the_page_follows_what_the_server_learned(
             seen.append(page.locator("veilface-login output").text_content())
             route.fulfill(status=502, json={"detail": "away"})
 
-        page.route("**/face", lose, times=1)
+        page.route("**/face", lose, times=2)
         stand_before(page, "Log in")
-        told(page).to_have_text("Welcome, kim")
-        assert seen == [""], "nobody is welcome before the server says so"
+        told(page).to_have_text("away")
+        told(page).to_have_text("Welcome, kim", timeout=1000 * PATIENCE_S)
+        assert seen == ["", ""], "nobody is welcome before the server says so"
     finally:
         context.close()
 

@@ -1,5 +1,8 @@
 """What is expected of a point, in closed form, against templates that were not fitted."""
 
+import tracemalloc
+from collections.abc import Iterator
+
 import numpy as np
 import pytest
 
@@ -12,7 +15,7 @@ from templates.keys.randomness import Keystream
 from templates.space.lifting import Strategy, lift
 from tests.verify.population import M, N, decoys, enrolled, photos_of, templates_of, unit
 from verify.cohort import people_like
-from verify.expectation import ExpectationFit, _Fit, draw_wolves, fit_expectation
+from verify.expectation import Array64, ExpectationFit, _Fit, _kept, draw_wolves, fit_expectation
 from verify.metrics import rate
 from verify.point_ascent import ascend_points
 
@@ -192,3 +195,20 @@ def test_probes_that_climb_are_fitted_too(monkeypatch: pytest.MonkeyPatch) -> No
         spreads = expectation.statistics(ends)[1]
         off.append(float(np.mean(close.std(axis=1) / spreads)) - 1)
     assert abs(off[1]) < off[0] / 2
+
+
+def test_templates_that_are_kept_are_held_once() -> None:
+    tile, count, m, n = 10, 200, 8, 256
+    drawn = np.random.default_rng(0).standard_normal((count + 20, m + 1, n))
+
+    def tiles() -> Iterator[tuple[Array64, Array64]]:
+        for first in range(0, len(drawn), tile):
+            yield drawn[first : first + tile, 0], drawn[first : first + tile, 1:]
+
+    tracemalloc.start()
+    kept = _kept(tiles(), count, m=m, n=n)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    np.testing.assert_array_equal(kept.feet, drawn[:count, 0].astype(np.float32))
+    np.testing.assert_array_equal(kept.bases, drawn[:count, 1:].astype(np.float32))
+    assert peak < 1.2 * (kept.feet.nbytes + kept.bases.nbytes)

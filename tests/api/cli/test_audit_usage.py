@@ -202,14 +202,27 @@ def test_a_wrong_label_is_named(world: World, fairface_root: Path, tmp_path: Pat
         ([], "give the attacker more faces"),
     ],
 )
+@pytest.mark.usefixtures("before_any_face")
 def test_sizes_that_do_not_fit_are_refused(
     world: World, fairface_root: Path, tmp_path: Path, sizes: list[str], reason: str
 ) -> None:
     asked = ("--strategy", "raw", "--generated-dim", "4", "--service-dim", "4", *sizes)
-    cache = fairface_root / "faces.cache"
-    ran = fairface(world, fairface_root, *asked, "--cache", cache, "--out", tmp_path / "out")
+    ran = fairface(world, fairface_root, *asked, "--out", tmp_path / "out")
     refused(ran, reason, 1)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.usefixtures("before_any_face")
+def test_more_decoys_than_the_faces_give_are_refused(
+    world: World, fairface_root: Path, tmp_path: Path
+) -> None:
+    header, *lines = (fairface_root / "fairface_label_train.csv").read_text().splitlines()
+    more = [f"{copy}/{line}" for copy in range(6) for line in lines]
+    (tmp_path / "fairface_label_train.csv").write_text("\n".join([header, *more]))
+    shutil.copy(fairface_root / "fairface_label_val.csv", tmp_path)
+    asked = ("--lifting", "200", "--generated-dim", "4", "--service-dim", "4", "--dim", "160")
+    ran = fairface(world, tmp_path, *asked, "--strategy", "raw,adversarial")
+    refused(ran, "takes 160 decoys, and a fold of the attacker's, 175 faces, gives 87: give", 1)
 
 
 @pytest.mark.parametrize(

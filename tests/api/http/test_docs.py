@@ -2,10 +2,12 @@
 
 import json
 import re
+import warnings
 from pathlib import Path
 from typing import Any
 
 import pytest
+from fastapi import FastAPI
 from fastapi.routing import APIRoute
 
 from api.http.app import create_app
@@ -145,3 +147,20 @@ def test_every_route_is_documented() -> None:
     for route in app.routes:
         if isinstance(route, APIRoute):
             assert route.include_in_schema, route.path
+
+
+@pytest.mark.parametrize("port", [None, 8422])
+def test_the_document_is_there_before_a_request_asks_for_it(
+    monkeypatch: pytest.MonkeyPatch, port: int | None
+) -> None:
+    """The framework builds it under filters for warnings, which are the whole process's."""
+
+    class Caught:
+        def __init__(self, *_args: object, **_options: object) -> None:
+            raise AssertionError("filters of the process are changed while requests are answered")
+
+    app = create_app(Settings(operations_port=port))
+    monkeypatch.setattr(warnings, "catch_warnings", Caught)
+    assert ("/metrics" in app.openapi()["paths"]) == (port is None)
+    with pytest.raises(AssertionError, match="filters of the process"):
+        FastAPI.openapi(app)

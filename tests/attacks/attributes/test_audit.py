@@ -1,4 +1,5 @@
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,14 +13,33 @@ from attacks.attributes.audit import (
 from attacks.attributes.measures import Leakage, measure
 from attacks.attributes.plan import AttributePlan
 from attacks.attributes.rows import AttributeRow
+from attacks.errors import AuditError
 from attacks.outcomes import RAW_SCHEME, AttackOutcome, Knowledge, Property, Scheme
 from attacks.verdict import judge
+from templates.errors import DecoyError, LiftingError
 from tests.attacks.attributes.people import faces
+from verify.fairface_labels import GENDERS, RACES, Label
 from verify.metrics import wilson
 
 SERVICE = Scheme("adversarial", "generator", 32)
 POOL = Scheme("adversarial", "pool", 32)
 FACES = 200
+LABELS = {
+    Path(f"{number}.png"): Label("20-29", GENDERS[number % 2], RACES[number % 3])
+    for number in range(240)
+}
+
+
+def plan(strategy: str, m: int) -> AttributeAuditPlan:
+    """An audit of a scheme with a pool, of 110 lifting faces and 120 of the attacker's."""
+    return AttributeAuditPlan(
+        schemes=(RAW_SCHEME, Scheme(strategy, "pool", m)),
+        attributes=("gender",),
+        attackers=AttributePlan(feature_ks=(10,), lifts=1, attackers=()),
+        lifting=110,
+        attack=120,
+        attacked=30,
+    )
 
 
 def row(
@@ -157,3 +177,39 @@ def test_an_audit_reports_its_progress_and_the_sizes_of_its_parts() -> None:
         "attacked": 30,
         "duplicates_dropped": 0,
     }
+
+
+@pytest.mark.parametrize(("strategy", "most"), [("adversarial", 15), ("hybrid", 31)])
+def test_no_more_decoys_are_asked_of_a_pool_than_it_gives(strategy: str, most: int) -> None:
+    """The attacker's folds have 30 faces, which are lifted with one another."""
+    plan(strategy, most).require_faces(LABELS)
+    run_attribute_audit(plan(strategy, most), faces(230, seed=1), faces(40, seed=2))
+    with pytest.raises(AuditError, match="30 faces, gives 15: give more faces, or ask for smaller"):
+        plan(strategy, most + 1).require_faces(LABELS)
+    with pytest.raises((LiftingError, DecoyError)):
+        run_attribute_audit(plan(strategy, 63), faces(230, seed=1), faces(40, seed=2))
+
+
+def test_decoys_of_another_gender_and_race_are_counted() -> None:
+    """Of two genders and three races, all as frequent, a third of the faces."""
+    plan("hybrid+", 21).require_faces(LABELS)
+    with pytest.raises(AuditError, match="30 faces, gives 10 of another gender and race"):
+        plan("hybrid+", 22).require_faces(LABELS)
+    few = {path: replace(label, race=RACES[0]) for path, label in LABELS.items()}
+    with pytest.raises(AuditError, match="110 faces, gives 0 of another gender and race"):
+        plan("hybrid+", 2).require_faces(few)
+
+
+def test_generated_decoys_need_no_pool() -> None:
+    replace(plan("hybrid", 4), schemes=(replace(SERVICE, dim=63),)).require_faces(LABELS)
+
+
+def test_too_few_faces_are_refused_before_they_are_embedded() -> None:
+    few = dict(list(LABELS.items())[:120])
+    with pytest.raises(AuditError, match="10 faces leave 7 in the gallery of a fold, and 10"):
+        plan("hybrid", 4).require_faces(few)
+    tiny = replace(plan("hybrid", 4), attackers=AttributePlan(k=5, feature_ks=(5,)))
+    with pytest.raises(AuditError, match="a fold of 2 faces is too small to hold some of them out"):
+        tiny.require_faces(few)
+    with pytest.raises(AuditError, match="cannot be taken from 110 training faces"):
+        plan("hybrid", 4).require_faces(dict(list(few.items())[:110]))
