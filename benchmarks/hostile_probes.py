@@ -150,7 +150,7 @@ def both_thresholds(similarities: Doubles, scores: Doubles, target: float) -> tu
 def rules_table(contract: Contract, source: DecoyGenerator, faces: Faces) -> dict[str, object]:
     """FNMR by one score, by its cohort form, and by both thresholds, on the same trials."""
     table: dict[str, object] = {}
-    cohort = contract.cohort[:]
+    cohort = contract.cohort.restored()
     for photos in (1, 3):
         enrolled, probes, owners = faces.split(photos)
         templates = lifted(enrolled, source, contract.binding.m, f"genuine {photos}")
@@ -297,7 +297,7 @@ def cost_table(contract: Contract, template: SubspaceBatch, probe: Floats) -> di
     verifier = Verifier(contract, rotation=rotation)
     data = wire.encode(template[0], contract_id=contract.contract_id)
     stored = Enrollment(data, "0" * 32, contract.contract_id, ())
-    cohort = contract.cohort[:]
+    cohort = contract.cohort.restored()
 
     def milliseconds(run: object, repeats: int = 60) -> float:
         assert callable(run)

@@ -46,8 +46,8 @@ __all__ = [
 ]
 
 Probes = NDArray[np.float32] | NDArray[np.float64] | SubspaceBatch
-_FEW = 16
-"""Probes that read a `RoundedBatch` sooner as it is than restored."""
+_FEW_ROWS = 128
+"""Of lifted probes, m + 1 each, that a `RoundedBatch` need not be restored for."""
 _DEVICE: ContextVar[str | None] = ContextVar("device", default=None)
 
 
@@ -109,7 +109,7 @@ def pairwise_distances(
         Of the spherical subspace-to-subspace iteration; unused otherwise.
     dtype : float32 or float64
         Precision of the bulk work. Distances below 0.1 and nearly singular pairs are computed in
-        float64 in any case.
+        float64 in any case. In float64 the bases of a `RoundedBatch` are made orthonormal again.
     threads : int, optional
         At most; by default as many as the matrix library would use. Their number does not change
         the result. Float64 uses the library's.
@@ -135,11 +135,11 @@ def pairwise_distances(
     distances: Floats
     device = _DEVICE.get()
     if isinstance(templates, RoundedBatch):
-        bulk = device is not None or np.dtype(dtype) == np.float64
-        if isinstance(probes, SubspaceBatch) and len(probes) <= _FEW and not bulk:
+        lifted = isinstance(probes, SubspaceBatch) and len(probes) * (probes.m + 1) <= _FEW_ROWS
+        if lifted and device is None and np.dtype(dtype) == np.float32:
             distances = _tiles().to_rounded(probes, templates, **options)
             return distances
-        templates = templates[:]
+        templates = templates.restored()
     if np.dtype(dtype) == np.float64:
         distances = exact.pairwise(probes, templates, **options)
     elif device is not None:

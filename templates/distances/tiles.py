@@ -58,7 +58,6 @@ _TINY = np.float32(np.finfo(np.float32).tiny)
 _NO_LABELS = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
 
 _Kept = TypeVar("_Kept", bound="_Nearest | _Counts")
-_Array = TypeVar("_Array", Array32, NDArray[np.int8])
 
 
 # --- what is asked for ---------------------------------------------------------------------------
@@ -149,9 +148,13 @@ def paired(
 def to_rounded(
     probes: SubspaceBatch, templates: RoundedBatch, *, metric: Metric, steps: int
 ) -> Array32:
-    """Distances of a few probes to all templates, (P, T)."""
+    """Distances of a few probes to all templates, (P, T), on the calling thread."""
+    out = np.empty((len(probes), len(templates)), dtype=np.float32)
     solver = _Solver(probes, templates, metric, steps)
-    return np.stack([solver.to_rounded(i) for i in range(len(probes))])
+    with single_threaded():
+        for i in range(len(probes)):
+            out[i] = solver.to_rounded(i)
+    return out
 
 
 def warm_up() -> None:
@@ -474,8 +477,10 @@ class _Solver:
         product = np.zeros((m_d + 1, m_e + 1, wide), dtype=np.float32)
         squares, out = np.zeros(wide, dtype=np.float32), np.empty(wide, dtype=np.float32)
         squares[:count] = _squares(batch.feet)
-        sides = _locked(feet), _locked(batch.numbers), _locked(steps)
-        rounded_products(stacked[0], *sides, product)
+        # Of the feet the numbers are as they are; those of the bases lack their scales.
+        scaled = stacked[0] * batch.scales
+        sides = _locked(feet), batch.numbers, _locked(steps)
+        rounded_products(stacked[0], scaled, *sides, product)
         tile = Tile(product.reshape(-1), _squares(probes.feet[i : i + 1]), squares, m_d, m_e)
         work = np.zeros(self._scratch, dtype=np.float32)
         if solve(tile, self._options, work, Result(out, wide, count)):
@@ -486,9 +491,13 @@ class _Solver:
     def _exact(self, i: Indices, j: Indices) -> NDArray[np.float64]:
         options: dict[str, Any] = {"metric": self._metric, "steps": self._options.steps}
         templates = self._templates
-        if isinstance(templates, RoundedBatch):
-            templates, j = templates[j], np.arange(len(j))
-        return exact.pairs(self._probes, templates, i, j, **options)
+        if isinstance(templates, SubspaceBatch):
+            return exact.pairs(self._probes, templates, i, j, **options)
+        out = np.empty(len(i))
+        for part in parts(len(i), LANES):
+            some = templates.restored(j[part])
+            out[part] = exact.pairs(self._probes, some, i[part], np.arange(len(some)), **options)
+        return out
 
 
 def _squares(rows: Array32) -> Array32:
@@ -497,7 +506,7 @@ def _squares(rows: Array32) -> Array32:
     return squares
 
 
-def _locked(array: _Array) -> _Array:
+def _locked(array: Array32) -> Array32:
     """View that cannot be written, as those of a batch: kernels are compiled for one kind."""
     view = array.view()
     view.flags.writeable = False

@@ -1,22 +1,31 @@
-"""Two hosts decide as one: both up, one cut off inside a write, one killed inside a write."""
+"""Two hosts decide as one: both up, one cut off inside a write, one killed inside a write.
+
+And nginx before them, as docs/deployment.md has it.
+"""
 
 import itertools
+import ssl
+import subprocess
+import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Any
 
 import httpx
 import psycopg
 import pytest
 
 from api.process.opening import open_keyring, open_store
+from templates.keys.probe_signature import signed_probe
 from tests.api.cli.conftest import run
-from tests.api.deployment import bearer
+from tests.api.deployment import bearer, images
 from tests.patience import PATIENCE_S, wait_until
 from tests.reliability.cluster import Cluster
 from tests.reliability.hosts import Host, Network, two_hosts
-from tests.reliability.operations import LOST, Clients, Operation, People
+from tests.reliability.operations import LOST, Clients, Operation, People, Tokens
+from tests.reliability.proxy import NAME, nginx, require_nginx
 
 pytestmark = pytest.mark.long
 
@@ -25,11 +34,13 @@ LIMIT = 40
 LOCKOUT = 4
 PEOPLE = {"ann": 1, "ben": 2, "cas": 3, "dan": 4}
 STRANGER = 9
+WAITS = "wait_event_type = 'Lock'"
 
 
 @pytest.fixture
 def network() -> Iterator[Network]:
-    with Network(2) as made:
+    """Two hosts, and a third where a client is."""
+    with Network(3) as made:
         yield made
 
 
@@ -93,7 +104,7 @@ def write_that_waits(
     with psycopg.connect(cluster.url) as held:
         held.execute("SELECT * FROM audit_head FOR UPDATE")
         thread.start()
-        wait_until(lambda: sessions(cluster, host, "wait_event_type = 'Lock'"))
+        wait_until(lambda: sessions(cluster, host, WAITS))
         yield answers
 
 
@@ -164,3 +175,108 @@ def decide_as_one(cluster: Cluster, first: Host, second: Host) -> None:
     store = open_store(settings, open_keyring(settings))
     assert store.audit_log.verify().intact
     store.close()
+
+
+UNTIL_REFUSED = """
+import ssl, sys, httpx
+url, chain, name = sys.argv[1:]
+context = ssl.create_default_context(cafile=chain)
+with httpx.Client(verify=context, trust_env=False, timeout=600) as client:
+    for number in range(4 * int({limit})):
+        headers = {{"Host": name, "X-Forwarded-For": f"203.0.113.{{number % 250}}"}}
+        sent = {{"headers": headers, "extensions": {{"sni_hostname": name}}}}
+        if client.get(f"{{url}}/nowhere", **sent).status_code == 429:
+            print("refused")
+            break
+"""
+
+
+class ThroughProxy:
+    """A client that knows the proxy's name and certificate."""
+
+    def __init__(self, url: str, certificate: Path, people: People, tokens: Tokens) -> None:
+        context = ssl.create_default_context(cafile=str(certificate))
+        self._client = httpx.Client(
+            base_url=url,
+            verify=context,
+            headers={"Host": NAME},
+            timeout=PATIENCE_S,
+            trust_env=False,
+        )
+        self._people, self._tokens = people, tokens
+
+    def send(self, method: str, path: str, token: str = "", **sent: Any) -> httpx.Response:
+        sent |= {"headers": bearer(token), "extensions": {"sni_hostname": NAME}}
+        return self._client.request(method, path, **sent)
+
+    def enroll(self, subject: str) -> int:
+        files = images(self._people.photos[PEOPLE[subject]])
+        path = f"/v1/subjects/{subject}/enrollment"
+        return self.send("PUT", path, self._tokens.enroll, files=files).status_code
+
+    def verify(self, subject: str) -> httpx.Response:
+        token = self._tokens.verify
+        body = signed_probe(token, subject, self._people.embeddings[PEOPLE[subject]])
+        return self.send("POST", f"/v1/subjects/{subject}/verify", token, json=body)
+
+
+def verifications(host: Host) -> int:
+    """How many reached a host."""
+    return sum(line.get("route", "").endswith("/verify") for line in host.service.log)
+
+
+def test_nginx_leads_to_both_hosts_and_repeats_no_verification(
+    network: Network, cluster: Cluster, tmp_path: Path
+) -> None:
+    require_nginx()
+    limits = {"trusted_proxies": network.address, "rate_limit_address": "200/day"}
+    with ExitStack() as running:
+        hosts = running.enter_context(two_hosts(network, cluster, tmp_path, **limits))
+        deployment = hosts[0].service.deployment
+        folder = tmp_path / "nginx"
+        addresses = [host.address for host in hosts]
+        url = running.enter_context(
+            nginx(folder, network.address, addresses, deployment.settings.port)
+        )
+        people = People(deployment, list(PEOPLE.values()))
+        client = ThroughProxy(url, folder / "chain.pem", people, Tokens(deployment))
+        assert [client.enroll(subject) for subject in PEOPLE] == [201] * len(PEOPLE)
+        assert client.send("GET", "/metrics").status_code == 404
+        for subject in itertools.islice(itertools.cycle(PEOPLE), 12):
+            assert client.verify(subject).json()["decision"] == "accept"
+        wait_until(lambda: all(map(verifications, hosts)), what="verifications on both hosts")
+
+        # One address is refused, whatever it says that it forwards, and no other one with it.
+        script = UNTIL_REFUSED.format(limit=200 * deployment.settings.workers * len(hosts))
+        arguments = [url, str(folder / "chain.pem"), NAME]
+        done = subprocess.run(
+            [*network.within(2), sys.executable, "-c", script, *arguments],
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE_S,
+        )
+        assert (done.stdout.strip(), done.stderr) == ("refused", "")
+        assert client.verify("ann").json()["decision"] == "accept"
+
+        # A host is killed inside a verification: the other one never sees that.
+        answers: list[httpx.Response] = []
+        with psycopg.connect(cluster.url) as held:
+            held.execute("SELECT * FROM audit_head FOR UPDATE")
+            thread = threading.Thread(target=lambda: answers.append(client.verify("ben")))
+            thread.start()
+
+            def serving() -> list[Host]:
+                return [each for each in hosts if sessions(cluster, each, WAITS)]
+
+            wait_until(serving)
+            (killed,) = serving()
+            (other,) = (each for each in hosts if each is not killed)
+            before = verifications(other)
+            killed.service.kill()
+            thread.join(PATIENCE_S)
+        assert [answer.status_code for answer in answers] == [502]
+        assert client.verify("cas").json()["decision"] == "accept"
+        wait_until(lambda: verifications(other) > before)
+        assert verifications(other) == before + 1
+        for subject in itertools.islice(itertools.cycle(PEOPLE), 12):
+            assert client.verify(subject).json()["decision"] == "accept"

@@ -100,7 +100,7 @@ def test_decision_agrees_with_brute_force(
     assert decision.distance == pytest.approx(np.sqrt(2 - 2 * similarity), abs=1e-4)
     assert decision.score == pytest.approx(z, abs=1e-3)
     # What is expected is what templates of nobody give, whoever drew them.
-    crowd = [spherical(probe, template) for template in contract.cohort[:]]
+    crowd = [spherical(probe, template) for template in contract.cohort.restored()]
     assert means[0] == pytest.approx(np.mean(crowd), abs=4 * np.std(crowd) / np.sqrt(len(crowd)))
     assert spreads[0] == pytest.approx(np.std(crowd, ddof=1), rel=0.3)
     calibration = contract.calibration("p2s")

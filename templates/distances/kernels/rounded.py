@@ -1,4 +1,4 @@
-"""Products of a few rows with templates that are rounded to eight bits.
+"""Products of a lifted probe with templates that are rounded to eight bits.
 
 Reading the templates from memory is what takes the time, so each is read once, as it is stored.
 """
@@ -13,6 +13,7 @@ from templates.distances.kernels.lanes import compiled_sums
 @compiled_sums
 def rounded_products(
     stacked: Array32,
+    scaled: Array32,
     feet: Array32,
     numbers: NDArray[np.int8],
     steps: Array32,
@@ -23,7 +24,9 @@ def rounded_products(
     Parameters
     ----------
     stacked : (R, n)
-        Rows of the probes.
+        Rows of a probe.
+    scaled : (R, n)
+        The same, times the scales of the coordinates.
     feet : (T, n)
     numbers : (T, m, n)
     steps : (T, m)
@@ -41,7 +44,7 @@ def rounded_products(
         for k in range(numbers.shape[1]):
             row = numbers[t, k]
             for r in range(rows):
-                probe = stacked[r]
+                probe = scaled[r]
                 total = np.float32(0)
                 for x in range(n):
                     total += np.float32(row[x]) * probe[x]

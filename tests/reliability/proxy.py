@@ -1,0 +1,71 @@
+"""nginx before two hosts, as docs/deployment.md has it."""
+
+import os
+import re
+import shutil
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from tests.patience import PATIENCE_S, wait_until
+from tests.ports import free_port
+from tests.reliability.service import ROOT
+
+PAGE = (ROOT / "docs" / "deployment.md").read_text(encoding="utf-8")
+NAME = "faces.example.org"
+
+
+def require_nginx() -> None:
+    """Skip the test without nginx, or fail it where ``VEILFACE_REQUIRE_NGINX=1`` asks for it."""
+    if shutil.which("nginx") is None or shutil.which("openssl") is None:
+        reason = "nginx or openssl is not installed"
+        if os.environ.get("VEILFACE_REQUIRE_NGINX") == "1":
+            pytest.fail(f"{reason}, and VEILFACE_REQUIRE_NGINX=1 asks for both")
+        pytest.skip(reason)
+
+
+def write_configuration(block: str, folder: Path, listen: str) -> Path:
+    """Write a block of the pages as a file of nginx's own, with a certificate for it."""
+    subprocess.run(
+        ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256",
+         "-nodes", "-subj", f"/CN={NAME}", "-addext", f"subjectAltName=DNS:{NAME}",
+         "-keyout", folder / "key.pem", "-out", folder / "chain.pem"],
+        check=True, capture_output=True,
+    )  # fmt: skip
+    block = block.replace("/etc/ssl/faces/", f"{folder}/")
+    block = block.replace("listen 443 ssl", f"listen {listen} ssl")
+    kept = "".join(
+        f"{name}_temp_path {folder}/{name};\n"
+        for name in ("client_body", "proxy", "fastcgi", "uwsgi", "scgi")
+    )
+    path = folder / "nginx.conf"
+    path.write_text(
+        f"pid {folder}/pid;\nerror_log {folder}/error.log;\nevents {{}}\n"
+        f"http {{\naccess_log off;\n{kept}{block}}}\n"
+    )
+    return path
+
+
+@contextmanager
+def nginx(folder: Path, address: str, hosts: list[str], port: int) -> Iterator[str]:
+    """Run nginx at an address, before hosts that serve on a port; gives its URL."""
+    require_nginx()
+    (block,) = re.findall(r"```nginx\n(upstream .*?)```", PAGE, re.S)
+    for number, host in enumerate(hosts):
+        written = f"10.0.0.{11 + number}:8421"
+        assert written in block
+        block = block.replace(written, f"{host}:{port}")
+    folder.mkdir()
+    listen = f"{address}:{free_port()}"
+    path = write_configuration(block, folder, listen)
+    command = ["nginx", "-p", folder, "-c", path, "-e", folder / "error.log"]
+    running = subprocess.Popen([*command, "-g", "daemon off;"])
+    try:
+        wait_until((folder / "pid").exists, what="nginx")
+        yield f"https://{listen}"
+    finally:
+        running.terminate()
+        running.wait(timeout=PATIENCE_S)
