@@ -107,6 +107,7 @@ def test_ci_shows_a_skipped_audit_and_fails_on_a_vulnerability(
         ),
         "chromium": "exit 1",
         "systemd-analyze": "exit 1",
+        "nginx": "exit 1",
         "unshare": 'test "$1" = --net',
         "ip": "exit 1",
     }.items():

@@ -7,8 +7,6 @@ import json
 import os
 import re
 import shlex
-import shutil
-import socket
 import subprocess
 import sys
 import tomllib
@@ -33,6 +31,8 @@ from tests.api.cli.conftest import run
 from tests.api.deployment import PROBE_M, Deployment, bearer, deploy, images, photo
 from tests.clients.conftest import Running, started
 from tests.patience import PATIENCE_S
+from tests.ports import free_port
+from tests.reliability.proxy import require_nginx, write_configuration
 from verify.evaluation.embeddings_file import read_embeddings
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -489,28 +489,13 @@ def test_toml_is_read(snippet: Snippet, tmp_path: Path, monkeypatch: pytest.Monk
 
 @pytest.mark.parametrize("snippet", of("nginx"), ids=lambda each: each.where)
 def test_nginx_accepts_it(snippet: Snippet, tmp_path: Path) -> None:
-    if shutil.which("nginx") is None or shutil.which("openssl") is None:
-        pytest.skip("nginx or openssl is not installed")
-    subprocess.run(
-        ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256",
-         "-nodes", "-subj", "/CN=faces.example.org", "-keyout", tmp_path / "key.pem",
-         "-out", tmp_path / "chain.pem"],
-        check=True, capture_output=True,
-    )  # fmt: skip
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    code = snippet.code.replace("/etc/ssl/faces/", f"{tmp_path}/")
-    code = code.replace("listen 443 ssl", f"listen 127.0.0.1:{port} ssl")
-    (tmp_path / "nginx.conf").write_text(
-        f"pid {tmp_path}/pid;\nerror_log {tmp_path}/error.log;\nevents {{}}\n"
-        f"http {{\naccess_log off;\n{code}}}\n"
-    )
+    require_nginx()
+    path = write_configuration(snippet.code, tmp_path, f"127.0.0.1:{free_port()}")
     done = subprocess.run(
-        ["nginx", "-t", "-q", "-p", tmp_path, "-c", tmp_path / "nginx.conf",
-         "-e", tmp_path / "error.log"],
-        capture_output=True, text=True,
-    )  # fmt: skip
+        ["nginx", "-t", "-q", "-p", tmp_path, "-c", path, "-e", tmp_path / "error.log"],
+        capture_output=True,
+        text=True,
+    )
     assert done.returncode == 0, done.stderr
 
 

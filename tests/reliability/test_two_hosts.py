@@ -205,7 +205,7 @@ class ThroughProxy:
         )
         self._people, self._tokens = people, tokens
 
-    def send(self, method: str, path: str, token: str = "", **sent: Any) -> httpx.Response:
+    def send(self, method: str, path: str, token: str, **sent: Any) -> httpx.Response:
         sent |= {"headers": bearer(token), "extensions": {"sni_hostname": NAME}}
         return self._client.request(method, path, **sent)
 
@@ -241,7 +241,7 @@ def test_nginx_leads_to_both_hosts_and_repeats_no_verification(
         people = People(deployment, list(PEOPLE.values()))
         client = ThroughProxy(url, folder / "chain.pem", people, Tokens(deployment))
         assert [client.enroll(subject) for subject in PEOPLE] == [201] * len(PEOPLE)
-        assert client.send("GET", "/metrics").status_code == 404
+        assert client.send("GET", "/metrics", "none").status_code == 404
         for subject in itertools.islice(itertools.cycle(PEOPLE), 12):
             assert client.verify(subject).json()["decision"] == "accept"
         wait_until(lambda: all(map(verifications, hosts)), what="verifications on both hosts")
