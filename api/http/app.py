@@ -249,6 +249,10 @@ async def _open(
         )
     )
     tasks.start_soon(readiness.watch)
+    if runtime.contract.takes_lifted_probes:
+        # No lifted probe but one that comes now waits for it.
+        lift = partial(getattr, runtime.contract, "cohort")
+        tasks.start_soon(partial(anyio.to_thread.run_sync, lift, abandon_on_cancel=True))
     if settings.webhook_url is not None and settings.webhook_secret_file is not None:
         secrets = read_webhook_secrets(settings.webhook_secret_file)
         tasks.start_soon(partial(deliver, runtime.store.outbox, settings.webhook_url, secrets))

@@ -16,6 +16,7 @@ import binascii
 import hashlib
 import json
 import math
+import threading
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -64,6 +65,7 @@ VERSION = 2
 MAX_FILE_BYTES = 128 * 2**20
 MAX_CALIBRATIONS = 64
 _EXPECTATION, _NOBODY = "expectation.", "nobody."
+_LIFTING = threading.Lock()
 SEALED = frozenset(
     {
         *(_EXPECTATION + name for name in EXPECTATION_TENSORS),
@@ -179,9 +181,17 @@ class Contract:
         """Whether it has a calibration for them."""
         return any(entry.mode == "s2s" for entry in self.calibrations)
 
-    @cached_property
+    @property
     def cohort(self) -> RoundedBatch:
-        """Templates of nobody that lifted probes are normalised by; lifted at the first use."""
+        """Templates of nobody that lifted probes are normalised by; lifted at the first use.
+
+        That takes seconds, and several times the memory: one thread does it, and others wait.
+        """
+        with _LIFTING:
+            return self._cohort
+
+    @cached_property
+    def _cohort(self) -> RoundedBatch:
         strategy = plain_strategy(self.binding.strategy)
         return self.nobody.cohort(strategy=strategy, m=self.binding.m)
 

@@ -49,6 +49,7 @@ from tests.api.deployment import (
 )
 from tests.api.http.test_enrollment import b64, lifted
 from tests.api.shapes import assert_answer, assert_error
+from tests.patience import wait_until
 
 
 @pytest.fixture
@@ -457,3 +458,10 @@ def test_weak_privacy_is_served_only_knowingly(fresh: Deployment, measured: bool
     assert (answer["verdict"] and answer["verdict"]["privacy"]["status"]) == (
         "FAIL" if measured else None
     )
+
+
+def test_the_cohort_is_lifted_before_a_probe_asks_for_it(fresh: Deployment) -> None:
+    with Client(create_app(fresh.settings)) as client:
+        contract = client.app.state.runtime.contract
+        assert contract.takes_lifted_probes
+        wait_until(lambda: "_cohort" in vars(contract), what="a cohort")

@@ -8,6 +8,8 @@ import hashlib
 import json
 import os
 import stat
+import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +38,7 @@ from templates.errors import ContractError, ContractMismatch, SealError, Uncalib
 from templates.keys.rotation import HAAR_VERSION, ROTATION_VERSION
 from templates.keys.sealing import KeyringSealer, MasterKeyring
 from templates.space.lifting import Strategy
+from templates.space.rounded import RoundedBatch
 from verify.strangers import STRANGERS
 
 N, M = 16, 3
@@ -696,3 +699,29 @@ def test_the_largest_contract_has_fewer_values_than_are_read() -> None:
         recorded={str(i): i for i in range(MAX_ITEMS)},
     )
     assert not too_many_parts(json.dumps(largest.public()).encode(), MAX_PARTS // 2)
+
+
+def test_one_thread_lifts_the_cohort(monkeypatch: pytest.MonkeyPatch) -> None:
+    contract = make_contract()
+    lift, lifts = Nobody.cohort, []
+    asked = threading.Barrier(4)
+
+    def slowly(*args: Any, **options: Any) -> RoundedBatch:
+        lifts.append(threading.get_ident())
+        time.sleep(0.2)  # The others ask meanwhile.
+        return lift(*args, **options)
+
+    def ask() -> None:
+        asked.wait()
+        seen.append(contract.cohort)
+
+    seen: list[RoundedBatch] = []
+    monkeypatch.setattr(Nobody, "cohort", slowly)
+    threads = [threading.Thread(target=ask) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(lifts) == 1
+    assert len(seen) == 4
+    assert all(each is seen[0] for each in seen)
