@@ -73,6 +73,7 @@ from templates.keys.webhook_secret import read_webhook_secrets
 
 VERSION = version("veilface")
 API = (
+    verification,  # asked most, so looked at first
     own_key,
     contract,
     pack,
@@ -82,7 +83,6 @@ API = (
     subjects,
     stored,
     challenges,
-    verification,
     lockout,
     audit_log,
     transfer,
