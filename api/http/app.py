@@ -281,6 +281,7 @@ def uvicorn_options(settings: Settings) -> dict[str, Any]:
         "log_config": uvicorn_log_config("warning" if settings.log_level == "info" else "info"),
         "access_log": False,
         "http": Protocol,
+        "loop": "uvloop",
         "server_header": False,
         "date_header": True,
         "timeout_graceful_shutdown": GRACE_S,
