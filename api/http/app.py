@@ -73,6 +73,7 @@ from templates.keys.webhook_secret import read_webhook_secrets
 
 VERSION = version("veilface")
 API = (
+    verification,  # asked most, so looked at first
     own_key,
     contract,
     pack,
@@ -82,7 +83,6 @@ API = (
     subjects,
     stored,
     challenges,
-    verification,
     lockout,
     audit_log,
     transfer,
@@ -290,6 +290,7 @@ def uvicorn_options(settings: Settings) -> dict[str, Any]:
         "log_config": uvicorn_log_config("warning" if settings.log_level == "info" else "info"),
         "access_log": False,
         "http": Protocol,
+        "loop": "uvloop",
         "server_header": False,
         "date_header": True,
         "timeout_graceful_shutdown": GRACE_S,

@@ -148,9 +148,9 @@ def _spherical_points(points: Doubles, right: Rows, *, as_stored: bool = False) 
     """Distances; with `as_stored` of N × k points to sets that storage has rounded."""
     units, feet, bases = normalised(points), right.feet, right.bases
     if as_stored:
-        projected = _projected(np.concatenate([units, feet[:, None]], axis=1), bases)
-        feet = feet - projected[:, -1]
-        inside = projected[:, :-1]
+        # Each by itself: BLAS takes a matrix and one row as they lie, and repacks it for two rows.
+        inside = _projected(units, bases)
+        feet = feet - _projected(feet[:, None], bases)[:, 0]
         nearest = normalised(inside)
         nearest += ~inside.any(axis=2, keepdims=True) * normalised(bases[:, :1])
     else:

@@ -60,6 +60,7 @@ class Database:
     ) -> None:
         self.url = checked_url(url)
         self.is_sqlite = self.url.get_backend_name() == "sqlite"
+        self._file = sqlite_file(self.url) if self.is_sqlite else None
         self._pool_size = pool_size
         self._max_overflow = max_overflow
         self._timeout = timeout
@@ -79,6 +80,8 @@ class Database:
 
         def once() -> T:
             with process.readers.connect() as connection:
+                if self.is_sqlite:
+                    _driver(connection).execute("BEGIN")
                 return work(connection)
 
         return _again(once)
@@ -146,9 +149,11 @@ class Database:
         def once() -> T:
             if self.is_sqlite:
                 # Threads queue here in turn; SQLite's own lock is polled and knows no order.
-                with process.writing, process.writers.begin() as connection:
+                with process.writing, process.engine.begin() as connection:
+                    with self._turn(None):
+                        _driver(connection).execute("BEGIN IMMEDIATE")
                     return work(connection)
-            with process.writers.begin() as connection:
+            with process.engine.begin() as connection:
                 connection.execute(locks, names)
                 return work(connection)
 
@@ -165,7 +170,6 @@ class Database:
         process = self._process()
         try:
             with process.writing, self._turn(wait), process.engine.connect() as connection:
-                # On the driver's connection: SQLAlchemy would begin a transaction around it.
                 driver = _driver(connection)
                 try:
                     if wait is not None:
@@ -244,9 +248,9 @@ class Database:
 
     def _turn(self, wait: float | None) -> contextlib.AbstractContextManager[None]:
         """The turn to wait for SQLite's lock; nothing on PostgreSQL."""
-        if not self.is_sqlite:
+        if self._file is None:
             return contextlib.nullcontext()
-        return next_in_line(sqlite_file(self.url), self._timeout if wait is None else wait)
+        return next_in_line(self._file, self._timeout if wait is None else wait)
 
     def _lock_limit(self, wait: float | None) -> str:
         return str(round(1000 * (self._timeout if wait is None else wait)))
@@ -271,13 +275,12 @@ class Database:
 
 
 class _Process:
-    """What belongs to one process: its engine, seen as readers' and as writers'."""
+    """What belongs to one process: its engine, and that seen as readers'."""
 
     def __init__(self, engine: Engine) -> None:
         self.pid = os.getpid()
         self.engine = engine
         self.writing = threading.Lock()
-        self.writers = engine.execution_options(veilface_write=True)
         self.readers = (
             engine
             if engine.dialect.name == "sqlite"
@@ -290,6 +293,11 @@ def _busy_timeout(seconds: float) -> str:
 
 
 def _driver(connection: Connection) -> Any:
+    """The connection below SQLAlchemy's.
+
+    SQLite's BEGIN is said there: as a listener of the engine's, it would make SQLAlchemy call
+    listeners around every statement.
+    """
     return connection.connection.driver_connection
 
 

@@ -1,7 +1,6 @@
 """What a connection to SQLite or PostgreSQL is made with: the URL, the pool, SQLite's settings."""
 
 import errno
-import functools
 import os
 import time
 from pathlib import Path
@@ -9,12 +8,11 @@ from typing import Any
 
 import sqlalchemy as sa
 from sqlalchemy import event
-from sqlalchemy.engine import URL, Connection, Engine, make_url
+from sqlalchemy.engine import URL, Engine, make_url
 from sqlalchemy.exc import ArgumentError
 
 from templates.errors import StoreError
 from templates.store.migrations import NEWEST
-from templates.store.turn import next_in_line
 
 APPLICATION = "veilface"
 """What sessions of PostgreSQL are named by, before the number of the schema that they need."""
@@ -66,7 +64,7 @@ def checked_url(text: str) -> URL:
 
 
 def make_engine(url: URL, *, timeout: float, pool_size: int, max_overflow: int) -> Engine:
-    """Make an engine, whose SQLite transactions write where the option ``veilface_write`` is set.
+    """Make an engine; on SQLite a transaction begins where somebody says BEGIN.
 
     Parameters
     ----------
@@ -104,7 +102,6 @@ def make_engine(url: URL, *, timeout: float, pool_size: int, max_overflow: int) 
         **pool,
     )
     event.listen(engine, "connect", _prepare_sqlite)
-    event.listen(engine, "begin", functools.partial(_begin_sqlite, path, timeout))
     return engine
 
 
@@ -134,7 +131,7 @@ def _create_private_file(path: Path) -> None:
 
 
 def _prepare_sqlite(connection: Any, _record: object) -> None:
-    connection.isolation_level = None  # transactions begin where _begin_sqlite says so
+    connection.isolation_level = None  # the driver begins none by itself
     cursor = connection.cursor()
     try:
         # Waiting first: the switch to WAL below needs the file for itself for a moment.
@@ -163,11 +160,3 @@ def _set_wal(cursor: Any) -> None:
                 "put the database file on a local disk"
             )
         return
-
-
-def _begin_sqlite(path: Path, timeout: float, connection: Connection) -> None:
-    if connection.get_execution_options().get("veilface_write", False):
-        with next_in_line(path, timeout):
-            connection.exec_driver_sql("BEGIN IMMEDIATE")
-    else:
-        connection.exec_driver_sql("BEGIN")
