@@ -66,6 +66,7 @@ from api.process.supervised import end_with_supervisor, is_supervised, open_pati
 from api.process.webhooks import deliver
 from api.settings import ENV_PREFIX, NO_PROXIES, Settings, load_settings
 from models.errors import ModelError
+from templates.contract.document import Contract
 from templates.distances import warm_up
 from templates.distances.blas import single_threaded
 from templates.errors import VeilfaceError
@@ -156,6 +157,14 @@ def _document(*, with_health: bool) -> dict[str, Any]:
     """The OpenAPI document, made now and once for a process, for the reason of :func:`_built`."""
     health_routes = _built(health) if with_health else ()
     return describe([*_built(*API), *health_routes], version=VERSION)
+
+
+def _lift_cohort(contract: Contract) -> None:
+    try:
+        _ = contract.cohort
+    except Exception as error:
+        # The next lifted probe tries again.
+        log("cohort not lifted", severity=logging.ERROR, error_type=type(error).__name__)
 
 
 def _operations_app(app: FastAPI) -> FastAPI:
@@ -250,9 +259,8 @@ async def _open(
     )
     tasks.start_soon(readiness.watch)
     if runtime.contract.takes_lifted_probes:
-        # No lifted probe but one that comes now waits for it.
-        lift = partial(getattr, runtime.contract, "cohort")
-        tasks.start_soon(partial(anyio.to_thread.run_sync, lift, abandon_on_cancel=True))
+        # No lifted probe but one that comes now waits for it; an end of the process does not.
+        threading.Thread(target=_lift_cohort, args=(runtime.contract,), daemon=True).start()
     if settings.webhook_url is not None and settings.webhook_secret_file is not None:
         secrets = read_webhook_secrets(settings.webhook_secret_file)
         tasks.start_soon(partial(deliver, runtime.store.outbox, settings.webhook_url, secrets))

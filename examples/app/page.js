@@ -20,7 +20,7 @@ const login = document.createElement("veilface-login");
 login.options = { runtime: ort };
 // Who is let in says the server.
 login.words = { accept: "", enrolled: "" };
-let attempts = 0;
+let attempts = 0; // and preparations of one: each takes a token
 login.authorize = () => {
   attempts++;
   return own("/token");
@@ -37,19 +37,19 @@ function ask({ service, action }) {
 // What counts is what the server learned itself, after an error too: an answer may have been lost.
 async function ended() {
   const attempt = attempts;
-  // The server keeps what it could not ask the service yet, until there is another attempt.
-  for (let wait = 2000; wait < 60000; wait *= 2) {
-    try {
-      const told = await own("/face");
-      if (!told.accepted) return ask(told);
-      login.remove();
-      output.value = `Welcome, ${told.name}`;
-      return;
-    } catch (error) {
-      output.value = error.message;
-      await after(wait);
+  // The server keeps what it could not ask the service yet, until another token is taken.
+  for (let wait = 0; wait < 60000; wait = 2 * wait || 2000) {
+    await after(wait);
+    const told = attempts === attempt && (await own("/face").catch((error) => ({ error })));
+    if (attempts !== attempt) return;
+    if (told.error) {
+      output.value = told.error.message;
+      continue;
     }
-    if (attempts > attempt) return;
+    if (!told.accepted) return ask(told);
+    login.remove();
+    output.value = `Welcome, ${told.name}`;
+    return;
   }
 }
 login.addEventListener("veilface-result", ended);

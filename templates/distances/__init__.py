@@ -46,7 +46,7 @@ __all__ = [
 ]
 
 Probes = NDArray[np.float32] | NDArray[np.float64] | SubspaceBatch
-_FEW_ROWS = 128
+_FEW_ROWS = 129
 """Of lifted probes, m + 1 each, that a `RoundedBatch` need not be restored for."""
 _DEVICE: ContextVar[str | None] = ContextVar("device", default=None)
 

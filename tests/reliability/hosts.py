@@ -56,6 +56,8 @@ class Network:
                     self._add(host, entered)
             except subprocess.CalledProcessError as error:
                 not_permitted(f"no network namespaces: {error.stderr.strip()}")
+            except PermissionError as error:
+                not_permitted(f"no network namespaces: {error}")
             self._left = entered.pop_all()
         return self
 
@@ -112,7 +114,7 @@ def _add_namespace(name: str, entered: ExitStack) -> None:
 def _enter(namespace: int) -> None:
     """Move the calling thread into a namespace (``os.setns`` from Python 3.12 on)."""
     if ctypes.CDLL(None, use_errno=True).setns(namespace, 0):
-        raise OSError(ctypes.get_errno(), "setns")
+        raise OSError(ctypes.get_errno(), "setns")  # a PermissionError where it is one
 
 
 class Host:

@@ -63,8 +63,13 @@ def nginx(folder: Path, address: str, hosts: list[str], port: int) -> Iterator[s
     path = write_configuration(block, folder, listen)
     command = ["nginx", "-p", folder, "-c", path, "-e", folder / "error.log"]
     running = subprocess.Popen([*command, "-g", "daemon off;"])
+
+    def runs() -> bool:
+        assert running.poll() is None, (folder / "error.log").read_text()
+        return (folder / "pid").exists()
+
     try:
-        wait_until((folder / "pid").exists, what="nginx")
+        wait_until(runs, what="nginx")
         yield f"https://{listen}"
     finally:
         running.terminate()

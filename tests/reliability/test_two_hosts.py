@@ -8,6 +8,7 @@ import ssl
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -35,6 +36,7 @@ LOCKOUT = 4
 PEOPLE = {"ann": 1, "ben": 2, "cas": 3, "dan": 4}
 STRANGER = 9
 WAITS = "wait_event_type = 'Lock'"
+KILLED = "killed-inside-a-verification"
 
 
 @pytest.fixture
@@ -205,8 +207,19 @@ class ThroughProxy:
         )
         self._people, self._tokens = people, tokens
 
-    def send(self, method: str, path: str, token: str, **sent: Any) -> httpx.Response:
-        sent |= {"headers": bearer(token), "extensions": {"sni_hostname": NAME}}
+    def __enter__(self) -> "ThroughProxy":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._client.close()
+
+    def send(
+        self, method: str, path: str, token: str, request_id: str | None = None, **sent: Any
+    ) -> httpx.Response:
+        headers = bearer(token)
+        if request_id is not None:
+            headers["X-Request-ID"] = request_id
+        sent |= {"headers": headers, "extensions": {"sni_hostname": NAME}}
         return self._client.request(method, path, **sent)
 
     def enroll(self, subject: str) -> int:
@@ -214,10 +227,10 @@ class ThroughProxy:
         path = f"/v1/subjects/{subject}/enrollment"
         return self.send("PUT", path, self._tokens.enroll, files=files).status_code
 
-    def verify(self, subject: str) -> httpx.Response:
+    def verify(self, subject: str, request_id: str | None = None) -> httpx.Response:
         token = self._tokens.verify
         body = signed_probe(token, subject, self._people.embeddings[PEOPLE[subject]])
-        return self.send("POST", f"/v1/subjects/{subject}/verify", token, json=body)
+        return self.send("POST", f"/v1/subjects/{subject}/verify", token, request_id, json=body)
 
 
 def verifications(host: Host) -> int:
@@ -239,7 +252,9 @@ def test_nginx_leads_to_both_hosts_and_repeats_no_verification(
             nginx(folder, network.address, addresses, deployment.settings.port)
         )
         people = People(deployment, list(PEOPLE.values()))
-        client = ThroughProxy(url, folder / "chain.pem", people, Tokens(deployment))
+        client = running.enter_context(
+            ThroughProxy(url, folder / "chain.pem", people, Tokens(deployment))
+        )
         assert [client.enroll(subject) for subject in PEOPLE] == [201] * len(PEOPLE)
         assert client.send("GET", "/metrics", "none").status_code == 404
         for subject in itertools.islice(itertools.cycle(PEOPLE), 12):
@@ -257,26 +272,28 @@ def test_nginx_leads_to_both_hosts_and_repeats_no_verification(
         )
         assert (done.stdout.strip(), done.stderr) == ("refused", "")
         assert client.verify("ann").json()["decision"] == "accept"
+        wait_until(lambda: sum(map(verifications, hosts)) == 13, what="all in the logs")
+        before = {host: verifications(host) for host in hosts}
 
-        # A host is killed inside a verification: the other one never sees that.
+        # A host is killed inside a verification: the other one never sees that. Connections that
+        # nginx keeps have ended: where one of those fails, it tries the same host again first.
+        time.sleep(6)
         answers: list[httpx.Response] = []
         with psycopg.connect(cluster.url) as held:
             held.execute("SELECT * FROM audit_head FOR UPDATE")
-            thread = threading.Thread(target=lambda: answers.append(client.verify("ben")))
+            thread = threading.Thread(
+                target=lambda: answers.append(client.verify("ben", KILLED)), daemon=True
+            )
             thread.start()
-
-            def serving() -> list[Host]:
-                return [each for each in hosts if sessions(cluster, each, WAITS)]
-
-            wait_until(serving)
-            (killed,) = serving()
-            (other,) = (each for each in hosts if each is not killed)
-            before = verifications(other)
+            killed = None
+            while killed is None:
+                killed = next((each for each in hosts if sessions(cluster, each, WAITS)), None)
             killed.service.kill()
             thread.join(PATIENCE_S)
-        assert [answer.status_code for answer in answers] == [502]
-        assert client.verify("cas").json()["decision"] == "accept"
-        wait_until(lambda: verifications(other) > before)
-        assert verifications(other) == before + 1
+        (other,) = (each for each in hosts if each is not killed)
+        # 503 where it waited for so long that the service itself gave up just before.
+        assert answers[0].status_code in (502, 503)
         for subject in itertools.islice(itertools.cycle(PEOPLE), 12):
             assert client.verify(subject).json()["decision"] == "accept"
+        wait_until(lambda: verifications(other) >= before[other] + 12)
+        assert KILLED not in [line.get("request_id") for line in other.service.log]

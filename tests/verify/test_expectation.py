@@ -211,4 +211,4 @@ def test_templates_that_are_kept_are_held_once() -> None:
     tracemalloc.stop()
     np.testing.assert_array_equal(kept.feet, drawn[:count, 0].astype(np.float32))
     np.testing.assert_array_equal(kept.bases, drawn[:count, 1:].astype(np.float32))
-    assert peak < 1.2 * (kept.feet.nbytes + kept.bases.nbytes)
+    assert peak < 1.6 * (kept.feet.nbytes + kept.bases.nbytes)

@@ -29,6 +29,7 @@ from api.process.runtime import Runtime
 from api.settings import Settings
 from models.pack import ModelPack
 from templates.contract.document import Rate
+from templates.contract.nobody import Nobody
 from templates.contract.verdict import Verdict
 from templates.decoys import DecoyGenerator
 from templates.keys.sealing import MasterKeyring
@@ -465,3 +466,18 @@ def test_the_cohort_is_lifted_before_a_probe_asks_for_it(fresh: Deployment) -> N
         contract = client.app.state.runtime.contract
         assert contract.takes_lifted_probes
         wait_until(lambda: "_cohort" in vars(contract), what="a cohort")
+
+
+def test_a_cohort_that_could_not_be_lifted_stops_nothing(
+    fresh: Deployment, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fails(*_: object, **__: object) -> None:
+        raise MemoryError
+
+    with monkeypatch.context() as context:
+        context.setattr(Nobody, "cohort", fails)
+        with Client(create_app(fresh.settings)) as client:
+            wait_until(lambda: "cohort not lifted" in capsys.readouterr().err, what="a log line")
+            assert client.get("/health/ready").status_code == 200
+            context.undo()
+            assert len(client.app.state.runtime.contract.cohort) > 0

@@ -702,6 +702,7 @@ def test_the_largest_contract_has_fewer_values_than_are_read() -> None:
 
 
 def test_one_thread_lifts_the_cohort(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From Python 3.12 on a cached property has no lock of its own."""
     contract = make_contract()
     lift, lifts = Nobody.cohort, []
     asked = threading.Barrier(4)
