@@ -40,7 +40,8 @@ async function ended() {
   // The server keeps what it could not ask the service yet, until another token is taken.
   for (let wait = 0; wait < 60000; wait = 2 * wait || 2000) {
     await after(wait);
-    const told = attempts === attempt && (await own("/face").catch((error) => ({ error })));
+    if (attempts !== attempt) return;
+    const told = await own("/face").catch((error) => ({ error }));
     if (attempts !== attempt) return;
     if (told.error) {
       output.value = told.error.message;

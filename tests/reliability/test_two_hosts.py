@@ -9,10 +9,11 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import httpx
 import psycopg
@@ -25,7 +26,7 @@ from tests.api.deployment import bearer, images
 from tests.patience import PATIENCE_S, wait_until
 from tests.reliability.cluster import Cluster
 from tests.reliability.hosts import Host, Network, two_hosts
-from tests.reliability.operations import LOST, Clients, Operation, People, Tokens
+from tests.reliability.operations import LOST, Clients, People, Tokens
 from tests.reliability.proxy import NAME, nginx, require_nginx
 
 pytestmark = pytest.mark.long
@@ -35,6 +36,7 @@ LIMIT = 40
 LOCKOUT = 4
 PEOPLE = {"ann": 1, "ben": 2, "cas": 3, "dan": 4}
 STRANGER = 9
+T = TypeVar("T")
 WAITS = "wait_event_type = 'Lock'"
 KILLED = "killed-inside-a-verification"
 
@@ -95,19 +97,26 @@ def exhausted_key(first: Host, second: Host) -> str:
 
 @contextmanager
 def write_that_waits(
-    cluster: Cluster, host: Host, verify: Callable[[], Operation]
-) -> Iterator[list[Operation]]:
+    cluster: Cluster, hosts: Sequence[Host], verify: Callable[[], T]
+) -> Iterator[tuple[Host, list[T]]]:
     """Hold a verification up in the middle of its transaction during the block.
 
-    What comes of it is in the list that is given, some time after the block.
+    Gives the one of the hosts that it is on, and a list, in which is what comes of it, some time
+    after the block.
     """
-    answers: list[Operation] = []
+    answers: list[T] = []
+    serving: list[Host] = []
     thread = threading.Thread(target=lambda: answers.append(verify()), daemon=True)
+
+    def waits() -> bool:
+        serving.extend(each for each in hosts if sessions(cluster, each, WAITS))
+        return bool(serving)
+
     with psycopg.connect(cluster.url) as held:
         held.execute("SELECT * FROM audit_head FOR UPDATE")
         thread.start()
-        wait_until(lambda: sessions(cluster, host, WAITS))
-        yield answers
+        wait_until(waits)
+        yield serving[0], answers
 
 
 def sessions(cluster: Cluster, host: Host, condition: str) -> int:
@@ -139,7 +148,8 @@ def decide_as_one(cluster: Cluster, first: Host, second: Host) -> None:
     exhausted = exhausted_key(first, second)
 
     # The first is cut off inside a write, with the locks that every write needs.
-    with write_that_waits(cluster, first, lambda: a.verify("cas", PEOPLE["cas"])) as cut:
+    verify = partial(a.verify, "cas", PEOPLE["cas"])
+    with write_that_waits(cluster, [first], verify) as (_, cut):
         first.cut_off()
     writes = "xact_start IS NOT NULL"
     wait_until(lambda: not sessions(cluster, first, writes), what="the end of its session")
@@ -164,7 +174,8 @@ def decide_as_one(cluster: Cluster, first: Host, second: Host) -> None:
     wait_until(lambda: {describe(host, exhausted) for host in (first, second)} == {429})
 
     # The second is killed inside a write.
-    with write_that_waits(cluster, second, lambda: b.verify("cas", PEOPLE["cas"])) as killed:
+    verify = partial(b.verify, "cas", PEOPLE["cas"])
+    with write_that_waits(cluster, [second], verify) as (_, killed):
         second.service.kill()
     wait_until(lambda: killed, what="that its client notices")
     assert killed[0].outcome in (503, LOST)
@@ -278,18 +289,10 @@ def test_nginx_leads_to_both_hosts_and_repeats_no_verification(
         # A host is killed inside a verification: the other one never sees that. Connections that
         # nginx keeps have ended: where one of those fails, it tries the same host again first.
         time.sleep(6)
-        answers: list[httpx.Response] = []
-        with psycopg.connect(cluster.url) as held:
-            held.execute("SELECT * FROM audit_head FOR UPDATE")
-            thread = threading.Thread(
-                target=lambda: answers.append(client.verify("ben", KILLED)), daemon=True
-            )
-            thread.start()
-            killed = None
-            while killed is None:
-                killed = next((each for each in hosts if sessions(cluster, each, WAITS)), None)
+        verify = partial(client.verify, "ben", KILLED)
+        with write_that_waits(cluster, hosts, verify) as (killed, answers):
             killed.service.kill()
-            thread.join(PATIENCE_S)
+            wait_until(lambda: answers)
         (other,) = (each for each in hosts if each is not killed)
         # 503 where it waited for so long that the service itself gave up just before.
         assert answers[0].status_code in (502, 503)

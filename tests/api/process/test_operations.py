@@ -1,8 +1,6 @@
 """Readiness that is honest, a port for operations, TLS, and a bound on what is in flight."""
 
-import datetime
 import http.client
-import ipaddress
 import json
 import re
 import signal
@@ -20,8 +18,7 @@ import anyio
 import httpx
 import pytest
 import sqlalchemy as sa
-from cryptography import x509
-from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 
 from api.http.app import create_app, environment_of
@@ -37,6 +34,7 @@ from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, deploy, images, photo
 from tests.api.process.test_server import in_flight
 from tests.api.shapes import assert_error
+from tests.certificates import self_signed
 from tests.patience import PATIENCE_S, wait_until
 from tests.ports import free_port
 
@@ -430,38 +428,6 @@ def test_workers_share_the_port_and_say_that_they_stop(tmp_path: Path) -> None:
 
 
 # TLS
-
-
-def self_signed(folder: Path, *, mode: int = 0o600) -> tuple[Path, Path]:
-    key = ec.generate_private_key(ec.SECP256R1())
-    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "veilface test")])
-    now = datetime.datetime.now(datetime.UTC)
-    certificate = (
-        x509.CertificateBuilder()
-        .subject_name(name)
-        .issuer_name(name)
-        .public_key(key.public_key())
-        .serial_number(x509.random_serial_number())
-        .not_valid_before(now - datetime.timedelta(hours=1))
-        .not_valid_after(now + datetime.timedelta(hours=1))
-        .add_extension(
-            x509.SubjectAlternativeName([x509.IPAddress(ipaddress.ip_address("127.0.0.1"))]), False
-        )
-        .add_extension(x509.BasicConstraints(ca=True, path_length=None), True)
-        .sign(key, hashes.SHA256())
-    )
-    folder.mkdir(parents=True, exist_ok=True)
-    paths = folder / "certificate.pem", folder / "key.pem"
-    paths[0].write_bytes(certificate.public_bytes(serialization.Encoding.PEM))
-    paths[1].write_bytes(
-        key.private_bytes(
-            serialization.Encoding.PEM,
-            serialization.PrivateFormat.PKCS8,
-            serialization.NoEncryption(),
-        )
-    )
-    paths[1].chmod(mode)
-    return paths
 
 
 HEALTHCHECK = Path(__file__).resolve().parents[3] / "deploy/Dockerfile"
