@@ -96,3 +96,14 @@ def test_workers_end_with_their_supervisor(tmp_path: Path) -> None:
         wait_until(lambda: not service.is_ready())
         with Service(deployment, tmp_path) as again:
             assert Clients(again, People(deployment, [1])).verify("a", 1).accepted
+
+
+def test_workers_share_what_the_supervisor_loaded(tmp_path: Path, mbf_pack_dir: Path) -> None:
+    deployment = deploy(tmp_path, pack=mbf_pack_dir, port=free_port(), **QUIET)
+    with Service(deployment, tmp_path) as service:
+        # It has run an inference. A thread that a library had kept would be missing in the workers,
+        # and whoever waits for one waits for ever.
+        assert psutil.Process(service.process.pid).num_threads() == 1
+        for worker in service.workers():
+            memory = psutil.Process(worker).memory_full_info()
+            assert memory.uss < memory.rss / 2
