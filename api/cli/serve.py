@@ -19,6 +19,7 @@ from api.process.operations import tls_options
 from api.process.runtime import Runtime, bootstrap_token
 from api.process.supervisor import run_server
 from api.settings import Settings
+from models.sessions import resolve_providers
 from templates.contract.document import Contract
 from templates.decoys import DecoyGenerator
 
@@ -112,7 +113,13 @@ def _opened_once(settings: Settings, *, check: bool) -> tuple[Contract, str | No
     tls_options(settings)
     RateLimits.open(settings)
     open_audit_report(settings)
-    runtime = Runtime.open(settings)
+    if check or settings.workers == 1 or settings.pack is None:
+        opened = settings
+    else:
+        # What an accelerator's library has begun does not survive a fork: it begins in the workers.
+        resolve_providers(settings.providers)
+        opened = settings.model_copy(update={"providers": ("cpu",)})
+    runtime = Runtime.open(opened)
     if warning := key_beside_database(settings):
         message(f"warning: {warning}")
     try:

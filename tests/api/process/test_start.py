@@ -355,6 +355,37 @@ def test_serving_keeps_no_second_copy_of_the_models(
     assert alive == [False]
 
 
+def test_accelerators_are_not_started_before_the_fork(
+    fresh: Deployment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    providers: list[tuple[str, ...]] = []
+    really_open = Runtime.open
+
+    def noted(settings: Settings) -> Runtime:
+        providers.append(settings.providers)
+        return really_open(settings)
+
+    monkeypatch.setattr(Runtime, "open", noted)
+    monkeypatch.setattr("api.cli.serve.run_server", lambda *_given, **_named: None)
+    options = (
+        "--data-dir",
+        fresh.settings.data_dir,
+        "--pack",
+        str(fresh.settings.pack),
+        "--port",
+        "0",
+    )
+    named = "CPUExecutionProvider"
+    for more in (["--workers", "2"], [], ["--workers", "2", "--check"]):
+        ran = run("serve", "--port", "0", *folders, "--providers", named, *more)
+        assert ran.status == 0, ran.stderr
+    assert providers == [("cpu",), (named,), (named,)]
+    ran = run("serve", "--port", "0", *folders, "--providers", "cuda", "--workers", "2")
+    assert ran.status == 1
+    assert "'cuda' was requested and is not available" in ran.stderr
+    assert len(providers) == 3
+
+
 def test_recalibration_keeps_the_templates(fresh: Deployment) -> None:
     with Client(create_app(fresh.settings), headers=bearer(fresh.token)) as client:
         client.put("/v1/subjects/a/enrollment", files=images(photo(1)))
