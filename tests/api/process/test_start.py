@@ -367,14 +367,7 @@ def test_accelerators_are_not_started_before_the_fork(
 
     monkeypatch.setattr(Runtime, "open", noted)
     monkeypatch.setattr("api.cli.serve.run_server", lambda *_given, **_named: None)
-    options = (
-        "--data-dir",
-        fresh.settings.data_dir,
-        "--pack",
-        str(fresh.settings.pack),
-        "--port",
-        "0",
-    )
+    folders = ("--data-dir", fresh.settings.data_dir, "--pack", str(fresh.settings.pack))
     named = "CPUExecutionProvider"
     for more in (["--workers", "2"], [], ["--workers", "2", "--check"]):
         ran = run("serve", "--port", "0", *folders, "--providers", named, *more)
