@@ -66,10 +66,6 @@ class LivenessGraph:
     ----------
     session
         A graph with one image input and one output (batch, classes).
-    input_name
-        Name of the image input.
-    sha256
-        Of its file.
     expects
         Crop, input and reading of the output.
     normalised

@@ -309,8 +309,6 @@ class ModelPack:
             first in rank, the largest and most central one.
         quality
             Limits; ``None`` checks nothing but that there is a face.
-        limits
-            Of the decoder.
         liveness
             Also say how live the face looks; the pack needs a liveness graph.
 
