@@ -59,15 +59,13 @@ class Sides(NamedTuple):
     stolen: SubspaceBatch
 
 
-def estimate_from_sets(sides: Sides, *, steps: int | None = None) -> Array64:
+def estimate_from_sets(sides: Sides) -> Array64:
     """Estimate R from S sets and their images under R.
 
     Parameters
     ----------
     sides
         Template i of ``stolen`` is the image of template i of ``sent``, in another basis.
-    steps
-        Most steps of the refinement; None: by the number of accounts.
 
     Returns
     -------
@@ -86,9 +84,7 @@ def estimate_from_sets(sides: Sides, *, steps: int | None = None) -> Array64:
     estimate = polar_factor(product_pairs(sides))
     settled = 0.0
     enough = sent.bases.shape[0] * (sent.bases.shape[1] + 1) >= 2 * sent.feet.shape[1]
-    if steps is None:
-        steps = FEW_ALIGNMENTS if enough else ALIGNMENTS
-    for _ in range(steps):
+    for _ in range(FEW_ALIGNMENTS if enough else ALIGNMENTS):
         turned = sent.bases @ estimate.T
         left, values, right = np.linalg.svd(stolen.bases @ turned.transpose(0, 2, 1))
         fit = float(values.sum())

@@ -21,10 +21,6 @@ class Accuracies:
     ----------
     dataset, metric
         Of which set, by which metric, point to subspace.
-    raw
-        Of raw descriptors.
-    of
-        By scheme.
     """
 
     dataset: str
@@ -39,8 +35,6 @@ class Point:
 
     Parameters
     ----------
-    scheme
-        Whose templates.
     accuracy
         Mean ten-fold accuracy of verification, a fraction.
     leaks

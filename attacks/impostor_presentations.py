@@ -39,8 +39,6 @@ def verify_presentations(
         Of the pack that embedded the photos.
     level
         Name of a level; the contract's default where None.
-    seed
-        Decoys and rotations are drawn of it.
 
     Raises
     ------

@@ -51,8 +51,6 @@ def smallest_private(
 
     Parameters
     ----------
-    judge
-        Measures the privacy of a dimension.
     dims
         In rising order.
     otherwise

@@ -106,8 +106,6 @@ def draw_population(
     ----------
     descriptors : (N, n) floating
         Unit rows.
-    identities
-        N names.
     victims, owners
         How many; of people with two photos or more. Of the people who are left a third belong to
         the attacker and the others calibrate.

@@ -39,8 +39,6 @@ class System:
 
     Parameters
     ----------
-    scheme
-        What protects the templates.
     contract
         Calibrated on people who are neither victims, nor decoys, nor the attacker's.
     lifter
@@ -58,8 +56,6 @@ class System:
         Faces of other people, which the attacker has.
     raw_thresholds
         By level, the cosine at which raw descriptors of the calibration have the level's FMR.
-    seed
-        Of all that is random.
     """
 
     scheme: Scheme

@@ -15,7 +15,7 @@ Example
 import argparse
 from pathlib import Path
 
-from attacks.likelihood import find_least_decoy_like
+from attacks.likelihood import find_least_decoy_like, likeliest_guesses
 from attacks.outcomes import GENERATED, POOLED, AttackOutcome, Scheme
 from attacks.population import Population, draw_population, without_decoy_people
 from attacks.stored import foot_point_attack, nearest_neighbour_attack
@@ -58,7 +58,7 @@ def rows_of(
             )
             level = system.level
             outcomes = [*foot_point_attack(system), *nearest_neighbour_attack(system)]
-            outcomes += find_least_decoy_like(system)
+            outcomes += find_least_decoy_like(system, likeliest_guesses(system), kind="LFW")
             judged = [outcome for outcome in outcomes if outcome.judged]
             best = max(judged, key=lambda outcome: outcome.measured.value)
             foot = next(outcome for outcome in judged if outcome.attack == "foot-point")

@@ -37,8 +37,6 @@ class TrainingSet:
         Of others that it lifted, and did not learn from: what it chooses its settings by.
     classes
         Number of classes of every attribute.
-    seed
-        Of whatever is random in the training.
     """
 
     features: Features

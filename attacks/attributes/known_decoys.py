@@ -51,8 +51,6 @@ def find_decoys(
         At most so many: the decoys that the strategy takes.
     skip : (P,) int64, optional
         Entry that is the face itself, where the attacker lifted entries of its own pool.
-    progress
-        See `nearest_neighbours`.
     """
     nearest = nearest_neighbours(
         templates,

@@ -8,7 +8,7 @@ or less often, than the same ones dealt out at random?
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from enum import StrEnum
 
 import numpy as np
@@ -64,13 +64,7 @@ class Baselines:
 
     def to_json(self) -> dict[str, Json]:
         """JSON form."""
-        return {
-            "uniform": self.uniform,
-            "majority_of_training": self.majority_of_training,
-            "majority": self.majority,
-            "prior": self.prior,
-            "same_predictions": self.same_predictions,
-        }
+        return asdict(self)
 
 
 @dataclass(frozen=True)
@@ -102,10 +96,6 @@ class InferenceMeasures:
         Mean over the classes that occur of the share found.
     confusion
         Counts; a row for each true class, a column for each predicted one.
-    information
-        See `MutualInformation`.
-    baselines
-        See `Baselines`.
     advantage
         Accuracy minus the majority's share; negative below it.
     p_value

@@ -46,8 +46,6 @@ def nearest_neighbours(
         Unit rows.
     k
         Number of neighbours, at most G and 1,000.
-    metrics
-        Those to search by.
     skip : (P,) int64, optional
         Position in the gallery that each template does not find: that of the face in it, where the
         attacker lifted faces of the gallery. The gallery must have more than ``k`` faces then.

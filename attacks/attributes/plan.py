@@ -115,8 +115,6 @@ class Side:
 
     Parameters
     ----------
-    entries
-        The faces of the pool.
     pool
         The same as decoys, labelled where they have gender and race.
     gallery
@@ -182,14 +180,8 @@ class Setup:
 
     Parameters
     ----------
-    split, plan, seed
-        As they were given.
     side
         Of the attacked faces: the lifting database as pool, all of the attacker's as gallery.
-    generator
-        Of generated decoys.
-    folds
-        Of the attacker's faces.
     """
 
     split: Split

@@ -36,8 +36,6 @@ class Decoder:
     ----------
     network
         (B, n) → (B, 3, SIZE, SIZE), values in [0, 1].
-    epochs
-        Epochs trained.
     """
 
     network: "nn.Sequential"

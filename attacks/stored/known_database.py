@@ -203,8 +203,6 @@ def attack_with_draws(
 
     Parameters
     ----------
-    lift
-        The victims, lifted.
     drawn : (K, n) float32
         The draws.
     """

@@ -122,8 +122,6 @@ class Trial:
 
     Parameters
     ----------
-    variant
-        Its name.
     does
         What the attacker does with it, to complete "The attacker …".
     probes
