@@ -43,8 +43,6 @@ class CalibrationReport:
 
     Parameters
     ----------
-    consistency
-        How ``photo_consistency`` was set.
     unresolved
         Sentences about the FMR targets that the data cannot resolve.
     left_out
@@ -52,8 +50,6 @@ class CalibrationReport:
     suspicious
         People who may be one person under two names: look at them before believing a threshold
         at FMR 1e-4 or below, then name them in ``aliases`` (docs/design-measurements.md §1.3).
-    suspicious_above
-        Raw cosine that makes a pair suspicious.
     ten_folds
         Results of the ten-fold protocol, one per calibration in the contract's order; empty
         under protocol ``fmr``.
@@ -122,8 +118,6 @@ def calibrate(
     ----------
     descriptors : (N, n) floating
         Unit rows.
-    identities
-        N names.
     binding, source
         What the contract binds to, and the decoy source it names.
     exclude

@@ -55,8 +55,6 @@ class CalibrationOptions:
     ----------
     protocol
         ``fmr`` sets levels by target FMR; ``ten-fold`` adds the level ``accuracy``.
-    metric, steps
-        The distance that will decide.
     probe_dims
         Dimensions of the probes: 0 for raw ones, others for lifted ones.
     probe_photos

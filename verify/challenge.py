@@ -75,8 +75,6 @@ def movements_failure(
     ----------
     poses
         Of the frames, in their order.
-    movements
-        What was asked.
     """
     if abs(poses[0].yaw) > FRONT_YAW or abs(poses[0].pitch) > FRONT_PITCH:
         return LivenessFailure.NOT_FRONTAL

@@ -43,8 +43,6 @@ class Lifter:
 
     Parameters
     ----------
-    strategy, source
-        How to lift, and with whose decoys.
     contract_id
         Written into the wire bytes.
     """

@@ -20,8 +20,6 @@ class Decision:
     reason
         ``match`` or ``no_match``; a subject that does not exist is also ``no_match``. ``liveness``
         where the probe is not taken for a living person's, whether it matches or not.
-    level
-        Security level that decided.
     fmr
         The level's target FMR; for a level without a target, the FMR seen in calibration.
     contract_id, calibration_id

@@ -59,12 +59,8 @@ class Climbers:
 
     Parameters
     ----------
-    level
-        That decides.
     accepted, most
         Share of the templates that accept, of all probes and of the one that most accept.
-    probes, templates
-        Their numbers.
     fitted
         Whether where others climbed to is in the fit; where not, the form could not follow.
     """
@@ -87,8 +83,6 @@ class ExpectationFit:
 
     Parameters
     ----------
-    expectation
-        What a decision rests on.
     climbs
         Fits that include where probes climbed to: ``CLIMBS``, or fewer where the form could not
         follow these too, so that drawn probes alone count from there on.

@@ -29,8 +29,6 @@ def wilson(errors: float, trials: int, *, confidence: float = 0.95) -> tuple[flo
     ----------
     errors
         Number of errors; a mean over repeats of the same trials need not be whole.
-    trials
-        Number of trials.
     confidence
         Of the two-sided interval.
 
@@ -207,8 +205,6 @@ def subject_bootstrap(
         The two people of every trial that went wrong.
     people
         Number of people; the indices in ``errors`` are below it.
-    trials
-        Number of trials.
     weighted_trials
         Total weight of all trials under the (people,) weights of one replicate.
     """

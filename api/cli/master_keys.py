@@ -122,12 +122,8 @@ class Rewrapped:
 
     Attributes
     ----------
-    key_id
-        Id of that key.
     changed
         Number of keys and secrets that were wrapped again.
-    files
-        Files that were sealed again.
     is_complete
         Whether no older key wraps anything any more.
     """

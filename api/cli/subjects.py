@@ -249,9 +249,9 @@ def verify(
         except ApiError as error:
             raise UsageError(error.message) from None
         with _named(photos):
-            probe = verifier.embed_photos(pack, data, policy=face, limits=runtime.image_limits)
+            probe = verifier.photo_probe(pack, data, policy=face, limits=runtime.image_limits)
         decision = verifier.decide_embedding(
-            probe, template, holder_key=holder_key, level=level, photos=len(photos)
+            probe.embedding, template, holder_key=holder_key, level=level, photos=probe.photos
         )
         outcome = "accept" if decision.accepted else "reject"
         # Another action than the service's: what an operator tries is not counted by the lockout.

@@ -32,18 +32,12 @@ class Evaluated:
 
     Parameters
     ----------
-    facts
-        Counts of the set.
-    material
-        What was compared.
     kept : (P,) int64
         Pairs of the set that were compared, as positions in it.
     runs
         In the order of the plan.
     source_of
         Position of the decoy source of each lifted cell.
-    work
-        What each unit took, in the order of the plan.
     """
 
     facts: SetFacts
@@ -60,8 +54,6 @@ class Work:
 
     Parameters
     ----------
-    unit
-        What was done.
     seconds
         Of one thread, from the descriptors to the figures.
     resumed

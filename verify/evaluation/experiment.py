@@ -47,8 +47,6 @@ def run_evaluation(
 
     Parameters
     ----------
-    sources
-        Decoys.
     labels
         Of photos or people: gives results by group, and hybrid+ its attributes.
     out

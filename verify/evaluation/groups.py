@@ -62,8 +62,6 @@ class Group:
 
     Parameters
     ----------
-    name
-        The label.
     fmr, fnmr
         Of impostor trials within the group, and of its genuine trials.
     fmr_judged, fnmr_judged
@@ -84,10 +82,6 @@ class Worst:
 
     Parameters
     ----------
-    group
-        Its name.
-    rate
-        Its rate.
     apart
         Whether the group's interval lies wholly above the rate of all groups together. The
         interval is Wilson's at 1 − 0.05 / k for k judged groups: the highest of k rates is above
@@ -109,8 +103,6 @@ class GroupReport:
 
     Parameters
     ----------
-    attribute
-        Such as ``gender``.
     target_fmr
         The target of the threshold on all impostor trials.
     threshold
@@ -212,8 +204,6 @@ def by_group(
         Whether a pair shows one person.
     first_labels, second_labels
         Label of each photo of each pair, None where it has none.
-    attribute
-        What the labels tell.
     thresholds
         The threshold of each run, set on all its trials; a pair at or above it matches.
     target_fmr

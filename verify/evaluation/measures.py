@@ -43,8 +43,6 @@ class VerificationMeasures:
 
     Parameters
     ----------
-    ten_fold
-        Accuracies and thresholds of the folds.
     eer, auc, d_prime
         Equal error rate; area under the ROC; (μ_g − μ_i) / √((σ_g² + σ_i²) / 2) of similarities.
     at

@@ -35,16 +35,12 @@ class EvaluationPlan:
     ----------
     strategies
         Of ``STRATEGIES``.
-    dims
-        Subspace dimensions m.
     modes, metrics
         Of lifted comparisons.
     shared_decoys
         Whether both sides of subspace-to-subspace comparisons draw from the whole pool.
     repeats, seed
         Everything random is repeated with the seeds ``seed … seed + repeats − 1``.
-    targets
-        FMR targets.
     steps
         Of the spherical iteration.
     device

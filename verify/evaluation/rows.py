@@ -28,8 +28,6 @@ class SetFacts:
 
     Parameters
     ----------
-    name
-        Of the set.
     genuine, impostor
         Pairs that were compared.
     failed_genuine, failed_impostor

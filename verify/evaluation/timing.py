@@ -24,8 +24,6 @@ def timings(material: Material, cells: Sequence[tuple[Cell, int | None]]) -> lis
 
     Parameters
     ----------
-    material
-        Its descriptors are compared.
     cells
         Each with the position of its decoy source.
 

@@ -23,8 +23,6 @@ class ScoredSet:
 
     Parameters
     ----------
-    presented
-        The set.
     scores : (k,) float64
         NaN where no face was acquired.
     embeddings : (k, n) float32

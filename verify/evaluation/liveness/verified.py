@@ -17,8 +17,6 @@ class VerifiedSet:
 
     Parameters
     ----------
-    scored
-        The set.
     matched, tried : (k,) bool
         Whether a photo was accepted, and whether it was shown at all: photos of people who are
         not enrolled, and those that people were enrolled by, are not. One without a face is
