@@ -59,8 +59,7 @@ def setup(
         Path,
         typer.Argument(
             help="Labelled photos of people like those who will be enrolled, but never enrolled "
-            "themselves: one subfolder for each person.",
-            show_default=False,
+            "themselves: one subfolder for each person."
         ),
     ],
     *,
@@ -69,8 +68,7 @@ def setup(
         list[Path],
         typer.Option(
             help="Folder of photos of many other faces, of any kind, at any depth: decoys are "
-            "fitted to them. May be given several times.",
-            show_default=False,
+            "fitted to them. May be given several times."
         ),
     ],
     like: Annotated[
@@ -78,8 +76,7 @@ def setup(
         typer.Option(
             help="Folder of 300 photos or more of further people of the kind that will be "
             "enrolled, whom decoys are adapted to. Unset: people of PEOPLE whom the calibration "
-            "can spare.",
-            show_default=False,
+            "can spare."
         ),
     ] = None,
     aligned: Aligned = False,
