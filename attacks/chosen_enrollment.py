@@ -60,17 +60,12 @@ class Sides(NamedTuple):
 
 
 def estimate_from_sets(sides: Sides) -> Array64:
-    """Estimate R from S sets and their images under R.
+    """Estimate R from S sets and their images; (n, n) orthogonal, undone by ``estimate.T @ x``.
 
     Parameters
     ----------
     sides
         Template i of ``stolen`` is the image of template i of ``sent``, in another basis.
-
-    Returns
-    -------
-    ndarray of float64, shape (n, n)
-        Orthogonal; x of the tenant is taken back by ``estimate.T @ x``.
 
     Notes
     -----

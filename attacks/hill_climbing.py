@@ -264,11 +264,6 @@ def dictionary_outcomes(system: System) -> list[AttackOutcome]:
     Every service that decides at an FMR is open to this, protected or not; only a lockout bounds
     it. The order of the faces is the prior's, so it does not depend on the answers, and all victims
     can be tried at once.
-
-    Returns
-    -------
-    list of AttackOutcome
-        As of :func:`climbing_outcomes`.
     """
     faces = attacker_prior(system).faces[: LOCKOUTS[-1]].astype(np.float32)
     accepted = decide(faces, system.templates, system.contract, system.points, system.level)

@@ -202,7 +202,7 @@ class PassiveLiveness:
 
 
 def crop_face(picture: NDArray[np.uint8], box: Box, expects: LivenessInput) -> NDArray[np.uint8]:
-    """Cut a face with its surroundings out of a frame, as the graph was trained.
+    """Cut a face with its surroundings out of a frame, (size, size, 3), as the graph was trained.
 
     Parameters
     ----------
@@ -210,10 +210,6 @@ def crop_face(picture: NDArray[np.uint8], box: Box, expects: LivenessInput) -> N
         RGB uint8, shape (h, w, 3).
     box
         x1, y1, x2, y2 in pixels.
-
-    Returns
-    -------
-    ndarray of uint8, shape (size, size, 3)
 
     Raises
     ------

@@ -214,23 +214,20 @@ class ModelPack:
         """Crop of a face on the five-point template, uint8, shape (s, s, 3)."""
         return align(image, face.keypoints, size=self.crop_size)
 
-    def embed(self, aligned: NDArray[np.uint8], *, flip: bool | None = None) -> NDArray[np.float32]:
+    def embed(self, aligned: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Embed aligned crops.
 
         Parameters
         ----------
         aligned
             RGB uint8, shape (B, s, s, 3).
-        flip
-            Overrides the pack's own setting, for experiments.
 
         Returns
         -------
         ndarray of float32, shape (B, n)
             Unit rows.
         """
-        chosen = self._embedder.preprocessing.flip if flip is None else flip
-        return self._embedder.embed(aligned, flip=chosen)
+        return self._embedder.embed(aligned, flip=self._embedder.preprocessing.flip)
 
     def embed_both(
         self, aligned: NDArray[np.uint8]

@@ -142,11 +142,6 @@ def calibrate(
     progress
         Called with what is being done and the share of the whole, which rises from 0 to 1.
 
-    Returns
-    -------
-    Calibrated
-        Contract and report.
-
     Raises
     ------
     ContractError

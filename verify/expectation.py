@@ -306,16 +306,12 @@ class _Fit:
 
 
 def draw_wolves(people: Array64, count: int, *, stream: Keystream) -> Array64:
-    """Draw unit probes that lie near many templates: axes of faces, the mean face, mixtures.
+    """Draw unit probes (count, n) near many templates: axes of faces, the mean face, mixtures.
 
     Parameters
     ----------
     people : (N, n) float64
         Faces, drawn or real, whose axes are taken.
-
-    Returns
-    -------
-    ndarray of float64, shape (count, n)
     """
     mean = people.mean(axis=0)
     length = float(np.linalg.norm(mean))

@@ -23,7 +23,7 @@ RULE_OF_THREE = 3.0
 
 
 def wilson(errors: float, trials: int, *, confidence: float = 0.95) -> tuple[float, float]:
-    """Wilson score interval of a proportion.
+    """Wilson score interval of a proportion; (0, 1) where there are no trials.
 
     Parameters
     ----------
@@ -31,11 +31,6 @@ def wilson(errors: float, trials: int, *, confidence: float = 0.95) -> tuple[flo
         Number of errors; a mean over repeats of the same trials need not be whole.
     confidence
         Of the two-sided interval.
-
-    Returns
-    -------
-    tuple of float
-        Lower and upper bound; (0, 1) where there are no trials.
 
     References
     ----------

@@ -2,7 +2,7 @@
 
 import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
@@ -53,12 +53,7 @@ class SearchCost:
         """JSON form, with the estimate for one scheme at the paper's size."""
         pairs = full_pairs(AttributePlan(), faces=PAPER_FACES, templates=PAPER_TEMPLATES)
         return {
-            "n": self.n,
-            "m": self.m,
-            "k": self.k,
-            "threads": self.threads,
-            "pairs": self.pairs,
-            "seconds": self.seconds,
+            **asdict(self),
             "seconds_per_million_pairs": self.per_million,
             "paper_faces": PAPER_FACES,
             "paper_templates": PAPER_TEMPLATES,

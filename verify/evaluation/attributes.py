@@ -101,7 +101,7 @@ def voted(
     *,
     k: int = NEIGHBOURS,
 ) -> list[str | None]:
-    """Give each face the label that most of its k nearest labelled entries have.
+    """Give each face the label that most of its k nearest labelled entries have; None without any.
 
     Equal votes go to the label that comes first in the alphabet.
 
@@ -113,11 +113,6 @@ def voted(
         One per entry; None where it has none.
     k
         Number of neighbours; all entries where fewer have a label.
-
-    Returns
-    -------
-    list
-        One label per face; None where no entry has one.
     """
     known = [i for i, label in enumerate(labels) if label is not None]
     if not known or not len(descriptors):
@@ -137,7 +132,7 @@ def voted(
 def resembling(
     pool: DecoyPool, descriptors: NDArray[np.float32], *, cosine: float
 ) -> NDArray[np.int64]:
-    """Find the entries of a pool that may show people of a set.
+    """Find the entries of a pool that may show people of a set; their numbers, ascending.
 
     A person in the pool lies in every template that their descriptor is a decoy of (docs/method.md
     §4.3): people of the test set are excluded from the decoys before it is evaluated.
@@ -148,11 +143,6 @@ def resembling(
         Unit rows, of the set.
     cosine
         An entry resembles a face where the cosine of the two is at least this.
-
-    Returns
-    -------
-    int64
-        Their numbers, ascending.
 
     Raises
     ------
@@ -167,17 +157,12 @@ def resembling(
 def resembling_rows(
     rows: NDArray[np.float32], others: NDArray[np.float32], *, cosine: float
 ) -> NDArray[np.int64]:
-    """Find the rows that have a cosine of at least ``cosine`` with any of the others.
+    """Find the rows that have a cosine of at least ``cosine`` with any of the others, ascending.
 
     Parameters
     ----------
     rows, others : (N, n) and (M, n) float32
         Unit rows; the cosines are made a tile at a time.
-
-    Returns
-    -------
-    int64
-        Their numbers, ascending.
     """
     resembles = np.zeros(len(rows), dtype=np.bool_)
     for start in range(0, len(rows), _ROWS):

@@ -7,7 +7,7 @@ for a group's FMR where both people are in it, and as a cross trial where they a
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,13 +47,7 @@ class MeanRate:
 
     def json(self) -> dict[str, float | int | None]:
         """JSON form."""
-        return {
-            "value": self.value,
-            "errors": self.errors,
-            "trials": self.trials,
-            "ci_low": self.ci_low,
-            "ci_high": self.ci_high,
-        }
+        return {"value": self.value, **asdict(self)}
 
 
 @dataclass(frozen=True)

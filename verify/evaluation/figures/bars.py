@@ -18,6 +18,7 @@ from verify.evaluation.figures.style import (
     SMALL_SIZE,
     house_style,
     mark_cut,
+    name_groups,
     panels,
 )
 from verify.evaluation.row_labels import (
@@ -211,30 +212,8 @@ def _dress(axes: Axes, layout: _Layout, scale: tuple[float, float]) -> None:
     marks = [(place, dim) for dims in layout.places.values() for dim, place in dims.items()]
     axes.set_xticks([place for place, _ in marks], [str(dim) for _, dim in marks])
     axes.tick_params(axis="x", length=0, pad=2)
-    for group, centre in layout.centres.items():
-        axes.annotate(
-            layout.names[group],
-            (centre, 0),
-            xycoords=("data", "axes fraction"),
-            xytext=(0, -18),
-            textcoords="offset points",
-            ha="center",
-            va="top",
-            fontsize=INK_SIZE,
-            linespacing=1.15,
-            annotation_clip=False,
-        )
-    axes.annotate(
-        "m =",
-        (0, 0),
-        xycoords="axes fraction",
-        xytext=(-4, -4),
-        textcoords="offset points",
-        ha="right",
-        va="top",
-        fontsize=SMALL_SIZE,
-        annotation_clip=False,
-    )
+    names = [(layout.names[group], centre) for group, centre in layout.centres.items()]
+    name_groups(axes, names, below=18, fontsize=INK_SIZE, linespacing=1.15)
     if floor > 0:
         mark_cut(axes)
         start = f"axis starts at {floor:g} %" + (" (chance)" if floor == CHANCE else "")
