@@ -98,9 +98,7 @@ class Moments:
         )
 
 
-def estimate_rotation(
-    stolen: Moments, lifted: Moments, pairs: Array64 | None = None, *, steps: int = ALIGNMENTS
-) -> Array64:
+def estimate_rotation(stolen: Moments, lifted: Moments, pairs: Array64 | None = None) -> Array64:
     """Estimate the rotation of a tenant that has one for all, from its database.
 
     Parameters
@@ -134,7 +132,7 @@ def estimate_rotation(
         known += weight * precision.max() * pairs
     known = stolen.axes.T @ known @ lifted.axes
     turn = np.diag(np.where(np.diagonal(known) < 0, -1.0, 1.0))
-    for _ in range(steps):
+    for _ in range(ALIGNMENTS):
         turn = polar_factor(weight * stolen.variances[:, None] * turn * gain + known)
     return np.asarray(stolen.axes @ turn @ lifted.axes.T)
 
