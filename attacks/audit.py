@@ -107,8 +107,6 @@ def run_audit(
 
     Parameters
     ----------
-    faces, identities
-        Embedded photos, and the name of the person on each.
     decoys
         What the service lifts with; None to fit a generator to people of no other group.
     start_service

@@ -69,8 +69,6 @@ class Moments:
         Those axes, as columns.
     power
         Mean ‖p‖².
-    templates, m
-        How many templates, of which dimension.
     """
 
     mean: Array64

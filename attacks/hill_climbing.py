@@ -293,8 +293,6 @@ def climb_service(
     ----------
     scored, deciding
         One a victim: what answers a probe with its score, and with the decision only.
-    most_attempts
-        Of a climber on one victim.
     """
     prior = attacker_prior(system)
     outcomes: list[AttackOutcome] = []

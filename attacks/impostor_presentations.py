@@ -37,8 +37,6 @@ def verify_presentations(
     ----------
     info
         Of the pack that embedded the photos.
-    level
-        Name of a level; the contract's default where None.
 
     Raises
     ------

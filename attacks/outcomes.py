@@ -140,8 +140,6 @@ class AttackOutcome:
         Its name, such as ``foot-point``; one name has one meaning in all reports.
     variant
         What distinguishes it from the other outcomes of this attack on this scheme; may be empty.
-    leaked, knowledge
-        What was stolen, and what the attacker has beside it.
     assumption
         One sentence: what the attacker has and does, and what counts as success.
     level

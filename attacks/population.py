@@ -63,8 +63,6 @@ class Population:
 
     Parameters
     ----------
-    victims
-        Their templates are attacked.
     owners
         Their ``enrolled`` descriptor, of one photo, makes up the pool of real decoys; ``fresh`` is
         the photo that they come to log in with.

@@ -36,8 +36,6 @@ def document(
         ``fairface`` or ``templates``.
     rows
         Of attribute inference, one for each scheme, attribute, attacker and seed.
-    limits
-        What the operator accepts, by name.
     comparisons
         Schemes, as text, that are there to compare with: they are judged, and do not decide
         whether the audit passes.

@@ -49,8 +49,6 @@ def several_templates(
         Of every person (k_i, n) unit rows. The last is the fresh photo; of the others, T are
         lifted, one template each. People with fewer are left out, and T that nobody reaches; T
         that fewer than 20 people reach is reported, and not judged.
-    guess
-        The strongest guess from one template.
 
     Returns
     -------

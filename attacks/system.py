@@ -123,8 +123,6 @@ def raw_thresholds(
     descriptors : (N, n) float32
     names
         N people.
-    targets
-        FMR by name of the level.
     """
     person = np.unique(np.asarray(names), return_inverse=True)[1]
     upper: list[NDArray[np.float32]] = []

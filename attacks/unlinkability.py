@@ -37,8 +37,6 @@ class Unlinkability:
         Bins of equal width over all scores.
     local : (bins,) float64
         D(s): how much a score in the bin speaks for one person rather than two.
-    genuine, impostor
-        Numbers of scores.
     first_rank
         Share of rows whose mate has the highest score of the row: identification at rank 1.
     """

@@ -38,8 +38,6 @@ class Detector(ABC):
 
     Parameters
     ----------
-    session
-        A graph with one image input.
     size
         Side of the canvas, a multiple of 32.
     fixed

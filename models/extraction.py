@@ -114,8 +114,6 @@ class Extractor:
     ----------
     cache
         Where known embeddings are kept; ``None`` computes all anew.
-    aligned
-        Take the files as aligned crops: no detection.
     mirrored
         Embed every face with the mirror image added too, beside the embedding without it; the
         pack must be one without.

@@ -152,11 +152,6 @@ class LivenessGraph:
 class PassiveLiveness:
     """The liveness graphs of a pack. Safe from several threads at once.
 
-    Parameters
-    ----------
-    graphs
-        One or more, which score in the same unit.
-
     Raises
     ------
     ModelError

@@ -55,8 +55,6 @@ class PackInfo:
     ----------
     name
         Of the folder, or of the file without its suffix.
-    n
-        Embedding dimension.
     embedder_file, embedder_sha256
         Name and SHA-256 (hex) of the embedder's file.
     preprocessing

@@ -118,8 +118,6 @@ def calibrate(
     ----------
     descriptors : (N, n) floating
         Unit rows.
-    binding, source
-        What the contract binds to, and the decoy source it names.
     exclude
         People to leave out, such as those of a test.
     aliases
@@ -137,8 +135,6 @@ def calibrate(
         A contract's strangers, to keep them with their cohort; by default new ones are drawn.
     recorded
         Facts for the contract file, such as the pack's name and detector.
-    dataset
-        What the descriptors came from, for the contract file.
     progress
         Called with what is being done and the share of the whole, which rises from 0 to 1.
 

@@ -98,8 +98,6 @@ def point_trials(
 
     Parameters
     ----------
-    templates
-        One for each of ``plan.compared``.
     sets
         The photos of every probe; those of more than one are averaged.
     consistency

@@ -45,8 +45,6 @@ class Consistency:
         Least agreement of the photos of one probe.
     fmr
         Pairs of photos of different people that reach it.
-    refused
-        Genuine sets of photos that it refuses.
     """
 
     threshold: float

@@ -23,8 +23,6 @@ class LabelledFolder:
 
     Parameters
     ----------
-    root
-        The folder that was read.
     paths, identities
         Equal lengths, sorted by person and file name.
     ignored

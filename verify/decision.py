@@ -15,8 +15,6 @@ class Decision:
 
     Parameters
     ----------
-    accepted
-        Whether the probe's score reached the level's threshold.
     reason
         ``match`` or ``no_match``; a subject that does not exist is also ``no_match``. ``liveness``
         where the probe is not taken for a living person's, whether it matches or not.

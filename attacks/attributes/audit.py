@@ -159,8 +159,6 @@ def run_attribute_audit(
 
     Parameters
     ----------
-    train, validation
-        FairFace's two parts, or the photos of them that ``plan.sample`` chose.
     progress
         Called with the share of the attacks that is done, which rises to 1.
 

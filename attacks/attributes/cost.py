@@ -27,10 +27,6 @@ class SearchCost:
 
     Parameters
     ----------
-    k
-        Neighbours that were searched for.
-    threads
-        Cores that it ran on.
     pairs
         (template, face) pairs that were timed.
     seconds

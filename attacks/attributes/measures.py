@@ -100,8 +100,6 @@ class InferenceMeasures:
         Accuracy minus the majority's share; negative below it.
     p_value
         Two-sided, of the accuracy among permutations of the predictions.
-    leakage
-        What the test says at `SIGNIFICANCE`.
     """
 
     accuracy: Rate
@@ -139,8 +137,6 @@ def measure(
         Class numbers, 0 … ``classes`` − 1.
     training : (T,) int64
         Class numbers of the attacker's own faces.
-    seed
-        Of the permutations for the mutual information.
 
     Raises
     ------

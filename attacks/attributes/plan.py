@@ -32,8 +32,6 @@ class AttributePlan:
 
     Parameters
     ----------
-    k
-        Neighbours of the paper's attacker.
     feature_ks
         Neighbours whose votes the trained attackers see.
     attackers
@@ -55,8 +53,6 @@ class AttributePlan:
         axes and neighbours of the other parts.
     held_out
         Share of the lifted faces that the attacker chooses settings and attackers by.
-    threads
-        Templates are searched on so many cores.
 
     Raises
     ------
@@ -103,8 +99,6 @@ class Side:
         Labelled faces to search for neighbours, in random order.
     nearby
         The first of them, at most as many as the plan says.
-    axes
-        Found on the gallery.
     form
         What tells the gallery's faces from generated decoys; None without a generator.
     """
@@ -140,8 +134,6 @@ class Fold:
 
     Parameters
     ----------
-    own
-        Faces that the attacker lifts.
     entries : (faces,) int64
         Their positions in the side's pool.
     held : (faces,) bool

@@ -26,8 +26,6 @@ class AttributeRow:
         What the attacker has: ``algorithm`` (and other, labelled faces), or ``decoys`` too.
     classes
         Names in the order of the confusion's rows and columns.
-    measures
-        On the attacked faces.
     held_out
         The attacker's strength (`InferenceMeasures.strength`) on faces that it lifted itself and
         did not learn from, of ``knn`` on all that it lifted: what it chooses the best attacker by,

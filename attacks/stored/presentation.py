@@ -126,8 +126,6 @@ class Trial:
         What the attacker does with it, to complete "The attacker …".
     probes
         One for each victim, or one for all.
-    knowledge, leaked
-        What it takes.
     """
 
     variant: str

@@ -34,8 +34,6 @@ class Evaluated:
     ----------
     kept : (P,) int64
         Pairs of the set that were compared, as positions in it.
-    runs
-        In the order of the plan.
     source_of
         Position of the decoy source of each lifted cell.
     """

@@ -51,10 +51,6 @@ def run_evaluation(
         Of photos or people: gives results by group, and hybrid+ its attributes.
     out
         Folder of finished units, which are not computed again.
-    options
-        What the results record beside the plan.
-    note
-        Called with sentences that a reader should know.
 
     Raises
     ------

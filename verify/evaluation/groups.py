@@ -101,14 +101,8 @@ class GroupReport:
         The target of the threshold on all impostor trials.
     threshold
         Similarity; the mean over the runs.
-    runs
-        Number of runs that the errors are means of.
     groups
         In the order of their names; ages in the order of years.
-    overall_fmr, overall_fnmr
-        Over all trials, with or without labels.
-    pooled_fmr, pooled_fnmr
-        Over the trials of all groups together.
     cross_fmr
         Over impostor trials of two people of two groups.
     mixed
@@ -200,8 +194,6 @@ def by_group(
         Label of each photo of each pair, None where it has none.
     thresholds
         The threshold of each run, set on all its trials; a pair at or above it matches.
-    target_fmr
-        What the thresholds were set for.
 
     Raises
     ------

@@ -28,8 +28,6 @@ class SetFacts:
 
     Parameters
     ----------
-    genuine, impostor
-        Pairs that were compared.
     failed_genuine, failed_impostor
         Pairs with a photo that gave no descriptor.
     fta

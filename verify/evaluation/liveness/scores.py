@@ -27,8 +27,6 @@ class ScoredSet:
         NaN where no face was acquired.
     embeddings : (k, n) float32
         Of the same faces; undefined where no face was acquired.
-    failures
-        Why there is none, in the order of the set.
     """
 
     presented: PresentationSet
