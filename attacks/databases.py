@@ -158,14 +158,6 @@ class _Tenant:
         """Number of others."""
         return len(self.lifted) - self.victims - accounts
 
-    def own_rotations(self, system: System) -> list[Rotation]:
-        """One of each template."""
-        return rotations_of(system, f"database {self.name}", "template", len(self.lifted))
-
-    def holders_rotations(self, system: System) -> list[Rotation]:
-        """One of each template, by a key that its holder has for both tenants."""
-        return holder_rotations_of(system, f"database {self.name}", len(self.lifted))
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class _Side:
@@ -352,8 +344,9 @@ def _enrolled(
 def _settings(system: System, tenants: Sequence[_Tenant], numbers: Sequence[int]) -> list[_Setting]:
     """What is stolen, with how many accounts; the first for a number of accounts is its control."""
     most = max(numbers)
-    rotated = [tenant.own_rotations(system) for tenant in tenants]
-    held = [tenant.holders_rotations(system) for tenant in tenants]
+    named = [(f"database {tenant.name}", len(tenant.lifted)) for tenant in tenants]
+    rotated = [rotations_of(system, name, "template", count) for name, count in named]
+    held = [holder_rotations_of(system, name, count) for name, count in named]
     alike = [[own[0]] * len(own) for own in rotated]
     stolen, kept, control = (
         [_Side.of(tenant, turns, most) for tenant, turns in zip(tenants, side, strict=True)]

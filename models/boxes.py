@@ -98,5 +98,7 @@ def non_maximum_suppression(
         return np.empty(0, dtype=np.intp)
     corners = boxes.astype(np.float64)
     with_sides = np.concatenate([corners[:, :2], corners[:, 2:] - corners[:, :2]], axis=1)
-    kept = cv2.dnn.NMSBoxes(with_sides, scores, 0.0, threshold, top_k=MAX_CANDIDATES)
+    kept = cv2.dnn.NMSBoxes(
+        with_sides.tolist(), scores.tolist(), 0.0, threshold, top_k=MAX_CANDIDATES
+    )
     return np.asarray(kept, dtype=np.intp)

@@ -26,7 +26,8 @@ class Scrfd(Detector):
         """Faces found in one pass on a canvas of ``size``, in pixels of ``image``."""
         canvas, scale = letterbox(image, size, enlarge=True)
         blob = (canvas.astype(np.float32) - np.float32(127.5)) * np.float32(1 / 128)
-        outputs = self._session.run({self._input_name: _nchw(blob)})
+        blob = np.ascontiguousarray(blob.transpose(2, 0, 1)[None])
+        outputs = self._session.run({self._input_name: blob})
         boxes, scores, keypoints = [], [], []
         for stride, (score, distance, point) in zip(STRIDES, _by_stride(outputs), strict=True):
             rows, columns = size[0] // stride, size[1] // stride
@@ -40,10 +41,6 @@ class Scrfd(Detector):
             scores.append(score[cells])
             keypoints.append(centres[:, None, :] + point[cells].reshape(-1, 5, 2) * stride)
         return faces_from_candidates(boxes, scores, keypoints, overlap=OVERLAP, scale=scale)
-
-
-def _nchw(blob: NDArray[np.float32]) -> NDArray[np.float32]:
-    return np.ascontiguousarray(blob.transpose(2, 0, 1)[None])
 
 
 def _by_stride(

@@ -42,11 +42,6 @@ KNN = "knn"
 ATTACKERS = (KNN, *TRAINED)
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(fairface)
-
-
 @takes_settings(*BULK)
 @takes_limits("attribute-leakage")
 def fairface(

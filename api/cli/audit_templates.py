@@ -30,11 +30,6 @@ from templates.space.lifting import Strategy
 from verify import labelled_folder
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(templates)
-
-
 @takes_settings(*BULK)
 @takes_limits(
     "foot-point-success",

@@ -43,11 +43,6 @@ class Protocol(StrEnum):
     TEN_FOLD = "ten-fold"
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(calibrate)
-
-
 @takes_settings(*BULK)
 def calibrate(
     folder: Annotated[

@@ -16,11 +16,6 @@ from api.demo.run import Outcome, run_demo
 from models.demo import DEMO_NOTICE
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(demo)
-
-
 def demo(
     *,
     folder: Annotated[

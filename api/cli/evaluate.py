@@ -39,11 +39,6 @@ from verify.evaluation.units import Mode
 LIFTED_MODES = (Mode.POINT, Mode.SUBSPACE)
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(evaluate)
-
-
 @takes_settings(*BULK)
 def evaluate(
     datasets: Annotated[

@@ -37,11 +37,6 @@ from verify.evaluation.rows import Json
 from verify.evaluation.tables import write_lines
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("evaluate liveness")(evaluate_liveness)
-
-
 @takes_settings(*BULK)
 def evaluate_liveness(
     data: Annotated[

@@ -254,8 +254,8 @@ def rotate_tenant(
         say(f"Dropped the keys of {dropped} older epochs.")
 
 
-master_keys.register(app)
-renewal.register(app)
+for _command in (master_keys.master, master_keys.rotate, master_keys.rewrap, renewal.renew):
+    app.command()(_command)
 
 
 @app.command("verify-receipt")

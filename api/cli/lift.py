@@ -33,11 +33,6 @@ MAX_CONTRACT_BYTES = 256 * 2**20
 MAX_PHOTO_BYTES = 64 * 2**20
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(lift)
-
-
 def lift(
     photos: Annotated[
         list[Path],

@@ -22,11 +22,6 @@ from api.settings import Settings
 from templates.decoys import DecoyGenerator
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(serve)
-
-
 @takes_settings(*Settings.model_fields)
 def serve(
     *,

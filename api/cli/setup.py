@@ -48,11 +48,6 @@ from verify.own_decoys import SAME_PHOTO
 CACHES = "setup-*.cache"
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(setup)
-
-
 @takes_settings("pack", "providers", "data_dir", "master_key_file", "accept_weak_privacy")
 def setup(
     people: Annotated[

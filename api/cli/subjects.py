@@ -53,12 +53,6 @@ HolderKeyFile = Annotated[
 ]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    app.command()(enroll)
-    app.command()(verify)
-
-
 @takes_settings(*LOCAL)
 def enroll(
     subject: Subject,

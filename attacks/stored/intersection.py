@@ -126,7 +126,7 @@ def same_descriptor(system: System, *, lifts: Sequence[int] = LIFTS) -> list[Att
             for number in range(max(lifts))
         ]
         for count in lifts:
-            meetings = _meetings(batches[:count])
+            meetings = [meeting_point(*stacked) for stacked in _stacked(batches[:count])]
             unique = np.array([meeting.shared == 0 for meeting in meetings])
             guesses = np.stack([meeting.point for meeting in meetings])
             gaps = np.linalg.norm(guesses - system.victims.enrolled, axis=1)[unique]
@@ -177,7 +177,3 @@ def _stacked(batches: Sequence[SubspaceBatch]) -> Iterator[tuple[Array, Array]]:
             np.stack([batch.feet[row] for batch in batches]).astype(np.float64),
             np.stack([batch.bases[row] for batch in batches]).astype(np.float64),
         )
-
-
-def _meetings(batches: Sequence[SubspaceBatch]) -> list[Meeting]:
-    return [meeting_point(feet, bases) for feet, bases in _stacked(batches)]

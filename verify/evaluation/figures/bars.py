@@ -114,10 +114,6 @@ def _measured(row: Row) -> bool:
     return row.get("accuracy_mean") is not None
 
 
-def _group(row: Row) -> Group:
-    return str(row["strategy"]), str(row.get("decoys") or ""), bool(row.get("shared_decoys"))
-
-
 def _merged(rows: Sequence[Row]) -> bool:
     """Return whether every s-to-s row with a pool shares it: then sharing splits no group."""
     return all(row.get("shared_decoys") is not False for row in rows if row["mode"] == "s2s")
@@ -146,8 +142,8 @@ def _layout(rows: Sequence[Row]) -> _Layout:
 
 
 def _placed(row: Row, merged: bool) -> Group:
-    strategy, decoys, shared = _group(row)
-    return strategy, decoys, shared and not merged
+    shared = bool(row.get("shared_decoys")) and not merged
+    return str(row["strategy"]), str(row.get("decoys") or ""), shared
 
 
 def _bars(axes: Axes, rows: Sequence[Row], layout: _Layout, metrics: Sequence[str]) -> None:
