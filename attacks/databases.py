@@ -247,8 +247,6 @@ def link_databases(
     accounts
         Numbers of the attacker's own accounts with both tenants; those beyond its faces are left
         out. With 0 it has the two databases only.
-    strangers
-        Further templates in each database.
 
     Returns
     -------

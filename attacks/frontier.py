@@ -100,13 +100,9 @@ def frontier(results: Row, rows: Sequence[Row], *, most_lost: float) -> dict[str
 
     Parameters
     ----------
-    results
-        ``results.json`` of ``veilface evaluate``.
     rows
         Of attribute inference; of several attackers the one that was strongest on the attacker's
         own held-out faces counts.
-    most_lost
-        A fraction, such as 0.005.
 
     Raises
     ------

@@ -51,8 +51,6 @@ def smallest_private(
 
     Parameters
     ----------
-    dims
-        In rising order.
     otherwise
         The dimension to take where none passes; measured as well.
     """

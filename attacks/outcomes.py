@@ -215,10 +215,6 @@ def unproven(control: AttackOutcome, what: str, *, least: float | None = None) -
 
     Parameters
     ----------
-    control
-        The same attack where it must succeed.
-    what
-        What the control is, as words of the sentence.
     least
         Share that the control must reach; None: it must succeed as
         :attr:`AttackOutcome.succeeds` says.

@@ -121,8 +121,6 @@ def raw_thresholds(
     Parameters
     ----------
     descriptors : (N, n) float32
-    names
-        N people.
     """
     person = np.unique(np.asarray(names), return_inverse=True)[1]
     upper: list[NDArray[np.float32]] = []

@@ -18,7 +18,8 @@ from pathlib import Path
 from attacks.likelihood import find_least_decoy_like, likeliest_guesses
 from attacks.outcomes import GENERATED, POOLED, AttackOutcome, Scheme
 from attacks.population import Population, draw_population, without_decoy_people
-from attacks.stored import foot_point_attack, nearest_neighbour_attack
+from attacks.stored.foot_point import foot_point_attack
+from attacks.stored.nearest_neighbour import nearest_neighbour_attack
 from attacks.system import enroll_victims, owners_pool
 from models.cache import EmbeddingCache
 from models.extraction import Extractor

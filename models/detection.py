@@ -210,8 +210,6 @@ def letterbox(
     ----------
     size
         Height and width of the canvas.
-    enlarge
-        Whether a picture smaller than the canvas is enlarged to fill it.
 
     Returns
     -------

@@ -82,8 +82,6 @@ class Extraction:
         The k files that were embedded, in the order in which they were given.
     failures
         All others, in the order in which they were given.
-    cached
-        How many of ``paths`` came from the cache.
     mirrored
         The embeddings with the mirror image added, where they were asked for.
     """

@@ -118,8 +118,6 @@ def calibrate(
     ----------
     descriptors : (N, n) floating
         Unit rows.
-    exclude
-        People to leave out, such as those of a test.
     aliases
         Second names of one person, mapped to the first.
     attributes

@@ -43,8 +43,6 @@ class Consistency:
         photos, their raw cosine.
     probe_threshold
         Least agreement of the photos of one probe.
-    fmr
-        Pairs of photos of different people that reach it.
     """
 
     threshold: float

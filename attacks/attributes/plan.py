@@ -32,16 +32,12 @@ class AttributePlan:
 
     Parameters
     ----------
-    feature_ks
-        Neighbours whose votes the trained attackers see.
     attackers
         Of `attackers.TRAINED`. Boosting is left out by default: on FairFace it finds as much as the
         other two, in ten times their time.
     lifts
         Times that the attacker lifts each of its own faces to train on. None for as many as
         ``training_most`` allows, 1 to 3: labels are scarce, and lifting is free.
-    training_most
-        At most so many own faces are lifted, chosen at random.
     gallery_most
         Trained attackers see the neighbours among at most so many random faces of the gallery, of
         their own templates and of the attacked ones alike. The paper's attacker searches all of the

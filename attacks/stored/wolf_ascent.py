@@ -35,8 +35,6 @@ class Ground:
     radii : (K,) float32
     targets
         How many of the K are targets.
-    threshold
-        Of the level that the wolf is made for.
     """
 
     feet: Array32

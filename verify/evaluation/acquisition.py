@@ -38,8 +38,6 @@ class PackSource:
         The pack; on a cluster the same path must lead to it on every worker.
     providers, threads, flip
         As in :meth:`models.pack.ModelPack.load`.
-    mirrored
-        Whether descriptors with the mirror image are wanted beside those without.
     """
 
     folder: Path

@@ -54,8 +54,6 @@ class Work:
     ----------
     seconds
         Of one thread, from the descriptors to the figures.
-    resumed
-        Whether its similarities were there already.
     """
 
     unit: Unit
@@ -71,11 +69,6 @@ def prepare(
     sources: Sequence[Source],
 ) -> tuple[Material, SetFacts, NDArray[np.int64]]:
     """Take the pairs of which both photos gave a descriptor; the others are counted.
-
-    Parameters
-    ----------
-    attributes
-        One for each acquired row.
 
     Raises
     ------

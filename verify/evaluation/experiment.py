@@ -45,13 +45,6 @@ def run_evaluation(
 ) -> Json:
     """Evaluate a plan; return the document of the results.
 
-    Parameters
-    ----------
-    labels
-        Of photos or people: gives results by group, and hybrid+ its attributes.
-    out
-        Folder of finished units, which are not computed again.
-
     Raises
     ------
     EvaluationError

@@ -19,8 +19,6 @@ class ErrorsAt:
 
     Parameters
     ----------
-    target
-        FMR that the threshold must not exceed.
     threshold
         Similarity.
     errors, trials

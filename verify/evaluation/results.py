@@ -70,8 +70,6 @@ class SourceFacts:
     ----------
     source
         As it is in the file; for a set, without the entries that resemble its people.
-    left_out
-        Number of those entries.
     """
 
     source: Source

@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from attacks.errors import AuditError
-from attacks.learned import invert, train
-from attacks.learned.inverter import Inverter
+from attacks.learned.inverter import Inverter, invert, train
 from attacks.system import System
 from templates.space.subspace import SubspaceBatch
 from tests.verify.synthetic import random_rotation

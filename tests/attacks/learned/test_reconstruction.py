@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from attacks.errors import AuditError
-from attacks.learned import decoder, reconstruct, score_images, train_decoder
-from attacks.learned.decoder import SIZE, Images, resized
+from attacks.learned import decoder
+from attacks.learned.decoder import SIZE, Images, resized, train_decoder
+from attacks.learned.reconstruction import reconstruct, score_images
 from attacks.outcomes import CONTROL
 from attacks.system import System
 
