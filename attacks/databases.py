@@ -40,6 +40,7 @@ from attacks.system import System
 from attacks.unlinkability import unlinkability
 from templates.keys.randomness import Keystream
 from templates.keys.rotation import Rotation
+from templates.space.embedding import normalised
 from templates.space.subspace import SubspaceBatch
 from verify.cohort import client_source
 
@@ -142,7 +143,7 @@ def whitened_cosines(left: SubspaceBatch, right: SubspaceBatch, spread: Moments)
     for batch in (left, right):
         rows = batch.feet.astype(np.float64) @ spread.axes
         rows = (rows - rows.mean(axis=0)) / scale
-        sides.append(rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-300))
+        sides.append(normalised(rows))
     return np.asarray(sides[0] @ sides[1].T)
 
 

@@ -19,6 +19,7 @@ from attacks.prior import Array64, Prior, attacker_prior
 from attacks.recovery import fmr_of
 from attacks.system import System
 from templates.contract.document import Level
+from templates.space.embedding import normalised
 from verify.metrics import rate
 
 LOCKOUTS = (5, 50)
@@ -80,8 +81,7 @@ class _Asked:
 
     def __call__(self, probe: Array64) -> float:
         """Score of the direction of a probe."""
-        unit = probe / np.linalg.norm(probe)
-        answer = self._ask(np.ascontiguousarray(unit, dtype=np.float32))
+        answer = self._ask(np.ascontiguousarray(normalised(probe), dtype=np.float32))
         self.attempts += 1
         if answer.accepted:
             self.accepted_at = self.attempts
@@ -109,16 +109,14 @@ def _gradient(prior: Prior, asked: _Asked, rng: np.random.Generator) -> None:
             for sign in (1.0, -1.0):
                 if asked.over():
                     return
-                trial = place + sign * reach * step / np.linalg.norm(step)
-                trial /= np.linalg.norm(trial)
+                trial = normalised(place + sign * reach * normalised(step))
                 gains.append(asked(trial) - best)
                 steps.append(trial - place)
         moves = np.stack(steps)
         slope = moves.T @ np.linalg.lstsq(moves @ moves.T, np.asarray(gains), rcond=1e-6)[0]
         if asked.over():
             return
-        trial = place + reach * slope / max(float(np.linalg.norm(slope)), 1e-12)
-        trial /= np.linalg.norm(trial)
+        trial = normalised(place + reach * normalised(slope))
         score = asked(trial)
         index = int(np.argmax(gains))
         if gains[index] + best > max(score, best):
@@ -152,12 +150,10 @@ def _regression(prior: Prior, asked: _Asked, rng: np.random.Generator) -> None:
         for step in np.geomspace(0.5, 0.02, _ASCENT_STEPS):
             slope = turned.T @ (weights * (linear + 2 * square * (turned @ place)))
             slope -= (slope @ place) * place
-            place = place + step * slope / max(float(np.linalg.norm(slope)), 1e-12)
-            place /= np.linalg.norm(place)
+            place = normalised(place + step * normalised(slope))
         if np.max(seen @ place) > _SAME:
             aside = prior.axes @ rng.normal(size=len(place))
-            place = place + 0.3 * aside / np.linalg.norm(aside)
-            place /= np.linalg.norm(place)
+            place = normalised(place + 0.3 * normalised(aside))
         scores.append(asked(place))
         probes.append(place)
 

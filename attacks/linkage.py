@@ -22,6 +22,7 @@ from templates.contract.canonical import Json
 from templates.distances import Metric, pairwise_distances, similarity
 from templates.keys.randomness import KEY_BYTES, Keystream
 from templates.keys.rotation import Rotation, TenantRotation, holder_rotation
+from templates.space.embedding import normalised
 from templates.space.subspace import SubspaceBatch, Turn
 
 Array64 = NDArray[np.float64]
@@ -36,10 +37,7 @@ def nearest_similarities(left: SubspaceBatch, right: SubspaceBatch) -> Array64:
 
 def foot_cosines(left: SubspaceBatch, right: SubspaceBatch) -> Array64:
     """Cosines of the foot points, (T, U)."""
-    first, second = (
-        batch.feet.astype(np.float64) / np.maximum(batch.foot_norms, 1e-300)[:, None]
-        for batch in (left, right)
-    )
+    first, second = (normalised(batch.feet.astype(np.float64)) for batch in (left, right))
     return np.asarray(first @ second.T)
 
 

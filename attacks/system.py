@@ -17,6 +17,7 @@ from templates.distances import Metric
 from templates.errors import Uncalibrated
 from templates.keys.randomness import Keystream
 from templates.keys.rotation import ROTATION_VERSION
+from templates.space.embedding import normalised
 from templates.space.lifting import Strategy
 from templates.space.subspace import SubspaceBatch
 from verify import CalibrationOptions, calibrate
@@ -237,7 +238,7 @@ def _calibrated(
             for one in range(person.max() + 1)
         ]
     )
-    people = np.asarray(means / np.linalg.norm(means, axis=1, keepdims=True), dtype=np.float32)
+    people = normalised(means).astype(np.float32)
     generator = client_source(source)
     with Keystream.seeded("audit", seed, binding.strategy, binding.m, "strangers") as stream:
         strangers = people_like(generator, people)

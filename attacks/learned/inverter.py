@@ -18,6 +18,7 @@ from attacks.learned.extra import need
 from attacks.outcomes import AttackOutcome, Knowledge
 from attacks.recovery import recovery_outcome
 from attacks.system import System
+from templates.space.embedding import normalised
 from templates.space.subspace import SubspaceBatch
 
 if TYPE_CHECKING:
@@ -65,7 +66,7 @@ class Inverter:
                     torch.tensor(batch.bases[rows]),
                 )
                 out[rows] = _guess(self.rounds, feet, bases).double().numpy()
-        return np.asarray(out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-300))
+        return normalised(out)
 
 
 def _slices(count: int) -> Iterator[slice]:
