@@ -187,6 +187,7 @@ def run_load(
         "p99_ms": round(p99, 1),
         "server_cpu_ms_per_decision": round(1000 * used / max(decided, 1), 2),
         "server_rss_mib": rss_mib(processes()),
+        "server_pss_mib": pss_mib(processes()),
     }
 
 
@@ -198,6 +199,12 @@ def cpu_seconds(processes: Sequence[psutil.Process]) -> float:
 def rss_mib(processes: Sequence[psutil.Process]) -> float:
     """Resident memory of processes, together."""
     total: int = sum(process.memory_info().rss for process in processes)
+    return round(total / 2**20, 1)
+
+
+def pss_mib(processes: Sequence[psutil.Process]) -> float:
+    """Resident memory of processes, where what several share counts once (Linux)."""
+    total: int = sum(process.memory_full_info().pss for process in processes)
     return round(total / 2**20, 1)
 
 

@@ -1,12 +1,13 @@
-"""The service under a mixed load for hours: private memory and latencies, minute by minute.
+"""The service under a mixed load for hours: memory and latencies, minute by minute.
 
 Starts ``veilface serve`` with two workers on PostgreSQL, enrolls people of LFW, and sends a steady
 mixture of requests: single photos, bursts of three, lifted probes, embeddings, enrollments of
 guests, erasures of the oldest guest. Requests start at their times whatever the answers do, so that
-a service that falls behind shows it in the latencies. At every full minute the private memory of
-the service's processes is read: a share in libraries would move with whatever else runs.
+a service that falls behind shows it in the latencies. At every full minute the anonymous memory of
+the service's processes is read, what workers share with their supervisor counted once: a share in
+libraries would move with whatever else runs.
 
-The test, chosen before the first run: the mean private memory of the last ten minutes is at most
+The test, chosen before the first run: the mean memory of the last ten minutes is at most
 2 % above that of the ten minutes after the first ten, and every answer is a decision, or what was
 asked for. Else the exit status is 1.
 
@@ -132,14 +133,14 @@ def soak(
             time.sleep(max(0.0, due - time.perf_counter()))
             minute = int(turn / rate / 60)
             if minute > len(memory):
-                memory.append(private_mib(processes()))
+                memory.append(anonymous_mib(processes()))
             (kind,) = draw.choices(kinds, weights)
             threads.submit(load.send, kind, minute, random.Random(turn), due)
-    memory.append(private_mib(processes()))
+    memory.append(anonymous_mib(processes()))
     return [
         {
             "minute": minute + 1,
-            "private_mib": mib,
+            "anonymous_mib": mib,
             "requests": sum(map(len, load.seconds[minute].values())),
             "ms": {
                 kind: [round(1000 * float(x), 1) for x in np.percentile(times, [50, 95])]
@@ -150,15 +151,18 @@ def soak(
     ]
 
 
-def private_mib(processes: Sequence[psutil.Process]) -> float:
-    """Memory of processes together that no other process has too."""
-    total = sum(process.memory_full_info().uss for process in processes)
-    return round(float(total) / 2**20, 1)
+def anonymous_mib(processes: Sequence[psutil.Process]) -> float:
+    """Memory of processes that is of no file; what several share counts once (Linux)."""
+    kib = 0
+    for process in processes:
+        parts = Path(f"/proc/{process.pid}/smaps_rollup").read_text().splitlines()
+        kib += sum(int(part.split()[1]) for part in parts if part.startswith("Pss_Anon:"))
+    return round(kib / 2**10, 1)
 
 
 def growth(rows: Sequence[dict[str, Any]]) -> float | None:
     """Growth of the last ten minutes' mean over that of the ten after the first ten, a ratio."""
-    mib = [row["private_mib"] for row in rows]
+    mib = [row["anonymous_mib"] for row in rows]
     if len(mib) < 3 * WARM_UP_MINUTES:
         return None
     base = float(np.mean(mib[WARM_UP_MINUTES : 2 * WARM_UP_MINUTES]))
@@ -176,8 +180,8 @@ def figure(rows: Sequence[dict[str, Any]]) -> Figure:
     with house_style():
         drawn, (memory, latency) = panels(2, 1, widths=[8.0], heights=[2.6, 3.4])
         minutes = [row["minute"] for row in rows]
-        memory[0].plot(minutes, [row["private_mib"] for row in rows], color=HUES[0])
-        memory[0].set(ylabel="private, MiB", ylim=(0, None))
+        memory[0].plot(minutes, [row["anonymous_mib"] for row in rows], color=HUES[0])
+        memory[0].set(ylabel="anonymous, MiB", ylim=(0, None))
         for hue, kind in zip(HUES, MIX, strict=False):
             seen = [row for row in rows if kind in row["ms"]]
             latency[0].plot(

@@ -14,11 +14,10 @@ import psycopg
 import pytest
 from sqlalchemy.engine import make_url
 
-from api.http.app import environment_of
 from api.process.opening import open_keyring, open_store
 from api.settings import Settings
 from tests.api.cli.conftest import Ran, run
-from tests.api.deployment import deploy, photo
+from tests.api.deployment import deploy, environment_of, photo
 from tests.databases import empty_database, postgres_server
 
 pytestmark = pytest.mark.long

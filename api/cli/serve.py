@@ -19,6 +19,7 @@ from api.process.operations import tls_options
 from api.process.runtime import Runtime, bootstrap_token
 from api.process.supervisor import run_server
 from api.settings import Settings
+from templates.contract.document import Contract
 from templates.decoys import DecoyGenerator
 
 
@@ -44,7 +45,7 @@ def serve(
 
 def start(settings: Settings, *, check: bool = False) -> None:
     """Open everything once, then serve until the process is told to stop."""
-    token, demo = _opened_once(settings, check=check)
+    contract, token, demo = _opened_once(settings, check=check)
     if demo and not settings.demo:
         settings = settings.model_copy(update={"demo": True})
     if check:
@@ -58,7 +59,7 @@ def start(settings: Settings, *, check: bool = False) -> None:
     counting = nullcontext() if settings.workers == 1 else shared_directory()
     try:
         with counting:
-            run_server(settings, on_ready=partial(_say_where, settings))
+            run_server(settings, contract, on_ready=partial(_say_where, settings))
     except SystemExit as error:
         if error.code:
             raise CommandError("the service did not start; its log says why") from None
@@ -91,11 +92,13 @@ def _address(host: str, port: int) -> str:
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
-def _opened_once(settings: Settings, *, check: bool) -> tuple[str | None, bool]:
+def _opened_once(settings: Settings, *, check: bool) -> tuple[Contract, str | None, bool]:
     """Open everything and let go of it again, models included, before the workers open theirs.
 
     Returns
     -------
+    contract : Contract
+        The one that workers serve.
     token : str or None
         The first API key, made now; None where there is one, and for a mere check.
     demo : bool
@@ -119,7 +122,7 @@ def _opened_once(settings: Settings, *, check: bool) -> tuple[str | None, bool]:
         token = None if check else bootstrap_token(runtime.store, settings)
         if check and (warning := runtime.superseded_calibrations()) is not None:
             message(f"warning: {warning}")
-        return token, bool(demo_notice(binding.embedder_sha256, n=binding.n))
+        return runtime.contract, token, bool(demo_notice(binding.embedder_sha256, n=binding.n))
     finally:
         runtime.close()
 

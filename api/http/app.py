@@ -64,7 +64,7 @@ from api.process.operations import (
 from api.process.runtime import Runtime
 from api.process.supervised import end_with_supervisor, is_supervised, open_patiently, told_to_stop
 from api.process.webhooks import deliver
-from api.settings import ENV_PREFIX, NO_PROXIES, Settings, load_settings
+from api.settings import NO_PROXIES, Settings
 from models.errors import ModelError
 from templates.contract.document import Contract
 from templates.distances import warm_up
@@ -89,9 +89,8 @@ API = (
     transfer,
 )
 GRACE_S = 20
-IMPORT_S = 60
-"""Seconds in which a worker must show that it lives. It cannot before it has imported everything,
-and on a slow or busy machine uvicorn's five seconds would end each worker before it ever began."""
+SIGN_OF_LIFE_S = 60
+"""Seconds in which a worker must show that it lives; on a busy machine, uvicorn's five are few."""
 
 
 def create_app(
@@ -281,18 +280,11 @@ async def _close(runtime: Runtime) -> None:
     log("stopped", pid=os.getpid())
 
 
-def app_from_environment() -> FastAPI:
-    """Make the application in a worker process; the settings come from the environment."""
-    return create_app(load_settings())
-
-
-def uvicorn_options(settings: Settings) -> dict[str, Any]:
-    """Return the keyword arguments of ``uvicorn.run``.
-
-    With one worker the application itself is passed; several are started anew, and take the
-    settings from their environment, in which :func:`environment_of` has to stand.
-    """
-    options: dict[str, Any] = {
+def uvicorn_options(settings: Settings, contract: Contract) -> dict[str, Any]:
+    """Return the keyword arguments of ``uvicorn.Config``."""
+    return {
+        "app": create_app(settings, open_runtime=partial(Runtime.open, contract=contract)),
+        "workers": settings.workers,
         "host": settings.host,
         "port": settings.port,
         "log_config": uvicorn_log_config("warning" if settings.log_level == "info" else "info"),
@@ -302,32 +294,10 @@ def uvicorn_options(settings: Settings) -> dict[str, Any]:
         "server_header": False,
         "date_header": True,
         "timeout_graceful_shutdown": GRACE_S,
-        "timeout_worker_healthcheck": IMPORT_S,
+        "timeout_worker_healthcheck": SIGN_OF_LIFE_S,
         "proxy_headers": settings.trusted_proxies != NO_PROXIES,
         "forwarded_allow_ips": settings.trusted_proxies,
         **tls_options(settings),
-    }
-    if settings.workers == 1:
-        return {"app": create_app(settings), **options}
-    return {
-        "app": "api.http.app:app_from_environment",
-        "factory": True,
-        "workers": settings.workers,
-        **options,
-    }
-
-
-def environment_of(settings: Settings) -> dict[str, str]:
-    """Write the settings as environment variables.
-
-    All of them, because a setting that equals its default may have been given as a flag, over
-    another value in the TOML file.
-    """
-    values = {name: getattr(settings, name) for name in Settings.model_fields}
-    return {
-        ENV_PREFIX + name.upper(): ",".join(value) if isinstance(value, tuple) else str(value)
-        for name, value in values.items()
-        if value is not None
     }
 
 

@@ -4,8 +4,10 @@ No label comes from a client: a path is its route's template, a method one of th
 and there is no tenant, no subject and no key among them. So the number of series is bounded.
 
 Several workers share what they count through files in a private folder (prometheus_client's
-multiprocess mode): each of them answers for all. A folder's files outlive their worker, because a
-counter must not fall; those of dead workers are merged into one.
+multiprocess mode): each of them answers for all. It expects the folder's name before it is
+imported, and workers are forks of a supervisor that has imported it, so each begins anew. A
+folder's files outlive their worker, because a counter must not fall; those of dead workers are
+merged into one.
 """
 
 import fcntl
@@ -24,8 +26,10 @@ from prometheus_client import (
     ProcessCollector,
     disable_created_metrics,
     generate_latest,
+    values,
 )
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+from prometheus_client.metrics import MetricWrapperBase
 from prometheus_client.metrics_core import Metric
 from prometheus_client.mmap_dict import MmapedDict, mmap_key
 from prometheus_client.multiprocess import MultiProcessCollector, mark_process_dead
@@ -35,8 +39,6 @@ from api.http.errors import ERROR_CODES
 from api.process.environment import variables_set
 
 DIRECTORY_VARIABLE = "PROMETHEUS_MULTIPROC_DIR"
-SHARED = os.environ.get(DIRECTORY_VARIABLE)
-"""Folder that the workers share; read where prometheus_client reads it, when it is imported."""
 
 UNMATCHED = "unmatched"
 METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
@@ -135,17 +137,29 @@ BUILD = Gauge(
     registry=REGISTRY,
 )
 
-# A worker that starts has seen no failure yet; 0 would ring the alarm at each start.
-STORE_UP.set(1)
-MODEL_UP.set(1)
+_METRICS = [metric for metric in list(globals().values()) if isinstance(metric, MetricWrapperBase)]
 
-# So that a rate over the first event is not missing: a series that appears with 1 has no rise.
-for _code in ERROR_CODES:
-    ERRORS.labels(_code)
-for _limit in LIMITS:
-    RATE_LIMITED.labels(_limit)
-for _kind in LOCKOUTS:
-    LOCKED_OUT.labels(_kind)
+
+def _begin() -> None:
+    """Let all series begin, with values of the kind that prometheus_client makes now."""
+    for metric in _METRICS:
+        if metric._labelnames:
+            metric._metrics.clear()
+        else:
+            metric._metric_init()  # type: ignore[no-untyped-call]
+    # A worker that starts has seen no failure yet; 0 would ring the alarm at each start.
+    STORE_UP.set(1)
+    MODEL_UP.set(1)
+    # So that a rate over the first event is not missing: a series that appears with 1 has no rise.
+    for code in ERROR_CODES:
+        ERRORS.labels(code)
+    for limit in LIMITS:
+        RATE_LIMITED.labels(limit)
+    for kind in LOCKOUTS:
+        LOCKED_OUT.labels(kind)
+
+
+_begin()
 
 
 def step(name: str) -> AbstractContextManager[object]:
@@ -199,24 +213,21 @@ def set_build(*, version: str, contract_id: str) -> None:
 
 def exposition() -> bytes:
     """Write all metrics, of all workers, in Prometheus' text format 0.0.4."""
-    if SHARED is None:
+    directory = _shared()
+    if directory is None:
         return generate_latest(REGISTRY)
-    directory = Path(SHARED)
     registry = CollectorRegistry()
     PlatformCollector(registry=registry)
     registry.register(_Workers(directory))
     with _locked(directory):
         _forget_gauges(directory)
-        MultiProcessCollector(registry, path=SHARED)  # type: ignore[no-untyped-call]
+        MultiProcessCollector(registry, path=str(directory))  # type: ignore[no-untyped-call]
         return generate_latest(registry)
 
 
 @contextmanager
 def shared_directory() -> Iterator[Path]:
-    """Make the private folder in which workers count together, and remove it at the end.
-
-    Only processes that start meanwhile use it: this one has imported prometheus_client already.
-    """
+    """Make the private folder in which workers count together, and remove it at the end."""
     with (
         tempfile.TemporaryDirectory(prefix="veilface-metrics-") as folder,
         variables_set({DIRECTORY_VARIABLE: folder}),
@@ -224,14 +235,22 @@ def shared_directory() -> Iterator[Path]:
         yield Path(folder)
 
 
-def join_shared_directory() -> None:
-    """Merge what dead workers left into one file; a worker calls this at its start.
+def _shared() -> Path | None:
+    folder = os.environ.get(DIRECTORY_VARIABLE)
+    return None if folder is None else Path(folder)
 
-    Otherwise a worker that dies again and again would fill the disk, and slow each scrape.
+
+def join_shared_directory() -> None:
+    """Count in the shared folder, if there is one, from now on; a worker calls this at its start.
+
+    What dead workers left is merged into one file. Otherwise a worker that dies again and again
+    would fill the disk, and slow each scrape.
     """
-    if SHARED is None:
+    directory = _shared()
+    if directory is None:
         return
-    directory = Path(SHARED)
+    values.ValueClass = values.get_value_class()  # type: ignore[no-untyped-call]
+    _begin()
     with _locked(directory):
         _forget_gauges(directory)
         for kind in ("counter", "histogram"):
@@ -320,6 +339,5 @@ class _Workers(Collector):
         yield from families.values()
 
 
-if SHARED is None:
-    ProcessCollector(registry=REGISTRY)
-    PlatformCollector(registry=REGISTRY)
+ProcessCollector(registry=REGISTRY)
+PlatformCollector(registry=REGISTRY)

@@ -148,8 +148,15 @@ class Runtime:
         self.stand_ins = StandIns(self.contract, self.keyring, key=self._stand_in_key)
 
     @classmethod
-    def open(cls, settings: Settings) -> "Runtime":
+    def open(cls, settings: Settings, *, contract: Contract | None = None) -> "Runtime":
         """Open everything that the settings name, and run one inference where there is a pack.
+
+        Parameters
+        ----------
+        settings
+            What is opened.
+        contract
+            The settings' contract, if it is open already.
 
         Raises
         ------
@@ -157,7 +164,7 @@ class Runtime:
             One sentence on the first thing that is wrong.
         """
         keyring = open_keyring(settings)
-        contract = open_contract(settings, keyring)
+        contract = contract or open_contract(settings, keyring)
         source = open_decoys(settings, keyring, contract)
         pack = open_pack(settings, contract)
         if pack is not None:

@@ -38,7 +38,8 @@ def is_supervised() -> bool:
 def supervisor_lives() -> bool:
     """Whether the supervisor runs."""
     parent = multiprocessing.parent_process()
-    return parent is not None and parent.is_alive()
+    # Not the pipe that tells of its end: workers that were forked later hold its other end too.
+    return parent is not None and parent.pid == os.getppid()
 
 
 def open_patiently(open_it: Callable[[], T], told: threading.Event) -> T:

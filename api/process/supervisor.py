@@ -1,6 +1,12 @@
-"""The server process, and the supervisor of its workers where there are several."""
+"""The server process, and the supervisor of its workers where there are several.
+
+Workers are forks of the supervisor. What it has loaded, the contract and its cohort, the kernels
+and all modules, is in memory once, and a worker in place of one that died starts at once.
+"""
 
 import contextlib
+import gc
+import multiprocessing
 import signal
 import socket
 import sys
@@ -8,20 +14,28 @@ from collections.abc import Callable
 
 import uvicorn
 from uvicorn.config import STARTUP_FAILURE
-from uvicorn.supervisors.multiprocess import Multiprocess
+from uvicorn.supervisors import multiprocess
+from uvicorn.supervisors.multiprocess import SIGNALS, Multiprocess, Process
 
-from api.http.app import environment_of, uvicorn_options
-from api.process.environment import variables_set
+from api.http.app import uvicorn_options
+from api.process.allocator import give_back
 from api.settings import Settings
+from templates.contract.document import Contract
+from templates.distances import warm_up
+from templates.distances.blas import single_threaded
 
 
-def run_server(settings: Settings, *, on_ready: Callable[[], None] = lambda: None) -> None:
+def run_server(
+    settings: Settings, contract: Contract, *, on_ready: Callable[[], None] = lambda: None
+) -> None:
     """Serve until told to stop.
 
     Parameters
     ----------
     settings
         What is served, where, and by how many workers.
+    contract
+        The one that the settings name.
     on_ready
         Called once, when all workers take connections.
 
@@ -30,8 +44,7 @@ def run_server(settings: Settings, *, on_ready: Callable[[], None] = lambda: Non
     SystemExit
         With a status other than 0 where the service, or one of its workers, could not start.
     """
-    options = uvicorn_options(settings)
-    config = uvicorn.Config(**options)
+    config = uvicorn.Config(**uvicorn_options(settings, contract))
     if settings.workers == 1:
         server = OneWorker(config, on_ready)
         with contextlib.suppress(KeyboardInterrupt):
@@ -39,9 +52,16 @@ def run_server(settings: Settings, *, on_ready: Callable[[], None] = lambda: Non
         if not server.started:
             sys.exit(STARTUP_FAILURE)
         return
+    if contract.takes_lifted_probes:
+        with single_threaded():
+            warm_up()
+            _ = contract.cohort
+    # What workers share stays shared while nobody writes to it: the collector would.
+    gc.collect()
+    gc.freeze()
+    give_back()
     workers = Workers(config, [config.bind_socket()], on_ready)
-    with variables_set(environment_of(settings)):
-        workers.run()
+    workers.run()
     if workers.gave_up:
         sys.exit(STARTUP_FAILURE)
 
@@ -59,14 +79,43 @@ class OneWorker(uvicorn.Server):
         self._on_ready()
 
 
-class Workers(Multiprocess):
-    """uvicorn's supervisor, which notices at once when a worker dies.
+class Worker(Process):
+    """uvicorn's worker, as a fork of the supervisor.
 
-    Every half second it asks each worker for a sign of life, through a pipe of which it holds both
-    ends itself. A worker killed between question and answer would leave the supervisor waiting
-    for all of ``timeout_worker_healthcheck``, deaf to other deaths and to the signal to stop.
-    With the worker's end held by the worker alone, the pipe breaks when it dies.
+    Every half second the supervisor asks each worker for a sign of life, through a pipe of which
+    uvicorn lets it hold both ends. A worker killed between question and answer would leave it
+    waiting for all of ``timeout_worker_healthcheck``, deaf to other deaths and to the signal to
+    stop. With the worker's end held by the worker alone, the pipe breaks when it dies.
     """
+
+    def __init__(self, config: uvicorn.Config, sockets: list[socket.socket]) -> None:
+        super().__init__(config, sockets)
+        forked = multiprocessing.get_context("fork").Process(target=self._serve, args=(sockets,))
+        self.process = forked  # type: ignore[assignment]  # uvicorn's is spawned
+
+    def start(self) -> None:
+        """Fork; no signal comes between that and the worker's own handling of signals."""
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+        try:
+            super().start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        self.child_conn.close()
+
+    def _serve(self, sockets: list[socket.socket]) -> None:
+        for number in SIGNALS:
+            signal.signal(number, signal.SIG_DFL)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
+        with contextlib.suppress(KeyboardInterrupt):
+            self.target(sockets)
+
+
+# What the supervisor calls for a worker.
+multiprocess.Process = Worker  # type: ignore[misc]
+
+
+class Workers(Multiprocess):
+    """uvicorn's supervisor, which says when all workers are ready, and why it stopped."""
 
     gave_up = False
     """Whether it stopped because a worker could not start, not because it was told to."""
@@ -80,20 +129,12 @@ class Workers(Multiprocess):
         super().__init__(config, sockets)
         self._on_ready: Callable[[], None] | None = on_ready
 
-    def init_processes(self) -> None:
-        """Start the workers."""
-        super().init_processes()
-        self._leave_the_workers_their_ends()
-
     def keep_subprocess_alive(self) -> None:
         """Replace workers that died or hang; give up where one could not start."""
-        # Before too: a signal may have added a worker, and it is asked at once.
-        self._leave_the_workers_their_ends()
         told = self.should_exit.is_set()
         super().keep_subprocess_alive()
         told = told or not {signal.SIGINT, signal.SIGTERM}.isdisjoint(self.signal_queue)
         self.gave_up = self.should_exit.is_set() and not told
-        self._leave_the_workers_their_ends()
         self._say_when_ready()
 
     def _say_when_ready(self) -> None:
@@ -103,7 +144,3 @@ class Workers(Multiprocess):
         if all(process.is_ready(timeout=patience) for process in self.processes):
             self._on_ready()
             self._on_ready = None
-
-    def _leave_the_workers_their_ends(self) -> None:
-        for process in self.processes:
-            process.child_conn.close()

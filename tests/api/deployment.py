@@ -20,7 +20,7 @@ from api.process.runtime import (
     open_store,
     prepare_database,
 )
-from api.settings import Settings
+from api.settings import ENV_PREFIX, Settings
 from models.pack import ModelPack
 from templates.contract.document import Binding, Calibration, Contract, Level, Rate
 from templates.contract.expectation import PointExpectation
@@ -216,6 +216,16 @@ def deploy(folder: Path, *, database_url: str | None = None, **changes: Any) -> 
         store.close()
     assert token is not None
     return Deployment(settings, token, contract, source)
+
+
+def environment_of(settings: Settings) -> dict[str, str]:
+    """All settings as environment variables, for a process that takes them from there."""
+    values = {name: getattr(settings, name) for name in Settings.model_fields}
+    return {
+        ENV_PREFIX + name.upper(): ",".join(value) if isinstance(value, tuple) else str(value)
+        for name, value in values.items()
+        if value is not None
+    }
 
 
 def bearer(token: str) -> dict[str, str]:

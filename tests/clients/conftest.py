@@ -10,9 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from api.http.app import environment_of
 from benchmarks.deployment import service as serve
-from tests.api.deployment import Deployment, deploy
+from tests.api.deployment import Deployment, deploy, environment_of
 from tests.ports import free_port
 
 VEILFACE = Path(sys.executable).with_name("veilface")

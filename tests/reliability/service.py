@@ -15,8 +15,7 @@ from typing import Any
 import httpx
 import psutil
 
-from api.http.app import environment_of
-from tests.api.deployment import Deployment
+from tests.api.deployment import Deployment, environment_of
 from tests.patience import PATIENCE_S
 
 START_S = PATIENCE_S

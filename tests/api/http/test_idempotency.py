@@ -9,12 +9,11 @@ from typing import Any
 
 import pytest
 
-from api.http.app import environment_of
 from api.http.holder_keys import holder_key_of
 from api.http.routes import enrollment
 from api.http.schemas import HOLDER_KEY
 from tests.api.client import Client
-from tests.api.deployment import Deployment, bearer, images, photo
+from tests.api.deployment import Deployment, bearer, environment_of, images, photo
 from tests.api.shapes import assert_error
 
 
@@ -122,7 +121,8 @@ ROOT = Path(__file__).resolve().parents[3]
 KILLED_AFTER_THE_COMMIT = """
 import json, os, signal, sys
 
-from api.http.app import app_from_environment
+from api.http.app import create_app
+from api.settings import load_settings
 from templates.store.subjects import Subjects
 from tests.api.client import Client
 from tests.api.deployment import images, photo
@@ -135,7 +135,7 @@ def put_and_end(*given, **named):
 
 Subjects.put = put_and_end
 path, headers, fields = json.loads(sys.argv[1])
-with Client(app_from_environment()) as client:
+with Client(create_app(load_settings())) as client:
     client.put(path, files=images(photo(1)), headers=headers, data=fields)
 """
 

@@ -19,14 +19,14 @@ import httpx
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from api.http.app import VERSION, environment_of
+from api.http.app import VERSION
 from api.http.errors import ERROR_CODES
 from api.limits.admission import Gate
 from api.process.housekeeping import purge_regularly
 from api.process.metrics import exposition, shared_directory, step
 from templates.store.lockout import LockedOut
 from tests.api.client import Client
-from tests.api.deployment import Deployment, bearer, deploy, images, photo
+from tests.api.deployment import Deployment, bearer, deploy, environment_of, images, photo
 from tests.patience import PATIENCE_S, wait_until
 from tests.ports import free_port
 

@@ -21,7 +21,7 @@ import sqlalchemy as sa
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 
-from api.http.app import create_app, environment_of
+from api.http.app import create_app
 from api.http.context import RequestContext, _Body
 from api.http.errors import StartError
 from api.process import healthcheck
@@ -31,7 +31,7 @@ from api.settings import Settings, load_settings
 from models.errors import ModelError
 from templates.store import TemplateStore
 from tests.api.client import Client
-from tests.api.deployment import Deployment, bearer, deploy, images, photo
+from tests.api.deployment import Deployment, bearer, deploy, environment_of, images, photo
 from tests.api.process.test_server import in_flight
 from tests.api.shapes import assert_error
 from tests.certificates import self_signed

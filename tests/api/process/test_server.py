@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import os
 import re
 import signal
 import socket
@@ -15,19 +14,19 @@ from pathlib import Path
 
 import httpx
 import pytest
-import uvicorn
 
-from api.http.app import environment_of
-from api.process.supervisor import run_server
-from tests.api.deployment import Deployment, bearer, deploy, images, photo
+from tests.api.deployment import Deployment, bearer, deploy, environment_of, images, photo
 from tests.api.shapes import assert_error
 from tests.patience import PATIENCE_S, wait_until
 from tests.ports import free_port
 
 RUN = """
-from api.settings import load_settings
+from api.process.opening import open_contract, open_keyring
 from api.process.supervisor import run_server
-run_server(load_settings())
+from api.settings import load_settings
+
+settings = load_settings()
+run_server(settings, open_contract(settings, open_keyring(settings)))
 """
 
 
@@ -116,30 +115,6 @@ def test_the_kernels_are_compiled_before_the_server_is_ready(tmp_path: Path) -> 
         "count_within",
     } <= named
     assert sorted(path.name for path in kernels.rglob("*.nb[ci]")) == ready
-
-
-def test_the_settings_are_in_the_environment_while_workers_are_started(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Flags are nowhere else where a worker could find them."""
-    settings = deploy(tmp_path, workers=2, port=free_port(), queue_limit=7).settings
-    seen: dict[str, str] = {}
-
-    class Workers:
-        gave_up = False
-
-        def __init__(self, config: uvicorn.Config, sockets: list[socket.socket], _: object) -> None:
-            for each in sockets:
-                each.close()
-
-        def run(self) -> None:
-            seen.update(os.environ)
-
-    monkeypatch.setattr("api.process.supervisor.Workers", Workers)
-    run_server(settings)
-    assert {name: seen.get(name) for name in environment_of(settings)} == environment_of(settings)
-    assert seen["VEILFACE_QUEUE_LIMIT"] == "7"
-    assert "VEILFACE_QUEUE_LIMIT" not in os.environ
 
 
 @pytest.mark.usefixtures("http")

@@ -5,9 +5,9 @@ import pytest
 from typer.testing import CliRunner
 
 from api.cli import app
-from api.http.app import environment_of
 from api.http.errors import StartError
 from api.settings import Settings, load_settings, settings_table
+from tests.api.deployment import environment_of
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
 
@@ -170,14 +170,9 @@ def test_a_database_url_that_cannot_be_used_is_refused_by_name(
 
 
 @pytest.mark.parametrize("given", ["", "off", " off "])
-def test_a_limit_that_is_off_stays_off_on_its_way_to_workers(
-    monkeypatch: pytest.MonkeyPatch, given: str
-) -> None:
+def test_a_limit_may_be_off(given: str) -> None:
     settings = load_settings(rate_limit_key=given, trusted_proxies="")
     assert (settings.rate_limit_key, settings.trusted_proxies) == ("off", "none")
-    for name, value in environment_of(settings).items():
-        monkeypatch.setenv(name, value)
-    assert load_settings() == settings
 
 
 def test_a_limit_may_be_written_as_the_library_takes_it() -> None:
@@ -185,7 +180,9 @@ def test_a_limit_may_be_written_as_the_library_takes_it() -> None:
         assert load_settings(rate_limit_key=text).rate_limit_key == text
 
 
-def test_settings_travel_to_workers_in_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_kind_of_setting_is_read_from_the_environment(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     settings = load_settings(
         port=9,
         providers=("cuda", "cpu"),

@@ -28,7 +28,7 @@ from api.process.opening import (
 from api.process.runtime import Runtime
 from api.settings import Settings
 from models.pack import ModelPack
-from templates.contract.document import Rate
+from templates.contract.document import Contract, Rate
 from templates.contract.nobody import Nobody
 from templates.contract.verdict import Verdict
 from templates.decoys import DecoyGenerator
@@ -343,7 +343,7 @@ def test_serving_keeps_no_second_copy_of_the_models(
         opened.append(weakref.ref(runtime))
         return runtime
 
-    def serving(_: Settings, *, on_ready: Callable[[], None]) -> None:
+    def serving(_: Settings, _contract: Contract, *, on_ready: Callable[[], None]) -> None:
         gc.collect()
         alive.extend(each() is not None for each in opened)
 

@@ -22,7 +22,7 @@ import httpx
 import pytest
 from anyio.from_thread import start_blocking_portal
 
-from api.http.app import create_app, environment_of
+from api.http.app import create_app
 from api.http.errors import StartError
 from api.process.runtime import open_keyring, open_store
 from api.process.webhooks import LONGEST_S, deliver, send
@@ -33,7 +33,7 @@ from templates.keys.webhook_secret import read_webhook_secrets, signatures
 from templates.store import TemplateStore
 from templates.store.outbox import LEASE, Event, Outbox
 from tests.api.client import Client
-from tests.api.deployment import Deployment, bearer, deploy, images, photo
+from tests.api.deployment import Deployment, bearer, deploy, environment_of, images, photo
 from tests.clients.conftest import VEILFACE
 from tests.patience import PATIENCE_S, wait_until
 from tests.ports import free_port

@@ -8,9 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from api.http.app import environment_of
 from api.process.runtime import file_sealer, open_keyring
-from tests.api.deployment import deploy
+from tests.api.deployment import deploy, environment_of
 from tests.patience import PATIENCE_S
 
 SERVE = """
