@@ -7,7 +7,6 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from attacks.chosen_enrollment import chosen_enrollment
 from attacks.comparer import link_by_comparer
@@ -108,12 +107,8 @@ def run_audit(
 
     Parameters
     ----------
-    faces, identities
-        Embedded photos, and the name of the person on each.
     decoys
         What the service lifts with; None to fit a generator to people of no other group.
-    aligned
-        Whether the photos are aligned crops.
     start_service
         None where no service is attacked.
     further
@@ -178,9 +173,8 @@ def run_audit(
         )
         result.schemes.append({**audited.scheme.to_json(), **_operating_point(system)})
         attacker_faces = brought if audited.pool_of_owners else np.concatenate([known, brought])
-        attacks = _attacks(
-            plan, system, population, faces, attacker_faces, crops, start_service, kind
-        )
+        informed = replace(system, attacker=np.concatenate([system.attacker, attacker_faces]))
+        attacks = _attacks(plan, system, informed, population, faces, crops, start_service, kind)
         for done, attack in enumerate(attacks, start=1):
             result.outcomes.extend(attack())
             progress((number + done / len(attacks)) / len(schemes))
@@ -255,38 +249,38 @@ def _settings(
 def _attacks(
     plan: AuditPlan,
     system: System,
+    informed: System,
     population: Population,
     faces: Extraction,
-    known: NDArray[np.float32],
     crops: FaceCrops | None,
     start_service: StartService | None,
     kind: str,
 ) -> list[Callable[[], list[AttackOutcome]]]:
-    """All attacks on a scheme, in the order of the report."""
+    """All attacks on a scheme, in the order of the report; ``informed`` has all known faces."""
     inverters: dict[str, Inverter] = {}
-    likeliest = cache(lambda: likeliest_guesses(system, known))
+    likeliest = cache(lambda: likeliest_guesses(informed))
     seconds = plan.training_seconds
 
     def likelihood() -> list[AttackOutcome]:
-        outcomes = find_least_decoy_like(system, known, kind=kind, guesses=likeliest())
+        outcomes = find_least_decoy_like(informed, likeliest(), kind=kind)
         return outcomes + simulate_unlimited(
-            system, known, kind=kind, fitted_to=plan.decoy_faces, measured=outcomes
+            informed, kind=kind, fitted_to=plan.decoy_faces, measured=outcomes
         )
 
     def learned() -> list[AttackOutcome]:
         if seconds is None:
             return []
-        inverter, outcomes = invert(system, known, seconds=seconds, seed=plan.seed)
+        inverter, outcomes = invert(informed, seconds=seconds, seed=plan.seed)
         inverters["inverter"] = inverter
         return outcomes
 
     def holders() -> list[AttackOutcome]:
         guesses: dict[str, Guess] = {
             "foot-point": foot_points,
-            "decoy-likelihood": likeliest_guess(system, known),
+            "decoy-likelihood": likeliest_guess(informed),
         }
         outcomes = guess_with_and_without_holder_keys(system, guesses | inverters)
-        return outcomes + guess_from_few_decoys(system, known)
+        return outcomes + guess_from_few_decoys(informed)
 
     def drawn() -> list[AttackOutcome]:
         if crops is None:
@@ -322,7 +316,7 @@ def _attacks(
         lambda: template_attacks(system),
         learned,
         holders,
-        lambda: several_templates(system, population.albums, likeliest_guess(system, known)),
+        lambda: several_templates(system, population.albums, likeliest_guess(informed)),
         drawn,
         lambda: link(system, liftings=3, most_people=LINKED),
         lambda: link_by_comparer(system, population.mates),

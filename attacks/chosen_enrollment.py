@@ -59,20 +59,13 @@ class Sides(NamedTuple):
     stolen: SubspaceBatch
 
 
-def estimate_from_sets(sides: Sides, *, steps: int | None = None) -> Array64:
-    """Estimate R from S sets and their images under R.
+def estimate_from_sets(sides: Sides) -> Array64:
+    """Estimate R from S sets and their images; (n, n) orthogonal, undone by ``estimate.T @ x``.
 
     Parameters
     ----------
     sides
         Template i of ``stolen`` is the image of template i of ``sent``, in another basis.
-    steps
-        Most steps of the refinement; None: by the number of accounts.
-
-    Returns
-    -------
-    ndarray of float64, shape (n, n)
-        Orthogonal; x of the tenant is taken back by ``estimate.T @ x``.
 
     Notes
     -----
@@ -86,9 +79,7 @@ def estimate_from_sets(sides: Sides, *, steps: int | None = None) -> Array64:
     estimate = polar_factor(product_pairs(sides))
     settled = 0.0
     enough = sent.bases.shape[0] * (sent.bases.shape[1] + 1) >= 2 * sent.feet.shape[1]
-    if steps is None:
-        steps = FEW_ALIGNMENTS if enough else ALIGNMENTS
-    for _ in range(steps):
+    for _ in range(FEW_ALIGNMENTS if enough else ALIGNMENTS):
         turned = sent.bases @ estimate.T
         left, values, right = np.linalg.svd(stolen.bases @ turned.transpose(0, 2, 1))
         fit = float(values.sum())

@@ -25,6 +25,7 @@ from templates.space.subspace import SubspaceBatch
 from verify.metrics import equal_error_rate, fnmr_at_fmr, rate, resolvable
 
 LIFTINGS = 2
+"""Of the victims, and of the people that the comparer is trained on, with other decoys each."""
 LEAST_MATES = 20
 """People with two photos that a comparer is trained on at least."""
 MOST_PEOPLE = 60
@@ -120,9 +121,9 @@ def train_comparer(features: Array64) -> Any:
 
 
 def _lifted_pairs(
-    system: System, people: Subjects, purpose: str, liftings: int
+    system: System, people: Subjects, purpose: str
 ) -> Iterator[tuple[SubspaceBatch, SubspaceBatch]]:
-    for number in range(liftings):
+    for number in range(LIFTINGS):
         yield (
             system.lift(people.enrolled, f"{purpose}, first {number}"),
             system.lift(people.fresh, f"{purpose}, second {number}"),
@@ -130,12 +131,7 @@ def _lifted_pairs(
 
 
 def link_by_comparer(
-    system: System,
-    mates: Subjects,
-    *,
-    liftings: int = LIFTINGS,
-    permutations: int = 500,
-    most_people: int = MOST_PEOPLE,
+    system: System, mates: Subjects, *, most_people: int = MOST_PEOPLE
 ) -> list[AttackOutcome]:
     """Link two templates of each victim, one of ``enrolled`` and one of the fresh photo.
 
@@ -143,10 +139,6 @@ def link_by_comparer(
     ----------
     mates
         The attacker's people with two photos or more, which the comparer is trained on.
-    liftings
-        Of the victims, and of the mates, with other decoys each.
-    permutations
-        Of the null.
     most_people
         Victims, and mates, that are used: the time grows with the square.
 
@@ -162,11 +154,11 @@ def link_by_comparer(
     features = PairFeatures(system)
     own = mates.first(most_people)
     comparer = train_comparer(
-        np.stack([features(*pair) for pair in _lifted_pairs(system, own, "mates", liftings)])
+        np.stack([features(*pair) for pair in _lifted_pairs(system, own, "mates")])
     )
     victims = system.victims.first(most_people)
     scores, nearest = [], []
-    for pair in _lifted_pairs(system, victims, "comparer", liftings):
+    for pair in _lifted_pairs(system, victims, "comparer"):
         compared = features(*pair)
         logits = comparer.decision_function(compared.reshape(-1, compared.shape[2]))
         scores.append(logits.reshape(compared.shape[:2]))
@@ -177,18 +169,18 @@ def link_by_comparer(
     half = len(victims) // 2
     others = np.stack(scores)[:, :half, half : 2 * half]
     return [
-        _outcome(system, np.stack(scores), beside, permutations, control=False),
-        _outcome(system, others, trained_on, permutations, control=True),
+        _outcome(system, np.stack(scores), beside, control=False),
+        _outcome(system, others, trained_on, control=True),
     ]
 
 
 def _outcome(
-    system: System, scores: Array64, beside: dict[str, Json], permutations: int, *, control: bool
+    system: System, scores: Array64, beside: dict[str, Json], *, control: bool
 ) -> AttackOutcome:
     """Report scores (L, V, V) whose diagonals are said to be mated."""
     return linkage_outcome(
         system,
-        unlinkability(scores, permutations=permutations, seed=system.seed),
+        unlinkability(scores, seed=system.seed),
         attack="trained-linkage",
         variant="different people" if control else "keys leaked",
         leaked=Leaked.HOLDER_KEYS,

@@ -40,6 +40,7 @@ from attacks.system import System
 from attacks.unlinkability import unlinkability
 from templates.keys.randomness import Keystream
 from templates.keys.rotation import Rotation
+from templates.space.embedding import normalised
 from templates.space.subspace import SubspaceBatch
 from verify.cohort import client_source
 
@@ -69,8 +70,6 @@ class Moments:
         Those axes, as columns.
     power
         Mean ‖p‖².
-    templates, m
-        How many templates, of which dimension.
     """
 
     mean: Array64
@@ -98,9 +97,7 @@ class Moments:
         )
 
 
-def estimate_rotation(
-    stolen: Moments, lifted: Moments, pairs: Array64 | None = None, *, steps: int = ALIGNMENTS
-) -> Array64:
+def estimate_rotation(stolen: Moments, lifted: Moments, pairs: Array64 | None = None) -> Array64:
     """Estimate the rotation of a tenant that has one for all, from its database.
 
     Parameters
@@ -134,7 +131,7 @@ def estimate_rotation(
         known += weight * precision.max() * pairs
     known = stolen.axes.T @ known @ lifted.axes
     turn = np.diag(np.where(np.diagonal(known) < 0, -1.0, 1.0))
-    for _ in range(steps):
+    for _ in range(ALIGNMENTS):
         turn = polar_factor(weight * stolen.variances[:, None] * turn * gain + known)
     return np.asarray(stolen.axes @ turn @ lifted.axes.T)
 
@@ -146,7 +143,7 @@ def whitened_cosines(left: SubspaceBatch, right: SubspaceBatch, spread: Moments)
     for batch in (left, right):
         rows = batch.feet.astype(np.float64) @ spread.axes
         rows = (rows - rows.mean(axis=0)) / scale
-        sides.append(rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-300))
+        sides.append(normalised(rows))
     return np.asarray(sides[0] @ sides[1].T)
 
 
@@ -161,14 +158,6 @@ class _Tenant:
     def strangers(self, accounts: int) -> int:
         """Number of others."""
         return len(self.lifted) - self.victims - accounts
-
-    def own_rotations(self, system: System) -> list[Rotation]:
-        """One of each template."""
-        return rotations_of(system, f"database {self.name}", "template", len(self.lifted))
-
-    def holders_rotations(self, system: System) -> list[Rotation]:
-        """One of each template, by a key that its holder has for both tenants."""
-        return holder_rotations_of(system, f"database {self.name}", len(self.lifted))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -259,8 +248,6 @@ def link_databases(
     accounts
         Numbers of the attacker's own accounts with both tenants; those beyond its faces are left
         out. With 0 it has the two databases only.
-    strangers
-        Further templates in each database.
 
     Returns
     -------
@@ -356,8 +343,9 @@ def _enrolled(
 def _settings(system: System, tenants: Sequence[_Tenant], numbers: Sequence[int]) -> list[_Setting]:
     """What is stolen, with how many accounts; the first for a number of accounts is its control."""
     most = max(numbers)
-    rotated = [tenant.own_rotations(system) for tenant in tenants]
-    held = [tenant.holders_rotations(system) for tenant in tenants]
+    named = [(f"database {tenant.name}", len(tenant.lifted)) for tenant in tenants]
+    rotated = [rotations_of(system, name, "template", count) for name, count in named]
+    held = [holder_rotations_of(system, name, count) for name, count in named]
     alike = [[own[0]] * len(own) for own in rotated]
     stolen, kept, control = (
         [_Side.of(tenant, turns, most) for tenant, turns in zip(tenants, side, strict=True)]

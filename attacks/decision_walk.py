@@ -270,7 +270,7 @@ def walk(
     prior: Prior,
     guesser: _Guesser,
     *,
-    counts: Sequence[int] = QUESTIONS,
+    counts: Sequence[int],
 ) -> Walk:
     """Attack one template.
 
@@ -297,18 +297,17 @@ def walk(
 
 
 def reconstruct_from_decisions(
-    system: System, *, counts: Sequence[int] = QUESTIONS, lockouts: Sequence[int] = LOCKOUTS
+    system: System, *, counts: Sequence[int] = QUESTIONS
 ) -> list[AttackOutcome]:
     """Reconstruct every victim's descriptor from accepted and rejected probes.
+
+    A lockout ends only the search for the first accept: an accepted probe sets the count of
+    failures back, and the attacker sends that one again wherever the next would be one too many.
 
     Parameters
     ----------
     counts
         Numbers of questions after which the attacker guesses, in ascending order.
-    lockouts
-        Failures in a row that end the attack. An accepted probe sets the count back, and the
-        attacker has one from its first accept on: it sends that one again wherever the next
-        failure would be one too many. So a lockout ends only the search for the first.
 
     Returns
     -------
@@ -323,7 +322,7 @@ def reconstruct_from_decisions(
     ]
     most = counts[-1]
     outcomes = [_outcome(system, walks, count, FOOT) for count in counts]
-    outcomes += [_outcome(system, walks, most, FOOT, limit=limit) for limit in lockouts]
+    outcomes += [_outcome(system, walks, most, FOOT, limit=limit) for limit in LOCKOUTS]
     if LIKELIEST in guesser.kinds:
         outcomes.append(_outcome(system, walks, most, LIKELIEST))
     control = _outcome(system, walks, most, FOOT, people=system.victims.mismatched())

@@ -21,10 +21,6 @@ class Accuracies:
     ----------
     dataset, metric
         Of which set, by which metric, point to subspace.
-    raw
-        Of raw descriptors.
-    of
-        By scheme.
     """
 
     dataset: str
@@ -39,8 +35,6 @@ class Point:
 
     Parameters
     ----------
-    scheme
-        Whose templates.
     accuracy
         Mean ten-fold accuracy of verification, a fraction.
     leaks
@@ -106,13 +100,9 @@ def frontier(results: Row, rows: Sequence[Row], *, most_lost: float) -> dict[str
 
     Parameters
     ----------
-    results
-        ``results.json`` of ``veilface evaluate``.
     rows
         Of attribute inference; of several attackers the one that was strongest on the attacker's
         own held-out faces counts.
-    most_lost
-        A fraction, such as 0.005.
 
     Raises
     ------

@@ -19,6 +19,7 @@ from attacks.prior import Array64, Prior, attacker_prior
 from attacks.recovery import fmr_of
 from attacks.system import System
 from templates.contract.document import Level
+from templates.space.embedding import normalised
 from verify.metrics import rate
 
 LOCKOUTS = (5, 50)
@@ -55,8 +56,6 @@ class Climb:
 
     Parameters
     ----------
-    climber
-        Which.
     attempts
         Probes sent: up to the first that was accepted, or all.
     accepted_at
@@ -64,7 +63,6 @@ class Climb:
         failed, so a lockout after k consecutive failures ends the attack where it is above k.
     """
 
-    climber: Climber
     attempts: int
     accepted_at: int | None
 
@@ -83,8 +81,7 @@ class _Asked:
 
     def __call__(self, probe: Array64) -> float:
         """Score of the direction of a probe."""
-        unit = probe / np.linalg.norm(probe)
-        answer = self._ask(np.ascontiguousarray(unit, dtype=np.float32))
+        answer = self._ask(np.ascontiguousarray(normalised(probe), dtype=np.float32))
         self.attempts += 1
         if answer.accepted:
             self.accepted_at = self.attempts
@@ -112,16 +109,14 @@ def _gradient(prior: Prior, asked: _Asked, rng: np.random.Generator) -> None:
             for sign in (1.0, -1.0):
                 if asked.over():
                     return
-                trial = place + sign * reach * step / np.linalg.norm(step)
-                trial /= np.linalg.norm(trial)
+                trial = normalised(place + sign * reach * normalised(step))
                 gains.append(asked(trial) - best)
                 steps.append(trial - place)
         moves = np.stack(steps)
         slope = moves.T @ np.linalg.lstsq(moves @ moves.T, np.asarray(gains), rcond=1e-6)[0]
         if asked.over():
             return
-        trial = place + reach * slope / max(float(np.linalg.norm(slope)), 1e-12)
-        trial /= np.linalg.norm(trial)
+        trial = normalised(place + reach * normalised(slope))
         score = asked(trial)
         index = int(np.argmax(gains))
         if gains[index] + best > max(score, best):
@@ -155,12 +150,10 @@ def _regression(prior: Prior, asked: _Asked, rng: np.random.Generator) -> None:
         for step in np.geomspace(0.5, 0.02, _ASCENT_STEPS):
             slope = turned.T @ (weights * (linear + 2 * square * (turned @ place)))
             slope -= (slope @ place) * place
-            place = place + step * slope / max(float(np.linalg.norm(slope)), 1e-12)
-            place /= np.linalg.norm(place)
+            place = normalised(place + step * normalised(slope))
         if np.max(seen @ place) > _SAME:
             aside = prior.axes @ rng.normal(size=len(place))
-            place = place + 0.3 * aside / np.linalg.norm(aside)
-            place /= np.linalg.norm(place)
+            place = normalised(place + 0.3 * normalised(aside))
         scores.append(asked(place))
         probes.append(place)
 
@@ -187,10 +180,6 @@ def climb(
     ----------
     victims
         By number of the victim, what answers a unit probe, (n,) float32.
-    prior
-        Of ``attacks.prior.learn_prior``.
-    most_attempts
-        Where to give up.
 
     Raises
     ------
@@ -201,7 +190,7 @@ def climb(
     for number, ask in victims.items():
         asked = _Asked(_scored(ask) if climber is not Climber.DICTIONARY else ask, most_attempts)
         _CLIMBERS[climber](prior, asked, np.random.default_rng((seed, number)))
-        climbs.append(Climb(climber, asked.attempts, asked.accepted_at))
+        climbs.append(Climb(asked.attempts, asked.accepted_at))
     return climbs
 
 
@@ -216,35 +205,18 @@ def _scored(ask: Ask) -> Ask:
 
 
 def climbing_outcomes(
+    climber: Climber,
     climbs: Sequence[Climb],
     scheme: Scheme,
     level: Level,
     *,
     most_attempts: int,
-    lockouts: Sequence[int] = LOCKOUTS,
 ) -> list[AttackOutcome]:
-    """Report climbs of one kind, against lockouts that are simulated here.
+    """Report the climbs of a climber, against lockouts that are simulated here.
 
-    Parameters
-    ----------
-    climbs
-        All of one climber, one a victim.
-    level
-        That the service decided at.
-    most_attempts
-        As :func:`climb` was given.
-    lockouts
-        Consecutive failures after which an attack ends. All attempts before the first that is
-        accepted have failed, so an attack is over by then or not at all.
-
-    Raises
-    ------
-    AuditError
-        No climbs, or of two climbers.
+    All attempts before the first that is accepted have failed, so an attack is over by a number of
+    consecutive failures or not at all.
     """
-    if len({attack.climber for attack in climbs}) != 1:
-        raise AuditError("an outcome is of the climbs of one climber")
-    climber = climbs[0].climber
     scored = climber is not Climber.DICTIONARY
     reached = np.array(
         [np.inf if attack.accepted_at is None else attack.accepted_at for attack in climbs]
@@ -277,41 +249,30 @@ def climbing_outcomes(
             },
         )
         for limit in sorted(
-            {*(attack for attack in lockouts if attack <= most_attempts), most_attempts}
+            {*(limit for limit in LOCKOUTS if limit <= most_attempts), most_attempts}
         )
     ]
 
 
-def dictionary_outcomes(
-    system: System, *, most_attempts: int = LOCKOUTS[-1]
-) -> list[AttackOutcome]:
-    """Try the attacker's best faces on every victim's template, seeing decisions only.
+def dictionary_outcomes(system: System) -> list[AttackOutcome]:
+    """Try the attacker's 50 best faces on every victim's template, seeing decisions only.
 
     Every service that decides at an FMR is open to this, protected or not; only a lockout bounds
     it. The order of the faces is the prior's, so it does not depend on the answers, and all victims
     can be tried at once.
-
-    Parameters
-    ----------
-    most_attempts
-        Faces that are tried on each.
-
-    Returns
-    -------
-    list of AttackOutcome
-        As of :func:`climbing_outcomes`.
     """
-    faces = attacker_prior(system).faces[:most_attempts].astype(np.float32)
+    faces = attacker_prior(system).faces[: LOCKOUTS[-1]].astype(np.float32)
     accepted = decide(faces, system.templates, system.contract, system.points, system.level)
     climbs = [
         Climb(
-            Climber.DICTIONARY,
             attempts=int(np.argmax(column)) + 1 if column.any() else len(faces),
             accepted_at=int(np.argmax(column)) + 1 if column.any() else None,
         )
         for column in accepted.T
     ]
-    return climbing_outcomes(climbs, system.scheme, system.level, most_attempts=len(faces))
+    return climbing_outcomes(
+        Climber.DICTIONARY, climbs, system.scheme, system.level, most_attempts=len(faces)
+    )
 
 
 def climb_service(
@@ -328,8 +289,6 @@ def climb_service(
     ----------
     scored, deciding
         One a victim: what answers a probe with its score, and with the decision only.
-    most_attempts
-        Of a climber on one victim.
     """
     prior = attacker_prior(system)
     outcomes: list[AttackOutcome] = []
@@ -347,7 +306,7 @@ def climb_service(
                 else None,
             )
             for outcome in climbing_outcomes(
-                climbs, system.scheme, system.level, most_attempts=most
+                climber, climbs, system.scheme, system.level, most_attempts=most
             )
         ]
     return outcomes

@@ -72,11 +72,6 @@ def guess_with_and_without_holder_keys(
 ) -> list[AttackOutcome]:
     """Guess the victims' descriptors from templates whose holders keep a key.
 
-    Parameters
-    ----------
-    guesses
-        How, by the name of the attack.
-
     Returns
     -------
     list of AttackOutcome
@@ -105,15 +100,8 @@ def guess_with_and_without_holder_keys(
     return judged_by_controls(outcomes, KEPT, STOLEN)
 
 
-def guess_from_few_decoys(
-    system: System, faces: NDArray[np.float32] | None = None
-) -> list[AttackOutcome]:
+def guess_from_few_decoys(system: System) -> list[AttackOutcome]:
     """Make the same attacks on templates of m = 4: a control, which is not judged.
-
-    Parameters
-    ----------
-    faces : (A, n) float32
-        Faces that the attacker has beside the system's.
 
     Returns
     -------
@@ -127,7 +115,7 @@ def guess_from_few_decoys(
     templates = system.lift(system.victims.enrolled, "few decoys", m=CONTROL_DIM)
     guesses: dict[str, Guess] = {
         "foot-point": foot_points,
-        "decoy-likelihood": likeliest_guess(replace(system, scheme=scheme), faces),
+        "decoy-likelihood": likeliest_guess(replace(system, scheme=scheme)),
     }
     return [
         recovery_outcome(

@@ -6,7 +6,7 @@ shows what a set holds of the same person (ISO/IEC 30107-3, IAPMR).
 
 import numpy as np
 
-from enroll.enroller import Enroller, Enrollment
+from enroll.enroller import Enroller
 from models.pack import PackInfo
 from templates.contract.document import Contract
 from templates.decoys import DecoySource
@@ -37,10 +37,6 @@ def verify_presentations(
     ----------
     info
         Of the pack that embedded the photos.
-    level
-        Name of a level; the contract's default where None.
-    seed
-        Decoys and rotations are drawn of it.
 
     Raises
     ------
@@ -82,7 +78,8 @@ def verify_presentations(
         for row in np.setdiff1d(np.flatnonzero(of_subject), chosen):
             tried[row] = True
             if scored.acquired[row]:
-                matched[row] = _accepts(verifier, template, scored, int(row), name)
+                embedding = scored.embeddings[row]
+                matched[row] = verifier.decide_embedding(embedding, template, level=name).accepted
     return VerifiedSet(
         scored=scored,
         matched=matched,
@@ -93,9 +90,3 @@ def verify_presentations(
         enrolled=enrolled,
         left_out=tuple(left_out),
     )
-
-
-def _accepts(
-    verifier: Verifier, template: Enrollment, scored: ScoredSet, row: int, level: str
-) -> bool:
-    return verifier.decide_embedding(scored.embeddings[row], template, level=level).accepted

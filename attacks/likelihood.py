@@ -9,12 +9,10 @@ people are of one set.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from attacks.errors import AuditError
 from attacks.outcomes import CONTROL, GENERATED, AttackOutcome, Knowledge, Leaked, Property
 from attacks.population import Subjects
 from attacks.privacy import DRAWS, SimulatedPeople, decoy_moments, extrapolate, face_counts
@@ -76,45 +74,28 @@ def likeliest_points(templates: SubspaceBatch, form: Array64) -> Array64:
 GENERATOR = "generator"
 
 
-def likeliest_guesses(
-    system: System, faces: NDArray[np.float32] | None = None, *, draws: int = DRAWS
-) -> dict[str, Array64]:
+def likeliest_guesses(system: System) -> dict[str, Array64]:
     """Guess the victims' descriptors from the decoys' statistics, and from faces too.
-
-    Parameters
-    ----------
-    faces : (A, n) float32
-        Faces that the attacker has beside the system's.
-    draws
-        Decoys that the attacker draws. For a pool, of the generator that is fitted to it and given
-        to clients.
 
     Returns
     -------
     dict of ndarray of float64, shape (V, n)
         By what they rest on; unit rows. ``generator``: the point that is least like a decoy,
-        where the scheme takes decoys only. ``1160 faces`` and other numbers: of
-        ``attacks.second_order``, with so many faces; the last one has them all.
-
-    Raises
-    ------
-    AuditError
-        There are no more draws than dimensions.
+        where the scheme takes decoys only; of a pool, like one of the generator that clients have
+        for it. ``1160 faces`` and other numbers: of ``attacks.second_order``, with so many faces;
+        the last one has them all.
     """
-    if draws <= system.templates.n:
-        raise AuditError("a covariance needs more draws than the embedding has dimensions")
     count = decoy_count(system.scheme)
     guesses: dict[str, Array64] = {}
     decoys: Moments | None = None
     if system.source is not None and count:
         with Keystream.seeded("audit", system.seed, "decoys that the attacker draws") as stream:
-            drawn = client_source(system.source).draw(draws, 1, stream=stream)[:, 0, :]
+            drawn = client_source(system.source).draw(DRAWS, 1, stream=stream)[:, 0, :]
         decoys = Moments.of(second_moment(drawn))
         if count == system.scheme.dim:
             guesses[GENERATOR] = likeliest_points(system.templates, precision(drawn))
-    known = known_faces(system, faces)
-    shuffled = np.random.default_rng(system.seed).permutation(known)
-    for number in face_counts(len(known)):
+    shuffled = np.random.default_rng(system.seed).permutation(system.attacker)
+    for number in face_counts(len(system.attacker)):
         some = shuffled[:number]
         prior = np.eye(system.templates.n) / system.templates.n if decoys is None else decoys.moment
         noise = 0.0 if decoys is None or system.source is None else system.source.noise
@@ -125,27 +106,15 @@ def likeliest_guesses(
     return guesses
 
 
-def known_faces(system: System, faces: NDArray[np.float32] | None) -> NDArray[np.float32]:
-    """Return the attacker's faces with those that it has beside the system's."""
-    return system.attacker if faces is None else np.concatenate([system.attacker, faces])
-
-
 def find_least_decoy_like(
-    system: System,
-    faces: NDArray[np.float32] | None = None,
-    *,
-    kind: str = "the audited set",
-    draws: int = DRAWS,
-    guesses: Mapping[str, Array64] | None = None,
+    system: System, guesses: Mapping[str, Array64], *, kind: str
 ) -> list[AttackOutcome]:
-    """Report the guesses of :func:`likeliest_guesses`, which takes the same parameters.
+    """Report the guesses of :func:`likeliest_guesses`.
 
     Parameters
     ----------
     kind
         Where the attacker's faces are from, in words.
-    guesses
-        What that function returned for them, where it was called before.
 
     Returns
     -------
@@ -153,8 +122,6 @@ def find_least_decoy_like(
         Named ``decoy-likelihood``, one for each guess, and a control that is not judged: the guess
         with all faces, scored against fresh photos of other victims.
     """
-    if guesses is None:
-        guesses = likeliest_guesses(system, faces, draws=draws)
 
     def outcome(name: str, people: Subjects | None = None) -> AttackOutcome:
         number = 0 if name == GENERATOR else int(name.split()[0])
@@ -172,19 +139,16 @@ def find_least_decoy_like(
             + (" of another victim (a control)" if control else ""),
             people=people,
             unjudged=CONTROL if control else None,
-            details={"draws": draws, "faces": number, "faces_from": kind},
+            details={"draws": DRAWS, "faces": number, "faces_from": kind},
         )
 
     outcomes = [outcome(name) for name in guesses]
     return [*outcomes, outcome(list(guesses)[-1], system.victims.mismatched())]
 
 
-def likeliest_guess(
-    system: System, faces: NDArray[np.float32] | None = None
-) -> Callable[[SubspaceBatch], Array64]:
+def likeliest_guess(system: System) -> Callable[[SubspaceBatch], Array64]:
     """Return the guess with all faces of :func:`likeliest_guesses`, for templates of any people."""
-    known = replace(system, attacker=known_faces(system, faces))
-    moments, decoys = attacker_moments(known)
+    moments, decoys = attacker_moments(system)
     count = decoy_count(system.scheme)
     return lambda templates: likeliest_descriptors(templates, moments, decoys, count=count)
 
@@ -204,20 +168,15 @@ def attacker_moments(system: System) -> tuple[Moments, Moments | None]:
 
 def simulate_unlimited(
     system: System,
-    faces: NDArray[np.float32] | None = None,
     *,
-    kind: str = "the audited set",
+    kind: str,
     fitted_to: int | None,
-    measured: Sequence[AttackOutcome] = (),
+    measured: Sequence[AttackOutcome],
 ) -> list[AttackOutcome]:
     """Report the attacker who knows the people's second moments exactly, on simulated people.
 
     Parameters
     ----------
-    faces
-        Beside the system's; their second moments are the simulated people's.
-    kind
-        Where the faces are from, in words.
     fitted_to
         Number of faces that the generator was fitted to: as many draws are fitted to anew. None
         where that is not known, or decoys are adapted to a sample: the people are lifted with the
@@ -233,7 +192,7 @@ def simulate_unlimited(
     """
     if system.scheme.decoys != GENERATED or system.source is None:
         return []
-    known = known_faces(system, faces)
+    known = system.attacker
     strategy = plain_strategy(Strategy(system.scheme.strategy))
     decoys = decoy_moments(system.source, seed=system.seed)
     people = SimulatedPeople.draw(

@@ -22,10 +22,8 @@ from templates.contract.canonical import Json
 from templates.distances import Metric, pairwise_distances, similarity
 from templates.keys.randomness import KEY_BYTES, Keystream
 from templates.keys.rotation import Rotation, TenantRotation, holder_rotation
+from templates.space.embedding import normalised
 from templates.space.subspace import SubspaceBatch, Turn
-
-LIFTINGS = 4
-"""Times that every victim is lifted for both tenants, with other decoys and other keys."""
 
 Array64 = NDArray[np.float64]
 Score = Callable[[SubspaceBatch, SubspaceBatch], Array64]
@@ -39,10 +37,7 @@ def nearest_similarities(left: SubspaceBatch, right: SubspaceBatch) -> Array64:
 
 def foot_cosines(left: SubspaceBatch, right: SubspaceBatch) -> Array64:
     """Cosines of the foot points, (T, U)."""
-    first, second = (
-        batch.feet.astype(np.float64) / np.maximum(batch.foot_norms, 1e-300)[:, None]
-        for batch in (left, right)
-    )
+    first, second = (normalised(batch.feet.astype(np.float64)) for batch in (left, right))
     return np.asarray(first @ second.T)
 
 
@@ -170,13 +165,7 @@ def linkage_outcome(
     )
 
 
-def link(
-    system: System,
-    *,
-    liftings: int = LIFTINGS,
-    permutations: int = 500,
-    most_people: int = 400,
-) -> list[AttackOutcome]:
+def link(system: System, *, liftings: int, most_people: int = 400) -> list[AttackOutcome]:
     """Link two templates of each victim, one by one.
 
     One tenant has enrolled each victim from ``system.victims.enrolled``, the other, or the same
@@ -185,9 +174,8 @@ def link(
     Parameters
     ----------
     liftings
-        Independent repetitions, which make the histograms finer.
-    permutations
-        Of the null.
+        Times that every victim is lifted for both tenants, with other decoys and other keys, which
+        makes the histograms finer.
     most_people
         Victims that are used: the time grows with the square.
 
@@ -210,9 +198,7 @@ def link(
     rows = {
         (setting.name, name): linkage_outcome(
             system,
-            unlinkability(
-                np.stack(scores[setting.name, name]), permutations=permutations, seed=system.seed
-            ),
+            unlinkability(np.stack(scores[setting.name, name]), seed=system.seed),
             attack="linkage",
             variant=f"{setting.name}, {name}",
             leaked=setting.leaked,

@@ -51,10 +51,6 @@ def smallest_private(
 
     Parameters
     ----------
-    judge
-        Measures the privacy of a dimension.
-    dims
-        In rising order.
     otherwise
         The dimension to take where none passes; measured as well.
     """

@@ -1,7 +1,7 @@
 """What every attack reports: who was assumed to know what, and how often it succeeded."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
 from typing import Any, TypeAlias
 
@@ -98,7 +98,7 @@ class Scheme:
 
     def to_json(self) -> dict[str, Json]:
         """Return the three fields."""
-        return {"strategy": self.strategy, "decoys": self.decoys, "dim": self.dim}
+        return asdict(self)
 
 
 RAW_SCHEME = Scheme(RAW, None, 0)
@@ -110,8 +110,6 @@ class Estimate:
 
     Parameters
     ----------
-    value, ci_low, ci_high
-        The measure and its bounds.
     trials
         Number of scores that it rests on.
     interval
@@ -126,13 +124,7 @@ class Estimate:
 
     def to_json(self) -> dict[str, Json]:
         """JSON form."""
-        return {
-            "value": self.value,
-            "ci_low": self.ci_low,
-            "ci_high": self.ci_high,
-            "trials": self.trials,
-            "interval": self.interval,
-        }
+        return asdict(self)
 
 
 Measured: TypeAlias = Rate | Estimate
@@ -148,18 +140,10 @@ class AttackOutcome:
         Its name, such as ``foot-point``; one name has one meaning in all reports.
     variant
         What distinguishes it from the other outcomes of this attack on this scheme; may be empty.
-    breaks
-        The property that its success breaks.
-    leaked, knowledge
-        What was stolen, and what the attacker has beside it.
     assumption
         One sentence: what the attacker has and does, and what counts as success.
-    scheme
-        What was attacked.
     level
         The security level that success is judged at, such as ``fmr-1e-3``; None where none is.
-    measured
-        How often it succeeded.
     chance
         How often guessing would have: the level's FMR, or the majority class.
     unjudged
@@ -231,10 +215,6 @@ def unproven(control: AttackOutcome, what: str, *, least: float | None = None) -
 
     Parameters
     ----------
-    control
-        The same attack where it must succeed.
-    what
-        What the control is, as words of the sentence.
     least
         Share that the control must reach; None: it must succeed as
         :attr:`AttackOutcome.succeeds` says.

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attacks.errors import AuditError
-from templates.space.embedding import unit_descriptors
+from templates.space.embedding import normalised, unit_descriptors
 
 ENROLLED_PHOTOS = 3
 """Most photos that are averaged into a victim's template."""
@@ -63,8 +63,6 @@ class Population:
 
     Parameters
     ----------
-    victims
-        Their templates are attacked.
     owners
         Their ``enrolled`` descriptor, of one photo, makes up the pool of real decoys; ``fresh`` is
         the photo that they come to log in with.
@@ -106,8 +104,6 @@ def draw_population(
     ----------
     descriptors : (N, n) floating
         Unit rows.
-    identities
-        N names.
     victims, owners
         How many; of people with two photos or more. Of the people who are left a third belong to
         the attacker and the others calibrate.
@@ -188,7 +184,7 @@ def _people(rows: NDArray[np.float64], photos: Sequence[NDArray[np.int64]], most
     means = np.array([rows[photo_rows].mean(axis=0) for photo_rows in taken])
     means = means.reshape(-1, rows.shape[1])  # of nobody too
     return Subjects(
-        enrolled=(means / np.linalg.norm(means, axis=1, keepdims=True)).astype(np.float32),
+        enrolled=normalised(means).astype(np.float32),
         fresh=rows[np.array([photo_rows[-1] for photo_rows in photos], dtype=np.int64)].astype(
             np.float32
         ),

@@ -118,9 +118,9 @@ def _cover(scores: Array64, chance: float) -> NDArray[np.int64]:
     return np.concatenate([np.asarray(order, dtype=np.int64), rest[np.argsort(-peaks)]])
 
 
-def attacker_prior(system: System, *, most: int = PRIOR_TEMPLATES) -> Prior:
+def attacker_prior(system: System) -> Prior:
     """Learn the prior of the system's attacker, from templates of some of its faces."""
-    count = min(most, len(system.attacker) // 2)
+    count = min(PRIOR_TEMPLATES, len(system.attacker) // 2)
     if count < 2:
         raise AuditError("a prior is learnt on faces of four people or more")
     templates = system.lift(system.attacker[-count:], "rehearsal of a climb")

@@ -1,9 +1,9 @@
 """How many templates the strongest attacker opens who knows second moments: one figure for an m.
 
 ``veilface calibrate`` chooses m by it, and an audit reports the same attack. The attackers differ
-in the faces that they have: 1,000, 5,000, all that there are, and without limit. The last one is
-simulated, because nobody has faces without limit; what is left to it is the error that the decoy
-generator made on the faces that it was fitted to.
+in the faces that they have: 1,000, 5,000, and all that there are. One without limit is simulated,
+because nobody has faces without limit; what is left to it is the error that the decoy generator
+made on the faces that it was fitted to.
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,6 @@ from attacks.second_order import (
     likeliest_descriptors,
     second_moment,
     with_noise_moment,
-    without_noise_moment,
 )
 from templates.contract.canonical import Json
 from templates.contract.document import Rate
@@ -95,8 +94,6 @@ class Privacy:
 
     Parameters
     ----------
-    thefts
-        One for each attacker.
     extrapolated
         As :func:`extrapolate` gives it; None where there are too few attackers.
     """
@@ -208,8 +205,6 @@ class AttackSetup:
     ----------
     enrolled, fresh : (V, n) float32
         What is lifted, and another photo of the same person; unit rows.
-    source
-        The deployment's decoys.
     faces : (A, n) float32
         Of other people: the attacker's.
     owners : (A,) int64
@@ -218,9 +213,6 @@ class AttackSetup:
         Second moments of the source; of a pool, those of the generator that clients receive for it.
     attackers
         By number of faces, second moments as that attacker estimates them.
-    simulated
-        People of the attacker without limit; None where it is not known what the source was
-        fitted to.
     match_cosine
         Cosine to the fresh photo from which on a guess is a match.
     """
@@ -232,7 +224,6 @@ class AttackSetup:
     owners: NDArray[np.int64]
     decoys: Moments
     attackers: tuple[tuple[int, Moments], ...]
-    simulated: SimulatedPeople | None
     match_cosine: float
     seed: int
 
@@ -246,7 +237,6 @@ class AttackSetup:
         *,
         match_cosine: float,
         owners: NDArray[np.int64] | None = None,
-        fitted_to: int | None = None,
         most: int = MOST_LIFTED,
         seed: int = 0,
     ) -> "AttackSetup":
@@ -260,8 +250,6 @@ class AttackSetup:
             Of other people of the same kind.
         owners : (A,) int64
             Whose each is; None: of a person of its own.
-        fitted_to
-            Of :meth:`SimulatedPeople.draw`; no attacker without limit where ``fitted_to`` is None.
 
         Raises
         ------
@@ -281,16 +269,6 @@ class AttackSetup:
             for count in face_counts(len(shuffled))
         )
         chosen = slice(0, most)
-        simulated = None
-        if fitted_to is not None:
-            simulated = SimulatedPeople.draw(
-                shuffled.mean(axis=0, dtype=np.float64),
-                without_noise_moment(attackers[-1][1].moment, source.noise),
-                np.einsum("ij,ij->i", enrolled[chosen], fresh[chosen]),
-                fitted_to=fitted_to,
-                noise=source.noise,
-                seed=seed,
-            )
         return cls(
             np.asarray(enrolled[chosen], dtype=np.float32),
             np.asarray(fresh[chosen], dtype=np.float32),
@@ -299,7 +277,6 @@ class AttackSetup:
             order if owners is None else np.asarray(owners, dtype=np.int64)[order],
             decoys,
             attackers,
-            simulated,
             match_cosine,
             seed,
         )
@@ -312,9 +289,8 @@ class AttackSetup:
         source: DecoySource,
         *,
         match_cosine: float,
-        photos: int = 3,
-        fitted_to: int | None = None,
-        seed: int = 0,
+        photos: int,
+        seed: int,
     ) -> "AttackSetup":
         """Prepare from labelled photos (N, n): half of the people at most are attacked.
 
@@ -338,7 +314,6 @@ class AttackSetup:
             source,
             match_cosine=match_cosine,
             owners=person[others],
-            fitted_to=fitted_to,
             seed=seed,
         )
 
@@ -368,11 +343,9 @@ def privacy_of(setup: AttackSetup, *, strategy: Strategy, m: int) -> Privacy:
         )
         for faces, moments in setup.attackers
     ]
-    thefts = [Theft.of("foot point", 0, feet, fresh, cosine), *finite]
-    if setup.simulated is not None:
-        thefts.append(setup.simulated.theft(plain, m, match_cosine=cosine, seed=setup.seed))
     extrapolated = extrapolate([(theft.faces or 0, theft.found) for theft in finite])
-    return Privacy(strategy, m, tuple(thefts), extrapolated)
+    thefts = (Theft.of("foot point", 0, feet, fresh, cosine), *finite)
+    return Privacy(strategy, m, thefts, extrapolated)
 
 
 def extrapolate(found: Sequence[tuple[int, Rate]], *, to: float = np.inf) -> float | None:

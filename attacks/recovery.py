@@ -104,7 +104,6 @@ def recovery_outcome(
     knowledge: Knowledge,
     assumption: str,
     variant: str = "",
-    breaks: Property = Property.IRREVERSIBILITY,
     unjudged: str | None = None,
     people: Subjects | None = None,
     details: Mapping[str, Json] | None = None,
@@ -114,7 +113,7 @@ def recovery_outcome(
     return AttackOutcome(
         attack=attack,
         variant=variant,
-        breaks=breaks,
+        breaks=Property.IRREVERSIBILITY,
         leaked=leaked,
         knowledge=knowledge,
         assumption=assumption,

@@ -34,21 +34,11 @@ def document(
     ----------
     kind
         ``fairface`` or ``templates``.
-    outcomes
-        Of all attacks.
     rows
         Of attribute inference, one for each scheme, attribute, attacker and seed.
-    limits
-        What the operator accepts, by name.
     comparisons
         Schemes, as text, that are there to compare with: they are judged, and do not decide
         whether the audit passes.
-    model
-        The embedder.
-    settings
-        Sizes, seeds and options.
-    more
-        Further parts.
     """
     verdicts = judge(outcomes, limits=limits)
     audited = [verdict for verdict in verdicts if str(verdict.scheme) not in comparisons]

@@ -160,17 +160,13 @@ def _attributes(rows: Sequence[Row]) -> Iterable[str]:
                     percent(row["balanced_accuracy"]),
                     percent(row["chance"]),
                     f"{fixed(row['mutual_information_bits'], 3)} "
-                    f"({fixed(_null(row['mutual_information_null']), 3)})",
+                    f"({fixed(row['mutual_information_null']['mean'], 3)})",
                     plain(row["leakage"]),
                 ]
                 for row in of_attribute
             ],
             [True, True, True, False, False, False, False, True],
         )
-
-
-def _null(null: Any) -> float | None:
-    return null.get("mean") if isinstance(null, Mapping) else null
 
 
 def _frontier(report: Row) -> Iterable[str]:

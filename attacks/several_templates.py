@@ -27,6 +27,7 @@ from templates.space.embedding import normalised
 from templates.space.subspace import SubspaceBatch
 
 COUNTS = (1, 2, 3, 4, 5)
+"""T: numbers of templates."""
 SAME, TWO_SECRETS = "the same photos", "the same photos under two lift secrets"
 OVERLAPS = {
     "two of three photos the same": ((0, 1, 2), (0, 1, 3)),
@@ -38,11 +39,7 @@ JUDGED_PEOPLE = 20
 
 
 def several_templates(
-    system: System,
-    photos: Sequence[NDArray[np.float32]],
-    guess: Guess,
-    *,
-    counts: Sequence[int] = COUNTS,
+    system: System, photos: Sequence[NDArray[np.float32]], guess: Guess
 ) -> list[AttackOutcome]:
     """Steal several templates of each person, with the holder's key and without it.
 
@@ -52,10 +49,6 @@ def several_templates(
         Of every person (k_i, n) unit rows. The last is the fresh photo; of the others, T are
         lifted, one template each. People with fewer are left out, and T that nobody reaches; T
         that fewer than 20 people reach is reported, and not judged.
-    guess
-        The strongest guess from one template.
-    counts
-        T: numbers of templates.
 
     Returns
     -------
@@ -85,7 +78,7 @@ def several_templates(
             ]
             people = _people(enough, _means(enough, range(max(map(max, chosen)) + 1)))
             outcomes += _guessed(system, batches, guess, name, people, len(batches))
-    reached = [count for count in counts if any(len(album) > count for album in photos)]
+    reached = [count for count in COUNTS if any(len(album) > count for album in photos)]
     for count in reached:
         enough = [album for album in photos if len(album) > count]
         batches = [

@@ -17,6 +17,7 @@ from templates.distances import Metric
 from templates.errors import Uncalibrated
 from templates.keys.randomness import Keystream
 from templates.keys.rotation import ROTATION_VERSION
+from templates.space.embedding import normalised
 from templates.space.lifting import Strategy
 from templates.space.subspace import SubspaceBatch
 from verify import CalibrationOptions, calibrate
@@ -39,8 +40,6 @@ class System:
 
     Parameters
     ----------
-    scheme
-        What protects the templates.
     contract
         Calibrated on people who are neither victims, nor decoys, nor the attacker's.
     lifter
@@ -58,8 +57,6 @@ class System:
         Faces of other people, which the attacker has.
     raw_thresholds
         By level, the cosine at which raw descriptors of the calibration have the level's FMR.
-    seed
-        Of all that is random.
     """
 
     scheme: Scheme
@@ -125,10 +122,6 @@ def raw_thresholds(
     Parameters
     ----------
     descriptors : (N, n) float32
-    names
-        N people.
-    targets
-        FMR by name of the level.
     """
     person = np.unique(np.asarray(names), return_inverse=True)[1]
     upper: list[NDArray[np.float32]] = []
@@ -245,7 +238,7 @@ def _calibrated(
             for one in range(person.max() + 1)
         ]
     )
-    people = np.asarray(means / np.linalg.norm(means, axis=1, keepdims=True), dtype=np.float32)
+    people = normalised(means).astype(np.float32)
     generator = client_source(source)
     with Keystream.seeded("audit", seed, binding.strategy, binding.m, "strangers") as stream:
         strangers = people_like(generator, people)

@@ -17,6 +17,7 @@ MOST_BINS = 100
 SCORES_PER_BIN = 10
 """Mated scores to a bin, on average, as in the authors' own code."""
 LEAST_PERMUTATIONS = 200
+REPLICATES = 500
 _INTERVAL = "bootstrap by person, centred"
 
 Array64 = NDArray[np.float64]
@@ -36,10 +37,6 @@ class Unlinkability:
         Bins of equal width over all scores.
     local : (bins,) float64
         D(s): how much a score in the bin speaks for one person rather than two.
-    genuine, impostor
-        Numbers of scores.
-    permutations
-        Number of them.
     first_rank
         Share of rows whose mate has the highest score of the row: identification at rank 1.
     """
@@ -68,27 +65,26 @@ class Unlinkability:
         }
 
 
-def local_d(genuine: Array64, impostor: Array64, *, omega: float = 1.0) -> Array64:
+def local_d(genuine: Array64, impostor: Array64) -> Array64:
     """D(s) from histograms of genuine and impostor scores on the same bins.
 
     Parameters
     ----------
     genuine, impostor : (..., B) float64
         Counts or weights; each normalised here.
-    omega
-        Prior odds of genuine against impostor.
 
     Returns
     -------
     ndarray of float64, shape (..., B)
-        2 ωLR / (1 + ωLR) − 1 where ωLR > 1 and 0 elsewhere; 1 where only genuine scores fall.
+        2 LR / (1 + LR) − 1 where LR > 1 and 0 elsewhere, for even prior odds; 1 where only
+        genuine scores fall.
 
     References
     ----------
     Gomez-Barrero, Galbally, Rathgeb, Busch, "General framework to evaluate unlinkability in
     biometric template protection systems", IEEE TIFS 2018, eq. 6 and 7.
     """
-    genuine_share = omega * genuine / np.maximum(genuine.sum(axis=-1, keepdims=True), 1e-300)
+    genuine_share = genuine / np.maximum(genuine.sum(axis=-1, keepdims=True), 1e-300)
     impostor_share = impostor / np.maximum(impostor.sum(axis=-1, keepdims=True), 1e-300)
     # 2 LR / (1 + LR) − 1 = (a − b) / (a + b) for LR = a / b, which needs no division by b = 0.
     total = genuine_share + impostor_share
@@ -98,19 +94,14 @@ def local_d(genuine: Array64, impostor: Array64, *, omega: float = 1.0) -> Array
     return np.asarray(np.maximum(difference, 0.0))
 
 
-def global_d(genuine: Array64, impostor: Array64, *, omega: float = 1.0) -> Array64:
+def global_d(genuine: Array64, impostor: Array64) -> Array64:
     """D_sys = Σ p(s | genuine) D(s) Δs from histograms (..., B); shape (...)."""
     shares = genuine / np.maximum(genuine.sum(axis=-1, keepdims=True), 1e-300)
-    return np.asarray((shares * local_d(genuine, impostor, omega=omega)).sum(axis=-1))
+    return np.asarray((shares * local_d(genuine, impostor)).sum(axis=-1))
 
 
 def unlinkability(
-    scores: NDArray[np.floating],
-    *,
-    bins: int | None = None,
-    permutations: int = 500,
-    replicates: int = 500,
-    seed: int,
+    scores: NDArray[np.floating], *, permutations: int = 500, seed: int
 ) -> Unlinkability:
     """Measure what a linkage score tells.
 
@@ -119,8 +110,6 @@ def unlinkability(
     scores : (L, V, V) floating
         Of template i in one database with template j in another, in each of L independent
         liftings of the same V people; i = j is genuine.
-    bins
-        Number of bins; by default one for ten genuine scores, 100 at most.
     permutations
         Random assignments of mates, the same in all liftings: rows and columns keep what they
         have in common, which a shuffle of single scores would destroy.
@@ -137,7 +126,7 @@ def unlinkability(
         raise AuditError(f"a null needs {LEAST_PERMUTATIONS} permutations, not {permutations}")
     liftings, people = values.shape[:2]
     rng = np.random.default_rng(seed)
-    count = bins or int(np.clip(liftings * people // SCORES_PER_BIN, 2, MOST_BINS))
+    count = int(np.clip(liftings * people // SCORES_PER_BIN, 2, MOST_BINS))
     edges = np.linspace(values.min(), np.nextafter(values.max(), np.inf), count + 1)
     bin_of = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, count - 1)
     every = np.bincount(bin_of.ravel(), minlength=count).astype(np.float64)
@@ -151,7 +140,7 @@ def unlinkability(
     shuffles = [histograms(rng.permutation(people)) for _ in range(permutations)]
     null = global_d(np.stack([m for m, _ in shuffles]), np.stack([n for _, n in shuffles]))
     value = float(global_d(genuine, impostor))
-    spread = _bootstrap(bin_of, count, replicates, rng)
+    spread = _bootstrap(bin_of, count, rng)
     low, high = np.quantile(spread - spread.mean(), (0.025, 0.975))
     best = values.argmax(axis=2)
     return Unlinkability(
@@ -173,10 +162,8 @@ def unlinkability(
     )
 
 
-def _bootstrap(
-    bin_of: NDArray[np.int64], count: int, replicates: int, rng: np.random.Generator
-) -> Array64:
-    """D_sys of resampled people, (replicates,).
+def _bootstrap(bin_of: NDArray[np.int64], count: int, rng: np.random.Generator) -> Array64:
+    """D_sys of resampled people, (REPLICATES,).
 
     Few scores raise D_sys, and a resample holds fewer different ones, so the replicates lie above
     the value; their spread about their own mean is what is used.
@@ -187,8 +174,8 @@ def _bootstrap(
     # by_row[i, b]: scores of row i in bin b, all liftings, with the mates and apart from them.
     mates = np.bincount(cells[:, own, own].ravel(), minlength=people * count)
     mates = mates.reshape(people, count).astype(np.float64)
-    out = np.empty(replicates)
-    for index in range(replicates):
+    out = np.empty(REPLICATES)
+    for index in range(REPLICATES):
         drawn = rng.integers(people, size=people)
         weights = np.bincount(drawn, minlength=people).astype(np.float64)
         pairs = weights[:, None] * weights

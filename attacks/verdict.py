@@ -135,12 +135,6 @@ class Cell:
 
     Parameters
     ----------
-    outcome
-        The attack.
-    limit
-        Name of the limit.
-    most
-        Its value.
     excess, low, high
         What is compared with the limit, and its interval.
     """

@@ -15,10 +15,11 @@ Example
 import argparse
 from pathlib import Path
 
-from attacks.likelihood import find_least_decoy_like
+from attacks.likelihood import find_least_decoy_like, likeliest_guesses
 from attacks.outcomes import GENERATED, POOLED, AttackOutcome, Scheme
 from attacks.population import Population, draw_population, without_decoy_people
-from attacks.stored import foot_point_attack, nearest_neighbour_attack
+from attacks.stored.foot_point import foot_point_attack
+from attacks.stored.nearest_neighbour import nearest_neighbour_attack
 from attacks.system import enroll_victims, owners_pool
 from models.cache import EmbeddingCache
 from models.extraction import Extractor
@@ -58,7 +59,7 @@ def rows_of(
             )
             level = system.level
             outcomes = [*foot_point_attack(system), *nearest_neighbour_attack(system)]
-            outcomes += find_least_decoy_like(system)
+            outcomes += find_least_decoy_like(system, likeliest_guesses(system), kind="LFW")
             judged = [outcome for outcome in outcomes if outcome.judged]
             best = max(judged, key=lambda outcome: outcome.measured.value)
             foot = next(outcome for outcome in judged if outcome.attack == "foot-point")

@@ -22,12 +22,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attacks.more_faces import unlimited
-from attacks.privacy import AttackSetup, Theft, privacy_of
+from attacks.privacy import AttackSetup, SimulatedPeople, Theft, privacy_of
+from attacks.second_order import without_noise_moment
 from models.extraction import Extractor
 from models.pack import ModelPack
 from templates.decoys import NOISE_ENERGY, DecoyGenerator
 from templates.space.embedding import normalised
-from templates.space.lifting import Strategy
+from templates.space.lifting import Strategy, plain_strategy
 from verify import labelled_folder
 from verify.evaluation.embeddings_file import read_embeddings
 
@@ -153,13 +154,23 @@ def main() -> None:
             attacker,
             DecoyGenerator.fit(fitted),
             match_cosine=MATCH_COSINE,
-            fitted_to=len(fitted),
             most=args.victims,
+            seed=args.seed,
+        )
+        without_limit = SimulatedPeople.draw(
+            setup.faces.mean(axis=0, dtype=np.float64),
+            without_noise_moment(setup.attackers[-1][1].moment, setup.source.noise),
+            np.einsum("ij,ij->i", setup.enrolled, setup.fresh),
+            fitted_to=len(fitted),
+            noise=setup.source.noise,
             seed=args.seed,
         )
         for strategy, m in GRID:
             privacy = privacy_of(setup, strategy=strategy, m=m)
-            cells = " | ".join(shown(theft) for theft in privacy.thefts)
+            simulated = without_limit.theft(
+                plain_strategy(strategy), m, match_cosine=MATCH_COSINE, seed=args.seed
+            )
+            cells = " | ".join(shown(theft) for theft in (*privacy.thefts, simulated))
             extrapolated = 100 * (privacy.extrapolated or 0.0)
             print(
                 f"| {strategy} | {kind}, {len(fitted):,} | {m} | {cells} | {extrapolated:.0f} |",

@@ -22,16 +22,12 @@ TEMPLATE_NAME = "arcface-112"
 
 
 def template(size: int) -> NDArray[np.float64]:
-    """Five points of the template, in pixels of a ``size`` x ``size`` crop.
+    """Five points of the template, (5, 2) float64, in pixels of a ``size`` x ``size`` crop.
 
     Parameters
     ----------
     size
         A multiple of 112, or of 128 (then x moves by ``8 * ratio``).
-
-    Returns
-    -------
-    ndarray of float64, shape (5, 2)
 
     Raises
     ------

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -84,7 +85,7 @@ def non_maximum_suppression(
     boxes
         Shape (k, 4), x1 y1 x2 y2.
     scores
-        Shape (k,).
+        Shape (k,), above 0.
     threshold
         Boxes with an intersection over union above it are dropped.
 
@@ -93,19 +94,11 @@ def non_maximum_suppression(
     ndarray of intp
         Indices that are kept, best score first; at most `MAX_CANDIDATES` are considered.
     """
-    order = np.argsort(-scores, kind="stable")[:MAX_CANDIDATES]
-    x1, y1, x2, y2 = boxes[order].astype(np.float64).T
-    areas = np.maximum(x2 - x1, 0) * np.maximum(y2 - y1, 0)
-    alive = np.ones(len(order), dtype=bool)
-    kept = []
-    for i in range(len(order)):
-        if not alive[i]:
-            continue
-        kept.append(i)
-        rest = slice(i + 1, None)
-        overlap_x = np.minimum(x2[i], x2[rest]) - np.maximum(x1[i], x1[rest])
-        overlap_y = np.minimum(y2[i], y2[rest]) - np.maximum(y1[i], y1[rest])
-        intersection = np.maximum(overlap_x, 0) * np.maximum(overlap_y, 0)
-        union = areas[i] + areas[rest] - intersection
-        alive[rest] &= intersection <= threshold * union
-    return order[np.asarray(kept, dtype=np.intp)]
+    if not len(boxes):
+        return np.empty(0, dtype=np.intp)
+    corners = boxes.astype(np.float64)
+    with_sides = np.concatenate([corners[:, :2], corners[:, 2:] - corners[:, :2]], axis=1)
+    kept = cv2.dnn.NMSBoxes(
+        with_sides.tolist(), scores.tolist(), 0.0, threshold, top_k=MAX_CANDIDATES
+    )
+    return np.asarray(kept, dtype=np.intp)

@@ -50,7 +50,7 @@ _IR_VERSION = 8
 
 
 def build_demo_pack(folder: Path) -> Path:
-    """Write the demo model into ``folder`` as a pack without a detector.
+    """Write the demo model into ``folder``, which is returned, as a pack without a detector.
 
     The pack takes aligned 112 x 112 faces (:func:`models.synthetic.draw_face` draws them) with
     the usual ArcFace preprocessing.
@@ -59,11 +59,6 @@ def build_demo_pack(folder: Path) -> Path:
     ----------
     folder : Path
         Made when it is missing. ``demo.onnx`` in it is replaced.
-
-    Returns
-    -------
-    Path
-        ``folder``, to be given to ``ModelPack.load``.
 
     Raises
     ------

@@ -1,13 +1,15 @@
 """What every face detector does alike: the canvas, and which canvas speaks for which face."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from models.boxes import Face, intersection_over_union, non_maximum_suppression
+from models.errors import ModelError
+from models.sessions import Session
 
 DEFAULT_SIZE = 640
 # A canvas for faces that fill the picture, which the default one makes too large.
@@ -31,21 +33,48 @@ _LEAST_SPREAD = 1.0
 Size = tuple[int, int]  # height, width
 
 
-class Detector(Protocol):
-    """A face detector with five points per face."""
+class Detector(ABC):
+    """A face detector with five points per face.
+
+    Parameters
+    ----------
+    size
+        Side of the canvas, a multiple of 32.
+    fixed
+        Height and width where the graph accepts no other.
+    """
 
     kind: str
-    sizes: tuple[Size, ...]
     score_threshold: float
     recommended_score: float
+    """For photos of a person who wants to be seen."""
 
-    def canvas(self, image: NDArray[np.uint8], size: Size) -> Size:
+    def __init__(
+        self,
+        session: Session,
+        *,
+        input_name: str,
+        size: int = DEFAULT_SIZE,
+        fixed: Size | None = None,
+    ) -> None:
+        self._session = session
+        self._input_name = input_name
+        self._fixed = fixed is not None
+        self.sizes = canvas_sizes(size, fixed)
+
+    def canvas(self, image: NDArray[np.uint8], size: Size) -> Size:  # noqa: ARG002 - of some kinds
         """The canvas that a pass of ``size`` really takes for ``image``."""
-        ...
+        return size
 
+    @abstractmethod
     def detect_once(self, image: NDArray[np.uint8], size: Size) -> list[Face]:
         """Faces found in one pass on a canvas of ``size``, in pixels of ``image``."""
-        ...
+
+    def _misfit(self, stride: int, size: Size) -> ModelError:
+        return ModelError(
+            f"{self._session.name}: the outputs at stride {stride} do not fit a"
+            f" {size[1]} x {size[0]} canvas."
+        )
 
 
 def canvas_sizes(size: int, fixed: Size | None) -> tuple[Size, ...]:
@@ -181,8 +210,6 @@ def letterbox(
     ----------
     size
         Height and width of the canvas.
-    enlarge
-        Whether a picture smaller than the canvas is enlarged to fill it.
 
     Returns
     -------

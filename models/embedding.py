@@ -52,10 +52,6 @@ class Embedder:
     ----------
     session
         A graph with one image input and one output (batch, n).
-    input_name
-        Name of the image input.
-    preprocessing
-        Size, channel order, mean and scale.
     batch
         The batch size where the graph accepts no other; ``None`` where any will do.
     """
@@ -80,8 +76,6 @@ class Embedder:
         ----------
         crops
             RGB uint8, shape (B, s, s, 3) with the size of the preprocessing.
-        flip
-            Whether the raw embedding of the mirrored crop is added before normalising.
 
         Returns
         -------

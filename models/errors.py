@@ -110,8 +110,6 @@ class PhotoRejected(ModelError):
         Position of the photo in the set, from 0. Words count from 1.
     cause
         What was wrong with it; it has its own code and message.
-    count
-        Photos in the set.
     """
 
     def __init__(self, index: int, cause: ModelError, *, count: int) -> None:

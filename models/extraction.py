@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 
 from models.alignment import align
 from models.cache import EmbeddingCache
-from models.decoding import DEFAULT_LIMITS, ImageLimits, decode_image
+from models.decoding import DEFAULT_LIMITS, decode_image
 from models.errors import FaceError, ImageError
 from models.pack import FacePolicy, ModelPack
-from models.quality import QualityLimits
 from models.sessions import default_workers
 
 if TYPE_CHECKING:
@@ -49,8 +48,6 @@ class MarkedPhoto:
 
     Parameters
     ----------
-    photo
-        The file, or the encoded photo.
     keypoints : (5, 2) float64
         Left eye, right eye, nose, left and right mouth corner, in pixels, as seen in the picture.
     """
@@ -85,8 +82,6 @@ class Extraction:
         The k files that were embedded, in the order in which they were given.
     failures
         All others, in the order in which they were given.
-    cached
-        How many of ``paths`` came from the cache.
     mirrored
         The embeddings with the mirror image added, where they were asked for.
     """
@@ -102,11 +97,6 @@ class Extraction:
         """Number of files that were tried."""
         return len(self.paths) + len(self.failures)
 
-    @property
-    def failure_to_acquire(self) -> float:
-        """FTA of ISO/IEC 19795-1: failed files over all files; 0 where there were none."""
-        return len(self.failures) / self.attempts if self.attempts else 0.0
-
     def failure_counts(self) -> dict[str, int]:
         """Failures by code, most frequent first."""
         return dict(Counter(failure.code for failure in self.failures).most_common())
@@ -115,22 +105,13 @@ class Extraction:
 class Extractor:
     """Embeds files with one pack.
 
+    Of several faces the largest and most central is taken, since labelled sets state whom a photo
+    shows, and bystanders are common. Every face that is found will do, as in public protocols.
+
     Parameters
     ----------
-    pack
-        The models.
     cache
         Where known embeddings are kept; ``None`` computes all anew.
-    policy
-        ``LARGEST`` by default: labelled sets state whom a photo shows, and bystanders are common.
-    quality
-        Limits; ``None`` (default) takes every face that is found, as public protocols do.
-    aligned
-        Take the files as aligned crops: no detection.
-    workers
-        Threads that decode, detect and align; ``None`` for one per core.
-    limits
-        Of the decoder.
     mirrored
         Embed every face with the mirror image added too, beside the embedding without it; the
         pack must be one without.
@@ -146,23 +127,15 @@ class Extractor:
         pack: ModelPack,
         *,
         cache: EmbeddingCache | None = None,
-        policy: FacePolicy = FacePolicy.LARGEST,
-        quality: QualityLimits | None = None,
         aligned: bool = False,
-        workers: int | None = None,
-        limits: ImageLimits = DEFAULT_LIMITS,
         mirrored: bool = False,
     ) -> None:
         if mirrored and pack.info.preprocessing["flip"]:
             raise ValueError("the pack adds the mirror image already")
         self._pack = pack
         self._cache = cache
-        self._policy = policy
-        self._quality = quality
         self._aligned = aligned or pack.info.detector is None
         self._trusts_marks = not aligned and pack.info.detector is None
-        self._workers = workers or default_workers()
-        self._limits = limits
         # One kind of embedding, or the two kinds that are made together.
         self._kinds = tuple(
             self._settings_digest({**pack.info.preprocessing, "flip": flip})
@@ -202,7 +175,7 @@ class Extractor:
         bar = _Bar(len(files), progress)
         keep_after = time.monotonic() + _KEPT_SECONDS
         try:
-            with bar, ThreadPoolExecutor(self._workers) as pool:
+            with bar, ThreadPoolExecutor(default_workers()) as pool:
                 for start in range(0, len(files), CHUNK):
                     chunk = files[start : start + CHUNK]
                     prepared = list(pool.map(self._prepare, chunk))
@@ -245,13 +218,13 @@ class Extractor:
         info = self._pack.info
         detector = None
         if not self._aligned and info.detector is not None:
-            detector = [info.detector.sha256, list(info.detector.input_size), self._policy.value]
+            detector = [info.detector.sha256, list(info.detector.input_size), FacePolicy.LARGEST]
         settings = {
             "embedder": info.embedder_sha256,
             "preprocessing": preprocessing,
             "detector": detector,
-            # A cached embedding must not outlive a stricter gate.
-            "quality": None if self._quality is None else repr(self._quality),
+            # Of the gate, which is open: caches of before have it.
+            "quality": None,
         }
         return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).digest()
 
@@ -259,7 +232,7 @@ class Extractor:
         """Read, look up, decode, find the face; whatever is wrong with the file is an answer."""
         path = named(source)
         try:
-            data = _read(source, self._limits.max_bytes)
+            data = _read(source)
             content = hashlib.sha256(data).digest()
             marks = None
             if isinstance(source, MarkedPhoto) and self._trusts_marks:
@@ -271,14 +244,12 @@ class Extractor:
             if len(embeddings) == len(key):
                 return _Prepared(key, embedding=embeddings)
             if marks is not None:
-                image = decode_image(data, limits=self._limits)
+                image = decode_image(data)
                 crop = align(image, marks, size=self._pack.crop_size)
             elif self._aligned:
-                crop = self._pack.as_aligned(decode_image(data, limits=self._limits))
+                crop = self._pack.as_aligned(decode_image(data))
             else:
-                crop = self._pack.crop_photo(
-                    data, policy=self._policy, quality=self._quality, limits=self._limits
-                ).crop
+                crop = self._pack.crop_photo(data, policy=FacePolicy.LARGEST, quality=None).crop
             return _Prepared(key, crop=crop)
         except (ImageError, FaceError) as error:
             return _Prepared((), failure=Failure(path, error.code, str(error)))
@@ -319,14 +290,14 @@ def named(source: Source) -> Path:
     return Path(photo.name if isinstance(photo, EncodedImage) else photo)
 
 
-def _read(source: Path | EncodedImage | MarkedPhoto, max_bytes: int) -> bytes:
+def _read(source: Path | EncodedImage | MarkedPhoto) -> bytes:
     if isinstance(source, MarkedPhoto):
-        return _read(source.photo, max_bytes)
+        return _read(source.photo)
     if isinstance(source, EncodedImage):
         return source.data
     with source.open("rb") as file:
         # One byte more than allowed, so that the decoder sees that it is too much.
-        return file.read(max_bytes + 1)
+        return file.read(DEFAULT_LIMITS.max_bytes + 1)
 
 
 class _Bar:

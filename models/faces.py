@@ -18,8 +18,6 @@ class FaceCrop:
     ----------
     crop
         Aligned, RGB uint8, shape (s, s, 3). Never shown by ``repr``.
-    quality
-        What was measured.
     face
         As it was detected; ``None`` for crops that came aligned.
     liveness
@@ -48,8 +46,6 @@ class FaceSample:
     ----------
     embedding
         float32, shape (n,), unit norm. Never shown by ``repr``.
-    quality
-        What was measured.
     box
         x1, y1, x2, y2 in pixels of the upright photo; ``None`` for crops that came aligned.
     liveness

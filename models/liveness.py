@@ -66,10 +66,6 @@ class LivenessGraph:
     ----------
     session
         A graph with one image input and one output (batch, classes).
-    input_name
-        Name of the image input.
-    sha256
-        Of its file.
     expects
         Crop, input and reading of the output.
     normalised
@@ -156,11 +152,6 @@ class LivenessGraph:
 class PassiveLiveness:
     """The liveness graphs of a pack. Safe from several threads at once.
 
-    Parameters
-    ----------
-    graphs
-        One or more, which score in the same unit.
-
     Raises
     ------
     ModelError
@@ -206,7 +197,7 @@ class PassiveLiveness:
 
 
 def crop_face(picture: NDArray[np.uint8], box: Box, expects: LivenessInput) -> NDArray[np.uint8]:
-    """Cut a face with its surroundings out of a frame, as the graph was trained.
+    """Cut a face with its surroundings out of a frame, (size, size, 3), as the graph was trained.
 
     Parameters
     ----------
@@ -214,10 +205,6 @@ def crop_face(picture: NDArray[np.uint8], box: Box, expects: LivenessInput) -> N
         RGB uint8, shape (h, w, 3).
     box
         x1, y1, x2, y2 in pixels.
-
-    Returns
-    -------
-    ndarray of uint8, shape (size, size, 3)
 
     Raises
     ------

@@ -30,11 +30,6 @@ def open_liveness(
 ) -> PassiveLiveness | None:
     """Load the liveness graphs of a pack; None where there is none.
 
-    Parameters
-    ----------
-    detects
-        Whether the pack has a detector.
-
     Raises
     ------
     PackError

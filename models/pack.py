@@ -55,8 +55,6 @@ class PackInfo:
     ----------
     name
         Of the folder, or of the file without its suffix.
-    n
-        Embedding dimension.
     embedder_file, embedder_sha256
         Name and SHA-256 (hex) of the embedder's file.
     preprocessing
@@ -214,23 +212,20 @@ class ModelPack:
         """Crop of a face on the five-point template, uint8, shape (s, s, 3)."""
         return align(image, face.keypoints, size=self.crop_size)
 
-    def embed(self, aligned: NDArray[np.uint8], *, flip: bool | None = None) -> NDArray[np.float32]:
+    def embed(self, aligned: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Embed aligned crops.
 
         Parameters
         ----------
         aligned
             RGB uint8, shape (B, s, s, 3).
-        flip
-            Overrides the pack's own setting, for experiments.
 
         Returns
         -------
         ndarray of float32, shape (B, n)
             Unit rows.
         """
-        chosen = self._embedder.preprocessing.flip if flip is None else flip
-        return self._embedder.embed(aligned, flip=chosen)
+        return self._embedder.embed(aligned, flip=self._embedder.preprocessing.flip)
 
     def embed_both(
         self, aligned: NDArray[np.uint8]
@@ -309,8 +304,6 @@ class ModelPack:
             first in rank, the largest and most central one.
         quality
             Limits; ``None`` checks nothing but that there is a face.
-        limits
-            Of the decoder.
         liveness
             Also say how live the face looks; the pack needs a liveness graph.
 

@@ -4,73 +4,36 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.boxes import Face
-from models.detection import (
-    DEFAULT_SIZE,
-    Size,
-    canvas_sizes,
-    cell_centres,
-    faces_from_candidates,
-    letterbox,
-)
+from models.detection import Detector, Size, cell_centres, faces_from_candidates, letterbox
 from models.errors import ModelError
-from models.sessions import Session
 
 STRIDES = (8, 16, 32)
-SCORE_THRESHOLD = 0.5
-RECOMMENDED_SCORE = 0.6  # for photos of a person who wants to be seen
 OVERLAP = 0.4
 
 
-class Scrfd:
-    """SCRFD with keypoints.
+class Scrfd(Detector):
+    """SCRFD with keypoints: pictures are enlarged to fill the canvas, so each size is another one.
 
-    Parameters
-    ----------
-    session
-        A graph with one image input and nine outputs: scores, boxes and points at strides 8, 16
-        and 32, boxes and points as distances from the cell in units of the stride.
-    input_name
-        Name of the image input.
-    size
-        Side of the canvas, a multiple of 32.
-    fixed
-        Height and width where the graph accepts no other.
+    The graph has nine outputs: scores, boxes and points at strides 8, 16 and 32, boxes and points
+    as distances from the cell in units of the stride.
     """
 
     kind = "scrfd"
-    score_threshold = SCORE_THRESHOLD
-    recommended_score = RECOMMENDED_SCORE
-
-    def __init__(
-        self,
-        session: Session,
-        *,
-        input_name: str,
-        size: int = DEFAULT_SIZE,
-        fixed: Size | None = None,
-    ) -> None:
-        self._session = session
-        self._input_name = input_name
-        self.sizes = canvas_sizes(size, fixed)
-
-    def canvas(self, image: NDArray[np.uint8], size: Size) -> Size:  # noqa: ARG002 - Detector
-        """Canvas of a pass: pictures are enlarged to fill it, so each size is another one."""
-        return size
+    score_threshold = 0.5
+    recommended_score = 0.6
 
     def detect_once(self, image: NDArray[np.uint8], size: Size) -> list[Face]:
         """Faces found in one pass on a canvas of ``size``, in pixels of ``image``."""
         canvas, scale = letterbox(image, size, enlarge=True)
         blob = (canvas.astype(np.float32) - np.float32(127.5)) * np.float32(1 / 128)
-        outputs = self._session.run({self._input_name: _nchw(blob)})
+        blob = np.ascontiguousarray(blob.transpose(2, 0, 1)[None])
+        outputs = self._session.run({self._input_name: blob})
         boxes, scores, keypoints = [], [], []
         for stride, (score, distance, point) in zip(STRIDES, _by_stride(outputs), strict=True):
             rows, columns = size[0] // stride, size[1] // stride
             per_cell, rest = divmod(len(score), rows * columns)
             if rest or per_cell == 0 or len(distance) != len(score) or len(point) != len(score):
-                raise ModelError(
-                    f"{self._session.name}: the outputs at stride {stride} do not fit a"
-                    f" {size[1]} x {size[0]} canvas."
-                )
+                raise self._misfit(stride, size)
             cells = np.flatnonzero(score >= self.score_threshold)
             centres = cell_centres(rows, columns, stride=stride, per_cell=per_cell)[cells]
             reach = distance[cells] * stride
@@ -78,10 +41,6 @@ class Scrfd:
             scores.append(score[cells])
             keypoints.append(centres[:, None, :] + point[cells].reshape(-1, 5, 2) * stride)
         return faces_from_candidates(boxes, scores, keypoints, overlap=OVERLAP, scale=scale)
-
-
-def _nchw(blob: NDArray[np.float32]) -> NDArray[np.float32]:
-    return np.ascontiguousarray(blob.transpose(2, 0, 1)[None])
 
 
 def _by_stride(

@@ -146,8 +146,6 @@ class Session:
 
         Parameters
         ----------
-        feeds
-            Input name to array.
         outputs
             Names of the wanted outputs, in order; all where absent.
 

@@ -4,57 +4,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.boxes import Face
-from models.detection import (
-    DEFAULT_SIZE,
-    Size,
-    canvas_sizes,
-    cell_centres,
-    faces_from_candidates,
-    letterbox,
-)
-from models.errors import ModelError
-from models.sessions import Session
+from models.detection import Detector, Size, cell_centres, faces_from_candidates, letterbox
 
 STRIDES = (8, 16, 32)
-SCORE_THRESHOLD = 0.6
-RECOMMENDED_SCORE = 0.7  # for photos of a person who wants to be seen
 OVERLAP = 0.3
 OUTPUTS = tuple(f"{role}_{stride}" for role in ("cls", "obj", "bbox", "kps") for stride in STRIDES)
 # exp of a wild regression must not overflow; 2**10 strides exceed any canvas.
 _MAX_LOG_SIDE = 7.0
 
 
-class YuNet:
-    """YuNet with five points.
-
-    Parameters
-    ----------
-    session
-        A graph with one image input and the outputs ``cls_8`` ... ``kps_32``.
-    input_name
-        Name of the image input.
-    size
-        Side of the canvas, a multiple of 32.
-    fixed
-        Height and width where the graph accepts no other.
-    """
+class YuNet(Detector):
+    """YuNet with five points; the graph has the outputs ``cls_8`` ... ``kps_32``."""
 
     kind = "yunet"
-    score_threshold = SCORE_THRESHOLD
-    recommended_score = RECOMMENDED_SCORE
-
-    def __init__(
-        self,
-        session: Session,
-        *,
-        input_name: str,
-        size: int = DEFAULT_SIZE,
-        fixed: Size | None = None,
-    ) -> None:
-        self._session = session
-        self._input_name = input_name
-        self._fixed = fixed is not None
-        self.sizes = canvas_sizes(size, fixed)
+    score_threshold = 0.6
+    recommended_score = 0.7
 
     def canvas(self, image: NDArray[np.uint8], size: Size) -> Size:
         """Canvas of a pass: no larger than the picture needs, unless the graph fixes it."""
@@ -73,10 +37,7 @@ class YuNet:
             rows, columns = size[0] // stride, size[1] // stride
             cls = named[f"cls_{stride}"].reshape(-1)
             if len(cls) != rows * columns:
-                raise ModelError(
-                    f"{self._session.name}: the outputs at stride {stride} do not fit a"
-                    f" {size[1]} x {size[0]} canvas."
-                )
+                raise self._misfit(stride, size)
             obj = named[f"obj_{stride}"].reshape(-1)
             score = np.sqrt(np.clip(cls, 0, 1) * np.clip(obj, 0, 1))
             cells = np.flatnonzero(score >= self.score_threshold)

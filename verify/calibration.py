@@ -43,8 +43,6 @@ class CalibrationReport:
 
     Parameters
     ----------
-    consistency
-        How ``photo_consistency`` was set.
     unresolved
         Sentences about the FMR targets that the data cannot resolve.
     left_out
@@ -52,8 +50,6 @@ class CalibrationReport:
     suspicious
         People who may be one person under two names: look at them before believing a threshold
         at FMR 1e-4 or below, then name them in ``aliases`` (docs/design-measurements.md §1.3).
-    suspicious_above
-        Raw cosine that makes a pair suspicious.
     ten_folds
         Results of the ten-fold protocol, one per calibration in the contract's order; empty
         under protocol ``fmr``.
@@ -122,12 +118,6 @@ def calibrate(
     ----------
     descriptors : (N, n) floating
         Unit rows.
-    identities
-        N names.
-    binding, source
-        What the contract binds to, and the decoy source it names.
-    exclude
-        People to leave out, such as those of a test.
     aliases
         Second names of one person, mapped to the first.
     attributes
@@ -143,15 +133,8 @@ def calibrate(
         A contract's strangers, to keep them with their cohort; by default new ones are drawn.
     recorded
         Facts for the contract file, such as the pack's name and detector.
-    dataset
-        What the descriptors came from, for the contract file.
     progress
         Called with what is being done and the share of the whole, which rises from 0 to 1.
-
-    Returns
-    -------
-    Calibrated
-        Contract and report.
 
     Raises
     ------

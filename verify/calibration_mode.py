@@ -55,8 +55,6 @@ class CalibrationOptions:
     ----------
     protocol
         ``fmr`` sets levels by target FMR; ``ten-fold`` adds the level ``accuracy``.
-    metric, steps
-        The distance that will decide.
     probe_dims
         Dimensions of the probes: 0 for raw ones, others for lifted ones.
     probe_photos
@@ -66,8 +64,6 @@ class CalibrationOptions:
         See ``probe_photos``.
     targets
         FMR targets, powers of ten; those that the data cannot resolve are left out and reported.
-    photos_per_enrollment
-        Most photos averaged into one template.
     suspicious_above
         Raw cosine from which two people are reported as suspiciously alike. On LFW with ArcFace
         descriptors the cosine of different people passes 0.37 once in 100,000 pairs, and half of
@@ -122,8 +118,6 @@ class ModeResult:
 
     Parameters
     ----------
-    calibration
-        With all levels that the trials resolve.
     unresolved
         Sentences about the targets that they do not.
     left_out

@@ -70,13 +70,6 @@ def movements_failure(
     depends on a person's proportions or on how the camera is held. Of two movements in one frame
     the larger counts, by its own measure. Coming closer counts once: whoever stays near makes the
     later movements there, and those frames count by their turn. Frames between movements are free.
-
-    Parameters
-    ----------
-    poses
-        Of the frames, in their order.
-    movements
-        What was asked.
     """
     if abs(poses[0].yaw) > FRONT_YAW or abs(poses[0].pitch) > FRONT_PITCH:
         return LivenessFailure.NOT_FRONTAL

@@ -43,8 +43,6 @@ class Lifter:
 
     Parameters
     ----------
-    strategy, source
-        How to lift, and with whose decoys.
     contract_id
         Written into the wire bytes.
     """
@@ -100,8 +98,6 @@ def point_trials(
 
     Parameters
     ----------
-    templates
-        One for each of ``plan.compared``.
     sets
         The photos of every probe; those of more than one are averaged.
     consistency

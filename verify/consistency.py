@@ -43,10 +43,6 @@ class Consistency:
         photos, their raw cosine.
     probe_threshold
         Least agreement of the photos of one probe.
-    fmr
-        Pairs of photos of different people that reach it.
-    refused
-        Genuine sets of photos that it refuses.
     """
 
     threshold: float
@@ -94,7 +90,7 @@ def photo_consistency(
     two names, which dominate what is seen there, do not move it.
     """
     impostor = impostor_cosines(descriptors, person_of, rng=rng)
-    tail = impostor_tail(impostor, lax_fmr=LAXEST_FMR)
+    tail = impostor_tail(impostor)
     lax, strict = tail.lax, tail.at(STRICTEST_FMR)
     genuine = np.sort(_genuine_agreements(descriptors, person_of, photos=photos, rng=rng))
     allowed = max(0, int(MOST_REFUSED * (len(genuine) + 1)) - 1)
@@ -113,7 +109,7 @@ def match_cosine(
     """Raw cosine at FMR 1e-3 of labelled unit descriptors, (N, n): a match without any template."""
     person_of = np.unique(np.asarray(identities), return_inverse=True)[1]
     impostor = impostor_cosines(descriptors, person_of, rng=np.random.default_rng(seed))
-    return impostor_tail(impostor, lax_fmr=LAXEST_FMR).lax
+    return impostor_tail(impostor).lax
 
 
 @dataclass(frozen=True)
@@ -129,9 +125,9 @@ class ImpostorTail:
         return self.lax + self.mean_excess * float(np.log(self.lax_fmr / fmr))
 
 
-def impostor_tail(impostor: NDArray[np.float32], *, lax_fmr: float) -> ImpostorTail:
-    """Fit the tail beyond ``lax_fmr``, or beyond what ten pairs exceed where that is more."""
-    lax_fmr = min(0.5, max(lax_fmr, _TAIL / impostor.size))
+def impostor_tail(impostor: NDArray[np.float32]) -> ImpostorTail:
+    """Fit the tail beyond FMR 1e-3, or beyond what ten pairs exceed where that is more."""
+    lax_fmr = min(0.5, max(LAXEST_FMR, _TAIL / impostor.size))
     count = min(impostor.size, most_errors(lax_fmr, impostor.size) + 2)
     # Only the upper tail decides; sorting all pairs in float64 would triple the memory.
     highest = np.sort(np.partition(impostor, impostor.size - count)[-count:]).astype(np.float64)

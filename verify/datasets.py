@@ -10,6 +10,7 @@ from verify.tenfold import FOLDS, Pair
 
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp"})
 MAX_PAIRS_BYTES = 16 * 2**20
+_MOST_SHOWN = 20
 
 
 class DatasetError(VeilfaceError):
@@ -22,8 +23,6 @@ class LabelledFolder:
 
     Parameters
     ----------
-    root
-        The folder that was read.
     paths, identities
         Equal lengths, sorted by person and file name.
     ignored
@@ -233,8 +232,8 @@ def decoded(data: bytes, *, file: Path) -> str:
         raise DatasetError(f"{file} is not UTF-8 text; save it as UTF-8") from None
 
 
-def faults_in(where: Path, expected: str, faults: Sequence[str], *, most: int = 20) -> str:
-    """Word the message of a :class:`DatasetError`: the first ``most`` faults, and how many more."""
-    shown = "; ".join(faults[:most])
-    more = f"; and {len(faults) - most} more" if len(faults) > most else ""
+def faults_in(where: Path, expected: str, faults: Sequence[str]) -> str:
+    """Word the message of a :class:`DatasetError`: the first faults, and how many more."""
+    shown = "; ".join(faults[:_MOST_SHOWN])
+    more = f"; and {len(faults) - _MOST_SHOWN} more" if len(faults) > _MOST_SHOWN else ""
     return f"{where} has {len(faults)} fault(s), {expected}: {shown}{more}"

@@ -15,13 +15,9 @@ class Decision:
 
     Parameters
     ----------
-    accepted
-        Whether the probe's score reached the level's threshold.
     reason
         ``match`` or ``no_match``; a subject that does not exist is also ``no_match``. ``liveness``
         where the probe is not taken for a living person's, whether it matches or not.
-    level
-        Security level that decided.
     fmr
         The level's target FMR; for a level without a target, the FMR seen in calibration.
     contract_id, calibration_id

@@ -59,12 +59,8 @@ class Climbers:
 
     Parameters
     ----------
-    level
-        That decides.
     accepted, most
         Share of the templates that accept, of all probes and of the one that most accept.
-    probes, templates
-        Their numbers.
     fitted
         Whether where others climbed to is in the fit; where not, the form could not follow.
     """
@@ -87,8 +83,6 @@ class ExpectationFit:
 
     Parameters
     ----------
-    expectation
-        What a decision rests on.
     climbs
         Fits that include where probes climbed to: ``CLIMBS``, or fewer where the form could not
         follow these too, so that drawn probes alone count from there on.
@@ -312,16 +306,12 @@ class _Fit:
 
 
 def draw_wolves(people: Array64, count: int, *, stream: Keystream) -> Array64:
-    """Draw unit probes that lie near many templates: axes of faces, the mean face, mixtures.
+    """Draw unit probes (count, n) near many templates: axes of faces, the mean face, mixtures.
 
     Parameters
     ----------
     people : (N, n) float64
         Faces, drawn or real, whose axes are taken.
-
-    Returns
-    -------
-    ndarray of float64, shape (count, n)
     """
     mean = people.mean(axis=0)
     length = float(np.linalg.norm(mean))

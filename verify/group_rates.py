@@ -60,8 +60,6 @@ class PeopleGroups:
 
     Parameters
     ----------
-    attribute
-        Such as ``gender``.
     names
         Its groups; ages in the order of years.
     of : (people,) int64

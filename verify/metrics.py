@@ -23,21 +23,14 @@ RULE_OF_THREE = 3.0
 
 
 def wilson(errors: float, trials: int, *, confidence: float = 0.95) -> tuple[float, float]:
-    """Wilson score interval of a proportion.
+    """Wilson score interval of a proportion; (0, 1) where there are no trials.
 
     Parameters
     ----------
     errors
         Number of errors; a mean over repeats of the same trials need not be whole.
-    trials
-        Number of trials.
     confidence
         Of the two-sided interval.
-
-    Returns
-    -------
-    tuple of float
-        Lower and upper bound; (0, 1) where there are no trials.
 
     References
     ----------
@@ -207,8 +200,6 @@ def subject_bootstrap(
         The two people of every trial that went wrong.
     people
         Number of people; the indices in ``errors`` are below it.
-    trials
-        Number of trials.
     weighted_trials
         Total weight of all trials under the (people,) weights of one replicate.
     """

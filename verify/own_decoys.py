@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from templates.decoys import DecoyGenerator, DecoyPool, DecoySource
 from templates.decoys.statistics import DescriptorStatistics
 from templates.errors import ContractError
-from verify.consistency import LAXEST_FMR, impostor_tail
+from verify.consistency import impostor_tail
 from verify.evaluation.attributes import resembling_rows
 from verify.raw_pairs import impostor_cosines
 
@@ -84,8 +84,6 @@ def require_others(
 
     Parameters
     ----------
-    source
-        A generator, or a pool.
     descriptors, identities : (N, n) float32 unit rows, N names
         Of the calibration, without those that are left out of it.
 
@@ -131,9 +129,7 @@ def _likeness(
     same = person[order][1:] == person[order][:-1]
     pairs = order[:-1][same], order[1:][same]
     genuine = np.einsum("ij,ij->i", descriptors[pairs[0]], descriptors[pairs[1]])
-    tail = impostor_tail(
-        impostor_cosines(descriptors, person, rng=np.random.default_rng(0)), lax_fmr=LAXEST_FMR
-    )
+    tail = impostor_tail(impostor_cosines(descriptors, person, rng=np.random.default_rng(0)))
     tries = entries * len(descriptors) / (person.max() + 1)
     chance = min(tail.at(MOST_PEOPLE / 2 / tries), SAME_PHOTO)
     return max(float(np.median(genuine)) if len(genuine) else SAME_PHOTO, chance)

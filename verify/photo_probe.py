@@ -59,7 +59,6 @@ def probe_of_photos(
     *,
     passive: bool,
     policy: FacePolicy = FacePolicy.SINGLE,
-    quality: QualityLimits | None = DEFAULT_QUALITY,
     limits: ImageLimits = DEFAULT_LIMITS,
 ) -> PhotoProbe:
     """Average photos of one person; with `passive`, say whether they look live on average.
@@ -71,9 +70,7 @@ def probe_of_photos(
     InconsistentImages
         Where the photos do not show one person.
     """
-    samples = embed_photos(
-        pack, photos, policy=policy, quality=quality, limits=limits, liveness=passive
-    )
+    samples = embed_photos(pack, photos, policy=policy, limits=limits, liveness=passive)
     rows = np.stack([sample.embedding for sample in samples])
     mean = mean_embedding(rows, consistency=contract.probe_consistency)
     scores = [sample.liveness for sample in samples if sample.liveness is not None]
@@ -99,8 +96,6 @@ def probe_of_frames(
 
     Parameters
     ----------
-    movements
-        What the challenge asked for.
     passive
         Whether the frames that are averaged must look live too.
 

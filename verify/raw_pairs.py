@@ -10,6 +10,7 @@ from templates.errors import ContractError
 
 TILE = 1024
 MOST_PHOTOS = 8_000
+MOST_PAIRS = 50
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,6 @@ def suspicious_pairs(
     people: Sequence[str],
     *,
     above: float,
-    most: int = 50,
 ) -> list[SuspiciousPair]:
     """Pairs of people with two photos of raw cosine ``above`` or more, most alike first."""
     best: dict[tuple[int, int], float] = {}
@@ -62,7 +62,7 @@ def suspicious_pairs(
             a, b = int(person_of[start + row]), int(person_of[start + column])
             key = (min(a, b), max(a, b))
             best[key] = max(best.get(key, -1.0), float(tile[row, column]))
-    ranked = sorted(best.items(), key=lambda entry: -entry[1])[:most]
+    ranked = sorted(best.items(), key=lambda entry: -entry[1])[:MOST_PAIRS]
     return [SuspiciousPair(people[a], people[b], round(cosine, 3)) for (a, b), cosine in ranked]
 
 

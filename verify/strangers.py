@@ -74,8 +74,6 @@ def make_nobody(
 
     Parameters
     ----------
-    source
-        The contract's decoy source.
     strangers
         What they are drawn from, in equal shares (:func:`strangers_like`).
     stream

@@ -32,8 +32,6 @@ class Impostors:
         Minus infinity marks a cell that is no trial (a probe against its own person).
     trials
         Number of cells that are trials.
-    people
-        Number of people.
     person_pairs
         Number of distinct unordered pairs of people among the trials.
     people_of

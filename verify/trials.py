@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from templates.space.agreement import weakest_split
+from templates.space.embedding import normalised
 
 Indices = NDArray[np.int64]
 
@@ -178,7 +179,7 @@ def enrolled_means(descriptors: NDArray[np.float32], plan: TrialPlan) -> NDArray
 def unit_means(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
     """Average and normalise sets of descriptors, (S, k, n) to (S, n)."""
     means = descriptors.mean(axis=1, dtype=np.float64)
-    return np.asarray(means / np.linalg.norm(means, axis=1, keepdims=True), dtype=np.float32)
+    return normalised(means).astype(np.float32)
 
 
 def chosen_photos(

@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from models.decoding import DEFAULT_LIMITS, ImageLimits
 from models.pack import FacePolicy, ModelPack
-from models.quality import DEFAULT_QUALITY, QualityLimits
 from templates.contract import wire
 from templates.contract.document import Calibration, Contract, Level
-from templates.distances import Metric, paired_distances, similarity
+from templates.distances import paired_distances, similarity
 from templates.errors import ContractMismatch, InvalidTemplate
 from templates.keys.randomness import KEY_BYTES
 from templates.keys.rotation import HolderKey, TenantRotation, holder_rotation
@@ -66,8 +65,6 @@ class Verifier:
 
     Parameters
     ----------
-    contract
-        Whose calibrations decide.
     rotation
         What gives each template of the tenant its rotation.
 
@@ -87,16 +84,16 @@ class Verifier:
         self._rotation = rotation
         self._nobodys_key = secrets.token_bytes(KEY_BYTES)
 
-    def embed_photos(
+    def photo_probe(
         self,
         pack: ModelPack,
         photos: Sequence[bytes],
         *,
+        passive: bool = False,
         policy: FacePolicy = FacePolicy.SINGLE,
-        quality: QualityLimits | None = DEFAULT_QUALITY,
         limits: ImageLimits = DEFAULT_LIMITS,
-    ) -> NDArray[np.float32]:
-        """Make one probe, (n,), of 1 to 5 photo files of one person.
+    ) -> PhotoProbe:
+        """Make one probe of 1 to 5 photo files; with `passive`, say whether they look live.
 
         Raises
         ------
@@ -106,39 +103,14 @@ class Verifier:
             Where one photo has no usable face.
         InconsistentImages
             Where the photos do not show one person.
-        """
-        return self.photo_probe(
-            pack, photos, policy=policy, quality=quality, limits=limits
-        ).embedding
-
-    def photo_probe(
-        self,
-        pack: ModelPack,
-        photos: Sequence[bytes],
-        *,
-        passive: bool = False,
-        policy: FacePolicy = FacePolicy.SINGLE,
-        quality: QualityLimits | None = DEFAULT_QUALITY,
-        limits: ImageLimits = DEFAULT_LIMITS,
-    ) -> PhotoProbe:
-        """:meth:`embed_photos`, and with `passive` whether the photos look live.
-
-        Raises
-        ------
         Uncalibrated
-            Where the contract has no liveness threshold.
+            With `passive`, where the contract has no liveness threshold.
         """
         self._require(pack)
         if not 1 <= len(photos) <= MAX_PROBE_PHOTOS:
             raise ValueError(f"a probe has 1 to {MAX_PROBE_PHOTOS} photos, not {len(photos)}")
         return probe_of_photos(
-            pack,
-            self._contract,
-            photos,
-            passive=passive,
-            policy=policy,
-            quality=quality,
-            limits=limits,
+            pack, self._contract, photos, passive=passive, policy=policy, limits=limits
         )
 
     def frames_probe(
@@ -174,7 +146,7 @@ class Verifier:
         InvalidEmbedding
             Where an embedding is not a finite unit vector of n numbers.
         InconsistentImages
-            As :meth:`embed_photos`.
+            Where they are not of one person.
         """
         rows = unit_rows(embeddings, n=self._contract.binding.n, most=MAX_PROBE_PHOTOS)
         return mean_embedding(rows, consistency=self._contract.probe_consistency)
@@ -186,7 +158,6 @@ class Verifier:
         *,
         holder_key: HolderKey | None = None,
         level: str | None = None,
-        metric: Metric | None = None,
         photos: int = 1,
     ) -> Decision:
         """Decide for a unit-norm embedding, (n,).
@@ -201,8 +172,6 @@ class Verifier:
             it; one that needs none ignores what is sent.
         level
             Name of a level; the contract's default where None.
-        metric
-            The contract's first p-to-s calibration decides where None.
         photos
             Photos of one person that the embedding is the normalised mean of.
 
@@ -211,12 +180,12 @@ class Verifier:
         InvalidEmbedding
             Where the probe is not a finite unit vector of n numbers.
         Uncalibrated
-            Where the contract has no such level or metric.
+            Where the contract has no such level.
         ContractMismatch, InvalidTemplate
             Where the stored bytes are not a template that this contract serves.
         """
         name = level or self._contract.default_level
-        calibration = self._contract.calibration("p2s", metric, probe_photos=photos, level=name)
+        calibration = self._contract.calibration("p2s", probe_photos=photos, level=name)
         rule = _Rule(calibration, calibration.level(name))
         probe = unit_rows(embedding, n=self._contract.binding.n, most=1)
         template, turn = self._opened(stored, holder_key, read=wire.decode_as_stored)
@@ -230,7 +199,6 @@ class Verifier:
         *,
         holder_key: HolderKey | None = None,
         level: str | None = None,
-        metric: Metric | None = None,
     ) -> Decision:
         """Decide for a probe that the client lifted, in the wire format, un-rotated.
 
@@ -251,7 +219,7 @@ class Verifier:
         subspace = received.subspace
         if subspace.n != binding.n:
             raise InvalidTemplate(f"a lifted probe must have n = {binding.n}, not {subspace.n}")
-        calibration = self._contract.calibration("s2s", metric, subspace.m)
+        calibration = self._contract.calibration("s2s", probe_m=subspace.m)
         rule = _Rule(calibration, calibration.level(level or self._contract.default_level))
         self._require_honest_foot(subspace, calibration)
         lifted = SubspaceBatch.of([subspace])

@@ -51,10 +51,10 @@ def load(name: str) -> Any:
     """Import a command."""
     module = import_module(f"api.cli.{_MODULES.get(name, name)}")
     around = typer.Typer(**_LOOKS)
-    if hasattr(module, "register"):
-        module.register(around)
-    else:
+    if hasattr(module, "app"):
         around.add_typer(module.app, name=name)
+    else:
+        around.command(name)(getattr(module, name.replace(" ", "_")))
     return typer.main.get_group(around).commands[name]
 
 

@@ -49,8 +49,6 @@ def attacked_service(
 
     Parameters
     ----------
-    contract, source
-        What the service loads.
     templates
         Wire bytes, un-rotated; the service rotates and stores them.
 

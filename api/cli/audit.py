@@ -12,5 +12,5 @@ def audit() -> None:
     """Attack private templates, and hold the results against your limits."""
 
 
-audit_fairface.register(app)
-audit_templates.register(app)
+app.command()(audit_fairface.fairface)
+app.command()(audit_templates.templates)

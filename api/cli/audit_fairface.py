@@ -42,11 +42,6 @@ KNN = "knn"
 ATTACKERS = (KNN, *TRAINED)
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(fairface)
-
-
 @takes_settings(*BULK)
 @takes_limits("attribute-leakage")
 def fairface(
@@ -56,7 +51,6 @@ def fairface(
             metavar="ROOT",
             help="FairFace: a folder with `fairface_label_train.csv`, `fairface_label_val.csv` "
             "and the photos that they name.",
-            show_default=False,
         ),
     ],
     *,
@@ -68,16 +62,11 @@ def fairface(
             min=LEAST_FITTED,
             help="Training faces that are the lifting database. Unset: the paper's 10,000, or "
             "three tenths of a smaller training set.",
-            show_default=False,
         ),
     ] = None,
     attack: Annotated[
         int | None,
-        typer.Option(
-            min=100,
-            help="Most training faces that the attacker has. Unset: all others.",
-            show_default=False,
-        ),
+        typer.Option(min=100, help="Most training faces that the attacker has. Unset: all others."),
     ] = None,
     attacked: Annotated[
         int | None,
@@ -108,15 +97,13 @@ def fairface(
             max=1.0,
             help="Do not attack faces that resemble a training face to this cosine, such as 0.8: "
             "FairFace has near-duplicates.",
-            show_default=False,
         ),
     ] = None,
     evaluation: Annotated[
         Path | None,
         typer.Option(
             help="A `results.json` of `veilface evaluate`: adds accuracy against privacy, and the "
-            "operating point that it recommends.",
-            show_default=False,
+            "operating point that it recommends."
         ),
     ] = None,
     max_accuracy_loss: Annotated[

@@ -37,8 +37,7 @@ def verify(
         str | None,
         typer.Option(
             help="What `audit-log head` wrote earlier, or a file with it. With it, a log that was "
-            "put back to an older state, head and all, is found too.",
-            show_default=False,
+            "put back to an older state, head and all, is found too."
         ),
     ] = None,
     as_json: AsJson = False,
@@ -124,11 +123,9 @@ def show(
     settings: Settings,
     subject: Annotated[
         str | None,
-        typer.Option(help="Only lines on this subject, of `--tenant`.", show_default=False),
+        typer.Option(help="Only lines on this subject, of `--tenant`."),
     ] = None,
-    tenant: Annotated[
-        str | None, typer.Option(help="Only lines of this tenant.", show_default=False)
-    ] = None,
+    tenant: Annotated[str | None, typer.Option(help="Only lines of this tenant.")] = None,
     after: Annotated[int, typer.Option(min=0, help="Begin after this line.")] = 0,
     limit: Annotated[int | None, typer.Option(min=1, help="At most so many lines.")] = None,
 ) -> None:

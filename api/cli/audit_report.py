@@ -94,13 +94,7 @@ def share_once_begun(description: str) -> Iterator[Callable[[float], None]]:
 def write_report(
     report: Document, out: Path, *, evaluation: Mapping[str, Any] | None = None
 ) -> list[Path]:
-    """Write the document, its Markdown, its figures and its HTML; return their files.
-
-    Parameters
-    ----------
-    evaluation
-        ``results.json`` of an evaluation: adds the figure of privacy against accuracy.
-    """
+    """Write the document, its Markdown, its figures and its HTML; return their files."""
     # Imported here: drawing loads a library that nothing else needs.
     from attacks.figures import write_figures
 

@@ -30,11 +30,6 @@ from templates.space.lifting import Strategy
 from verify import labelled_folder
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(templates)
-
-
 @takes_settings(*BULK)
 @takes_limits(
     "foot-point-success",
@@ -53,7 +48,6 @@ def templates(
             metavar="PEOPLE",
             help="Labelled faces: one subfolder for each person, with photos in it (as LFW has "
             "them). Victims and decoy owners need two photos or more.",
-            show_default=False,
         ),
     ],
     *,
@@ -63,8 +57,7 @@ def templates(
         Path | None,
         typer.Option(
             help="The file of `decoys build` that the service uses. Unset: `decoys.veil` in "
-            "`data_dir`.",
-            show_default=False,
+            "`data_dir`."
         ),
     ] = None,
     fit_decoys: Annotated[
@@ -79,24 +72,21 @@ def templates(
         Path | None,
         typer.Option(
             help="Audit the service of this contract: its strategy, dimension, thresholds and "
-            "cohort. Unset: each scheme is calibrated on people of PEOPLE who are not attacked.",
-            show_default=False,
+            "cohort. Unset: each scheme is calibrated on people of PEOPLE who are not attacked."
         ),
     ] = None,
     strategy: Annotated[
         Strategy | None,
         typer.Option(
             help="How templates are lifted; not with --contract. Unset: as by the contract in "
-            "`data_dir` where it is of these decoys, else adversarial.",
-            show_default=False,
+            "`data_dir` where it is of these decoys, else adversarial."
         ),
     ] = None,
     dim: Annotated[
         str | None,
         typer.Option(
             help="Dimensions m of templates, such as 16,32; not with --contract. Unset: that of "
-            f"the contract in `data_dir` where it is of these decoys, else {DEFAULT_DIM}.",
-            show_default=False,
+            f"the contract in `data_dir` where it is of these decoys, else {DEFAULT_DIM}."
         ),
     ] = None,
     victims: Annotated[int, typer.Option(min=20, help="People who are attacked.")] = 300,
@@ -130,7 +120,6 @@ def templates(
             "--learned/--no-learned",
             help="Train an inverter from template to embedding (needs the extra `torch`). Unset: "
             "where torch is installed.",
-            show_default=False,
         ),
     ] = None,
     training_seconds: Annotated[
@@ -149,8 +138,7 @@ def templates(
         typer.Option(
             help="Further faces that the attacker has: a folder of photos, or a `.npz` with "
             "`paths` and `descriptors` of the same pack. May be given several times. Photos of "
-            "victims, and people who are named like them, are left out.",
-            show_default=False,
+            "victims, and people who are named like them, are left out."
         ),
     ] = None,
     decoy_faces: Annotated[
@@ -160,7 +148,6 @@ def templates(
             help="Number of faces that the file of --decoys was fitted to: an attacker with "
             "unlimited faces is then simulated. --fit-decoys knows it. Unset, as for decoys that "
             "were adapted with --like: estimated with the decoys as they are, and not judged.",
-            show_default=False,
         ),
     ] = None,
     seed: Seed = 0,

@@ -58,15 +58,13 @@ def distances(
             min=1,
             help="Threads of the distances and of the products. Unset: those of the matrix "
             "library. Not with --device.",
-            show_default=False,
         ),
     ] = None,
     device: Annotated[
         str | None,
         typer.Option(
             help="Device of torch, such as `cuda` (extra `torch`). Unset: the processor, without "
-            "torch.",
-            show_default=False,
+            "torch."
         ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the embeddings.")] = 0,

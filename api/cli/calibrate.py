@@ -43,29 +43,20 @@ class Protocol(StrEnum):
     TEN_FOLD = "ten-fold"
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(calibrate)
-
-
 @takes_settings(*BULK)
 def calibrate(
     folder: Annotated[
         Path | None,
         typer.Argument(
             help="Labelled faces: one subfolder for each person, with photos in it (as LFW has "
-            "them). Not with --liveness.",
-            show_default=False,
+            "them). Not with --liveness."
         ),
     ] = None,
     *,
     settings: Settings,
     decoys: Annotated[
         Path | None,
-        typer.Option(
-            help="The file of `decoys build`. Unset: `decoys.veil` in `data_dir`.",
-            show_default=False,
-        ),
+        typer.Option(help="The file of `decoys build`. Unset: `decoys.veil` in `data_dir`."),
     ] = None,
     out: Annotated[
         Path | None,
@@ -82,7 +73,6 @@ def calibrate(
             min=1,
             max=MAX_M,
             help="Dimension m of stored templates. Unset: the smallest at which privacy passes.",
-            show_default=False,
         ),
     ] = None,
     probe_dims: Annotated[
@@ -90,8 +80,7 @@ def calibrate(
         typer.Option(
             help="Dimensions of lifted probes that clients may send, for example `2,4,8`; `none` "
             "for none, which is quicker. Raw probes, such as photos, are always calibrated. Unset: "
-            f"{DEFAULT_PROBE_DIM}, or --dim where that is smaller.",
-            show_default=False,
+            f"{DEFAULT_PROBE_DIM}, or --dim where that is smaller."
         ),
     ] = None,
     metric: Annotated[Metric, typer.Option(help="The distance that decides.")] = Metric.SPHERICAL,
@@ -106,32 +95,28 @@ def calibrate(
         Path | None,
         typer.Option(
             help="People to leave out, such as those in a test: a folder whose subfolders are "
-            "named like them, or a text file with a name on each line.",
-            show_default=False,
+            "named like them, or a text file with a name on each line."
         ),
     ] = None,
     aliases: Annotated[
         Path | None,
         typer.Option(
             help="People who appear under two names: a text file, `second name,first name` on each "
-            "line.",
-            show_default=False,
+            "line."
         ),
     ] = None,
     labels: Annotated[
         Path | None,
         typer.Option(
             help="A CSV `path,gender,race,age,...` of photos or people, as for `evaluate`: gives "
-            "error rates by group.",
-            show_default=False,
+            "error rates by group."
         ),
     ] = None,
     fairface: Annotated[
         Path | None,
         typer.Option(
             help="Instead of --labels, the folder of FairFace: gender, race and age are estimated "
-            "from its nearest training faces.",
-            show_default=False,
+            "from its nearest training faces."
         ),
     ] = None,
     worst_group: Annotated[
@@ -149,8 +134,7 @@ def calibrate(
         Path | None,
         typer.Option(
             help="Instead of people, live and perhaps attack photos, as for `evaluate liveness`: "
-            "sets the liveness threshold of the contract file, and changes nothing else in it.",
-            show_default=False,
+            "sets the liveness threshold of the contract file, and changes nothing else in it."
         ),
     ] = None,
     bpcer: Annotated[
@@ -163,8 +147,7 @@ def calibrate(
         LivenessPolicy | None,
         typer.Option(
             help="With --liveness: what every verification by this contract must pass, beside what "
-            "settings and API keys ask for. Unset: what the contract file says.",
-            show_default=False,
+            "settings and API keys ask for. Unset: what the contract file says."
         ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed for the random choices.")] = 0,

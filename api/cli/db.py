@@ -130,7 +130,7 @@ def compact(*, settings: Settings, as_json: AsJson = False) -> None:
 @app.command()
 @takes_settings(*STORE, "default_tenant")
 def unlock(
-    subject: Annotated[str, typer.Argument(help="Subject to unlock.", show_default=False)],
+    subject: Annotated[str, typer.Argument(help="Subject to unlock.")],
     *,
     settings: Settings,
     tenant: Tenant = None,
@@ -228,7 +228,7 @@ def template_enrollment(
 @app.command("erase-tenant")
 @takes_settings(*STORE)
 def erase_tenant(
-    tenant: Annotated[str, typer.Argument(help="The tenant's name.", show_default=False)],
+    tenant: Annotated[str, typer.Argument(help="The tenant's name.")],
     *,
     settings: Settings,
     confirm: Annotated[
@@ -239,7 +239,7 @@ def erase_tenant(
     ],
     out: Annotated[
         Path | None,
-        typer.Option(help="File for the receipt. Unset: it goes to stdout.", show_default=False),
+        typer.Option(help="File for the receipt. Unset: it goes to stdout."),
     ] = None,
 ) -> None:
     """Erase a tenant: its subjects, templates, keys and rotation; write a signed receipt.

@@ -48,11 +48,7 @@ def decoys() -> None:
 def build(
     photos: Annotated[
         list[Path],
-        typer.Argument(
-            metavar="SOURCE...",
-            help="Folders of face photos, at any depth.",
-            show_default=False,
-        ),
+        typer.Argument(metavar="SOURCE...", help="Folders of face photos, at any depth."),
     ],
     *,
     settings: Settings,
@@ -60,13 +56,12 @@ def build(
         list[Path] | None,
         typer.Option(
             help="Folder of some photos, 300 or more, of the kind that will be enrolled, of other "
-            "people than those: the decoys are spread as those are. May be given several times.",
-            show_default=False,
+            "people than those: the decoys are spread as those are. May be given several times."
         ),
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(help="The file. Unset: `decoys.veil` in `data_dir`.", show_default=False),
+        typer.Option(help="The file. Unset: `decoys.veil` in `data_dir`."),
     ] = None,
     kind: Annotated[
         Kind,
@@ -78,16 +73,14 @@ def build(
     labels: Annotated[
         Path | None,
         typer.Option(
-            help="FairFace label file. Unset: `fairface_label_*.csv` in SOURCE or beside it.",
-            show_default=False,
+            help="FairFace label file. Unset: `fairface_label_*.csv` in SOURCE or beside it."
         ),
     ] = None,
     exclude: Annotated[
         Path | None,
         typer.Option(
             help="People or photos to leave out: a text file with a name or a path on each line, "
-            "or a folder whose subfolders are named like the people.",
-            show_default=False,
+            "or a folder whose subfolders are named like the people."
         ),
     ] = None,
     limit: Annotated[

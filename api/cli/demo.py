@@ -16,11 +16,6 @@ from api.demo.run import Outcome, run_demo
 from models.demo import DEMO_NOTICE
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(demo)
-
-
 def demo(
     *,
     folder: Annotated[
@@ -30,16 +25,14 @@ def demo(
         Path | None,
         typer.Option(
             help="A real model pack, with --faces. Unset: a model that is built here and "
-            "recognises only cartoon faces.",
-            show_default=False,
+            "recognises only cartoon faces."
         ),
     ] = None,
     faces: Annotated[
         Path | None,
         typer.Option(
             help="Real faces, one subfolder for each person; 8 people need 5 photos each, and the "
-            "others serve as decoys and for the calibration.",
-            show_default=False,
+            "others serve as decoys and for the calibration."
         ),
     ] = None,
     dim: Annotated[int, typer.Option(min=1, max=128, help="Dimension m of the templates.")] = 16,

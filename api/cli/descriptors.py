@@ -33,8 +33,7 @@ Cache = Annotated[
     Path | None,
     typer.Option(
         help="Keep embeddings in this file, sealed with the master key, so that the next run on "
-        "the same photos is quick. Unset: they are not kept.",
-        show_default=False,
+        "the same photos is quick. Unset: they are not kept."
     ),
 ]
 

@@ -140,8 +140,6 @@ def measure(question: Question, *, progress: Callable[[int], None] = lambda _: N
 
     Parameters
     ----------
-    question
-        What to measure.
     progress
         Called with 1 as often as ``question.rounds`` says.
 

@@ -39,11 +39,6 @@ from verify.evaluation.units import Mode
 LIFTED_MODES = (Mode.POINT, Mode.SUBSPACE)
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(evaluate)
-
-
 @takes_settings(*BULK)
 def evaluate(
     datasets: Annotated[
@@ -52,7 +47,6 @@ def evaluate(
             metavar="DATASET...",
             help="What to evaluate on: an InsightFace `.bin` file, a folder of LFW, CFP or "
             "AgeDB-30, or a CSV `path_a,path_b,same[,fold]` of your own photos.",
-            show_default=False,
         ),
     ],
     *,
@@ -61,23 +55,20 @@ def evaluate(
         Path | None,
         typer.Option(
             help="With `--pack none`: embeddings computed elsewhere, a `.npz` file with the "
-            "arrays `paths` and `descriptors`.",
-            show_default=False,
+            "arrays `paths` and `descriptors`."
         ),
     ] = None,
     decoys: Annotated[
         list[Path] | None,
         typer.Option(
             help="A file of `decoys build`; a pool and a generator may both be given. Without "
-            "one, only strategies without decoys run.",
-            show_default=False,
+            "one, only strategies without decoys run."
         ),
     ] = None,
     strategy: Annotated[
         str | None,
         typer.Option(
-            help=f"Of {', '.join(STRATEGIES)}. Unset: all that the decoys allow but the sub- ones.",
-            show_default=False,
+            help=f"Of {', '.join(STRATEGIES)}. Unset: all that the decoys allow but the sub- ones."
         ),
     ] = None,
     dim: Annotated[str, typer.Option(help="Subspace dimensions m.")] = ",".join(map(str, DIMS)),
@@ -106,8 +97,7 @@ def evaluate(
         Path | None,
         typer.Option(
             help="A CSV `path,gender,race,age,...` of photos or people: gives results by group, "
-            "and hybrid+ its attributes.",
-            show_default=False,
+            "and hybrid+ its attributes."
         ),
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder of the results; a run goes on there.")] = Path(
@@ -119,7 +109,6 @@ def evaluate(
             "--aligned/--no-aligned",
             help="Whether the photos are aligned crops. Unset: they are where all of them have "
             "the size that the embedder takes, and in `.bin` files.",
-            show_default=False,
         ),
     ] = None,
     flip: Flip = False,
@@ -139,9 +128,7 @@ def evaluate(
     audit: Annotated[
         Path | None,
         typer.Option(
-            help="A `report.json` of `veilface audit`: adds the figure of privacy against "
-            "accuracy.",
-            show_default=False,
+            help="A `report.json` of `veilface audit`: adds the figure of privacy against accuracy."
         ),
     ] = None,
     _quick: Annotated[bool, quick(dim="4,16", metric="spherical", repeats=1)] = False,

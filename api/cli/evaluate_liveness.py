@@ -37,19 +37,13 @@ from verify.evaluation.rows import Json
 from verify.evaluation.tables import write_lines
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("evaluate liveness")(evaluate_liveness)
-
-
 @takes_settings(*BULK)
 def evaluate_liveness(
     data: Annotated[
         Path,
         typer.Argument(
             help="Photos: a folder with `live/` and `spoof/SPECIES/`, or a CSV "
-            "`path,presentation[,subject]`, where presentation is `live` or a species.",
-            show_default=False,
+            "`path,presentation[,subject]`, where presentation is `live` or a species."
         ),
     ],
     *,
@@ -58,15 +52,13 @@ def evaluate_liveness(
         Path | None,
         typer.Option(
             help="A contract file: its liveness threshold is applied, and, with the decoys, "
-            "attacks go through the whole verification.",
-            show_default=False,
+            "attacks go through the whole verification."
         ),
     ] = None,
     decoys: Annotated[
         Path | None,
         typer.Option(
-            help="The contract's decoys. Unset: `decoys.veil` in `data_dir`, where it is.",
-            show_default=False,
+            help="The contract's decoys. Unset: `decoys.veil` in `data_dir`, where it is."
         ),
     ] = None,
     bpcer: Annotated[
@@ -75,10 +67,7 @@ def evaluate_liveness(
     ] = "0.01,0.05,0.1",
     level: Annotated[
         str | None,
-        typer.Option(
-            help="Level of the whole verification. Unset: the contract's default.",
-            show_default=False,
-        ),
+        typer.Option(help="Level of the whole verification. Unset: the contract's default."),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the templates.")] = 0,
     out: Annotated[Path, typer.Option(help="Folder of the results.")] = Path("liveness"),

@@ -74,8 +74,6 @@ def open_embedder(
 
     Parameters
     ----------
-    flip
-        Add the mirror image everywhere.
     raw_flip
         Compare raw embeddings with the mirror image too.
     aligned

@@ -40,14 +40,11 @@ def create(
     settings: Settings,
     right: Annotated[
         list[Right],
-        typer.Option(help="A right of the key; repeat for several.", show_default=False),
+        typer.Option(help="A right of the key; repeat for several."),
     ],
     tenant: Annotated[
         str | None,
-        typer.Option(
-            help="Tenant, created if it is new. Unset: the setting `default_tenant`.",
-            show_default=False,
-        ),
+        typer.Option(help="Tenant, created if it is new. Unset: the setting `default_tenant`."),
     ] = None,
     label: Annotated[str, typer.Option(help="What the key is for, as `list` shows it.")] = "",
     days: Annotated[
@@ -58,8 +55,7 @@ def create(
         str | None,
         typer.Option(
             help="Lowest security level that it may ask for, as `fmr-1e-4`: it verifies at none "
-            "of a larger false match rate. Unset: the setting `lowest_level`.",
-            show_default=False,
+            "of a larger false match rate. Unset: the setting `lowest_level`."
         ),
     ] = None,
     liveness: Annotated[
@@ -100,9 +96,7 @@ def create(
 def list_keys(
     *,
     settings: Settings,
-    tenant: Annotated[
-        str | None, typer.Option(help="Only this tenant's.", show_default=False)
-    ] = None,
+    tenant: Annotated[str | None, typer.Option(help="Only this tenant's.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """List API keys by prefix; the keys themselves are not kept.
@@ -135,7 +129,7 @@ def list_keys(
 def revoke(
     prefix: Annotated[
         str,
-        typer.Argument(help="The 12 digits after `vf_`, as in `list`.", show_default=False),
+        typer.Argument(help="The 12 digits after `vf_`, as in `list`."),
     ],
     *,
     settings: Settings,
@@ -161,7 +155,7 @@ def revoke(
 def replace(
     prefix: Annotated[
         str,
-        typer.Argument(help="The 12 digits after `vf_` of the old key.", show_default=False),
+        typer.Argument(help="The 12 digits after `vf_` of the old key."),
     ],
     *,
     settings: Settings,
@@ -260,22 +254,19 @@ def rotate_tenant(
         say(f"Dropped the keys of {dropped} older epochs.")
 
 
-master_keys.register(app)
-renewal.register(app)
+for _command in (master_keys.master, master_keys.rotate, master_keys.rewrap, renewal.renew):
+    app.command()(_command)
 
 
 @app.command("verify-receipt")
 def verify_receipt(
-    receipt: Annotated[
-        Path, typer.Argument(help="JSON that the DELETE call returned.", show_default=False)
-    ],
+    receipt: Annotated[Path, typer.Argument(help="JSON that the DELETE call returned.")],
     *,
     public_key: Annotated[
         str,
         typer.Option(
             help="The service's receipt key in base64, or a file with the JSON of "
-            "`GET /v1/contract`.",
-            show_default=False,
+            "`GET /v1/contract`."
         ),
     ],
     as_json: AsJson = False,

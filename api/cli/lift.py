@@ -33,39 +33,31 @@ MAX_CONTRACT_BYTES = 256 * 2**20
 MAX_PHOTO_BYTES = 64 * 2**20
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(lift)
-
-
 def lift(
     photos: Annotated[
         list[Path],
-        typer.Argument(help=f"1 to {MAX_PHOTOS} photos of one person.", show_default=False),
+        typer.Argument(help=f"1 to {MAX_PHOTOS} photos of one person."),
     ],
     *,
-    pack: Annotated[Path, typer.Option(help="The model pack of the contract.", show_default=False)],
+    pack: Annotated[Path, typer.Option(help="The model pack of the contract.")],
     generator: Annotated[
         Path,
         typer.Option(
             help="The decoy generator: the bytes of `GET /v1/contract/generator`, or the file "
-            "that `decoys build` wrote.",
-            show_default=False,
+            "that `decoys build` wrote."
         ),
     ],
     contract: Annotated[
         Path,
         typer.Option(
             help="The JSON of `GET /v1/contract`, or the contract file. Only its public part is "
-            "read.",
-            show_default=False,
+            "read."
         ),
     ],
     out: Annotated[
         Path,
         typer.Option(
-            help="Where the template's bytes go. `-` writes a JSON body for REST to stdout.",
-            show_default=False,
+            help="Where the template's bytes go. `-` writes a JSON body for REST to stdout."
         ),
     ],
     probe: Annotated[
@@ -74,23 +66,20 @@ def lift(
     subject: Annotated[
         str | None,
         typer.Option(
-            help="With `--probe --out -`: whom the probe is for; it is signed for one subject.",
-            show_default=False,
+            help="With `--probe --out -`: whom the probe is for; it is signed for one subject."
         ),
     ] = None,
     level: Annotated[
         str | None,
         typer.Option(
-            help="With `--probe --out -`: security level to ask for. Unset: the contract's.",
-            show_default=False,
+            help="With `--probe --out -`: security level to ask for. Unset: the contract's."
         ),
     ] = None,
     dim: Annotated[
         int | None,
         typer.Option(
             help="Dimension of a probe, one that the contract is calibrated for. Unset: the "
-            "largest of these. An enrollment always has the contract's own.",
-            show_default=False,
+            "largest of these. An enrollment always has the contract's own."
         ),
     ] = None,
     face: Annotated[
@@ -102,8 +91,7 @@ def lift(
     holder_key_file: Annotated[
         Path | None,
         typer.Option(
-            help="With `--out -`: private file with the holder's key, which the body will carry.",
-            show_default=False,
+            help="With `--out -`: private file with the holder's key, which the body will carry."
         ),
     ] = None,
     as_json: AsJson = False,

@@ -22,12 +22,6 @@ from templates.store import TemplateStore
 FILES = (*STORE, "contract_file", "decoys_file")
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    for command in (master, rotate, rewrap):
-        app.command()(command)
-
-
 @takes_settings("data_dir", "master_key_file")
 def master(*, settings: Settings, as_json: AsJson = False) -> None:
     """Create the master key file; an existing one is never touched.
@@ -122,12 +116,8 @@ class Rewrapped:
 
     Attributes
     ----------
-    key_id
-        Id of that key.
     changed
         Number of keys and secrets that were wrapped again.
-    files
-        Files that were sealed again.
     is_complete
         Whether no older key wraps anything any more.
     """

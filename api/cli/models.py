@@ -38,8 +38,7 @@ def fetch(
     name: Annotated[
         str,
         typer.Argument(
-            help=f"Name of the pack, and of its folder. Known: {', '.join(KNOWN_PACKS)}.",
-            show_default=False,
+            help=f"Name of the pack, and of its folder. Known: {', '.join(KNOWN_PACKS)}."
         ),
     ],
     *,
@@ -50,14 +49,12 @@ def fetch(
             metavar="URL",
             help="Address of a zip archive or an .onnx file, or a file of this machine; repeat for "
             "a detector and an embedder that come apart.",
-            show_default=False,
         ),
     ] = None,
     sha256: Annotated[
         list[str] | None,
         typer.Option(
-            help="What the file must hash to, in hex; once for each --from, in the same order.",
-            show_default=False,
+            help="What the file must hash to, in hex; once for each --from, in the same order."
         ),
     ] = None,
     into: Annotated[Path, typer.Option(help="Folder of the packs.")] = Path("packs"),
@@ -66,8 +63,7 @@ def fetch(
         typer.Option(
             help="What the embedder was trained on, where its graph does not tell: `arcface` is "
             "(x - 127.5) / 127.5, `imagenet` mean and deviation of each channel, `raw` 0 to 255. "
-            "Written to `pack.toml`.",
-            show_default=False,
+            "Written to `pack.toml`."
         ),
     ] = None,
     accept_licence: Annotated[
@@ -181,7 +177,7 @@ def _usable(info: PackInfo) -> str:
 def inspect(
     pack: Annotated[
         Path,
-        typer.Argument(help="Folder of .onnx files, or one embedder file.", show_default=False),
+        typer.Argument(help="Folder of .onnx files, or one embedder file."),
     ],
     *,
     as_json: AsJson = False,

@@ -36,7 +36,7 @@ AsJson = Annotated[
 ]
 Tenant = Annotated[
     str | None,
-    typer.Option(help="Tenant. Unset: the setting `default_tenant`.", show_default=False),
+    typer.Option(help="Tenant. Unset: the setting `default_tenant`."),
 ]
 
 Device = Annotated[
@@ -135,7 +135,6 @@ _CONFIG = inspect.Parameter(
         typer.Option(
             help=f"TOML file with settings. Unset: `{CONFIG_VARIABLE}`, then `veilface.toml`.",
             rich_help_panel="Settings",
-            show_default=False,
         ),
     ],
 )
@@ -157,7 +156,6 @@ def _flag(name: str, declared: FieldInfo) -> inspect.Parameter:
         f"--{flag}/--no-{flag}" if kind is bool else f"--{flag}",
         help=f"{declared.description}{shown} Variable: `{ENV_PREFIX}{name.upper()}`.",
         rich_help_panel="Settings",
-        show_default=False,
     )
     return inspect.Parameter(
         name,

@@ -26,11 +26,6 @@ from templates.store.identifiers import utc_now
 from templates.store.renewal import Renewed
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(renew)
-
-
 @dataclass(frozen=True)
 class _Tenant:
     name: str

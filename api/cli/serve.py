@@ -24,11 +24,6 @@ from templates.contract.document import Contract
 from templates.decoys import DecoyGenerator
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(serve)
-
-
 @takes_settings(*Settings.model_fields)
 def serve(
     *,

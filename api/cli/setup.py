@@ -48,19 +48,13 @@ from verify.own_decoys import SAME_PHOTO
 CACHES = "setup-*.cache"
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(setup)
-
-
 @takes_settings("pack", "providers", "data_dir", "master_key_file", "accept_weak_privacy")
 def setup(
     people: Annotated[
         Path,
         typer.Argument(
             help="Labelled photos of people like those who will be enrolled, but never enrolled "
-            "themselves: one subfolder for each person.",
-            show_default=False,
+            "themselves: one subfolder for each person."
         ),
     ],
     *,
@@ -69,8 +63,7 @@ def setup(
         list[Path],
         typer.Option(
             help="Folder of photos of many other faces, of any kind, at any depth: decoys are "
-            "fitted to them. May be given several times.",
-            show_default=False,
+            "fitted to them. May be given several times."
         ),
     ],
     like: Annotated[
@@ -78,8 +71,7 @@ def setup(
         typer.Option(
             help="Folder of 300 photos or more of further people of the kind that will be "
             "enrolled, whom decoys are adapted to. Unset: people of PEOPLE whom the calibration "
-            "can spare.",
-            show_default=False,
+            "can spare."
         ),
     ] = None,
     aligned: Aligned = False,

@@ -37,7 +37,7 @@ from templates.store.subject_rows import Source, Storage, TemplateNotStored
 from templates.store.subjects import Precondition
 from verify import MAX_PROBE_PHOTOS, OpenedTemplate, Verifier
 
-Subject = Annotated[str, typer.Argument(help="Id of the person.", show_default=False)]
+Subject = Annotated[str, typer.Argument(help="Id of the person.")]
 Face = Annotated[
     FacePolicy,
     typer.Option(
@@ -53,18 +53,12 @@ HolderKeyFile = Annotated[
 ]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    app.command()(enroll)
-    app.command()(verify)
-
-
 @takes_settings(*LOCAL)
 def enroll(
     subject: Subject,
     photos: Annotated[
         list[Path],
-        typer.Argument(help=f"1 to {MAX_PHOTOS} photos of that person.", show_default=False),
+        typer.Argument(help=f"1 to {MAX_PHOTOS} photos of that person."),
     ],
     *,
     settings: Settings,
@@ -82,16 +76,14 @@ def enroll(
         Path | None,
         typer.Option(
             help="Write the sealed template to this new file, and store none: every verification "
-            "of the person then needs the file.",
-            show_default=False,
+            "of the person then needs the file."
         ),
     ] = None,
     holder_key_file: HolderKeyFile = None,
     new_holder_key_file: Annotated[
         Path | None,
         typer.Option(
-            help="Make a holder's key, and write it into this file, which must not exist yet.",
-            show_default=False,
+            help="Make a holder's key, and write it into this file, which must not exist yet."
         ),
     ] = None,
     no_replace: Annotated[
@@ -100,9 +92,7 @@ def enroll(
     replace: Annotated[
         str | None,
         typer.Option(
-            metavar="TEMPLATE_ID",
-            help="Replace the enrollment with this template id only.",
-            show_default=False,
+            metavar="TEMPLATE_ID", help="Replace the enrollment with this template id only."
         ),
     ] = None,
     as_json: AsJson = False,
@@ -205,8 +195,7 @@ def verify(
         str | None,
         typer.Option(
             help="Security level, not below the setting `lowest_level`. Unset: the contract's "
-            "default.",
-            show_default=False,
+            "default."
         ),
     ] = None,
     tenant: Tenant = None,
@@ -214,8 +203,7 @@ def verify(
     held_template: Annotated[
         Path | None,
         typer.Option(
-            help="File that `enroll --held-template` wrote, of a person who keeps their template.",
-            show_default=False,
+            help="File that `enroll --held-template` wrote, of a person who keeps their template."
         ),
     ] = None,
     holder_key_file: HolderKeyFile = None,
@@ -249,9 +237,9 @@ def verify(
         except ApiError as error:
             raise UsageError(error.message) from None
         with _named(photos):
-            probe = verifier.embed_photos(pack, data, policy=face, limits=runtime.image_limits)
+            probe = verifier.photo_probe(pack, data, policy=face, limits=runtime.image_limits)
         decision = verifier.decide_embedding(
-            probe, template, holder_key=holder_key, level=level, photos=len(photos)
+            probe.embedding, template, holder_key=holder_key, level=level, photos=probe.photos
         )
         outcome = "accept" if decision.accepted else "reject"
         # Another action than the service's: what an operator tries is not counted by the lockout.

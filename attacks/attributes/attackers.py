@@ -37,8 +37,6 @@ class TrainingSet:
         Of others that it lifted, and did not learn from: what it chooses its settings by.
     classes
         Number of classes of every attribute.
-    seed
-        Of whatever is random in the training.
     """
 
     features: Features
@@ -119,38 +117,31 @@ class KernelMachine:
     """
 
     def __init__(self, training: TrainingSet) -> None:
-        from scipy.linalg import cho_factor, cho_solve
+        from sklearn.kernel_ridge import KernelRidge
 
         self._scale = _Scale(training.features.derived)
         self._length = float(np.sqrt(np.mean(np.sum(training.features.foot**2, axis=1)))) or 1.0
-        self._rows = self._joined(training.features)
-        self._targets = np.hstack(
+        rows, held_out = self._joined(training.features), self._joined(training.held_out_features)
+        targets = np.hstack(
             [np.eye(count)[training.labels[name]] for name, count in training.classes.items()]
         )
-        self._mean = self._targets.mean(axis=0)
+        self._mean = targets.mean(axis=0)
         self._columns: dict[str, slice] = {}
         for name, count in training.classes.items():
             start = sum(part.stop - part.start for part in self._columns.values())
             self._columns[name] = slice(start, start + count)
-        squares = _squared_distances(self._rows, self._rows)
-        held_out = _squared_distances(self._joined(training.held_out_features), self._rows)
-        best: dict[str, tuple[float, float]] = {}
-        weights: dict[float, NDArray[np.float32]] = {}
+        best: dict[str, float] = {}
+        self._machines: dict[str, Any] = {}
         for width in _KERNEL_WIDTHS:
             # The ridge of 1 keeps the condition number below the number of rows: enough digits.
-            kernel = np.exp(np.float32(-width) * squares)
-            kernel[np.diag_indices(len(kernel))] += _RIDGE
-            factor = cho_factor(kernel, overwrite_a=True, check_finite=False)
-            centred = (self._targets - self._mean).astype(np.float32)
-            weights[width] = cho_solve(factor, centred, check_finite=False)
-            scores = np.exp(np.float32(-width) * held_out) @ weights[width] + self._mean
+            machine = KernelRidge(alpha=_RIDGE, kernel="rbf", gamma=width)
+            machine.fit(rows, (targets - self._mean).astype(np.float32))
+            scores = machine.predict(held_out) + self._mean
             for name, columns in self._columns.items():
                 predicted = np.argmax(scores[:, columns], axis=1)
                 score = float(np.mean(predicted == training.held_out_labels[name]))
-                if name not in best or score > best[name][0]:
-                    best[name] = (score, width)
-        self._widths = {name: width for name, (_, width) in best.items()}
-        self._weights = {width: weights[width] for width in set(self._widths.values())}
+                if score > best.get(name, -1.0):
+                    best[name], self._machines[name] = score, machine
 
     def scores(self, features: Features) -> dict[str, Scores]:
         """Score every class, by attribute (P, classes); the highest is the prediction."""
@@ -161,12 +152,11 @@ class KernelMachine:
         }
         for start in range(0, len(rows), _KERNEL_ROWS):
             tile = slice(start, start + _KERNEL_ROWS)
-            squares = _squared_distances(rows[tile], self._rows)
-            for width, weights in self._weights.items():
-                kernel = np.exp(np.float32(-width) * squares)
+            for machine in set(self._machines.values()):
+                predicted = machine.predict(rows[tile]) + self._mean
                 for name, columns in self._columns.items():
-                    if self._widths[name] == width:
-                        out[name][tile] = kernel @ weights[:, columns] + self._mean[columns]
+                    if self._machines[name] is machine:
+                        out[name][tile] = predicted[:, columns]
         return out
 
     def _joined(self, features: Features) -> NDArray[np.float32]:
@@ -203,10 +193,3 @@ def _probabilities(
     for name, model in models.items():
         out[name][:, model.classes_] = model.predict_proba(rows)
     return out
-
-
-def _squared_distances(
-    left: NDArray[np.float32], right: NDArray[np.float32]
-) -> NDArray[np.float32]:
-    squares = np.einsum("ij,ij->i", left, left)[:, None] + np.einsum("ij,ij->i", right, right)
-    return np.asarray(np.maximum(squares - 2 * (left @ right.T), 0), dtype=np.float32)

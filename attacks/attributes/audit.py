@@ -13,7 +13,6 @@ from attacks.attributes.faces import (
     LabelledFaces,
     Split,
     attacker_faces,
-    near_duplicates,
     split,
 )
 from attacks.attributes.plan import (
@@ -26,6 +25,7 @@ from attacks.attributes.rows import AttributeRow, strongest
 from attacks.outcomes import COMPARED, AttackOutcome, Knowledge, Leaked, Property, Scheme
 from attacks.population import LEAST_FITTED
 from models.extraction import Extraction
+from verify.evaluation.attributes import resembling_rows
 from verify.fairface_labels import CLASSES, Label
 
 PAPER_LIFTING = 10_000
@@ -71,10 +71,6 @@ class AttributeAuditPlan:
 
     Parameters
     ----------
-    schemes, attributes
-        What is attacked, and what is inferred.
-    attackers
-        Their settings.
     lifting
         Training faces that are the lifting database; see :func:`default_lifting`.
     attack, attacked
@@ -82,8 +78,6 @@ class AttributeAuditPlan:
         None for all.
     drop_duplicates
         Cosine from which an attacked face resembles a training face too much; None to keep all.
-    seed
-        Of all that is random.
     """
 
     schemes: tuple[Scheme, ...]
@@ -165,8 +159,6 @@ def run_attribute_audit(
 
     Parameters
     ----------
-    train, validation
-        FairFace's two parts, or the photos of them that ``plan.sample`` chose.
     progress
         Called with the share of the attacks that is done, which rises to 1.
 
@@ -177,7 +169,8 @@ def run_attribute_audit(
     """
     duplicates = 0
     if plan.drop_duplicates is not None:
-        dropped = near_duplicates(
+        # FairFace's two parts share photos, and who has the victim's own face infers nothing.
+        dropped = resembling_rows(
             validation.descriptors, train.descriptors, cosine=plan.drop_duplicates
         )
         validation = validation.take(np.setdiff1d(np.arange(len(validation)), dropped))
@@ -220,8 +213,6 @@ def attribute_outcomes(rows: Sequence[AttributeRow], *, audited: Scheme) -> list
 
     Parameters
     ----------
-    rows
-        Of all schemes.
     audited
         The scheme that is judged; the others are reported to compare with.
     """

@@ -35,14 +35,12 @@ _TRAINING_WORK = 30_000
 
 
 def run_scheme(
-    setup: Setup, scheme: Scheme, *, progress: Progress | None = None
+    setup: Setup, scheme: Scheme, *, progress: Progress = lambda _work: None
 ) -> list[AttributeRow]:
     """Attack one scheme with every attacker of the plan, for every attribute.
 
     Parameters
     ----------
-    setup
-        From `prepare`.
     scheme
         Raw descriptors, or a strategy with the pool of the lifting faces or the generator. hybrid+
         lifts the attacked faces by their true labels, as the paper does.
@@ -70,7 +68,7 @@ def run_scheme(
     had a part in the axes or in the gallery that it is judged by. The generator it has.
     Memory holds the templates of one tile at a time.
     """
-    advance = None if progress is None else _one_at_a_time(progress)
+    advance = _one_at_a_time(progress)
     training_work = _TRAINING_WORK * own_templates(setup, scheme)
     own, is_held_out = observe_own(setup, scheme, advance)
     victims = observe_attacked(setup, scheme, advance)
@@ -89,8 +87,7 @@ def run_scheme(
         attacked, held_out, seconds = _trained(setup, name, features, truths)
         choices = _chosen(attacked), _chosen(held_out)
         predictions.append(_Predictions(name, None, Knowledge.ALGORITHM, *choices, seconds))
-        if advance is not None:
-            advance(training_work)
+        advance(training_work)
     if not (victims.guessed is None or training.guessed is None or validation.guessed is None):
         name, knowledge = _LIKELIHOOD, Knowledge.ALGORITHM
         if scheme.decoys == POOLED:
@@ -102,8 +99,7 @@ def run_scheme(
         if victims.absent:
             choices = _among(attacked, victims.absent), _among(held_out, validation.absent)
             predictions.append(_Predictions(_RULE, None, knowledge, *choices, seconds))
-        if advance is not None:
-            advance(training_work)
+        advance(training_work)
     rows: list[AttributeRow] = []
     for prediction in predictions:
         held_out_truth = own.truth if prediction.attacker == _KNN else validation.truth

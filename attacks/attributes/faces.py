@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from attacks.errors import AuditError
 from templates.decoys.source import Attributes
 from templates.space.embedding import unit_descriptors
-from verify.evaluation.attributes import resembling_rows
 
 Array32 = NDArray[np.float32]
 Codes = NDArray[np.int64]
@@ -30,8 +29,6 @@ class LabelledFaces:
 
     Raises
     ------
-    AuditError
-        Labels that do not fit the faces or the classes, or faces without attributes.
     InvalidEmbedding
         A descriptor is not a finite unit vector.
     """
@@ -43,22 +40,6 @@ class LabelledFaces:
     def __post_init__(self) -> None:
         rows = np.ascontiguousarray(unit_descriptors(self.descriptors), dtype=np.float32)
         object.__setattr__(self, "descriptors", rows)
-        if not self.classes or set(self.labels) != set(self.classes):
-            raise AuditError(
-                f"faces need labels of the attributes that have classes: seen labels of "
-                f"{sorted(self.labels)} and classes of {sorted(self.classes)}"
-            )
-        for attribute, names in self.classes.items():
-            codes = np.asarray(self.labels[attribute])
-            if len(names) < 2 or len(set(names)) != len(names):
-                raise AuditError(f"{attribute} needs two or more classes of distinct names")
-            if codes.shape != (len(rows),) or codes.dtype.kind not in "iu":
-                raise AuditError(
-                    f"expected a class number of {attribute} for each of {len(rows)} faces, seen "
-                    f"{codes.dtype} of shape {codes.shape}"
-                )
-            if codes.size and not 0 <= codes.min() <= codes.max() < len(names):
-                raise AuditError(f"{attribute} has class numbers outside 0 to {len(names) - 1}")
 
     def __len__(self) -> int:
         return len(self.descriptors)
@@ -144,8 +125,8 @@ def split(
     attacked: LabelledFaces,
     *,
     lifting: int,
-    attack: int | None = None,
-    attacked_most: int | None = None,
+    attack: int,
+    attacked_most: int | None,
     seed: int,
 ) -> Split:
     """Deal out the parts as in paper §4.3.
@@ -154,41 +135,29 @@ def split(
     ----------
     train
         Labelled faces: ``lifting`` random ones become the lifting database (the paper: 10,000),
-        ``attack`` others the attacker's.
-    attacked
-        The validation faces.
-    attack
-        None for all the others, as in the paper.
+        ``attack`` others the attacker's (:func:`attacker_faces`).
     attacked_most
         Attack at most so many validation faces, chosen at random; None for all.
-    seed
-        Same seed, same parts.
 
     Raises
     ------
     AuditError
-        There are too few faces, or the two sets do not fit each other.
+        There is no face to attack.
     """
-    if train.n != attacked.n or dict(train.classes) != dict(attacked.classes):
-        raise AuditError(
-            "the faces to train with and those to attack differ in the dimension of their "
-            "embeddings or in their classes"
-        )
-    wanted = attacker_faces(len(train), lifting=lifting, attack=attack)
-    if not len(attacked) or (attacked_most is not None and attacked_most < 1):
+    if not len(attacked):
         raise AuditError("at least one face must be attacked")
     generator = np.random.default_rng([seed, 0])
     order = generator.permutation(len(train))
     victims = generator.permutation(len(attacked))[: attacked_most or len(attacked)]
     return Split(
         train.take(order[:lifting]),
-        train.take(order[lifting : lifting + wanted]),
+        train.take(order[lifting : lifting + attack]),
         attacked.take(np.sort(victims)),
     )
 
 
 def attacker_faces(training: int, *, lifting: int, attack: int | None) -> int:
-    """Return how many of so many training faces are the attacker's; see :func:`split`.
+    """Return how many of so many training faces are the attacker's: ``attack``, or all others.
 
     Raises
     ------
@@ -204,25 +173,3 @@ def attacker_faces(training: int, *, lifting: int, attack: int | None) -> int:
             "choose smaller sizes"
         )
     return wanted
-
-
-def near_duplicates(attacked: Array32, training: Array32, *, cosine: float) -> NDArray[np.int64]:
-    """Find attacked faces of which the training faces show nearly the same photo.
-
-    FairFace's two parts share such photos. An attacker who has the victim's own labelled face
-    infers nothing: they are removed before the split.
-
-    Parameters
-    ----------
-    attacked : (A, n) float32
-    training : (T, n) float32
-        Unit rows.
-    cosine
-        A pair of at least this cosine is one of near-duplicates.
-
-    Returns
-    -------
-    int64
-        Positions in ``attacked``, ascending.
-    """
-    return resembling_rows(attacked, training, cosine=cosine)

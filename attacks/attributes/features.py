@@ -125,8 +125,6 @@ def features_of(
         Of ``attacked`` in the gallery, as many as the largest of ``ks`` or more.
     gallery
         Labelled faces that are in none of these templates.
-    ks
-        Numbers of neighbours whose votes are counted.
 
     Returns
     -------

@@ -18,6 +18,7 @@ from verify.evaluation.figures.style import (
     RULE,
     SMALL_SIZE,
     house_style,
+    name_groups,
     panels,
 )
 from verify.evaluation.row_labels import order_of
@@ -212,29 +213,8 @@ def _dress(
     axes.set_xticks(
         list(places.values()), [str(dim) if dim else "" for _, _, dim in places], color=QUIET
     )
-    for (strategy, decoys), centre in centres.items():
-        axes.annotate(
-            f"{strategy}\n{decoys}".rstrip(),
-            (centre, 0),
-            xycoords=("data", "axes fraction"),
-            xytext=(0, -16),
-            textcoords="offset points",
-            ha="center",
-            va="top",
-            fontsize=SMALL_SIZE + 0.5,
-            annotation_clip=False,
-        )
-    axes.annotate(
-        "m =",
-        (0, 0),
-        xycoords="axes fraction",
-        xytext=(-4, -4),
-        textcoords="offset points",
-        ha="right",
-        va="top",
-        fontsize=SMALL_SIZE,
-        annotation_clip=False,
-    )
+    names = [("\n".join(group).rstrip(), centre) for group, centre in centres.items()]
+    name_groups(axes, names, below=16, fontsize=SMALL_SIZE + 0.5)
 
 
 def _legend(figure: Figure, knowledge: set[str]) -> None:

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from attacks.attributes.neighbours import Advance, nearest_neighbours
 from templates.distances import Metric
+from templates.space.embedding import normalised
 from templates.space.subspace import SubspaceBatch
 
 Array32 = NDArray[np.float32]
@@ -51,8 +52,6 @@ def find_decoys(
         At most so many: the decoys that the strategy takes.
     skip : (P,) int64, optional
         Entry that is the face itself, where the attacker lifted entries of its own pool.
-    progress
-        See `nearest_neighbours`.
     """
     nearest = nearest_neighbours(
         templates,
@@ -83,8 +82,7 @@ def strip(templates: SubspaceBatch, pool: Array32, decoys: Decoys) -> Array32:
     feet = templates.feet.astype(np.float64)
     for _ in range(2):  # once more removes what rounding left
         feet -= (left @ (left.transpose(0, 2, 1) @ feet[:, :, None]))[:, :, 0]
-    norms = np.linalg.norm(feet, axis=1, keepdims=True)
-    return np.asarray(feet / np.maximum(norms, 1e-12), dtype=np.float32)
+    return normalised(feet).astype(np.float32)
 
 
 def never_seen(decoys: Decoys, labels: Codes, classes: int) -> Flags:

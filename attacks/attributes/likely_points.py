@@ -21,10 +21,10 @@ DRAWS = 4000
 _FACES_PER_AXIS = 2
 
 
-def decoy_precision(source: DecoySource, *, seed: int, draws: int = DRAWS) -> Form:
+def decoy_precision(source: DecoySource, *, seed: int) -> Form:
     """Inverse covariance (n, n) of so many decoys that the attacker draws, 2 n at the least."""
     with Keystream.seeded("attributes", seed, "decoys that the attacker draws") as stream:
-        drawn = source.draw(max(draws, _FACES_PER_AXIS * source.n), 1, stream=stream)[:, 0, :]
+        drawn = source.draw(max(DRAWS, _FACES_PER_AXIS * source.n), 1, stream=stream)[:, 0, :]
     return precision(drawn)
 
 

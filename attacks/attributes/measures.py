@@ -8,7 +8,7 @@ or less often, than the same ones dealt out at random?
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from enum import StrEnum
 
 import numpy as np
@@ -64,13 +64,7 @@ class Baselines:
 
     def to_json(self) -> dict[str, Json]:
         """JSON form."""
-        return {
-            "uniform": self.uniform,
-            "majority_of_training": self.majority_of_training,
-            "majority": self.majority,
-            "prior": self.prior,
-            "same_predictions": self.same_predictions,
-        }
+        return asdict(self)
 
 
 @dataclass(frozen=True)
@@ -102,16 +96,10 @@ class InferenceMeasures:
         Mean over the classes that occur of the share found.
     confusion
         Counts; a row for each true class, a column for each predicted one.
-    information
-        See `MutualInformation`.
-    baselines
-        See `Baselines`.
     advantage
         Accuracy minus the majority's share; negative below it.
     p_value
         Two-sided, of the accuracy among permutations of the predictions.
-    leakage
-        What the test says at `SIGNIFICANCE`.
     """
 
     accuracy: Rate
@@ -149,8 +137,6 @@ def measure(
         Class numbers, 0 … ``classes`` − 1.
     training : (T,) int64
         Class numbers of the attacker's own faces.
-    seed
-        Of the permutations for the mutual information.
 
     Raises
     ------

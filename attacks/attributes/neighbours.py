@@ -46,8 +46,6 @@ def nearest_neighbours(
         Unit rows.
     k
         Number of neighbours, at most G and 1,000.
-    metrics
-        Those to search by.
     skip : (P,) int64, optional
         Position in the gallery that each template does not find: that of the face in it, where the
         attacker lifted faces of the gallery. The gallery must have more than ``k`` faces then.
@@ -141,7 +139,7 @@ def merged(first: Neighbours, second: Neighbours, *, after: int, k: int) -> Neig
 
 
 def votes(neighbours: Neighbours, labels: Codes, classes: int, *, k: int) -> Array32:
-    """Share of the k nearest neighbours in each class.
+    """Share of the k nearest neighbours in each class, (P, classes) float32.
 
     Parameters
     ----------
@@ -149,10 +147,6 @@ def votes(neighbours: Neighbours, labels: Codes, classes: int, *, k: int) -> Arr
         With K ≥ k.
     labels : (G,) int64
         Class numbers of the gallery.
-
-    Returns
-    -------
-    float32, shape (P, classes)
     """
     of = labels[neighbours.indices[:, :k]]
     return np.stack([(of == code).mean(axis=1) for code in range(classes)], axis=1).astype(

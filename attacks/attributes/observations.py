@@ -77,7 +77,7 @@ class Observations:
         )
 
 
-def observe_attacked(setup: Setup, scheme: Scheme, progress: Progress | None) -> Observations:
+def observe_attacked(setup: Setup, scheme: Scheme, progress: Progress) -> Observations:
     """Lift the attacked faces with the deployment's decoys, and look at their templates.
 
     ``progress`` is called with the work that was just done; see `search_work`.
@@ -88,7 +88,7 @@ def observe_attacked(setup: Setup, scheme: Scheme, progress: Progress | None) ->
 
 
 def observe_own(
-    setup: Setup, scheme: Scheme, progress: Progress | None
+    setup: Setup, scheme: Scheme, progress: Progress
 ) -> tuple[Observations, NDArray[np.bool_]]:
     """Lift the attacker's own faces, fold by fold; which of them are held out.
 
@@ -147,12 +147,11 @@ class _Observer:
     scheme: Scheme
     side: Side
     whole: bool
-    progress: Progress | None
+    progress: Progress
 
-    def advance(self, products: int) -> Progress | None:
+    def advance(self, products: int) -> Progress:
         """Return a callback that counts a pair as so many products."""
-        report = self.progress
-        return None if report is None else lambda pairs: report(products * pairs)
+        return lambda pairs: self.progress(products * pairs)
 
 
 def _observe(

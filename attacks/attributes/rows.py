@@ -15,10 +15,6 @@ class AttributeRow:
 
     Parameters
     ----------
-    scheme
-        What was attacked.
-    attribute
-        Such as ``gender``.
     attacker
         ``knn`` (the paper's), ``logistic``, ``svm`` or ``boosting`` (trained on faces that the
         attacker lifted), ``likelihood`` (``svm`` with the point that is least like the generator's
@@ -30,14 +26,10 @@ class AttributeRow:
         What the attacker has: ``algorithm`` (and other, labelled faces), or ``decoys`` too.
     classes
         Names in the order of the confusion's rows and columns.
-    measures
-        On the attacked faces.
     held_out
         The attacker's strength (`InferenceMeasures.strength`) on faces that it lifted itself and
         did not learn from, of ``knn`` on all that it lifted: what it chooses the best attacker by,
         before it sees a victim.
-    seed
-        Of lifting, training and permutations.
     seconds
         Time that this attacker took for all attributes, without lifting and neighbour search where
         others share them.

@@ -4,18 +4,7 @@ Nothing here imports torch before an attack is made.
 """
 
 from attacks.learned.crops import FaceCrops
-from attacks.learned.decoder import Decoder, train_decoder
-from attacks.learned.inverter import Inverter, invert, train
-from attacks.learned.reconstruction import Reconstruction, reconstruct, score_images
+from attacks.learned.inverter import invert
+from attacks.learned.reconstruction import reconstruct
 
-__all__ = [
-    "Decoder",
-    "FaceCrops",
-    "Inverter",
-    "Reconstruction",
-    "invert",
-    "reconstruct",
-    "score_images",
-    "train",
-    "train_decoder",
-]
+__all__ = ["FaceCrops", "invert", "reconstruct"]

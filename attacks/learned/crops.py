@@ -1,6 +1,5 @@
 """Aligned faces, for the decoder that draws faces from embeddings."""
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,12 +18,11 @@ class FaceCrops:
 
     def of(self, rows: NDArray[np.int64]) -> NDArray[np.uint8]:
         """Crops of some rows of the faces, uint8 (B, s, s, 3)."""
-        size = int(self._pack.info.preprocessing["size"])
         crops = []
         for row in rows.tolist():
             image = decode_image(self._faces.paths[row].read_bytes())
             if self._aligned:
-                crops.append(cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA))
+                crops.append(self._pack.as_aligned(image))
             else:
                 crops.append(self._pack.align(image, self._pack.detect(image)[0]))
         return np.stack(crops)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from attacks.errors import AuditError
 from attacks.learned.extra import need
+from templates.space.embedding import normalised
 
 if TYPE_CHECKING:
     from torch import nn
@@ -36,8 +37,6 @@ class Decoder:
     ----------
     network
         (B, n) → (B, 3, SIZE, SIZE), values in [0, 1].
-    epochs
-        Epochs trained.
     """
 
     network: "nn.Sequential"
@@ -58,9 +57,8 @@ class Decoder:
 
 def _directions(descriptors: NDArray[np.floating]) -> NDArray[np.float32]:
     """Rows of length √n, so that their entries are of order one."""
-    rows = np.asarray(descriptors, dtype=np.float64)
-    lengths = np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-300)
-    return np.ascontiguousarray(rows / lengths * np.sqrt(rows.shape[1]), dtype=np.float32)
+    rows = normalised(np.asarray(descriptors, dtype=np.float64))
+    return np.ascontiguousarray(rows * np.sqrt(rows.shape[1]), dtype=np.float32)
 
 
 def resized(images: Images, size: int) -> Images:

@@ -18,6 +18,7 @@ from attacks.learned.extra import need
 from attacks.outcomes import AttackOutcome, Knowledge
 from attacks.recovery import recovery_outcome
 from attacks.system import System
+from templates.space.embedding import normalised
 from templates.space.subspace import SubspaceBatch
 
 if TYPE_CHECKING:
@@ -44,10 +45,6 @@ class Inverter:
 
     Parameters
     ----------
-    rounds
-        One network a round.
-    epochs
-        Epochs trained.
     held_out_cosine, held_out_foot
         Mean cosine to the truth of the guesses, and of the foot points, on faces of the attacker
         that it was not trained on.
@@ -69,7 +66,7 @@ class Inverter:
                     torch.tensor(batch.bases[rows]),
                 )
                 out[rows] = _guess(self.rounds, feet, bases).double().numpy()
-        return np.asarray(out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-300))
+        return normalised(out)
 
 
 def _slices(count: int) -> Iterator[slice]:
@@ -182,19 +179,9 @@ def _cosines(rows: NDArray[np.floating], truth: NDArray[np.floating]) -> NDArray
 
 
 def invert(
-    system: System,
-    faces: NDArray[np.float32] | None = None,
-    *,
-    seconds: float = SECONDS,
-    epochs: int = MOST_EPOCHS,
-    seed: int,
+    system: System, *, seconds: float = SECONDS, epochs: int = MOST_EPOCHS, seed: int
 ) -> tuple[Inverter, list[AttackOutcome]]:
     """Train an inverter for the system's scheme, and let it guess the victims' descriptors.
-
-    Parameters
-    ----------
-    faces : (A, n) float32
-        Faces that the attacker has beside the system's.
 
     Returns
     -------
@@ -204,10 +191,8 @@ def invert(
         One, named ``inverter``. Its details hold the cosine of the foot point beside the guess's:
         the better of the two is what an attacker uses.
     """
-    known = system.attacker if faces is None else np.concatenate([system.attacker, faces])
-    known = np.ascontiguousarray(known, dtype=np.float32)
     inverter = train(
-        known,
+        system.attacker,
         lambda rows, epoch: system.lift(rows, f"inverter, epoch {epoch}"),
         seconds=seconds,
         epochs=epochs,
@@ -224,7 +209,7 @@ def invert(
             "to train a network that maps a template to its embedding; success is a match of "
             "the guess with a fresh photo",
             details={
-                "faces": len(known),
+                "faces": len(system.attacker),
                 "epochs": inverter.epochs,
                 "foot_point_cosine_to_truth_mean": float(foot.mean()),
                 "held_out_cosine_mean": inverter.held_out_cosine,

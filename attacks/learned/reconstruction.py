@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attacks.errors import AuditError
-from attacks.learned.decoder import SECONDS, SIZE, Images, resized, train_decoder
+from attacks.learned.decoder import MOST_EPOCHS, SIZE, Images, resized, train_decoder
 from attacks.learned.extra import need
 from attacks.outcomes import (
     CONTROL,
@@ -93,9 +93,9 @@ def reconstruct(
     photos: Images,
     *,
     embed: Embed,
-    guesses: Mapping[str, NDArray[np.floating]] | None = None,
-    seconds: float = SECONDS,
-    epochs: int | None = None,
+    guesses: Mapping[str, NDArray[np.floating]],
+    seconds: float,
+    epochs: int = MOST_EPOCHS,
     seed: int,
 ) -> list[AttackOutcome]:
     """Train a decoder on the auditor's images, and draw the victims from their templates.
@@ -107,8 +107,6 @@ def reconstruct(
     photos : (V, s, s, 3) uint8
         An aligned photo of each victim, of the embedder's size, to compare with: not the fresh
         one.
-    embed
-        The service's embedder.
     guesses
         Further guesses of the victims' descriptors, by name, (V, n): such as an inverter's.
 
@@ -124,16 +122,15 @@ def reconstruct(
         Arrays that do not fit, or the ``torch`` extra is not installed.
     """
     count = len(system.victims)
-    if len(photos) != count or any(len(rows) != count for rows in (guesses or {}).values()):
+    if len(photos) != count or any(len(rows) != count for rows in guesses.values()):
         raise AuditError(f"{count} victims need a photo and a guess each")
     need("skimage.metrics")  # before the training rather than after it
-    options = {} if epochs is None else {"epochs": epochs}
-    decoder = train_decoder(images, descriptors, seconds=seconds, seed=seed, **options)
+    decoder = train_decoder(images, descriptors, seconds=seconds, epochs=epochs, seed=seed)
     noise = np.random.default_rng(seed).normal(size=system.victims.enrolled.shape)
     inputs: dict[str, NDArray[np.floating]] = {
         RAW: system.victims.enrolled,
         FOOT: system.templates.feet,
-        **(guesses or {}),
+        **guesses,
         NOISE: noise,
     }
     outcomes = []

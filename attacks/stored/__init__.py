@@ -15,8 +15,6 @@ SOME = 150
 FEW = 60
 """Victims whose descriptor is lifted again and again: it is recovered in every trial or in none."""
 
-__all__ = ["foot_point_attack", "nearest_neighbour_attack", "template_attacks"]
-
 
 def template_attacks(system: System) -> list[AttackOutcome]:
     """Run all attacks on stored templates, in order."""

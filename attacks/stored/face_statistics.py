@@ -36,8 +36,10 @@ class FaceStatistics:
         rows = descriptors.astype(np.float64)
         if len(rows) < 2:
             raise AuditError("the statistics of faces need at least two faces of the attacker's")
+        from sklearn.covariance import ledoit_wolf
+
         mean = rows.mean(axis=0)
-        values, vectors = np.linalg.eigh(_shrunk_covariance(rows - mean))
+        values, vectors = np.linalg.eigh(ledoit_wolf(rows - mean, assume_centered=True)[0])
         roots = np.sqrt(np.maximum(values, values[-1] * 1e-6))
         return cls(
             mean=mean,
@@ -61,15 +63,3 @@ class FaceStatistics:
         feet = self.whitened(templates.feet)
         inside = (feet[:, None, :] @ bases.transpose(0, 2, 1)) @ bases
         return feet - inside[:, 0, :], bases
-
-
-def _shrunk_covariance(centred: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Covariance, drawn towards its mean variance by as much as lowers the expected error most."""
-    count, n = centred.shape
-    covariance = centred.T @ centred / count
-    mean_variance = np.trace(covariance) / n
-    squares = np.sum(covariance**2)
-    error = (np.mean(np.sum(centred**2, axis=1) ** 2) - squares) / (count * n)
-    distance = squares / n - mean_variance**2
-    share = min(error / distance, 1.0) if distance > 0 else 0.0
-    return np.asarray((1 - share) * covariance + share * mean_variance * np.eye(n))

@@ -6,13 +6,13 @@ from numpy.typing import NDArray
 from attacks.outcomes import AttackOutcome, Knowledge
 from attacks.recovery import recovery_outcome
 from attacks.system import System
+from templates.space.embedding import normalised
 from templates.space.subspace import SubspaceBatch
 
 
 def foot_points(templates: SubspaceBatch) -> NDArray[np.float64]:
     """Return p / ‖p‖ of every template, shape (T, n)."""
-    feet = templates.feet.astype(np.float64)
-    return np.asarray(feet / np.linalg.norm(feet, axis=1, keepdims=True))
+    return normalised(templates.feet.astype(np.float64))
 
 
 def foot_point_attack(system: System) -> list[AttackOutcome]:

@@ -19,28 +19,21 @@ Pairs = NDArray[np.int64]
 """(P, 2): person who comes, template they come to."""
 
 
-def impersonation_attack(
-    system: System, *, faces: NDArray[np.float32] | None = None
-) -> list[AttackOutcome]:
+def impersonation_attack(system: System) -> list[AttackOutcome]:
     """Owners of decoys against the templates that hold them.
 
     With a pool they come with another photo of themselves, where there is one, else with the photo
-    in the pool. With a generator they are the people that a generator is fitted to here, and come
-    to every template that was lifted with it. Empty for a scheme without decoys.
-
-    Parameters
-    ----------
-    faces : (N, n)
-        One photo of each of some people: a generator is fitted to the first half of them, and the
-        others are strangers to it. The attacker's where None. A generator that is fitted to few
-        people lets them in, and a service's is fitted to thousands: with fewer than
-        ``FACES_PER_DIMENSION`` for each number the outcome is not judged.
+    in the pool. With a generator they are the first half of the attacker's faces, which a generator
+    is fitted to here, and come to every template that was lifted with it; the others are strangers
+    to it. A generator that is fitted to few people lets them in, and a service's is fitted to
+    thousands: with fewer than ``FACES_PER_DIMENSION`` for each number the outcome is not judged.
+    Empty for a scheme without decoys.
     """
     if not decoy_count(system.scheme) or system.source is None:
         return []
     if system.scheme.decoys == POOLED and isinstance(system.source, DecoyPool):
         return [_pooled(system, system.source)]
-    return [_generated(system, system.attacker if faces is None else faces)]
+    return [_generated(system)]
 
 
 def _pooled(system: System, pool: DecoyPool) -> AttackOutcome:
@@ -67,7 +60,8 @@ def _pooled(system: System, pool: DecoyPool) -> AttackOutcome:
     )
 
 
-def _generated(system: System, faces: NDArray[np.float32]) -> AttackOutcome:
+def _generated(system: System) -> AttackOutcome:
+    faces = system.attacker
     half = len(faces) // 2
     enough = half >= FACES_PER_DIMENSION * faces.shape[1]
     fitted, strangers = faces[:half], faces[half:]

@@ -15,6 +15,7 @@ from attacks.recovery import recovery_outcome
 from attacks.system import System
 from templates.decoys import Attributes
 from templates.keys.randomness import Keystream
+from templates.space.embedding import normalised
 from templates.space.lifting import Strategy, lift
 from templates.space.subspace import SubspaceBatch
 
@@ -88,11 +89,11 @@ def nearest_common_point(feet: Array, bases: Array, starts: Array) -> Array:
     radii = np.sqrt(np.maximum(1 - np.einsum("ti,ti->t", feet, feet), 0))
     rows = bases.reshape(-1, bases.shape[2])
     total = feet.sum(axis=0)
-    points = _normalised(starts)
+    points = normalised(starts)
     for _ in range(_ROUNDS):
         inside = (points @ rows.T).reshape(len(points), len(feet), -1)
         inside *= (radii / np.maximum(np.linalg.norm(inside, axis=2), 1e-12))[:, :, None]
-        following = _normalised(total + inside.reshape(len(points), -1) @ rows)
+        following = normalised(total + inside.reshape(len(points), -1) @ rows)
         moved = float(np.abs(following - points).max())
         points = following
         if moved < 1e-7:
@@ -111,10 +112,6 @@ def nearest_common_points(batches: Sequence[SubspaceBatch]) -> Array:
     return np.stack(points)
 
 
-def _normalised(rows: Array) -> Array:
-    return np.asarray(rows / np.maximum(np.linalg.norm(rows, axis=-1, keepdims=True), 1e-12))
-
-
 def same_descriptor(system: System, *, lifts: Sequence[int] = LIFTS) -> list[AttackOutcome]:
     """Intersect T templates of one descriptor: as they are lifted, and through the wire format."""
     outcomes = []
@@ -126,7 +123,7 @@ def same_descriptor(system: System, *, lifts: Sequence[int] = LIFTS) -> list[Att
             for number in range(max(lifts))
         ]
         for count in lifts:
-            meetings = _meetings(batches[:count])
+            meetings = [meeting_point(*stacked) for stacked in _stacked(batches[:count])]
             unique = np.array([meeting.shared == 0 for meeting in meetings])
             guesses = np.stack([meeting.point for meeting in meetings])
             gaps = np.linalg.norm(guesses - system.victims.enrolled, axis=1)[unique]
@@ -177,7 +174,3 @@ def _stacked(batches: Sequence[SubspaceBatch]) -> Iterator[tuple[Array, Array]]:
             np.stack([batch.feet[row] for batch in batches]).astype(np.float64),
             np.stack([batch.bases[row] for batch in batches]).astype(np.float64),
         )
-
-
-def _meetings(batches: Sequence[SubspaceBatch]) -> list[Meeting]:
-    return [meeting_point(feet, bases) for feet, bases in _stacked(batches)]

@@ -87,7 +87,7 @@ def likeliest(
     basis: NDArray[np.float64],
     decoys: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Point of a subspace that a descriptor is likeliest to be, given decoys in it.
+    """Point of a subspace, (n,), that a descriptor is likeliest to be, given decoys in it.
 
     Parameters
     ----------
@@ -96,10 +96,6 @@ def likeliest(
         Orthonormal. Both in coordinates in which descriptors follow N(0, I).
     decoys : (k, n)
         Points of the subspace, at least one.
-
-    Returns
-    -------
-    (n,)
 
     Notes
     -----
@@ -203,8 +199,6 @@ def attack_with_draws(
 
     Parameters
     ----------
-    lift
-        The victims, lifted.
     drawn : (K, n) float32
         The draws.
     """

@@ -122,14 +122,10 @@ class Trial:
 
     Parameters
     ----------
-    variant
-        Its name.
     does
         What the attacker does with it, to complete "The attacker …".
     probes
         One for each victim, or one for all.
-    knowledge, leaked
-        What it takes.
     """
 
     variant: str

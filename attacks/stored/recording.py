@@ -19,8 +19,6 @@ class RecordingSource:
 
     Parameters
     ----------
-    inner
-        Where the decoys come from.
     noise
         Length of the random vector that is added to every decoy, which has length 1, before it is
         normalised again; what is remembered is the decoy without it.
@@ -88,8 +86,6 @@ def recorded_lift(
     ----------
     source
         Instead of the system's.
-    noise
-        See ``RecordingSource``.
     """
     recording = RecordingSource(source or system.lifter.source, noise=noise)
     lifter = replace(system.lifter, source=recording)

@@ -35,8 +35,6 @@ class Ground:
     radii : (K,) float32
     targets
         How many of the K are targets.
-    threshold
-        Of the level that the wolf is made for.
     """
 
     feet: Array32
@@ -82,22 +80,18 @@ class Ground:
         return objective, slopes
 
 
-def ascend_subspaces(
-    starts: SubspaceBatch, ground: Ground, *, rounds: int = ROUNDS
-) -> SubspaceBatch:
+def ascend_subspaces(starts: SubspaceBatch, ground: Ground) -> SubspaceBatch:
     """Climb with lifted probes, whose foot points keep their norm."""
-    ends = [
-        _ascend(starts.feet[row], starts.bases[row], ground, rounds) for row in range(len(starts))
-    ]
+    ends = [_ascend(starts.feet[row], starts.bases[row], ground) for row in range(len(starts))]
     return SubspaceBatch(np.stack([foot for foot, _ in ends]), np.stack([e for _, e in ends]))
 
 
-def _ascend(foot: Array32, basis: Array32, ground: Ground, rounds: int) -> tuple[Array32, Array32]:
+def _ascend(foot: Array32, basis: Array32, ground: Ground) -> tuple[Array32, Array32]:
     norm = float(np.linalg.norm(foot))
     radius = np.float32(np.sqrt(max(0.0, 1 - norm**2)))
     best_foot, best_basis, best_value = foot, basis, -np.inf
     v: Array32 | None = None
-    for number, step in enumerate(step_lengths(rounds)):
+    for number, step in enumerate(step_lengths(ROUNDS)):
         # The best v moves little in a step: it is searched for anew now and then only.
         again = None if number % _SEARCH_EVERY == 0 else v
         similarities, v, nearest = _closest(foot, basis, radius, ground, again)

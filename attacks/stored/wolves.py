@@ -31,8 +31,6 @@ def axis_wolves(faces: NDArray[np.float32], m: int, *, foot_norm: float, seed: i
     ----------
     foot_norm
         Norm of an honest probe's foot point; wolves have it, a fifth less and a fifth more, and 0.
-    seed
-        Of the mixtures of axes.
     """
     rng = np.random.default_rng(seed)
     mean = faces.mean(axis=0, dtype=np.float64)

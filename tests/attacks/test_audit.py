@@ -28,7 +28,7 @@ def test_an_audit_of_two_schemes_reports_its_progress(monkeypatch: pytest.Monkey
     given: list[int] = []
 
     def attacks(*arguments: Any) -> list[Any]:
-        given.append(len(arguments[4]))
+        given.append(len(arguments[2].attacker) - len(arguments[1].attacker))
         return [list, list, list]
 
     monkeypatch.setattr(audit, "_attacks", attacks)

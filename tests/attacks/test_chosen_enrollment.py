@@ -45,7 +45,7 @@ def test_the_pairs_alone_fix_it_too(system: System) -> None:
     rotation = random_rotation(seed=6)
     sent = system.lift(system.attacker[:20], "test of chosen enrollment")
     stolen = in_another_basis(sent).rotated(rotation)
-    assert alignment(estimate_from_sets(Sides(sent, stolen), steps=0), rotation) > 0.999
+    assert alignment(polar_factor(product_pairs(Sides(sent, stolen))), rotation) > 0.999
 
 
 def test_pairs_beyond_a_number_are_not_needed(

@@ -27,11 +27,6 @@ def test_local_d_is_the_papers_formula_bin_by_bin() -> None:
     assert global_d(genuine, impostor) == pytest.approx(np.dot(genuine / 20, expected))
 
 
-def test_prior_odds_scale_the_likelihood_ratio() -> None:
-    genuine, impostor = np.array([1.0, 3.0]), np.array([3.0, 1.0])
-    np.testing.assert_allclose(local_d(genuine, impostor, omega=2.0), [0.0, 2 * 6 / 7 - 1])
-
-
 def test_d_sys_of_shifted_gaussians_is_the_integral() -> None:
     shift = 1.5
 
@@ -40,7 +35,7 @@ def test_d_sys_of_shifted_gaussians_is_the_integral() -> None:
         return float(a * max(a - b, 0) / (a + b))
 
     expected = quad(density, -8, 10)[0]
-    measured = unlinkability(gaussian_scores(shift), bins=30, seed=0)
+    measured = unlinkability(gaussian_scores(shift), seed=0)
     assert measured.d_sys.value == pytest.approx(expected, abs=0.05)
     assert measured.d_sys.value > measured.null_95
     assert measured.d_sys.ci_low <= measured.d_sys.value <= measured.d_sys.ci_high

@@ -9,10 +9,8 @@ from PIL import Image
 from models import extraction
 from models.alignment import align, template
 from models.cache import EmbeddingCache
-from models.decoding import ImageLimits
 from models.extraction import Extractor
 from models.pack import FacePolicy, ModelPack
-from models.quality import QualityLimits
 from tests.models.graphs import pooled, pooling_embedder, unit, write_pack
 
 
@@ -41,12 +39,12 @@ def expected(seeds) -> np.ndarray:
 def test_rows_follow_the_order_of_the_paths(pack, files, monkeypatch):
     monkeypatch.setattr(extraction, "CHUNK", 3)
     order = [4, 0, 6, 2, 1, 5, 3]
-    result = Extractor(pack, workers=3).extract([files[i] for i in order])
+    result = Extractor(pack).extract([files[i] for i in order])
     np.testing.assert_allclose(result.descriptors, expected(order), atol=2e-5)
     assert result.paths == [files[i] for i in order]
     assert result.descriptors.dtype == np.float32
     assert result.descriptors.flags.c_contiguous
-    assert (result.failures, result.failure_to_acquire) == ([], 0.0)
+    assert result.failures == []
 
 
 def test_every_file_is_accounted_for(pack, files, tmp_path):
@@ -65,7 +63,6 @@ def test_every_file_is_accounted_for(pack, files, tmp_path):
     ]
     assert all(failure.reason.endswith(".") for failure in result.failures)
     assert result.failure_counts() == {"unsupported_image": 3, "unreadable_file": 1}
-    assert result.failure_to_acquire == pytest.approx(4 / 6)
     np.testing.assert_allclose(result.descriptors, expected([0, 1]), atol=2e-5)
 
 
@@ -73,14 +70,13 @@ def test_a_file_over_the_limit_is_not_read_whole(pack, tmp_path):
     path = tmp_path / "huge.png"
     with path.open("wb") as file:
         file.truncate(2**40)
-    result = Extractor(pack, limits=ImageLimits(max_bytes=1000)).extract([path])
+    result = Extractor(pack).extract([path])
     assert [failure.code for failure in result.failures] == ["image_too_large"]
 
 
 def test_nothing_in_nothing_out(pack):
     result = Extractor(pack).extract([])
     assert result.descriptors.shape == (0, pack.info.n)
-    assert result.failure_to_acquire == 0.0
 
 
 def test_copies_of_one_file_are_embedded_once(pack, files, tmp_path, monkeypatch):
@@ -113,7 +109,7 @@ def test_the_cache_knows_the_picture_and_not_its_name(pack, files):
     np.testing.assert_allclose(result.descriptors, expected([1]), atol=2e-5)
 
 
-def test_another_model_preprocessing_or_gate_misses_the_cache(pack, files, tmp_path):
+def test_another_model_or_preprocessing_misses_the_cache(pack, files, tmp_path):
     cache = EmbeddingCache()
     Extractor(pack, cache=cache).extract(files)
     folder = write_pack(tmp_path / "same", e=pooling_embedder())
@@ -121,9 +117,8 @@ def test_another_model_preprocessing_or_gate_misses_the_cache(pack, files, tmp_p
     others = [
         Extractor(ModelPack.load(folder, flip=True), cache=cache),
         Extractor(ModelPack.load(other_model), cache=cache),
-        Extractor(pack, cache=cache, quality=QualityLimits()),
     ]
-    assert [other.extract(files[:1]).cached for other in others] == [0, 0, 0]
+    assert [other.extract(files[:1]).cached for other in others] == [0, 0]
     assert Extractor(ModelPack.load(folder), cache=cache).extract(files[:1]).cached == 1
 
 

@@ -14,7 +14,7 @@ from models.boxes import Face
 from models.decoding import decode_image
 from models.errors import PhotoRejected
 from models.pack import ModelPack
-from models.scrfd import RECOMMENDED_SCORE
+from models.scrfd import Scrfd
 from templates.contract.document import Contract, LivenessCalibration
 from templates.errors import Uncalibrated
 from tests.api.deployment import RATE, make_contract, make_source
@@ -83,7 +83,7 @@ def unsure(monkeypatch: pytest.MonkeyPatch, places: set[int]) -> None:
         faces = detect(pack, image)
         if next(seen) not in places:
             return faces
-        return [replace(face, score=RECOMMENDED_SCORE - 0.01) for face in faces]
+        return [replace(face, score=Scrfd.recommended_score - 0.01) for face in faces]
 
     monkeypatch.setattr(ModelPack, "detect", detect_unsurely)
 

@@ -305,15 +305,9 @@ def test_stored_templates_of_another_contract_are_refused(
         verifier.decide_embedding(NEW.descriptors[0], dataclasses.replace(stored[0], wire=thin))
 
 
-def test_unknown_levels_and_metrics_are_refused(
-    verifier: Verifier, stored: list[Enrollment]
-) -> None:
-    from templates.distances import Metric
-
+def test_unknown_levels_are_refused(verifier: Verifier, stored: list[Enrollment]) -> None:
     with pytest.raises(Uncalibrated, match="calibrated are: fmr-1e-2, fmr-1e-3"):
         verifier.decide_embedding(NEW.descriptors[0], stored[0], level="fmr-1e-9")
-    with pytest.raises(Uncalibrated, match="no calibration for p2s euclidean"):
-        verifier.decide_embedding(NEW.descriptors[0], stored[0], metric=Metric.EUCLIDEAN)
 
 
 def test_a_rotation_of_another_dimension_is_refused(contract: Contract) -> None:

@@ -36,14 +36,8 @@ class PackSource:
     ----------
     folder
         The pack; on a cluster the same path must lead to it on every worker.
-    embedder_sha256
-        What the embedder must be.
     providers, threads, flip
         As in :meth:`models.pack.ModelPack.load`.
-    aligned
-        Whether the photos are aligned crops.
-    mirrored
-        Whether descriptors with the mirror image are wanted beside those without.
     """
 
     folder: Path

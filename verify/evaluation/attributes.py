@@ -13,13 +13,12 @@ from verify.evaluation.labels_file import Labels
 from verify.evaluation.plan import EvaluationError
 
 NEIGHBOURS = 10
+"""All entries where fewer have a label."""
 _ROWS = 1024
 
 
-def predict_attributes(
-    descriptors: NDArray[np.float32], pool: DecoyPool, *, k: int = NEIGHBOURS
-) -> list[Attributes]:
-    """Predict gender and race by the vote of the k nearest entries of a labelled pool.
+def predict_attributes(descriptors: NDArray[np.float32], pool: DecoyPool) -> list[Attributes]:
+    """Predict gender and race by the vote of the nearest entries of a labelled pool.
 
     hybrid+ needs the attributes of the faces it lifts; the paper predicts those of unlabelled
     faces. The vote is taken for each attribute by itself (:func:`voted`).
@@ -28,8 +27,6 @@ def predict_attributes(
     ----------
     descriptors : (N, n) float32
         Unit rows.
-    k
-        Number of neighbours; all entries where fewer have a label.
 
     Returns
     -------
@@ -48,8 +45,8 @@ def predict_attributes(
             "attributes are predicted from a labelled decoy pool, and this one has no labels; "
             "build the pool from a folder with FairFace labels"
         )
-    genders = voted(descriptors, entries, [label.gender for label in labels], k=k)
-    races = voted(descriptors, entries, [label.race for label in labels], k=k)
+    genders = voted(descriptors, entries, [label.gender for label in labels])
+    races = voted(descriptors, entries, [label.race for label in labels])
     return [Attributes(gender, race) for gender, race in zip(genders, races, strict=True)]
 
 
@@ -98,10 +95,8 @@ def voted(
     descriptors: NDArray[np.float32],
     entries: NDArray[np.float32],
     labels: Sequence[str | None],
-    *,
-    k: int = NEIGHBOURS,
 ) -> list[str | None]:
-    """Give each face the label that most of its k nearest labelled entries have.
+    """Give each face the label that most of its nearest labelled entries have; None without any.
 
     Equal votes go to the label that comes first in the alphabet.
 
@@ -111,19 +106,12 @@ def voted(
         Unit rows.
     labels
         One per entry; None where it has none.
-    k
-        Number of neighbours; all entries where fewer have a label.
-
-    Returns
-    -------
-    list
-        One label per face; None where no entry has one.
     """
     known = [i for i, label in enumerate(labels) if label is not None]
     if not known or not len(descriptors):
         return [None] * len(descriptors)
     names, number_of = np.unique([str(labels[i]) for i in known], return_inverse=True)
-    nearest_of, k = entries[known].T, min(k, len(known))
+    nearest_of, k = entries[known].T, min(NEIGHBOURS, len(known))
     chosen: list[str | None] = []
     for start in range(0, len(descriptors), _ROWS):
         # Of unit rows, the nearest by Euclidean distance are the nearest by angle.
@@ -137,7 +125,7 @@ def voted(
 def resembling(
     pool: DecoyPool, descriptors: NDArray[np.float32], *, cosine: float
 ) -> NDArray[np.int64]:
-    """Find the entries of a pool that may show people of a set.
+    """Find the entries of a pool that may show people of a set; their numbers, ascending.
 
     A person in the pool lies in every template that their descriptor is a decoy of (docs/method.md
     §4.3): people of the test set are excluded from the decoys before it is evaluated.
@@ -148,11 +136,6 @@ def resembling(
         Unit rows, of the set.
     cosine
         An entry resembles a face where the cosine of the two is at least this.
-
-    Returns
-    -------
-    int64
-        Their numbers, ascending.
 
     Raises
     ------
@@ -167,17 +150,12 @@ def resembling(
 def resembling_rows(
     rows: NDArray[np.float32], others: NDArray[np.float32], *, cosine: float
 ) -> NDArray[np.int64]:
-    """Find the rows that have a cosine of at least ``cosine`` with any of the others.
+    """Find the rows that have a cosine of at least ``cosine`` with any of the others, ascending.
 
     Parameters
     ----------
     rows, others : (N, n) and (M, n) float32
         Unit rows; the cosines are made a tile at a time.
-
-    Returns
-    -------
-    int64
-        Their numbers, ascending.
     """
     resembles = np.zeros(len(rows), dtype=np.bool_)
     for start in range(0, len(rows), _ROWS):

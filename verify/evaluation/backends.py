@@ -32,8 +32,6 @@ class Backend:
     ----------
     scheduler
         ``tcp://…`` or ``tls://…`` address of a Dask scheduler; None for local processes.
-    jobs
-        Number of local processes.
     """
 
     scheduler: str | None = None

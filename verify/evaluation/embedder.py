@@ -59,12 +59,6 @@ class PackEmbedder:
 
     Parameters
     ----------
-    pack, folder
-        The pack, and where it lies.
-    providers
-        That it was loaded with.
-    facts
-        What the results record about it.
     mirrored
         Whether embeddings with the mirror image are wanted beside those without.
     aligned

@@ -40,8 +40,6 @@ class EmbeddingsFile:
         As the file has them, all different.
     descriptors : (N, n) float32
         Unit rows.
-    sha256
-        Of the file.
     """
 
     paths: tuple[str, ...]

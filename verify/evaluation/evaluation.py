@@ -32,18 +32,10 @@ class Evaluated:
 
     Parameters
     ----------
-    facts
-        Counts of the set.
-    material
-        What was compared.
     kept : (P,) int64
         Pairs of the set that were compared, as positions in it.
-    runs
-        In the order of the plan.
     source_of
         Position of the decoy source of each lifted cell.
-    work
-        What each unit took, in the order of the plan.
     """
 
     facts: SetFacts
@@ -60,12 +52,8 @@ class Work:
 
     Parameters
     ----------
-    unit
-        What was done.
     seconds
         Of one thread, from the descriptors to the figures.
-    resumed
-        Whether its similarities were there already.
     """
 
     unit: Unit
@@ -81,11 +69,6 @@ def prepare(
     sources: Sequence[Source],
 ) -> tuple[Material, SetFacts, NDArray[np.int64]]:
     """Take the pairs of which both photos gave a descriptor; the others are counted.
-
-    Parameters
-    ----------
-    attributes
-        One for each acquired row.
 
     Raises
     ------

@@ -45,19 +45,6 @@ def run_evaluation(
 ) -> Json:
     """Evaluate a plan; return the document of the results.
 
-    Parameters
-    ----------
-    sources
-        Decoys.
-    labels
-        Of photos or people: gives results by group, and hybrid+ its attributes.
-    out
-        Folder of finished units, which are not computed again.
-    options
-        What the results record beside the plan.
-    note
-        Called with sentences that a reader should know.
-
     Raises
     ------
     EvaluationError

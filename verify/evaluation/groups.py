@@ -7,7 +7,7 @@ for a group's FMR where both people are in it, and as a cross trial where they a
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,13 +47,7 @@ class MeanRate:
 
     def json(self) -> dict[str, float | int | None]:
         """JSON form."""
-        return {
-            "value": self.value,
-            "errors": self.errors,
-            "trials": self.trials,
-            "ci_low": self.ci_low,
-            "ci_high": self.ci_high,
-        }
+        return {"value": self.value, **asdict(self)}
 
 
 @dataclass(frozen=True)
@@ -62,8 +56,6 @@ class Group:
 
     Parameters
     ----------
-    name
-        The label.
     fmr, fnmr
         Of impostor trials within the group, and of its genuine trials.
     fmr_judged, fnmr_judged
@@ -84,10 +76,6 @@ class Worst:
 
     Parameters
     ----------
-    group
-        Its name.
-    rate
-        Its rate.
     apart
         Whether the group's interval lies wholly above the rate of all groups together. The
         interval is Wilson's at 1 − 0.05 / k for k judged groups: the highest of k rates is above
@@ -109,20 +97,12 @@ class GroupReport:
 
     Parameters
     ----------
-    attribute
-        Such as ``gender``.
     target_fmr
         The target of the threshold on all impostor trials.
     threshold
         Similarity; the mean over the runs.
-    runs
-        Number of runs that the errors are means of.
     groups
         In the order of their names; ages in the order of years.
-    overall_fmr, overall_fnmr
-        Over all trials, with or without labels.
-    pooled_fmr, pooled_fnmr
-        Over the trials of all groups together.
     cross_fmr
         Over impostor trials of two people of two groups.
     mixed
@@ -212,12 +192,8 @@ def by_group(
         Whether a pair shows one person.
     first_labels, second_labels
         Label of each photo of each pair, None where it has none.
-    attribute
-        What the labels tell.
     thresholds
         The threshold of each run, set on all its trials; a pair at or above it matches.
-    target_fmr
-        What the thresholds were set for.
 
     Raises
     ------

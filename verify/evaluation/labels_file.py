@@ -39,8 +39,6 @@ class Labels:
 
     Parameters
     ----------
-    attributes
-        Names of the attributes, in the order of the columns.
     of
         By the path or name of a row: its labels by attribute; an empty cell is absent.
     """

@@ -45,14 +45,14 @@ def percent(fraction: float | None) -> str:
     return f"{value:.2g}" if 0 < value < 0.1 else f"{value:.2f}"
 
 
-def significant(value: float | None, digits: int = 3) -> str:
-    """Return a number with so many significant digits, never in exponents."""
+def significant(value: float | None) -> str:
+    """Return a number with three significant digits, never in exponents."""
     if value is None or not math.isfinite(value):
         return MISSING
     if value == 0:
         return "0"
-    rounded = float(f"{value:.{digits - 1}e}")
-    decimals = digits - 1 - math.floor(math.log10(abs(rounded)))
+    rounded = float(f"{value:.2e}")
+    decimals = 2 - math.floor(math.log10(abs(rounded)))
     return f"{rounded:,.{max(0, decimals)}f}"
 
 

@@ -19,8 +19,6 @@ class ErrorsAt:
 
     Parameters
     ----------
-    target
-        FMR that the threshold must not exceed.
     threshold
         Similarity.
     errors, trials
@@ -43,8 +41,6 @@ class VerificationMeasures:
 
     Parameters
     ----------
-    ten_fold
-        Accuracies and thresholds of the folds.
     eer, auc, d_prime
         Equal error rate; area under the ROC; (μ_g − μ_i) / √((σ_g² + σ_i²) / 2) of similarities.
     at

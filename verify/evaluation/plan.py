@@ -35,18 +35,12 @@ class EvaluationPlan:
     ----------
     strategies
         Of ``STRATEGIES``.
-    dims
-        Subspace dimensions m.
     modes, metrics
         Of lifted comparisons.
     shared_decoys
         Whether both sides of subspace-to-subspace comparisons draw from the whole pool.
     repeats, seed
         Everything random is repeated with the seeds ``seed … seed + repeats − 1``.
-    targets
-        FMR targets.
-    steps
-        Of the spherical iteration.
     device
         Of torch, for subspace-to-subspace distances; None for the processor.
 
@@ -90,13 +84,7 @@ class EvaluationPlan:
 
 
 def default_strategies(sources: Sequence[Source], *, raw_flip: bool) -> tuple[str, ...]:
-    """All strategies that the decoys allow but the sub- ones.
-
-    Parameters
-    ----------
-    raw_flip
-        Whether embeddings with the mirror image are there beside those without.
-    """
+    """All strategies that the decoys allow but the sub- ones."""
     able = set(WITHOUT_DECOYS) - (set() if raw_flip else {RAW_FLIP})
     if sources:
         able |= {Strategy.ADVERSARIAL, Strategy.HYBRID}

@@ -87,17 +87,13 @@ class OperatingPoints:
     def fnmr(
         self, fmrs: Array64, *, genuine: Array64 | None = None, impostor: Array64 | None = None
     ) -> Array64:
-        """FNMR at the lowest threshold whose FMR is at most each of ``fmrs``.
+        """FNMR, (F,), at the lowest threshold whose FMR is at most each of ``fmrs``.
 
         Parameters
         ----------
         fmrs : (F,) float64
         genuine, impostor : (G,), (I,) float64, optional
             Whole-numbered weights of the trials; 1 each by default.
-
-        Returns
-        -------
-        ndarray of float64, shape (F,)
         """
         genuine_weights = np.ones(self._genuine_order.size) if genuine is None else genuine
         impostor_weights = np.ones(self._impostor_order.size) if impostor is None else impostor

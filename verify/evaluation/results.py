@@ -42,8 +42,6 @@ class Model:
 
     Parameters
     ----------
-    n
-        Their dimension.
     facts
         For the reader: pack, detector, or file of embeddings with its SHA-256.
     embedder_sha256, preprocessing
@@ -72,10 +70,6 @@ class SourceFacts:
     ----------
     source
         As it is in the file; for a set, without the entries that resemble its people.
-    file, sha256
-        Name and SHA-256 of the file.
-    left_out
-        Number of those entries.
     """
 
     source: Source

@@ -28,10 +28,6 @@ class SetFacts:
 
     Parameters
     ----------
-    name
-        Of the set.
-    genuine, impostor
-        Pairs that were compared.
     failed_genuine, failed_impostor
         Pairs with a photo that gave no descriptor.
     fta
@@ -64,14 +60,7 @@ def grouped(runs: Sequence[Run]) -> dict[tuple[Cell, Search], list[Run]]:
 
 def cell_json(cell: Cell) -> Json:
     """Name a cell, as rows, runs, curves and timings do."""
-    return {
-        "strategy": cell.strategy,
-        "decoys": cell.decoys,
-        "shared_decoys": cell.shared_decoys,
-        "dim": cell.dim,
-        "mode": cell.mode.value,
-        "metric": cell.metric,
-    }
+    return {**asdict(cell), "mode": cell.mode.value}
 
 
 def row_json(

@@ -27,12 +27,6 @@ class Run:
 
     Parameters
     ----------
-    cell, lifted, seed
-        What was run.
-    search
-        How the folds chose their thresholds.
-    measures
-        Its figures.
     similarities : (P,) float64
     curve : (F,) float64
         FNMR at FMR ≤ each point of ``fmr_grid``.
@@ -61,8 +55,6 @@ def run_unit(
 
     Parameters
     ----------
-    targets
-        FMR targets.
     known
         Similarities of an earlier run of this unit, in the order of ``unit_layout``.
 

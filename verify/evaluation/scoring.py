@@ -39,8 +39,6 @@ class Scores:
 
     Parameters
     ----------
-    cell
-        The configuration.
     lifted
         Which photo of each pair was lifted; None for raw descriptors and codes.
     similarities : (P,) float64

@@ -22,13 +22,6 @@ _REPEATS = 5
 def timings(material: Material, cells: Sequence[tuple[Cell, int | None]]) -> list[Json]:
     """Time bulk comparisons of every cell, on one thread.
 
-    Parameters
-    ----------
-    material
-        Its descriptors are compared.
-    cells
-        Each with the position of its decoy source.
-
     Returns
     -------
     list of dict

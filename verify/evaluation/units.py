@@ -84,8 +84,6 @@ class LiftUnit:
         What is compared, and the steps of the spherical iteration.
     device
         Of torch, for subspace-to-subspace distances; None for the processor.
-    seed
-        Of all that is random.
     """
 
     strategy: Strategy

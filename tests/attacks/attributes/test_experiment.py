@@ -284,8 +284,6 @@ def test_the_default_grid_is_the_papers_and_ours() -> None:
 
 
 def test_what_cannot_be_run_is_refused() -> None:
-    with pytest.raises(AuditError, match="no attacker is called oracle"):
-        AttributePlan(attackers=("oracle",))
     small = Split(faces(60, seed=1), faces(40, seed=2), faces(30, seed=3))
     with pytest.raises(AuditError, match="neighbours are asked for"):
         prepare(small, plan=AttributePlan(), seed=0)

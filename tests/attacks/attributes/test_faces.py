@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from attacks.attributes.faces import LabelledFaces, near_duplicates, split
+from attacks.attributes.faces import LabelledFaces, attacker_faces, split
 from attacks.errors import AuditError
 from tests.attacks.attributes.people import CLASSES, faces
 
@@ -17,7 +17,7 @@ def keys(some: LabelledFaces) -> set[bytes]:
 
 
 def test_parts_have_no_face_in_common_and_leave_none_out() -> None:
-    parts = split(TRAIN, VALIDATION, lifting=25, seed=3)
+    parts = split(TRAIN, VALIDATION, lifting=25, attack=35, attacked_most=None, seed=3)
     assert [len(parts.lifting), len(parts.attack), len(parts.attacked)] == [25, 35, 20]
     assert keys(parts.lifting) | keys(parts.attack) == keys(TRAIN)
     assert keys(parts.attacked) == keys(VALIDATION)
@@ -32,7 +32,10 @@ def test_labels_follow_their_faces() -> None:
 
 
 def test_a_seed_gives_the_same_parts_and_another_seed_others() -> None:
-    one, same, other = (split(TRAIN, VALIDATION, lifting=25, seed=s) for s in (4, 4, 5))
+    one, same, other = (
+        split(TRAIN, VALIDATION, lifting=25, attack=35, attacked_most=None, seed=s)
+        for s in (4, 4, 5)
+    )
     assert one.lifting.descriptors.tobytes() == same.lifting.descriptors.tobytes()
     assert keys(one.lifting) != keys(other.lifting)
 
@@ -40,20 +43,20 @@ def test_a_seed_gives_the_same_parts_and_another_seed_others() -> None:
 @pytest.mark.parametrize(
     ("sizes", "said"),
     [
-        ({"lifting": 60}, "60 lifting faces and the others"),
-        ({"lifting": 0}, "must be 1 or more"),
+        ({"lifting": 60, "attack": None}, "60 lifting faces and the others"),
+        ({"lifting": 0, "attack": None}, "must be 1 or more"),
         ({"lifting": 30, "attack": 31}, "cannot be taken from 60 training faces"),
-        ({"lifting": 30, "attacked_most": 0}, "at least one face must be attacked"),
     ],
 )
 def test_sizes_that_do_not_fit_are_named(sizes: dict[str, Any], said: str) -> None:
     with pytest.raises(AuditError, match=said):
-        split(TRAIN, VALIDATION, seed=0, **sizes)
+        attacker_faces(60, **sizes)
 
 
-def test_sets_that_do_not_fit_each_other_are_refused() -> None:
-    with pytest.raises(AuditError, match="differ in the dimension"):
-        split(TRAIN, faces(20, n=32), lifting=25, seed=0)
+def test_without_a_face_to_attack_it_is_said() -> None:
+    nobody = VALIDATION.take(np.arange(0))
+    with pytest.raises(AuditError, match="at least one face must be attacked"):
+        split(TRAIN, nobody, lifting=25, attack=35, attacked_most=None, seed=0)
 
 
 def test_labels_that_are_no_class_are_counted_and_not_shown() -> None:
@@ -71,19 +74,3 @@ def test_names_come_back_as_they_were_given() -> None:
     assert some.names("gender") == names
     assert [a.gender for a in some.decoy_attributes()] == names
     assert [a.race for a in some.decoy_attributes()] == [None] * 3
-
-
-def test_codes_outside_the_classes_are_refused() -> None:
-    codes = {"gender": np.array([0, 2]), "race": np.array([0, 1])}
-    with pytest.raises(AuditError, match="outside 0 to 1"):
-        LabelledFaces(TRAIN.descriptors[:2], codes, CLASSES)
-
-
-def test_near_duplicates_are_found_and_nothing_else() -> None:
-    attacked = VALIDATION.descriptors.copy()
-    attacked[5] = TRAIN.descriptors[11]
-    nudged = TRAIN.descriptors[40] + 0.01 * VALIDATION.descriptors[9]
-    attacked[9] = nudged / np.linalg.norm(nudged)
-    cosines = attacked.astype(np.float64) @ TRAIN.descriptors.T.astype(np.float64)
-    assert np.sort(cosines.max(axis=1))[-3] < 0.95
-    assert near_duplicates(attacked, TRAIN.descriptors, cosine=0.99).tolist() == [5, 9]

@@ -33,10 +33,10 @@ def labelled(root: Path, part: str, count: int, extractor: Extractor) -> Labelle
 @pytest.fixture(scope="module")
 def setup(fairface: Path, mbf_pack_dir: Path) -> Setup:
     # FairFace's photos are small: on this canvas all but a few are found, in a quarter of the time.
-    extractor = Extractor(ModelPack.load(mbf_pack_dir, detector_size=320), quality=None)
+    extractor = Extractor(ModelPack.load(mbf_pack_dir, detector_size=320))
     train = labelled(fairface, "train", TRAIN, extractor)
     attacked = labelled(fairface, "val", VALIDATION, extractor)
-    parts = split(train, attacked, lifting=130, seed=0)
+    parts = split(train, attacked, lifting=130, attack=len(train) - 130, attacked_most=None, seed=0)
     return prepare(parts, plan=AttributePlan(feature_ks=(10, 50)), seed=0)
 
 

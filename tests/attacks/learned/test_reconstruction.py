@@ -1,12 +1,14 @@
 import sys
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from attacks.errors import AuditError
-from attacks.learned import decoder, reconstruct, score_images, train_decoder
-from attacks.learned.decoder import SIZE, Images, resized
+from attacks.learned import decoder
+from attacks.learned.decoder import SIZE, Images, resized, train_decoder
+from attacks.learned.reconstruction import reconstruct, score_images
 from attacks.outcomes import CONTROL
 from attacks.system import System
 
@@ -87,7 +89,7 @@ def test_a_decoder_that_draws_no_raw_embedding_proves_nothing(
     faces = mirrored.victims.enrolled
     blank = np.zeros((len(faces), SIZE, SIZE, 3), dtype=np.uint8)
     outcomes = reconstruct(
-        mirrored, blank, faces, paint(faces), embed=embed, seconds=1e9, epochs=1, seed=0
+        mirrored, blank, faces, paint(faces), embed=embed, guesses={}, seconds=1e9, epochs=1, seed=0
     )
     assert [row.unjudged for row in outcomes] == [
         CONTROL,
@@ -130,8 +132,9 @@ def test_resizing_keeps_the_mean() -> None:
 
 def test_what_does_not_fit_is_refused(mirrored: System) -> None:
     faces = mirrored.victims.enrolled
+    options: dict[str, Any] = {"embed": embed, "guesses": {}, "seconds": 1, "seed": 0}
     with pytest.raises(AuditError, match="photo and a guess"):
-        reconstruct(mirrored, paint(faces), faces, paint(faces)[:3], embed=embed, seed=0)
+        reconstruct(mirrored, paint(faces), faces, paint(faces)[:3], **options)
     with pytest.raises(AuditError, match="32 images"):
         train_decoder(paint(faces)[:8], faces[:8], seed=0)
     with pytest.raises(AuditError, match="uint8"):
@@ -144,4 +147,6 @@ def test_without_the_extra_the_remedy_is_named(
     monkeypatch.setitem(sys.modules, "skimage.metrics", None)
     faces = mirrored.victims.enrolled
     with pytest.raises(AuditError, match=r'pip install "veilface\[torch\]"'):
-        reconstruct(mirrored, paint(faces), faces, paint(faces), embed=embed, seed=0)
+        reconstruct(
+            mirrored, paint(faces), faces, paint(faces), embed=embed, guesses={}, seconds=1, seed=0
+        )

@@ -36,11 +36,13 @@ def test_people_may_be_given_for_the_fit() -> None:
     """The half that is fitted comes to the templates, and the other half says what chance is."""
     system = system_of("generator")
     enough = 8 * system.templates.n
-    (judged,) = impersonation_attack(system, faces=noise(enough, system.templates.n, seed=7))
+    (judged,) = impersonation_attack(
+        replace(system, attacker=noise(enough, system.templates.n, seed=7))
+    )
     assert judged.judged
     assert share(judged) < 0.02
     faces = noise(300, system.templates.n, seed=4)
-    (outcome,) = impersonation_attack(system, faces=faces)
+    (outcome,) = impersonation_attack(replace(system, attacker=faces))
     assert outcome.details["fitted_to"] == 150
     assert counts(outcome)[1] == 150 * VICTIMS
     assert count(outcome.details["strangers"])[1] == 150 * VICTIMS
@@ -53,7 +55,9 @@ def test_the_people_of_a_generator_of_very_few_are_accepted() -> None:
     n = system.templates.n
     four = np.tile(noise(4, n, seed=4), (25, 1)) + 0.2 * noise(100, n, seed=5)
     fitted = (four / np.linalg.norm(four, axis=1, keepdims=True)).astype(np.float32)
-    (outcome,) = impersonation_attack(system, faces=np.concatenate([fitted, noise(100, n, seed=6)]))
+    (outcome,) = impersonation_attack(
+        replace(system, attacker=np.concatenate([fitted, noise(100, n, seed=6)]))
+    )
     assert outcome.details["fitted_to"] == 100
     assert counts(outcome)[1] == 100 * VICTIMS
     assert not outcome.judged

@@ -30,7 +30,8 @@ def voted(cosines: NDArray[np.float64], labels: list[str | None], k: int) -> str
 
 
 @pytest.mark.parametrize("k", [1, 4, 10])
-def test_the_vote_is_that_of_the_nearest_entries(k: int) -> None:
+def test_the_vote_is_that_of_the_nearest_entries(k: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(attributes, "NEIGHBOURS", k)
     rng = np.random.default_rng(4)
     genders = [str(g) for g in rng.choice(["Female", "Male"], 90)]
     races: list[str | None] = [str(r) for r in rng.choice(["Black", "Indian", "White"], 90)]
@@ -40,7 +41,7 @@ def test_the_vote_is_that_of_the_nearest_entries(k: int) -> None:
         entries, labels=[Attributes(g, r) for g, r in zip(genders, races, strict=True)]
     )
     cosines = faces.astype(np.float64) @ entries.astype(np.float64).T
-    assert predict_attributes(faces, pool, k=k) == [
+    assert predict_attributes(faces, pool) == [
         Attributes(voted(row, list(genders), k), voted(row, races, k)) for row in cosines
     ]
 

@@ -24,16 +24,7 @@ def weights(n: int, bits: int, *, stream: Keystream) -> tuple[Matrix, ...]:
 def code(
     descriptors: NDArray[np.float32], layers: tuple[Matrix, ...], flips: tuple[Flips, ...]
 ) -> NDArray[np.bool_]:
-    """Hash each descriptor under the directions diag(flips) · layers[0].
-
-    Parameters
-    ----------
-    descriptors : (R, n) float32
-
-    Returns
-    -------
-    bool, shape (R, bits)
-    """
+    """Hash (R, n) descriptors under the directions diag(flips) · layers[0]; (R, bits)."""
     (directions,), (signs,) = layers, flips
     projected: NDArray[np.floating] = (descriptors * signs) @ directions
     return projected > 0

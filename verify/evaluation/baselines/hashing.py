@@ -109,16 +109,12 @@ def packed_bytes(bits: int) -> int:
 
 
 def hash_comparison(codes_a: Codes, codes_b: Codes) -> NDArray[np.int64]:
-    """Hamming distances of every code to every other, as a matcher would compute them.
+    """Hamming distances of every code to every other, (A, B), as a matcher would compute them.
 
     Parameters
     ----------
     codes_a, codes_b : (A, b) and (B, b) uint8
         Packed codes (``numpy.packbits``), of equal length.
-
-    Returns
-    -------
-    int64, shape (A, B)
     """
     words_a, words_b = _words(codes_a), _words(codes_b)
     distances = np.zeros((len(words_a), len(words_b)), dtype=np.int64)

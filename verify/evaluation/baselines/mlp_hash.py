@@ -52,16 +52,7 @@ def weights(n: int, bits: int, *, stream: Keystream) -> tuple[Matrix, ...]:
 def code(
     descriptors: NDArray[np.float32], layers: tuple[Matrix, ...], flips: tuple[Flips, ...]
 ) -> NDArray[np.bool_]:
-    """Hash each descriptor by the perceptron whose weights are diag(flips[i]) · layers[i].
-
-    Parameters
-    ----------
-    descriptors : (R, n) float32
-
-    Returns
-    -------
-    bool, shape (R, bits)
-    """
+    """Hash (R, n) descriptors by the perceptron of weights diag(flips) · layers; (R, bits)."""
     values: NDArray[np.floating] = descriptors
     for layer, signs in zip(layers[:-1], flips[:-1], strict=True):
         values = (values * signs) @ layer

@@ -18,10 +18,6 @@ def orthonormal(inputs: int, outputs: int, *, stream: Keystream) -> Matrix:
     The papers orthonormalise random numbers by Gram–Schmidt; Householder's QR of a Gaussian
     matrix, with the signs of R's diagonal moved into Q, gives the Haar measure without its loss of
     orthogonality.
-
-    Returns
-    -------
-    float32, shape (inputs, outputs)
     """
     narrow, wide = sorted((inputs, outputs))
     drawn = stream.normal((wide, narrow)).astype(np.float32)

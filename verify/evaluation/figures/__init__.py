@@ -19,8 +19,6 @@ def write_figures(
 
     Parameters
     ----------
-    results
-        What `veilface evaluate` writes as ``results.json``.
     folder
         An existing folder; files of these names are replaced.
     audit

@@ -18,6 +18,7 @@ from verify.evaluation.figures.style import (
     SMALL_SIZE,
     house_style,
     mark_cut,
+    name_groups,
     panels,
 )
 from verify.evaluation.row_labels import (
@@ -113,10 +114,6 @@ def _measured(row: Row) -> bool:
     return row.get("accuracy_mean") is not None
 
 
-def _group(row: Row) -> Group:
-    return str(row["strategy"]), str(row.get("decoys") or ""), bool(row.get("shared_decoys"))
-
-
 def _merged(rows: Sequence[Row]) -> bool:
     """Return whether every s-to-s row with a pool shares it: then sharing splits no group."""
     return all(row.get("shared_decoys") is not False for row in rows if row["mode"] == "s2s")
@@ -145,8 +142,8 @@ def _layout(rows: Sequence[Row]) -> _Layout:
 
 
 def _placed(row: Row, merged: bool) -> Group:
-    strategy, decoys, shared = _group(row)
-    return strategy, decoys, shared and not merged
+    shared = bool(row.get("shared_decoys")) and not merged
+    return str(row["strategy"]), str(row.get("decoys") or ""), shared
 
 
 def _bars(axes: Axes, rows: Sequence[Row], layout: _Layout, metrics: Sequence[str]) -> None:
@@ -211,30 +208,8 @@ def _dress(axes: Axes, layout: _Layout, scale: tuple[float, float]) -> None:
     marks = [(place, dim) for dims in layout.places.values() for dim, place in dims.items()]
     axes.set_xticks([place for place, _ in marks], [str(dim) for _, dim in marks])
     axes.tick_params(axis="x", length=0, pad=2)
-    for group, centre in layout.centres.items():
-        axes.annotate(
-            layout.names[group],
-            (centre, 0),
-            xycoords=("data", "axes fraction"),
-            xytext=(0, -18),
-            textcoords="offset points",
-            ha="center",
-            va="top",
-            fontsize=INK_SIZE,
-            linespacing=1.15,
-            annotation_clip=False,
-        )
-    axes.annotate(
-        "m =",
-        (0, 0),
-        xycoords="axes fraction",
-        xytext=(-4, -4),
-        textcoords="offset points",
-        ha="right",
-        va="top",
-        fontsize=SMALL_SIZE,
-        annotation_clip=False,
-    )
+    names = [(layout.names[group], centre) for group, centre in layout.centres.items()]
+    name_groups(axes, names, below=18, fontsize=INK_SIZE, linespacing=1.15)
     if floor > 0:
         mark_cut(axes)
         start = f"axis starts at {floor:g} %" + (" (chance)" if floor == CHANCE else "")

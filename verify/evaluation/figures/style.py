@@ -10,7 +10,7 @@ each has a hatch, a marker or a dash of its own, and they differ in lightness.
 """
 
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -123,6 +123,35 @@ def side_legend(figure: Figure, handles: Sequence[Line2D], side: float) -> None:
         handlelength=2.8,
         labelspacing=0.6,
         borderaxespad=0,
+    )
+
+
+def name_groups(
+    axes: Axes, centres: Iterable[tuple[str, float]], *, below: float, **text: Any
+) -> None:
+    """Write the names of groups of bars below their dimensions, and what these are."""
+    for name, centre in centres:
+        axes.annotate(
+            name,
+            (centre, 0),
+            xycoords=("data", "axes fraction"),
+            xytext=(0, -below),
+            textcoords="offset points",
+            ha="center",
+            va="top",
+            annotation_clip=False,
+            **text,
+        )
+    axes.annotate(
+        "m =",
+        (0, 0),
+        xycoords="axes fraction",
+        xytext=(-4, -4),
+        textcoords="offset points",
+        ha="right",
+        va="top",
+        fontsize=SMALL_SIZE,
+        annotation_clip=False,
     )
 
 

@@ -73,11 +73,6 @@ def read_presentations(path: Path, *, attacks: bool) -> PresentationSet:
     Where the name of every photo of a folder begins with a number and an underscore, as in NUAA
     (``0001_00_…``), that number is the subject's.
 
-    Parameters
-    ----------
-    attacks
-        Whether there must be attack photos.
-
     Raises
     ------
     DatasetError

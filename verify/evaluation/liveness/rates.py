@@ -47,8 +47,6 @@ def share(errors: NDArray[np.bool_], subjects: Sequence[str | None]) -> Rate:
     Parameters
     ----------
     errors : (k,) bool
-    subjects
-        k names.
     """
     people, codes = np.unique([name or "" for name in subjects], return_inverse=True)
     if None in subjects or len(people) < LEAST_PEOPLE:

@@ -23,14 +23,10 @@ class ScoredSet:
 
     Parameters
     ----------
-    presented
-        The set.
     scores : (k,) float64
         NaN where no face was acquired.
     embeddings : (k, n) float32
         Of the same faces; undefined where no face was acquired.
-    failures
-        Why there is none, in the order of the set.
     """
 
     presented: PresentationSet

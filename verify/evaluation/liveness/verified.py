@@ -17,16 +17,10 @@ class VerifiedSet:
 
     Parameters
     ----------
-    scored
-        The set.
     matched, tried : (k,) bool
         Whether a photo was accepted, and whether it was shown at all: photos of people who are
         not enrolled, and those that people were enrolled by, are not. One without a face is
         shown, and not accepted.
-    level, target_fmr
-        At which they were decided.
-    enrolled_photos, enrolled
-        Photos of a template, and templates.
     left_out
         Subjects who were not enrolled: too few live photos with a face, or they do not agree.
     """

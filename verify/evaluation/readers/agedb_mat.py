@@ -15,8 +15,6 @@ from verify.tenfold import FOLDS
 _MAX_BYTES = 16 * 2**20
 _DEEPEST = 8
 
-Cells = NDArray[np.object_]
-
 
 @dataclass(frozen=True)
 class MatProtocol:

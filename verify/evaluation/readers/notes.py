@@ -31,7 +31,8 @@ def notes(benchmark: VerificationSet) -> list[str]:
         )
     if own := int(np.count_nonzero(benchmark.first == benchmark.second)):
         sentences.append(f"{name}: {_pairs(own)} a photo with itself")
-    if twice := pairs - len(np.unique(_unordered(benchmark), axis=0)):
+    unordered = np.sort(np.stack([benchmark.first, benchmark.second], axis=1), axis=1)
+    if twice := pairs - len(np.unique(unordered, axis=0)):
         sentences.append(f"{name}: {_pairs(twice)} the same two photos as another pair")
     if benchmark.people is not None:
         people = np.unique(np.array(benchmark.people), return_inverse=True)[1]
@@ -43,7 +44,3 @@ def notes(benchmark: VerificationSet) -> list[str]:
 
 def _pairs(count: int) -> str:
     return f"{count:,} pair compares" if count == 1 else f"{count:,} pairs compare"
-
-
-def _unordered(benchmark: VerificationSet) -> np.ndarray[tuple[int, int], np.dtype[np.int64]]:
-    return np.sort(np.stack([benchmark.first, benchmark.second], axis=1), axis=1)
