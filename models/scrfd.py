@@ -4,7 +4,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.boxes import Face
-from models.detection import Detector, Size, cell_centres, faces_from_candidates, letterbox
+from models.detection import (
+    Detector,
+    Size,
+    cell_corners,
+    channels_first,
+    faces_from_candidates,
+    letterbox,
+)
 from models.errors import ModelError
 
 STRIDES = (8, 16, 32)
@@ -25,8 +32,9 @@ class Scrfd(Detector):
     def detect_once(self, image: NDArray[np.uint8], size: Size) -> list[Face]:
         """Faces found in one pass on a canvas of ``size``, in pixels of ``image``."""
         canvas, scale = letterbox(image, size, enlarge=True)
-        blob = (canvas.astype(np.float32) - np.float32(127.5)) * np.float32(1 / 128)
-        blob = np.ascontiguousarray(blob.transpose(2, 0, 1)[None])
+        blob = channels_first(canvas)
+        blob -= np.float32(127.5)
+        blob *= np.float32(1 / 128)
         outputs = self._session.run({self._input_name: blob})
         boxes, scores, keypoints = [], [], []
         for stride, (score, distance, point) in zip(STRIDES, _by_stride(outputs), strict=True):
@@ -35,7 +43,7 @@ class Scrfd(Detector):
             if rest or per_cell == 0 or len(distance) != len(score) or len(point) != len(score):
                 raise self._misfit(stride, size)
             cells = np.flatnonzero(score >= self.score_threshold)
-            centres = cell_centres(rows, columns, stride=stride, per_cell=per_cell)[cells]
+            centres = cell_corners(cells, columns, stride=stride, per_cell=per_cell)
             reach = distance[cells] * stride
             boxes.append(np.concatenate([centres - reach[:, :2], centres + reach[:, 2:]], axis=1))
             scores.append(score[cells])

@@ -4,7 +4,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.boxes import Face
-from models.detection import Detector, Size, cell_centres, faces_from_candidates, letterbox
+from models.detection import (
+    Detector,
+    Size,
+    cell_corners,
+    channels_first,
+    faces_from_candidates,
+    letterbox,
+)
 
 STRIDES = (8, 16, 32)
 OVERLAP = 0.3
@@ -28,7 +35,7 @@ class YuNet(Detector):
         """Faces found in one pass on a canvas of ``size``, in pixels of ``image``."""
         size = self.canvas(image, size)
         canvas, scale = letterbox(image, size, enlarge=False)
-        blob = np.ascontiguousarray(canvas[:, :, ::-1].transpose(2, 0, 1)[None], dtype=np.float32)
+        blob = channels_first(canvas, (2, 1, 0))
         named = dict(
             zip(OUTPUTS, self._session.run({self._input_name: blob}, OUTPUTS), strict=True)
         )
@@ -41,7 +48,7 @@ class YuNet(Detector):
             obj = named[f"obj_{stride}"].reshape(-1)
             score = np.sqrt(np.clip(cls, 0, 1) * np.clip(obj, 0, 1))
             cells = np.flatnonzero(score >= self.score_threshold)
-            corner = cell_centres(rows, columns, stride=stride, per_cell=1)[cells]
+            corner = cell_corners(cells, columns, stride=stride)
             box = named[f"bbox_{stride}"].reshape(-1, 4)[cells]
             centre = corner + box[:, :2] * stride
             half = np.exp(np.minimum(box[:, 2:], _MAX_LOG_SIDE)) * (stride / 2)
