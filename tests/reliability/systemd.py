@@ -117,19 +117,19 @@ class Machine:
             )
         assert self._process.stdout is not None
         said = self._process.stdout.readline().strip()
+        if not said.isdigit():
+            self._process.communicate(timeout=PATIENCE_S)
+            not_permitted(f"no systemd in namespaces: {errors.read_text().strip()}")
+        self._pid = int(said)
         try:
-            if not said.isdigit():
-                not_permitted(f"no systemd in namespaces: {errors.read_text().strip()}")
-            self._pid = int(said)
             wait_until(self._runs, what="the machine's start")
         except BaseException:
             self._end()
             raise
         return self
 
-    def __exit__(self, kind: object, *_: object) -> None:
-        if kind is not None:
-            print(self.run("journalctl", "--no-pager", "--lines=100", check=False))
+    def __exit__(self, *_: object) -> None:
+        print(self.run("journalctl", "--no-pager", "--lines=100", check=False))
         self._end()
 
     @property
