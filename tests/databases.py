@@ -36,8 +36,11 @@ def postgres_server() -> str:
 
 
 @contextmanager
-def empty_database() -> Iterator[str]:
-    """Make a database on the server, and drop it after the block; gives its URL."""
+def empty_database(options: str = "") -> Iterator[str]:
+    """Make a database on the server, and drop it after the block; gives its URL.
+
+    ``options`` are those of ``CREATE DATABASE``.
+    """
     server = postgres_server()
     try:
         connection = psycopg.connect(server, autocommit=True, connect_timeout=3)
@@ -48,7 +51,7 @@ def empty_database() -> Iterator[str]:
         pytest.skip(reason)
     name = f"veilface_test_{secrets.token_hex(6)}"
     with connection:
-        connection.execute(f'CREATE DATABASE "{name}"')
+        connection.execute(f'CREATE DATABASE "{name}" {options}')
         # Tests kill clients, never the server: no need to wait for its disk.
         connection.execute(f'ALTER DATABASE "{name}" SET synchronous_commit TO off')
         yield make_url(server).set(database=name).render_as_string(hide_password=False)

@@ -1,6 +1,5 @@
 """The files in deploy/: what they set exists, nothing secret gets in; what can be run is run."""
 
-import os
 import re
 import shutil
 import subprocess
@@ -11,6 +10,7 @@ import pytest
 import yaml
 
 from api.settings import ENV_PREFIX, Settings
+from tests.reliability.systemd import require_systemd
 
 ROOT = Path(__file__).resolve().parent.parent
 DEPLOY = ROOT / "deploy"
@@ -121,10 +121,7 @@ def test_the_image_has_the_versions_that_are_tested() -> None:
 
 @pytest.fixture
 def systemd() -> None:
-    if shutil.which("systemd-analyze") is None:
-        if os.environ.get("VEILFACE_REQUIRE_SYSTEMD") == "1":
-            pytest.fail("systemd is not installed, and VEILFACE_REQUIRE_SYSTEMD=1 asks for it")
-        pytest.skip("systemd is not installed")
+    require_systemd()
 
 
 @pytest.mark.usefixtures("systemd")

@@ -40,7 +40,7 @@ BIN = Path(sys.executable).parent
 SETTINGS_ALONE = "sets names for the commands after it"
 SAME_IN_README = "the commands of the README, which tests/test_readme.py runs"
 OWN_DATA = "needs hours with real data; a test of the command runs it on its own"
-NEEDS_A_HOST = "installs a service on a host; the page says what was executed and how"
+NEEDS_A_HOST = "starts containers on a host; the page says what was executed and how"
 
 # Pages of which another test executes every block of a kind.
 WHOLE_PAGES = {
@@ -71,6 +71,7 @@ ELSEWHERE = {
     ("docs/evaluation.md", "LFW=~/lfw.bin"): "tests/test_readme.py",
     ("docs/cli.md", "veilface demo"): "tests/test_tutorial.py",
     ("docs/deployment.md", "DEPLOY=/opt/veilface-deploy"): "tests/test_compose.py",
+    ("docs/deployment.md", "python3 -m venv /opt/veilface"): "tests/reliability/test_systemd.py",
     ("docs/deployment.md", "set -e"): "tests/reliability/test_upgrade.py",
 }
 # Blocks of commands that are executed here, in this process, on a tiny deployment.
@@ -170,7 +171,6 @@ NOT_EXECUTED = {
     ("docs/operations.md", "caddyfile", "{"): "Caddy is not installed where the tests run",
     ("docs/deployment.md", "sh", "export VEILFACE_DATA=/opt/veilface-deploy/data "
      "VEILFACE_SECRETS=/opt/veilface-deploy/secrets"): NEEDS_A_HOST,
-    ("docs/deployment.md", "sh", "python3 -m venv /opt/veilface"): NEEDS_A_HOST,
     ("docs/deployment.md", "sh", "pinned() { echo \"$1@$(docker buildx imagetools inspect \"$1\" "
      "--format '{{.Manifest.Digest}}')\"; }"): "asks an image registry; the page says so",
 }  # fmt: skip

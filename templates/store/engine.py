@@ -88,6 +88,8 @@ def make_engine(url: URL, *, timeout: float, pool_size: int, max_overflow: int) 
             connect_args={
                 "connect_timeout": max(2, round(timeout)),
                 "application_name": f"{APPLICATION} {NEWEST}",
+                # Text would arrive as bytes from a server that was made without a locale.
+                "client_encoding": "utf8",
                 "options": _session_options(url),
                 **_CUT_OFF,
             },

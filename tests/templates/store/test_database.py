@@ -15,6 +15,7 @@ from templates.keys.sealing import MasterKeyring
 from templates.store import TemplateStore
 from templates.store.database import Database
 from templates.store.schema import TenantRow
+from tests.databases import empty_database
 from tests.patience import PATIENCE_S
 from tests.templates.store.conftest import put
 
@@ -104,6 +105,15 @@ def test_no_server_is_store_unavailable() -> None:
     for call in (database.read, database.write):
         with pytest.raises(StoreUnavailable, match="does not answer"):
             call(lambda connection: connection.execute(sa.select(1)))
+
+
+def test_a_database_of_a_server_without_a_locale_is_used(keyring: MasterKeyring) -> None:
+    with empty_database("ENCODING 'SQL_ASCII' LOCALE 'C' TEMPLATE template0") as url:
+        store = TemplateStore(url, keyring)
+        store.upgrade()
+        store.tenants.create("acme")
+        assert [tenant.name for tenant in store.tenants.all()] == ["acme"]
+        store.close()
 
 
 def test_a_lost_connection_is_replaced(
