@@ -137,6 +137,12 @@ class Workers(Multiprocess):
         self.gave_up = self.should_exit.is_set() and not told
         self._say_when_ready()
 
+    def terminate_all(self) -> None:
+        """Tell all workers to stop; nobody listens then, so a new connection does not wait."""
+        for listening in self.sockets:
+            listening.close()
+        super().terminate_all()
+
     def _say_when_ready(self) -> None:
         if self._on_ready is None or self.should_exit.is_set():
             return

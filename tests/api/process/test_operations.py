@@ -420,7 +420,16 @@ def test_workers_share_the_port_and_say_that_they_stop(tmp_path: Path) -> None:
                 }
             return False
 
+        def refused() -> bool:
+            try:
+                socket.create_connection(("127.0.0.1", port)).close()
+            except ConnectionRefusedError:
+                return True
+            return False
+
         wait_until(stopping, what="a worker that says that it stops")
+        wait_until(refused, what="a port that nobody listens on")
+        assert in_flight(f"http://127.0.0.1:{beside}") == 8
         for raw in held:
             raw.close()
         assert process.wait(timeout=PATIENCE_S) == 0
