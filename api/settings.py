@@ -35,6 +35,7 @@ DEFAULT_CONFIG_FILE = Path("veilface.toml")
 MIB = 1024 * 1024
 OFF = "off"
 NONE = NO_PROXIES = "none"
+MAX_ONNX_THREADS = 256
 
 _ORIGIN = re.compile(
     r"(?:https://(?!.*:443$)|http://(?!.*:80$))(?:[a-z0-9.-]+|\[[0-9a-f:]+\])(?::[0-9]{1,5})?"
@@ -145,7 +146,7 @@ class Settings(BaseSettings):
         "that is absent is an error.",
     )
     onnx_threads: int = Field(
-        1, ge=1, le=256, description="Threads that one inference of the pack may use."
+        1, ge=1, le=MAX_ONNX_THREADS, description="Threads that one inference of the pack may use."
     )
     compute_slots: int = Field(
         0,

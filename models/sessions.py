@@ -3,7 +3,7 @@
 import os
 import threading
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import onnxruntime as ort
@@ -23,6 +23,12 @@ PROVIDERS = {
     "xnnpack": "XnnpackExecutionProvider",
 }
 _SHORT = {full: short for short, full in PROVIDERS.items()}
+
+Optimisation = Literal["all", "extended"]
+_LEVELS = {
+    "all": ort.GraphOptimizationLevel.ORT_ENABLE_ALL,
+    "extended": ort.GraphOptimizationLevel.ORT_ENABLE_EXTENDED,
+}
 
 # onnxruntime writes warnings about declared output shapes to stderr for every detector that runs
 # at another size than it was exported for; errors still reach us as exceptions.
@@ -74,6 +80,9 @@ class Session:
         be in use after loading; nothing falls back silently.
     threads
         Threads inside one operator; ``None`` leaves the choice to onnxruntime (all cores).
+    optimisation
+        What onnxruntime may change in the graph: ``all``, its default, or ``extended``, which
+        leaves the layout of the tensors as it is. All else runs with ``all``.
     """
 
     def __init__(
@@ -83,12 +92,14 @@ class Session:
         name: str,
         providers: Sequence[str] = ("cpu",),
         threads: int | None = None,
+        optimisation: Optimisation = "all",
     ) -> None:
         if threads is not None and threads < 1:
             raise ModelError(f"The number of inference threads must be at least 1, not {threads}.")
         self.name = name
         self.providers = resolve_providers(providers)
         self.threads = threads
+        self.optimisation = optimisation
         self._model: bytes | None = model
         self._loaded: Any = None
         self._loading = threading.Lock()
@@ -116,6 +127,7 @@ class Session:
         # (docs/models.md has the measurement).
         options.enable_mem_pattern = False
         options.enable_cpu_mem_arena = True
+        options.graph_optimization_level = _LEVELS[self.optimisation]
         if self.threads is not None:
             options.intra_op_num_threads = self.threads
             options.inter_op_num_threads = 1

@@ -101,6 +101,7 @@ HERE = {
         "veilface audit-log head > head.txt",
         "veilface audit-log show --subject alice --limit 100",
         "veilface db current --json",
+        "veilface bench models --pack buffalo_l",
     )
 }
 # Blocks that are executed here by bash, against a running service.

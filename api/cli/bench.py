@@ -3,12 +3,14 @@
 import os
 from collections.abc import Sequence
 from enum import StrEnum
-from typing import Annotated, TypeVar
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
 
 import typer
 from rich.table import Table
 
-from api.cli.console import emit, progress, say, show, table
+from api.cli import model_bench
+from api.cli.console import demo_notice, emit, message, progress, say, show, table
 from api.cli.distance_bench import (
     MODES,
     Question,
@@ -18,8 +20,10 @@ from api.cli.distance_bench import (
     memory_needed,
 )
 from api.cli.errors import CommandError, UsageError
+from api.cli.files import read_bounded
 from api.cli.inputs import listed
-from api.cli.options import AsJson
+from api.cli.options import AsJson, takes_settings
+from api.settings import MAX_ONNX_THREADS, Settings, processors
 from templates.distances import DEFAULT_STEPS, Metric, require_device
 from templates.errors import TemplateError
 
@@ -124,11 +128,98 @@ def distances(
     say(f"Measured with {place}. docs/distances.md says how to read it.")
 
 
-def _numbers(text: str, option: str, *, at_least: int) -> tuple[int, ...]:
+@app.command()
+@takes_settings("pack", "providers")
+def models(
+    *,
+    settings: Settings,
+    photo: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="A photo with a face; repeat for more. Unset: some are drawn.", show_default=False
+        ),
+    ] = None,
+    threads: Annotated[
+        str | None,
+        typer.Option(
+            help="Values of `onnx_threads` to try beside its default. Unset: 1, 2, 4 and 8, as far "
+            "as there are processors.",
+            show_default=False,
+        ),
+    ] = None,
+    repeats: Annotated[
+        int, typer.Option(min=1, help="Timed repeats; medians of them are shown.")
+    ] = 9,
+    as_json: AsJson = False,
+) -> None:
+    """Time a pack, and say which `onnx_threads` and `compute_slots` suit this machine.
+
+    Needs: a pack. Run it where the service will run, and while little else runs there. Each graph
+    is timed with the optimisations of ONNX Runtime, and whole photos with one caller, with as many
+    as there are processors, and with twice as many. Takes some minutes.
+
+    Example: `veilface bench models --pack ~/.insightface/models/buffalo_l`
+    """
+    if settings.pack is None:
+        raise UsageError("a pack is what is timed; name it with --pack")
+    here = processors()
+    if threads is None:
+        threads = ",".join(str(count) for count in (1, 2, 4, 8) if count <= here)
+    bench = model_bench.ModelBench(
+        path=settings.pack,
+        providers=settings.providers,
+        threads=_numbers(threads, "--threads", at_least=1, at_most=MAX_ONNX_THREADS),
+        repeats=repeats,
+        photos={str(path): read_bounded(path, settings.max_image_bytes) for path in photo or ()},
+    )
+    with progress("measuring", bench.rounds) as advance:
+        photos, graphs = bench.time_photos(advance), bench.time_graphs(advance)
+    used = max(row.processors_used for row in photos)
+    if used < 0.75 * here:
+        message(
+            f"note: the photos used {used:.1f} of {here} processors at most; if other programs had "
+            "the rest, measure again without them"
+        )
+    info, advised = bench.pack.info, model_bench.advice(photos)
+    notice = demo_notice(info.embedder_sha256, n=info.n)
+    if as_json:
+        emit(
+            {
+                "pack": info.name,
+                "processors": here,
+                "providers": settings.providers,
+                "repeats": repeats,
+                "graphs": [row._asdict() for row in graphs],
+                "photos": [row._asdict() for row in photos],
+                "advice": advised,
+                **notice,
+            }
+        )
+        return
+    show(
+        _medians(f"One inference of {info.name}", graphs, model_bench.GraphRow._fields),
+        _medians("Whole photos", photos, model_bench.PhotoRow._fields[:-2]),
+    )
+    say(f"Medians of {repeats} repeats on {here} processors.")
+    say(advised)
+
+
+def _medians(title: str, rows: Sequence[tuple[Any, ...]], columns: Sequence[str]) -> Table:
+    listing = table(title, *columns)
+    for row in rows:
+        shown = row[: len(columns)]
+        listing.add_row(*(f"{x:.2f}" if isinstance(x, float) else str(x) for x in shown))
+    return listing
+
+
+def _numbers(
+    text: str, option: str, *, at_least: int, at_most: int | None = None
+) -> tuple[int, ...]:
     values = listed(text, int, option, expected="whole numbers such as 8,16")
-    wrong = [value for value in values if value < at_least]
-    if wrong:
-        raise UsageError(f"{option} takes numbers from {at_least}, not {wrong[0]}")
+    taken = f"from {at_least}" + ("" if at_most is None else f" to {at_most}")
+    for value in values:
+        if value < at_least or (at_most is not None and value > at_most):
+            raise UsageError(f"{option} takes numbers {taken}, not {value}")
     return tuple(dict.fromkeys(values))
 
 
