@@ -390,7 +390,7 @@ class Settings(BaseSettings):
     @field_validator("rate_limit_key", "rate_limit_address")
     @classmethod
     def _known_limit(cls, value: str) -> str:
-        # Not kept empty: an empty variable, by which it travels to workers, counts as unset.
+        # Not kept empty: an empty variable counts as unset.
         if value.strip() in ("", OFF):
             return OFF
         try:

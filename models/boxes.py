@@ -83,7 +83,7 @@ def non_maximum_suppression(
     Parameters
     ----------
     boxes
-        Shape (k, 4), x1 y1 x2 y2.
+        Shape (k, 4), x1 y1 x2 y2, with positive sides.
     scores
         Shape (k,), above 0.
     threshold

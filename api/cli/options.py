@@ -118,10 +118,7 @@ def takes_settings(*names: str) -> Callable[[Callable[..., R]], Callable[..., R]
 
 @contextmanager
 def configured_by(file: Path | None) -> Iterator[None]:
-    """Let the TOML file named on the command line win over ``VEILFACE_CONFIG``.
-
-    The variable stays set while the command runs: the workers of ``serve`` read it too.
-    """
+    """Let the TOML file named on the command line win over ``VEILFACE_CONFIG`` in the block."""
     with variables_set({} if file is None else {CONFIG_VARIABLE: str(file)}):
         yield
 

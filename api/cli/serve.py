@@ -1,7 +1,10 @@
 """``veilface serve``: the REST service."""
 
+import signal
 import socket
-from contextlib import nullcontext
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from typing import Annotated
 
@@ -41,29 +44,36 @@ def serve(
 
     Example: `veilface serve --pack buffalo_l --data-dir veilface-data --workers 2`
     """
-    start(settings, check=check)
+    with _ended_by_sigterm():
+        contract, token, demo = _opened_once(settings, check=check)
+        if demo and not settings.demo:
+            settings = settings.model_copy(update={"demo": True})
+        if check:
+            say("Everything fits together: contract, decoys, pack, database and master key.")
+            return
+        if token is not None:
+            say(f"API key with all rights of tenant {settings.default_tenant}, shown only now:")
+            say(token)
+            del token  # workers get a copy of what is left
+        settings = _with_ports(settings)
+        # Workers count together in a folder; a single process counts in its memory.
+        counting = nullcontext() if settings.workers == 1 else shared_directory()
+        try:
+            with counting:
+                run_server(settings, contract, on_ready=partial(_say_where, settings))
+        except SystemExit as error:
+            if error.code:
+                raise CommandError("the service did not start; its log says why") from None
 
 
-def start(settings: Settings, *, check: bool = False) -> None:
-    """Open everything once, then serve until the process is told to stop."""
-    contract, token, demo = _opened_once(settings, check=check)
-    if demo and not settings.demo:
-        settings = settings.model_copy(update={"demo": True})
-    if check:
-        say("Everything fits together: contract, decoys, pack, database and master key.")
-        return
-    if token is not None:
-        say(f"API key with all rights of tenant {settings.default_tenant}, shown only now:")
-        say(token)
-    settings = _with_ports(settings)
-    # Workers count together in a folder; a single process counts in its memory.
-    counting = nullcontext() if settings.workers == 1 else shared_directory()
+@contextmanager
+def _ended_by_sigterm() -> Iterator[None]:
+    """End by SIGTERM, cleaning up, while the server has no handler yet: process 1 ignores it."""
+    before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     try:
-        with counting:
-            run_server(settings, contract, on_ready=partial(_say_where, settings))
-    except SystemExit as error:
-        if error.code:
-            raise CommandError("the service did not start; its log says why") from None
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _say_where(settings: Settings) -> None:

@@ -1,6 +1,8 @@
 """``veilface setup``: from a pack and photos to a service that is judged and ready to start."""
 
+import os
 import shlex
+import sys
 import time
 from collections.abc import Collection, Sequence
 from dataclasses import replace
@@ -140,14 +142,16 @@ def setup(
     if as_json and not serve:
         return
     # Imported here: a server takes long to load.
-    from api.cli.serve import service_url, start
+    from api.cli.serve import service_url
 
     if not as_json:
         if not serve:
             say("Start it: veilface serve")
         _tell_calls(service_url(settings), api_key_file(settings))
     if serve:
-        start(settings)
+        # Anew: this process has run the models, and what accelerators have begun outlives no fork.
+        sys.stdout.flush()
+        os.execv(sys.executable, [sys.executable, "-P", "-m", "api.cli", "serve"])  # noqa: S606
 
 
 def assign_roles(labelled: LabelledFolder, faces: Sequence[Path], like: Sequence[Path]) -> Roles:

@@ -106,8 +106,7 @@ class Worker(Process):
         for number in SIGNALS:
             signal.signal(number, signal.SIG_DFL)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
-        with contextlib.suppress(KeyboardInterrupt):
-            self.target(sockets)
+        self.target(sockets)
 
 
 # What the supervisor calls for a worker.
@@ -128,6 +127,15 @@ class Workers(Multiprocess):
     ) -> None:
         super().__init__(config, sockets)
         self._on_ready: Callable[[], None] | None = on_ready
+
+    def run(self) -> None:
+        """Start workers and look after them until told to stop; none outlives a failure to."""
+        try:
+            super().run()
+        except BaseException:
+            self.terminate_all()
+            self.join_all()
+            raise
 
     def keep_subprocess_alive(self) -> None:
         """Replace workers that died or hang; give up where one could not start."""

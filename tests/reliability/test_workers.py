@@ -100,10 +100,29 @@ def test_workers_end_with_their_supervisor(tmp_path: Path) -> None:
 
 def test_workers_share_what_the_supervisor_loaded(tmp_path: Path, mbf_pack_dir: Path) -> None:
     deployment = deploy(tmp_path, pack=mbf_pack_dir, port=free_port(), **QUIET)
-    with Service(deployment, tmp_path) as service:
-        # It has run an inference. A thread that a library had kept would be missing in the workers,
-        # and whoever waits for one waits for ever.
+    with Service(deployment, tmp_path, within=["env", "--unset", "OMP_NUM_THREADS"]) as service:
+        # It has run an inference, with all threads of the matrix library, which end at a fork. One
+        # that a library had kept would be missing in the workers: who waits for it waits for ever.
         assert psutil.Process(service.process.pid).num_threads() == 1
         for worker in service.workers():
             memory = psutil.Process(worker).memory_full_info()
             assert memory.uss < memory.rss / 2
+
+
+def test_a_fork_that_fails_ends_the_service(tmp_path: Path) -> None:
+    (tmp_path / "sitecustomize.py").write_text(
+        "import itertools, os\n"
+        "fork, forks = os.fork, itertools.count()\n"
+        "def third_fails():\n"
+        "    if next(forks) < 2:\n"
+        "        return fork()\n"
+        "    raise BlockingIOError(11, 'Resource temporarily unavailable')\n"
+        "os.fork = third_fails\n"
+    )
+    deployment = deploy(tmp_path, port=free_port(), **QUIET)
+    within = ["env", f"PYTHONPATH={tmp_path}"]
+    with Service(deployment, tmp_path, within) as service:
+        first, second = service.workers()
+        service.kill_worker(first)
+        assert service.process.wait(timeout=START_S) == 1
+        assert not psutil.pid_exists(second)

@@ -1,7 +1,9 @@
 """`veilface setup`: one command from photos to a service, which goes on where it was stopped."""
 
+import os
 import shutil
 import stat
+import subprocess
 import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -355,3 +357,10 @@ def test_from_nothing_to_a_contract(folders: Path, monkeypatch: pytest.MonkeyPat
     assert not list(Path("veilface-data").glob("*.cache"))
     assert not list(Path("veilface-data").glob("*.key"))
     assert run("serve", "--check").status == 0
+
+    executed: list[tuple[str, list[str]]] = []
+    monkeypatch.setattr(os, "execv", lambda *given: executed.append(given))
+    assert setup("--accept-weak-privacy", "--serve").status == 0
+    ((program, (_, *arguments)),) = executed
+    served = subprocess.run([program, *arguments, "--check"], capture_output=True, check=False)
+    assert served.returncode == 0, served.stderr

@@ -117,6 +117,25 @@ def test_the_kernels_are_compiled_before_the_server_is_ready(tmp_path: Path) -> 
     assert sorted(path.name for path in kernels.rglob("*.nb[ci]")) == ready
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("seconds", [0.0, 0.5])
+def test_a_start_that_is_stopped_leaves_nothing(tmp_path: Path, seconds: float) -> None:
+    deployment = deploy(tmp_path, workers=2, port=free_port(), compute_slots=1)
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "api.cli", "serve"],
+        cwd=Path(__file__).resolve().parents[3],
+        env={**environment_of(deployment.settings), "TMPDIR": str(temporary)},
+        stderr=subprocess.DEVNULL,
+    )
+    wait_until(lambda: any(temporary.iterdir()), what="the folder that workers count in")
+    time.sleep(seconds)
+    process.terminate()
+    assert process.wait(timeout=PATIENCE_S) == 0
+    assert list(temporary.iterdir()) == []
+
+
 @pytest.mark.usefixtures("http")
 def test_workers_share_the_database_and_nothing_else(server: Server) -> None:
     def verify(person: int) -> str:
