@@ -210,6 +210,8 @@ def letterbox(
     ----------
     size
         Height and width of the canvas.
+    enlarge
+        Whether a picture smaller than the canvas is enlarged to fill it.
 
     Returns
     -------

@@ -76,6 +76,8 @@ class Embedder:
         ----------
         crops
             RGB uint8, shape (B, s, s, 3) with the size of the preprocessing.
+        flip
+            Whether the raw embedding of the mirrored crop is added before normalising.
 
         Returns
         -------

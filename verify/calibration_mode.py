@@ -62,6 +62,8 @@ class CalibrationOptions:
         ``least_people`` have as many photos left over after the enrollment.
     least_people
         See ``probe_photos``.
+    photos_per_enrollment
+        Most photos averaged into one template.
     targets
         FMR targets, powers of ten; those that the data cannot resolve are left out and reported.
     suspicious_above

@@ -43,6 +43,10 @@ class Consistency:
         photos, their raw cosine.
     probe_threshold
         Least agreement of the photos of one probe.
+    fmr
+        Of pairs of photos of different people, how many reach it.
+    refused
+        Of genuine sets of photos, how many it refuses.
     """
 
     threshold: float

@@ -118,6 +118,8 @@ class Rewrapped:
     ----------
     changed
         Number of keys and secrets that were wrapped again.
+    files
+        Files that were sealed again.
     is_complete
         Whether no older key wraps anything any more.
     """

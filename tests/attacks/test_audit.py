@@ -1,14 +1,18 @@
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
+import numpy as np
 import pytest
 
 from attacks import audit
 from attacks.audit import AuditPlan, run_audit
 from attacks.further_faces import FurtherFaces
+from attacks.system import System
 from models.extraction import Extraction
 from models.pack import ModelPack
+from templates.distances.kernels.arguments import Array32
 from tests.attacks.stored.systems import OWNERS, VICTIMS, M, generator, system_of
 from tests.verify.synthetic import draw_people
 
@@ -53,3 +57,14 @@ def test_an_audit_of_two_schemes_reports_its_progress(monkeypatch: pytest.Monkey
     (more,) = result.settings["further_attacker_faces"]
     assert more["faces"] + more["left_out"] == 7
     assert given == [OWNERS + more["faces"], more["faces"]]
+
+
+def test_attacks_that_use_faces_have_the_further_ones(system: System, strangers: Array32) -> None:
+    informed = replace(system, attacker=np.concatenate([system.attacker, strangers]))
+    unused: Any = None
+    plan = AuditPlan(training_seconds=0.1)
+    attacks = audit._attacks(plan, system, informed, *[unused] * 4, "a test")
+    outcomes = {attack.__name__: attack for attack in attacks}
+    known = len(system.attacker) + len(strangers)
+    assert outcomes["likelihood"]()[1].details["faces"] == known
+    assert outcomes["learned"]()[0].details["faces"] == known

@@ -32,6 +32,9 @@ for folder in run tmp dev etc/systemd/system; do
   mount -t tmpfs -o mode=0755 tmpfs "$root/$folder"
 done
 chmod 1777 "$root/tmp"
+for shared in sys-kernel-debug sys-kernel-tracing sys-fs-fuse-connections dev-hugepages; do
+  ln -s /dev/null "$root/etc/systemd/system/$shared.mount"
+done
 mkdir "$root/dev/pts" "$root/dev/shm"
 for device in null zero full random urandom tty; do
   touch "$root/dev/$device"
@@ -47,6 +50,7 @@ while [ $# -gt 0 ]; do
 done
 mount -t cgroup2 cgroup2 "$base/groups"
 mkdir "$group"
+[ -w "$group/cgroup.kill" ] || { rmdir "$group"; echo "no cgroup.kill" >&2; exit 1; }
 { unshare --pid --fork sh -c 'echo 0 > "$1/cgroup.procs"; shift; exec "$@"' sh "$group" \
   unshare --cgroup --mount --uts --ipc sh -c "$inside" sh "$root" "$systemd" ||
   echo failed; } < /dev/null &
@@ -114,6 +118,7 @@ class Machine:
                 stdout=subprocess.PIPE,
                 stderr=file,
                 text=True,
+                start_new_session=True,  # who interrupts the tests shall not end what cleans up
             )
         assert self._process.stdout is not None
         said = self._process.stdout.readline().strip()
@@ -129,8 +134,10 @@ class Machine:
         return self
 
     def __exit__(self, *_: object) -> None:
-        print(self.run("journalctl", "--no-pager", "--lines=100", check=False))
-        self._end()
+        try:
+            print(self.run("journalctl", "--no-pager", "--lines=100", check=False))
+        finally:
+            self._end()
 
     @property
     def root(self) -> Path:

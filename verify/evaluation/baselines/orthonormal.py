@@ -13,7 +13,7 @@ Flips = NDArray[np.float32]
 
 
 def orthonormal(inputs: int, outputs: int, *, stream: Keystream) -> Matrix:
-    """Draw a matrix uniformly (Haar) among those with orthonormal columns, or rows where it widens.
+    """Draw a float32 matrix (Haar) with orthonormal columns, or rows where it widens.
 
     The papers orthonormalise random numbers by Gram–Schmidt; Householder's QR of a Gaussian
     matrix, with the signs of R's diagonal moved into Q, gives the Haar measure without its loss of
