@@ -31,7 +31,7 @@ PATIENCE_S = 60
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     folder = tmp_path_factory.mktemp("server")
     deployment = deploy(folder, workers=1, port=free_port())
-    assert uvicorn_options(deployment.settings)["http"] is Protocol
+    assert uvicorn_options(deployment.settings, deployment.contract)["http"] is Protocol
     running = Server(deployment, folder)
     try:
         running.wait()

@@ -384,7 +384,8 @@ def test_forwarded_addresses_are_believed_from_proxies_only(
     settings = tight.settings.model_copy(update={"trusted_proxies": trusted})
 
     async def scenario() -> None:
-        config = uvicorn.Config(**{**uvicorn_options(settings), "log_config": None})
+        options = uvicorn_options(settings, tight.contract)
+        config = uvicorn.Config(**{**options, "log_config": None})
         config.load()
         app = config.app
         assert isinstance(app, FastAPI)
