@@ -121,6 +121,8 @@ def test_a_face_never_leaves_the_browser(
     assert_accessible(tab, "enrolled-privately")
 
     page.get_by_role("link", name="Verify this person").click()
+    # Else the files may be chosen in the view that is about to go.
+    expect(page.get_by_role("heading", name="Verify", exact=True)).to_be_visible()
     choose(page, own[2])
     expect(page.get_by_label("Passkey", exact=True)).to_be_checked()
     press(page, "Verify")
@@ -206,6 +208,8 @@ def test_the_same_photos_are_lifted_once(
     assert first not in again
 
     page.get_by_role("link", name="Verify this person").click()
+    # Else the files may be chosen in the view that is about to go.
+    expect(page.get_by_role("heading", name="Verify", exact=True)).to_be_visible()
     choose(page, own[1])
     press(page, "Verify")
     alert = page.get_by_role("alert")
