@@ -7,9 +7,9 @@ a service that falls behind shows it in the latencies. At every full minute the 
 the service's processes is read, what workers share with their supervisor counted once: a share in
 libraries would move with whatever else runs.
 
-The test, chosen before the first run: the mean memory of the last ten minutes is at most
-2 % above that of the ten minutes after the first ten, and every answer is a decision, or what was
-asked for. Else the exit status is 1.
+The test, chosen before the first run, when it was of private memory: the mean of the last ten
+minutes is at most 2 % above that of the ten minutes after the first ten, and every answer is a
+decision, or what was asked for. Else the exit status is 1.
 
 Example
 -------
