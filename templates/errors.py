@@ -101,5 +101,9 @@ class StoreUnavailable(StoreError):
     """The database does not respond."""
 
 
+class DatabaseFileRemoved(StoreUnavailable):
+    """The path of the open database names another file, or none: what is written would be lost."""
+
+
 class StoreBusy(StoreUnavailable):
     """The database answers, but cannot do this now: the same request may succeed in a moment."""

@@ -174,16 +174,18 @@ def purge(
     """
     retention = retention_of(settings)
     with checked_store(settings) as store:
-        due, erased = store.retention.due(retention), 0
+        due, erased, log_purged = store.retention.due(retention), 0, True
         if not dry_run:
             erased = store.retention.erase_expired(retention)
-            store.purge()
+            log_purged = store.purge()
     if as_json:
-        emit({"due": due, "erased": erased})
+        emit({"due": due, "erased": erased, "log_purged": log_purged})
     elif dry_run:
         say(f"{due} subjects are due to be erased.")
     else:
         say(f"Erased {erased} subjects and all expired records.")
+        if not log_purged:
+            say("A reader keeps old pages in SQLite's write-ahead log: purge again when it ended.")
 
 
 @app.command("template-enrollment")

@@ -63,7 +63,7 @@ class Erasures:
         """
         work = self._work(tenant, subject_id, by)
         receipt, erased = self._context.write(work, lock=subject_lock(tenant, subject_id))
-        log_purged = self._context.database.try_purge_log()
+        log_purged = self._context.database.purge_log()
         return Erasure(receipt=receipt, erased=erased, log_purged=log_purged)
 
     def erase_if(

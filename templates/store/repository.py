@@ -138,14 +138,8 @@ class TemplateStore:
         # One at a time: on PostgreSQL another worker's trial has the same row, not yet removed.
         self.database.write(work, lock="trial write")
 
-    def purge(self, *, wait: float | None = None) -> bool:
+    def purge(self) -> bool:
         """Remove expired records, and on SQLite empty the write-ahead log.
-
-        Parameters
-        ----------
-        wait
-            Seconds that emptying the log may wait for readers, and so make writers wait; the
-            store's timeout by default.
 
         Returns
         -------
@@ -155,7 +149,7 @@ class TemplateStore:
         self.idempotency.expire()
         self.attempts.expire()
         self.outbox.expire()
-        return self.database.purge_log(wait=wait)
+        return self.database.purge_log()
 
     def compact(self) -> None:
         """Rewrite the tables of subjects and of keys, so that no page keeps what was erased.

@@ -138,7 +138,7 @@ class WrappedKeys:
                     total += counts.changed
                     if progress is not None:
                         progress(counts.changed)
-        database.try_purge_log()
+        database.purge_log()
         return total
 
     def count(self) -> dict[str, int]:

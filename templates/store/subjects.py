@@ -287,7 +287,7 @@ class Subjects:
 
         stored = context.write(work, lock=subject_lock(tenant, subject_id))
         if not stored.created:
-            context.database.try_purge_log()
+            context.database.purge_log()
         return stored
 
     def get(

@@ -164,7 +164,7 @@ class TenantErasures:
             receipt, erased = context.write_alone(
                 lambda connection: self._finish(connection, tenant_id, tenant, by)
             )
-        return TenantErasure(receipt, erased, log_purged=context.database.try_purge_log())
+        return TenantErasure(receipt, erased, log_purged=context.database.purge_log())
 
     def held(self, tenant: str) -> ErasedTenant:
         """Count what there is of a tenant now; :class:`UnknownTenant` where there is none."""

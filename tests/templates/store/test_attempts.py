@@ -186,6 +186,20 @@ def test_the_check_tells_how_long(ada: TemplateStore, clock: Clock) -> None:
     assert len(list(ada.audit_log.lines())) == lines + 1
 
 
+def test_a_clock_that_is_set_back_prolongs_no_lock_by_more_than_its_length(
+    ada: TemplateStore, clock: Clock
+) -> None:
+    for _ in range(5):
+        attempt(ada)
+    clock.pass_by(seconds=-29)
+    assert attempt(ada) == "locked 59"
+    clock.pass_by(days=-1)
+    assert attempt(ada) == "reject"
+    assert attempt(ada) == "locked 60"
+    clock.pass_by(seconds=60)
+    assert attempt(ada, accepted=True) == "accept"
+
+
 def test_an_accept_clears_the_count_and_notes_the_use(ada: TemplateStore, clock: Clock) -> None:
     used = sa.select(SubjectRow.last_used_at)
     for _ in range(4):
