@@ -13,7 +13,7 @@ from typing import Any
 
 import anyio
 import anyio.to_thread
-from fastapi import APIRouter, FastAPI, Request
+from fastapi import APIRouter, Depends, FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.routing import iter_route_contexts
 from starlette.exceptions import HTTPException
@@ -25,6 +25,7 @@ from api.http.audit import note_refusal
 from api.http.audit_report import open_audit_report
 from api.http.context import RequestContext
 from api.http.cors import Cors
+from api.http.deps import refuse_unknown
 from api.http.errors import ApiError, StartError, api_error
 from api.http.openapi import allowed_methods
 from api.http.protocol import Protocol
@@ -145,7 +146,7 @@ def _built(*modules: ModuleType) -> tuple[BaseRoute, ...]:
     """
     router = APIRouter(generate_unique_id_function=operation_id)
     for module in modules:
-        router.include_router(module.router)
+        router.include_router(module.router, dependencies=[Depends(refuse_unknown)])
     for _ in iter_route_contexts(router.routes):
         pass
     return tuple(router.routes)

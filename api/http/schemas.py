@@ -321,6 +321,10 @@ class ReceiptAnswer(_Answer):
 
     receipt: SignedReceipt
     claims: ReceiptClaims
+    log_purged: bool = Field(
+        description="False where a reader of SQLite's database keeps old pages in the write-ahead "
+        "log just now: they go with a later purge."
+    )
 
 
 class ExportAnswer(_Answer):

@@ -12,7 +12,7 @@ from api.http.auth import Caller
 from api.http.bodies import (
     Form,
     base64_field,
-    content_type,
+    is_form,
     parse_json,
     reject_unknown,
     sent_form,
@@ -24,7 +24,6 @@ from api.http.deps import (
     IdempotencyDep,
     RuntimeDep,
     SubjectDep,
-    query_of,
 )
 from api.http.errors import ApiError
 from api.http.holder_keys import FIELD, HolderKeyHeaderDep, digest, holder_key_of
@@ -32,7 +31,7 @@ from api.http.idempotency import Outcome, kept_with, once, written
 from api.http.openapi import BODY, ENROLLMENT_BODY, EVERY_CALL, IDEMPOTENT, PHOTO, error_responses
 from api.http.preconditions import PreconditionDep, asked
 from api.http.schemas import EnrollmentAnswer
-from api.http.values import face_policy, one_of, storage_of
+from api.http.values import face_policy, storage_of
 from api.limits.admission import Gate
 from api.process.runtime import Runtime
 from enroll import Enrollment, Holder
@@ -102,28 +101,28 @@ async def enroll(
     A token for this subject may stand in the place of the API key; the enrollment uses it up.
     """
     settings = runtime.settings
-    query = query_of(request, ("face",))
     if caller.subject_token is not None:
         precondition = caller.subject_token.precondition(precondition)
     async with gate.admitted(caller.prefix):
-        if content_type(request) == "multipart/form-data":
+        if is_form(request):
             runtime.required_pack()
             runtime.require_decoys()
-            form = await sent_form(request, settings, max_images=settings.max_images)
+            form = await sent_form(
+                request, settings, field="images", max_images=settings.max_images
+            )
             return await _enroll_photos(
                 request,
                 caller,
                 subject,
                 form,
-                query,
                 idempotency_key,
                 holder_key_header,
                 precondition,
             )
+        body = await sent_json(request, settings, ("template", "storage", FIELD), photos="images")
+        # After the fields: a caller that only forgot how to send a photo needs no further right.
         caller.require("embeddings")
-        body = await sent_json(request, settings)
         await gate.query(lambda: runtime.require_template_enrollment(caller.tenant))
-        reject_unknown([*body, *query], ("template", "storage", FIELD))
         template = base64_field(body.get("template"), "template", code="invalid_template")
         storage = storage_of(body)
         holder_key = holder_key_of(holder_key_header, body)
@@ -173,7 +172,6 @@ async def _enroll_photos(
     caller: Caller,
     subject: str,
     form: Form,
-    query: dict[str, str],
     idempotency_key: str | None,
     holder_key_header: str | None,
     precondition: Precondition | None,
@@ -183,7 +181,7 @@ async def _enroll_photos(
     pack, photos = runtime.required_pack(), form.images("images")
     reject_unknown(form.fields, ("attributes", "face", "storage", FIELD))
     storage = storage_of(form.fields)
-    policy = face_policy(one_of(form.fields, query, "face"))
+    policy = face_policy(form.fields.get("face"))
     attributes = parse_attributes(form.fields.get("attributes"))
     holder_key = holder_key_of(holder_key_header, form.fields)
 

@@ -9,7 +9,7 @@ from starlette.responses import Response
 from api.http.answers import answer
 from api.http.audit import by
 from api.http.auth import note_subject
-from api.http.bodies import base64_field, reject_unknown, sent_json
+from api.http.bodies import base64_field, sent_json
 from api.http.deps import Exports, GateDep, IdempotencyDep, RuntimeDep, SubjectDep
 from api.http.errors import ApiError
 from api.http.idempotency import Outcome, kept_with, once, written
@@ -103,8 +103,7 @@ async def import_subject(
     """
     settings = runtime.settings
     async with gate.admitted(caller.prefix):
-        body = await sent_json(request, settings)
-        reject_unknown(body, ("export", "restore"))
+        body = await sent_json(request, settings, ("export", "restore"))
         restore = body.get("restore", False)
         if not isinstance(restore, bool):
             raise ApiError(

@@ -21,7 +21,7 @@ from starlette.responses import Response
 from api.http.answers import answer
 from api.http.audit import by
 from api.http.auth import Caller
-from api.http.deps import GateDep, IdempotencyDep, RuntimeDep, SubjectDep, Verifies, query_of
+from api.http.deps import GateDep, IdempotencyDep, RuntimeDep, SubjectDep, Verifies
 from api.http.errors import ApiError
 from api.http.holder_keys import HolderKeyHeaderDep, digest
 from api.http.idempotency import Outcome, once, replay_header
@@ -114,10 +114,9 @@ async def verify(
     A token for this subject may stand in the place of the API key; the decision uses it up. With
     a token an `Idempotency-Key` is taken: the same request gets the same answer once more.
     """
-    query = query_of(request, ("level", "face"))
     async with gate.admitted(caller.prefix):
         with step("body"):
-            probe = await sent_probe(request, runtime, caller, subject, query, holder_key_header)
+            probe = await sent_probe(request, runtime, caller, subject, holder_key_header)
 
         def work(claim: Claim | None) -> Outcome:
             def kept(decision: Decision) -> tuple[Claim, Answer] | None:

@@ -115,7 +115,9 @@ def test_text_that_utf8_cannot_carry(client: Client) -> None:
         )
         assert_error(answer, 422, "validation_failed")
     answer = client.post(
-        "/v1/subjects/a/verify", content=b'{"embedding": [1.0], "level": "\\ud800"}'
+        "/v1/subjects/a/verify",
+        content=b'{"embedding": [1.0], "level": "\\ud800"}',
+        headers={"Content-Type": "application/json"},
     )
     assert_error(answer, 422, "validation_failed")
 

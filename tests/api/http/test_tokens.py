@@ -178,6 +178,16 @@ def test_a_token_outlives_a_restart_and_its_key_does_not(service: Service) -> No
     assert_error(verify(client, revoked), 401, "unauthorized")
 
 
+def test_a_token_from_before_the_clock_was_set_back_is_refused(
+    shared: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    client, _ = shared
+    with monkeypatch.context() as patch:
+        patch.setattr("api.http.routes.tokens.LONGEST_S", 86_400)
+        issued = issue(client, lifetime_s=86_400)
+    assert_error(verify(client, issued["token"]), 401, "replayed")
+
+
 def test_a_late_token_is_refused(shared: Service) -> None:
     client, deployment = shared
     issued = issue(client, lifetime_s=1)
@@ -199,9 +209,8 @@ def test_a_token_is_for_its_subject_action_and_level_only(shared: Service) -> No
     client.put("/v1/subjects/bob/enrollment", files=images(photo(2)))
     lax, strict = issue(client, level=LAX)["token"], issue(client, level=STRICT)["token"]
     for token, level in ((strict, LAX), (lax, STRICT), (lax, "accuracy")):
-        for options in ({"params": {"level": level}}, {"data": {"level": level}}):
-            refused = verify(client, token, **options)
-            assert assert_error(refused, 403, "forbidden") == {"token": "level"}
+        refused = verify(client, token, data={"level": level})
+        assert assert_error(refused, 403, "forbidden") == {"token": "level"}
     refused = verify(client, strict, 2, "bob")
     assert assert_error(refused, 403, "forbidden") == {"token": "subject"}
     refused = enroll(client, strict, 1, "alice")
@@ -211,7 +220,7 @@ def test_a_token_is_for_its_subject_action_and_level_only(shared: Service) -> No
     assert assert_error(refused, 403, "forbidden") == {"token": "call"}
     assert assert_error(enroll(client, writing, 2, "bob"), 403, "forbidden") == {"token": "subject"}
     # None of it used a token up, and its own level may be named.
-    assert verify(client, lax, params={"level": LAX}).json()["level"] == LAX
+    assert verify(client, lax, data={"level": LAX}).json()["level"] == LAX
     assert verify(client, strict).json()["level"] == STRICT
     assert enroll(client, writing, 1, "alice").status_code == 200
 

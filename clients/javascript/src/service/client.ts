@@ -148,7 +148,7 @@ export class Session {
       method: "DELETE",
       path: subjectPath(subject),
       headers: idempotency(),
-      read: answer<Receipt>({ receipt: "object", claims: "object" }),
+      read: answer<Receipt>({ receipt: "object", claims: "object", log_purged: "boolean" }),
     });
   }
 
