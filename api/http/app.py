@@ -64,14 +64,12 @@ from api.process.operations import (
 )
 from api.process.runtime import Runtime
 from api.process.supervised import end_with_supervisor, is_supervised, open_patiently, told_to_stop
-from api.process.webhooks import deliver
 from api.settings import NO_PROXIES, Settings
 from models.errors import ModelError
 from templates.contract.document import Contract
 from templates.distances import warm_up
 from templates.distances.blas import single_threaded
 from templates.errors import VeilfaceError
-from templates.keys.webhook_secret import read_webhook_secrets
 
 VERSION = version("veilface")
 API = (
@@ -261,9 +259,6 @@ async def _open(
     if runtime.contract.takes_lifted_probes:
         # No lifted probe but one that comes now waits for it; an end of the process does not.
         threading.Thread(target=_lift_cohort, args=(runtime.contract,), daemon=True).start()
-    if settings.webhook_url is not None and settings.webhook_secret_file is not None:
-        secrets = read_webhook_secrets(settings.webhook_secret_file)
-        tasks.start_soon(partial(deliver, runtime.store.outbox, settings.webhook_url, secrets))
     if is_supervised():
         tasks.start_soon(end_with_supervisor)
     if settings.operations_port is not None:

@@ -104,12 +104,6 @@ RATE_STORAGE_FAILURES = Counter(
 PURGE_FAILURES = Counter(
     "veilface_purge_failures", "Rounds of housekeeping that failed.", registry=REGISTRY
 )
-WEBHOOKS = Counter(
-    "veilface_webhooks",
-    "Webhooks that were sent: `taken` by the endpoint, or `failed` for now.",
-    ("outcome",),
-    registry=REGISTRY,
-)
 IN_FLIGHT = Gauge(
     "veilface_requests_in_flight",
     "Requests that are being answered now.",

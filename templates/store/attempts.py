@@ -25,7 +25,6 @@ from templates.store.idempotency import Answer, Claim, Idempotency
 from templates.store.identifiers import UnknownTenant, checked_subject_id
 from templates.store.lockout import LockedOut, LockoutPolicy, Nonce, Replayed, Superseded
 from templates.store.nonces import Nonces, spend
-from templates.store.outbox import EventType
 from templates.store.schema import FailedAttemptsRow, UsedNonceRow
 from templates.store.standing import UNKNOWN_RETENTION, AttemptsStatus, Standing
 from templates.store.subject_rows import (
@@ -395,19 +394,6 @@ class Attempts:
         line = self._context.audit_log.append(connection, entry)
         if new_status is not None:
             self._standing.write(connection, row, asked["pseudonym"], new_status, line)
-            until = new_status.locked_until
-            if until is not None or new_status.disabled_at is not None:
-                # Of an unknown subject too: whether it is told must not show who is enrolled.
-                self._context.outbox.add(
-                    connection,
-                    EventType.LOCKED_OUT,
-                    tenant_id=row.tenant_id,
-                    tenant=asked["tenant"],
-                    pseudonym=asked["pseudonym"],
-                    subject_id=asked["subject_id"],
-                    until=None if until is None else until.isoformat(),
-                    disabled=new_status.disabled_at is not None,
-                )
         return refusal
 
 

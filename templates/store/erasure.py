@@ -9,7 +9,6 @@ from sqlalchemy.engine import Connection
 from templates.store.audit_log import PROGRAM, By, Entry
 from templates.store.context import StoreContext
 from templates.store.identifiers import checked_subject_id
-from templates.store.outbox import EventType
 from templates.store.receipts import Erased, Receipt, keep_receipt, latest_receipt
 from templates.store.schema import (
     FailedAttemptsRow,
@@ -56,8 +55,7 @@ class Erasures:
         own call removed.
 
         What stays is the receipt, and the lines of the audit log, which name the subject by its
-        pseudonym; where events are told, also those of the subject that the endpoint has not taken
-        yet, sealed, for a week at most. The nonces of signed probes stay for their few minutes:
+        pseudonym. The nonces of signed probes stay for their few minutes:
         they belong to an API key and name no subject. As the failed attempts go, an erasure ends a
         lock: whoever may erase and enroll a subject may also start its count anew.
         """
@@ -103,15 +101,6 @@ class Erasures:
             pseudonym = signer.pseudonym(tenant, subject_id)
             receipt, outcome = remove(connection, pseudonym)
             audit_log.append(connection, Entry("erase", outcome, by, tenant, pseudonym))
-            if outcome == "erased":
-                self._context.outbox.add(
-                    connection,
-                    EventType.ERASED,
-                    tenant_id=tenant_id_of(connection, tenant),
-                    tenant=tenant,
-                    pseudonym=pseudonym,
-                    subject_id=subject_id,
-                )
             return receipt, outcome == "erased"
 
         def remove(connection: Connection, pseudonym: str) -> tuple[Receipt, str]:

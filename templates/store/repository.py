@@ -7,7 +7,6 @@ from sqlalchemy.engine import Connection
 
 from templates.keys.sealing import MasterKeyring
 from templates.store import deployment, migrate
-from templates.store.adoption import Adoption, adopt
 from templates.store.api_keys import ApiKeys
 from templates.store.attempts import Attempts
 from templates.store.context import StoreContext
@@ -28,7 +27,6 @@ from templates.store.schema import (
     FailedAttemptsRow,
     IdempotencyRow,
     MasterKeyCheckRow,
-    OutboxRow,
     RotationKeyRow,
     SubjectRow,
     TemplateRow,
@@ -60,17 +58,13 @@ class TemplateStore:
         timeout: float = 10.0,
         clock: Clock = utc_now,
         lockout: LockoutPolicy = _LOCKOUT,
-        tells_events: bool = False,
     ) -> None:
         database = Database(url, pool_size=pool_size, max_overflow=max_overflow, timeout=timeout)
-        self._context = context = StoreContext.of(
-            database, keyring, clock, tells_events=tells_events
-        )
+        self._context = context = StoreContext.of(database, keyring, clock)
         self.database = database
         self.secrets = context.secrets
         self.signer = context.signer
         self.audit_log = context.audit_log
-        self.outbox = context.outbox
         self.tenants = Tenants(context)
         self.api_keys = ApiKeys(context, self.tenants)
         self.nonces = Nonces(context)
@@ -86,18 +80,14 @@ class TemplateStore:
         self.wrapped_keys = WrappedKeys(context)
         self.renewal = Renewal(context, self.tenants)
 
-    def upgrade(self) -> Adoption:
-        """Bring the schema to this program's version; safe when several workers start at once.
-
-        Rows of a version that did not authenticate them are authenticated, once: see
-        :func:`adoption.adopt`.
-        """
+    def upgrade(self) -> None:
+        """Bring the schema to this program's version; safe when several workers start at once."""
         context = self._context
         migrate.upgrade(self.database)
         deployment.mark_master_key(self.database, context.keyring, context.clock)
         self.check()
         self.audit_log.begin()
-        return adopt(context)
+        self.signer.prepare()  # so that the first reader makes no secret, which is a write
 
     def check(self) -> None:
         """Raise, naming the remedy, unless schema and master key are the right ones."""
@@ -148,7 +138,6 @@ class TemplateStore:
         """
         self.idempotency.expire()
         self.attempts.expire()
-        self.outbox.expire()
         return self.database.purge_log()
 
     def compact(self) -> None:
@@ -166,7 +155,6 @@ _HOLD_SUBJECT_DATA = (
     TemplateRow,
     FailedAttemptsRow,
     IdempotencyRow,
-    OutboxRow,
     RotationKeyRow,
     ApiKeyRow,
     UsedNonceRow,

@@ -280,24 +280,6 @@ class IdempotencyRow(Base):
     mac: Mapped[bytes | None] = mapped_column(MAC)
 
 
-class OutboxRow(Base):
-    """An event that the operator's endpoint is to be told, until it has taken it."""
-
-    __tablename__ = "outbox"
-    __table_args__ = (Index("ix_outbox_tenant_id_pseudonym", "tenant_id", "pseudonym"),)
-
-    sequence: Mapped[int] = mapped_column(SERIAL, primary_key=True, autoincrement=True)
-    event_id: Mapped[str] = mapped_column(UUID_HEX)
-    tenant_id: Mapped[str] = mapped_column(UUID_HEX, ForeignKey("tenants.id", ondelete="CASCADE"))
-    pseudonym: Mapped[str] = mapped_column(PSEUDONYM)
-    wrapped_body: Mapped[bytes] = mapped_column(LargeBinary)
-    wrapping_key: Mapped[str] = mapped_column(KEY_ID)
-    attempts: Mapped[int] = mapped_column(Integer)
-    created_at: Mapped[datetime] = mapped_column(UtcDateTime)
-    due_at: Mapped[datetime] = mapped_column(UtcDateTime, index=True)
-    mac: Mapped[bytes | None] = mapped_column(MAC)
-
-
 class KnownCalibrationsRow(Base):
     """Calibrations of a contract that were served, in the order in which they came first."""
 

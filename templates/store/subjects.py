@@ -25,7 +25,6 @@ from templates.store.identifiers import (
 )
 from templates.store.lockout import Nonce
 from templates.store.nonces import Nonces
-from templates.store.outbox import EventType
 from templates.store.schema import FailedAttemptsRow, SubjectRow, TemplateRow, TenantRow
 from templates.store.subject_rows import (
     RECORD_COLUMNS,
@@ -268,16 +267,6 @@ class Subjects:
                 "enroll", outcome, by, tenant, pseudonym, detail=detail, nonce=nonce_digest
             )
             context.audit_log.append(connection, entry)
-            context.outbox.add(
-                connection,
-                EventType.ENROLLED,
-                tenant_id=tenant_id,
-                tenant=tenant,
-                pseudonym=pseudonym,
-                subject_id=subject_id,
-                template_id=template_id,
-                replaced=not is_new,
-            )
             if once is not None and is_held:
                 self._idempotency.note_written(connection, once.claim, template_id)
             elif once is not None:

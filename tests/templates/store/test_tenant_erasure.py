@@ -28,7 +28,6 @@ from templates.store.schema import (
     Base,
     FailedAttemptsRow,
     IdempotencyRow,
-    OutboxRow,
     RotationKeyRow,
     SubjectRow,
     TemplateRow,
@@ -50,7 +49,6 @@ OF_A_TENANT = (
     FailedAttemptsRow,
     IdempotencyRow,
     UsedNonceRow,
-    OutboxRow,
     TenantErasureRow,
     TenantRow,
 )
@@ -133,7 +131,6 @@ def test_everything_of_the_tenant_goes_and_nothing_of_another(
         FailedAttemptsRow: theirs["failed_attempts"],
         IdempotencyRow: theirs["idempotency_records"],
         UsedNonceRow: theirs["nonces"],
-        OutboxRow: 0,
         TenantErasureRow: 0,
         TenantRow: 1,
     }
