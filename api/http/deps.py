@@ -4,7 +4,7 @@ from functools import partial
 from typing import Annotated
 from urllib.parse import parse_qsl
 
-from fastapi import Depends, Header, Path, Query, Request
+from fastapi import Depends, Path, Query, Request
 from pydantic import BeforeValidator
 
 from api.http.auth import Caller, CallerDep, holding, note_subject
@@ -45,35 +45,6 @@ async def subject_of(
         request, runtime.store.signer.pseudonym(caller.tenant, checked_subject_id(subject_id))
     )
     return subject_id
-
-
-async def idempotency_key_of(
-    idempotency_key: Annotated[
-        str | None,
-        Header(
-            description="1 to 255 visible characters. The same key with the same request gives "
-            "the stored answer for 24 hours; with another request, `idempotency_conflict`.",
-            examples=["9b2c6a0e-5c5f-4f5e-8f0b-1d9f4c1f7a11"],
-        ),
-    ] = None,
-) -> str | None:
-    """Check the Idempotency-Key header.
-
-    Raises
-    ------
-    ApiError
-        ``validation_failed``.
-    """
-    if idempotency_key is None:
-        return None
-    visible = all("!" <= character <= "~" for character in idempotency_key)
-    if not visible or not 1 <= len(idempotency_key) <= 255:
-        raise ApiError(
-            "validation_failed",
-            "Idempotency-Key must have 1 to 255 visible ASCII characters",
-            {"field": "Idempotency-Key"},
-        )
-    return idempotency_key
 
 
 async def enrolls_or_verifies(caller: CallerDep) -> Caller:
@@ -137,7 +108,6 @@ Limit = Annotated[
 RuntimeDep = Annotated[Runtime, Depends(runtime_of)]
 GateDep = Annotated[Gate, Depends(gate_of)]
 SubjectDep = Annotated[str, Depends(subject_of)]
-IdempotencyDep = Annotated[str | None, Depends(idempotency_key_of)]
 Enrolls = Annotated[Caller, Depends(holding("enroll"))]
 EnrollsOrVerifies = Annotated[Caller, Depends(enrolls_or_verifies)]
 Verifies = Annotated[Caller, Depends(holding("verify"))]

@@ -53,17 +53,13 @@ PROBES = ("embedding", "embeddings", "template")
 
 @dataclass(frozen=True)
 class Probe:
-    """What is compared, how, with whose template, and what keeps it from a second use.
-
-    `asked` is what tells the request from another one, but for the holder's key.
-    """
+    """What is compared, how, with whose template, and what keeps it from a second use."""
 
     kind: Literal["photo", "frames", "embedding", "template"]
     compare: Callable[[Verifier, OpenedTemplate], Decision]
     held_template: bytes | None = field(repr=False)
     nonce: Nonce | None
     holder_key: bytearray | None = field(repr=False)
-    asked: tuple[str | bytes, ...] = field(repr=False)
 
 
 async def sent_probe(
@@ -152,7 +148,6 @@ async def _photos(
         held_template,
         nonce,
         holder_key,
-        asked=(level, str(policy), challenge_id or "", held_template or b"", *photos),
     )
 
 
@@ -246,8 +241,6 @@ async def _signed(
         held_template,
         nonce,
         holder_key,
-        # The HMAC is of all that is signed.
-        asked=(body["hmac"], held_template or b""),
     )
 
 

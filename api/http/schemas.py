@@ -295,7 +295,7 @@ class SignedReceipt(_Shape):
 class ErasedItem(_Shape):
     """Records of one kind that the erasure removed."""
 
-    item: Literal["template", "data_key", "metadata", "failed_attempts", "idempotency_records"]
+    item: Literal["template", "data_key", "metadata", "failed_attempts"]
     count: int
 
 

@@ -21,7 +21,6 @@ from templates.errors import StoreError
 from templates.store.attempt_queries import NOTE_USE, before, named, standing
 from templates.store.audit_log import By, Entry
 from templates.store.context import StoreContext
-from templates.store.idempotency import Answer, Claim, Idempotency
 from templates.store.identifiers import UnknownTenant, checked_subject_id
 from templates.store.lockout import LockedOut, LockoutPolicy, Nonce, Replayed, Superseded
 from templates.store.nonces import Nonces, spend
@@ -84,12 +83,10 @@ class Attempts:
         self,
         context: StoreContext,
         nonces: Nonces,
-        idempotency: Idempotency,
         policy: LockoutPolicy,
     ) -> None:
         self._context = context
         self._nonces = nonces
-        self._idempotency = idempotency
         self._standing = Standing(context, policy)
 
     def begin(
@@ -139,7 +136,6 @@ class Attempts:
         contract_ids: Sequence[str] | None = None,
         level: str,
         nonce: Nonce | None,
-        kept: tuple[Claim, Answer] | None = None,
         by: By,
     ) -> None:
         """Count a decision, in one transaction, before anybody is told of it.
@@ -166,8 +162,6 @@ class Attempts:
             Security level of the decision, for the audit log.
         nonce
             Of a signed probe; None for a photo.
-        kept
-            What is answered under an idempotency key, and its claim.
         by
             Who asked.
 
@@ -179,19 +173,12 @@ class Attempts:
             If the subject is locked now.
         Superseded
             If the subject's template is another one now. Nothing is written.
-        IdempotencyConflict
-            If another run of the same request has taken over, or the subject was erased. Nothing is
-            written: a decision that is not counted is told to nobody either, so whoever provokes it
-            learns nothing, and the nonce is used up by the run whose decision is told.
         UnknownTenant, StoreError, StoreUnavailable
         """
 
         def work(connection: Connection) -> LockedOut | Replayed | None:
             asked = self._asked(tenant, subject_id, nonce, contract_ids)
-            refusal = self._record(connection, asked, accepted, template_id, nonce, level, by)
-            if kept is not None and refusal is None:
-                self._idempotency.finish(connection, *kept)
-            return refusal
+            return self._record(connection, asked, accepted, template_id, nonce, level, by)
 
         refusal = self._context.write(work, lock=subject_lock(tenant, subject_id))
         if refusal is not None:
@@ -206,7 +193,6 @@ class Attempts:
         contract_ids: Sequence[str],
         nonce: Nonce | None,
         held_template: bytes | None = None,
-        kept: Callable[[D], tuple[Claim, Answer] | None] = lambda _decided: None,
         by: By,
     ) -> D:
         """:meth:`begin`, a decision and :meth:`conclude` while nobody replaces the template.
@@ -218,7 +204,7 @@ class Attempts:
 
         Raises
         ------
-        LockedOut, Replayed, IdempotencyConflict, UnknownTenant, SealError, StoreError,
+        LockedOut, Replayed, UnknownTenant, SealError, StoreError,
         StoreUnavailable
         """
 
@@ -229,8 +215,6 @@ class Attempts:
             refusal = self._record(
                 connection, asked, decided.accepted, attempt.template_id, nonce, decided.level, by
             )
-            if refusal is None and (answered := kept(decided)) is not None:
-                self._idempotency.finish(connection, *answered)
             return decided if refusal is None else refusal
 
         outcome = self._context.write(work, lock=subject_lock(tenant, subject_id))

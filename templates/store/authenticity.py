@@ -26,7 +26,6 @@ from templates.store.schema import (
     AuditRow,
     Base,
     FailedAttemptsRow,
-    IdempotencyRow,
     KnownCalibrationsRow,
     TenantRow,
 )
@@ -57,16 +56,6 @@ AUTHENTICATED: dict[type[Base], tuple[str, ...]] = {
         "locked_until",
         "disabled_at",
         "line",
-    ),
-    IdempotencyRow: (
-        "tenant_id",
-        "actor",
-        "key_hash",
-        "request_hash",
-        "claim",
-        "status",
-        "body",
-        "expires_at",
     ),
     KnownCalibrationsRow: ("contract_id", "position", "calibration_ids", "created_at"),
 }

@@ -12,7 +12,6 @@ from templates.store.identifiers import checked_subject_id
 from templates.store.receipts import Erased, Receipt, keep_receipt, latest_receipt
 from templates.store.schema import (
     FailedAttemptsRow,
-    IdempotencyRow,
     SubjectRow,
     TemplateRow,
     TenantRow,
@@ -49,8 +48,8 @@ class Erasures:
     def erase(self, tenant: str, subject_id: str, *, by: By = PROGRAM) -> Erasure:
         """Remove all that is held of a subject, its data key included; leave a signed receipt.
 
-        In one transaction: template, metadata, data key, failed attempts and idempotency records
-        go, the receipt comes. Erasing again returns the receipt of the first time; erasing who
+        In one transaction: template, metadata, data key and failed attempts go, the receipt
+        comes. Erasing again returns the receipt of the first time; erasing who
         was never enrolled leaves a receipt that says nothing was held. The receipt counts what its
         own call removed.
 
@@ -106,14 +105,12 @@ class Erasures:
         def remove(connection: Connection, pseudonym: str) -> tuple[Receipt, str]:
             tenant_id = tenant_id_of(connection, tenant)
 
-            def removed(table: type[FailedAttemptsRow | IdempotencyRow]) -> int:
-                whose = table.tenant_id == tenant_id, table.pseudonym == pseudonym
-                return connection.execute(sa.delete(table).where(*whose)).rowcount
-
-            failed_attempts, idempotency_records = (
-                removed(FailedAttemptsRow),
-                removed(IdempotencyRow),
-            )
+            failed_attempts = connection.execute(
+                sa.delete(FailedAttemptsRow).where(
+                    FailedAttemptsRow.tenant_id == tenant_id,
+                    FailedAttemptsRow.pseudonym == pseudonym,
+                )
+            ).rowcount
             contract_id, templates, subjects = None, 0, 0
             subject_pk = subject_pk_of(connection, tenant_id, subject_id)
             if subject_pk is None:
@@ -143,7 +140,6 @@ class Erasures:
                     data_key=subjects,  # a column of the subject's row, with the metadata
                     metadata=subjects,
                     failed_attempts=failed_attempts,
-                    idempotency_records=idempotency_records,
                 ),
                 erased_at=now,
             )

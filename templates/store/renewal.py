@@ -8,9 +8,8 @@ or all:
 ==================  ================================================================================
 audit chain         a line ends the time of the old key, the next begins that of the new one
 rows                those that are authentic get a MAC under the new key
-pseudonyms          new lines name subjects by new pseudonyms; counts of failures, events, answers
-                    of repeated writes and receipts are brought forward, lines of before are found
-                    by the old pseudonyms
+pseudonyms          new lines name subjects by new pseudonyms; counts of failures and receipts
+                    are brought forward, lines of before are found by the old pseudonyms
 receipts            those that are kept are signed again; the old key stays known, with the time
 exports, stand-ins  made with the new secret from now on
 ==================  ================================================================================
@@ -54,7 +53,6 @@ from templates.store.schema import (
     AuditRow,
     Base,
     FailedAttemptsRow,
-    IdempotencyRow,
     ReceiptRow,
     SecretRow,
     TenantRow,
@@ -233,8 +231,6 @@ def _authenticate_again(
     columns = list(columns_of(table))
     if table is ApiKeyRow:
         columns.append(TENANT_OF_KEY.label("tenant"))
-    if table is IdempotencyRow:
-        columns.append(IdempotencyRow.pseudonym)
     authentic, changed = 0, []
     # Read whole before it is written: a cursor over rows that change meanwhile is not defined.
     for row in read_rows(connection, sa.select(*columns), table):
@@ -279,18 +275,8 @@ def _again(pseudonym: str | None, fresh: Fresh) -> str | None:
     return digest_again(secret.value, bytes.fromhex(pseudonym)).hex()
 
 
-def _hashed_again(own_hash: bytes, fresh: Fresh) -> bytes:
-    secret = fresh.get(SecretName.IDEMPOTENCY)
-    return own_hash if secret is None else digest_again(secret.value, own_hash)
-
-
 _FORWARD: dict[type[Base], dict[str, Callable[[Any, Fresh], Any]]] = {
     FailedAttemptsRow: {"pseudonym": _again},
-    IdempotencyRow: {
-        "key_hash": _hashed_again,
-        "request_hash": _hashed_again,
-        "pseudonym": _again,
-    },
 }
 """Columns that hold keyed digests."""
 

@@ -12,7 +12,6 @@ from templates.store.attempts import Attempts
 from templates.store.context import StoreContext
 from templates.store.database import Database
 from templates.store.erasure import Erasures
-from templates.store.idempotency import Idempotency
 from templates.store.identifiers import Clock, utc_now
 from templates.store.known_calibrations import KnownCalibrations
 from templates.store.lockout import LockoutPolicy
@@ -25,7 +24,6 @@ from templates.store.rewrap import WrappedKeys
 from templates.store.schema import (
     ApiKeyRow,
     FailedAttemptsRow,
-    IdempotencyRow,
     MasterKeyCheckRow,
     RotationKeyRow,
     SubjectRow,
@@ -68,9 +66,8 @@ class TemplateStore:
         self.tenants = Tenants(context)
         self.api_keys = ApiKeys(context, self.tenants)
         self.nonces = Nonces(context)
-        self.idempotency = Idempotency(context)
-        self.subjects = Subjects(context, self.nonces, self.idempotency)
-        self.attempts = Attempts(context, self.nonces, self.idempotency, lockout)
+        self.subjects = Subjects(context, self.nonces)
+        self.attempts = Attempts(context, self.nonces, lockout)
         self.erasures = Erasures(context)
         self.retention = RetentionJob(context, self.erasures)
         self.transfers = Transfers(context)
@@ -136,7 +133,6 @@ class TemplateStore:
         bool
             False if a reader outlasted the wait: the log is emptied another time.
         """
-        self.idempotency.expire()
         self.attempts.expire()
         return self.database.purge_log()
 
@@ -154,7 +150,6 @@ _HOLD_SUBJECT_DATA = (
     SubjectRow,
     TemplateRow,
     FailedAttemptsRow,
-    IdempotencyRow,
     RotationKeyRow,
     ApiKeyRow,
     UsedNonceRow,

@@ -31,7 +31,6 @@ from templates.store.schema import (
     ApiKeyRow,
     Base,
     FailedAttemptsRow,
-    IdempotencyRow,
     RotationKeyRow,
     SubjectRow,
     TemplateRow,
@@ -95,12 +94,6 @@ _IN_BATCHES = (
         FailedAttemptsRow,
         [FailedAttemptsRow.tenant_id, FailedAttemptsRow.pseudonym],
         lambda tenant_id: FailedAttemptsRow.tenant_id == tenant_id,
-    ),
-    _Records(
-        ("idempotency_records",),
-        IdempotencyRow,
-        [IdempotencyRow.tenant_id, IdempotencyRow.actor, IdempotencyRow.key_hash],
-        lambda tenant_id: IdempotencyRow.tenant_id == tenant_id,
     ),
     _Records(
         ("nonces",),

@@ -1,12 +1,12 @@
 """Enrollment: photos, or a client's template."""
 
 import base64
-from functools import partial
 from typing import Any
 
 from fastapi import APIRouter, Request
 from starlette.responses import Response
 
+from api.http.answers import answer
 from api.http.audit import by
 from api.http.auth import Caller
 from api.http.bodies import (
@@ -21,15 +21,13 @@ from api.http.bodies import (
 from api.http.deps import (
     Enrolls,
     GateDep,
-    IdempotencyDep,
     RuntimeDep,
     SubjectDep,
 )
 from api.http.errors import ApiError
-from api.http.holder_keys import FIELD, HolderKeyHeaderDep, digest, holder_key_of
-from api.http.idempotency import Outcome, kept_with, once, written
-from api.http.openapi import BODY, ENROLLMENT_BODY, EVERY_CALL, IDEMPOTENT, PHOTO, error_responses
-from api.http.preconditions import PreconditionDep, asked
+from api.http.holder_keys import FIELD, HolderKeyHeaderDep, holder_key_of, wiping
+from api.http.openapi import BODY, ENROLLMENT_BODY, EVERY_CALL, PHOTO, error_responses
+from api.http.preconditions import PreconditionDep, etag
 from api.http.schemas import EnrollmentAnswer
 from api.http.values import face_policy, storage_of
 from api.limits.admission import Gate
@@ -38,10 +36,9 @@ from enroll import Enrollment, Holder
 from models.quality import Quality
 from templates.decoys import Attributes
 from templates.store.audit_log import By
-from templates.store.idempotency import Claim
 from templates.store.lockout import Nonce
 from templates.store.subject_rows import Source, Storage
-from templates.store.subjects import Precondition, StoredTemplate
+from templates.store.subjects import Precondition
 
 router = APIRouter(prefix="/v1/subjects", tags=["subjects"])
 
@@ -49,7 +46,6 @@ CODES = (
     *EVERY_CALL,
     *BODY,
     *PHOTO,
-    *IDEMPOTENT,
     "too_many_images",
     "forbidden",
     "replayed",
@@ -77,7 +73,6 @@ async def enroll(
     subject: SubjectDep,
     runtime: RuntimeDep,
     gate: GateDep,
-    idempotency_key: IdempotencyDep,
     holder_key_header: HolderKeyHeaderDep,
     precondition: PreconditionDep,
 ) -> Response:
@@ -115,7 +110,6 @@ async def enroll(
                 caller,
                 subject,
                 form,
-                idempotency_key,
                 holder_key_header,
                 precondition,
             )
@@ -127,7 +121,7 @@ async def enroll(
         storage = storage_of(body)
         holder_key = holder_key_of(holder_key_header, body)
 
-        def work(claim: Claim | None) -> Outcome:
+        def work() -> dict[str, Any]:
             nonce = _unused_nonce(runtime, caller)
             epoch = runtime.epoch(caller.tenant)
             enrollment = runtime.enroller(caller.tenant, epoch).from_template(
@@ -142,29 +136,12 @@ async def enroll(
                 Source.TEMPLATE,
                 storage,
                 precondition,
-                claim,
                 nonce,
                 by(request),
             )
 
-        outcome = await once(
-            request,
-            caller,
-            idempotency_key,
-            operation="enroll-template",
-            asked=[
-                subject,
-                template,
-                *_named(storage),
-                *asked(precondition),
-                *digest(holder_key),
-            ],
-            subject=subject,
-            work=work,
-            run=partial(gate.compute, key=caller.prefix),
-            holder_key=holder_key,
-        )
-        return written(request, outcome)
+        body = await gate.compute(wiping(holder_key, work), key=caller.prefix)
+        return _written(request, body)
 
 
 async def _enroll_photos(
@@ -172,7 +149,6 @@ async def _enroll_photos(
     caller: Caller,
     subject: str,
     form: Form,
-    idempotency_key: str | None,
     holder_key_header: str | None,
     precondition: Precondition | None,
 ) -> Response:
@@ -185,7 +161,7 @@ async def _enroll_photos(
     attributes = parse_attributes(form.fields.get("attributes"))
     holder_key = holder_key_of(holder_key_header, form.fields)
 
-    def work(claim: Claim | None) -> Outcome:
+    def work() -> dict[str, Any]:
         nonce = _unused_nonce(runtime, caller)
         epoch = runtime.epoch(caller.tenant)
         enrollment = runtime.enroller(caller.tenant, epoch).from_photos(
@@ -205,32 +181,12 @@ async def _enroll_photos(
             Source.PHOTOS,
             storage,
             precondition,
-            claim,
             nonce,
             by(request),
         )
 
-    outcome = await once(
-        request,
-        caller,
-        idempotency_key,
-        operation="enroll-photos",
-        asked=[
-            subject,
-            str(policy),
-            attributes.gender or "",
-            attributes.race or "",
-            *_named(storage),
-            *asked(precondition),
-            *photos,
-            *digest(holder_key),
-        ],
-        subject=subject,
-        work=work,
-        run=partial(gate.compute, key=caller.prefix),
-        holder_key=holder_key,
-    )
-    return written(request, outcome)
+    body = await gate.compute(wiping(holder_key, work), key=caller.prefix)
+    return _written(request, body)
 
 
 def parse_attributes(text: str | None) -> Attributes:
@@ -273,8 +229,7 @@ def _unused_nonce(runtime: Runtime, caller: Caller) -> Nonce | None:
     Raises
     ------
     Replayed
-        Where the token was used or is late: before anything is decoded, and after a repeated
-        request had its answer.
+        Where the token was used or is late: before anything is decoded.
     """
     if caller.subject_token is None:
         return None
@@ -283,11 +238,6 @@ def _unused_nonce(runtime: Runtime, caller: Caller) -> Nonce | None:
     nonce = caller.subject_token.nonce
     runtime.store.nonces.require_unused(nonce)
     return nonce
-
-
-def _named(storage: Storage) -> list[str]:
-    """What a request asks for beside the default: records of earlier versions name nothing."""
-    return [] if storage is Storage.SERVICE else [storage.value]
 
 
 def _quality(quality: object) -> dict[str, Any]:
@@ -303,41 +253,40 @@ def _stored(
     source: Source,
     storage: Storage,
     precondition: Precondition | None,
-    claim: Claim | None,
     nonce: Nonce | None,
     who: By,
-) -> Outcome:
-    def outcome(stored: StoredTemplate) -> Outcome:
-        body: dict[str, Any] = {
-            "template_id": stored.template_id,
-            "contract_id": enrollment.contract_id,
-            "replaced": not stored.created,
-            "holder_key": enrollment.holder_salt is not None,
-            "images": [
-                {
-                    "index": result.index,
-                    "status": "used",
-                    "quality": _quality(result.quality),
-                }
-                for result in enrollment.per_photo
-            ],
-        }
-        if stored.held_template is not None:
-            body["held_template"] = base64.b64encode(stored.held_template).decode("ascii")
-        return Outcome(201 if stored.created else 200, body)
+) -> dict[str, Any]:
+    stored = runtime.put(
+        tenant,
+        subject,
+        epoch,
+        enrollment,
+        source=source,
+        photos=len(enrollment.per_photo),
+        storage=storage,
+        precondition=precondition,
+        nonce=nonce,
+        by=who,
+    )
+    body: dict[str, Any] = {
+        "template_id": stored.template_id,
+        "contract_id": enrollment.contract_id,
+        "replaced": not stored.created,
+        "holder_key": enrollment.holder_salt is not None,
+        "images": [
+            {"index": result.index, "status": "used", "quality": _quality(result.quality)}
+            for result in enrollment.per_photo
+        ],
+    }
+    if stored.held_template is not None:
+        body["held_template"] = base64.b64encode(stored.held_template).decode("ascii")
+    return body
 
-    return outcome(
-        runtime.put(
-            tenant,
-            subject,
-            epoch,
-            enrollment,
-            source=source,
-            photos=len(enrollment.per_photo),
-            storage=storage,
-            precondition=precondition,
-            once=kept_with(claim, outcome),
-            nonce=nonce,
-            by=who,
-        )
+
+def _written(request: Request, body: dict[str, Any]) -> Response:
+    return answer(
+        request,
+        body,
+        status=200 if body["replaced"] else 201,
+        headers={"ETag": etag(body["template_id"])},
     )

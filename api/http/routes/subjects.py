@@ -11,7 +11,6 @@ from api.http.deps import (
     Enrolls,
     Erases,
     GateDep,
-    IdempotencyDep,
     Limit,
     RuntimeDep,
     SubjectDep,
@@ -92,13 +91,12 @@ async def erase_subject(
     subject: SubjectDep,
     runtime: RuntimeDep,
     gate: GateDep,
-    _idempotency_key: IdempotencyDep,
     _precondition: NoPreconditionDep,
 ) -> Response:
     """Right: `erase`. Erases template, metadata and data key; answers with a signed receipt.
 
-    Erasing again returns the same receipt, and after another enrollment it erases that one: an
-    `Idempotency-Key` is accepted and changes nothing. `If-Match` and `If-None-Match` are refused.
+    Erasing again returns the same receipt, and after another enrollment it erases that one.
+    `If-Match` and `If-None-Match` are refused.
     A key that also has `enroll` or `admin` is told of a subject that never was there; another one
     gets a receipt that says nothing was held.
     """
@@ -115,7 +113,6 @@ async def erase_subject(
         request.state.log["log_purged"] = erasure.log_purged
         return {**receipt_json(erasure.receipt), "log_purged": erasure.log_purged}
 
-    # No stored answer: after another enrollment it would claim an erasure that did not happen.
     return answer(request, await gate.query(work))
 
 

@@ -10,19 +10,18 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
 from templates.errors import StoreError
 from templates.keys.sealing import MasterKeyring
-from templates.store import Claim, Receipt, TemplateStore, verify_receipt
+from templates.store import Receipt, TemplateStore, verify_receipt
 from templates.store.database import Database
 from templates.store.receipts import key_fingerprint
 from templates.store.schema import (
     Base,
     FailedAttemptsRow,
-    IdempotencyRow,
     ReceiptRow,
     SubjectRow,
     TemplateRow,
 )
 from tests.patience import PATIENCE_S
-from tests.templates.store.conftest import CONTRACT, Clock, compact_until, finish, put
+from tests.templates.store.conftest import CONTRACT, Clock, compact_until, put
 
 
 def count(database: Database, table: type[Base]) -> int:
@@ -36,11 +35,6 @@ def test_everything_about_the_subject_goes_at_once(
     database = Database(database_url)
     for name in ("ada", "eve"):
         put(store, name, b"wire")
-        claim = store.idempotency.claim(
-            "default", actor="key", key=f"enroll {name}", request=b"r", subject_id=name
-        )
-        assert isinstance(claim, Claim)
-        finish(store, claim, status=201, body=name.encode())
         failed = sa.insert(FailedAttemptsRow).values(
             tenant_id=store.tenants.get("default").id,
             pseudonym=store.signer.pseudonym("default", name),
@@ -57,7 +51,7 @@ def test_everything_about_the_subject_goes_at_once(
     assert erasure.receipt.held
     assert store.subjects.get("default", "ada") is None
     assert store.subjects.describe("default", "ada") is None
-    for table in (SubjectRow, TemplateRow, IdempotencyRow, FailedAttemptsRow):
+    for table in (SubjectRow, TemplateRow, FailedAttemptsRow):
         assert count(database, table) == 1, table  # eve's
     assert store.subjects.get("default", "eve") is not None
     claims = verify_receipt(erasure.receipt, store.signer.public_key())
@@ -67,7 +61,6 @@ def test_everything_about_the_subject_goes_at_once(
         {"item": "data_key", "count": 1},
         {"item": "metadata", "count": 1},
         {"item": "failed_attempts", "count": 1},
-        {"item": "idempotency_records", "count": 1},
     ]
     database.close()
 

@@ -238,30 +238,6 @@ def upgrade() -> None:
         sa.PrimaryKeyConstraint("tenant_id", "pseudonym", name=op.f("pk_failed_attempts")),
     )
     op.create_table(
-        "idempotency",
-        sa.Column("tenant_id", sa.String(length=32), nullable=False),
-        sa.Column("actor", sa.String(length=64), nullable=False),
-        sa.Column("key_hash", sa.LargeBinary(length=32), nullable=False),
-        sa.Column("request_hash", sa.LargeBinary(length=32), nullable=False),
-        sa.Column("pseudonym", sa.String(length=64), nullable=True),
-        sa.Column("claim", sa.String(length=32), nullable=False),
-        sa.Column("claimed_until", sa.DateTime(timezone=True), nullable=False),
-        sa.Column("status", sa.Integer(), nullable=True),
-        sa.Column("body", sa.LargeBinary(), nullable=True),
-        sa.Column("created_at", sa.DateTime(timezone=True), nullable=False),
-        sa.Column("expires_at", sa.DateTime(timezone=True), nullable=False),
-        sa.Column("mac", sa.LargeBinary(length=32), nullable=True),
-        sa.ForeignKeyConstraint(
-            ["tenant_id"],
-            ["tenants.id"],
-            name=op.f("fk_idempotency_tenant_id_tenants"),
-            ondelete="CASCADE",
-        ),
-        sa.PrimaryKeyConstraint("tenant_id", "actor", "key_hash", name=op.f("pk_idempotency")),
-    )
-    op.create_index(op.f("ix_idempotency_expires_at"), "idempotency", ["expires_at"], unique=False)
-    op.create_index(op.f("ix_idempotency_pseudonym"), "idempotency", ["pseudonym"], unique=False)
-    op.create_table(
         "rotation_keys",
         sa.Column("tenant_id", sa.String(length=32), nullable=False),
         sa.Column("epoch", sa.Integer(), nullable=False),
