@@ -13,7 +13,6 @@ import shlex
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
-from urllib.parse import urlsplit
 
 import limits
 from pydantic import Field, ValidationError, ValidationInfo, field_validator
@@ -40,31 +39,6 @@ MAX_ONNX_THREADS = 256
 _ORIGIN = re.compile(
     r"(?:https://(?!.*:443$)|http://(?!.*:80$))(?:[a-z0-9.-]+|\[[0-9a-f:]+\])(?::[0-9]{1,5})?"
 )
-
-
-_HOST = re.compile(r"[a-z0-9._-]+|[0-9a-f:.]+")
-
-
-def _is_endpoint(url: str) -> bool:
-    """Whether events may be sent to a URL, and can be."""
-    try:
-        parts = urlsplit(url)
-        host, port = parts.hostname or "", parts.port
-        host.encode("idna")  # as the resolver does: no empty label, none that is too long
-    except ValueError:
-        return False
-    if not url.isascii() or not url.isprintable() or " " in url or "@" in parts.netloc:
-        return False
-    if _HOST.fullmatch(host) is None or port == 0:
-        return False
-    return parts.scheme == "https" or (parts.scheme == "http" and _is_loopback(host))
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return host == "localhost" or ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 def config_file() -> Path | None:
@@ -329,18 +303,6 @@ class Settings(BaseSettings):
         description="Seconds between two rounds in which a worker removes expired records and, "
         "on SQLite, empties the write-ahead log; the first is at the start.",
     )
-    webhook_url: str | None = Field(
-        None,
-        description="Where enrollments, erasures and lockouts are told, as `https://…`, or "
-        "`http://127.0.0.1:…` on this machine (docs/webhooks.md). Only this setting names it. "
-        "Unset: nowhere.",
-    )
-    webhook_secret_file: Path | None = Field(
-        None,
-        validate_default=True,
-        description="File with the secrets that webhooks are signed with, mode 0600, one a line as "
-        "`whsec_` and base64; the first is current.",
-    )
     log_level: Literal["debug", "info", "warning", "error"] = Field(
         "info", description="Least severe log line that is written."
     )
@@ -449,25 +411,6 @@ class Settings(BaseSettings):
     def _both_of_tls(cls, value: Path | None, info: ValidationInfo) -> Path | None:
         if (value is None) != (info.data.get("tls_certificate") is None):
             raise ValueError("give tls_certificate and tls_key, or neither")
-        return value
-
-    @field_validator("webhook_url")
-    @classmethod
-    def _known_endpoint(cls, value: str | None) -> str | None:
-        if not value:
-            return None
-        if not _is_endpoint(value):
-            raise ValueError(
-                "write https://HOST/PATH or https://HOST:PORT/PATH in ASCII, without a password; "
-                "http is for this machine alone, as http://127.0.0.1:PORT/PATH"
-            )
-        return value
-
-    @field_validator("webhook_secret_file")
-    @classmethod
-    def _both_of_webhooks(cls, value: Path | None, info: ValidationInfo) -> Path | None:
-        if (value is None) != (info.data.get("webhook_url") is None):
-            raise ValueError("give webhook_url and webhook_secret_file, or neither")
         return value
 
     @field_validator("lockout_longest_s")

@@ -26,8 +26,7 @@
     │   ├── BrokenAuditLog       an audit log whose head or key is missing or forged [13]
     │   ├── ExportSuperseded     an export from before an erasure, or of a retired key [14]
     │   ├── EnrollmentConflict   another template than the one that a write may replace [17]
-    │   ├── TemplateNotStored    the subject's holder keeps the template, and did not send it [15]
-    │   └── IdempotencyConflict  a key that was used for another request, or still runs [2]
+    │   └── TemplateNotStored    the subject's holder keeps the template, and did not send it [15]
     ├── InconsistentImages [3]   photos that do not show one and the same person
     ├── DatasetError [4]         a dataset that cannot be read
     ├── EvaluationError [5]      an evaluation that cannot be made as it was asked for
@@ -40,7 +39,7 @@
         └── UsageError           wrong usage of a command
 
 Each is defined here, or next to what raises it: [1] ``templates.store.identifiers``,
-[2] ``templates.store.idempotency``, [3] ``templates.space.agreement``, [4] ``verify.datasets``,
+[3] ``templates.space.agreement``, [4] ``verify.datasets``,
 [5] ``verify.evaluation.plan``, [6] ``verify.evaluation.backends``, [7] ``attacks.errors``,
 [8] ``api.http.errors``, [9] ``api.process.preparation``, [10] ``api.cli.errors``,
 [11] ``templates.store.tenants``, [12] ``templates.store.lockout``,
@@ -99,6 +98,10 @@ class StoreError(VeilfaceError):
 
 class StoreUnavailable(StoreError):
     """The database does not respond."""
+
+
+class DatabaseFileRemoved(StoreUnavailable):
+    """The path of the open database names another file, or none: what is written would be lost."""
 
 
 class StoreBusy(StoreUnavailable):

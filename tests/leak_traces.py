@@ -304,7 +304,6 @@ def _enroll_and_verify(traces: ServiceTraces, client: httpx.Client, pid: int) ->
             f"/v1/subjects/{subject}/enrollment",
             files=form(*photos),
             data={"face": "largest"},
-            headers={"Idempotency-Key": f"enroll-{subject.rsplit('.', 1)[1]}"},
         )
         assert answer.status_code == 201, answer.text
 
@@ -363,7 +362,6 @@ def _enroll_with_a_key(traces: ServiceTraces, client: httpx.Client) -> None:
         f"{path}/enrollment",
         files=form(*photos),
         data={**largest, "holder_key": text},
-        headers={"Idempotency-Key": "keyed"},
     )
     assert (answer.status_code, answer.json()["holder_key"]) == (201, True), answer.text
 
@@ -458,8 +456,8 @@ def _send_bad_requests(traces: ServiceTraces, client: httpx.Client) -> None:
     enroll("unsupported_image", files={"images": ("x.jpg", photos[1].data[:3000], "image/jpeg")})
     enroll("malformed_request", files=form(photos[1]), data={"attributes": text})
     enroll("request_too_large", files=form(material.large, material.large, material.large))
-    enroll("idempotency_conflict", files=form(photos[1]), data=largest,
-           headers={"Idempotency-Key": "enroll-2"})  # fmt: skip
+    enroll("enrollment_conflict", files=form(photos[1]), data=largest,
+           headers={"If-None-Match": "*"})  # fmt: skip
 
 
 def _open_the_store(traces: ServiceTraces) -> None:

@@ -52,7 +52,6 @@ WHOLE_PAGES = {
     ("docs/login.md", "js"): "tests/examples/test_login.py",
     ("docs/javascript.md", "js"): "tests/clients/javascript/test_docs.py",
     ("docs/backups.md", "sh"): "tests/test_backup.py",
-    ("docs/webhooks.md", "python"): "tests/api/process/test_webhooks.py",
 }
 # Blocks that another test executes: page and first line.
 ELSEWHERE = {

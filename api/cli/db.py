@@ -35,35 +35,21 @@ def upgrade(*, settings: Settings, as_json: AsJson = False) -> None:
     Safe to run again. Make a backup, and stop every process of an earlier version first, unless
     the new schema serves it (docs/deployment.md "An upgrade without a pause").
 
-    A database from before rows were authenticated is authenticated once, as it is: look through
-    `veilface keys list` first. API keys that the audit log does not know stay out, and are named.
-
     Example: `veilface db upgrade --database-url postgresql+psycopg://veilface@localhost/veilface`
     """
     store = open_store(settings, open_keyring(settings))
     try:
         before = _revision(settings)
-        adoption = store.upgrade()
+        store.upgrade()
         after = _revision(settings)
     finally:
         store.close()
     if as_json:
-        emit(
-            {
-                "before": before,
-                "after": after,
-                "authenticated": adoption.rows,
-                "refused_keys": list(adoption.refused),
-            }
-        )
+        emit({"before": before, "after": after})
     elif before == after:
         say(f"The schema is up to date: {after}.")
     else:
         say(f"Migrated from {before or 'an empty database'} to {after}.")
-    if adoption.rows and not as_json:
-        say(f"Authenticated the {adoption.rows} rows there were.")
-    for prefix in adoption.refused:
-        message(f"key {prefix} does not match the audit log and no longer works; replace it")
 
 
 @app.command()
@@ -174,16 +160,18 @@ def purge(
     """
     retention = retention_of(settings)
     with checked_store(settings) as store:
-        due, erased = store.retention.due(retention), 0
+        due, erased, log_purged = store.retention.due(retention), 0, True
         if not dry_run:
             erased = store.retention.erase_expired(retention)
-            store.purge()
+            log_purged = store.purge()
     if as_json:
-        emit({"due": due, "erased": erased})
+        emit({"due": due, "erased": erased, "log_purged": log_purged})
     elif dry_run:
         say(f"{due} subjects are due to be erased.")
     else:
         say(f"Erased {erased} subjects and all expired records.")
+        if not log_purged:
+            say("A reader keeps old pages in SQLite's write-ahead log: purge again when it ended.")
 
 
 @app.command("template-enrollment")

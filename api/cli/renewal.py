@@ -50,7 +50,7 @@ def renew(
     """Renew every secret of the deployment, after its database and master key were stolen.
 
     Puts a new master key in force and drops the old one, draws the keys of the audit log, of
-    receipts, pseudonyms, repeated writes, exports and stand-ins anew, gives every tenant a new
+    receipts, pseudonyms, exports and stand-ins anew, gives every tenant a new
     rotation key, and lists what people must do: who enrolls again, which API keys are replaced,
     which anchor of the audit log is kept. The service may run meanwhile; writes wait for one
     transaction. Receipts and audit lines from before still verify. Killed at any moment nothing is

@@ -13,7 +13,7 @@ from typing import Any
 
 import anyio
 import anyio.to_thread
-from fastapi import APIRouter, FastAPI, Request
+from fastapi import APIRouter, Depends, FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.routing import iter_route_contexts
 from starlette.exceptions import HTTPException
@@ -25,6 +25,7 @@ from api.http.audit import note_refusal
 from api.http.audit_report import open_audit_report
 from api.http.context import RequestContext
 from api.http.cors import Cors
+from api.http.deps import refuse_unknown
 from api.http.errors import ApiError, StartError, api_error
 from api.http.openapi import allowed_methods
 from api.http.protocol import Protocol
@@ -63,14 +64,12 @@ from api.process.operations import (
 )
 from api.process.runtime import Runtime
 from api.process.supervised import end_with_supervisor, is_supervised, open_patiently, told_to_stop
-from api.process.webhooks import deliver
 from api.settings import NO_PROXIES, Settings
 from models.errors import ModelError
 from templates.contract.document import Contract
 from templates.distances import warm_up
 from templates.distances.blas import single_threaded
 from templates.errors import VeilfaceError
-from templates.keys.webhook_secret import read_webhook_secrets
 
 VERSION = version("veilface")
 API = (
@@ -145,7 +144,7 @@ def _built(*modules: ModuleType) -> tuple[BaseRoute, ...]:
     """
     router = APIRouter(generate_unique_id_function=operation_id)
     for module in modules:
-        router.include_router(module.router)
+        router.include_router(module.router, dependencies=[Depends(refuse_unknown)])
     for _ in iter_route_contexts(router.routes):
         pass
     return tuple(router.routes)
@@ -260,9 +259,6 @@ async def _open(
     if runtime.contract.takes_lifted_probes:
         # No lifted probe but one that comes now waits for it; an end of the process does not.
         threading.Thread(target=_lift_cohort, args=(runtime.contract,), daemon=True).start()
-    if settings.webhook_url is not None and settings.webhook_secret_file is not None:
-        secrets = read_webhook_secrets(settings.webhook_secret_file)
-        tasks.start_soon(partial(deliver, runtime.store.outbox, settings.webhook_url, secrets))
     if is_supervised():
         tasks.start_soon(end_with_supervisor)
     if settings.operations_port is not None:

@@ -53,7 +53,7 @@ class Caller:
 
     @property
     def name(self) -> str:
-        """What it is counted by, and what keeps its idempotency keys apart from others'."""
+        """What it is counted by."""
         token = self.subject_token
         return self.prefix if token is None else f"{self.prefix}:{token.token_id}"
 
@@ -173,7 +173,7 @@ async def _require_token(
     route = request.scope["route"].name
     token.require(route, request.path_params.get("subject_id"))
     if route not in USES:
-        # Those find it out themselves, once a repeated request had its answer.
+        # Those look for themselves, in the transaction that uses it up too.
         await gate.query(lambda: runtime.store.nonces.require_unused(token.nonce))
 
 

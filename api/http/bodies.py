@@ -7,6 +7,7 @@ parts over 1 MiB to a temporary file, where a face has no business to be.
 import base64
 import binascii
 import json
+import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -22,6 +23,8 @@ from api.limits.admission import MAX_JSON_BYTES, read_limited, stream_limited
 from api.settings import Settings
 from templates.contract.canonical import too_many_parts
 
+_FORM, _JSON = "multipart/form-data", "application/json"
+_MEDIA_TYPE = re.compile(r"[a-z0-9.+-]{1,63}/[a-z0-9.+-]{1,63}")
 MAX_FIELD_BYTES = 4096
 LONG_FIELDS = {"held_template": MAX_JSON_BYTES}
 """Text fields that may be longer, and how long: what fits into a JSON body fits into a form."""
@@ -51,15 +54,9 @@ class Form:
         came = [key for key, _ in self.files if key in names]
         name = came[0] if came else names[0]
         stray = sorted({key for key, _ in self.files if key != name} | ({name} & set(self.fields)))
-        if stray:
+        if stray or not self.files:
             raise ApiError(
-                "validation_failed",
-                f"send the photos as files of the multipart field {name}",
-                {"field": name},
-            )
-        if not self.files:
-            raise ApiError(
-                "validation_failed", f"the multipart field {name} is missing", {"field": name}
+                "validation_failed", f"{_how_to_send(name)}, and no other file", {"field": name}
             )
         return [data for _, data in self.files]
 
@@ -122,13 +119,39 @@ class _InMemoryParser(MultiPartParser):
         super().on_part_data(data, start, end)
 
 
-def content_type(request: Request) -> str:
-    """Return the media type without its parameters, in lower case."""
+def is_form(request: Request) -> bool:
+    """Whether the body is a multipart form, as its content type says."""
+    return _media_type(request) == _FORM
+
+
+def _media_type(request: Request) -> str:
     return request.headers.get("content-type", "").partition(";")[0].strip().lower()
 
 
-async def sent_form(request: Request, settings: Settings, *, max_images: int) -> Form:
-    """Read a multipart body within the limits of the settings; raises as :func:`read_form`."""
+def _how_to_send(photos: str) -> str:
+    return f"send photos as files of the multipart field {photos} (curl: -F {photos}=@photo.jpg)"
+
+
+def _require_type(request: Request, media_type: str, how: str) -> None:
+    """Refuse a body of another type, in words that say what came and what to send."""
+    if request.headers.get("content-encoding", "identity").lower() != "identity":
+        raise ApiError(
+            "malformed_request", "the body is compressed: send it without a Content-Encoding"
+        )
+    sent = _media_type(request)
+    if sent != media_type:
+        named = sent if _MEDIA_TYPE.fullmatch(sent) else "of no known type"
+        raise ApiError(
+            "malformed_request", f"the body is {named}: {how}", {"content_type": media_type}
+        )
+
+
+async def sent_form(request: Request, settings: Settings, *, field: str, max_images: int) -> Form:
+    """Read a multipart body within the limits of the settings; raises as :func:`read_form`.
+
+    `field` is the one that photos are sent in.
+    """
+    _require_type(request, _FORM, _how_to_send(field))
     return await read_form(
         request,
         max_bytes=settings.max_request_bytes,
@@ -138,11 +161,36 @@ async def sent_form(request: Request, settings: Settings, *, max_images: int) ->
     )
 
 
-async def sent_json(request: Request, settings: Settings) -> dict[str, Any]:
-    """Read a JSON object within the limits of the settings; raises as :func:`read_json`."""
-    return await read_json(
+async def sent_json(
+    request: Request, settings: Settings, known: Collection[str], *, photos: str | None = None
+) -> dict[str, Any]:
+    """Read a JSON object within the limits of the settings.
+
+    Parameters
+    ----------
+    request, settings
+        Whose body it is, and its limits.
+    known
+        Names of fields that the call reads. Others are refused: a misspelt `level` must not pass as
+        the default.
+    photos
+        Multipart field for photos, where the call takes these too.
+
+    Raises
+    ------
+    ApiError
+        ``validation_failed`` for an unknown field; the message never repeats the input. Else as
+        :func:`read_json`.
+    """
+    how = "send JSON as application/json"
+    if photos is not None:
+        how = f"{_how_to_send(photos)}, and what is no photo as application/json"
+    _require_type(request, _JSON, how)
+    body = await read_json(
         request, max_bytes=settings.max_request_bytes, timeout_s=settings.body_timeout_s
     )
+    reject_unknown(body, known, otherwise="" if photos is None else f"; {_how_to_send(photos)}")
+    return body
 
 
 async def read_form(
@@ -163,7 +211,9 @@ async def read_form(
             form = await parser.parse()
         except (MultiPartException, UnicodeError, ValueError):
             raise ApiError(
-                "malformed_request", "the body is not a well-formed multipart form"
+                "malformed_request",
+                "the body is not a well-formed multipart form: let your HTTP library write both "
+                "the form and its Content-Type, which names the boundary",
             ) from None
     files: list[tuple[str, bytes]] = []
     fields: dict[str, str] = {}
@@ -203,7 +253,7 @@ async def read_json(request: Request, *, max_bytes: int, timeout_s: float) -> di
             value = parse_json(body)
     except (ValueError, RecursionError):
         raise ApiError(
-            "malformed_request", "the body is not well-formed JSON, or names a field twice"
+            "malformed_request", "the body is not well-formed JSON in UTF-8, or names a field twice"
         ) from None
     if not isinstance(value, dict):
         raise ApiError("malformed_request", "the body must be a JSON object")
@@ -211,13 +261,17 @@ async def read_json(request: Request, *, max_bytes: int, timeout_s: float) -> di
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Parse JSON in which no object names a field twice: readers differ in which one counts.
+    """Parse JSON, as bytes in UTF-8, in which no object names a field twice.
+
+    Readers differ in which of two counts, and in how they guess other encodings.
 
     Raises
     ------
     ValueError, RecursionError
         It is no such JSON.
     """
+    if isinstance(text, bytes):
+        text = text.decode("utf-8-sig")
     return json.loads(text, object_pairs_hook=_unique)
 
 
@@ -250,18 +304,18 @@ class _arrives_within:
             ) from None
 
 
-def reject_unknown(names: Collection[str], known: Collection[str]) -> None:
-    """Refuse fields that nobody reads: a misspelt `level` must not pass as the default.
+def reject_unknown(names: Collection[str], known: Collection[str], *, otherwise: str = "") -> None:
+    """Refuse fields that nobody reads.
 
     Raises
     ------
     ApiError
-        ``validation_failed``; the message lists the known fields and never repeats the input.
+        ``validation_failed``; the message lists the known fields, and ends as `otherwise` says.
     """
     if not set(names) <= set(known):
         raise ApiError(
             "validation_failed",
-            f"unknown field; known are {', '.join(sorted(known))}",
+            f"unknown field; known are {', '.join(sorted(known))}{otherwise}",
             {"known": sorted(known)},
         )
 

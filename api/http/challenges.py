@@ -12,6 +12,7 @@ from datetime import UTC, datetime, timedelta
 
 from api.http.bodies import parse_json
 from api.http.errors import ApiError
+from api.http.values import in_time
 from templates.errors import SealError
 from templates.keys.sealing import MasterKeyring
 from templates.store.lockout import Nonce, Replayed
@@ -102,10 +103,10 @@ def opened_challenge(
     if body["subject"] not in (None, subject):
         raise unknown
     expires = datetime.fromtimestamp(body["expires"], UTC)
-    if datetime.now(UTC) > expires:
+    if not in_time(expires, LIFETIME):
         raise Replayed(
-            f"the challenge has expired: its frames must arrive within {LIFETIME.seconds} s; ask "
-            "for another one"
+            "the challenge has expired, or the service's clock was set back: its frames must "
+            f"arrive within {LIFETIME.seconds} s; ask for another one"
         )
     movements = tuple(Movement(movement) for movement in body["movements"])
     return Challenge(movements, Nonce(body["key"], body["nonce"], expires))

@@ -241,6 +241,9 @@ class RequestContext:
             if not operations:
                 rate_limits: RateLimits = scope["app"].state.rate_limits
                 await rate_limits.count_address(scope)
+            if b"%2f" in scope.get("raw_path", b"").lower():
+                # Routes see it decoded: an id that a visitor chose would select another call.
+                raise ApiError("validation_failed", "the path has an encoded slash: no id has one")
             await (self._cors.preflight(scope) or self._app)(scope, body.receive, send)
         except ApiError as refusal:
             await refuse(refusal)

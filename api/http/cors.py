@@ -17,7 +17,6 @@ METHODS = ("GET", "PUT", "POST", "DELETE")
 REQUEST_HEADERS = (
     "Authorization",
     "Content-Type",
-    "Idempotency-Key",
     "If-Match",
     "If-None-Match",
     "Veilface-Holder-Key",
@@ -26,7 +25,6 @@ REQUEST_HEADERS = (
 )
 ANSWER_HEADERS = (
     "ETag",
-    "Idempotency-Replayed",
     "Retry-After",
     "X-Decoy-Source-ID",
     "X-Request-ID",

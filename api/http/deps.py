@@ -1,9 +1,11 @@
 """Dependencies of the routes, as annotated aliases."""
 
-from collections.abc import Collection
+from functools import partial
 from typing import Annotated
+from urllib.parse import parse_qsl
 
-from fastapi import Depends, Header, Path, Request
+from fastapi import Depends, Path, Query, Request
+from pydantic import BeforeValidator
 
 from api.http.auth import Caller, CallerDep, holding, note_subject
 from api.http.errors import ApiError
@@ -45,35 +47,6 @@ async def subject_of(
     return subject_id
 
 
-async def idempotency_key_of(
-    idempotency_key: Annotated[
-        str | None,
-        Header(
-            description="1 to 255 visible characters. The same key with the same request gives "
-            "the stored answer for 24 hours; with another request, `idempotency_conflict`.",
-            examples=["9b2c6a0e-5c5f-4f5e-8f0b-1d9f4c1f7a11"],
-        ),
-    ] = None,
-) -> str | None:
-    """Check the Idempotency-Key header.
-
-    Raises
-    ------
-    ApiError
-        ``validation_failed``.
-    """
-    if idempotency_key is None:
-        return None
-    visible = all("!" <= character <= "~" for character in idempotency_key)
-    if not visible or not 1 <= len(idempotency_key) <= 255:
-        raise ApiError(
-            "validation_failed",
-            "Idempotency-Key must have 1 to 255 visible ASCII characters",
-            {"field": "Idempotency-Key"},
-        )
-    return idempotency_key
-
-
 async def enrolls_or_verifies(caller: CallerDep) -> Caller:
     """Demand one of the rights to send a photo, or a token for a browser that will.
 
@@ -91,30 +64,50 @@ async def enrolls_or_verifies(caller: CallerDep) -> Caller:
     return caller
 
 
-def query_of(request: Request, known: Collection[str]) -> dict[str, str]:
-    """Return the query, refusing what nobody reads: a misspelt `level` is not the default.
+async def refuse_unknown(request: Request) -> None:
+    """Refuse what the call does not read: a misspelt name must not pass as the default.
+
+    Every route has it. Fields of bodies are refused where they are read.
 
     Raises
     ------
     ApiError
-        ``validation_failed``.
+        ``validation_failed``: a query parameter that the route does not declare, that comes twice,
+        or that is not ``name=value`` in UTF-8; or a body where the call takes none.
     """
-    query: dict[str, str] = {}
-    for name, value in request.query_params.multi_items():
-        if name not in known or name in query:
-            raise ApiError(
-                "validation_failed",
-                "unknown or repeated query parameter; known are: " + (", ".join(known) or "none"),
-                {"known": list(known)},
-            )
-        query[name] = value
-    return query
+    known = [field.alias for field in request.scope["route"].dependant.query_params]
+    try:
+        query = request.scope["query_string"].decode("ascii")
+        names = [name for name, _ in _pairs(query)] if query else []
+    except ValueError:
+        raise ApiError("validation_failed", "the query is not name=value pairs in UTF-8") from None
+    if not set(names) <= set(known) or len(set(names)) < len(names):
+        raise ApiError(
+            "validation_failed",
+            "unknown or repeated query parameter; known are: " + (", ".join(known) or "none"),
+            {"known": known},
+        )
+    headers = request.headers
+    sent = headers.get("content-length", "0") != "0" or "transfer-encoding" in headers
+    if sent and request.method in ("GET", "DELETE"):
+        raise ApiError("validation_failed", "this call takes no body: send it without one")
 
 
+_pairs = partial(parse_qsl, keep_blank_values=True, strict_parsing=True, errors="strict")
+
+
+def _digits(value: str | int) -> str | int:
+    if isinstance(value, str) and not (value.isascii() and value.isdigit()):
+        raise ValueError("not a whole number")
+    return value
+
+
+Limit = Annotated[
+    int, BeforeValidator(_digits), Query(ge=1, le=1000, description="Entries on one page, at most.")
+]
 RuntimeDep = Annotated[Runtime, Depends(runtime_of)]
 GateDep = Annotated[Gate, Depends(gate_of)]
 SubjectDep = Annotated[str, Depends(subject_of)]
-IdempotencyDep = Annotated[str | None, Depends(idempotency_key_of)]
 Enrolls = Annotated[Caller, Depends(holding("enroll"))]
 EnrollsOrVerifies = Annotated[Caller, Depends(enrolls_or_verifies)]
 Verifies = Annotated[Caller, Depends(holding("verify"))]

@@ -23,7 +23,6 @@ from templates.errors import (
     VeilfaceError,
 )
 from templates.space.agreement import InconsistentImages
-from templates.store.idempotency import IdempotencyConflict
 from templates.store.identifiers import InvalidIdentifier, UnknownTenant
 from templates.store.lockout import LockedOut, Replayed
 from templates.store.subject_rows import TemplateNotStored
@@ -88,11 +87,6 @@ ERROR_CODES: dict[str, ErrorCode] = {
         ErrorCode("not_found", 404, "There is nothing at this path."),
         ErrorCode("method_not_allowed", 405, "The path exists, but not with this method."),
         ErrorCode("contract_mismatch", 409, "The template belongs to another contract."),
-        ErrorCode(
-            "idempotency_conflict",
-            409,
-            "The Idempotency-Key was used for another request, or the first is still running.",
-        ),
         ErrorCode(
             "enrollment_conflict",
             409,
@@ -210,7 +204,6 @@ _TABLE: tuple[tuple[type[Exception], str, str | None], ...] = (
     (Uncalibrated, "uncalibrated", None),
     (SealError, "store_unavailable", "the stored data cannot be opened with the master key"),
     (InvalidIdentifier, "validation_failed", None),
-    (IdempotencyConflict, "idempotency_conflict", None),
     (ExportSuperseded, "export_superseded", None),
     (TemplateNotStored, "template_not_stored", None),
     (Replayed, "replayed", None),

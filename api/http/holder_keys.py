@@ -1,18 +1,19 @@
 """The key that the holder of an enrollment keeps, as a request carries it."""
 
-import hashlib
-from collections.abc import Mapping
-from typing import Annotated, Any
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, TypeVar
 
 from fastapi import Depends, Header, Request
 
 from api.http.errors import ApiError
 from api.http.schemas import HOLDER_KEY
 from templates.errors import SealError
-from templates.keys.holder_key import decode_holder_key
+from templates.keys.holder_key import decode_holder_key, wipe
 
 HEADER = "Veilface-Holder-Key"
 FIELD = "holder_key"
+
+T = TypeVar("T")
 
 
 async def holder_key_header_of(
@@ -61,9 +62,19 @@ def holder_key_of(header: str | None, fields: Mapping[str, Any]) -> bytearray | 
         raise _refused(str(error)) from None
 
 
-def digest(key: bytearray | None) -> list[bytes]:
-    """Return what tells two requests with different keys apart; nothing where there is no key."""
-    return [] if key is None else [hashlib.sha256(key).digest()]
+def wiping(key: bytearray | None, work: Callable[[], T]) -> Callable[[], T]:
+    """Return work that forgets the key in the end.
+
+    In the thread of the work: nobody waits for one whose request was cancelled.
+    """
+
+    def wiped() -> T:
+        try:
+            return work()
+        finally:
+            wipe(key)
+
+    return wiped
 
 
 def _refused(message: str) -> ApiError:

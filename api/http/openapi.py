@@ -32,7 +32,6 @@ EVERY_CALL = (
     "internal_error",
 )
 BODY = ("malformed_request", "request_too_large", "validation_failed")
-IDEMPOTENT = ("idempotency_conflict",)
 PHOTO = (
     "unsupported_image",
     "image_too_large",

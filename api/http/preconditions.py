@@ -70,10 +70,5 @@ NoPreconditionDep = Annotated[None, Depends(refuse_precondition)]
 PreconditionDep = Annotated[Precondition | None, Depends(precondition_of)]
 
 
-def asked(precondition: Precondition | None) -> list[str]:
-    """Return what tells requests with different preconditions apart; nothing without one."""
-    return [] if precondition is None else [etag(precondition.template_id or "*")]
-
-
 def _refused(message: str) -> ApiError:
     return ApiError("validation_failed", message, {"field": "If-Match, If-None-Match"})

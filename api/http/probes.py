@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from api.http.auth import Caller
 from api.http.bodies import (
     base64_field,
-    content_type,
+    is_form,
     reject_unknown,
     sent_form,
     sent_json,
@@ -32,7 +32,6 @@ from api.http.values import (
     embeddings_of,
     face_policy,
     held_template_of,
-    one_of,
 )
 from api.process.metrics import step
 from api.process.runtime import Runtime
@@ -54,17 +53,13 @@ PROBES = ("embedding", "embeddings", "template")
 
 @dataclass(frozen=True)
 class Probe:
-    """What is compared, how, with whose template, and what keeps it from a second use.
-
-    `asked` is what tells the request from another one, but for the holder's key.
-    """
+    """What is compared, how, with whose template, and what keeps it from a second use."""
 
     kind: Literal["photo", "frames", "embedding", "template"]
     compare: Callable[[Verifier, OpenedTemplate], Decision]
     held_template: bytes | None = field(repr=False)
     nonce: Nonce | None
     holder_key: bytearray | None = field(repr=False)
-    asked: tuple[str | bytes, ...] = field(repr=False)
 
 
 async def sent_probe(
@@ -72,18 +67,17 @@ async def sent_probe(
     runtime: Runtime,
     caller: Caller,
     subject: str,
-    query: dict[str, str],
     holder_key_header: str | None,
 ) -> Probe:
-    """Read the probe of a request; `query` has no names but ``level`` and ``face``.
+    """Read the probe of a request.
 
     Raises
     ------
     ApiError, VeilfaceError
         Whatever is wrong with it, or forbids it, that can be told without decoding anything.
     """
-    read = _photos if content_type(request) == "multipart/form-data" else _signed
-    return await read(request, runtime, caller, subject, query, holder_key_header)
+    read = _photos if is_form(request) else _signed
+    return await read(request, runtime, caller, subject, holder_key_header)
 
 
 async def _photos(
@@ -91,19 +85,18 @@ async def _photos(
     runtime: Runtime,
     caller: Caller,
     subject: str,
-    query: dict[str, str],
     holder_key_header: str | None,
 ) -> Probe:
     pack = runtime.required_pack()
     settings = runtime.settings
-    form = await sent_form(request, settings, max_images=MAX_FRAMES)
+    form = await sent_form(request, settings, field="image", max_images=MAX_FRAMES)
     photos = form.images("image", "images")
     reject_unknown(form.fields, ("level", "face", "held_template", CHALLENGE, FIELD))
     challenge_id = text_field(form.fields.get(CHALLENGE), CHALLENGE, max_length=MAX_ID)
     _check_count(len(photos), settings, is_challenge=challenge_id is not None)
     held_template = held_template_of(form.fields)
-    level = _level(runtime, caller, one_of(form.fields, query, "level"))
-    policy = face_policy(one_of(form.fields, query, "face"))
+    level = _level(runtime, caller, text_field(form.fields.get("level"), "level"))
+    policy = face_policy(form.fields.get("face"))
     holder_key = holder_key_of(holder_key_header, form.fields)
 
     liveness = runtime.liveness.require(
@@ -155,7 +148,6 @@ async def _photos(
         held_template,
         nonce,
         holder_key,
-        asked=(level, str(policy), challenge_id or "", held_template or b"", *photos),
     )
 
 
@@ -202,22 +194,20 @@ async def _signed(
     runtime: Runtime,
     caller: Caller,
     subject: str,
-    query: dict[str, str],
     holder_key_header: str | None,
 ) -> Probe:
-    caller.require("embeddings")
     settings = runtime.settings
-    body = await sent_json(request, settings)
-    reject_unknown(body, (*PROBES, "level", "held_template", FIELD, *SIGNATURE_FIELDS))
+    known = (*PROBES, "level", "held_template", FIELD, *SIGNATURE_FIELDS)
+    body = await sent_json(request, settings, known, photos="image")
     named = [kind for kind in PROBES if kind in body]
     if len(named) != 1:
         raise ApiError(
             "validation_failed",
             "send exactly one of embedding, embeddings and template, or photos",
         )
-    if "face" in query:
-        raise ApiError("validation_failed", "face applies to photos only", {"field": "face"})
-    asked = one_of(body, query, "level")
+    # After the fields: a caller that only forgot how to send a photo needs no further right.
+    caller.require("embeddings")
+    asked = text_field(body.get("level"), "level")
     held_template = held_template_of(body)
     kind, value = named[0], body[named[0]]
     sent: bytes | NDArray[np.float64]
@@ -251,8 +241,6 @@ async def _signed(
         held_template,
         nonce,
         holder_key,
-        # The HMAC is of all that is signed.
-        asked=(body["hmac"], held_template or b""),
     )
 
 

@@ -295,7 +295,7 @@ class SignedReceipt(_Shape):
 class ErasedItem(_Shape):
     """Records of one kind that the erasure removed."""
 
-    item: Literal["template", "data_key", "metadata", "failed_attempts", "idempotency_records"]
+    item: Literal["template", "data_key", "metadata", "failed_attempts"]
     count: int
 
 
@@ -321,6 +321,10 @@ class ReceiptAnswer(_Answer):
 
     receipt: SignedReceipt
     claims: ReceiptClaims
+    log_purged: bool = Field(
+        description="False where a reader of SQLite's database keeps old pages in the write-ahead "
+        "log just now: they go with a later purge."
+    )
 
 
 class ExportAnswer(_Answer):

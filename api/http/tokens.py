@@ -16,6 +16,7 @@ from typing import Literal, get_args
 
 from api.http.bodies import parse_json
 from api.http.errors import ApiError
+from api.http.values import in_time
 from templates.errors import SealError
 from templates.keys.api_token import SUBJECT_TOKEN
 from templates.keys.sealing import MasterKeyring
@@ -75,11 +76,11 @@ class SubjectToken:
 
     @property
     def late(self) -> bool:
-        """Whether its time is over."""
-        return datetime.now(UTC) > self.expires_at
+        """Whether its time is over, or has not come."""
+        return not in_time(self.expires_at, timedelta(seconds=LONGEST_S))
 
     def require_in_time(self) -> None:
-        """Refuse a token whose time is over.
+        """Refuse a token that is late.
 
         Raises
         ------
@@ -87,7 +88,11 @@ class SubjectToken:
             Without a line in the audit log: whoever finds an old token could write there for ever.
         """
         if self.late:
-            raise Replayed("the token has expired: ask your server for another one", recorded=True)
+            raise Replayed(
+                "the token has expired, or the service's clock was set back: ask your server for "
+                "another one",
+                recorded=True,
+            )
 
     def require(self, route: str, subject: str | None) -> None:
         """Refuse a call that the token is not for; `subject` is the one that the path names.

@@ -1,7 +1,7 @@
 """Fields of a request, checked and turned into the values of the packages below."""
 
 from collections.abc import Mapping
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from templates.store.subject_rows import Storage
 from verify import MAX_PROBE_PHOTOS
 
 MAX_EMBEDDING = 4096
+CLOCKS_DIFFER = timedelta(seconds=60)
 
 
 def iso_time(value: datetime | None) -> str | None:
@@ -24,21 +25,14 @@ def iso_time(value: datetime | None) -> str | None:
     return value.astimezone(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
 
 
-def one_of(fields: Mapping[str, Any], query: Mapping[str, str], name: str) -> str | None:
-    """Return a field that may stand in the body or in the query.
+def in_time(expires_at: datetime, longest: timedelta) -> bool:
+    """Whether something that is good for `longest` at most is good now.
 
-    Raises
-    ------
-    ApiError
-        ``validation_failed`` if it is no short text, or stands in both and differs.
+    What ends later than that was made before the clock was set back, and is not good for that much
+    longer. Clocks of hosts may differ by a minute.
     """
-    inside = text_field(fields.get(name), name)
-    outside = text_field(query.get(name), name)
-    if inside is not None and outside is not None and inside != outside:
-        raise ApiError(
-            "validation_failed", f"{name} differs between body and query", {"field": name}
-        )
-    return outside if inside is None else inside
+    left = expires_at - datetime.now(UTC)
+    return timedelta(0) <= left <= longest + CLOCKS_DIFFER
 
 
 def face_policy(value: str | None) -> FacePolicy:

@@ -12,9 +12,6 @@ from api.process.metrics import PURGE_FAILURES
 from templates.store import TemplateStore
 from templates.store.retention import Retention
 
-PURGE_WAIT_S = 0.25
-"""Longest that emptying SQLite's log may make a request's write wait for readers."""
-
 FOR_EVER = Retention()
 
 
@@ -43,8 +40,15 @@ async def purge_regularly(
     def purge() -> None:
         if not keep.keeps_all:
             # Before the rest: it is emptied from the log of the same round.
-            store.retention.erase_expired(keep)
-        store.purge(wait=PURGE_WAIT_S)
+            erased = store.retention.erase_expired(keep)
+            if erased:
+                log("retention erased subjects", subjects=erased)
+        if not store.purge():
+            log(
+                "a reader of the database keeps its write-ahead log, with what was removed: it is "
+                "emptied another time",
+                severity=logging.WARNING,
+            )
 
     # A thread of its own: requests in the default limiter do not delay it, nor it them.
     limiter = anyio.CapacityLimiter(1)

@@ -30,10 +30,13 @@ FIELDS = frozenset(
         "security_level",
         "error_type",
         "receipt_id",
+        "log_purged",
+        "subjects",
         "contract_id",
         "version",
         "pack",
         "pid",
+        "ended_by",
     }
 )
 

@@ -11,6 +11,7 @@ merged into one.
 """
 
 import fcntl
+import logging
 import os
 import tempfile
 from collections.abc import Iterator
@@ -37,6 +38,7 @@ from prometheus_client.registry import Collector
 
 from api.http.errors import ERROR_CODES
 from api.process.environment import variables_set
+from api.process.logging import log
 
 DIRECTORY_VARIABLE = "PROMETHEUS_MULTIPROC_DIR"
 
@@ -44,6 +46,9 @@ UNMATCHED = "unmatched"
 METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
 LIMITS = ("key", "address")
 LOCKOUTS = ("locked", "disabled")
+KINDS = ("counter", "histogram", "gauge_livesum", "gauge_livemin", "gauge_livemax")
+FILE_BYTES = 1024 * 1024
+"""Of one file of counts: more than all series of a kind take, so that it never grows."""
 DEAD = 0
 """Stands for all dead workers in a file's name; no worker has this process id."""
 
@@ -98,12 +103,6 @@ RATE_STORAGE_FAILURES = Counter(
 )
 PURGE_FAILURES = Counter(
     "veilface_purge_failures", "Rounds of housekeeping that failed.", registry=REGISTRY
-)
-WEBHOOKS = Counter(
-    "veilface_webhooks",
-    "Webhooks that were sent: `taken` by the endpoint, or `failed` for now.",
-    ("outcome",),
-    registry=REGISTRY,
 )
 IN_FLIGHT = Gauge(
     "veilface_requests_in_flight",
@@ -249,12 +248,35 @@ def join_shared_directory() -> None:
     directory = _shared()
     if directory is None:
         return
+    own = [directory / f"{kind}_{os.getpid()}.db" for kind in KINDS]
+    try:
+        with _locked(directory):
+            _forget_gauges(directory)
+            for kind in ("counter", "histogram"):
+                _merge_dead(directory, kind)
+        for path in own:
+            _reserve(path)
+    except OSError as error:
+        for path in own:
+            path.unlink(missing_ok=True)
+        log(
+            "no room in the folder for temporary files: /metrics lacks what this worker counts",
+            severity=logging.ERROR,
+            pid=os.getpid(),
+            error_type=type(error).__name__,
+        )
+        return
     values.ValueClass = values.get_value_class()  # type: ignore[no-untyped-call]
     _begin()
-    with _locked(directory):
-        _forget_gauges(directory)
-        for kind in ("counter", "histogram"):
-            _merge_dead(directory, kind)
+
+
+def _reserve(path: Path) -> None:
+    """Make a file for what is counted, with room on the disk for all of it.
+
+    prometheus_client maps it into memory: a page for which there is no room ends the process.
+    """
+    with path.open("ab") as file:
+        os.posix_fallocate(file.fileno(), 0, FILE_BYTES)
 
 
 def _merge_dead(directory: Path, kind: str) -> None:
@@ -267,6 +289,7 @@ def _merge_dead(directory: Path, kind: str) -> None:
     # A glob for *.db does not find it before it is whole.
     unfinished = directory / f"{kind}.part"
     unfinished.unlink(missing_ok=True)
+    _reserve(unfinished)
     merged = MmapedDict(str(unfinished))  # type: ignore[no-untyped-call]
     for metric in sums:
         for sample in metric.samples:

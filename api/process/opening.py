@@ -23,7 +23,6 @@ from templates.contract.document import Contract
 from templates.decoys import DecoyGenerator, DecoyPool, load_source
 from templates.errors import ContractMismatch, SealError, StoreUnavailable, VeilfaceError
 from templates.keys.sealing import KeyringSealer, MasterKeyring
-from templates.keys.webhook_secret import read_webhook_secrets
 from templates.store import TemplateStore
 from templates.store.database import Database
 from templates.store.lockout import LockoutPolicy
@@ -150,14 +149,8 @@ def open_store(
     Raises
     ------
     StartError
-        If the URL is wrong, or the SQLite file cannot be made, or the webhook's secrets be read.
+        If the URL is wrong, or the SQLite file cannot be made.
     """
-    try:
-        secret_file = settings.webhook_secret_file
-        if secret_file is not None:
-            read_webhook_secrets(secret_file)
-    except SealError as error:
-        raise StartError(str(error)) from None
     try:
         if settings.database_url is None:
             settings.data_dir.mkdir(parents=True, exist_ok=True)
@@ -165,7 +158,6 @@ def open_store(
             settings.resolved_database_url,
             keyring,
             lockout=lockout_policy(settings, contract),
-            tells_events=secret_file is not None,
         )
     except (OSError, VeilfaceError) as error:
         raise StartError(f"the database cannot be opened: {error}") from None

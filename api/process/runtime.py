@@ -50,7 +50,7 @@ from templates.store.audit_log import By
 from templates.store.lockout import Nonce
 from templates.store.secret import SecretName
 from templates.store.subject_rows import Source, Storage, SubjectTemplate
-from templates.store.subjects import Guard, Once, Precondition, StoredTemplate
+from templates.store.subjects import Guard, Precondition, StoredTemplate
 from templates.store.tenants import RetiredRotation
 from verify import Verifier
 
@@ -323,14 +323,13 @@ class Runtime:
         photos: int,
         storage: Storage = Storage.SERVICE,
         precondition: Precondition | None = None,
-        once: Once | None = None,
         nonce: Nonce | None = None,
         by: By,
         guard: Guard | None = None,
     ) -> StoredTemplate:
         """Store an enrollment in place of an earlier one.
 
-        `storage`, `precondition`, `once`, `nonce` and `guard` are those of ``Subjects.put``.
+        `storage`, `precondition`, `nonce` and `guard` are those of ``Subjects.put``.
         """
         binding = self.contract.binding
         return self.store.subjects.put(
@@ -348,7 +347,6 @@ class Runtime:
             rotation_epoch=epoch,
             storage=storage,
             precondition=precondition,
-            once=once,
             guard=guard,
             nonce=nonce,
             by=by,

@@ -6,6 +6,7 @@ and all modules, is in memory once, and a worker in place of one that died start
 
 import contextlib
 import gc
+import logging
 import multiprocessing
 import signal
 import socket
@@ -19,6 +20,7 @@ from uvicorn.supervisors.multiprocess import SIGNALS, Multiprocess, Process
 
 from api.http.app import uvicorn_options
 from api.process.allocator import give_back
+from api.process.logging import configure, log
 from api.settings import Settings
 from templates.contract.document import Contract
 from templates.distances import warm_up
@@ -56,6 +58,7 @@ def run_server(
         with single_threaded():
             warm_up()
             _ = contract.cohort
+    configure(settings.log_level)
     # What workers share stays shared while nobody writes to it: the collector would.
     gc.collect()
     gc.freeze()
@@ -113,6 +116,13 @@ class Worker(Process):
 multiprocess.Process = Worker  # type: ignore[misc]
 
 
+def _end(exitcode: int | None) -> str:
+    """Name the signal that ended a process, or its exit status."""
+    if exitcode is not None and exitcode < 0:
+        return signal.Signals(-exitcode).name
+    return f"exit status {exitcode}"
+
+
 class Workers(Multiprocess):
     """uvicorn's supervisor, which says when all workers are ready, and why it stopped."""
 
@@ -140,7 +150,16 @@ class Workers(Multiprocess):
     def keep_subprocess_alive(self) -> None:
         """Replace workers that died or hang; give up where one could not start."""
         told = self.should_exit.is_set()
+        before = list(self.processes)
         super().keep_subprocess_alive()
+        for process in before:
+            if process not in self.processes:
+                log(
+                    "a worker ended: another one takes its place",
+                    severity=logging.ERROR,
+                    pid=process.pid,
+                    ended_by=_end(process.exitcode),
+                )
         told = told or not {signal.SIGINT, signal.SIGTERM}.isdisjoint(self.signal_queue)
         self.gave_up = self.should_exit.is_set() and not told
         self._say_when_ready()

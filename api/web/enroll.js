@@ -1,7 +1,7 @@
 import { facts, h, openDialog, workbench } from "./dom.js";
 import { newHolderKey } from "./holder.js";
 import { photoPicker } from "./photos.js";
-import { call, form, nonce, session, subjectPath } from "./service.js";
+import { call, form, session, subjectPath } from "./service.js";
 import { SPELLING, offNote, subjectField, switchOf, whyOff } from "./subject.js";
 import { problemBox } from "./words.js";
 
@@ -51,10 +51,7 @@ export function enrollView(id) {
   const sender = (name, photos, given) => (replaces) =>
     call("PUT", `${subjectPath(name)}/enrollment`, {
       body: form("images", photos, given),
-      headers: {
-        "Idempotency-Key": nonce(),
-        ...(replaces ? { "If-Match": `"${replaces}"` } : { "If-None-Match": "*" }),
-      },
+      headers: replaces ? { "If-Match": `"${replaces}"` } : { "If-None-Match": "*" },
     });
 
   function mayReplace(name) {

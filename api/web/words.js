@@ -26,7 +26,6 @@ const REMEDIES = {
   overloaded: "Try again in a moment.",
   store_unavailable: "Try again in a moment. If it keeps happening, tell the operator.",
   model_unavailable: "This service cannot take photos. Ask the operator.",
-  idempotency_conflict: "Wait a moment and try again.",
   enrollment_conflict: "This person was enrolled or erased meanwhile. Look them up, and enroll them again if need be.",
   export_superseded: "Export the person again from where they are enrolled.",
   passkey_refused: "Try again, on the device that has the passkey. If it is lost, enroll the person again.",

@@ -8,7 +8,6 @@ from templates.store.attempts import Attempt
 from templates.store.audit_chain import Anchor, Line, Problem, Verification
 from templates.store.audit_log import AuditLog, BrokenAuditLog, By, Entry
 from templates.store.erasure import Erasure
-from templates.store.idempotency import Answer, Claim, IdempotencyConflict
 from templates.store.identifiers import InvalidIdentifier, UnknownTenant
 from templates.store.lockout import LockedOut, LockoutPolicy, Nonce, Replayed, Superseded
 from templates.store.receipts import Receipt, verify_receipt
@@ -28,17 +27,14 @@ from templates.store.tenants import RetiredRotation, RotationKey, Tenant
 
 __all__ = [
     "Anchor",
-    "Answer",
     "ApiKey",
     "Attempt",
     "AttemptsStatus",
     "AuditLog",
     "BrokenAuditLog",
     "By",
-    "Claim",
     "Entry",
     "Erasure",
-    "IdempotencyConflict",
     "InvalidIdentifier",
     "Line",
     "LockedOut",

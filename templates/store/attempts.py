@@ -21,11 +21,9 @@ from templates.errors import StoreError
 from templates.store.attempt_queries import NOTE_USE, before, named, standing
 from templates.store.audit_log import By, Entry
 from templates.store.context import StoreContext
-from templates.store.idempotency import Answer, Claim, Idempotency
 from templates.store.identifiers import UnknownTenant, checked_subject_id
 from templates.store.lockout import LockedOut, LockoutPolicy, Nonce, Replayed, Superseded
 from templates.store.nonces import Nonces, spend
-from templates.store.outbox import EventType
 from templates.store.schema import FailedAttemptsRow, UsedNonceRow
 from templates.store.standing import UNKNOWN_RETENTION, AttemptsStatus, Standing
 from templates.store.subject_rows import (
@@ -85,12 +83,10 @@ class Attempts:
         self,
         context: StoreContext,
         nonces: Nonces,
-        idempotency: Idempotency,
         policy: LockoutPolicy,
     ) -> None:
         self._context = context
         self._nonces = nonces
-        self._idempotency = idempotency
         self._standing = Standing(context, policy)
 
     def begin(
@@ -140,7 +136,6 @@ class Attempts:
         contract_ids: Sequence[str] | None = None,
         level: str,
         nonce: Nonce | None,
-        kept: tuple[Claim, Answer] | None = None,
         by: By,
     ) -> None:
         """Count a decision, in one transaction, before anybody is told of it.
@@ -167,8 +162,6 @@ class Attempts:
             Security level of the decision, for the audit log.
         nonce
             Of a signed probe; None for a photo.
-        kept
-            What is answered under an idempotency key, and its claim.
         by
             Who asked.
 
@@ -180,19 +173,12 @@ class Attempts:
             If the subject is locked now.
         Superseded
             If the subject's template is another one now. Nothing is written.
-        IdempotencyConflict
-            If another run of the same request has taken over, or the subject was erased. Nothing is
-            written: a decision that is not counted is told to nobody either, so whoever provokes it
-            learns nothing, and the nonce is used up by the run whose decision is told.
         UnknownTenant, StoreError, StoreUnavailable
         """
 
         def work(connection: Connection) -> LockedOut | Replayed | None:
             asked = self._asked(tenant, subject_id, nonce, contract_ids)
-            refusal = self._record(connection, asked, accepted, template_id, nonce, level, by)
-            if kept is not None and refusal is None:
-                self._idempotency.finish(connection, *kept)
-            return refusal
+            return self._record(connection, asked, accepted, template_id, nonce, level, by)
 
         refusal = self._context.write(work, lock=subject_lock(tenant, subject_id))
         if refusal is not None:
@@ -207,7 +193,6 @@ class Attempts:
         contract_ids: Sequence[str],
         nonce: Nonce | None,
         held_template: bytes | None = None,
-        kept: Callable[[D], tuple[Claim, Answer] | None] = lambda _decided: None,
         by: By,
     ) -> D:
         """:meth:`begin`, a decision and :meth:`conclude` while nobody replaces the template.
@@ -219,7 +204,7 @@ class Attempts:
 
         Raises
         ------
-        LockedOut, Replayed, IdempotencyConflict, UnknownTenant, SealError, StoreError,
+        LockedOut, Replayed, UnknownTenant, SealError, StoreError,
         StoreUnavailable
         """
 
@@ -230,8 +215,6 @@ class Attempts:
             refusal = self._record(
                 connection, asked, decided.accepted, attempt.template_id, nonce, decided.level, by
             )
-            if refusal is None and (answered := kept(decided)) is not None:
-                self._idempotency.finish(connection, *answered)
             return decided if refusal is None else refusal
 
         outcome = self._context.write(work, lock=subject_lock(tenant, subject_id))
@@ -395,19 +378,6 @@ class Attempts:
         line = self._context.audit_log.append(connection, entry)
         if new_status is not None:
             self._standing.write(connection, row, asked["pseudonym"], new_status, line)
-            until = new_status.locked_until
-            if until is not None or new_status.disabled_at is not None:
-                # Of an unknown subject too: whether it is told must not show who is enrolled.
-                self._context.outbox.add(
-                    connection,
-                    EventType.LOCKED_OUT,
-                    tenant_id=row.tenant_id,
-                    tenant=asked["tenant"],
-                    pseudonym=asked["pseudonym"],
-                    subject_id=asked["subject_id"],
-                    until=None if until is None else until.isoformat(),
-                    disabled=new_status.disabled_at is not None,
-                )
         return refusal
 
 

@@ -205,17 +205,8 @@ def true_line(keys: LineKeys, values: Mapping[str, Any]) -> Line | None:
 
 
 def head_mac(key: bytes, head: Anchor) -> bytes:
-    """MAC of the head row of a database whose rows are authenticated."""
-    return _head_mac(key, head, "head of authenticated rows")
-
-
-def is_head_before_authentication(key: bytes, head: Anchor, mac: bytes) -> bool:
-    """Whether the head row is a true one of a schema whose other rows carried no MAC."""
-    return hmac.compare_digest(_head_mac(key, head, "head"), mac)
-
-
-def _head_mac(key: bytes, head: Anchor, label: str) -> bytes:
-    return hmac.digest(key, encode_parts(label, head.sequence, head.hash), hashlib.sha256)
+    """MAC of the head row."""
+    return hmac.digest(key, encode_parts("head", head.sequence, head.hash), hashlib.sha256)
 
 
 def is_head(key: bytes, head: Anchor, mac: bytes) -> bool:

@@ -26,7 +26,6 @@ from templates.store.audit_chain import (
     Verification,
     head_mac,
     is_head,
-    is_head_before_authentication,
     line_hash,
     read_line,
     true_line,
@@ -185,23 +184,6 @@ class AuditLog:
         if written or head != START or mac:
             raise _without_key()  # which takes back the key that was made
         connection.execute(sa.update(AuditHeadRow).values(mac=head_mac(secret.value, START)))
-
-    def authenticates_rows(self, connection: Connection) -> bool:
-        """Whether the head says that the rows of this database are authenticated.
-
-        One that is missing or forged does too: who reads it is told, and no row is vouched for.
-        """
-        head, mac = read_head(connection)
-        return head is None or not is_head_before_authentication(self._key(), head, mac)
-
-    def begin_authentication(self, connection: Connection) -> bool:
-        """Let the head say that rows are authenticated from now on; False if it said so before."""
-        head, mac = read_head(connection, for_update=True)
-        key = self._key()
-        if head is None or not is_head_before_authentication(key, head, mac):
-            return False
-        connection.execute(sa.update(AuditHeadRow).values(mac=head_mac(key, head)))
-        return True
 
     def prepare(self) -> None:
         """Open the key of the chain; to be called before a transaction that appends.

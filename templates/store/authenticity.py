@@ -26,9 +26,7 @@ from templates.store.schema import (
     AuditRow,
     Base,
     FailedAttemptsRow,
-    IdempotencyRow,
     KnownCalibrationsRow,
-    OutboxRow,
     TenantRow,
 )
 
@@ -59,19 +57,7 @@ AUTHENTICATED: dict[type[Base], tuple[str, ...]] = {
         "disabled_at",
         "line",
     ),
-    IdempotencyRow: (
-        "tenant_id",
-        "actor",
-        "key_hash",
-        "request_hash",
-        "claim",
-        "status",
-        "body",
-        "expires_at",
-    ),
     KnownCalibrationsRow: ("contract_id", "position", "calibration_ids", "created_at"),
-    # Not the sealed body: it is bound to the event's id, and wrapped anew with the master key.
-    OutboxRow: ("event_id", "tenant_id", "pseudonym", "created_at"),
 }
 """The columns that a MAC covers, in its order, but for those of :data:`_LATER` that are NULL.
 `tenant` of a key is the name of its tenant: so the tenant's own row decides nothing about a request

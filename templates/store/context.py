@@ -11,7 +11,6 @@ from templates.store.audit_log import AuditLog
 from templates.store.database import Database
 from templates.store.deployment import Secrets
 from templates.store.identifiers import Clock
-from templates.store.outbox import Outbox
 from templates.store.receipts import ReceiptSigner
 
 T = TypeVar("T")
@@ -19,30 +18,21 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class StoreContext:
-    """The database of a deployment, its keys, its audit log, its outbox and its clock."""
+    """The database of a deployment, its keys, its audit log and its clock."""
 
     database: Database
     keyring: MasterKeyring
     secrets: Secrets
     signer: ReceiptSigner
     audit_log: AuditLog
-    outbox: Outbox
     clock: Clock
 
     @classmethod
-    def of(
-        cls,
-        database: Database,
-        keyring: MasterKeyring,
-        clock: Clock,
-        *,
-        tells_events: bool = False,
-    ) -> "StoreContext":
-        """Derive secrets, signer, audit log and outbox."""
+    def of(cls, database: Database, keyring: MasterKeyring, clock: Clock) -> "StoreContext":
+        """Derive secrets, signer and audit log."""
         secrets = Secrets(database, keyring, clock)
         audit_log = AuditLog(database, secrets, clock)
-        outbox = Outbox(database, keyring, secrets, audit_log, clock, tells=tells_events)
-        return cls(database, keyring, secrets, ReceiptSigner(secrets), audit_log, outbox, clock)
+        return cls(database, keyring, secrets, ReceiptSigner(secrets), audit_log, clock)
 
     def read(self, work: Callable[[Connection], T]) -> T:
         """:meth:`Secrets.read`, after opening the keys that rows are authenticated with."""

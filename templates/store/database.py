@@ -13,7 +13,8 @@ import random
 import sqlite3
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any, TypeVar
 
 import psycopg
@@ -22,7 +23,7 @@ from sqlalchemy.engine import Connection, Engine
 from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 
-from templates.errors import StoreBusy, StoreError, StoreUnavailable
+from templates.errors import DatabaseFileRemoved, StoreBusy, StoreError, StoreUnavailable
 from templates.store.engine import checked_url, make_engine, sqlite_file
 from templates.store.turn import next_in_line
 
@@ -33,6 +34,8 @@ _RETRIED_STATES = {"40001", "40P01"}  # serialisation failure, deadlock
 _DATABASE_ERRORS = (SQLAlchemyError, sqlite3.Error, psycopg.Error, OSError)
 _WRITING = "veilface writing"  # lock that every write shares, see await_writers
 _EMPTY_LOG = "PRAGMA wal_checkpoint(TRUNCATE)"
+PURGE_WAIT_S = 0.25
+"""Longest that emptying SQLite's log waits for readers, and so makes writers wait."""
 _UNAVAILABLE_CLASSES = {"08", "53", "57", "58"}  # connection, resources, operator, system
 
 
@@ -64,7 +67,7 @@ class Database:
         self._pool_size = pool_size
         self._max_overflow = max_overflow
         self._timeout = timeout
-        self._own = _Process(self._make_engine())
+        self._own = self._new_process()
 
     @property
     def engine(self) -> Engine:
@@ -82,6 +85,7 @@ class Database:
             with process.readers.connect() as connection:
                 if self.is_sqlite:
                     _driver(connection).execute("BEGIN")
+                    process.require_file()
                 return work(connection)
 
         return _again(once)
@@ -149,9 +153,10 @@ class Database:
         def once() -> T:
             if self.is_sqlite:
                 # Threads queue here in turn; SQLite's own lock is polled and knows no order.
-                with process.writing, process.engine.begin() as connection:
-                    with self._turn(None):
+                with process.turn_to_write(), process.engine.begin() as connection:
+                    with self._turn(self._timeout):
                         _driver(connection).execute("BEGIN IMMEDIATE")
+                    process.require_file()
                     return work(connection)
             with process.engine.begin() as connection:
                 connection.execute(locks, names)
@@ -159,36 +164,31 @@ class Database:
 
         return _again(once)
 
-    def purge_log(self, *, wait: float | None = None) -> bool:
+    def purge_log(self) -> bool:
         """Move SQLite's write-ahead log into the database file and empty it.
 
-        What a transaction removed may still stand in the log until then. Waits for readers up to
-        `wait` seconds, or the timeout; False if one outlasted it. Nothing to do on PostgreSQL.
+        What a transaction removed may still stand in the log until then. It is called after the
+        commit, so it never raises: False where a reader outlasted the wait, or the database failed.
+        Nothing to do on PostgreSQL.
         """
         if not self.is_sqlite:
             return True
         process = self._process()
         try:
-            with process.writing, self._turn(wait), process.engine.connect() as connection:
+            with (
+                process.turn_to_write(),
+                self._turn(PURGE_WAIT_S),
+                process.engine.connect() as connection,
+            ):
                 driver = _driver(connection)
+                driver.execute(_busy_timeout(PURGE_WAIT_S))
                 try:
-                    if wait is not None:
-                        driver.execute(_busy_timeout(wait))
                     busy, _, _ = driver.execute(_EMPTY_LOG).fetchone()
                 finally:
-                    if wait is not None:
-                        driver.execute(_busy_timeout(self._timeout))
-        except sqlite3.OperationalError:
+                    driver.execute(_busy_timeout(self._timeout))
+        except (*_DATABASE_ERRORS, StoreError):
             return False
-        except _DATABASE_ERRORS as error:
-            raise _translated(error) from None
         return not busy
-
-    def try_purge_log(self, *, wait: float | None = None) -> bool:
-        """:meth:`purge_log` after a commit: what is written is written, so this never raises."""
-        with contextlib.suppress(StoreError):
-            return self.purge_log(wait=wait)
-        return False
 
     def remove(self, table: type[Any], condition: sa.ColumnElement[bool], *, batch: int) -> int:
         """Remove the rows of a mapped table that meet a condition; returns how many.
@@ -211,7 +211,11 @@ class Database:
         process = self._process()
         try:
             autocommit = process.engine.execution_options(isolation_level="AUTOCOMMIT")
-            with process.writing, self._turn(None), autocommit.connect() as connection:
+            with (
+                process.turn_to_write(),
+                self._turn(self._timeout),
+                autocommit.connect() as connection,
+            ):
                 if self.is_sqlite:
                     _driver(connection).execute("VACUUM")
                 for table in () if self.is_sqlite else tables:
@@ -246,11 +250,9 @@ class Database:
         """
         self.write_alone(lambda _: None)
 
-    def _turn(self, wait: float | None) -> contextlib.AbstractContextManager[None]:
+    def _turn(self, wait: float) -> contextlib.AbstractContextManager[None]:
         """The turn to wait for SQLite's lock; nothing on PostgreSQL."""
-        if self._file is None:
-            return contextlib.nullcontext()
-        return next_in_line(self._file, self._timeout if wait is None else wait)
+        return contextlib.nullcontext() if self._file is None else next_in_line(self._file, wait)
 
     def _lock_limit(self, wait: float | None) -> str:
         return str(round(1000 * (self._timeout if wait is None else wait)))
@@ -259,16 +261,17 @@ class Database:
         if self._own.pid != os.getpid():
             # The sockets and file locks of the parent are not ours: forget them, unclosed.
             self._own.engine.dispose(close=False)
-            self._own = _Process(self._make_engine())
+            self._own = self._new_process()
         return self._own
 
-    def _make_engine(self) -> Engine:
-        return make_engine(
+    def _new_process(self) -> "_Process":
+        engine = make_engine(
             self.url,
             timeout=self._timeout,
             pool_size=self._pool_size,
             max_overflow=self._max_overflow,
         )
+        return _Process(engine, self._file, self._timeout)
 
     def __repr__(self) -> str:
         return f"Database({self.url.render_as_string(hide_password=True)!r})"
@@ -277,15 +280,54 @@ class Database:
 class _Process:
     """What belongs to one process: its engine, and that seen as readers'."""
 
-    def __init__(self, engine: Engine) -> None:
+    def __init__(self, engine: Engine, file: Path | None, timeout: float) -> None:
         self.pid = os.getpid()
         self.engine = engine
-        self.writing = threading.Lock()
+        self._file = file
+        self._identity = _identity(file)
+        if file is not None:
+            # SQLite would make an empty file, and the connection would stay with that one.
+            sa.event.listen(engine, "do_connect", lambda *_: self.require_file())
+        self._writing = threading.Lock()
+        self._timeout = timeout
         self.readers = (
             engine
             if engine.dialect.name == "sqlite"
             else engine.execution_options(isolation_level="AUTOCOMMIT")
         )
+
+    @contextlib.contextmanager
+    def turn_to_write(self) -> Iterator[None]:
+        """Hold the turn among the threads of this process; StoreBusy where it does not come."""
+        if not self._writing.acquire(timeout=self._timeout):
+            raise StoreBusy("other writes of this process take too long")
+        try:
+            yield
+        finally:
+            self._writing.release()
+
+    def require_file(self) -> None:
+        """Refuse to go on with a file that was removed: its writes would be gone with it.
+
+        Raises
+        ------
+        DatabaseFileRemoved
+        """
+        if _identity(self._file) != self._identity:
+            raise DatabaseFileRemoved(
+                "the database file was removed or replaced while it was open: put it back, or stop "
+                "the service first and start it again"
+            )
+
+
+def _identity(file: Path | None) -> tuple[int, int] | None:
+    if file is None:
+        return None
+    try:
+        status = file.stat()
+    except OSError:
+        return None
+    return status.st_dev, status.st_ino
 
 
 def _busy_timeout(seconds: float) -> str:

@@ -9,11 +9,9 @@ from sqlalchemy.engine import Connection
 from templates.store.audit_log import PROGRAM, By, Entry
 from templates.store.context import StoreContext
 from templates.store.identifiers import checked_subject_id
-from templates.store.outbox import EventType
 from templates.store.receipts import Erased, Receipt, keep_receipt, latest_receipt
 from templates.store.schema import (
     FailedAttemptsRow,
-    IdempotencyRow,
     SubjectRow,
     TemplateRow,
     TenantRow,
@@ -50,20 +48,19 @@ class Erasures:
     def erase(self, tenant: str, subject_id: str, *, by: By = PROGRAM) -> Erasure:
         """Remove all that is held of a subject, its data key included; leave a signed receipt.
 
-        In one transaction: template, metadata, data key, failed attempts and idempotency records
-        go, the receipt comes. Erasing again returns the receipt of the first time; erasing who
+        In one transaction: template, metadata, data key and failed attempts go, the receipt
+        comes. Erasing again returns the receipt of the first time; erasing who
         was never enrolled leaves a receipt that says nothing was held. The receipt counts what its
         own call removed.
 
         What stays is the receipt, and the lines of the audit log, which name the subject by its
-        pseudonym; where events are told, also those of the subject that the endpoint has not taken
-        yet, sealed, for a week at most. The nonces of signed probes stay for their few minutes:
+        pseudonym. The nonces of signed probes stay for their few minutes:
         they belong to an API key and name no subject. As the failed attempts go, an erasure ends a
         lock: whoever may erase and enroll a subject may also start its count anew.
         """
         work = self._work(tenant, subject_id, by)
         receipt, erased = self._context.write(work, lock=subject_lock(tenant, subject_id))
-        log_purged = self._context.database.try_purge_log()
+        log_purged = self._context.database.purge_log()
         return Erasure(receipt=receipt, erased=erased, log_purged=log_purged)
 
     def erase_if(
@@ -103,28 +100,17 @@ class Erasures:
             pseudonym = signer.pseudonym(tenant, subject_id)
             receipt, outcome = remove(connection, pseudonym)
             audit_log.append(connection, Entry("erase", outcome, by, tenant, pseudonym))
-            if outcome == "erased":
-                self._context.outbox.add(
-                    connection,
-                    EventType.ERASED,
-                    tenant_id=tenant_id_of(connection, tenant),
-                    tenant=tenant,
-                    pseudonym=pseudonym,
-                    subject_id=subject_id,
-                )
             return receipt, outcome == "erased"
 
         def remove(connection: Connection, pseudonym: str) -> tuple[Receipt, str]:
             tenant_id = tenant_id_of(connection, tenant)
 
-            def removed(table: type[FailedAttemptsRow | IdempotencyRow]) -> int:
-                whose = table.tenant_id == tenant_id, table.pseudonym == pseudonym
-                return connection.execute(sa.delete(table).where(*whose)).rowcount
-
-            failed_attempts, idempotency_records = (
-                removed(FailedAttemptsRow),
-                removed(IdempotencyRow),
-            )
+            failed_attempts = connection.execute(
+                sa.delete(FailedAttemptsRow).where(
+                    FailedAttemptsRow.tenant_id == tenant_id,
+                    FailedAttemptsRow.pseudonym == pseudonym,
+                )
+            ).rowcount
             contract_id, templates, subjects = None, 0, 0
             subject_pk = subject_pk_of(connection, tenant_id, subject_id)
             if subject_pk is None:
@@ -154,7 +140,6 @@ class Erasures:
                     data_key=subjects,  # a column of the subject's row, with the metadata
                     metadata=subjects,
                     failed_attempts=failed_attempts,
-                    idempotency_records=idempotency_records,
                 ),
                 erased_at=now,
             )

@@ -58,22 +58,6 @@ def upgrade(database: Database, revision: str = "head") -> None:
     database.write(work, lock=_LOCK, wait=0)
 
 
-def downgrade(database: Database, revision: str) -> None:
-    """Migrate downwards, to ``"base"`` for an empty database; data of dropped tables goes.
-
-    Raises
-    ------
-    StoreBusy
-        As :func:`upgrade`.
-    """
-
-    def work(connection: Connection) -> None:
-        with _short_waits(database, connection):
-            command.downgrade(_config(connection), revision)
-
-    database.write(work, lock=_LOCK, wait=0)
-
-
 def current_revision(database: Database) -> str | None:
     """Revision the database is at; None for an empty one."""
     return database.read(_revision_of)

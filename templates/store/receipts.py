@@ -49,7 +49,7 @@ class Erased:
     template, data_key, metadata
         1 or 0: they come and go together, but for a template that its holder keeps (0), which
         opens no more without the data key.
-    failed_attempts, idempotency_records
+    failed_attempts
         Records that named the subject by its pseudonym.
     """
 
@@ -58,7 +58,6 @@ class Erased:
     data_key: int
     metadata: int
     failed_attempts: int
-    idempotency_records: int
 
     @property
     def items(self) -> list[dict[str, Any]]:
@@ -82,8 +81,8 @@ class ErasedTenant:
         Keys of the tenant's rotation, one for each epoch that was left.
     api_keys
         API keys, those that were revoked or had expired before included.
-    failed_attempts, idempotency_records, nonces
-        Records of lockout, of repeated writes and of signed probes.
+    failed_attempts, nonces
+        Records of lockout and of signed probes.
     """
 
     subjects: int
@@ -92,7 +91,6 @@ class ErasedTenant:
     rotation_keys: int
     api_keys: int
     failed_attempts: int
-    idempotency_records: int
     nonces: int
 
     @property

@@ -8,9 +8,8 @@ or all:
 ==================  ================================================================================
 audit chain         a line ends the time of the old key, the next begins that of the new one
 rows                those that are authentic get a MAC under the new key
-pseudonyms          new lines name subjects by new pseudonyms; counts of failures, events, answers
-                    of repeated writes and receipts are brought forward, lines of before are found
-                    by the old pseudonyms
+pseudonyms          new lines name subjects by new pseudonyms; counts of failures and receipts
+                    are brought forward, lines of before are found by the old pseudonyms
 receipts            those that are kept are signed again; the old key stays known, with the time
 exports, stand-ins  made with the new secret from now on
 ==================  ================================================================================
@@ -21,7 +20,7 @@ What the thief did before, with write access to the database, stays as it was: r
 before are good if they were good under the old keys.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, cast
@@ -30,8 +29,7 @@ import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
 from templates.errors import StoreError
-from templates.store.adoption import contradicted_keys
-from templates.store.audit_chain import Anchor, Line, is_true_line
+from templates.store.audit_chain import Anchor, Line, LineKeys, is_true_line
 from templates.store.audit_log import PROGRAM, By, is_digest
 from templates.store.authenticity import (
     AUTHENTICATED,
@@ -50,14 +48,14 @@ from templates.store.receipts import (
 )
 from templates.store.record_check import read_rows
 from templates.store.schema import (
+    KEY_LINES,
     ApiKeyRow,
     AuditRow,
     Base,
     FailedAttemptsRow,
-    IdempotencyRow,
-    OutboxRow,
     ReceiptRow,
     SecretRow,
+    TenantRow,
 )
 from templates.store.secret import Secret, SecretName, digest_again
 from templates.store.tenants import Tenants
@@ -164,7 +162,7 @@ class Renewal:
                 "renew with the newest version that has used it"
             )
         before = audit_log.row_key()
-        refused = tuple(contradicted_keys(connection, audit_log.line_keys()))
+        refused = tuple(_contradicted_keys(connection, audit_log.line_keys()))
         for prefix in refused:
             warn("an API key that the audit log contradicts was not authenticated", key_id=prefix)
         chain, anchor = audit_log.hand_over(connection, by)
@@ -233,10 +231,6 @@ def _authenticate_again(
     columns = list(columns_of(table))
     if table is ApiKeyRow:
         columns.append(TENANT_OF_KEY.label("tenant"))
-    if table is IdempotencyRow:
-        columns.append(IdempotencyRow.pseudonym)
-    if table is OutboxRow:
-        columns.append(OutboxRow.sequence)
     authentic, changed = 0, []
     # Read whole before it is written: a cursor over rows that change meanwhile is not defined.
     for row in read_rows(connection, sa.select(*columns), table):
@@ -257,6 +251,22 @@ def _authenticate_again(
     return authentic
 
 
+def _contradicted_keys(connection: Connection, line_keys: LineKeys) -> Iterator[str]:
+    """Prefixes of the keys that the audit log does not know, or knows otherwise."""
+    keys = sa.select(ApiKeyRow.prefix, ApiKeyRow.revoked_at, TenantRow.name.label("tenant"))
+    query = keys.outerjoin(TenantRow, TenantRow.id == ApiKeyRow.tenant_id)
+    for key in connection.execute(query.order_by(ApiKeyRow.prefix)).all():
+        lines = [
+            line
+            for row in connection.execute(_LINES_OF_KEY, {"prefix": key.prefix})
+            if is_true_line(line_keys, line := Line(**row._mapping))
+        ]
+        created = any((line.action, line.tenant) == ("key-create", key.tenant) for line in lines)
+        revoked = any((line.action, line.outcome) == ("key-revoke", "revoked") for line in lines)
+        if not created or (revoked and key.revoked_at is None):
+            yield key.prefix
+
+
 def _again(pseudonym: str | None, fresh: Fresh) -> str | None:
     secret = fresh.get(SecretName.PSEUDONYM)
     # Whoever can write the database can write anything in its place.
@@ -265,19 +275,8 @@ def _again(pseudonym: str | None, fresh: Fresh) -> str | None:
     return digest_again(secret.value, bytes.fromhex(pseudonym)).hex()
 
 
-def _hashed_again(own_hash: bytes, fresh: Fresh) -> bytes:
-    secret = fresh.get(SecretName.IDEMPOTENCY)
-    return own_hash if secret is None else digest_again(secret.value, own_hash)
-
-
 _FORWARD: dict[type[Base], dict[str, Callable[[Any, Fresh], Any]]] = {
     FailedAttemptsRow: {"pseudonym": _again},
-    OutboxRow: {"pseudonym": _again},
-    IdempotencyRow: {
-        "key_hash": _hashed_again,
-        "request_hash": _hashed_again,
-        "pseudonym": _again,
-    },
 }
 """Columns that hold keyed digests."""
 
@@ -287,3 +286,6 @@ _ROTATIONS: Any = sa.select(*(getattr(AuditRow, name) for name in Line.__datacla
     AuditRow.outcome == "begun",
     AuditRow.sequence > sa.bindparam("after"),
 )
+_LINES_OF_KEY: Any = sa.select(
+    *(getattr(AuditRow, name) for name in Line.__dataclass_fields__)
+).where(AuditRow.detail == sa.bindparam("prefix"), KEY_LINES)

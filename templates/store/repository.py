@@ -7,13 +7,11 @@ from sqlalchemy.engine import Connection
 
 from templates.keys.sealing import MasterKeyring
 from templates.store import deployment, migrate
-from templates.store.adoption import Adoption, adopt
 from templates.store.api_keys import ApiKeys
 from templates.store.attempts import Attempts
 from templates.store.context import StoreContext
 from templates.store.database import Database
 from templates.store.erasure import Erasures
-from templates.store.idempotency import Idempotency
 from templates.store.identifiers import Clock, utc_now
 from templates.store.known_calibrations import KnownCalibrations
 from templates.store.lockout import LockoutPolicy
@@ -26,9 +24,7 @@ from templates.store.rewrap import WrappedKeys
 from templates.store.schema import (
     ApiKeyRow,
     FailedAttemptsRow,
-    IdempotencyRow,
     MasterKeyCheckRow,
-    OutboxRow,
     RotationKeyRow,
     SubjectRow,
     TemplateRow,
@@ -60,23 +56,18 @@ class TemplateStore:
         timeout: float = 10.0,
         clock: Clock = utc_now,
         lockout: LockoutPolicy = _LOCKOUT,
-        tells_events: bool = False,
     ) -> None:
         database = Database(url, pool_size=pool_size, max_overflow=max_overflow, timeout=timeout)
-        self._context = context = StoreContext.of(
-            database, keyring, clock, tells_events=tells_events
-        )
+        self._context = context = StoreContext.of(database, keyring, clock)
         self.database = database
         self.secrets = context.secrets
         self.signer = context.signer
         self.audit_log = context.audit_log
-        self.outbox = context.outbox
         self.tenants = Tenants(context)
         self.api_keys = ApiKeys(context, self.tenants)
         self.nonces = Nonces(context)
-        self.idempotency = Idempotency(context)
-        self.subjects = Subjects(context, self.nonces, self.idempotency)
-        self.attempts = Attempts(context, self.nonces, self.idempotency, lockout)
+        self.subjects = Subjects(context, self.nonces)
+        self.attempts = Attempts(context, self.nonces, lockout)
         self.erasures = Erasures(context)
         self.retention = RetentionJob(context, self.erasures)
         self.transfers = Transfers(context)
@@ -86,18 +77,14 @@ class TemplateStore:
         self.wrapped_keys = WrappedKeys(context)
         self.renewal = Renewal(context, self.tenants)
 
-    def upgrade(self) -> Adoption:
-        """Bring the schema to this program's version; safe when several workers start at once.
-
-        Rows of a version that did not authenticate them are authenticated, once: see
-        :func:`adoption.adopt`.
-        """
+    def upgrade(self) -> None:
+        """Bring the schema to this program's version; safe when several workers start at once."""
         context = self._context
         migrate.upgrade(self.database)
         deployment.mark_master_key(self.database, context.keyring, context.clock)
         self.check()
         self.audit_log.begin()
-        return adopt(context)
+        self.signer.prepare()  # so that the first reader makes no secret, which is a write
 
     def check(self) -> None:
         """Raise, naming the remedy, unless schema and master key are the right ones."""
@@ -138,24 +125,16 @@ class TemplateStore:
         # One at a time: on PostgreSQL another worker's trial has the same row, not yet removed.
         self.database.write(work, lock="trial write")
 
-    def purge(self, *, wait: float | None = None) -> bool:
+    def purge(self) -> bool:
         """Remove expired records, and on SQLite empty the write-ahead log.
-
-        Parameters
-        ----------
-        wait
-            Seconds that emptying the log may wait for readers, and so make writers wait; the
-            store's timeout by default.
 
         Returns
         -------
         bool
             False if a reader outlasted the wait: the log is emptied another time.
         """
-        self.idempotency.expire()
         self.attempts.expire()
-        self.outbox.expire()
-        return self.database.purge_log(wait=wait)
+        return self.database.purge_log()
 
     def compact(self) -> None:
         """Rewrite the tables of subjects and of keys, so that no page keeps what was erased.
@@ -171,8 +150,6 @@ _HOLD_SUBJECT_DATA = (
     SubjectRow,
     TemplateRow,
     FailedAttemptsRow,
-    IdempotencyRow,
-    OutboxRow,
     RotationKeyRow,
     ApiKeyRow,
     UsedNonceRow,

@@ -45,7 +45,6 @@ from templates.store.tenants import RetiredRotation, Tenants
 
 ACTION = "tenant-rotate"
 BATCH = 50
-PURGE_WAIT_S = 0.25
 _PAUSE_S = 0.05
 
 
@@ -147,7 +146,7 @@ class Rerotation:
                 break
             if not moved:
                 time.sleep(_PAUSE_S)  # another write holds them
-        database.try_purge_log(wait=PURGE_WAIT_S)
+        database.purge_log()
         if total:
             entry = _entry("moved", tenant, rotations.current_epoch(), by)
             self._context.audit_log.record(entry)
@@ -209,7 +208,7 @@ class Rerotation:
             return dropped
 
         dropped = self._context.write(work)
-        database.try_purge_log(wait=PURGE_WAIT_S)
+        database.purge_log()
         return dropped
 
     def _rotate_all(

@@ -23,7 +23,6 @@ from templates.store.schema import SubjectRow, TenantRow, UtcDateTime
 
 BATCH = 100
 LONGEST = timedelta(days=36_500)
-PURGE_WAIT_S = 0.25
 RETENTION = By("retention")
 
 Place = tuple[datetime, str]  # in the list of who is due: `updated_at` and the row's id
@@ -108,7 +107,7 @@ class RetentionJob:
         while rows := database.read(partial(_due, expired=expired, after=after, batch=batch)):
             for row in rows:
                 erased += self._erase(row, expired, by)
-            database.try_purge_log(wait=PURGE_WAIT_S)
+            database.purge_log()
             after = rows[-1].updated_at, rows[-1].id
         return erased
 

@@ -23,12 +23,10 @@ from templates.store.api_keys import PROBE_KEY_PURPOSE
 from templates.store.context import StoreContext
 from templates.store.deployment import CHECK_PURPOSE, SECRET_PURPOSE
 from templates.store.envelope import DATA_KEY_PURPOSE
-from templates.store.outbox import BODY_PURPOSE
 from templates.store.schema import (
     ApiKeyRow,
     Base,
     MasterKeyCheckRow,
-    OutboxRow,
     RotationKeyRow,
     SecretRow,
     SubjectRow,
@@ -75,14 +73,6 @@ WRAPPED_COLUMNS = (
         [ApiKeyRow.id],
         PROBE_KEY_PURPOSE,
         [ApiKeyRow.id],
-    ),
-    WrappedColumn(
-        OutboxRow,
-        OutboxRow.wrapped_body,
-        OutboxRow.wrapping_key,
-        [OutboxRow.sequence],
-        BODY_PURPOSE,
-        [OutboxRow.event_id],
     ),
     WrappedColumn(
         SecretRow,
@@ -138,7 +128,7 @@ class WrappedKeys:
                     total += counts.changed
                     if progress is not None:
                         progress(counts.changed)
-        database.try_purge_log()
+        database.purge_log()
         return total
 
     def count(self) -> dict[str, int]:

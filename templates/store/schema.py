@@ -259,45 +259,6 @@ class ReceiptRow(Base):
     created_at: Mapped[datetime] = mapped_column(UtcDateTime)
 
 
-class IdempotencyRow(Base):
-    """A write that carried an idempotency key: what was asked (keyed hashes) and answered."""
-
-    __tablename__ = "idempotency"
-
-    tenant_id: Mapped[str] = mapped_column(
-        UUID_HEX, ForeignKey("tenants.id", ondelete="CASCADE"), primary_key=True
-    )
-    actor: Mapped[str] = mapped_column(String(64), primary_key=True)
-    key_hash: Mapped[bytes] = mapped_column(LargeBinary(32), primary_key=True)
-    request_hash: Mapped[bytes] = mapped_column(LargeBinary(32))
-    pseudonym: Mapped[str | None] = mapped_column(PSEUDONYM, index=True)
-    claim: Mapped[str] = mapped_column(UUID_HEX)
-    claimed_until: Mapped[datetime] = mapped_column(UtcDateTime)
-    status: Mapped[int | None] = mapped_column(Integer)
-    body: Mapped[bytes | None] = mapped_column(LargeBinary)
-    created_at: Mapped[datetime] = mapped_column(UtcDateTime)
-    expires_at: Mapped[datetime] = mapped_column(UtcDateTime, index=True)
-    mac: Mapped[bytes | None] = mapped_column(MAC)
-
-
-class OutboxRow(Base):
-    """An event that the operator's endpoint is to be told, until it has taken it."""
-
-    __tablename__ = "outbox"
-    __table_args__ = (Index("ix_outbox_tenant_id_pseudonym", "tenant_id", "pseudonym"),)
-
-    sequence: Mapped[int] = mapped_column(SERIAL, primary_key=True, autoincrement=True)
-    event_id: Mapped[str] = mapped_column(UUID_HEX)
-    tenant_id: Mapped[str] = mapped_column(UUID_HEX, ForeignKey("tenants.id", ondelete="CASCADE"))
-    pseudonym: Mapped[str] = mapped_column(PSEUDONYM)
-    wrapped_body: Mapped[bytes] = mapped_column(LargeBinary)
-    wrapping_key: Mapped[str] = mapped_column(KEY_ID)
-    attempts: Mapped[int] = mapped_column(Integer)
-    created_at: Mapped[datetime] = mapped_column(UtcDateTime)
-    due_at: Mapped[datetime] = mapped_column(UtcDateTime, index=True)
-    mac: Mapped[bytes | None] = mapped_column(MAC)
-
-
 class KnownCalibrationsRow(Base):
     """Calibrations of a contract that were served, in the order in which they came first."""
 

@@ -21,7 +21,6 @@ class SecretName(StrEnum):
     CHAIN = "audit-chain"
     PSEUDONYM = "pseudonym"
     RECEIPT = "receipt-signing"
-    IDEMPOTENCY = "idempotency"
     EXPORT = "export"
     STAND_INS = "stand-ins"
     LIFTS = "lifts"

@@ -115,14 +115,20 @@ class Standing:
         )
 
     def refuse_locked(self, status: AttemptsStatus | None) -> None:
-        """Raise :class:`LockedOut` where the subject is locked now."""
+        """Raise :class:`LockedOut` where the subject is locked now.
+
+        A lock that began later than now, by more than its own length, does not hold: the clock was
+        set back, and the lock would last until the earlier time comes again.
+        """
         if not self._policy.after or status is None:
             return
         if status.disabled_at is not None:
             raise LockedOut(None)
-        now = self._context.clock()
-        if status.locked_until is not None and now < status.locked_until:
-            raise LockedOut((status.locked_until - now).total_seconds())
+        now, until = self._context.clock(), status.locked_until
+        if until is None or now >= until:
+            return
+        if status.last_failed_at - now < until - status.last_failed_at:
+            raise LockedOut((until - now).total_seconds())
 
     def write(
         self, connection: Connection, row: Any, pseudonym: str, status: AttemptsStatus, line: int

@@ -15,7 +15,6 @@ from templates.store.audit_log import PROGRAM, By, Entry
 from templates.store.context import StoreContext
 from templates.store.cursors import close_cursor, open_cursor
 from templates.store.envelope import Owner, close_envelope
-from templates.store.idempotency import Answer, Claim, Idempotency
 from templates.store.identifiers import (
     InvalidIdentifier,
     UnknownTenant,
@@ -25,7 +24,6 @@ from templates.store.identifiers import (
 )
 from templates.store.lockout import Nonce
 from templates.store.nonces import Nonces
-from templates.store.outbox import EventType
 from templates.store.schema import FailedAttemptsRow, SubjectRow, TemplateRow, TenantRow
 from templates.store.subject_rows import (
     RECORD_COLUMNS,
@@ -91,17 +89,6 @@ class StoredTemplate:
 
 
 @dataclass(frozen=True)
-class Once:
-    """An enrollment under an idempotency key: its claim, and what is answered, and kept, for it.
-
-    What is kept holds no `held_template`.
-    """
-
-    claim: Claim
-    answer: Callable[[StoredTemplate], Answer]
-
-
-@dataclass(frozen=True)
 class StoredForm:
     """A subject's template as it is stored.
 
@@ -131,9 +118,8 @@ class SubjectPage:
 class Subjects:
     """Repository of subjects."""
 
-    def __init__(self, context: StoreContext, nonces: Nonces, idempotency: Idempotency) -> None:
+    def __init__(self, context: StoreContext, nonces: Nonces) -> None:
         self._context = context
-        self._idempotency = idempotency
         self._nonces = nonces
 
     def put(
@@ -153,7 +139,6 @@ class Subjects:
         rotation_epoch: int | None = None,
         storage: Storage = Storage.SERVICE,
         precondition: Precondition | None = None,
-        once: Once | None = None,
         guard: Guard | None = None,
         nonce: Nonce | None = None,
         by: By = PROGRAM,
@@ -178,10 +163,7 @@ class Subjects:
         storage
             Who keeps the sealed template. A holder's is returned, and all but it is stored.
         precondition
-            What may be replaced; whatever there is by default. What an earlier run of the same
-            request wrote may be, too.
-        once
-            Where it has an idempotency key: its answer is kept in the same transaction.
+            What may be replaced; whatever there is by default.
         guard
             Called in the transaction with its connection and the subject's pseudonyms, before
             anything is written. What it raises takes the enrollment back; what it returns goes
@@ -196,8 +178,6 @@ class Subjects:
         InvalidIdentifier, UnknownTenant, StoreError, StoreUnavailable
         EnrollmentConflict
             If the subject does not meet the precondition.
-        IdempotencyConflict
-            If another run of the same request has taken over.
         Replayed
             If the nonce was used before.
 
@@ -229,8 +209,7 @@ class Subjects:
             enrolled_pk = subject_pk_of(connection, tenant_id, subject_id)
             if precondition is not None:
                 enrolled = connection.execute(_TEMPLATE_ID, {"pk": enrolled_pk}).scalar()
-                written = None if once is None else once.claim.written
-                if enrolled not in {precondition.template_id, written or precondition.template_id}:
+                if enrolled != precondition.template_id:
                     raise EnrollmentConflict(enrolled)
             nonce_digest = None if nonce is None else self._nonces.use(connection, nonce)
             guard_entry = None if guard is None else guard(connection, pseudonyms)
@@ -268,26 +247,11 @@ class Subjects:
                 "enroll", outcome, by, tenant, pseudonym, detail=detail, nonce=nonce_digest
             )
             context.audit_log.append(connection, entry)
-            context.outbox.add(
-                connection,
-                EventType.ENROLLED,
-                tenant_id=tenant_id,
-                tenant=tenant,
-                pseudonym=pseudonym,
-                subject_id=subject_id,
-                template_id=template_id,
-                replaced=not is_new,
-            )
-            if once is not None and is_held:
-                self._idempotency.note_written(connection, once.claim, template_id)
-            elif once is not None:
-                answer = once.answer(StoredTemplate(template_id, is_new))
-                self._idempotency.finish(connection, once.claim, answer)
             return StoredTemplate(template_id, is_new, envelope.ciphertext if is_held else None)
 
         stored = context.write(work, lock=subject_lock(tenant, subject_id))
         if not stored.created:
-            context.database.try_purge_log()
+            context.database.purge_log()
         return stored
 
     def get(

@@ -31,7 +31,6 @@ from templates.store.schema import (
     ApiKeyRow,
     Base,
     FailedAttemptsRow,
-    IdempotencyRow,
     RotationKeyRow,
     SubjectRow,
     TemplateRow,
@@ -97,12 +96,6 @@ _IN_BATCHES = (
         lambda tenant_id: FailedAttemptsRow.tenant_id == tenant_id,
     ),
     _Records(
-        ("idempotency_records",),
-        IdempotencyRow,
-        [IdempotencyRow.tenant_id, IdempotencyRow.actor, IdempotencyRow.key_hash],
-        lambda tenant_id: IdempotencyRow.tenant_id == tenant_id,
-    ),
-    _Records(
         ("nonces",),
         UsedNonceRow,
         [UsedNonceRow.api_key_id, UsedNonceRow.nonce_hash],
@@ -164,7 +157,7 @@ class TenantErasures:
             receipt, erased = context.write_alone(
                 lambda connection: self._finish(connection, tenant_id, tenant, by)
             )
-        return TenantErasure(receipt, erased, log_purged=context.database.try_purge_log())
+        return TenantErasure(receipt, erased, log_purged=context.database.purge_log())
 
     def held(self, tenant: str) -> ErasedTenant:
         """Count what there is of a tenant now; :class:`UnknownTenant` where there is none."""

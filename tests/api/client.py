@@ -35,7 +35,7 @@ def signed(path: str, authorization: str, options: dict[str, Any]) -> dict[str, 
     probe = _probe_of(body)
     if probe is None:
         return options
-    level = body.get("level", (options.get("params") or {}).get("level"))
+    level = body.get("level")
     if level is not None and not isinstance(level, str):
         return options
     fields = sign_probe(token, verifies[1], probe, level=level).fields()

@@ -106,7 +106,7 @@ def application(service: str, authorize: Authorize) -> Iterator[Application]:
             return self.rfile.read(int(self.headers.get("Content-Length", 0)))
 
         def passed_on(self) -> None:
-            names = ("Authorization", "Content-Type", "Idempotency-Key", "If-None-Match")
+            names = ("Authorization", "Content-Type", "If-None-Match")
             headers = {name: self.headers[name] for name in names if name in self.headers}
             response = upstream.request(
                 self.command, self.path, content=self.body(), headers=headers

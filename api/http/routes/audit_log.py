@@ -7,7 +7,7 @@ from starlette.responses import Response
 
 from api.http.answers import answer
 from api.http.auth import note_subject
-from api.http.deps import Administers, GateDep, RuntimeDep
+from api.http.deps import Administers, GateDep, Limit, RuntimeDep
 from api.http.openapi import EVERY_CALL, error_responses
 from api.http.schemas import AuditLine, AuditLogAnswer
 from api.http.values import iso_time
@@ -31,7 +31,7 @@ async def get_audit_log(
     caller: Administers,
     runtime: RuntimeDep,
     gate: GateDep,
-    limit: Annotated[int, Query(ge=1, le=1000, description="Lines on one page, at most.")] = 100,
+    limit: Limit = 100,
     cursor: Annotated[str | None, Query(description="`next_cursor` of the page before.")] = None,
     subject_id: Annotated[str | None, Query(description="Only lines on this subject.")] = None,
 ) -> Response:

@@ -4,7 +4,7 @@ from fastapi import APIRouter, Request
 from starlette.responses import Response
 
 from api.http.answers import answer
-from api.http.bodies import reject_unknown, sent_json, text_field
+from api.http.bodies import sent_json, text_field
 from api.http.challenges import new_challenge
 from api.http.deps import GateDep, RuntimeDep, Verifies
 from api.http.openapi import BODY, CHALLENGE_BODY, EVERY_CALL, error_responses
@@ -35,8 +35,7 @@ async def create_challenge(
     the token up.
     """
     async with gate.admitted(caller.prefix):
-        body = await sent_json(request, runtime.settings)
-    reject_unknown(body, ("subject_id",))
+        body = await sent_json(request, runtime.settings, ("subject_id",))
     subject = text_field(body.get("subject_id"), "subject_id", max_length=128)
     if subject is not None:
         checked_subject_id(subject)

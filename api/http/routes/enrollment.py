@@ -1,18 +1,18 @@
 """Enrollment: photos, or a client's template."""
 
 import base64
-from functools import partial
 from typing import Any
 
 from fastapi import APIRouter, Request
 from starlette.responses import Response
 
+from api.http.answers import answer
 from api.http.audit import by
 from api.http.auth import Caller
 from api.http.bodies import (
     Form,
     base64_field,
-    content_type,
+    is_form,
     parse_json,
     reject_unknown,
     sent_form,
@@ -21,28 +21,24 @@ from api.http.bodies import (
 from api.http.deps import (
     Enrolls,
     GateDep,
-    IdempotencyDep,
     RuntimeDep,
     SubjectDep,
-    query_of,
 )
 from api.http.errors import ApiError
-from api.http.holder_keys import FIELD, HolderKeyHeaderDep, digest, holder_key_of
-from api.http.idempotency import Outcome, kept_with, once, written
-from api.http.openapi import BODY, ENROLLMENT_BODY, EVERY_CALL, IDEMPOTENT, PHOTO, error_responses
-from api.http.preconditions import PreconditionDep, asked
+from api.http.holder_keys import FIELD, HolderKeyHeaderDep, holder_key_of, wiping
+from api.http.openapi import BODY, ENROLLMENT_BODY, EVERY_CALL, PHOTO, error_responses
+from api.http.preconditions import PreconditionDep, etag
 from api.http.schemas import EnrollmentAnswer
-from api.http.values import face_policy, one_of, storage_of
+from api.http.values import face_policy, storage_of
 from api.limits.admission import Gate
 from api.process.runtime import Runtime
 from enroll import Enrollment, Holder
 from models.quality import Quality
 from templates.decoys import Attributes
 from templates.store.audit_log import By
-from templates.store.idempotency import Claim
 from templates.store.lockout import Nonce
 from templates.store.subject_rows import Source, Storage
-from templates.store.subjects import Precondition, StoredTemplate
+from templates.store.subjects import Precondition
 
 router = APIRouter(prefix="/v1/subjects", tags=["subjects"])
 
@@ -50,7 +46,6 @@ CODES = (
     *EVERY_CALL,
     *BODY,
     *PHOTO,
-    *IDEMPOTENT,
     "too_many_images",
     "forbidden",
     "replayed",
@@ -78,7 +73,6 @@ async def enroll(
     subject: SubjectDep,
     runtime: RuntimeDep,
     gate: GateDep,
-    idempotency_key: IdempotencyDep,
     holder_key_header: HolderKeyHeaderDep,
     precondition: PreconditionDep,
 ) -> Response:
@@ -102,33 +96,32 @@ async def enroll(
     A token for this subject may stand in the place of the API key; the enrollment uses it up.
     """
     settings = runtime.settings
-    query = query_of(request, ("face",))
     if caller.subject_token is not None:
         precondition = caller.subject_token.precondition(precondition)
     async with gate.admitted(caller.prefix):
-        if content_type(request) == "multipart/form-data":
+        if is_form(request):
             runtime.required_pack()
             runtime.require_decoys()
-            form = await sent_form(request, settings, max_images=settings.max_images)
+            form = await sent_form(
+                request, settings, field="images", max_images=settings.max_images
+            )
             return await _enroll_photos(
                 request,
                 caller,
                 subject,
                 form,
-                query,
-                idempotency_key,
                 holder_key_header,
                 precondition,
             )
+        body = await sent_json(request, settings, ("template", "storage", FIELD), photos="images")
+        # After the fields: a caller that only forgot how to send a photo needs no further right.
         caller.require("embeddings")
-        body = await sent_json(request, settings)
         await gate.query(lambda: runtime.require_template_enrollment(caller.tenant))
-        reject_unknown([*body, *query], ("template", "storage", FIELD))
         template = base64_field(body.get("template"), "template", code="invalid_template")
         storage = storage_of(body)
         holder_key = holder_key_of(holder_key_header, body)
 
-        def work(claim: Claim | None) -> Outcome:
+        def work() -> dict[str, Any]:
             nonce = _unused_nonce(runtime, caller)
             epoch = runtime.epoch(caller.tenant)
             enrollment = runtime.enroller(caller.tenant, epoch).from_template(
@@ -143,29 +136,12 @@ async def enroll(
                 Source.TEMPLATE,
                 storage,
                 precondition,
-                claim,
                 nonce,
                 by(request),
             )
 
-        outcome = await once(
-            request,
-            caller,
-            idempotency_key,
-            operation="enroll-template",
-            asked=[
-                subject,
-                template,
-                *_named(storage),
-                *asked(precondition),
-                *digest(holder_key),
-            ],
-            subject=subject,
-            work=work,
-            run=partial(gate.compute, key=caller.prefix),
-            holder_key=holder_key,
-        )
-        return written(request, outcome)
+        body = await gate.compute(wiping(holder_key, work), key=caller.prefix)
+        return _written(request, body)
 
 
 async def _enroll_photos(
@@ -173,8 +149,6 @@ async def _enroll_photos(
     caller: Caller,
     subject: str,
     form: Form,
-    query: dict[str, str],
-    idempotency_key: str | None,
     holder_key_header: str | None,
     precondition: Precondition | None,
 ) -> Response:
@@ -183,11 +157,11 @@ async def _enroll_photos(
     pack, photos = runtime.required_pack(), form.images("images")
     reject_unknown(form.fields, ("attributes", "face", "storage", FIELD))
     storage = storage_of(form.fields)
-    policy = face_policy(one_of(form.fields, query, "face"))
+    policy = face_policy(form.fields.get("face"))
     attributes = parse_attributes(form.fields.get("attributes"))
     holder_key = holder_key_of(holder_key_header, form.fields)
 
-    def work(claim: Claim | None) -> Outcome:
+    def work() -> dict[str, Any]:
         nonce = _unused_nonce(runtime, caller)
         epoch = runtime.epoch(caller.tenant)
         enrollment = runtime.enroller(caller.tenant, epoch).from_photos(
@@ -207,32 +181,12 @@ async def _enroll_photos(
             Source.PHOTOS,
             storage,
             precondition,
-            claim,
             nonce,
             by(request),
         )
 
-    outcome = await once(
-        request,
-        caller,
-        idempotency_key,
-        operation="enroll-photos",
-        asked=[
-            subject,
-            str(policy),
-            attributes.gender or "",
-            attributes.race or "",
-            *_named(storage),
-            *asked(precondition),
-            *photos,
-            *digest(holder_key),
-        ],
-        subject=subject,
-        work=work,
-        run=partial(gate.compute, key=caller.prefix),
-        holder_key=holder_key,
-    )
-    return written(request, outcome)
+    body = await gate.compute(wiping(holder_key, work), key=caller.prefix)
+    return _written(request, body)
 
 
 def parse_attributes(text: str | None) -> Attributes:
@@ -275,8 +229,7 @@ def _unused_nonce(runtime: Runtime, caller: Caller) -> Nonce | None:
     Raises
     ------
     Replayed
-        Where the token was used or is late: before anything is decoded, and after a repeated
-        request had its answer.
+        Where the token was used or is late: before anything is decoded.
     """
     if caller.subject_token is None:
         return None
@@ -285,11 +238,6 @@ def _unused_nonce(runtime: Runtime, caller: Caller) -> Nonce | None:
     nonce = caller.subject_token.nonce
     runtime.store.nonces.require_unused(nonce)
     return nonce
-
-
-def _named(storage: Storage) -> list[str]:
-    """What a request asks for beside the default: records of earlier versions name nothing."""
-    return [] if storage is Storage.SERVICE else [storage.value]
 
 
 def _quality(quality: object) -> dict[str, Any]:
@@ -305,41 +253,40 @@ def _stored(
     source: Source,
     storage: Storage,
     precondition: Precondition | None,
-    claim: Claim | None,
     nonce: Nonce | None,
     who: By,
-) -> Outcome:
-    def outcome(stored: StoredTemplate) -> Outcome:
-        body: dict[str, Any] = {
-            "template_id": stored.template_id,
-            "contract_id": enrollment.contract_id,
-            "replaced": not stored.created,
-            "holder_key": enrollment.holder_salt is not None,
-            "images": [
-                {
-                    "index": result.index,
-                    "status": "used",
-                    "quality": _quality(result.quality),
-                }
-                for result in enrollment.per_photo
-            ],
-        }
-        if stored.held_template is not None:
-            body["held_template"] = base64.b64encode(stored.held_template).decode("ascii")
-        return Outcome(201 if stored.created else 200, body)
+) -> dict[str, Any]:
+    stored = runtime.put(
+        tenant,
+        subject,
+        epoch,
+        enrollment,
+        source=source,
+        photos=len(enrollment.per_photo),
+        storage=storage,
+        precondition=precondition,
+        nonce=nonce,
+        by=who,
+    )
+    body: dict[str, Any] = {
+        "template_id": stored.template_id,
+        "contract_id": enrollment.contract_id,
+        "replaced": not stored.created,
+        "holder_key": enrollment.holder_salt is not None,
+        "images": [
+            {"index": result.index, "status": "used", "quality": _quality(result.quality)}
+            for result in enrollment.per_photo
+        ],
+    }
+    if stored.held_template is not None:
+        body["held_template"] = base64.b64encode(stored.held_template).decode("ascii")
+    return body
 
-    return outcome(
-        runtime.put(
-            tenant,
-            subject,
-            epoch,
-            enrollment,
-            source=source,
-            photos=len(enrollment.per_photo),
-            storage=storage,
-            precondition=precondition,
-            once=kept_with(claim, outcome),
-            nonce=nonce,
-            by=who,
-        )
+
+def _written(request: Request, body: dict[str, Any]) -> Response:
+    return answer(
+        request,
+        body,
+        status=200 if body["replaced"] else 201,
+        headers={"ETag": etag(body["template_id"])},
     )

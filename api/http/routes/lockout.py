@@ -5,7 +5,7 @@ from starlette.responses import Response
 
 from api.http.answers import answer
 from api.http.audit import by
-from api.http.deps import Administers, GateDep, IdempotencyDep, RuntimeDep, SubjectDep
+from api.http.deps import Administers, GateDep, RuntimeDep, SubjectDep
 from api.http.errors import ApiError
 from api.http.openapi import EVERY_CALL, error_responses
 from api.http.schemas import LockoutAnswer, UnlockAnswer
@@ -53,12 +53,10 @@ async def unlock_subject(
     subject: SubjectDep,
     runtime: RuntimeDep,
     gate: GateDep,
-    _idempotency_key: IdempotencyDep,
 ) -> Response:
     """Right: `admin`. Forgets the failed attempts, and enables a subject that was disabled.
 
-    Idempotent by itself: an `Idempotency-Key` is accepted and changes nothing. Make sure first
-    that it was the subject who failed: after this, an attacker may try again too.
+    Make sure first that it was the subject who failed: after this, an attacker may try again too.
     """
     lifted = await gate.query(
         lambda: runtime.store.attempts.reset(caller.tenant, subject, by=by(request))

@@ -6,12 +6,12 @@ from fastapi import APIRouter, Request
 from starlette.responses import Response
 
 from api.http.answers import answer
-from api.http.bodies import content_type, reject_unknown, sent_form
-from api.http.deps import EnrollsOrVerifies, GateDep, RuntimeDep, query_of
-from api.http.errors import ApiError, plain_details
+from api.http.bodies import reject_unknown, sent_form
+from api.http.deps import EnrollsOrVerifies, GateDep, RuntimeDep
+from api.http.errors import plain_details
 from api.http.openapi import BODY, CHECK_BODY, CHECKED_PHOTO, EVERY_CALL, error_responses
 from api.http.schemas import PhotoCheckAnswer
-from api.http.values import face_policy, one_of
+from api.http.values import face_policy
 from api.process.metrics import step
 from models.errors import FaceError
 
@@ -35,16 +35,13 @@ async def check_photo(
     `usable` false.
     """
     settings = runtime.settings
-    query = query_of(request, ("face",))
     async with gate.admitted(caller.prefix):
-        if content_type(request) != "multipart/form-data":
-            raise ApiError("malformed_request", "send the photo as multipart/form-data")
         pack = runtime.required_pack()
         with step("body"):
-            form = await sent_form(request, settings, max_images=1)
+            form = await sent_form(request, settings, field="image", max_images=1)
         photo = form.images("image")[0]
         reject_unknown(form.fields, ("face",))
-        policy = face_policy(one_of(form.fields, query, "face"))
+        policy = face_policy(form.fields.get("face"))
 
         def work() -> dict[str, Any]:
             try:

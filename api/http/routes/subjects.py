@@ -7,7 +7,14 @@ from starlette.responses import Response
 
 from api.http.answers import answer
 from api.http.audit import by
-from api.http.deps import Enrolls, Erases, GateDep, IdempotencyDep, RuntimeDep, SubjectDep
+from api.http.deps import (
+    Enrolls,
+    Erases,
+    GateDep,
+    Limit,
+    RuntimeDep,
+    SubjectDep,
+)
 from api.http.errors import ApiError
 from api.http.openapi import EVERY_CALL, error_responses
 from api.http.preconditions import NoPreconditionDep, etag
@@ -31,7 +38,7 @@ async def list_subjects(
     caller: Enrolls,
     runtime: RuntimeDep,
     gate: GateDep,
-    limit: Annotated[int, Query(ge=1, le=1000, description="Subjects on one page.")] = 100,
+    limit: Limit = 100,
     cursor: Annotated[str | None, Query(description="`next_cursor` of the page before.")] = None,
     prefix: Annotated[
         str, Query(max_length=128, description="Only subjects whose ids begin so.")
@@ -84,13 +91,12 @@ async def erase_subject(
     subject: SubjectDep,
     runtime: RuntimeDep,
     gate: GateDep,
-    _idempotency_key: IdempotencyDep,
     _precondition: NoPreconditionDep,
 ) -> Response:
     """Right: `erase`. Erases template, metadata and data key; answers with a signed receipt.
 
-    Erasing again returns the same receipt, and after another enrollment it erases that one: an
-    `Idempotency-Key` is accepted and changes nothing. `If-Match` and `If-None-Match` are refused.
+    Erasing again returns the same receipt, and after another enrollment it erases that one.
+    `If-Match` and `If-None-Match` are refused.
     A key that also has `enroll` or `admin` is told of a subject that never was there; another one
     gets a receipt that says nothing was held.
     """
@@ -103,9 +109,10 @@ async def erase_subject(
             and store.erasures.receipt(caller.tenant, subject) is None
         ):
             raise ApiError("not_enrolled", "nobody was ever enrolled under this id")
-        return receipt_json(store.erasures.erase(caller.tenant, subject, by=by(request)).receipt)
+        erasure = store.erasures.erase(caller.tenant, subject, by=by(request))
+        request.state.log["log_purged"] = erasure.log_purged
+        return {**receipt_json(erasure.receipt), "log_purged": erasure.log_purged}
 
-    # No stored answer: after another enrollment it would claim an erasure that did not happen.
     return answer(request, await gate.query(work))
 
 

@@ -9,7 +9,7 @@ from starlette.responses import Response
 from api.http.answers import answer
 from api.http.audit import by
 from api.http.auth import CallerDep, note_subject
-from api.http.bodies import reject_unknown, sent_json, text_field
+from api.http.bodies import sent_json, text_field
 from api.http.deps import EnrollsOrVerifies, GateDep, RuntimeDep, SubjectDep
 from api.http.errors import ApiError
 from api.http.openapi import BODY, EVERY_CALL, TOKEN_BODY, error_responses
@@ -19,6 +19,8 @@ from api.http.values import iso_time
 from api.process.metrics import TOKENS
 from templates.store.audit_log import Entry
 from templates.store.identifiers import checked_subject_id
+
+FIELDS = ("subject_id", "action", "level", "lifetime_s", "replace")
 
 router = APIRouter(prefix="/v1", tags=["tokens"])
 
@@ -42,8 +44,7 @@ async def create_token(
     subject is enrolled or not. Ask with its `token_id` what came of it; never believe the page.
     """
     async with gate.admitted(caller.prefix):
-        body = await sent_json(request, runtime.settings)
-    reject_unknown(body, ("subject_id", "action", "level", "lifetime_s", "replace"))
+        body = await sent_json(request, runtime.settings, FIELDS)
     subject = text_field(body.get("subject_id"), "subject_id", max_length=128)
     if subject is None:
         raise _wrong("subject_id", "subject_id must be there")

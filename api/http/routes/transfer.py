@@ -1,7 +1,7 @@
 """Export and import of one subject, encrypted."""
 
 import base64
-from functools import partial
+from typing import Any
 
 from fastapi import APIRouter, Request
 from starlette.responses import Response
@@ -9,18 +9,15 @@ from starlette.responses import Response
 from api.http.answers import answer
 from api.http.audit import by
 from api.http.auth import note_subject
-from api.http.bodies import base64_field, reject_unknown, sent_json
-from api.http.deps import Exports, GateDep, IdempotencyDep, RuntimeDep, SubjectDep
+from api.http.bodies import base64_field, sent_json
+from api.http.deps import Exports, GateDep, RuntimeDep, SubjectDep
 from api.http.errors import ApiError
-from api.http.idempotency import Outcome, kept_with, once, written
-from api.http.openapi import BODY, EVERY_CALL, IDEMPOTENT, IMPORT_BODY, error_responses
-from api.http.preconditions import PreconditionDep, asked
+from api.http.openapi import BODY, EVERY_CALL, IMPORT_BODY, error_responses
+from api.http.preconditions import PreconditionDep, etag
 from api.http.schemas import ExportAnswer, ImportAnswer
 from api.http.transfer import open_export
-from templates.store.idempotency import Claim
 from templates.store.identifiers import checked_subject_id
 from templates.store.subject_rows import Source
-from templates.store.subjects import StoredTemplate
 
 router = APIRouter(prefix="/v1/subjects", tags=["transfer"])
 
@@ -74,7 +71,6 @@ async def export_subject(
         **error_responses(
             *EVERY_CALL,
             *BODY,
-            *IDEMPOTENT,
             "forbidden",
             "invalid_template",
             "contract_mismatch",
@@ -90,7 +86,6 @@ async def import_subject(
     caller: Exports,
     runtime: RuntimeDep,
     gate: GateDep,
-    idempotency_key: IdempotencyDep,
     precondition: PreconditionDep,
 ) -> Response:
     """Right: `export`. The template gets a new id, and a rotation of the importing tenant's.
@@ -103,8 +98,7 @@ async def import_subject(
     """
     settings = runtime.settings
     async with gate.admitted(caller.prefix):
-        body = await sent_json(request, settings)
-        reject_unknown(body, ("export", "restore"))
+        body = await sent_json(request, settings, ("export", "restore"))
         restore = body.get("restore", False)
         if not isinstance(restore, bool):
             raise ApiError(
@@ -129,7 +123,7 @@ async def import_subject(
             caller.tenant, exported.stamp, restore=restore, by=by(request)
         )
 
-        def work(claim: Claim | None) -> Outcome:
+        def work() -> dict[str, Any]:
             epoch = runtime.epoch(caller.tenant)
             enroller = runtime.enroller(caller.tenant, epoch)
             salt = exported.holder_salt
@@ -140,17 +134,6 @@ async def import_subject(
             else:
                 enrollment = enroller.from_template(exported.wire)
 
-            def outcome(stored: StoredTemplate) -> Outcome:
-                return Outcome(
-                    201 if stored.created else 200,
-                    {
-                        "template_id": stored.template_id,
-                        "contract_id": enrollment.contract_id,
-                        "replaced": not stored.created,
-                        "holder_key": salt is not None,
-                    },
-                )
-
             stored = runtime.put(
                 caller.tenant,
                 exported.subject_id,
@@ -159,20 +142,21 @@ async def import_subject(
                 source=Source(exported.source),
                 photos=exported.photos,
                 precondition=precondition,
-                once=kept_with(claim, outcome),
                 by=by(request),
                 guard=guard,
             )
-            return outcome(stored)
+            return {
+                "template_id": stored.template_id,
+                "contract_id": enrollment.contract_id,
+                "replaced": not stored.created,
+                "holder_key": salt is not None,
+                "subject_id": exported.subject_id,
+            }
 
-        imported = await once(
-            request,
-            caller,
-            idempotency_key,
-            operation="import",
-            asked=[data, *(["restore"] if restore else []), *asked(precondition)],
-            subject=exported.subject_id,
-            work=work,
-            run=partial(gate.compute, key=caller.prefix),
-        )
-        return written(request, imported, add={"subject_id": exported.subject_id})
+        body = await gate.compute(work, key=caller.prefix)
+    return answer(
+        request,
+        body,
+        status=200 if body["replaced"] else 201,
+        headers={"ETag": etag(body["template_id"])},
+    )

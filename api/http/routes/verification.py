@@ -10,9 +10,7 @@ no more are answered than of requests that come one after the other.
 """
 
 import contextlib
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 from fastapi import APIRouter, Request
@@ -21,11 +19,10 @@ from starlette.responses import Response
 from api.http.answers import answer
 from api.http.audit import by
 from api.http.auth import Caller
-from api.http.deps import GateDep, IdempotencyDep, RuntimeDep, SubjectDep, Verifies, query_of
+from api.http.deps import GateDep, RuntimeDep, SubjectDep, Verifies
 from api.http.errors import ApiError
-from api.http.holder_keys import HolderKeyHeaderDep, digest
-from api.http.idempotency import Outcome, once, replay_header
-from api.http.openapi import BODY, EVERY_CALL, IDEMPOTENT, PHOTO, VERIFY_BODY, error_responses
+from api.http.holder_keys import HolderKeyHeaderDep, wiping
+from api.http.openapi import BODY, EVERY_CALL, PHOTO, VERIFY_BODY, error_responses
 from api.http.probes import Probe, sent_probe
 from api.http.schemas import VerifyAnswer
 from api.process.metrics import count_decision, step
@@ -33,7 +30,6 @@ from api.process.runtime import Runtime
 from templates.errors import ContractMismatch
 from templates.store.attempts import Attempt
 from templates.store.audit_log import By
-from templates.store.idempotency import Answer, Claim
 from templates.store.lockout import Superseded
 from templates.store.tenants import RetiredRotation
 from verify import (
@@ -44,9 +40,6 @@ from verify import (
 )
 
 router = APIRouter(prefix="/v1/subjects", tags=["subjects"])
-
-Kept = Callable[[Decision], tuple[Claim, Answer] | None]
-"""What the store keeps of a decision under an idempotency key; None without one."""
 
 DECISIONS = 3
 """Times that a probe is decided while others may replace the template before the record; then they
@@ -66,7 +59,6 @@ CODES = (
     "uncalibrated",
     "replayed",
     "locked_out",
-    *IDEMPOTENT,
 )
 
 
@@ -85,7 +77,6 @@ async def verify(
     runtime: RuntimeDep,
     gate: GateDep,
     holder_key_header: HolderKeyHeaderDep,
-    idempotency_key: IdempotencyDep,
 ) -> Response:
     """Rights: `verify`, and `embeddings` for a probe that is not a photo.
 
@@ -111,51 +102,27 @@ async def verify(
     that is missing, altered, replaced or another subject's is a rejection; where the service
     stores the template, it changes nothing.
 
-    A token for this subject may stand in the place of the API key; the decision uses it up. With
-    a token an `Idempotency-Key` is taken: the same request gets the same answer once more.
+    A token for this subject may stand in the place of the API key; the decision uses it up.
     """
-    query = query_of(request, ("level", "face"))
     async with gate.admitted(caller.prefix):
         with step("body"):
-            probe = await sent_probe(request, runtime, caller, subject, query, holder_key_header)
+            probe = await sent_probe(request, runtime, caller, subject, holder_key_header)
 
-        def work(claim: Claim | None) -> Outcome:
-            def kept(decision: Decision) -> tuple[Claim, Answer] | None:
-                if claim is None:
-                    return None
-                return claim, Outcome(200, _body(decision, caller)).to_keep()
-
+        def work() -> Decision:
             if caller.subject_token is not None:
                 # Once more: the body and the turn to compute may have taken a while.
                 caller.subject_token.require_in_time()
-            decision = _decide_and_record(runtime, caller, subject, probe, kept, by(request))
-            return Outcome(200, _body(decision, caller))
+            return _decide_and_record(runtime, caller, subject, probe, by(request))
 
-        outcome = await once(
-            request,
-            caller,
-            # A browser that lost its answer has no other token. An answer to an API key may hold
-            # a distance, which is not kept.
-            None if caller.subject_token is None else idempotency_key,
-            operation="verify",
-            asked=[subject, *probe.asked, *digest(probe.holder_key)],
-            subject=subject,
-            work=work,
-            run=partial(gate.compute, key=caller.prefix),
-            holder_key=probe.holder_key,
-        )
-    body = outcome.body
+        decision = await gate.compute(wiping(probe.holder_key, work), key=caller.prefix)
+    body = _body(decision, caller)
     request.state.log["security_level"] = body["level"]
     request.state.log["decision"] = body["decision"]
     request.state.log["liveness"] = body["liveness"]
-    if not outcome.replayed:
-        count_decision(
-            accepted=body["decision"] == "accept",
-            reason=body["reason"],
-            level=body["level"],
-            probe=probe.kind,
-        )
-    return answer(request, body, headers=replay_header(outcome))
+    count_decision(
+        accepted=decision.accepted, reason=decision.reason, level=decision.level, probe=probe.kind
+    )
+    return answer(request, body)
 
 
 def _body(decision: Decision, caller: Caller) -> dict[str, Any]:
@@ -176,7 +143,7 @@ def _body(decision: Decision, caller: Caller) -> dict[str, Any]:
 
 
 def _decide_and_record(
-    runtime: Runtime, caller: Caller, subject: str, probe: Probe, kept: Kept, who: By
+    runtime: Runtime, caller: Caller, subject: str, probe: Probe, who: By
 ) -> Decision:
     """Decide and record; a template that was replaced or erased meanwhile accepts nobody."""
     attempts, contract_ids = runtime.store.attempts, runtime.contract.binding.contract_ids
@@ -207,7 +174,6 @@ def _decide_and_record(
                     contract_ids=contract_ids,
                     level=decision.level,
                     nonce=probe.nonce,
-                    kept=kept(decision),
                     by=who,
                 )
             return decision
@@ -218,7 +184,6 @@ def _decide_and_record(
         contract_ids=contract_ids,
         nonce=probe.nonce,
         held_template=probe.held_template,
-        kept=kept,
         by=who,
     )
 

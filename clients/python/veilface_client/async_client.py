@@ -110,10 +110,9 @@ class AsyncSession:
         exported: str | results.Export,
         *,
         restore: bool = False,
-        idempotency_key: str | None = None,
     ) -> results.Imported:
         """Import what :meth:`export` returned."""
-        return await self._send(calls.import_(exported, restore=restore, key=idempotency_key))
+        return await self._send(calls.import_(exported, restore=restore))
 
     async def create_token(
         self,
@@ -187,7 +186,6 @@ class AsyncClient(AsyncSession):
         storage: Storage | None = None,
         holder_key: bytes | None = None,
         replace: bool | str = True,
-        idempotency_key: str | None = None,
     ) -> results.Enrollment:
         """Enroll a subject, or replace its enrollment."""
         return await self._run(
@@ -200,7 +198,6 @@ class AsyncClient(AsyncSession):
                 storage=storage,
                 holder_key=holder_key,
                 replace=replace,
-                key=idempotency_key,
             )
         )
 

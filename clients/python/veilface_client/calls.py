@@ -6,7 +6,6 @@ Nothing here does I/O.
 import base64
 import json
 import re
-import secrets
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
@@ -26,7 +25,6 @@ Storage = Literal["service", "holder"]
 Action = Literal["verify", "enroll"]
 
 _SUBJECT = re.compile(r"[A-Za-z0-9._@:-]{1,128}")
-_KEY = re.compile(r"[\x21-\x7e]{1,255}")
 _TEMPLATE_ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
 
@@ -65,14 +63,6 @@ def subject_path(subject: str, rest: str = "") -> str:
     return f"/v1/subjects/{subject}{rest}"
 
 
-def idempotency(key: str | None) -> dict[str, str]:
-    """Return the header of a write: the caller's key, or one that is made for this call."""
-    key = secrets.token_urlsafe(24) if key is None else key
-    if not _KEY.fullmatch(key):
-        raise ValueError("an idempotency key has 1 to 255 visible ASCII characters")
-    return {"Idempotency-Key": key}
-
-
 def precondition(replace: bool | str) -> dict[str, str]:
     """Return the header that says what an enrollment may replace; none where it is anything."""
     if replace is True:
@@ -84,6 +74,11 @@ def precondition(replace: bool | str) -> dict[str, str]:
     return {"If-Match": f'"{replace}"'}
 
 
+def _resend(replace: bool | str) -> Resend:
+    """An enrollment that may replace only something would meet what its first sending wrote."""
+    return Resend.WHEN_LOST if replace is True else Resend.WHEN_NOT_DONE
+
+
 def enroll_photos(
     subject: str,
     photos: Sequence[bytes],
@@ -93,7 +88,6 @@ def enroll_photos(
     storage: Storage | None,
     holder_key: bytes | None,
     replace: bool | str,
-    key: str | None,
 ) -> Call[results.Enrollment]:
     """Enroll by photos."""
     fields = _fields(attributes=None if attributes is None else json.dumps(dict(attributes)))
@@ -104,13 +98,14 @@ def enroll_photos(
             **_fields(face=face, storage=storage),
             **holder_key_field(holder_key),
         },
-        "headers": {**idempotency(key), **precondition(replace)},
+        "headers": precondition(replace),
     }
     return Call(
         "PUT",
         subject_path(subject, "/enrollment"),
         lambda answer: parse(results.Enrollment, answer),
         lambda: content,
+        _resend(replace),
     )
 
 
@@ -121,19 +116,19 @@ def enroll_template(
     storage: Storage | None,
     holder_key: bytes | None,
     replace: bool | str,
-    key: str,
 ) -> Call[results.Enrollment]:
     """Enroll by a private template."""
     body = {"template": base64.b64encode(template).decode("ascii")}
     content = {
         "json": {**body, **_fields(storage=storage), **holder_key_field(holder_key)},
-        "headers": {**idempotency(key), **precondition(replace)},
+        "headers": precondition(replace),
     }
     return Call(
         "PUT",
         subject_path(subject, "/enrollment"),
         lambda answer: parse(results.Enrollment, answer),
         lambda: content,
+        _resend(replace),
     )
 
 
@@ -286,18 +281,16 @@ def export(subject: str) -> Call[results.Export]:
     return Call("GET", path, lambda answer: parse(results.Export, answer))
 
 
-def import_(
-    exported: str | results.Export, *, restore: bool, key: str | None
-) -> Call[results.Imported]:
+def import_(exported: str | results.Export, *, restore: bool) -> Call[results.Imported]:
     """Import what was exported."""
     text = exported.export if isinstance(exported, results.Export) else exported
     body = {"export": text, "restore": True} if restore else {"export": text}
-    content = {"json": body, "headers": idempotency(key)}
     return Call(
         "POST",
         "/v1/subjects/import",
         lambda answer: parse(results.Imported, answer),
-        lambda: content,
+        lambda: {"json": body},
+        Resend.WHEN_NOT_DONE,  # what went in already would be refused
     )
 
 
@@ -315,8 +308,7 @@ _Parsed = TypeVar("_Parsed", bound=results.Answer)
 
 
 def _erasing(path: str, model: type[_Parsed]) -> Call[_Parsed]:
-    headers = idempotency(None)
-    return Call("DELETE", path, lambda answer: parse(model, answer), lambda: {"headers": headers})
+    return Call("DELETE", path, lambda answer: parse(model, answer))
 
 
 def _file(photo: bytes) -> tuple[str, bytes, str]:

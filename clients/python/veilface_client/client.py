@@ -125,14 +125,13 @@ class Session:
         exported: str | results.Export,
         *,
         restore: bool = False,
-        idempotency_key: str | None = None,
     ) -> results.Imported:
         """Import what :meth:`export` returned. Right: ``export``.
 
         One that is older than the subject's last enrollment or erasure is a :class:`Conflict`,
         unless ``restore`` is set, which takes the right ``admin`` too.
         """
-        return self._send(calls.import_(exported, restore=restore, key=idempotency_key))
+        return self._send(calls.import_(exported, restore=restore))
 
     def create_token(
         self,
@@ -213,7 +212,6 @@ class Client(Session):
         storage: Storage | None = None,
         holder_key: bytes | None = None,
         replace: bool | str = True,
-        idempotency_key: str | None = None,
     ) -> results.Enrollment:
         """Enroll a subject, or replace its enrollment. Right: ``enroll``.
 
@@ -234,11 +232,8 @@ class Client(Session):
             the service does not keep. Who loses it enrolls again.
         replace
             What may be replaced: whatever there is, nothing (False), or the enrollment of this
-            ``template_id`` only; otherwise :class:`EnrollmentConflict`. With ``False`` and
-            ``storage="holder"`` a lost answer cannot be had again: the next sending conflicts.
-        idempotency_key
-            Of this one logical write; made anew for each call where it is not given. With
-            ``storage="holder"`` each sending enrolls again, and the last answer counts.
+            ``template_id`` only; otherwise :class:`EnrollmentConflict`. A lost answer is then not
+            asked for again: look with :meth:`describe` what is enrolled.
         """
         return self._run(
             flows.enroll(
@@ -250,7 +245,6 @@ class Client(Session):
                 storage=storage,
                 holder_key=holder_key,
                 replace=replace,
-                key=idempotency_key,
             )
         )
 

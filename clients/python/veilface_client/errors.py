@@ -13,7 +13,6 @@
     │   ├── Conflict
     │   │   ├── ContractMismatch
     │   │   ├── EnrollmentConflict
-    │   │   └── IdempotencyConflict
     │   ├── LockedOut           wait .retry_after, and offer another factor
     │   ├── RateLimited
     │   └── ServerFailed        a defect of the service
@@ -126,10 +125,6 @@ class EnrollmentConflict(Conflict):
     """The subject has another template than may be replaced; ``details["template_id"]`` is it."""
 
 
-class IdempotencyConflict(Conflict):
-    """The idempotency key was used for another request, or that one still runs."""
-
-
 class LockedOut(ServiceError):
     """Too many failed attempts on the subject; ``details["disabled"]``: an operator must act."""
 
@@ -202,7 +197,6 @@ FAMILIES: dict[str, type[ServiceError]] = {
     "not_found": NotFound,
     "method_not_allowed": InvalidRequest,
     "contract_mismatch": ContractMismatch,
-    "idempotency_conflict": IdempotencyConflict,
     "enrollment_conflict": EnrollmentConflict,
     "export_superseded": Conflict,
     "template_not_stored": Conflict,

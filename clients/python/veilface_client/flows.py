@@ -97,7 +97,6 @@ def enroll(
     storage: Storage | None,
     holder_key: bytes | None,
     replace: bool | str,
-    key: str | None,
 ) -> Flow[results.Enrollment]:
     """Enroll by photos."""
     pictures: list[bytes] = yield Work(lambda: read_photos(photos))
@@ -109,7 +108,6 @@ def enroll(
         storage=storage,
         holder_key=holder_key,
         replace=replace,
-        key=key,
     )
     return (yield from send(call, retries))
 

@@ -1,7 +1,5 @@
 """What a client has lifted: templates that enroll, and probes; no photo, and no embedding."""
 
-import hashlib
-import secrets
 from typing import Self
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -31,16 +29,4 @@ class Probe(_Lift):
 
 
 class Enrollable(_Lift):
-    """A template that enrolls, lifted and not yet (or perhaps) sent: no photo, no embedding.
-
-    Attributes
-    ----------
-    idempotency_key
-        Makes its enrollment one write, however often it is sent.
-    """
-
-    idempotency_key: str = Field(default_factory=lambda: secrets.token_urlsafe(24))
-
-    def key_for(self, subject: str) -> str:
-        """Return the ``Idempotency-Key`` of a subject: another subject is another write."""
-        return hashlib.sha256(f"{self.idempotency_key}/{subject}".encode()).hexdigest()
+    """A template that enrolls, lifted and not yet (or perhaps) sent: no photo, no embedding."""

@@ -136,14 +136,12 @@ def _enroll(
     holder_key: bytes | None,
     replace: bool | str,
 ) -> Flow[results.Enrollment]:
-    key = lift.key_for(subject)
     call = calls.enroll_template(
         subject,
         lift.template,
         storage=storage,
         holder_key=holder_key,
         replace=replace,
-        key=key,
     )
     return (yield from _send(call, lift, retries))
 

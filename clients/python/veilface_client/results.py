@@ -188,11 +188,13 @@ class _Verbatim(Answer):
 class Receipt(_Verbatim):
     """The signed receipt of an erasure. ``claims`` is for reading; ``receipt`` is what is signed.
 
-    ``raw`` is the answer as it came: ``veilface keys verify-receipt`` takes it.
+    ``raw`` is the answer as it came: ``veilface keys verify-receipt`` takes it. ``log_purged`` is
+    False where SQLite's log still holds old pages, which a later purge removes.
     """
 
     receipt: SignedText
     claims: dict[str, Any]
+    log_purged: bool
 
     @property
     def held(self) -> bool:

@@ -1,18 +1,20 @@
 """When a call is sent again, and after how long.
 
-======================================  ================  ==========================
-what happened                           verifications     all other calls
-======================================  ================  ==========================
-the connection was never made           again             again
-``overloaded``, ``rate_limited``        again             again
-the answer was lost or took too long    **no**            again, same idempotency key
-``store_unavailable``, 502, 503, 504    **no**            again, same idempotency key
-``idempotency_conflict`` of a resend    –                 again: the first still runs
-``locked_out``, everything else         no                no
-======================================  ================  ==========================
+======================================  ===================  ===============
+what happened                           verifications,       all other calls
+                                        conditional writes
+======================================  ===================  ===============
+the connection was never made           again                again
+``overloaded``, ``rate_limited``        again                again
+the answer was lost or took too long    **no**               again
+``store_unavailable``, 502, 503, 504    **no**               again
+``locked_out``, everything else         no                   no
+======================================  ===================  ===============
 
 A verification whose answer was lost may have been decided, and a rejection counts on the subject's
-lockout: sending it again would count twice. ``model_unavailable`` is no matter of waiting.
+lockout: sending it again would count twice. A write that may replace only something, or nothing,
+and an import, would be refused for what their own first sending wrote. ``model_unavailable`` is no
+matter of waiting.
 """
 
 import random
@@ -21,13 +23,10 @@ from dataclasses import dataclass
 from veilface_client.calls import Resend
 from veilface_client.errors import (
     ConnectionFailed,
-    IdempotencyConflict,
     RateLimited,
     Unavailable,
     VeilfaceError,
 )
-
-_CONFLICT_WAIT_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -64,11 +63,9 @@ class Retries:
         """
         if resend is Resend.NEVER or sending >= self.sendings:
             return None
-        if not _heals(error, again=sending > 1, resend=resend):
+        if not _heals(error, resend):
             return None
         told = getattr(error, "retry_after", None)
-        if told is None and isinstance(error, IdempotencyConflict):
-            told = _CONFLICT_WAIT_S
         if told is not None and told > self.patience_s:
             return None
         spread = min(self.longest_s, self.first_s * 2.0 ** (sending - 1))
@@ -79,7 +76,7 @@ class Retries:
 DEFAULT_RETRIES = Retries()
 
 
-def _heals(error: VeilfaceError, *, again: bool, resend: Resend) -> bool:
+def _heals(error: VeilfaceError, resend: Resend) -> bool:
     lost_is_safe = resend is Resend.WHEN_LOST
     if isinstance(error, ConnectionFailed):
         return lost_is_safe or not error.sent
@@ -89,4 +86,4 @@ def _heals(error: VeilfaceError, *, again: bool, resend: Resend) -> bool:
         if error.code == "overloaded":
             return True
         return lost_is_safe and error.code != "model_unavailable"
-    return isinstance(error, IdempotencyConflict) and again and lost_is_safe
+    return False

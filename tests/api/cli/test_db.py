@@ -26,8 +26,6 @@ def test_upgrade_check_and_current(tmp_path):
     assert upgraded.json == {
         "before": None,
         "after": head_revision(),
-        "authenticated": 0,
-        "refused_keys": [],
     }
     assert "up to date" in run("db", "upgrade", *where).stdout
     assert run("db", "check", *where).status == 0
@@ -149,10 +147,14 @@ def test_purge_erases_who_is_due(opened):
         )
     connection.close()
     keep = ("--retention-days", "30", *where, "--json")
-    assert run("db", "purge", *where, "--json").json == {"due": 0, "erased": 0}
-    assert run("db", "purge", "--dry-run", *keep).json == {"due": 1, "erased": 0}
+    assert run("db", "purge", *where, "--json").json == {"due": 0, "erased": 0, "log_purged": True}
+    assert run("db", "purge", "--dry-run", *keep).json == {
+        "due": 1,
+        "erased": 0,
+        "log_purged": True,
+    }
     assert store.subjects.describe("default", "old") is not None
-    assert run("db", "purge", *keep).json == {"due": 1, "erased": 1}
+    assert run("db", "purge", *keep).json == {"due": 1, "erased": 1, "log_purged": True}
     assert store.subjects.describe("default", "old") is None
     assert store.subjects.describe("default", "new") is not None
     assert store.erasures.receipt("default", "old") is not None

@@ -107,7 +107,7 @@ def test_it_says_what_is_left_to_do(used: tuple[Path, dict[str, Any]], tmp_path:
         "Enroll these 2 subjects of tenant default again, with new photos:\n    ada\n    bob\n",
         "veilface keys rotate-tenant --tenant default --stolen --finish",
         f"veilface keys replace {key.prefix} --grace-hours 0",
-        "audit-chain, export, idempotency, pseudonym, receipt-signing, stand-ins",
+        "audit-chain, export, pseudonym, receipt-signing, stand-ins",
     ):
         assert said in ran.stdout
     assert_renewed_once(data, known)

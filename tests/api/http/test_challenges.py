@@ -198,9 +198,12 @@ def test_why_is_told_to_keys_with_scores_only(active: Service) -> None:
     assert liveness(answer) == ("reject", "liveness", "failed", None)
 
 
-def test_a_late_answer_is_refused(active: Service, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("lifetime_s", [-2, 86_400])
+def test_an_answer_that_is_late_or_from_before_a_clock_was_set_back_is_refused(
+    active: Service, lifetime_s: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     client, _ = active
-    monkeypatch.setattr(challenges, "LIFETIME", timedelta(seconds=-2))
+    monkeypatch.setattr(challenges, "LIFETIME", timedelta(seconds=lifetime_s))
     late = challenge(client)
     frames = frames_of(performed(late["movements"]))
     monkeypatch.undo()

@@ -87,7 +87,7 @@ def test_every_operation_is_described(document: dict[str, Any]) -> None:
 
 def test_every_operation_documents_its_codes_with_examples(document: dict[str, Any]) -> None:
     seen = set()
-    for (method, path), operation in operations(document).items():
+    for (_, path), operation in operations(document).items():
         codes = {}
         for status, response in operation["responses"].items():
             if int(status) < 400:
@@ -104,11 +104,6 @@ def test_every_operation_documents_its_codes_with_examples(document: dict[str, A
             assert {"unauthorized", "store_unavailable"} <= set(codes)
         if "{subject_id}" in path:
             assert "validation_failed" in codes
-        if method in ("PUT", "DELETE") or path.endswith("/import"):
-            # DELETE is idempotent by itself: the header is taken, and no answer is kept.
-            assert ("idempotency_conflict" in codes) == (method != "DELETE")
-            parameters = [entry["name"] for entry in operation["parameters"]]
-            assert "idempotency-key" in [name.lower() for name in parameters]
         seen |= set(codes)
     # The last two have no operation of their own: they are the framework's.
     assert set(ERROR_CODES) - seen == {"method_not_allowed"}

@@ -18,7 +18,6 @@ PRODUCT_CODES = {
     405: {"method_not_allowed"},
     409: {
         "contract_mismatch",
-        "idempotency_conflict",
         "enrollment_conflict",
         "export_superseded",
         "template_not_stored",

@@ -228,32 +228,6 @@ def _lifted(deployment: Deployment) -> bytes:
     return wire.encode(template, contract_id=deployment.contract.contract_id, dtype="float32")
 
 
-def test_the_same_key_enrolls_again(both: tuple[Client, Deployment]) -> None:
-    """Its answer holds what the store must not keep, not even for a day."""
-    client, deployment = both
-    token = deployment.key("verify")
-    headers = {"Idempotency-Key": "key-1"}
-    first, second = (hold(client, "alice", 1, headers=headers) for _ in range(2))
-    assert attempt(client, token, "alice", 1, first)["decision"] == "reject"
-    assert attempt(client, token, "alice", 1, second)["decision"] == "accept"
-    # What is kept of the answer is the template's id.
-    query = sa.text("SELECT status, body FROM idempotency")
-    read = client.app.state.runtime.store.database.read
-    status, body = read(lambda each: each.execute(query).one())
-    described = client.get("/v1/subjects/alice").json()
-    assert (status, bytes(body)) == (None, described["template_id"].encode())
-    # It meets no precondition of its own.
-    never = {"Idempotency-Key": "key-2", "If-None-Match": "*"}
-    third, fourth = (hold(client, "bob", 1, headers=never) for _ in range(2))
-    assert attempt(client, token, "bob", 1, third)["decision"] == "reject"
-    assert attempt(client, token, "bob", 1, fourth)["decision"] == "accept"
-    # A kept answer is still one of its own request only.
-    stored = {"files": images(photo(1), photo(1, 1)), "headers": headers}
-    assert client.put("/v1/subjects/alice/enrollment", **stored).is_success
-    held = client.put("/v1/subjects/alice/enrollment", **stored, data={"storage": "holder"})
-    assert_error(held, 409, "idempotency_conflict")
-
-
 def test_without_the_template_a_subject_looks_like_none(
     client: Client, deployment: Deployment
 ) -> None:

@@ -2,7 +2,6 @@
 
 import base64
 import os
-import secrets
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -210,28 +209,6 @@ def test_the_key_stands_in_one_place(client: Client) -> None:
     path, photos = "/v1/subjects/once/verify", images(photo(1, 9), name="image")
     answer = client.post(path, files=photos, data={"holder_key": KEY}, headers={HEADER: KEY})
     assert_error(answer, 422, "validation_failed")
-    for method, where in (("POST", path), ("PUT", "/v1/subjects/once/enrollment")):
-        answer = client.request(method, where, params={"holder_key": KEY}, files=photos)
-        assert_error(answer, 422, "validation_failed")
-        assert KEY not in answer.text
-
-
-def test_a_repeated_enrollment_with_another_key_is_a_conflict(client: Client) -> None:
-    """The stored answer would say that a key is needed, and not that it is the one before."""
-    headers = {"Idempotency-Key": secrets.token_hex(8)}
-
-    def send(key: str) -> Any:
-        return client.put(
-            "/v1/subjects/idempotent/enrollment",
-            files=images(photo(1)),
-            data={"holder_key": key},
-            headers=headers,
-        )
-
-    assert send(KEY).status_code == 201
-    assert send(KEY).headers["Idempotency-Replayed"] == "true"
-    assert_error(send(OTHER), 409, "idempotency_conflict")
-    assert decided(client, "idempotent", KEY) == "accept"
 
 
 def test_renewed_rotations_and_master_keys_need_the_same_key(

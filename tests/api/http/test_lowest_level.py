@@ -92,11 +92,9 @@ def asker(running: tuple[Client, Deployment], kind: str) -> Ask:
     client, deployment = running
     probe = probes(deployment)[kind]
 
-    def ask(headers: dict[str, str], level: str | None = None, *, query: bool = False) -> Any:
+    def ask(headers: dict[str, str], level: str | None = None) -> Any:
         if level is None:
             options = probe
-        elif query:
-            options = {**probe, "params": {"level": level}}
         elif kind == "photo":
             options = {**probe, "data": {"level": level}}
         else:
@@ -118,10 +116,9 @@ def test_what_is_below_the_level_of_the_deployment_is_forbidden(
     for lowest_of_key in (None, LAX):
         headers = key(strict_service[1], lowest_of_key)
         for level in (LAX, "accuracy"):
-            for query in (False, True):
-                answer = ask(headers, level, query=query)
-                assert assert_error(answer, 403, "forbidden") == {"lowest_level": STRICT}
-                assert f"{level} is below {STRICT}" in answer.json()["error"]["message"]
+            answer = ask(headers, level)
+            assert assert_error(answer, 403, "forbidden") == {"lowest_level": STRICT}
+            assert f"{level} is below {STRICT}" in answer.json()["error"]["message"]
         assert level_of(ask(headers, STRICT)) == STRICT
         assert level_of(ask(headers)) == STRICT
         assert_error(ask(headers, "fmr-1e-9"), 422, "uncalibrated")

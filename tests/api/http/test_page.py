@@ -107,7 +107,7 @@ def test_a_browsers_copy_is_asked_for_again_and_not_sent_again(client: Client) -
 
 @pytest.mark.parametrize(
     "path",
-    ["/assets/", "/assets/index.html", "/assets/none.js", "/assets/..%2fapp.py", "/assets/%00",
+    ["/assets/", "/assets/index.html", "/assets/none.js", "/assets/../app.py", "/assets/%00",
      "/index.html", "/favicon.ico", "/demo/people", "/demo/people/person-1/0.png"],
 )  # fmt: skip
 def test_what_is_no_file_of_the_page_is_the_contracts_404(client: Client, path: str) -> None:

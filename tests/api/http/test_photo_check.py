@@ -87,8 +87,6 @@ def test_who_may_ask(client: Client, deployment: Deployment) -> None:
         ({"files": images(photo(1), name="images")}, 422, "validation_failed"),
         ({"files": images(photo(1), name="image"), "data": {"level": "x"}}, 422,
          "validation_failed"),
-        ({"files": images(photo(1), name="image"), "params": {"faces": "x"}}, 422,
-         "validation_failed"),
         ({"files": images(photo(1), name="image"), "data": {"face": "x"}}, 422,
          "validation_failed"),
         ({"json": {"image": "x"}}, 400, "malformed_request"),

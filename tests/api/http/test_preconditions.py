@@ -62,13 +62,9 @@ def test_an_import_heeds_them(both: tuple[Client, Deployment]) -> None:
     for headers in (NEVER, only("0" * 32)):
         assert assert_error(bring(headers), 409, "enrollment_conflict") == {"template_id": first}
     assert template_id(client, "ann") == first
-    keyed = {"Idempotency-Key": "once"}
-    assert_answer(bring(only(first) | keyed), 200, ImportAnswer)
+    assert_answer(bring(only(first)), 200, ImportAnswer)
     second = template_id(client, "ann")
     assert second != first
-    assert_error(bring(NEVER | keyed), 409, "idempotency_conflict")
-    assert bring(only(first) | keyed).headers["Idempotency-Replayed"] == "true"
-    assert template_id(client, "ann") == second
 
 
 @pytest.mark.parametrize("headers", [NEVER, only("0" * 32), {"If-Match": "*"}])
@@ -111,20 +107,6 @@ def test_of_many_at_once_one_enrolls(both: tuple[Client, Deployment]) -> None:
 
     assert send(NEVER) == [201, 409, 409, 409, 409, 409]
     assert send(only(template_id(client, "ann"))) == [200, 409, 409, 409, 409, 409]
-
-
-def test_a_repeated_write_is_answered_as_the_first(client: Client) -> None:
-    headers = {"Idempotency-Key": "one-write", **NEVER}
-    first = client.put(path("once"), files=images(photo(2)), headers=headers)
-    again = client.put(path("once"), files=images(photo(2)), headers=headers)
-    assert codes([first, again]) == [201, 201]
-    assert again.headers["Idempotency-Replayed"] == "true"
-    assert again.headers["ETag"] == first.headers["ETag"]
-    # Without the header it is another request.
-    other = client.put(
-        path("once"), files=images(photo(2)), headers={"Idempotency-Key": "one-write"}
-    )
-    assert_error(other, 409, "idempotency_conflict")
 
 
 @pytest.mark.parametrize(

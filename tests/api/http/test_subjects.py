@@ -1,12 +1,16 @@
+import contextlib
 import json
+import sqlite3
+from pathlib import Path
 
 import pytest
 
+from api.http.app import create_app
 from api.http.receipts import read_receipt_keys, verify_answer
 from api.http.schemas import ReceiptAnswer, SubjectAnswer, SubjectsAnswer
 from templates.errors import StoreError
 from tests.api.client import Client
-from tests.api.deployment import Deployment, bearer, images, photo
+from tests.api.deployment import Deployment, bearer, deploy, images, photo
 from tests.api.shapes import assert_answer, assert_error
 
 
@@ -42,6 +46,33 @@ def test_a_description_has_no_template(client: Client, deployment: Deployment) -
     assert body["current"] is True
     assert (body["enrolled_by"], body["photos"]) == ("photos", 1)
     assert len(json.dumps(body)) < 600
+
+
+def test_an_erasure_says_that_a_reader_keeps_old_pages(
+    client: Client, deployment: Deployment, capfd: pytest.CaptureFixture[str]
+) -> None:
+    enroll(client, "read")
+    with contextlib.closing(sqlite3.connect(deployment.settings.data_dir / "veilface.db")) as idle:
+        idle.execute("BEGIN")
+        idle.execute("SELECT count(*) FROM subjects").fetchone()
+        answer = assert_answer(client.delete("/v1/subjects/read"), 200, ReceiptAnswer)
+        assert answer["log_purged"] is False
+    assert '"log_purged": false' in capfd.readouterr().err
+    again = assert_answer(client.delete("/v1/subjects/read"), 200, ReceiptAnswer)
+    assert again["log_purged"] is True
+
+
+def test_a_database_that_was_removed_is_not_ready(tmp_path: Path) -> None:
+    own = deploy(tmp_path)
+    database = own.settings.data_dir / "veilface.db"
+    with Client(create_app(own.settings), headers=bearer(own.token)) as client:
+        database.rename(database.with_suffix(".aside"))
+        answer = client.put("/v1/subjects/lost/enrollment", files=images(photo(1)))
+        assert_error(answer, 503, "store_unavailable")
+        assert_error(client.get("/health/ready"), 503, "store_unavailable")
+        database.with_suffix(".aside").rename(database)
+        assert client.get("/health/ready").status_code == 200
+        enroll(client, "kept")
 
 
 def test_erasing_leaves_a_receipt_that_verifies(both: tuple[Client, Deployment]) -> None:

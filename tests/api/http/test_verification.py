@@ -46,7 +46,8 @@ def sender(deployment: Deployment, token: str) -> str:
 
 
 def ask(client: Client, token: str, subject: str = "alice", **request: Any) -> Any:
-    return client.post(f"/v1/subjects/{subject}/verify", headers=bearer(token), **request)
+    headers = bearer(token) | request.pop("headers", {})
+    return client.post(f"/v1/subjects/{subject}/verify", headers=headers, **request)
 
 
 def embedding(client: Client, person: int, shot: int = 5) -> list[float]:
@@ -226,6 +227,7 @@ def test_hostile_embeddings(client: Client, sender: str) -> None:
             client,
             sender,
             content=json.dumps({"embedding": case}),
+            headers={"Content-Type": "application/json"},
         )
         assert_error(answer, 400, "invalid_embedding")
 
@@ -262,10 +264,6 @@ def test_levels(client: Client, sender: str, token: str) -> None:
     ).json()
     assert accuracy["level"] == "accuracy"
     assert math.isclose(accuracy["fmr"], 1e-3)  # the rate that calibration saw
-    queried = ask(
-        client, token, files=images(photo(1), name="image"), params={"level": "fmr-1e-2"}
-    ).json()
-    assert queried["level"] == "fmr-1e-2"
     for level in ("fmr-1e-9", "x"):
         assert_error(
             ask(client, sender, json={"embedding": descriptor, "level": level}),
@@ -287,23 +285,18 @@ def test_fields_are_checked(client: Client, sender: str) -> None:
         {"json": {"embedding": descriptor, "template": "AAAA"}},
         {"json": {"embedding": descriptor, "levle": "fmr-1e-2"}},
         {"json": {"embedding": descriptor, "face": "largest"}},
-        {"json": {"embedding": descriptor}, "params": {"face": "largest"}},
-        {"json": {"embedding": descriptor}, "params": {"levle": "x"}},
-        {"json": {"embedding": descriptor, "level": "a"}, "params": {"level": "b"}},
         {"json": {"template": 5}},
         {"files": images(photo(1), name="photo")},
         {"files": images(photo(1), name="image"), "data": {"attributes": "{}"}},
         {"files": images(photo(1), name="image"), "data": {"face": "all"}},
-        {"files": images(photo(1), name="image"), "params": "level=a&level=b"},
     ]
     for case in cases:
         assert_error(ask(client, sender, **case), 422, "validation_failed")
 
 
 def test_largest_face_is_accepted_as_a_field(client: Client, token: str) -> None:
-    for request in ({"data": {"face": "largest"}}, {"params": {"face": "largest"}}):
-        answer = ask(client, token, files=images(photo(1), name="image"), **request)
-        assert answer.json()["decision"] == "accept"
+    answer = ask(client, token, files=images(photo(1), name="image"), data={"face": "largest"})
+    assert answer.json()["decision"] == "accept"
 
 
 def test_a_retired_master_key_does_not_tell_who_is_enrolled(

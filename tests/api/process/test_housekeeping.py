@@ -10,8 +10,8 @@ import sqlalchemy as sa
 from api.http.app import create_app
 from api.process.opening import open_keyring, open_store
 from templates.errors import StoreUnavailable
-from templates.store import TemplateStore
-from templates.store.schema import IdempotencyRow, SubjectRow
+from templates.store import By, TemplateStore
+from templates.store.schema import FailedAttemptsRow, SubjectRow
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, deploy, images, photo
 from tests.patience import wait_until
@@ -23,29 +23,32 @@ def own(tmp_path: Path) -> Deployment:
 
 
 def records(store: TemplateStore) -> int:
-    count = sa.select(sa.func.count()).select_from(IdempotencyRow)
+    count = sa.select(sa.func.count()).select_from(FailedAttemptsRow)
     return store.database.read(lambda each: each.execute(count).scalar_one())
 
 
 def expire_all(store: TemplateStore) -> None:
-    at = sa.func.datetime("now", "-1 day")
-    changed = sa.update(IdempotencyRow).values(expires_at=at)
+    at = sa.func.datetime("now", "-91 days")
+    changed = sa.update(FailedAttemptsRow).values(last_failed_at=at)
     store.database.write(lambda each: each.execute(changed))
 
 
-def claim(store: TemplateStore, key: str) -> None:
-    store.idempotency.claim("default", actor="x", key=key, request=b"r")
+def fail(store: TemplateStore, subject: str) -> None:
+    """Count a failure on somebody who is not enrolled."""
+    store.attempts.conclude(
+        "default", subject, accepted=False, template_id=None, level="m", nonce=None, by=By()
+    )
 
 
 def test_expired_records_go_at_the_start_and_later(own: Deployment) -> None:
     store = open_store(own.settings, open_keyring(own.settings))
-    claim(store, "before the start")
+    fail(store, "before-the-start")
     expire_all(store)
     with Client(create_app(own.settings)):
         wait_until(lambda: records(store) == 0)
-        claim(store, "while it runs")
+        fail(store, "while-it-runs")
         expire_all(store)
-        claim(store, "still wanted")
+        fail(store, "still-wanted")
         wait_until(lambda: records(store) == 1)
     store.close()
 
@@ -53,7 +56,7 @@ def test_expired_records_go_at_the_start_and_later(own: Deployment) -> None:
 def test_the_log_that_an_erasure_could_not_empty_is_emptied(own: Deployment) -> None:
     log = own.settings.data_dir / "veilface.db-wal"
     store = open_store(own.settings, open_keyring(own.settings))
-    claim(store, "a write")
+    fail(store, "a-write")
     assert log.stat().st_size > 0
     with Client(create_app(own.settings)):
         wait_until(lambda: log.stat().st_size == 0)

@@ -1,5 +1,6 @@
 """What is counted, by whom, and what no metric may say."""
 
+import json
 import os
 import re
 import signal
@@ -29,6 +30,7 @@ from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, deploy, environment_of, images, photo
 from tests.patience import PATIENCE_S, wait_until
 from tests.ports import free_port
+from tests.reliability.full_disk import may_mount, small_file_system
 
 Labels = dict[str, str]
 Samples = dict[tuple[str, frozenset[tuple[str, str]]], float]
@@ -147,7 +149,7 @@ def test_a_refusal_of_a_locked_subject_is_counted(
 
 def test_a_failed_purge_is_counted() -> None:
     class Broken:
-        def purge(self, *, wait: float) -> None:
+        def purge(self) -> bool:
             raise OSError
 
     failures: list[Exception] = []
@@ -340,6 +342,7 @@ def test_any_worker_answers_for_all_and_nothing_falls_when_one_dies(tmp_path: Pa
         until(lambda: len(workers(scraped()) - before) == 1)
         found = scraped()
         assert victim not in workers(found)
+        assert '"ended_by": "SIGKILL"' in (tmp_path / "log").read_text()
         assert value(found, "veilface_requests_total", **labels) == 20
         assert value(found, "veilface_store_up") == 1
         assert [path.stat().st_mode & 0o077 for path in temporary.glob("veilface-*")] == [0]
@@ -349,3 +352,43 @@ def test_any_worker_answers_for_all_and_nothing_falls_when_one_dies(tmp_path: Pa
     finally:
         process.kill()
         process.wait()
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not may_mount(), reason="may not mount a file system")
+def test_a_worker_starts_where_the_folder_for_temporary_files_is_full(tmp_path: Path) -> None:
+    """A page of a mapped file for which there is no room would end it, and each after it."""
+    deployment = deploy(tmp_path, workers=2, port=free_port(), compute_slots=1)
+    log = tmp_path / "log"
+
+    def lines() -> list[dict[str, Any]]:
+        return [json.loads(line) for line in log.read_text().splitlines() if line[:1] == "{"]
+
+    def started() -> list[int]:
+        return [line["pid"] for line in lines() if line["event"] == "started"]
+
+    with small_file_system() as temporary, log.open("wb") as stderr:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "api.cli", "serve"],
+            cwd=Path(__file__).resolve().parents[3],
+            env={**environment_of(deployment.settings), "TMPDIR": str(temporary)},
+            stdout=stderr,
+            stderr=stderr,
+        )
+        try:
+            wait_until(lambda: len(started()) == 2)
+            for pid in started():
+                with suppress(OSError), (temporary / f"filler-{pid}").open("wb") as filler:
+                    while filler.write(bytes(4096)):
+                        filler.flush()
+                os.kill(pid, signal.SIGKILL)
+            wait_until(lambda: len(started()) == 4)
+            url = f"http://127.0.0.1:{deployment.settings.port}"
+            assert httpx.get(f"{url}/health/ready", timeout=PATIENCE_S).status_code == 200
+            assert httpx.get(f"{url}/metrics", timeout=PATIENCE_S).status_code == 200
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(timeout=PATIENCE_S) == 0
+        finally:
+            process.kill()
+            process.wait()
+    assert [line["ended_by"] for line in lines() if "ended_by" in line] == ["SIGKILL"] * 2

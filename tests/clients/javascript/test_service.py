@@ -144,7 +144,7 @@ def test_a_lost_answer(node: Node, service: Running) -> None:
     _, first, again, lost, decided = outcomes
     assert (first["error"], first["sent"]) == ("ConnectionFailed", True)
     assert first["lift"].startswith("Enrollable")
-    assert again["value"]["replaced"] is False, "the same write"
+    assert again["value"]["replaced"] is True, "what the first sending wrote"
     assert (lost["error"], decided["value"]["accepted"]) == ("ConnectionFailed", True)
     enrolled, lost = calls(
         node,
@@ -155,7 +155,7 @@ def test_a_lost_answer(node: Node, service: Running) -> None:
         ],
         retries={"first": 0.01},
     )
-    assert enrolled["value"]["replaced"] is False
+    assert enrolled["value"]["replaced"] is True
     assert lost["error"] == "ConnectionFailed"
 
 
@@ -200,8 +200,8 @@ def test_tokens(node: Node, service: Running) -> None:
     _, made, _, first, repeated, another, described = calls(node, service, steps)
     assert "vft_" not in made["shown"]
     assert first["value"]["accepted"] is True
-    assert repeated["value"]["accepted"] is True, "the same request: its answer again"
-    assert (another["error"], another["code"]) == ("Unauthorized", "replayed")
+    for second in (repeated, another):
+        assert (second["error"], second["code"]) == ("Unauthorized", "replayed")
     assert described["error"] == "Forbidden"
     (outcome,) = calls(
         node, service, [{"call": "tokenOutcome", "args": ["js-dora", made["value"]["token_id"]]}]

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from templates.keys.sealing import MasterKeyring
-from templates.store import Answer, Claim, Source, Storage, StoredTemplate, TemplateStore
+from templates.store import Source, Storage, StoredTemplate, TemplateStore
 from templates.store.envelope import Envelope, close_envelope
 from tests.databases import (  # noqa: F401
     database_url,
@@ -126,9 +126,3 @@ def put(
         storage=storage,
         **changes,
     )
-
-
-def finish(store: TemplateStore, claim: Claim, *, status: int, body: bytes) -> None:
-    """Leave the answer of a write that has a transaction of its own here."""
-    answer = Answer(status, body)
-    store.database.write(lambda connection: store.idempotency.finish(connection, claim, answer))

@@ -12,7 +12,7 @@ from templates.contract.liveness_policy import LivenessPolicy
 from templates.errors import StoreError
 from templates.keys.api_token import probe_key
 from templates.keys.sealing import MasterKeyring
-from templates.store import By, NewApiKey, Right, TemplateStore, UnknownTenant, migrate
+from templates.store import By, NewApiKey, Right, TemplateStore, UnknownTenant
 from templates.store.database import Database
 from templates.store.schema import ApiKeyRow
 from tests.templates.store.conftest import Clock
@@ -290,21 +290,3 @@ def test_a_policy_that_is_not_known_asks_for_everything(store: TemplateStore) ->
     store.database.write(lambda connection: connection.execute(statement.values(liveness="iris")))
     (key,) = store.api_keys.all()
     assert key.liveness is LivenessPolicy.BOTH
-
-
-def test_keys_from_before_the_liveness_column_stay_good(store: TemplateStore) -> None:
-    """Their rows' MACs were made without it."""
-    token = store.api_keys.create("default", [Right.VERIFY]).token
-    migrate.downgrade(store.database, "0006")
-    migrate.upgrade(store.database)
-    assert store.api_keys.verify(token) is not None
-
-
-def test_the_schema_is_not_taken_back_while_a_key_asks_for_liveness(store: TemplateStore) -> None:
-    made = store.api_keys.create("default", [Right.VERIFY], liveness=LivenessPolicy.ACTIVE)
-    with pytest.raises(StoreError, match="1 API keys ask for liveness"):
-        migrate.downgrade(store.database, "0006")
-    assert store.api_keys.verify(made.token) is not None
-    assert store.api_keys.revoke(made.key.prefix)
-    migrate.downgrade(store.database, "0006")
-    migrate.upgrade(store.database)

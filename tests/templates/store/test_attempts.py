@@ -14,12 +14,9 @@ import sqlalchemy as sa
 from templates.errors import StoreError
 from templates.keys.sealing import MasterKeyring
 from templates.store import (
-    Answer,
     Attempt,
     AttemptsStatus,
     By,
-    Claim,
-    IdempotencyConflict,
     LockedOut,
     LockoutPolicy,
     Nonce,
@@ -184,6 +181,20 @@ def test_the_check_tells_how_long(ada: TemplateStore, clock: Clock) -> None:
         conclude(ada, template_id(ada, "ada"))
     assert again.value.recorded
     assert len(list(ada.audit_log.lines())) == lines + 1
+
+
+def test_a_clock_that_is_set_back_prolongs_no_lock_by_more_than_its_length(
+    ada: TemplateStore, clock: Clock
+) -> None:
+    for _ in range(5):
+        attempt(ada)
+    clock.pass_by(seconds=-29)
+    assert attempt(ada) == "locked 59"
+    clock.pass_by(days=-1)
+    assert attempt(ada) == "reject"
+    assert attempt(ada) == "locked 60"
+    clock.pass_by(seconds=60)
+    assert attempt(ada, accepted=True) == "accept"
 
 
 def test_an_accept_clears_the_count_and_notes_the_use(ada: TemplateStore, clock: Clock) -> None:
@@ -555,41 +566,6 @@ def test_a_refused_probe_is_used_up_too(ada: TemplateStore, prefix: str, clock: 
     assert attempt(ada, accepted=True, nonce=nonce) == "locked 30"
     clock.pass_by(seconds=31)
     assert attempt(ada, accepted=True, nonce=nonce) == "replayed"
-
-
-def test_a_decision_that_is_taken_back_uses_nothing_up_and_the_told_one_counts(
-    ada: TemplateStore, prefix: str, clock: Clock
-) -> None:
-    """Nobody is told the first: who provokes conflicts tries no more faces than are counted."""
-
-    def run(claimed: Claim | Answer) -> None:
-        assert isinstance(claimed, Claim)
-        ada.attempts.conclude(
-            "default",
-            "ada",
-            accepted=False,
-            template_id=template_id(ada, "ada"),
-            level="high",
-            nonce=nonce,
-            kept=(claimed, Answer(200, b"{}")),
-            by=BY,
-        )
-
-    nonce = nonce_of(prefix, clock)
-    asked = {"actor": "token", "key": "k", "request": b"r", "subject_id": "ada"}
-    late = ada.idempotency.claim("default", **asked)
-    clock.pass_by(minutes=1)
-    again = ada.idempotency.claim("default", **asked)
-    for _ in range(2):
-        with pytest.raises(IdempotencyConflict):
-            run(late)
-    assert ada.attempts.status("default", "ada") is None
-    run(again)
-    status = ada.attempts.status("default", "ada")
-    assert status is not None
-    assert status.consecutive == 1
-    with pytest.raises(Replayed):
-        run(late)
 
 
 def test_the_value_of_a_nonce_is_not_kept(ada: TemplateStore, prefix: str, clock: Clock) -> None:

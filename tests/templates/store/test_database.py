@@ -3,6 +3,7 @@ import socket
 import sqlite3
 import stat
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import psycopg
@@ -218,6 +219,40 @@ def test_a_busy_sqlite_file_is_store_unavailable(tmp_path: Path, keyring: Master
     holder.execute("ROLLBACK")
     holder.close()
     store.tenants.create("default")
+    store.close()
+
+
+def test_a_write_waits_for_its_turn_in_the_process_no_longer_than_the_timeout(
+    tmp_path: Path, keyring: MasterKeyring
+) -> None:
+    store = TemplateStore(f"sqlite:///{tmp_path / 'veilface.db'}", keyring, timeout=0.2)
+    store.upgrade()
+
+    def hang(_: sa.Connection) -> None:
+        with ThreadPoolExecutor(1) as other:
+            refused = other.submit(store.tenants.create, "default").exception(PATIENCE_S)
+        assert isinstance(refused, StoreUnavailable)
+
+    store.database.write(hang)
+    store.tenants.create("default")
+    store.close()
+
+
+def test_nothing_is_written_to_a_file_that_was_removed(
+    tmp_path: Path, keyring: MasterKeyring
+) -> None:
+    path, aside = tmp_path / "veilface.db", tmp_path / "aside.db"
+    store = TemplateStore(f"sqlite:///{path}", keyring)
+    store.upgrade()
+    path.rename(aside)
+    for replaced in (False, True):
+        if replaced:
+            path.touch()
+        for work in (store.ping, lambda: store.tenants.create("default")):
+            with pytest.raises(StoreUnavailable, match="removed or replaced"):
+                work()
+    aside.rename(path)
+    assert store.tenants.create("default")
     store.close()
 
 

@@ -10,19 +10,18 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
 from templates.errors import StoreError
 from templates.keys.sealing import MasterKeyring
-from templates.store import Claim, Receipt, TemplateStore, verify_receipt
+from templates.store import Receipt, TemplateStore, verify_receipt
 from templates.store.database import Database
 from templates.store.receipts import key_fingerprint
 from templates.store.schema import (
     Base,
     FailedAttemptsRow,
-    IdempotencyRow,
     ReceiptRow,
     SubjectRow,
     TemplateRow,
 )
 from tests.patience import PATIENCE_S
-from tests.templates.store.conftest import CONTRACT, Clock, compact_until, finish, put
+from tests.templates.store.conftest import CONTRACT, Clock, compact_until, put
 
 
 def count(database: Database, table: type[Base]) -> int:
@@ -36,11 +35,6 @@ def test_everything_about_the_subject_goes_at_once(
     database = Database(database_url)
     for name in ("ada", "eve"):
         put(store, name, b"wire")
-        claim = store.idempotency.claim(
-            "default", actor="key", key=f"enroll {name}", request=b"r", subject_id=name
-        )
-        assert isinstance(claim, Claim)
-        finish(store, claim, status=201, body=name.encode())
         failed = sa.insert(FailedAttemptsRow).values(
             tenant_id=store.tenants.get("default").id,
             pseudonym=store.signer.pseudonym("default", name),
@@ -57,7 +51,7 @@ def test_everything_about_the_subject_goes_at_once(
     assert erasure.receipt.held
     assert store.subjects.get("default", "ada") is None
     assert store.subjects.describe("default", "ada") is None
-    for table in (SubjectRow, TemplateRow, IdempotencyRow, FailedAttemptsRow):
+    for table in (SubjectRow, TemplateRow, FailedAttemptsRow):
         assert count(database, table) == 1, table  # eve's
     assert store.subjects.get("default", "eve") is not None
     claims = verify_receipt(erasure.receipt, store.signer.public_key())
@@ -67,7 +61,6 @@ def test_everything_about_the_subject_goes_at_once(
         {"item": "data_key", "count": 1},
         {"item": "metadata", "count": 1},
         {"item": "failed_attempts", "count": 1},
-        {"item": "idempotency_records", "count": 1},
     ]
     database.close()
 
@@ -251,7 +244,7 @@ def test_a_long_reader_delays_the_purge_and_is_reported(
     tmp_path: Path, keyring: MasterKeyring
 ) -> None:
     url = f"sqlite:///{tmp_path / 'veilface.db'}"
-    store = TemplateStore(url, keyring, timeout=0.2)
+    store = TemplateStore(url, keyring, timeout=PATIENCE_S)  # which no purge waits for
     store.upgrade()
     store.tenants.create("default")
     put(store, "ada", b"wire" * 1000)
@@ -260,18 +253,15 @@ def test_a_long_reader_delays_the_purge_and_is_reported(
     def read_while_erasing(connection: sa.Connection) -> None:
         assert connection.execute(sa.select(SubjectRow.id)).all()
         assert not store.erasures.erase("default", "ada").log_purged
-        assert not patient.purge(wait=0.05)  # gives up by its own limit, not by the store's
         timeout = sa.text("PRAGMA busy_timeout")
         assert (
-            patient.database.read(lambda each: each.execute(timeout).scalar_one())
+            store.database.read(lambda each: each.execute(timeout).scalar_one())
             == 1_000 * PATIENCE_S
         )
 
-    patient = TemplateStore(url, keyring, timeout=PATIENCE_S)
     database.read(read_while_erasing)
     assert store.subjects.get("default", "ada") is None
     assert store.purge()
-    patient.close()
     assert (tmp_path / "veilface.db-wal").stat().st_size == 0
     database.close()
     store.close()

@@ -16,7 +16,6 @@ from templates.store import (
     Storage,
     TemplateNotStored,
     TemplateStore,
-    migrate,
 )
 from templates.store.schema import Base
 from tests.templates.store.conftest import CONTRACT, Clock, put
@@ -227,18 +226,3 @@ def test_an_altered_data_key_is_no_rejection(store: TemplateStore) -> None:
     store.database.write(lambda each: each.exec_driver_sql(statement))
     with pytest.raises(SealError, match="altered, or belongs elsewhere"):
         opens(store, held)
-
-
-def test_the_schema_goes_back_while_nobody_holds_a_template(store: TemplateStore) -> None:
-    put(store, "eve", WIRE)
-    held = hold(store)
-    with pytest.raises(StoreError, match="holders keep templates"):
-        migrate.downgrade(store.database, "0005")
-    assert opens(store, held)
-    store.erasures.erase("default", "ada")
-    migrate.downgrade(store.database, "0005")
-    migrate.upgrade(store.database)
-    assert migrate.differences(store.database) == []
-    kept = store.subjects.get("default", "eve")
-    assert kept is not None
-    assert kept.wire == WIRE

@@ -1,7 +1,7 @@
 """Secrets after a theft: what a thief of database and master key can still do, and who notices."""
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
@@ -33,7 +33,7 @@ from templates.store.schema import (
 from templates.store.secret import Secret, SecretName
 from templates.store.transfers import ExportSuperseded
 from tests.patience import PATIENCE_S
-from tests.templates.store.conftest import Clock, finish, put
+from tests.templates.store.conftest import Clock, put
 from tests.templates.store.test_attempts import attempt
 from tests.templates.store.test_audit_log import SQLITE_TRIGGERS
 
@@ -114,7 +114,6 @@ def test_every_secret_is_drawn_anew_under_the_new_master_key(deployment: Deploym
         "audit-chain",
         "pseudonym",
         "receipt-signing",
-        "idempotency",
         "export",
         "stand-ins",
         "lifts",
@@ -386,22 +385,6 @@ def test_a_made_up_receipt_in_the_database_is_not_signed_again(deployment: Deplo
     receipt = store.erasures.erase("default", "ada").receipt
     deployment.run(sa.update(ReceiptRow).values(body=receipt.body.replace("false", "true")))
     assert deployment.renew().receipts == 0
-
-
-def test_repeated_writes_are_answered_as_before(deployment: Deployment) -> None:
-    store, worker = deployment.store, deployment.worker
-    ask: Callable[[TemplateStore, str], Any] = lambda asked, key: asked.idempotency.claim(  # noqa: E731
-        "default", actor="a", key=key, request=b"r", subject_id="ada"
-    )
-    done, running = ask(store, "done"), ask(store, "running")
-    finish(store, done, status=201, body=b"{}")
-    deployment.renew()
-    assert ask(worker, "done").body == b"{}"
-    with pytest.raises(StoreError, match="still running"):
-        ask(worker, "running")
-    finish(worker, running, status=201, body=b"{}")  # its hashes are others, its token is not
-    assert ask(worker, "running").status == 201
-    assert store.erasures.erase("default", "ada").receipt.claims["erased"][-1]["count"] == 2
 
 
 def test_an_export_of_before_undoes_no_enrollment_of_before(

@@ -80,20 +80,31 @@ def test_replacing_keeps_the_first_date_and_forgets_the_rest(
 
 
 def test_what_is_committed_is_not_reported_as_failed(
-    store: TemplateStore, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, keyring: MasterKeyring
 ) -> None:
+    store = TemplateStore(f"sqlite:///{tmp_path / 'veilface.db'}", keyring)
+    store.upgrade()
+    store.tenants.create("default")
     put(store, "ada", b"first")
+    fails = False
 
-    def fail(*, wait: float | None = None) -> bool:
-        raise StoreUnavailable("all connections to the database are busy")
+    def fail(*_: object) -> None:
+        nonlocal fails
+        if fails:
+            fails = False
+            raise StoreUnavailable("all connections to the database are busy")
 
-    monkeypatch.setattr(store.database, "purge_log", fail)
+    def after_a_commit(*_: object) -> None:
+        nonlocal fails
+        fails = True
+
+    sa.event.listen(store.database.engine, "checkout", fail)
+    sa.event.listen(store.database.engine, "commit", after_a_commit)
     assert not put(store, "ada", b"second").created
-    found = store.subjects.get("default", "ada")
-    assert found is not None
-    assert found.wire == b"second"
+    assert wire_of(store, "ada") == b"second"
     erasure = store.erasures.erase("default", "ada")
     assert (erasure.erased, erasure.log_purged) == (True, False)
+    store.close()
 
 
 def test_tenants_do_not_see_each_other(store: TemplateStore) -> None:

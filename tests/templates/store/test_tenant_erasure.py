@@ -13,7 +13,6 @@ from templates.errors import StoreError
 from templates.keys.sealing import MasterKeyring
 from templates.store import (
     By,
-    Claim,
     InvalidIdentifier,
     Nonce,
     Receipt,
@@ -27,8 +26,6 @@ from templates.store.schema import (
     ApiKeyRow,
     Base,
     FailedAttemptsRow,
-    IdempotencyRow,
-    OutboxRow,
     RotationKeyRow,
     SubjectRow,
     TemplateRow,
@@ -48,9 +45,7 @@ OF_A_TENANT = (
     RotationKeyRow,
     ApiKeyRow,
     FailedAttemptsRow,
-    IdempotencyRow,
     UsedNonceRow,
-    OutboxRow,
     TenantErasureRow,
     TenantRow,
 )
@@ -74,9 +69,6 @@ def fill(store: TemplateStore, tenant: str, *, subjects: int = 5) -> dict[str, i
             ),
             by=By(),
         )
-    for number in range(3):
-        claim = store.idempotency.claim(tenant, actor="key", key=f"k{number}", request=b"r")
-        assert isinstance(claim, Claim)
     store.rerotation.begin(tenant)
     return {
         "subjects": subjects,
@@ -85,7 +77,6 @@ def fill(store: TemplateStore, tenant: str, *, subjects: int = 5) -> dict[str, i
         "rotation_keys": 2,
         "api_keys": 2,
         "failed_attempts": subjects + 2,
-        "idempotency_records": 3,
         "nonces": subjects + 2,
     }
 
@@ -131,9 +122,7 @@ def test_everything_of_the_tenant_goes_and_nothing_of_another(
         RotationKeyRow: theirs["rotation_keys"],
         ApiKeyRow: theirs["api_keys"],
         FailedAttemptsRow: theirs["failed_attempts"],
-        IdempotencyRow: theirs["idempotency_records"],
         UsedNonceRow: theirs["nonces"],
-        OutboxRow: 0,
         TenantErasureRow: 0,
         TenantRow: 1,
     }
@@ -256,7 +245,7 @@ def test_concurrent_enrollments_leave_nothing(
             over = done.is_set()
             time.sleep(0.005)  # SQLite's lock is polled: without a pause others never get it
             try:
-                match generator.randrange(4):
+                match generator.randrange(3):
                     case 0:
                         service.erasures.erase("default", name)
                     case 1:
@@ -271,9 +260,6 @@ def test_concurrent_enrollments_leave_nothing(
                             by=By(),
                         )
                     case 2:
-                        key = f"{seed} {generator.random()}"
-                        service.idempotency.claim("default", actor="a", key=key, request=b"r")
-                    case 3:
                         put(service, name, b"wire")
                         acknowledged.append(name)
                 assert not over, "a write of an erased tenant was acknowledged"
@@ -424,7 +410,7 @@ def test_postgresql_keeps_no_row_after_compacting(
     store.tenants.create("default")
     fill(store, "default")
     tables = ["subjects", "templates", "rotation_keys", "api_keys", "used_nonces"]
-    tables += ["failed_attempts", "idempotency"]
+    tables.append("failed_attempts")
 
     def sizes(connection: sa.Connection) -> list[int]:
         query = sa.select(*(sa.func.pg_relation_size(table) for table in tables))

@@ -89,6 +89,8 @@ export interface SubjectPage extends Answer {
 export interface Receipt extends Answer {
   readonly receipt: { readonly body: string; readonly signature: string };
   readonly claims: Readonly<Record<string, unknown>>;
+  /** False where SQLite's log still holds old pages, which a later purge removes. */
+  readonly log_purged: boolean;
 }
 
 /** The contract's graphs, where the service serves them. */

@@ -15,7 +15,6 @@ import type {
   Token,
   TokenOutcome,
 } from "./answers.js";
-import { randomText } from "./base64.js";
 import { ConnectionFailed, errorOf, UnexpectedAnswer } from "./errors.js";
 import { holderKeyField } from "./holder-keys.js";
 import { DEFAULT_RETRIES, waitFor, type Resend, type Retries } from "./retries.js";
@@ -27,7 +26,6 @@ export const PROBE_PHOTOS = 5;
 
 const SUBJECT = /^(?!\.{1,2}$)[A-Za-z0-9._@:-]{1,128}$/;
 const VISIBLE = /^[\x21-\x7e]+$/;
-const IDEMPOTENCY_KEY = /^[\x21-\x7e]{1,255}$/;
 const TEMPLATE_ID = /^[A-Za-z0-9_-]{1,64}$/;
 // Connections that were never made, as Node names them; a browser does not tell.
 const NEVER_MADE = new Set(["ECONNREFUSED", "ENOTFOUND", "EAI_AGAIN", "UND_ERR_CONNECT_TIMEOUT"]);
@@ -111,6 +109,11 @@ export class Session {
     this.#fetch = options.fetch ?? ((input, init) => fetch(input, init));
   }
 
+  /** When an enrollment may be sent again: one that uses up a token or has a condition would meet itself. */
+  protected resendOf(replace: Replace = true): Resend {
+    return replace === true && !isToken(this.#bearer) ? "when-lost" : "when-not-done";
+  }
+
   /** The bearer, for signatures. */
   protected get bearer(): string {
     return this.#bearer;
@@ -147,8 +150,7 @@ export class Session {
     return this.send({
       method: "DELETE",
       path: subjectPath(subject),
-      headers: idempotency(),
-      read: answer<Receipt>({ receipt: "object", claims: "object" }),
+      read: answer<Receipt>({ receipt: "object", claims: "object", log_purged: "boolean" }),
     });
   }
 
@@ -302,18 +304,16 @@ export class Client extends Session {
    * Enroll a subject by 1 to 10 photos of one person, or replace its enrollment. Right: `enroll`.
    *
    * @param options.attributes `gender` and `race`, for services that lift with hybrid+.
-   * @param options.idempotencyKey of this one logical write; made anew where it is not given.
    */
   enroll(
     subject: string,
     photos: readonly Blob[],
     options: EnrollOptions & {
       readonly attributes?: Readonly<Record<string, string>>;
-      readonly idempotencyKey?: string;
     } = {},
   ): Promise<Enrollment> {
     requirePhotos(photos, ENROLL_PHOTOS);
-    const { attributes, face, storage, holderKey, replace, idempotencyKey } = options;
+    const { attributes, face, storage, holderKey, replace } = options;
     const more = {
       attributes: attributes && JSON.stringify(attributes),
       face,
@@ -323,9 +323,10 @@ export class Client extends Session {
     return this.send({
       method: "PUT",
       path: subjectPath(subject, "/enrollment"),
-      headers: { ...idempotency(idempotencyKey), ...precondition(replace) },
+      headers: precondition(replace),
       body: () => form("images", photos, more),
       read: readEnrollment,
+      resend: this.resendOf(replace),
     });
   }
 
@@ -352,15 +353,12 @@ export class Client extends Session {
       held_template: heldTemplate,
       ...holderKeyField(holderKey),
     };
-    // Under a token a verification that is sent again gets the answer of the first.
-    const token = isToken(this.bearer);
     return this.send({
       method: "POST",
       path: subjectPath(subject, "/verify"),
-      headers: token ? idempotency() : {},
       body: () => form("image", photos, more),
       read: readDecision,
-      resend: token ? "when-lost" : "when-not-done",
+      resend: "when-not-done",
     });
   }
 }
@@ -371,14 +369,6 @@ export function subjectPath(subject: string, rest = ""): string {
     throw new RangeError("a subject id has 1 to 128 characters out of A-Z a-z 0-9 . _ @ : -");
   }
   return `/v1/subjects/${subject}${rest}`;
-}
-
-/** The header of a write: the caller's key, or one that is made for this call. */
-export function idempotency(key: string = randomText(24)): Record<string, string> {
-  if (!IDEMPOTENCY_KEY.test(key)) {
-    throw new RangeError("an idempotency key has 1 to 255 visible ASCII characters");
-  }
-  return { "Idempotency-Key": key };
 }
 
 /** The header that says what an enrollment may replace; none where it is anything. */

@@ -13,7 +13,6 @@
  * │   ├── Conflict
  * │   │   ├── ContractMismatch
  * │   │   ├── EnrollmentConflict
- * │   │   └── IdempotencyConflict
  * │   ├── LockedOut           wait .retryAfter, and offer another factor
  * │   ├── RateLimited
  * │   └── ServerFailed        a defect of the service
@@ -98,10 +97,6 @@ export class ContractMismatch extends Conflict {
 export class EnrollmentConflict extends Conflict {
   override name = "EnrollmentConflict";
 }
-/** The idempotency key was used for another request, or that one still runs. */
-export class IdempotencyConflict extends Conflict {
-  override name = "IdempotencyConflict";
-}
 /** Too many failed attempts on the subject; `details.disabled`: an operator must act. */
 export class LockedOut extends ServiceError {
   override name = "LockedOut";
@@ -155,7 +150,6 @@ export const FAMILIES: Readonly<Record<string, Family>> = {
   not_found: NotFound,
   method_not_allowed: InvalidRequest,
   contract_mismatch: ContractMismatch,
-  idempotency_conflict: IdempotencyConflict,
   enrollment_conflict: EnrollmentConflict,
   export_superseded: Conflict,
   template_not_stored: Conflict,

@@ -1,13 +1,7 @@
 /** What a client has lifted: templates that enroll, and probes; no photo, and no embedding. */
 
-import { sha256 } from "../models/pack.js";
-import { randomText } from "./base64.js";
-
 abstract class Lift {
   readonly #template: Uint8Array;
-  readonly #key = randomText(24);
-  /** Seconds since 1970. */
-  readonly liftedAt = Math.floor(Date.now() / 1000);
 
   constructor(
     template: Uint8Array,
@@ -19,11 +13,6 @@ abstract class Lift {
   /** The wire bytes. Printing the lift does not show them. */
   get template(): Uint8Array {
     return this.#template;
-  }
-
-  /** The `Idempotency-Key` of a subject: another subject is another write. */
-  keyFor(subject: string): Promise<string> {
-    return sha256(new TextEncoder().encode(`${this.#key}/${subject}`));
   }
 }
 

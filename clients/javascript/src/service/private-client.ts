@@ -12,7 +12,6 @@ import { base64 } from "./base64.js";
 import {
   ENROLL_PHOTOS,
   fields,
-  idempotency,
   precondition,
   PROBE_PHOTOS,
   readDecision,
@@ -28,7 +27,7 @@ import { ContractMismatch, UnexpectedAnswer } from "./errors.js";
 import { holderKeyField } from "./holder-keys.js";
 import { Enrollable, Probe } from "./lifts.js";
 import { LiftInputs, SharedInputs } from "./lift-inputs.js";
-import { canSign, isToken, signedProbe } from "./signature.js";
+import { canSign, signedProbe } from "./signature.js";
 
 const LOOKS = 3;
 
@@ -217,33 +216,35 @@ export class PrivateClient extends Session {
 
   async #enroll(subject: string, lift: Enrollable, options: EnrollOptions): Promise<Enrollment> {
     const { storage, holderKey, replace } = options;
-    const headers = { ...idempotency(await lift.keyFor(subject)), ...precondition(replace) };
+    const headers = precondition(replace);
     const template = base64(lift.template);
     const body = fields({ template, storage, ...holderKeyField(holderKey) });
     const path = subjectPath(subject, "/enrollment");
     return this.#naming(lift, () =>
-      this.send({ method: "PUT", path, headers, body: () => body, read: readEnrollment }),
+      this.send({
+        method: "PUT",
+        path,
+        headers,
+        body: () => body,
+        read: readEnrollment,
+        resend: this.resendOf(replace),
+      }),
     );
   }
 
   async #verify(subject: string, lift: Probe, options: VerifyOptions): Promise<Decision> {
     const { level, heldTemplate, holderKey } = options;
     const more = fields({ held_template: heldTemplate, ...holderKeyField(holderKey) });
-    const token = isToken(this.bearer);
-    const key = await lift.keyFor(subject);
-    // Under a token a request that is repeated must be the same; under a key its nonce is another.
-    const once = token ? { nonce: key, timestamp: lift.liftedAt } : {};
     return this.#naming(lift, () =>
       this.send({
         method: "POST",
         path: subjectPath(subject, "/verify"),
-        headers: token ? idempotency(key) : {},
         body: async () => ({
-          ...(await signedProbe(this.bearer, subject, lift.template, { level, ...once })),
+          ...(await signedProbe(this.bearer, subject, lift.template, { level })),
           ...more,
         }),
         read: readDecision,
-        resend: token ? "when-lost" : "when-not-done",
+        resend: "when-not-done",
       }),
     );
   }

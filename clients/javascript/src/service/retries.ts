@@ -1,7 +1,7 @@
 /** When and how often a call is sent again, as the Python client does it. */
 
 import type { VeilfaceError } from "../errors.js";
-import { ConnectionFailed, IdempotencyConflict, RateLimited, ServiceError, Unavailable } from "./errors.js";
+import { ConnectionFailed, RateLimited, ServiceError, Unavailable } from "./errors.js";
 
 /** When a call may be sent again: also when its answer was lost, or only when it was not done. */
 export type Resend = "when-lost" | "when-not-done" | "never";
@@ -20,28 +20,25 @@ export interface Retries {
 
 export const DEFAULT_RETRIES: Retries = { sendings: 4, first: 0.25, longest: 8, patience: 30 };
 
-const CONFLICT_WAIT = 1;
-
 /** Seconds to wait before sending again; undefined: throw the error. */
 export function waitFor(
   error: VeilfaceError,
   { sending, resend, retries }: { sending: number; resend: Resend; retries: Retries },
 ): number | undefined {
   if (resend === "never" || sending >= retries.sendings) return undefined;
-  if (!heals(error, sending > 1, resend)) return undefined;
-  const asked = error instanceof ServiceError ? error.retryAfter : undefined;
-  const told = asked ?? (error instanceof IdempotencyConflict ? CONFLICT_WAIT : 0);
+  if (!heals(error, resend)) return undefined;
+  const told = (error instanceof ServiceError ? error.retryAfter : undefined) ?? 0;
   if (told > retries.patience) return undefined;
   const spread = Math.min(retries.longest, retries.first * 2 ** (sending - 1));
   return told + Math.random() * spread;
 }
 
-function heals(error: VeilfaceError, again: boolean, resend: Resend): boolean {
+function heals(error: VeilfaceError, resend: Resend): boolean {
   const lostIsSafe = resend === "when-lost";
   if (error instanceof ConnectionFailed) return lostIsSafe || !error.sent;
   if (error instanceof RateLimited) return true;
   if (error instanceof Unavailable) {
     return error.code === "overloaded" || (lostIsSafe && error.code !== "model_unavailable");
   }
-  return error instanceof IdempotencyConflict && again && lostIsSafe;
+  return false;
 }

@@ -1,0 +1,145 @@
+"""What a call does not know: names in the query, bodies, content types, slashes in ids."""
+
+import base64
+import gzip
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from tests.api.client import Client
+from tests.api.deployment import Deployment, bearer, images, photo
+from tests.api.shapes import assert_error
+
+
+def operations(client: Client) -> Iterator[tuple[str, str]]:
+    for path, entry in client.app.openapi()["paths"].items():
+        for method in entry:
+            yield method.upper(), path.format(subject_id="alice", token_id="t", sha256="0" * 64)
+
+
+def test_no_call_takes_an_unknown_query_parameter(client: Client) -> None:
+    calls = list(operations(client))
+    assert ("GET", "/health/live") in calls
+    for method, path in calls:
+        answer = client.request(method, path, params={"dry_run": "true"})
+        details = assert_error(answer, 422, "validation_failed")
+        assert "dry_run" not in details["known"]
+
+
+@pytest.mark.parametrize(
+    "query",
+    [
+        "limit=5&limit=6",
+        "limit=%2B5",
+        "limit=+5",
+        "limit=5.0",
+        "limit=1_0",
+        "limit=",
+        "limit",
+        "prefix=%ff",
+        "prefix=a&&limit=5",
+        "Limit=5",
+        "limit=5&subject=alice",
+    ],
+)
+def test_a_query_has_one_reading(client: Client, query: str) -> None:
+    assert_error(client.get(f"/v1/subjects?{query}"), 422, "validation_failed")
+
+
+@pytest.mark.parametrize(
+    ("method", "path"),
+    [
+        ("DELETE", "/v1/subjects/alice%2Flockout"),
+        ("GET", "/v1/subjects/alice%2fexport"),
+        ("GET", "/v1/subjects/alice/tokens%2Ft"),
+        ("GET", "/v1%2Fcontract"),
+    ],
+)
+def test_an_encoded_slash_selects_no_call(client: Client, method: str, path: str) -> None:
+    assert_error(client.request(method, path), 422, "validation_failed")
+
+
+def test_a_call_that_takes_no_body_is_sent_none(client: Client) -> None:
+    client.put("/v1/subjects/kept/enrollment", files=images(photo(1)))
+    answer = client.delete("/v1/subjects/kept", json={"dry_run": True})
+    assert_error(answer, 422, "validation_failed")
+    assert client.get("/v1/subjects/kept").status_code == 200
+    assert client.delete("/v1/subjects/kept", content=b"").status_code == 200
+
+
+PHOTO = photo(1)
+BASE64 = base64.b64encode(PHOTO).decode()
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "field"),
+    [
+        ("PUT", "/v1/subjects/alice/enrollment", "images"),
+        ("POST", "/v1/subjects/alice/verify", "image"),
+        ("POST", "/v1/photos/check", "image"),
+    ],
+)
+@pytest.mark.parametrize(
+    ("sent", "status", "said"),
+    [
+        ({"content": PHOTO}, 400, "the body is of no known type"),
+        ({"content": PHOTO, "headers": {"Content-Type": "image/png"}}, 400, "is image/png"),
+        ({"data": {"image": BASE64}}, 400, "is application/x-www-form-urlencoded"),
+        ({"json": {"image": BASE64}}, (422, 400), ""),
+        ({"files": {"image": (None, BASE64)}}, 422, ""),
+    ],
+)
+def test_a_photo_sent_in_the_wrong_way_is_told_the_right_one(
+    client: Client,
+    deployment: Deployment,
+    method: str,
+    path: str,
+    field: str,
+    sent: dict[str, Any],
+    status: int | tuple[int, int],
+    said: str,
+) -> None:
+    """In the place of `forbidden`, which would have an operator grant the right `embeddings`."""
+    headers = bearer(deployment.key("enroll", "verify")) | sent.get("headers", {})
+    answer = client.request(method, path, **{**sent, "headers": headers})
+    message = answer.json()["error"]["message"]
+    if isinstance(status, tuple):
+        status = status[path.endswith("check")]
+    code = {400: "malformed_request", 422: "validation_failed"}[status]
+    assert_error(answer, status, code)
+    assert f"-F {field}=@photo.jpg" in message
+    assert said in message
+
+
+TOKEN = {"subject_id": "alice", "action": "verify"}
+
+
+@pytest.mark.parametrize(
+    ("body", "headers"),
+    [
+        (json.dumps(TOKEN).encode(), {"Content-Type": "text/plain"}),
+        (json.dumps(TOKEN).encode(), {}),
+        (json.dumps(TOKEN).encode("utf-16"), {"Content-Type": "application/json"}),
+        (json.dumps(TOKEN).encode("utf-32-le"), {"Content-Type": "application/json"}),
+        (PHOTO, {"Content-Type": "application/json"}),
+        (
+            gzip.compress(json.dumps(TOKEN).encode()),
+            {"Content-Type": "application/json", "Content-Encoding": "gzip"},
+        ),
+    ],
+)
+def test_json_is_utf8_and_says_that_it_is_json(
+    client: Client, body: bytes, headers: dict[str, str]
+) -> None:
+    assert_error(client.post("/v1/tokens", content=body, headers=headers), 400, "malformed_request")
+
+
+def test_a_charset_and_a_byte_order_mark_change_nothing(client: Client) -> None:
+    answer = client.post(
+        "/v1/tokens",
+        content=json.dumps(TOKEN).encode("utf-8-sig"),
+        headers={"Content-Type": "Application/JSON; charset=UTF-8"},
+    )
+    assert answer.status_code == 201
