@@ -87,6 +87,7 @@ wheels: | $(UV)
 	rm -rf dist/wheels .bootstrap/alone
 	for folder in . clients/python; do $(UV) build --quiet --wheel --out-dir dist/wheels \
 		--build-constraints deploy/build.lock --require-hashes $$folder || exit 1; done
+	! $(PYTHON) -m zipfile -l dist/wheels/veilface-*.whl | grep -vE '^(File Name|veilface/|veilface-[^/]*\.dist-info/)'
 	test ! -d api/web/client || $(PYTHON) -m zipfile -l dist/wheels/veilface-*.whl | grep -F api/web/client/client.js.gz >/dev/null
 	$(UV) venv --quiet --python '>=3.11' .bootstrap/alone
 	$(UV) pip install --quiet --python .bootstrap/alone/bin/python --constraint requirements.lock dist/wheels/veilface_client-*.whl

@@ -23,14 +23,22 @@ def running_service(folder: Path) -> Iterator[httpx.Client]:
     """Start ``veilface serve`` on a free local port; a client with the bootstrap key."""
     port = _free_port()
     log, shown = folder / "serve.log", folder / "serve.out"
-    command = [sys.executable, "-m", "api.cli", "serve", "--config", str(folder / "veilface.toml")]
+    command = [
+        sys.executable,
+        "-P",
+        "-m",
+        "veilface",
+        "serve",
+        "--config",
+        str(folder / "veilface.toml"),
+    ]
     # Settings of the person who runs the demo must not reach it.
     environment = {k: v for k, v in os.environ.items() if not k.startswith("VEILFACE_")}
     shown.unlink(missing_ok=True)
     # The first start prints a token with all rights: nobody else may read it on its way.
     with log.open("wb") as errors, open(shown, "xb", opener=_privately) as output:
         process = subprocess.Popen(  # noqa: S603 - our own command, no shell
-            [*command, "--port", str(port)],
+            [*command, "--config", str(folder / "veilface.toml"), "--port", str(port)],
             stdout=output,
             stderr=errors,
             env={**environment, "PYTHONUNBUFFERED": "1"},

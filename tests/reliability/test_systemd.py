@@ -87,7 +87,7 @@ class Unit:
     def is_healthy(self) -> bool:
         """Whether the check passes that the page runs."""
         config = "VEILFACE_CONFIG=/etc/veilface/veilface.toml"
-        check = f"{config} {PYTHON} -m api.process.healthcheck && echo healthy"
+        check = f"{config} {PYTHON} -m veilface.healthcheck && echo healthy"
         return self._machine.run("sh", "-c", check, check=False).endswith("healthy")
 
     def wait_for(self, workers: int, restarts: int = 0) -> None:

@@ -303,7 +303,7 @@ def test_any_worker_answers_for_all_and_nothing_falls_when_one_dies(tmp_path: Pa
     temporary.mkdir()
     with (tmp_path / "log").open("wb") as log:
         process = subprocess.Popen(
-            [sys.executable, "-m", "api.cli", "serve"],
+            [sys.executable, "-m", "veilface", "serve"],
             cwd=Path(__file__).resolve().parents[3],
             env={**environment_of(deployment.settings), "TMPDIR": str(temporary)},
             stdout=log,
