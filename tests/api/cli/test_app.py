@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import tomllib
@@ -126,3 +127,23 @@ def test_a_name_of_ours_in_the_working_directory_is_not_imported(
     )  # fmt: skip
     assert "the wrong module" not in done.stderr
     assert shown in done.stdout
+
+
+INTERRUPTED = """
+import os, signal, time
+try:
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(600)
+except KeyboardInterrupt:
+    raise ImportError("cv2 cannot be loaded") from None
+"""
+
+
+def test_ctrl_c_during_an_import_ends_the_program_without_a_word(tmp_path: Path) -> None:
+    (tmp_path / "cv2.py").write_text(INTERRUPTED)
+    done = subprocess.run(
+        [sys.executable, "-P", "-m", "veilface", "verify", "ann", "photo.jpg"],
+        cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(tmp_path)}, capture_output=True,
+        text=True, timeout=PATIENCE_S, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGINT, "", "")
