@@ -1,6 +1,6 @@
 import pytest
 
-from api.process.runtime import bootstrap_token, open_keyring, open_store
+from api.process.runtime import open_keyring, open_store
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, images, photo
 from tests.api.shapes import assert_error
@@ -82,12 +82,6 @@ def test_a_wrong_secret_of_a_known_prefix_is_refused(
     token = deployment.token
     changed = token[:-1] + ("0" if token[-1] != "0" else "1")
     assert_error(client.get("/v1/contract", headers=bearer(changed)), 401, "unauthorized")
-
-
-def test_there_is_one_bootstrap_key(deployment: Deployment) -> None:
-    store = open_store(deployment.settings, open_keyring(deployment.settings))
-    assert bootstrap_token(store, deployment.settings) is None
-    store.close()
 
 
 def test_health_needs_no_key(client: Client) -> None:
