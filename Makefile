@@ -11,7 +11,7 @@ PYTEST = OMP_NUM_THREADS=1 $(VENV)/pytest --numprocesses=$(WORKERS) --maxprocess
 # Bytecode is kept: without it, every process that a test starts compiles all that it imports.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo install extras docs test test-all lint types javascript javascript-package audit sbom platforms wheels image release workflows lock clean
+.PHONY: demo install extras docs test test-all lint types javascript javascript-package audit sbom platforms wheels lowest image release workflows lock clean
 
 demo: .venv/core
 	$(VENV)/veilface demo
@@ -93,6 +93,15 @@ wheels: | $(UV)
 	$(UV) pip install --quiet --python .bootstrap/alone/bin/python --constraint requirements.lock dist/wheels/veilface_client-*.whl
 	.bootstrap/alone/bin/python -I -W error -c "import veilface_client, sys; sys.exit('api' in sys.modules)"
 	.bootstrap/alone/bin/veilface-client --version
+
+# The wheel with the oldest libraries that pyproject.toml allows, where a folder `api` would be imported instead of ours.
+lowest: wheels
+	rm -rf .bootstrap/lowest && mkdir -p .bootstrap/lowest/elsewhere/api
+	echo 'raise SystemExit("the wrong api")' > .bootstrap/lowest/elsewhere/api/__init__.py
+	$(UV) venv --quiet --python '>=3.11' .bootstrap/lowest/venv
+	$(UV) pip install --quiet --python .bootstrap/lowest/venv/bin/python --resolution lowest-direct --only-binary :all: -r pyproject.toml
+	$(UV) pip install --quiet --python .bootstrap/lowest/venv/bin/python --no-deps dist/wheels/veilface-*.whl
+	cd .bootstrap/lowest/elsewhere && PYTHONPATH=. ../venv/bin/veilface demo
 
 # The container's image, without a registry; as root.
 image:
