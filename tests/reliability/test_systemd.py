@@ -58,7 +58,7 @@ def machine(tmp_path: Path) -> Iterator[Machine]:
 
 def install(machine: Machine, enable: str = "enable --now") -> None:
     """Run the page's commands, without PostgreSQL's and in the end with this one of systemctl."""
-    others = r"^(python3|/opt/veilface/bin/pip|runuser -u postgres) .*\n"
+    others = r"^(make|python3|/opt/veilface/bin/pip|runuser -u postgres) .*\n"
     commands = re.sub(others, "", INSTALL, flags=re.M)
     assert commands.count("enable --now") == 1
     commands = PACKAGES + commands.replace("enable --now", enable)
