@@ -129,7 +129,7 @@ workflows: | $(UV)
 # What the image has of requirements.lock, for tools that know no other form: pip on a host, the audit, the bill of materials.
 dist/requirements.lock: requirements.lock pyproject.toml | $(UV)
 	mkdir -p dist
-	$(UV) pip compile --quiet --universal --generate-hashes --python-version 3.11 --constraint requirements.lock pyproject.toml --extra redis -o $@
+	$(UV) pip compile --quiet --universal --generate-hashes --python-version 3.11 --constraint requirements.lock pyproject.toml --extra postgres --extra redis -o $@
 
 .venv/core: requirements.lock pyproject.toml | $(UV)
 	test -x $(VENV)/python || $(UV) venv --quiet --python '>=3.11' .venv

@@ -23,6 +23,7 @@ EXTRAS = {
     "evaluate": ("joblib", "matplotlib"),
     "audit": ("matplotlib", "sklearn"),
     "cluster": ("distributed",),
+    "postgres": ("psycopg",),
     "redis": ("redis",),
     "torch": ("skimage", "torch"),
 }
