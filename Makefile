@@ -1,7 +1,9 @@
 # Everything a newcomer runs. Needs only git, make and Python 3.11 or newer.
 PYTHON ?= python3
-UV := $(or $(shell command -v uv),.bootstrap/bin/uv)
+UV := .bootstrap/bin/uv
 VENV := .venv/bin
+# What is installed has the versions and hashes of requirements.lock, or is refused.
+LOCKED := --quiet --require-hashes --constraint requirements.lock --build-constraints requirements.lock
 
 # A worker for each core, so one thread for each matrix library: several, with more threads than
 # cores between them, mostly wait for each other. And one worker more, for a fifth of their time is waiting.
@@ -11,7 +13,7 @@ PYTEST = OMP_NUM_THREADS=1 $(VENV)/pytest --numprocesses=$(WORKERS) --maxprocess
 # Bytecode is kept: without it, every process that a test starts compiles all that it imports.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo install extras docs test test-all lint types javascript javascript-package audit sbom platforms wheels image release workflows lock clean
+.PHONY: demo install extras docs test test-all lint types javascript javascript-package audit sbom platforms wheels lowest image release workflows lock clean
 
 demo: .venv/core
 	$(VENV)/veilface demo
@@ -22,7 +24,7 @@ install: .venv/core
 # What the service does without and some commands need: `make extras EXTRAS=evaluate,audit`.
 EXTRAS ?= all
 extras: .venv/core
-	$(UV) pip install --quiet --python $(VENV)/python --constraint requirements-dev.lock -e ".[$(EXTRAS)]"
+	$(UV) pip install --quiet --python $(VENV)/python --constraint requirements.lock -e ".[$(EXTRAS)]"
 
 # What guards behaviour, in minutes.
 test: .venv/dev
@@ -58,24 +60,22 @@ javascript-package: javascript
 # What the image depends on, and the wheel's core with it: known vulnerabilities, and a bill of materials (CycloneDX), which
 # names what private mode runs too. Without an advisory service nothing is audited, which fails with status 3 of the script,
 # and is said.
-audit: | $(UV)
-	mkdir -p dist
+audit: dist/requirements.lock
 	rm -f dist/audit.json
-	-$(UV) tool run --quiet --from pip-audit==2.10.1 pip-audit --requirement deploy/requirements.lock \
+	-$(UV) tool run --quiet --from pip-audit==2.10.1 pip-audit --requirement dist/requirements.lock \
 		--disable-pip --progress-spinner off --format json --output dist/audit.json >/dev/null 2>&1
 	$(PYTHON) .ci/audit_report.py dist/audit.json
 
-sbom: | $(UV)
-	mkdir -p dist
-	$(UV) tool run --quiet --from cyclonedx-bom==7.5.0 cyclonedx-py requirements deploy/requirements.lock \
+sbom: dist/requirements.lock
+	$(UV) tool run --quiet --from cyclonedx-bom==7.5.0 cyclonedx-py requirements dist/requirements.lock \
 		--output-reproducible --output-file dist/sbom.json
 	$(PYTHON) .ci/sbom_of_page.py dist/sbom.json
 
 # A wheel of every package that the image depends on, for both of its processors and each Python: nothing is compiled.
-platforms: | $(UV)
+platforms: dist/requirements.lock
 	for python in 3.11 3.12 3.13 3.14; do for processor in x86_64 aarch64; do \
 		$(UV) pip compile --quiet --no-deps --only-binary :all: --python-version $$python \
-		--python-platform $$processor-unknown-linux-gnu deploy/requirements.lock >/dev/null || exit 1; done; done
+		--python-platform $$processor-unknown-linux-gnu dist/requirements.lock >/dev/null || exit 1; done; done
 
 # The site of docs/, in dist/docs; a link that leads nowhere fails.
 docs: | $(UV)
@@ -86,12 +86,22 @@ docs: | $(UV)
 wheels: | $(UV)
 	rm -rf dist/wheels .bootstrap/alone
 	for folder in . clients/python; do $(UV) build --quiet --wheel --out-dir dist/wheels \
-		--build-constraints deploy/build.lock --require-hashes $$folder || exit 1; done
+		--build-constraints requirements.lock --require-hashes $$folder || exit 1; done
+	! $(PYTHON) -m zipfile -l dist/wheels/veilface-*.whl | grep -vE '^(File Name|veilface/|veilface-[^/]*\.dist-info/)'
 	test ! -d api/web/client || $(PYTHON) -m zipfile -l dist/wheels/veilface-*.whl | grep -F api/web/client/client.js.gz >/dev/null
 	$(UV) venv --quiet --python '>=3.11' .bootstrap/alone
 	$(UV) pip install --quiet --python .bootstrap/alone/bin/python --constraint requirements.lock dist/wheels/veilface_client-*.whl
 	.bootstrap/alone/bin/python -I -W error -c "import veilface_client, sys; sys.exit('api' in sys.modules)"
 	.bootstrap/alone/bin/veilface-client --version
+
+# The wheel with the oldest libraries that pyproject.toml allows, where a folder `api` would be imported instead of ours.
+lowest: wheels
+	rm -rf .bootstrap/lowest && mkdir -p .bootstrap/lowest/elsewhere/api
+	echo 'raise SystemExit("the wrong api")' > .bootstrap/lowest/elsewhere/api/__init__.py
+	$(UV) venv --quiet --python '>=3.11' .bootstrap/lowest/venv
+	$(UV) pip install --quiet --python .bootstrap/lowest/venv/bin/python --resolution lowest-direct --only-binary :all: -r pyproject.toml
+	$(UV) pip install --quiet --python .bootstrap/lowest/venv/bin/python --no-deps dist/wheels/veilface-*.whl
+	cd .bootstrap/lowest/elsewhere && PYTHONPATH=. ../venv/bin/veilface demo
 
 # The container's image, without a registry; as root.
 image:
@@ -116,26 +126,31 @@ release:
 workflows: | $(UV)
 	$(UV) tool run --quiet --from zizmor==1.32.0 zizmor --quiet --offline --persona=pedantic --strict-collection .github/workflows
 
+# What the image has of requirements.lock, for tools that know no other form: pip on a host, the audit, the bill of materials.
+dist/requirements.lock: requirements.lock pyproject.toml | $(UV)
+	mkdir -p dist
+	$(UV) pip compile --quiet --universal --generate-hashes --python-version 3.11 --constraint requirements.lock pyproject.toml --extra postgres --extra redis -o $@
+
 .venv/core: requirements.lock pyproject.toml | $(UV)
 	test -x $(VENV)/python || $(UV) venv --quiet --python '>=3.11' .venv
-	$(UV) pip install --quiet --python $(VENV)/python --require-hashes -r requirements.lock
-	$(UV) pip install --quiet --python $(VENV)/python --no-deps -e .
+	$(UV) pip install $(LOCKED) --python $(VENV)/python -r pyproject.toml
+	$(UV) pip install --quiet --python $(VENV)/python --build-constraints requirements.lock --no-deps -e .
 	touch $@
 
-.venv/dev: requirements-dev.lock clients/python/pyproject.toml .venv/core | $(UV)
-	$(UV) pip install --quiet --python $(VENV)/python --require-hashes -r requirements-dev.lock
-	$(UV) pip install --quiet --python $(VENV)/python --no-deps -e clients/python
+.venv/dev: clients/python/pyproject.toml .venv/core | $(UV)
+	$(UV) pip install $(LOCKED) --python $(VENV)/python -r pyproject.toml --extra all --group dev
+	$(UV) pip install --quiet --python $(VENV)/python --build-constraints requirements.lock --no-deps -e clients/python
 	touch $@
 
-.bootstrap/bin/uv:
+# The version and hashes of uv stand in the lock file too.
+.bootstrap/bin/uv: requirements.lock
 	$(PYTHON) -m venv .bootstrap
-	.bootstrap/bin/python -m pip install --quiet uv
+	sed -n '/^uv==/,/[^\\]$$/p' requirements.lock > .bootstrap/uv.lock
+	.bootstrap/bin/python -m pip install --quiet --require-hashes --requirement .bootstrap/uv.lock
+	touch $@
 
 lock: | $(UV)
-	$(UV) pip compile --quiet --upgrade pyproject.toml --universal --generate-hashes --python-version 3.11 -o requirements.lock
-	$(UV) pip compile --quiet pyproject.toml --extra all --group dev --universal --generate-hashes --python-version 3.11 -c requirements.lock -o requirements-dev.lock
-	$(UV) pip compile --quiet pyproject.toml --extra redis --universal --generate-hashes --python-version 3.11 -c requirements.lock -o deploy/requirements.lock
-	echo hatchling | $(UV) pip compile --quiet --upgrade - --universal --generate-hashes --python-version 3.11 -o deploy/build.lock
+	$(UV) pip compile --quiet --upgrade --universal --generate-hashes --python-version 3.11 pyproject.toml --extra all --group build --group dev -o requirements.lock
 
 clean:
 	rm -rf .venv .bootstrap dist clients/javascript/dist clients/javascript/node_modules api/web/client .schemathesis templates/distances/kernels/__pycache__ .mypy_cache .pytest_cache .ruff_cache .hypothesis

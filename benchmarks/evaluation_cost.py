@@ -35,7 +35,7 @@ def memory_of(process: psutil.Process) -> int:
 def main(arguments: list[str]) -> int:
     """Run the command with these arguments, and print what it took."""
     start = time.monotonic()
-    process = psutil.Popen([sys.executable, "-m", "api.cli", "evaluate", *arguments])
+    process = psutil.Popen([sys.executable, "-P", "-m", "veilface", "evaluate", *arguments])
     peak = 0
     while process.poll() is None:
         peak = max(peak, memory_of(process))

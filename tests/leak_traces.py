@@ -237,13 +237,13 @@ def exercise(material: Material, folder: Path, *, database_url: str) -> ServiceT
     }
     with (folder / "out").open("wb") as out, (folder / "err").open("wb") as err:
         process = subprocess.Popen(
-            [sys.executable, "-m", "api.cli", "serve", "--port", "0", "--workers", "2"],
+            [sys.executable, "-m", "veilface", "serve", "--port", "0", "--workers", "2"],
             cwd=ROOT, env=environment, stdout=out, stderr=err,
         )  # fmt: skip
     try:
         url = _await_ready(process, folder)
         subprocess.run(
-            [sys.executable, "-m", "api.cli", "db", "template-enrollment", "--allow"],
+            [sys.executable, "-m", "veilface", "db", "template-enrollment", "--allow"],
             cwd=ROOT, env=environment, check=True, capture_output=True,
         )  # fmt: skip
         words = (folder / "out").read_text().split()

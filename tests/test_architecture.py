@@ -8,7 +8,15 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-LAYERS = {"templates": 1, "models": 1, "enroll": 2, "verify": 2, "attacks": 3, "api": 4}
+LAYERS = {
+    "templates": 1,
+    "models": 1,
+    "enroll": 2,
+    "verify": 2,
+    "attacks": 3,
+    "api": 4,
+    "veilface": 5,
+}
 
 
 def imported_packages(source: str) -> set[str]:

@@ -30,10 +30,3 @@ def test_the_bill_names_what_private_mode_brings_into_the_wheel(tmp_path: Path) 
         (digest,) = component["hashes"]
         assert len(bytes.fromhex(digest["content"])) == hashlib.sha512().digest_size
         assert {"ref": component["bom-ref"]} in written["dependencies"]
-
-
-def test_make_sbom_adds_it() -> None:
-    # Where `make` runs the tests, another one says what folder it leaves.
-    command = ["make", "--dry-run", "--no-print-directory", "sbom"]
-    dry = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-    assert dry.stdout.splitlines()[-1].endswith(" .ci/sbom_of_page.py dist/sbom.json")

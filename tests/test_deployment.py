@@ -106,19 +106,6 @@ def test_the_image_gets_the_code_and_its_locked_dependencies_only() -> None:
     assert "--require-hashes" in DOCKERFILE
 
 
-def test_the_image_has_the_versions_that_are_tested() -> None:
-    def pins(path: Path) -> dict[str, str]:
-        return dict(re.findall(r"^([a-z0-9-]+)(?:\[\w+\])?==(\S+)", path.read_text(), re.M))
-
-    deployed, tested = pins(DEPLOY / "requirements.lock"), pins(ROOT / "requirements.lock")
-    assert tested
-    assert {name: deployed[name] for name in tested} == tested
-    extra = set(deployed) - set(tested)
-    assert "redis" in extra
-    of_development = pins(ROOT / "requirements-dev.lock")
-    assert all(deployed[name] == of_development[name] for name in extra & set(of_development))
-
-
 @pytest.fixture
 def systemd() -> None:
     require_systemd()

@@ -152,7 +152,10 @@ PARSED = {
     ),
     ("docs/evaluation-columns.md", "veilface evaluate ~/lfw --pack $PACK --labels labels.csv "
      "--strategy raw,random --out groups"): OWN_DATA,
-    ("docs/evaluation.md", "dask scheduler --host 127.0.0.1 --port 8786 &"): OWN_DATA,
+    (
+        "docs/evaluation.md",
+        "dask scheduler --host 127.0.0.1 --port 8786 --preload veilface &",
+    ): OWN_DATA,
     ("docs/liveness.md", "veilface calibrate --liveness booth --bpcer 0.05 --pack buffalo_l "
      "--out contract.json"): OWN_DATA,
     ("docs/liveness.md", "veilface evaluate liveness other-booth --pack buffalo_l "

@@ -1,6 +1,5 @@
-"""`make release`, with its builders replaced, and the workflows of a forge that call it."""
+"""The notes of a release, and the workflows of a forge that make one."""
 
-import hashlib
 import re
 import shutil
 import subprocess
@@ -31,21 +30,6 @@ CHANGELOG = """\
 
 - What was released before.
 """
-# What the targets that `make release` asks for leave behind.
-BUILT = {
-    "wheels/veilface-1.10.0-py3-none-any.whl": b"the service",
-    "wheels/veilface_client-1.9.0-py3-none-any.whl": b"the client",
-    "npm/veilface-client-1.9.0.tgz": b"the client of browsers",
-    "sbom.json": b"{}",
-}
-PROGRAMS = ["basename", "cp", "git", "make", "mkdir", "rm", "sha256sum"]
-IMAGE = "veilface-1.10.0-image.tar.gz"
-
-
-def put(file: Path, text: str) -> None:
-    file.parent.mkdir(exist_ok=True)
-    file.write_text(f"#!/bin/sh\n{text}\n")
-    file.chmod(0o755)
 
 
 def git(folder: Path, *arguments: str) -> None:
@@ -54,84 +38,30 @@ def git(folder: Path, *arguments: str) -> None:
 
 
 @pytest.fixture
-def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A repository of its own, with the Makefile and the scripts; root and podman are in it."""
-    folder = tmp_path / "checkout"
-    shutil.copytree(ROOT / ".ci", folder / ".ci")
-    shutil.copy(ROOT / "Makefile", folder)
-    (folder / "CHANGELOG.md").write_text(CHANGELOG)
-    (folder / "pyproject.toml").write_text('[project]\nversion = "1.10.0"\n')
-    (folder / ".gitignore").write_text("dist/\n")
-    put(folder / ".ci" / "image", 'printf "the image" > "$1"')
-    git(folder, "init")
-    git(folder, "add", "--all")
-    git(folder, "commit", "--message", "Release")
-    tools = tmp_path / "tools"
-    put(tools / "podman", "exit 1")
-    put(tools / "id", "echo 0")
-    for program in PROGRAMS:
-        (tools / program).symlink_to(shutil.which(program) or pytest.fail(f"there is no {program}"))
-    monkeypatch.setenv("PATH", str(tools))
-    return folder
+def checkout(tmp_path: Path) -> Path:
+    """A repository of its own, with the script."""
+    (tmp_path / ".ci").mkdir()
+    shutil.copy(ROOT / ".ci" / "release_notes.py", tmp_path / ".ci")
+    (tmp_path / "CHANGELOG.md").write_text(CHANGELOG)
+    (tmp_path / "pyproject.toml").write_text('[project]\nversion = "1.10.0"\n')
+    git(tmp_path, "init")
+    git(tmp_path, "add", "--all")
+    git(tmp_path, "commit", "--message", "Release")
+    return tmp_path
 
 
-def release(checkout: Path, *settings: str) -> "subprocess.CompletedProcess[str]":
-    """Run the target; its builders write what they are asked for, and note that they were."""
-    builders = checkout.parent / "builders"
-    for name, content in BUILT.items():
-        file = builders / "dist" / name
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_bytes(content)
-    builder = checkout.parent / "tools" / "make-instead"
-    put(builder, f'echo "asked: $*"\ncp -R {builders}/dist .')
-    command = ["make", "release", f"MAKE={builder}", f"PYTHON={sys.executable}", *settings]
-    return subprocess.run(command, cwd=checkout, capture_output=True, text=True, check=False)
+def notes(checkout: Path) -> "subprocess.CompletedProcess[str]":
+    command = [sys.executable, checkout / ".ci" / "release_notes.py"]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
-def released(checkout: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in (checkout / "dist" / "release").iterdir()}
-
-
-def test_a_release_is_what_was_built_with_notes_and_checksums(checkout: Path) -> None:
-    old = checkout / "dist" / "release" / "veilface-1.1.0-py3-none-any.whl"
-    old.parent.mkdir(parents=True)
-    old.touch()
-    ran = release(checkout)
-    assert ran.returncode == 0, ran.stderr
-    assert "asked: javascript-package wheels sbom\n" in ran.stdout
-    files = released(checkout)
-    sums = files.pop("SHA256SUMS").decode().splitlines()
-    assert sorted(sums) == sorted(
-        f"{hashlib.sha256(content).hexdigest()}  {name}" for name, content in files.items()
-    )
-    assert files.pop("NOTES.md").decode() == "### Added\n\n- What is released.\n"
-    assert files.pop(IMAGE) == b"the image"
-    assert files == {Path(name).name: content for name, content in BUILT.items()}
-
-
-@pytest.mark.parametrize("without", ["root", "podman"])
-def test_a_release_has_its_image_unless_it_is_told_not_to(checkout: Path, without: str) -> None:
-    tools = checkout.parent / "tools"
-    if without == "root":
-        put(tools / "id", "echo 1000")
-    else:
-        (tools / "podman").unlink()
-    ran = release(checkout)
-    assert ran.returncode != 0
-    assert ran.stderr.startswith("no release: its image needs root and podman; IMAGE=no leaves it")
-    assert "asked:" not in ran.stdout
-    assert not (checkout / "dist" / "release").exists()
-    ran = release(checkout, "IMAGE=no")
-    assert ran.returncode == 0, ran.stderr
-    built = {Path(name).name for name in BUILT}
-    assert released(checkout).keys() == {*built, "NOTES.md", "SHA256SUMS"}
-
-
-def test_an_image_that_fails_fails_the_release(checkout: Path) -> None:
-    put(checkout / ".ci" / "image", "exit 1")
-    git(checkout, "commit", "--all", "--message", "No image")
-    assert release(checkout).returncode != 0
-    assert "SHA256SUMS" not in released(checkout)
+@pytest.mark.parametrize("tags", [(), ("v1.10.0", "vendored")])
+def test_the_notes_are_those_of_the_version(checkout: Path, tags: tuple[str, ...]) -> None:
+    for tag in tags:
+        git(checkout, "tag", tag)
+    written = notes(checkout)
+    assert (written.returncode, written.stderr) == (0, "")
+    assert written.stdout == "### Added\n\n- What is released.\n"
 
 
 def undescribed(checkout: Path) -> str:
@@ -148,7 +78,7 @@ def empty(checkout: Path) -> str:
 
 
 def changed(checkout: Path) -> str:
-    (checkout / "Makefile").write_text((checkout / "Makefile").read_text() + "\n")
+    (checkout / "pyproject.toml").write_text('[project]\nversion = "1.10.1"\n')
     return "1 files are not as they were committed"
 
 
@@ -170,19 +100,11 @@ def tagged_twice(checkout: Path) -> str:
 @pytest.mark.parametrize(
     "spoil", [undescribed, empty, changed, untracked, tagged_otherwise, tagged_twice]
 )
-def test_nothing_is_built_where_there_is_nothing_to_release(checkout: Path, spoil: Any) -> None:
+def test_there_are_no_notes_where_there_is_nothing_to_release(checkout: Path, spoil: Any) -> None:
     reason = spoil(checkout)
-    ran = release(checkout)
-    assert ran.returncode != 0
-    assert f"no release: {reason}" in ran.stderr
-    assert "asked:" not in ran.stdout
-    assert not (checkout / "dist" / "release").exists()
-
-
-def test_the_tag_of_the_version_releases_it(checkout: Path) -> None:
-    git(checkout, "tag", "v1.10.0")
-    git(checkout, "tag", "vendored")
-    assert release(checkout).returncode == 0
+    written = notes(checkout)
+    assert (written.returncode, written.stdout) == (1, "")
+    assert written.stderr.startswith(f"no release: {reason}")
 
 
 @pytest.mark.parametrize("file", WORKFLOWS, ids=lambda file: str(file.name))

@@ -4,6 +4,7 @@ So ``veilface --help`` is there at once, and ``veilface lift``, which a client m
 probe, and the workers of ``veilface serve`` do not import what the audit needs.
 """
 
+import signal
 from importlib import import_module
 from typing import Annotated, Any
 
@@ -73,7 +74,10 @@ class Veilface(Commands):
         if (both := " ".join(args[:2])) in COMMANDS:
             args = [both, *args[2:]]
         name, command, rest = super().resolve_command(ctx, args)
-        return name, command and load(name), rest
+        loaded = command and load(name)
+        if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:  # as veilface/__main__.py leaves it
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+        return name, loaded, rest
 
     def get_params(self, ctx: Any) -> Any:
         """Give every flag a default: Typer imports pydantic to convert a value that is none."""

@@ -1,18 +1,21 @@
 """``veilface audit-log``: who did what, and whether the log is whole."""
 
 import json
+from collections.abc import Iterable, Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from api.cli.console import emit, message, progress, say
+from api.cli.console import emit, message, progress, say, say_lines
 from api.cli.errors import UsageError
 from api.cli.files import read_bounded
 from api.cli.options import STORE, AsJson, takes_settings
 from api.http.values import iso_time
 from api.process.opening import checked_store
 from api.settings import Settings
+from templates.store import TemplateStore
 from templates.store.audit_chain import Anchor, Line
 from templates.store.audit_log import AuditLog, BrokenAuditLog
 from templates.store.identifiers import InvalidIdentifier
@@ -135,19 +138,30 @@ def show(
 
     Example: `veilface audit-log show --subject alice --limit 100`
     """
-    written = 0
     with checked_store(settings) as store:
         name = tenant or (settings.default_tenant if subject is not None else None)
         pseudonyms = () if subject is None else store.signer.pseudonyms(str(name), subject)
-        for line in store.audit_log.lines(after=after):
-            if name is not None and line.tenant != name:
-                continue
-            if pseudonyms and line.pseudonym not in pseudonyms:
-                continue
-            say(json.dumps(_described(line)))
-            written += 1
-            if written == limit:
-                return
+        lines = store.audit_log.lines(after=after)
+        if name is not None:
+            lines = _lines_of(store, name, lines)
+        chosen = (line for line in lines if not pseudonyms or line.pseudonym in pseudonyms)
+        say_lines(json.dumps(_described(line)) for line in islice(chosen, limit))
+
+
+def _lines_of(store: TemplateStore, tenant: str, lines: Iterable[Line]) -> Iterator[Line]:
+    """Return the lines of a tenant, which may be erased; refuse one that has neither line nor row.
+
+    Raises
+    ------
+    UnknownTenant
+    """
+    there = False
+    for line in lines:
+        if line.tenant == tenant:
+            there = True
+            yield line
+    if not there:
+        store.tenants.get(tenant)
 
 
 def _described(line: Line) -> dict[str, Any]:

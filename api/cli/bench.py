@@ -20,7 +20,7 @@ from api.cli.distance_bench import (
     memory_needed,
 )
 from api.cli.errors import CommandError, UsageError
-from api.cli.files import read_bounded
+from api.cli.files import read_photo
 from api.cli.inputs import listed
 from api.cli.options import AsJson, takes_settings
 from api.settings import MAX_ONNX_THREADS, Settings, processors
@@ -170,7 +170,7 @@ def models(
         providers=settings.providers,
         threads=_numbers(threads, "--threads", at_least=1, at_most=MAX_ONNX_THREADS),
         repeats=repeats,
-        photos={str(path): read_bounded(path, settings.max_image_bytes) for path in photo or ()},
+        photos={str(path): read_photo(path, settings.max_image_bytes) for path in photo or ()},
     )
     with progress("measuring", bench.rounds) as advance:
         photos, graphs = bench.time_photos(advance), bench.time_graphs(advance)

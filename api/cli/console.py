@@ -1,11 +1,14 @@
 """Where the command line speaks: results on stdout, everything else on stderr.
 
-Rich is imported where something is drawn: most commands fail, or speak, without it.
+Where the reader has gone, as that of ``veilface verify … | true``, a command goes on without words:
+its exit status is an answer too. Rich is imported where something is drawn: most commands fail, or
+speak, without it.
 """
 
 import json
+import os
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -22,17 +25,49 @@ _WIDTH_OF_A_FILE = 160  # where nobody looks at a terminal, tables are not squee
 
 def message(text: str) -> None:
     """Say something to the person; it does not disturb a program that reads stdout."""
-    typer.echo(text, err=True)
+    _write(text, err=True)
 
 
 def emit(value: Mapping[str, Any] | Sequence[Any]) -> None:
     """Write one JSON value to stdout."""
-    typer.echo(json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False))
+    say(as_json_text(value))
+
+
+def as_json_text(value: Mapping[str, Any] | Sequence[Any]) -> str:
+    """Write one JSON value as :func:`emit` does."""
+    return json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False)
 
 
 def say(text: str) -> None:
     """Write one line of the result to stdout."""
-    typer.echo(text)
+    _write(text)
+
+
+def say_lines(lines: Iterable[str]) -> None:
+    """Write lines to stdout, until there are no more or the reader has gone."""
+    try:
+        for line in lines:
+            typer.echo(line)
+    except BrokenPipeError:
+        drop_unwritten()
+
+
+def _write(text: str, *, err: bool = False) -> None:
+    try:
+        typer.echo(text, err=err)
+    except OSError as error:
+        if not (err or isinstance(error, BrokenPipeError)):
+            raise
+        drop_unwritten()
+
+
+def drop_unwritten() -> None:
+    """Forget what could not be written: at its end Python would try again, and fail."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except OSError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def table(title: str, *columns: str) -> "Table":
@@ -51,8 +86,10 @@ def show(*tables: "Table") -> None:
 
     width = None if sys.stdout.isatty() else _WIDTH_OF_A_FILE
     console = Console(file=sys.stdout, width=width)
-    for listing in tables:
-        console.print(listing)
+    with console.capture() as captured:
+        for listing in tables:
+            console.print(listing)
+    say(captured.get().removesuffix("\n"))
 
 
 def demo_notice(embedder_sha256: str, *, n: int) -> dict[str, str]:

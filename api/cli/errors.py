@@ -12,7 +12,7 @@ from typing import Any
 import typer
 from typer.core import TyperGroup
 
-from api.cli.console import message
+from api.cli.console import drop_unwritten, message
 from templates.errors import VeilfaceError
 
 FAILED = 1
@@ -23,6 +23,7 @@ EXTRAS = {
     "evaluate": ("joblib", "matplotlib"),
     "audit": ("matplotlib", "sklearn"),
     "cluster": ("distributed",),
+    "postgres": ("psycopg",),
     "redis": ("redis",),
     "torch": ("skimage", "torch"),
 }
@@ -44,10 +45,11 @@ class Commands(TyperGroup):
         """Run the chosen command; `verify` fails with a status that is no rejection."""
         try:
             return super().invoke(ctx)
-        except (typer.Exit, typer.Abort, typer.TyperException, BrokenPipeError):
+        except (typer.Exit, typer.Abort, typer.TyperException):
             raise
         except Exception as error:
             message(f"error: {sentence(error)}")
+            drop_unwritten()
             failed = _FAILED_STATUS.get(ctx.invoked_subcommand, FAILED)
             raise typer.Exit(USAGE if isinstance(error, UsageError) else failed) from None
 

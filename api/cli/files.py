@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from api.cli.errors import CommandError
+from api.cli.errors import CommandError, UsageError
 
 PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp"})
 
@@ -14,6 +14,20 @@ def read_bounded(path: Path, most: int) -> bytes:
     if len(data) > most:
         raise CommandError(f"{path} has more than {most} bytes; is it the right file?")
     return data
+
+
+def read_photo(path: Path, most: int) -> bytes:
+    """Read a photo that somebody named.
+
+    Raises
+    ------
+    UsageError
+        There is none.
+    """
+    try:
+        return read_bounded(path, most)
+    except FileNotFoundError:
+        raise UsageError(f"no such photo: {path}") from None
 
 
 def find_photos(folder: Path) -> list[Path]:

@@ -7,10 +7,11 @@ from typing import Annotated, Any
 import typer
 
 from api.cli import master_keys, renewal
-from api.cli.console import emit, message, progress, say, show, table
+from api.cli.console import as_json_text, emit, message, progress, say, show, table
 from api.cli.errors import CommandError, UsageError
 from api.cli.files import read_bounded
 from api.cli.master_keys import FILES, opened_store
+from api.cli.new_key import show_once
 from api.cli.options import STORE, AsJson, Tenant, takes_settings
 from api.http.audit import operator
 from api.http.receipts import read_receipt_keys, verify_answer
@@ -84,11 +85,12 @@ def create(
             liveness=liveness,
             by=operator(),
         )
-    if as_json:
-        emit({"token": made.token, **_described(made.key)})
-    else:
-        message(f"Key {made.key.prefix} of tenant {name}, shown only now:")
-        say(made.token)
+        if as_json:
+            text = as_json_text({"token": made.token, **_described(made.key)})
+        else:
+            message(f"Key {made.key.prefix} of tenant {name}, shown only now:")
+            text = made.token
+        show_once(store, made, text)
 
 
 @app.command("list")
@@ -174,13 +176,14 @@ def replace(
     """
     with opened_store(settings) as store:
         made = store.api_keys.replace(prefix, grace=timedelta(hours=grace_hours), by=operator())
-    if made is None:
-        raise CommandError("no valid key of this prefix; see `veilface keys list`")
-    if as_json:
-        emit({"token": made.token, "replaces": prefix, **_described(made.key)})
-    else:
-        message(f"Key {made.key.prefix} replaces {prefix}, shown only now:")
-        say(made.token)
+        if made is None:
+            raise CommandError("no valid key of this prefix; see `veilface keys list`")
+        if as_json:
+            text = as_json_text({"token": made.token, "replaces": prefix, **_described(made.key)})
+        else:
+            message(f"Key {made.key.prefix} replaces {prefix}, shown only now:")
+            text = made.token
+        show_once(store, made, text)
 
 
 @app.command("rotate-tenant")

@@ -10,7 +10,7 @@ import typer
 
 from api.cli.console import demo_notice, emit, say
 from api.cli.errors import CommandError, UsageError
-from api.cli.files import read_bounded
+from api.cli.files import read_bounded, read_photo
 from api.cli.options import AsJson
 from enroll.enroller import MAX_PHOTOS
 from models.errors import ModelError
@@ -180,7 +180,7 @@ def _signing_token(subject: str | None, level: str | None, *, asked: bool) -> st
 
 def embed_file(pack: ModelPack, photo: Path, *, policy: FacePolicy) -> np.ndarray[Any, Any]:
     """Embed one photo file; an error names the file. Returns float32 (n,), unit norm."""
-    data = read_bounded(photo, MAX_PHOTO_BYTES)
+    data = read_photo(photo, MAX_PHOTO_BYTES)
     try:
         return pack.embed_photo(data, policy=policy).embedding
     except ModelError as error:

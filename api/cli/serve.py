@@ -12,6 +12,7 @@ import typer
 
 from api.cli.console import demo_notice, message, say
 from api.cli.errors import CommandError
+from api.cli.new_key import show_once
 from api.cli.options import takes_settings
 from api.cli.verdict import private_mode_weakness, verdict_lines
 from api.http.audit_report import open_audit_report
@@ -19,12 +20,13 @@ from api.limits.rates import RateLimits
 from api.process.metrics import shared_directory
 from api.process.opening import key_beside_database, require_privacy
 from api.process.operations import tls_options
-from api.process.runtime import Runtime, bootstrap_token
+from api.process.runtime import Runtime
 from api.process.supervisor import run_server
 from api.settings import Settings
 from models.sessions import resolve_providers
 from templates.contract.document import Contract
 from templates.decoys import DecoyGenerator
+from templates.store import TemplateStore
 
 
 @takes_settings(*Settings.model_fields)
@@ -45,16 +47,12 @@ def serve(
     Example: `veilface serve --pack buffalo_l --data-dir veilface-data --workers 2`
     """
     with _ended_by_sigterm():
-        contract, token, demo = _opened_once(settings, check=check)
+        contract, demo = _opened_once(settings, check=check)
         if demo and not settings.demo:
             settings = settings.model_copy(update={"demo": True})
         if check:
             say("Everything fits together: contract, decoys, pack, database and master key.")
             return
-        if token is not None:
-            say(f"API key with all rights of tenant {settings.default_tenant}, shown only now:")
-            say(token)
-            del token  # workers get a copy of what is left
         settings = _with_ports(settings)
         # Workers count together in a folder; a single process counts in its memory.
         counting = nullcontext() if settings.workers == 1 else shared_directory()
@@ -103,15 +101,15 @@ def _address(host: str, port: int) -> str:
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
-def _opened_once(settings: Settings, *, check: bool) -> tuple[Contract, str | None, bool]:
+def _opened_once(settings: Settings, *, check: bool) -> tuple[Contract, bool]:
     """Open everything and let go of it again, models included, before the workers open theirs.
+
+    The first API key is made and shown where there is none, unless this is a mere check.
 
     Returns
     -------
     contract : Contract
         The one that workers serve.
-    token : str or None
-        The first API key, made now; None where there is one, and for a mere check.
     demo : bool
         Whether the embedder is the demo model.
     """
@@ -136,12 +134,20 @@ def _opened_once(settings: Settings, *, check: bool) -> tuple[Contract, str | No
         if browsers_lift and (weakness := private_mode_weakness(runtime.contract)) is not None:
             message(f"warning: private mode: {weakness}")
         binding = runtime.contract.binding
-        token = None if check else bootstrap_token(runtime.store, settings)
+        if not check:
+            _show_first_key(runtime.store, settings)
         if check and (warning := runtime.superseded_calibrations()) is not None:
             message(f"warning: {warning}")
-        return runtime.contract, token, bool(demo_notice(binding.embedder_sha256, n=binding.n))
+        return runtime.contract, bool(demo_notice(binding.embedder_sha256, n=binding.n))
     finally:
         runtime.close()
+
+
+def _show_first_key(store: TemplateStore, settings: Settings) -> None:
+    made = store.api_keys.bootstrap(tenant=settings.default_tenant)
+    if made is not None:
+        said = f"API key with all rights of tenant {settings.default_tenant}, shown only now:"
+        show_once(store, made, f"{said}\n{made.token}")
 
 
 def free_port(host: str, port: int, *, option: str = "") -> int:

@@ -151,7 +151,7 @@ def setup(
     if serve:
         # Anew: this process has run the models, and what accelerators have begun outlives no fork.
         sys.stdout.flush()
-        os.execv(sys.executable, [sys.executable, "-P", "-m", "api.cli", "serve"])  # noqa: S606
+        os.execv(sys.executable, [sys.executable, "-P", "-m", "veilface", "serve"])  # noqa: S606
 
 
 def assign_roles(labelled: LabelledFolder, faces: Sequence[Path], like: Sequence[Path]) -> Roles:

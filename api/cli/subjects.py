@@ -12,7 +12,7 @@ import typer
 
 from api.cli.console import demo_notice, emit, message, say
 from api.cli.errors import CommandError, UsageError
-from api.cli.files import read_bounded
+from api.cli.files import read_bounded, read_photo
 from api.cli.options import LOCAL, AsJson, Tenant, takes_settings
 from api.http.audit import operator
 from api.http.errors import ApiError
@@ -120,7 +120,7 @@ def enroll(
         holder_key: bytearray | None = new_holder_key()
     else:
         holder_key = None if holder_key_file is None else read_holder_key(holder_key_file)
-    data = [read_bounded(photo, settings.max_image_bytes) for photo in photos]
+    data = [read_photo(photo, settings.max_image_bytes) for photo in photos]
     runtime = Runtime.open(settings)
     try:
         pack = _required_pack(runtime)
@@ -221,11 +221,8 @@ def verify(
     """
     if len(photos) > MAX_PROBE_PHOTOS:
         raise UsageError(f"a verification takes 1 to {MAX_PROBE_PHOTOS} photos, not {len(photos)}")
-    for photo in photos:
-        if not photo.exists():
-            raise UsageError(f"no such photo: {photo}")
     holder_key = None if holder_key_file is None else read_holder_key(holder_key_file)
-    data = [read_bounded(photo, settings.max_image_bytes) for photo in photos]
+    data = [read_photo(photo, settings.max_image_bytes) for photo in photos]
     sealed = None if held_template is None else _handed_in(held_template)
     runtime = Runtime.open(settings)
     try:

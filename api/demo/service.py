@@ -20,17 +20,29 @@ START_TIMEOUT_S = 120.0
 
 @contextlib.contextmanager
 def running_service(folder: Path) -> Iterator[httpx.Client]:
-    """Start ``veilface serve`` on a free local port; a client with the bootstrap key."""
+    """Start ``veilface serve`` on a free local port; a client with the bootstrap key.
+
+    The service ends with the block, also where this process is ended by SIGTERM.
+    """
     port = _free_port()
     log, shown = folder / "serve.log", folder / "serve.out"
-    command = [sys.executable, "-m", "api.cli", "serve", "--config", str(folder / "veilface.toml")]
+    command = [
+        sys.executable,
+        "-P",
+        "-m",
+        "veilface",
+        "serve",
+        "--config",
+        str(folder / "veilface.toml"),
+    ]
     # Settings of the person who runs the demo must not reach it.
     environment = {k: v for k, v in os.environ.items() if not k.startswith("VEILFACE_")}
     shown.unlink(missing_ok=True)
     # The first start prints a token with all rights: nobody else may read it on its way.
     with log.open("wb") as errors, open(shown, "xb", opener=_privately) as output:
+        before = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
         process = subprocess.Popen(  # noqa: S603 - our own command, no shell
-            [*command, "--port", str(port)],
+            [*command, "--config", str(folder / "veilface.toml"), "--port", str(port)],
             stdout=output,
             stderr=errors,
             env={**environment, "PYTHONUNBUFFERED": "1"},
@@ -46,6 +58,7 @@ def running_service(folder: Path) -> Iterator[httpx.Client]:
                 yield client
         finally:
             process.send_signal(signal.SIGTERM)
+            signal.signal(signal.SIGTERM, before)
             try:
                 process.wait(timeout=20)
             except subprocess.TimeoutExpired:

@@ -56,7 +56,6 @@ from verify import Verifier
 
 __all__ = [
     "Runtime",
-    "bootstrap_token",
     "file_sealer",
     "open_contract",
     "open_decoys",
@@ -391,12 +390,3 @@ class Runtime:
     def close(self) -> None:
         """Let go of the database's connections."""
         self.store.close()
-
-
-def bootstrap_token(store: TemplateStore, settings: Settings) -> str | None:
-    """Make the first tenant and its first API key, with all rights; None if there is a key.
-
-    The token is shown once, by whoever calls this, and kept nowhere.
-    """
-    made = store.api_keys.bootstrap(tenant=settings.default_tenant)
-    return None if made is None else made.token

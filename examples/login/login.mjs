@@ -11,7 +11,8 @@ async function login(name, photo) {
   body.append("image", new Blob([await buffer(photo)]));
   const headers = { Authorization: `Bearer ${VEILFACE_API_KEY}` };
   const path = `${VEILFACE_URL}/v1/subjects/${name}/verify`;
-  const answer = await fetch(path, { method: "POST", body, headers });
+  const signal = AbortSignal.timeout(30_000);
+  const answer = await fetch(path, { method: "POST", body, headers, redirect: "error", signal });
   const { decision, error } = await answer.json();
   if ([401, 403].includes(answer.status)) throw new Error(error.message); // our key, not their face
   if (!answer.ok) return [answer.status, error.message]; // no face in the photo, locked out …

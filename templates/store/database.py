@@ -17,7 +17,6 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-import psycopg
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection, Engine
 from sqlalchemy.exc import DBAPIError, SQLAlchemyError
@@ -31,7 +30,19 @@ T = TypeVar("T")
 
 _ATTEMPTS = 5
 _RETRIED_STATES = {"40001", "40P01"}  # serialisation failure, deadlock
-_DATABASE_ERRORS = (SQLAlchemyError, sqlite3.Error, psycopg.Error, OSError)
+try:
+    import psycopg
+
+    _POSTGRES: tuple[type[Exception], ...] = (psycopg.Error,)
+    _UNANSWERED: tuple[type[Exception], ...] = (psycopg.OperationalError, psycopg.InterfaceError)
+except ModuleNotFoundError:  # of the extra `postgres`, without which there is SQLite
+    _POSTGRES = _UNANSWERED = ()
+_DATABASE_ERRORS: tuple[type[Exception], ...] = (
+    SQLAlchemyError,
+    sqlite3.Error,
+    OSError,
+    *_POSTGRES,
+)
 _WRITING = "veilface writing"  # lock that every write shares, see await_writers
 _EMPTY_LOG = "PRAGMA wal_checkpoint(TRUNCATE)"
 PURGE_WAIT_S = 0.25
@@ -392,25 +403,20 @@ def _translated(error: Exception) -> StoreError:
     name = type(cause).__name__
     if isinstance(cause, sqlite3.Error):
         return _sqlite_error(cause)
-    if isinstance(cause, psycopg.Error):
+    if isinstance(cause, _POSTGRES):
         state = _state(cause)
         if state == "42P01":
             return StoreError("a table is missing: run `veilface db upgrade`")
         if state == "55P03":
             return StoreBusy("another write holds the same rows for too long")
-        if lost or state[:2] in _UNAVAILABLE_CLASSES or _without_answer(cause):
+        # The server answers with a state; without one the connection failed.
+        unanswered = not state and isinstance(cause, _UNANSWERED)
+        if lost or state[:2] in _UNAVAILABLE_CLASSES or unanswered:
             return StoreUnavailable(f"the PostgreSQL server does not answer ({name} {state})")
         return StoreError(f"PostgreSQL refused the statement ({name} {state})")
     if isinstance(cause, OSError):
         return StoreUnavailable(f"the database cannot be reached: {cause.strerror}")
     return StoreError(f"the database cannot be used ({name})")
-
-
-def _without_answer(cause: psycopg.Error) -> bool:
-    # The server answers with a state; without one the connection failed.
-    return not _state(cause) and isinstance(
-        cause, psycopg.OperationalError | psycopg.InterfaceError
-    )
 
 
 def _sqlite_error(cause: sqlite3.Error) -> StoreError:

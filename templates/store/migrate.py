@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import psycopg
 import sqlalchemy as sa
 from alembic import command
 from alembic.autogenerate import compare_metadata
@@ -24,6 +23,7 @@ from templates.store.schema import Base
 
 _LOCK = "veilface schema"
 _TABLE_WAIT_S = 5.0
+_LOCK_NOT_AVAILABLE = "55P03"
 
 
 def upgrade(database: Database, revision: str = "head") -> None:
@@ -150,7 +150,7 @@ def _short_waits(database: Database, connection: Connection) -> Iterator[None]:
     try:
         yield
     except OperationalError as error:
-        if not isinstance(error.orig, psycopg.errors.LockNotAvailable):
+        if getattr(error.orig, "sqlstate", None) != _LOCK_NOT_AVAILABLE:
             raise
         raise StoreBusy(
             f"another session holds a table that the migration changes for more than "

@@ -14,7 +14,6 @@ from onnx import TensorProto, helper, numpy_helper
 from PIL import Image
 
 from api.process.runtime import (
-    bootstrap_token,
     file_sealer,
     open_keyring,
     open_store,
@@ -211,11 +210,11 @@ def deploy(folder: Path, *, database_url: str | None = None, **changes: Any) -> 
     store = open_store(settings, keyring)
     try:
         prepare_database(store)
-        token = bootstrap_token(store, settings)
+        first = store.api_keys.bootstrap(tenant=settings.default_tenant)
     finally:
         store.close()
-    assert token is not None
-    return Deployment(settings, token, contract, source)
+    assert first is not None
+    return Deployment(settings, first.token, contract, source)
 
 
 def environment_of(settings: Settings) -> dict[str, str]:

@@ -2,10 +2,7 @@
 
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
-
-import pytest
 
 import api
 from api.cli.errors import EXTRAS
@@ -50,22 +47,3 @@ def test_the_service_and_every_command_are_imported_without_an_extra() -> None:
 def test_the_block_is_felt() -> None:
     done = import_without(OPTIONAL, "verify.evaluation.figures")
     assert "matplotlib is not installed" in done.stderr
-
-
-@pytest.mark.parametrize("lock", ["requirements.lock", "deploy/requirements.lock"])
-def test_the_lock_of_the_service_has_no_more_than_it_needs(lock: str) -> None:
-    text = (ROOT.parent / lock).read_text()
-    assert "\nnumpy==" in text
-    for package in ("joblib", "matplotlib", "onnx", "scikit-learn", "torch", "distributed"):
-        assert f"\n{package}==" not in text
-    assert ("\nredis==" in text) == lock.startswith("deploy/")
-
-
-def test_the_lock_of_the_developers_has_every_extra() -> None:
-    text = (ROOT.parent / "requirements-dev.lock").read_text()
-    extras = tomllib.loads((ROOT.parent / "pyproject.toml").read_text())["project"][
-        "optional-dependencies"
-    ]
-    named = {each.partition(">=")[0] for some in extras.values() for each in some}
-    missing = [name for name in named if "[" not in name and f"\n{name}==" not in text]
-    assert missing == []

@@ -1,8 +1,13 @@
 """The command ``veilface-client`` against a running service."""
 
 import json
+import os
 import socket
+import subprocess
+import sys
 import threading
+import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -10,6 +15,7 @@ import pytest
 import veilface_client
 from tests.api.deployment import photo
 from tests.clients.conftest import Running
+from tests.patience import PATIENCE_S
 from tests.ports import free_port
 from veilface_client import Client
 from veilface_client.command import main
@@ -59,7 +65,6 @@ def test_no_decision_is_no_rejection(
     for arguments, said in (
         (["verify", "nobody", photos[0]], "not_enrolled"),
         (["verify", "../x", photos[0]], "a subject id has"),
-        (["verify", "cleo", str(tmp_path / "absent.png")], "absent.png: No such file"),
         (["verify", "cleo", photos[0], "--url", nowhere], "the service was not reached"),
     ):
         assert main(arguments) == 3
@@ -100,6 +105,51 @@ def test_what_is_missing_is_named(
         main(["verify", "cleo", photos[0]])
     assert ended.value.code == 2
     assert said in capsys.readouterr().err
+
+
+def test_a_missing_photo_is_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["verify", "cleo", str(tmp_path / "absent.png")])
+    assert ended.value.code == 2
+    assert "no such photo: " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("answered", [b"HTTP/1.1 200 OK\r\nx-slow: ", b"HTTP/1.1 200 OK\r\n\r\n"])
+def test_an_answer_that_comes_byte_by_byte_ends_at_the_time_limit(
+    answered: bytes, photos: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+
+        def drip() -> None:
+            with suppress(OSError), listener.accept()[0] as connection:
+                connection.sendall(answered)
+                while True:
+                    connection.sendall(b" ")
+                    time.sleep(0.05)
+
+        listener.settimeout(PATIENCE_S)
+        thread = threading.Thread(target=drip)
+        thread.start()
+        url = f"http://127.0.0.1:{listener.getsockname()[1]}"
+        assert main(["verify", "cleo", photos[0], "--url", url, "--timeout", "1"]) == 3
+        thread.join()
+    assert "no answer within 1 s" in capsys.readouterr().err
+
+
+def test_the_status_is_the_decision_where_nobody_reads_it(
+    service: Running, token: str, photos: list[str]
+) -> None:
+    read, write = os.pipe()
+    os.close(read)
+    with Client(service.url, token) as client:
+        client.enroll("dido", photos[0])
+        done = subprocess.run(
+            [sys.executable, "-P", "-m", "veilface_client", "verify", "dido", photos[1]],
+            stdout=write, stderr=subprocess.PIPE, timeout=PATIENCE_S, check=False,
+        )  # fmt: skip
+        client.erase("dido")
+    os.close(write)
+    assert (done.returncode, done.stderr) == (0, b"")
 
 
 def test_the_version_is_the_distributions(capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,8 +2,11 @@
 
 import re
 import subprocess
+import threading
 from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from urllib.parse import quote
 
 import httpx
 import pytest
@@ -111,6 +114,44 @@ def test_the_page_enrolls_whom_the_readme_logs_in(service: Service, tmp_path: Pa
         client.erase("anna")
     assert told[0] == "201 enrolled\n"
     assert told[1].startswith("409 ")
+
+
+class Impostor(BaseHTTPRequestHandler):
+    """Sends a request on to where everybody is accepted, or leaves it without an answer."""
+
+    redirects: bool
+
+    def do_POST(self) -> None:
+        self.rfile.read(int(self.headers["Content-Length"]))
+        if not self.redirects:
+            self.close_connection = False
+            return
+        accepts = self.path == "/accept"
+        self.send_response(200 if accepts else 307)
+        self.send_header("Location", "/accept")
+        self.send_header("Content-Length", "21" if accepts else "0")
+        self.end_headers()
+        self.wfile.write(b'{"decision":"accept"}' if accepts else b"")
+
+
+@pytest.mark.parametrize("redirects", [True, False])
+def test_another_answer_than_the_services_opens_nothing(tmp_path: Path, redirects: bool) -> None:
+    handler = type("Handler", (Impostor,), {"redirects": redirects})
+    port = free_port()
+    hurry = "const real = AbortSignal.timeout; AbortSignal.timeout = () => real(100)"
+    env = clean_environment(
+        VEILFACE_API_KEY="vf_key",
+        PORT=str(port),
+        NODE_OPTIONS="" if redirects else f"--import=data:text/javascript,{quote(hurry)}",
+    )
+    arguments = [node(), str(EXAMPLES / "login" / "login.mjs")]
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever).start()
+        env["VEILFACE_URL"] = f"http://127.0.0.1:{server.server_address[1]}"
+        with running(arguments, f"http://127.0.0.1:{port}/", env, tmp_path / "log") as url:
+            answer = httpx.post(f"{url}ann", content=b"x", timeout=PATIENCE_S)
+        server.shutdown()
+    assert (answer.status_code, answer.text) == (502, "use your password")
 
 
 def test_an_example_without_its_service_opens_nothing(tmp_path: Path) -> None:

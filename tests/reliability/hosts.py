@@ -137,7 +137,7 @@ class Host:
     def thinks_it_is_ready(self) -> bool:
         """Whether its health check passes on the host itself, which may be cut off."""
         asked = subprocess.run(
-            [*self.service.within, sys.executable, "-m", "api.process.healthcheck"],
+            [*self.service.within, sys.executable, "-m", "veilface.healthcheck"],
             cwd=ROOT,
             env=self.service.environment(),
             stderr=subprocess.DEVNULL,

@@ -56,7 +56,7 @@ class Service:
         """Start it, and return when every worker is ready."""
         self.starts += 1
         self._process = subprocess.Popen(
-            [*self.within, sys.executable, "-m", "api.cli", "serve"],
+            [*self.within, sys.executable, "-m", "veilface", "serve"],
             cwd=ROOT,
             env=self.environment(),
             stdout=subprocess.DEVNULL,

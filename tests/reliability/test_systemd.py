@@ -58,7 +58,7 @@ def machine(tmp_path: Path) -> Iterator[Machine]:
 
 def install(machine: Machine, enable: str = "enable --now") -> None:
     """Run the page's commands, without PostgreSQL's and in the end with this one of systemctl."""
-    others = r"^(python3|/opt/veilface/bin/pip|runuser -u postgres) .*\n"
+    others = r"^(make|python3|/opt/veilface/bin/pip|runuser -u postgres) .*\n"
     commands = re.sub(others, "", INSTALL, flags=re.M)
     assert commands.count("enable --now") == 1
     commands = PACKAGES + commands.replace("enable --now", enable)
@@ -87,7 +87,7 @@ class Unit:
     def is_healthy(self) -> bool:
         """Whether the check passes that the page runs."""
         config = "VEILFACE_CONFIG=/etc/veilface/veilface.toml"
-        check = f"{config} {PYTHON} -m api.process.healthcheck && echo healthy"
+        check = f"{config} {PYTHON} -m veilface.healthcheck && echo healthy"
         return self._machine.run("sh", "-c", check, check=False).endswith("healthy")
 
     def wait_for(self, workers: int, restarts: int = 0) -> None:

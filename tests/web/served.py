@@ -54,7 +54,7 @@ def serving(
     environment = {k: v for k, v in os.environ.items() if not k.startswith("VEILFACE_")}
     with log.open("wb") as errors, shown.open("wb") as output:
         process = subprocess.Popen(
-            [sys.executable, "-m", "api.cli", "serve", *options],
+            [sys.executable, "-m", "veilface", "serve", *options],
             stdout=output,
             stderr=errors,
             env={**environment, "PYTHONUNBUFFERED": "1", "OMP_NUM_THREADS": "1"},

@@ -15,6 +15,7 @@ from api.process.operations import Readiness
 router = APIRouter(tags=["health"])
 
 
+@router.head("/health/live", include_in_schema=False)
 @router.get(
     "/health/live",
     response_model=HealthAnswer,
@@ -26,6 +27,7 @@ async def live(request: Request) -> Response:
     return answer(request, {"status": "ok"})
 
 
+@router.head("/health/ready", include_in_schema=False)
 @router.get(
     "/health/ready",
     response_model=HealthAnswer,

@@ -158,6 +158,11 @@ test("keys, URLs and subjects are checked before anything is sent, and keys not 
   for (const subject of ["", "..", "a/b", "a".repeat(129)]) {
     assert.throws(() => client.verify(subject, PHOTOS), RangeError);
   }
+  for (const nothing of [undefined, null, 7]) {
+    assert.throws(() => client.enroll(nothing, PHOTOS), TypeError);
+    assert.throws(() => client.tokenOutcome("anna", nothing), TypeError);
+    assert.throws(() => new Client("http://host", nothing), TypeError);
+  }
 });
 
 test("a token signs with all of its text, a key with its secret; neither signs as the other", async () => {

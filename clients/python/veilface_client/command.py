@@ -4,6 +4,7 @@ The API key comes from the environment, never from an option: other users of a m
 """
 
 import argparse
+import asyncio
 import json
 import os
 import sys
@@ -13,7 +14,7 @@ from pathlib import Path
 import httpx
 
 from veilface_client import __version__, results
-from veilface_client.client import Client
+from veilface_client.async_client import AsyncClient
 from veilface_client.errors import VeilfaceError
 
 KEY, URL = "VEILFACE_API_KEY", "VEILFACE_URL"
@@ -33,23 +34,44 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error(f"the API key is missing: set the environment variable {KEY}")
     if not asked.url:
         parser.error(f"the service is missing: give --url, or set {URL}")
+    limits = httpx.Timeout(asked.timeout, connect=5.0)
     try:
-        client = Client(asked.url, token, timeout=httpx.Timeout(asked.timeout, connect=5.0))
+        client = AsyncClient(asked.url, token, timeout=limits)
     except ValueError as error:
         parser.error(str(error))
-    with client:
-        try:
-            answer = _enroll(client, asked) if asked.command == "enroll" else _verify(client, asked)
-        except (VeilfaceError, ValueError) as error:
-            return _failed(str(error))
-        except OSError as error:
-            return _failed(f"{error.filename}: {error.strerror}")
+    try:
+        answer = asyncio.run(_answer(client, asked))
+    except TimeoutError:
+        return _failed(
+            f"no answer within {asked.timeout:g} s; the service may have done what was asked"
+        )
+    except FileNotFoundError as error:
+        parser.error(f"no such photo: {error.filename}")
+    except OSError as error:
+        return _failed(f"{error.filename}: {error.strerror}")
+    except (VeilfaceError, ValueError) as error:
+        return _failed(str(error))
     if asked.json:
         # What the service kept to itself, and a template that was not asked for, are left out.
-        print(json.dumps(answer.model_dump(mode="json", exclude_none=True)))  # noqa: T201
+        text = json.dumps(answer.model_dump(mode="json", exclude_none=True))
     else:
-        print(_sentence(asked.subject, answer))  # noqa: T201
+        text = _sentence(asked.subject, answer)
+    try:
+        print(text, flush=True)  # noqa: T201
+    except BrokenPipeError:
+        # The reader has gone, and the exit status answers too. Python would write again at its end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return REJECTED if isinstance(answer, results.Decision) and not answer else ACCEPTED
+
+
+async def _answer(
+    client: AsyncClient, asked: argparse.Namespace
+) -> results.Enrollment | results.Decision:
+    """Ask the service; the time limit holds for all of it, however slowly bytes come."""
+    async with asyncio.timeout(asked.timeout), client:
+        if asked.command == "enroll":
+            return await client.enroll(asked.subject, asked.photos, replace=asked.replace)
+        return await client.verify(asked.subject, asked.photos, level=asked.level)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -67,7 +89,11 @@ def _parser() -> argparse.ArgumentParser:
     common.add_argument("--url", default=os.environ.get(URL), help=f"the service; default: {URL}")
     common.add_argument("--json", action="store_true", help="print the answer as JSON")
     common.add_argument(
-        "--timeout", type=float, default=60.0, metavar="SECONDS", help="for one sending; default 60"
+        "--timeout",
+        type=float,
+        default=60.0,
+        metavar="SECONDS",
+        help="for the whole answer; default 60",
     )
     commands = parser.add_subparsers(dest="command", required=True)
     enroll = commands.add_parser(
@@ -90,14 +116,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     verify.add_argument("--level", help="security level; default: the contract's")
     return parser
-
-
-def _enroll(client: Client, asked: argparse.Namespace) -> results.Enrollment:
-    return client.enroll(asked.subject, asked.photos, replace=asked.replace)
-
-
-def _verify(client: Client, asked: argparse.Namespace) -> results.Decision:
-    return client.verify(asked.subject, asked.photos, level=asked.level)
 
 
 def _sentence(subject: str, answer: results.Enrollment | results.Decision) -> str:

@@ -2,11 +2,13 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import tomllib
 from pathlib import Path
 
+import pytest
 from typer.testing import CliRunner
 
 from api.cli.app import COMMANDS, app
@@ -84,3 +86,64 @@ def test_the_shell_completes_options_of_a_command() -> None:
         prog_name="veilface",
     )
     assert completed.stdout.split() == ["--json"]
+
+
+LIBRARY = """
+import sys
+from veilface.__main__ import main
+sys.argv[1:] = ["--version"]
+try:
+    main()
+except SystemExit:
+    from joblib import Parallel, delayed
+    print(Parallel(n_jobs=2)(delayed(abs)(number) for number in [-1, -2]))
+"""
+
+
+@pytest.mark.parametrize(
+    ("shadow", "python_path", "program", "shown"),
+    [
+        ("api", True, ["-m", "veilface", "verify", "--help"], "accepted"),
+        ("random.py", False, ["-c", LIBRARY], "[1, 2]"),
+    ],
+    ids=["a folder in PYTHONPATH", "a module that a process of joblib would import"],
+)
+def test_a_name_of_ours_in_the_working_directory_is_not_imported(
+    tmp_path: Path, shadow: str, python_path: bool, program: list[str], shown: str
+) -> None:
+    """So neither breaks a command, nor is run by it."""
+    foreign = tmp_path / shadow
+    if not foreign.suffix:
+        foreign.mkdir()
+        foreign /= "__init__.py"
+    foreign.write_text("raise SystemExit('the wrong module')")
+    environment = {name: value for name, value in os.environ.items() if name[:6] != "PYTHON"}
+    if python_path:
+        environment["PYTHONPATH"] = str(tmp_path)
+    done = subprocess.run(
+        [sys.executable, "-P", *program],
+        cwd=tmp_path, env=environment, capture_output=True, text=True,
+        timeout=PATIENCE_S, check=False,
+    )  # fmt: skip
+    assert "the wrong module" not in done.stderr
+    assert shown in done.stdout
+
+
+INTERRUPTED = """
+import os, signal, time
+try:
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(600)
+except KeyboardInterrupt:
+    raise ImportError("cv2 cannot be loaded") from None
+"""
+
+
+def test_ctrl_c_during_an_import_ends_the_program_without_a_word(tmp_path: Path) -> None:
+    (tmp_path / "cv2.py").write_text(INTERRUPTED)
+    done = subprocess.run(
+        [sys.executable, "-P", "-m", "veilface", "verify", "ann", "photo.jpg"],
+        cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(tmp_path)}, capture_output=True,
+        text=True, timeout=PATIENCE_S, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGINT, "", "")

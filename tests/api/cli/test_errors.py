@@ -94,6 +94,7 @@ def test_every_extra_brings_what_its_commands_need():
         (("evaluate", "lfw.bin"), "joblib", "evaluate"),
         (("audit", "templates", "people"), "sklearn", "audit"),
         (("audit", "fairface", "faces"), "matplotlib", "audit"),
+        (("db", "upgrade", "--database-url", "postgresql:///faces"), "psycopg", "postgres"),
     ],
 )
 def test_a_missing_extra_is_named_before_any_work(monkeypatch, words, package, extra):

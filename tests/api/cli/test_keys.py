@@ -2,7 +2,10 @@ import base64
 import json
 import os
 import stat
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 
@@ -15,6 +18,7 @@ from templates.keys.key_file import locked, read_key_file, write_key_file
 from templates.keys.sealing import MasterKeyring
 from templates.store import TemplateStore
 from tests.api.cli.conftest import key_file, run
+from tests.patience import PATIENCE_S
 
 
 @pytest.fixture
@@ -86,6 +90,24 @@ def test_the_token_alone_is_on_stdout(veilface):
     assert made.stdout.startswith("vf_")
     assert len(made.stdout.split()) == 1
     assert "new-tenant" in made.stderr
+
+
+@pytest.mark.parametrize("command", [["create", "--right", "verify"], ["replace"]])
+def test_a_key_that_cannot_be_written_is_revoked(veilface, store, data, command):
+    old = veilface("keys", "create", "--right", "verify", "--json").json["prefix"]
+    if command == ["replace"]:
+        command = ["replace", old]
+    with Path("/dev/full").open("wb") as full:
+        done = subprocess.run(
+            [sys.executable, "-P", "-m", "veilface", "keys", *command, "--data-dir", str(data)],
+            stdout=full, stderr=subprocess.PIPE, text=True, timeout=PATIENCE_S, check=False,
+        )  # fmt: skip
+    assert done.returncode == 1
+    assert "could not be written (No space left on device), and is revoked" in done.stderr
+    assert "Exception ignored" not in done.stderr
+    others = [key for key in store.api_keys.all() if key.prefix != old]
+    assert others
+    assert all(key.revoked_at for key in others)
 
 
 def test_a_key_needs_rights_that_exist(veilface):

@@ -38,7 +38,7 @@ def started(folder: Path, *arguments: str) -> Iterator[tuple["subprocess.Popen[b
     environment = {k: v for k, v in os.environ.items() if not k.startswith("VEILFACE_")}
     with (folder / "out").open("w") as output, (folder / "err").open("w") as errors:
         process = subprocess.Popen(
-            [sys.executable, "-m", "api.cli", "serve", "--port", "0", *WEAK, *arguments],
+            [sys.executable, "-m", "veilface", "serve", "--port", "0", *WEAK, *arguments],
             env={**environment, "PYTHONUNBUFFERED": "1"},
             stdout=output,
             stderr=errors,
@@ -128,7 +128,7 @@ def test_a_master_key_beside_the_database_is_used_with_a_warning(world, data):
 @pytest.mark.parametrize("workers", ["1", pytest.param("2", marks=pytest.mark.long)])
 def test_where_it_listens_is_said_when_connections_are_taken(world, data, tmp_path, workers):
     process = subprocess.Popen(
-        [sys.executable, "-m", "api.cli", "serve", "--port", "0", "--operations-port", "0", *WEAK,
+        [sys.executable, "-m", "veilface", "serve", "--port", "0", "--operations-port", "0", *WEAK,
          "--data-dir", str(data), "--pack", str(world.pack), "--workers", workers],
         stderr=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
@@ -214,7 +214,7 @@ def test_the_check_looks_at_the_key_of_tls_and_the_storage_of_limits(world, data
 @pytest.mark.parametrize("arguments", [("--help",), ("db", "current", "--json")])
 def test_the_module_is_the_command(tmp_path, arguments):
     ran = subprocess.run(
-        [sys.executable, "-m", "api.cli", *arguments],
+        [sys.executable, "-m", "veilface", *arguments],
         capture_output=True,
         text=True,
         check=False,

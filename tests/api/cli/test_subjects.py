@@ -1,6 +1,13 @@
+import os
 import stat
+import subprocess
+import sys
+
+import pytest
 
 from models.demo import DEMO_NOTICE
+from tests.api.cli.conftest import run
+from tests.patience import PATIENCE_S
 
 STORED = ("--tenant", "default")
 
@@ -55,7 +62,7 @@ def test_what_stands_in_the_way_is_named(world, veilface, tmp_path):
     pack = ("--pack", world.pack)
     cases = [
         (("enroll", "ann", *photo, broken, *pack), 1, "broken.png"),
-        (("enroll", "ann", *photo, tmp_path / "absent.png", *pack), 1, "No such file"),
+        (("enroll", "ann", *photo, tmp_path / "absent.png", *pack), 2, "no such photo"),
         (("enroll", "ann", *photo, *world.photos(2, range(1)), *pack), 1, "same person"),
         (("enroll", "ann", *photo, *pack, "--tenant", "elsewhere"), 1, "no tenant"),
         (("enroll", "ann", *(photo * 11), *pack), 2, "1 to 10 photos"),
@@ -96,6 +103,22 @@ def test_a_verification_without_a_decision_is_no_rejection(world, veilface, tmp_
         ran = veilface(*arguments)
         assert (ran.status, ran.stdout) == (status, ""), (arguments, ran)
         assert said in ran.stderr
+
+
+@pytest.mark.parametrize("as_json", [(), ("--json",)])
+@pytest.mark.parametrize(("person", "status"), [(1, 0), (2, 1)])
+def test_the_status_is_the_decision_where_nobody_reads_it(world, data, person, status, as_json):
+    settings = ("--pack", str(world.pack), "--data-dir", str(data))
+    assert run("enroll", "ann", *world.photos(1, range(3)), *settings).status == 0
+    read, write = os.pipe()
+    os.close(read)
+    photo = str(*world.photos(person, range(3, 4)))
+    done = subprocess.run(
+        [sys.executable, "-P", "-m", "veilface", "verify", "ann", photo, *settings, *as_json],
+        stdout=write, stderr=write, timeout=PATIENCE_S, check=False,
+    )  # fmt: skip
+    os.close(write)
+    assert done.returncode == status
 
 
 def test_an_unknown_level_names_those_there_are(world, veilface):

@@ -1,5 +1,7 @@
-"""The demo's own service process: what it leaves on the disk."""
+"""The demo's own service process: what it leaves on the disk, and that it ends with the demo."""
 
+import os
+import signal
 import stat
 import subprocess
 import sys
@@ -10,7 +12,7 @@ import pytest
 
 from api.demo import service as demo_service
 from api.http.errors import StartError
-from tests.patience import wait_until
+from tests.patience import PATIENCE_S, wait_until
 
 
 def test_the_token_is_private_and_never_left_behind(
@@ -34,3 +36,31 @@ def test_the_token_is_private_and_never_left_behind(
         pass
     assert modes == [0o600]
     assert not shown.exists()
+
+
+DEMO = """
+import subprocess, sys
+from pathlib import Path
+from api.demo import service
+
+start = subprocess.Popen
+
+def waiting(command, **options):
+    process = start([sys.executable, "-c", "import time; time.sleep(600)"], **options)
+    Path("service").write_text(str(process.pid))
+    return process
+
+subprocess.Popen = waiting
+with service.running_service(Path()):
+    pass
+"""
+
+
+def test_sigterm_ends_the_service_too(tmp_path: Path) -> None:
+    demo = subprocess.Popen([sys.executable, "-c", DEMO], cwd=tmp_path)
+    noted = tmp_path / "service"
+    wait_until(lambda: noted.is_file() and noted.read_text(), what="the service")
+    demo.terminate()
+    assert demo.wait(PATIENCE_S) == 128 + signal.SIGTERM
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(noted.read_text()), 0)

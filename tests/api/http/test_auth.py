@@ -1,6 +1,6 @@
 import pytest
 
-from api.process.runtime import bootstrap_token, open_keyring, open_store
+from api.process.runtime import open_keyring, open_store
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, images, photo
 from tests.api.shapes import assert_error
@@ -84,15 +84,10 @@ def test_a_wrong_secret_of_a_known_prefix_is_refused(
     assert_error(client.get("/v1/contract", headers=bearer(changed)), 401, "unauthorized")
 
 
-def test_there_is_one_bootstrap_key(deployment: Deployment) -> None:
-    store = open_store(deployment.settings, open_keyring(deployment.settings))
-    assert bootstrap_token(store, deployment.settings) is None
-    store.close()
-
-
-def test_health_needs_no_key(client: Client) -> None:
-    for path in ("/health/live", "/health/ready"):
-        assert client.get(path, headers={"Authorization": ""}).status_code == 200
+@pytest.mark.parametrize("method", ["GET", "HEAD"])
+@pytest.mark.parametrize("path", ["/health/live", "/health/ready"])
+def test_health_needs_no_key(client: Client, method: str, path: str) -> None:
+    assert client.request(method, path, headers={"Authorization": ""}).status_code == 200
 
 
 def test_a_key_of_photos_only_works(client: Client, deployment: Deployment) -> None:

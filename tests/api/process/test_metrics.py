@@ -305,7 +305,7 @@ def test_any_worker_answers_for_all_and_nothing_falls_when_one_dies(tmp_path: Pa
     temporary.mkdir()
     with (tmp_path / "log").open("wb") as log:
         process = subprocess.Popen(
-            [sys.executable, "-m", "api.cli", "serve"],
+            [sys.executable, "-m", "veilface", "serve"],
             cwd=Path(__file__).resolve().parents[3],
             env={**environment_of(deployment.settings), "TMPDIR": str(temporary)},
             stdout=log,
@@ -369,7 +369,7 @@ def test_a_worker_starts_where_the_folder_for_temporary_files_is_full(tmp_path: 
 
     with small_file_system() as temporary, log.open("wb") as stderr:
         process = subprocess.Popen(
-            [sys.executable, "-m", "api.cli", "serve"],
+            [sys.executable, "-m", "veilface", "serve"],
             cwd=Path(__file__).resolve().parents[3],
             env={**environment_of(deployment.settings), "TMPDIR": str(temporary)},
             stdout=stderr,

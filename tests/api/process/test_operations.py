@@ -24,7 +24,6 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from api.http.app import create_app
 from api.http.context import RequestContext, _Body
 from api.http.errors import StartError
-from api.process import healthcheck
 from api.process.metrics import IN_FLIGHT, MODEL_UP, STORE_UP
 from api.process.operations import OPERATIONS_PATHS, operations_server, tls_options
 from api.settings import Settings, load_settings
@@ -37,6 +36,7 @@ from tests.api.shapes import assert_error
 from tests.certificates import self_signed
 from tests.patience import PATIENCE_S, wait_until
 from tests.ports import free_port
+from veilface import healthcheck
 
 READY = "/health/ready"
 
@@ -365,7 +365,7 @@ def serving(
     """Run ``veilface serve`` until ``url`` answers, and through the test."""
     with (folder / "log").open("wb") as log:
         process = subprocess.Popen(
-            [sys.executable, "-m", "api.cli", "serve"],
+            [sys.executable, "-m", "veilface", "serve"],
             cwd=Path(__file__).resolve().parents[3],
             env=environment_of(deployment.settings),
             stdout=log,

@@ -124,7 +124,7 @@ def test_a_start_that_is_stopped_leaves_nothing(tmp_path: Path, seconds: float) 
     temporary = tmp_path / "temporary"
     temporary.mkdir()
     process = subprocess.Popen(
-        [sys.executable, "-m", "api.cli", "serve"],
+        [sys.executable, "-m", "veilface", "serve"],
         cwd=Path(__file__).resolve().parents[3],
         env={**environment_of(deployment.settings), "TMPDIR": str(temporary)},
         stderr=subprocess.DEVNULL,

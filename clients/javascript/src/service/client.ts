@@ -98,7 +98,7 @@ export class Session {
       throw new RangeError("the URL is that of the service: https://HOST[:PORT]");
     }
     // fetch would repeat a header that it cannot send in its error.
-    if (!VISIBLE.test(bearer)) {
+    if (!VISIBLE.test(text(bearer, "the API key"))) {
       throw new RangeError("the API key has a character that no API key has, or is empty");
     }
     this.url = url.replace(/\/+$/, "");
@@ -214,7 +214,7 @@ export class Session {
 
   /** Ask what came of a token: never believe the page. Right: that of the action. */
   tokenOutcome(subject: string, tokenId: string): Promise<TokenOutcome> {
-    const path = subjectPath(subject, `/tokens/${encodeURIComponent(tokenId)}`);
+    const path = subjectPath(subject, `/tokens/${encodeURIComponent(text(tokenId, "a token's id"))}`);
     return this.send({ method: "GET", path, read: answer<TokenOutcome>({ used: "boolean" }) });
   }
 
@@ -363,9 +363,15 @@ export class Client extends Session {
   }
 }
 
+/** Refuse what JavaScript would turn into text: nobody is called "undefined". */
+function text(value: unknown, what: string): string {
+  if (typeof value === "string") return value;
+  throw new TypeError(`${what} is a string, not ${value === null ? "null" : typeof value}`);
+}
+
 /** The path of a subject; a subject id needs no escapes in it. */
 export function subjectPath(subject: string, rest = ""): string {
-  if (!SUBJECT.test(subject)) {
+  if (!SUBJECT.test(text(subject, "a subject id"))) {
     throw new RangeError("a subject id has 1 to 128 characters out of A-Z a-z 0-9 . _ @ : -");
   }
   return `/v1/subjects/${subject}${rest}`;

@@ -1,4 +1,4 @@
-"""``python -m api.process.healthcheck``: whether the service that has the same settings is ready.
+"""``python -P -m veilface.healthcheck``: whether the service that has the same settings is ready.
 
 For the HEALTHCHECK of the container. It takes the environment and the TOML file as the service
 does, so that it asks the right port, and speaks TLS where the service does. What `serve` was given
