@@ -185,21 +185,20 @@ class Database:
         if not self.is_sqlite:
             return True
         process = self._process()
-        try:
-            with (
-                process.turn_to_write(),
-                self._turn(PURGE_WAIT_S),
-                process.engine.connect() as connection,
-            ):
-                driver = _driver(connection)
-                driver.execute(_busy_timeout(PURGE_WAIT_S))
-                try:
-                    busy, _, _ = driver.execute(_EMPTY_LOG).fetchone()
-                finally:
-                    driver.execute(_busy_timeout(self._timeout))
-        except (*_DATABASE_ERRORS, StoreError):
-            return False
-        return not busy
+        with (
+            contextlib.suppress(*_DATABASE_ERRORS, StoreError),
+            process.turn_to_write(),
+            self._turn(PURGE_WAIT_S),
+            process.engine.connect() as connection,
+        ):
+            driver = _driver(connection)
+            driver.execute(_busy_timeout(PURGE_WAIT_S))
+            try:
+                busy, _, _ = driver.execute(_EMPTY_LOG).fetchone()
+            finally:
+                driver.execute(_busy_timeout(self._timeout))
+            return not busy
+        return False
 
     def remove(self, table: type[Any], condition: sa.ColumnElement[bool], *, batch: int) -> int:
         """Remove the rows of a mapped table that meet a condition; returns how many.

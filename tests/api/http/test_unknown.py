@@ -125,7 +125,7 @@ TOKEN = {"subject_id": "alice", "action": "verify"}
         (json.dumps(TOKEN).encode("utf-32-le"), {"Content-Type": "application/json"}),
         (PHOTO, {"Content-Type": "application/json"}),
         (
-            gzip.compress(json.dumps(TOKEN).encode()),
+            gzip.compress(json.dumps(TOKEN).encode(), mtime=0),
             {"Content-Type": "application/json", "Content-Encoding": "gzip"},
         ),
     ],
