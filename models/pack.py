@@ -261,7 +261,7 @@ class ModelPack:
                 self.detect(image), single=policy is FacePolicy.SINGLE, limits=quality
             )
             crop = self.align(image, face)
-        taken = FaceCrop(crop=crop, quality=measure(crop, face), face=face)
+        taken = FaceCrop(crop=crop, quality=measure(crop, face, image.shape), face=face)
         if quality is not None:
             self.require_quality(taken, quality)
         if liveness and self.liveness is not None and taken.box is not None:

@@ -43,6 +43,11 @@ class Quality:
         Mean luma of the centre of the aligned crop, 0...255.
     yaw, pitch, roll
         Degrees, see `measure_pose`; ``None`` for crops that came aligned.
+    border
+        Least distance of the five points from the border of the picture, as a share of the aligned
+        crop's side; negative where a point lies outside; ``None`` for crops that came aligned.
+    aspect
+        Height of the detected box over its width; ``None`` for crops that came aligned.
     """
 
     score: float | None
@@ -52,6 +57,8 @@ class Quality:
     yaw: float | None
     pitch: float | None
     roll: float | None
+    border: float | None
+    aspect: float | None
 
     def as_dict(self) -> dict[str, float | None]:
         """JSON-able form."""
@@ -73,6 +80,8 @@ class QualityLimits:
         As in `Quality`.
     max_yaw, max_pitch, max_roll
         Absolute degrees.
+    min_border, max_aspect
+        As in `Quality`: what `is_partly_hidden` goes by.
     second_face_share
         A further face counts when it reaches ``min_face_size`` and its area is at least this share
         of the main face's. 0, the default, counts every such face; 0.25 ignores people in the
@@ -87,13 +96,17 @@ class QualityLimits:
     max_yaw: float = 70.0
     max_pitch: float = 55.0
     max_roll: float = 45.0
+    min_border: float = 0.08
+    max_aspect: float = 1.7
     second_face_share: float = 0.0
 
 
 DEFAULT_QUALITY = QualityLimits()
 
 
-def measure(crop: NDArray[np.uint8], face: Face | None) -> Quality:
+def measure(
+    crop: NDArray[np.uint8], face: Face | None, image_shape: tuple[int, ...] = ()
+) -> Quality:
     """Measure one face.
 
     Parameters
@@ -102,13 +115,17 @@ def measure(crop: NDArray[np.uint8], face: Face | None) -> Quality:
         The aligned crop, RGB uint8, shape (s, s, 3).
     face
         The detection it came from; ``None`` for crops that came aligned.
+    image_shape
+        Height and width first, of the picture that a detection is in.
     """
     grey = cv2.cvtColor(crop, cv2.COLOR_RGB2GRAY)
     if grey.shape != (_SIDE, _SIDE):
         grey = cv2.resize(grey, (_SIDE, _SIDE), interpolation=cv2.INTER_AREA)
-    yaw = pitch = roll = None
+    yaw = pitch = roll = border = aspect = None
     if face is not None:
         yaw, pitch, roll = measure_pose(face.keypoints)
+        border = _border(face.keypoints, image_shape)
+        aspect = face.height / face.width
     return Quality(
         score=None if face is None else face.score,
         face_size=None if face is None else min(face.width, face.height),
@@ -117,7 +134,17 @@ def measure(crop: NDArray[np.uint8], face: Face | None) -> Quality:
         yaw=yaw,
         pitch=pitch,
         roll=roll,
+        border=border,
+        aspect=aspect,
     )
+
+
+def _border(keypoints: NDArray[np.floating], image_shape: tuple[int, ...]) -> float:
+    height, width = image_shape[:2]
+    far_corner = np.array([width - 1, height - 1]) - keypoints
+    matrix = similarity_transform(keypoints, template(_SIDE))
+    scale = float(np.hypot(matrix[0, 0], matrix[1, 0]))
+    return min(float(keypoints.min()), float(far_corner.min())) * scale / _SIDE
 
 
 def measure_sharpness(grey: NDArray[np.uint8]) -> float:
@@ -237,11 +264,33 @@ def check(
     }
     if pose:
         failed["pose"] = pose
+    if hidden := _hidden(quality, limits):
+        failed["hidden"] = hidden
     if failed:
         remedies = " ".join(_REMEDIES[name] for name in failed)
         raise LowQuality(
             f"The photo is not good enough ({', '.join(failed)}). {remedies}", details=failed
         )
+
+
+def is_partly_hidden(quality: Quality, limits: QualityLimits = DEFAULT_QUALITY) -> bool:
+    """Whether part of the face is covered, or lies outside the picture.
+
+    A detector puts five points on what it sees of a face, as if all of it were there. They then
+    reach the border of the picture, and the box, which goes round what is seen, is too narrow for
+    its height. A picture that was squeezed has such a box too. What covers a face from above or
+    from below leaves the box wide enough.
+    """
+    return bool(_hidden(quality, limits))
+
+
+def _hidden(quality: Quality, limits: QualityLimits) -> dict[str, dict[str, float]]:
+    hidden = {}
+    if quality.border is not None and quality.border < limits.min_border:
+        hidden["border"] = _measured(quality.border, limits.min_border)
+    if quality.aspect is not None and quality.aspect > limits.max_aspect:
+        hidden["aspect"] = _measured(quality.aspect, limits.max_aspect)
+    return hidden
 
 
 _REMEDIES = {
@@ -250,6 +299,7 @@ _REMEDIES = {
     "darkness": "Put more light on the face.",
     "brightness": "Put less light on the face.",
     "pose": "Look into the camera.",
+    "hidden": "Show the whole face, with nothing before it and some room around it.",
 }
 
 

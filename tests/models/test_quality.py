@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from models.alignment import TEMPLATE_112
 from models.boxes import Face
 from models.decoding import decode_image
-from models.errors import FaceTooSmall, LowQuality, MultipleFaces, NoFace
-from models.pack import ModelPack
+from models.errors import FaceError, FaceTooSmall, LowQuality, MultipleFaces, NoFace
+from models.pack import FacePolicy, ModelPack
 from models.quality import (
     Quality,
     QualityLimits,
@@ -18,12 +18,21 @@ from models.quality import (
     measure_sharpness,
     select_face,
 )
+from models.synthetic import encode_photo
 
 # A head in millimetres: eyes, nose and mouth as the alignment template has them (1.8 mm per pixel),
 # the nose 22 mm in front. x to the right of the picture, y down, z towards the camera.
 HEAD = np.column_stack([(TEMPLATE_112 - TEMPLATE_112.mean(0)) * 1.8, [0, 0, 22, 0, 0]])
 GOOD = Quality(
-    score=0.9, face_size=100.0, sharpness=3.0, brightness=120.0, yaw=0.0, pitch=0.0, roll=0.0
+    score=0.9,
+    face_size=100.0,
+    sharpness=3.0,
+    brightness=120.0,
+    yaw=0.0,
+    pitch=0.0,
+    roll=0.0,
+    border=0.5,
+    aspect=1.4,
 )
 
 
@@ -124,6 +133,8 @@ def test_the_good_pass():
         ({"yaw": -88.0}, "pose"),
         ({"pitch": 80.0}, "pose"),
         ({"roll": 179.0}, "pose"),
+        ({"border": -0.1}, "hidden"),
+        ({"aspect": 2.1}, "hidden"),
     ],
 )
 def test_each_failure_is_named_with_value_and_limit(change, name):
@@ -131,12 +142,11 @@ def test_each_failure_is_named_with_value_and_limit(change, name):
         check(Quality(**(GOOD.as_dict() | change)), recommended_score=0.6)
     assert list(caught.value.details) == [name]
     detail = caught.value.details[name]
-    (value,) = change.values()
-    if name == "pose":
-        (axis,) = change
-        assert detail == {axis: {"value": value, "limit": getattr(QualityLimits(), f"max_{axis}")}}
-    else:
-        assert detail["value"] == value
+    ((measured, value),) = change.items()
+    if name in ("pose", "hidden"):
+        assert list(detail) == [measured]
+        detail = detail[measured]
+    assert detail["value"] == value
     assert caught.value.code == "low_quality"
 
 
@@ -222,13 +232,12 @@ def photos(lfw_photos):
 
 
 def refusal(pack, image) -> set[str]:
-    faces = pack.detect(image)
-    if not faces:
-        return {"no_face"}
     try:
-        check(measure(pack.align(image, faces[0]), faces[0]), recommended_score=0.6)
+        pack.crop_photo(encode_photo(image), policy=FacePolicy.LARGEST)
     except LowQuality as error:
         return set(error.details)
+    except FaceError as error:
+        return {error.code}
     return set()
 
 
@@ -242,6 +251,23 @@ def test_degraded_real_photos_are_refused_by_name(pack, photos, kind):
     reasons = [refusal(pack, spoil(photo)) for photo in photos]
     named = sum(bool(reason & {name, "no_face"}) for reason in reasons)
     assert named >= 0.9 * len(photos), reasons
+
+
+PARTS = {
+    "eye strip": lambda x: x[95:125, 75:175].repeat(2, 0).repeat(2, 1),
+    "right half": lambda x: x[:, 125:],
+    "left half": lambda x: x[:, :125],
+    "lower half": lambda x: x[125:],
+    "forehead and eyes": lambda x: x[60:125, 70:180],
+    "mouth and chin": lambda x: x[140:190, 75:175],
+    "squeezed": lambda x: cv2.resize(x, (125, 250), interpolation=cv2.INTER_AREA),
+}
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_parts_of_real_faces_are_refused(pack, photos, part):
+    reasons = [refusal(pack, PARTS[part](photo)) for photo in photos]
+    assert all(reasons), reasons
 
 
 def test_profiles_are_refused_for_their_pose(pack, fairface):
