@@ -252,10 +252,11 @@ def check(
         failed["darkness"] = _measured(quality.brightness, limits.min_brightness)
     if quality.brightness > limits.max_brightness:
         failed["brightness"] = _measured(quality.brightness, limits.max_brightness)
+    if quality.roll is not None and abs(quality.roll) > limits.max_roll:
+        failed["turned"] = _measured(quality.roll, limits.max_roll)
     angles = {
         "yaw": (quality.yaw, limits.max_yaw),
         "pitch": (quality.pitch, limits.max_pitch),
-        "roll": (quality.roll, limits.max_roll),
     }
     pose = {
         name: _measured(value, limit)
@@ -298,6 +299,7 @@ _REMEDIES = {
     "blur": "Hold the camera still and focus on the face.",
     "darkness": "Put more light on the face.",
     "brightness": "Put less light on the face.",
+    "turned": "Hold the photo upright.",
     "pose": "Look into the camera.",
     "hidden": "Show the whole face, with nothing before it and some room around it.",
 }

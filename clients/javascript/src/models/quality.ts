@@ -28,6 +28,10 @@ export interface Quality {
   readonly yaw: number | null;
   readonly pitch: number | null;
   readonly roll: number | null;
+  /** Least distance of the five points from the picture's border, over the aligned crop's side. */
+  readonly border: number | null;
+  /** Height of the detected box over its width. */
+  readonly aspect: number | null;
 }
 
 /** What a face must reach: the names are those of {@link Quality}. */
@@ -41,6 +45,8 @@ export interface QualityLimits {
   readonly max_yaw: number;
   readonly max_pitch: number;
   readonly max_roll: number;
+  readonly min_border: number;
+  readonly max_aspect: number;
   /** A further face counts when its area is at least this share of the main face's. */
   readonly second_face_share: number;
 }
@@ -53,11 +59,13 @@ export const DEFAULT_QUALITY: QualityLimits = {
   max_yaw: 70,
   max_pitch: 55,
   max_roll: 45,
+  min_border: 0.08,
+  max_aspect: 1.7,
   second_face_share: 0,
 };
 
-/** Measure the aligned crop of a face; `face` is undefined for crops that came aligned. */
-export function measure(crop: RgbImage, face: Face | undefined): Quality {
+/** Measure the aligned crop of a face in `image`; `face` is undefined for crops that came aligned. */
+export function measure(crop: RgbImage, face: Face | undefined, image: RgbImage): Quality {
   const grey = greyCrop(crop);
   let brightness = 0;
   for (let y = MARGIN; y < SIDE - MARGIN; y++) {
@@ -72,7 +80,15 @@ export function measure(crop: RgbImage, face: Face | undefined): Quality {
     yaw: pose?.yaw ?? null,
     pitch: pose?.pitch ?? null,
     roll: pose?.roll ?? null,
+    border: face === undefined ? null : measureBorder(face.keypoints, image),
+    aspect: face === undefined ? null : boxHeight(face.box) / boxWidth(face.box),
   };
+}
+
+function measureBorder(keypoints: readonly Point[], image: RgbImage): number {
+  const [a, b] = similarityTransform(keypoints, template(SIDE));
+  const distances = keypoints.flatMap(([x, y]) => [x, y, image.width - 1 - x, image.height - 1 - y]);
+  return (Math.min(...distances) * Math.hypot(a, b)) / SIDE;
 }
 
 /** Luma in OpenCV's fixed point, 112 x 112. */
@@ -172,7 +188,9 @@ const REMEDIES: Readonly<Record<string, string>> = {
   blur: "Hold the camera still and focus on the face.",
   darkness: "Put more light on the face.",
   brightness: "Put less light on the face.",
+  turned: "Hold the photo upright.",
   pose: "Look into the camera.",
+  hidden: "Show the whole face, with nothing before it and some room around it.",
 };
 
 /**
@@ -203,13 +221,24 @@ export function check(quality: Quality, limits: QualityLimits, recommendedScore:
   if (quality.brightness > limits.max_brightness) {
     failed["brightness"] = measured(quality.brightness, limits.max_brightness);
   }
+  if (quality.roll !== null && Math.abs(quality.roll) > limits.max_roll) {
+    failed["turned"] = measured(quality.roll, limits.max_roll);
+  }
   const pose: Record<string, Measured> = {};
-  for (const name of ["yaw", "pitch", "roll"] as const) {
+  for (const name of ["yaw", "pitch"] as const) {
     const angle = quality[name];
     const limit = limits[`max_${name}`];
     if (angle !== null && Math.abs(angle) > limit) pose[name] = measured(angle, limit);
   }
   if (Object.keys(pose).length > 0) failed["pose"] = pose;
+  const hidden: Record<string, Measured> = {};
+  if (quality.border !== null && quality.border < limits.min_border) {
+    hidden["border"] = measured(quality.border, limits.min_border);
+  }
+  if (quality.aspect !== null && quality.aspect > limits.max_aspect) {
+    hidden["aspect"] = measured(quality.aspect, limits.max_aspect);
+  }
+  if (Object.keys(hidden).length > 0) failed["hidden"] = hidden;
   const names = Object.keys(failed);
   if (names.length > 0) {
     const remedies = names.map((name) => REMEDIES[name]).join(" ");
