@@ -126,7 +126,7 @@ def judge(
     try:
         main_face = select_face(faces, single=True, limits=DEFAULT_QUALITY)
         crop = pack.align(picture, main_face)
-        check(measure(crop, main_face, picture.shape), recommended_score=0.0)
+        check(measure(crop, main_face, picture), recommended_score=0.0)
         code = "accepted"
     except FaceError as error:
         code = error.code

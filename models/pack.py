@@ -263,7 +263,7 @@ class ModelPack:
             )
             crop = self.align(image, face)
             require_upright(self._detector, face, crop)
-        taken = FaceCrop(crop=crop, quality=measure(crop, face, image.shape), face=face)
+        taken = FaceCrop(crop=crop, quality=measure(crop, face, image), face=face)
         if quality is not None:
             self.require_quality(taken, quality)
         if liveness and self.liveness is not None and taken.box is not None:

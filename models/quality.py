@@ -17,6 +17,8 @@ _SIDE = 112
 _MARGIN = 20
 # Detail finer than this is noise of the sensor and of JPEG, which blur does not remove.
 _SMOOTHING = 1.5
+# Exposure is read from about so many pixels in each direction.
+_EXPOSURE_SIDE = 256
 # Geometry of the mean face on the template: half the distance of the eyes over how far the nose
 # stands out of the plane of eyes and mouth; the same for the distance from eyes to mouth; and
 # where the nose lies between eyes (0) and mouth (1) when the face looks straight ahead (mean of
@@ -41,6 +43,8 @@ class Quality:
         photo, below 0.5 for one that is useless.
     brightness
         Mean luma of the centre of the aligned crop, 0...255.
+    exposure
+        Luma that a twentieth of the whole picture exceeds, 0...255. It does not depend on skin.
     yaw, pitch, roll
         Degrees, see `measure_pose`; ``None`` for crops that came aligned.
     border
@@ -54,6 +58,7 @@ class Quality:
     face_size: float | None
     sharpness: float
     brightness: float
+    exposure: float
     yaw: float | None
     pitch: float | None
     roll: float | None
@@ -76,8 +81,9 @@ class QualityLimits:
         differ in what a value means.
     min_face_size
         Shorter side of the box in pixels.
-    min_sharpness, min_brightness, max_brightness
-        As in `Quality`.
+    min_sharpness, min_brightness, max_brightness, min_exposure
+        As in `Quality`. In an underexposed picture strangers look alike; a face that is dark in a
+        bright one is recognised down to a far lower luma.
     max_yaw, max_pitch, max_roll
         Absolute degrees.
     min_border, max_aspect
@@ -91,8 +97,9 @@ class QualityLimits:
     min_score: float | None = None
     min_face_size: float = 24.0
     min_sharpness: float = 0.5
-    min_brightness: float = 18.0
+    min_brightness: float = 6.0
     max_brightness: float = 235.0
+    min_exposure: float = 40.0
     max_yaw: float = 70.0
     max_pitch: float = 55.0
     max_roll: float = 45.0
@@ -104,9 +111,7 @@ class QualityLimits:
 DEFAULT_QUALITY = QualityLimits()
 
 
-def measure(
-    crop: NDArray[np.uint8], face: Face | None, image_shape: tuple[int, ...] = ()
-) -> Quality:
+def measure(crop: NDArray[np.uint8], face: Face | None, image: NDArray[np.uint8]) -> Quality:
     """Measure one face.
 
     Parameters
@@ -115,8 +120,8 @@ def measure(
         The aligned crop, RGB uint8, shape (s, s, 3).
     face
         The detection it came from; ``None`` for crops that came aligned.
-    image_shape
-        Height and width first, of the picture that a detection is in.
+    image
+        The picture, RGB uint8, shape (h, w, 3); of crops that came aligned, the crop.
     """
     grey = cv2.cvtColor(crop, cv2.COLOR_RGB2GRAY)
     if grey.shape != (_SIDE, _SIDE):
@@ -124,19 +129,27 @@ def measure(
     yaw = pitch = roll = border = aspect = None
     if face is not None:
         yaw, pitch, roll = measure_pose(face.keypoints)
-        border = _border(face.keypoints, image_shape)
+        border = _border(face.keypoints, image.shape)
         aspect = face.height / face.width
     return Quality(
         score=None if face is None else face.score,
         face_size=None if face is None else min(face.width, face.height),
         sharpness=measure_sharpness(np.asarray(grey, dtype=np.uint8)),
         brightness=float(grey[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN].mean()),
+        exposure=_exposure(image),
         yaw=yaw,
         pitch=pitch,
         roll=roll,
         border=border,
         aspect=aspect,
     )
+
+
+def _exposure(image: NDArray[np.uint8]) -> float:
+    step = max(1, max(image.shape[:2]) // _EXPOSURE_SIDE)
+    grey = cv2.cvtColor(np.ascontiguousarray(image[::step, ::step]), cv2.COLOR_RGB2GRAY)
+    counts = np.cumsum(np.bincount(grey.ravel(), minlength=256))
+    return float(np.searchsorted(counts, int(0.95 * (grey.size - 1)), side="right"))
 
 
 def _border(keypoints: NDArray[np.floating], image_shape: tuple[int, ...]) -> float:
@@ -248,7 +261,9 @@ def check(
         failed["score"] = _measured(quality.score, min_score)
     if quality.sharpness < limits.min_sharpness:
         failed["blur"] = _measured(quality.sharpness, limits.min_sharpness)
-    if quality.brightness < limits.min_brightness:
+    if quality.exposure < limits.min_exposure:
+        failed["darkness"] = _measured(quality.exposure, limits.min_exposure)
+    elif quality.brightness < limits.min_brightness:
         failed["darkness"] = _measured(quality.brightness, limits.min_brightness)
     if quality.brightness > limits.max_brightness:
         failed["brightness"] = _measured(quality.brightness, limits.max_brightness)

@@ -26,6 +26,7 @@ MOVING = QualityLimits(
     min_sharpness=0.0,
     min_brightness=0.0,
     max_brightness=255.0,
+    min_exposure=0.0,
     max_yaw=90.0,
     max_pitch=90.0,
     max_roll=180.0,

@@ -28,6 +28,7 @@ GOOD = Quality(
     face_size=100.0,
     sharpness=3.0,
     brightness=120.0,
+    exposure=200.0,
     yaw=0.0,
     pitch=0.0,
     roll=0.0,
@@ -111,7 +112,7 @@ def test_a_flat_picture_has_no_detail():
 def test_measures_do_not_depend_on_the_embedders_size():
     crop = np.repeat(texture()[:, :, None], 3, axis=2)
     large = cv2.resize(crop, (224, 224), interpolation=cv2.INTER_NEAREST)
-    small, big = measure(crop, None), measure(large, None)
+    small, big = measure(crop, None, crop), measure(large, None, large)
     assert big.sharpness == pytest.approx(small.sharpness, rel=1e-6)
     assert big.brightness == pytest.approx(small.brightness)
     assert small.score is None
@@ -129,6 +130,7 @@ def test_the_good_pass():
         ({"score": 0.1}, "score"),
         ({"sharpness": 0.1}, "blur"),
         ({"brightness": 3.0}, "darkness"),
+        ({"exposure": 30.0}, "darkness"),
         ({"brightness": 253.0}, "brightness"),
         ({"yaw": -88.0}, "pose"),
         ({"pitch": 80.0}, "pose"),
@@ -268,6 +270,14 @@ PARTS = {
 def test_parts_of_real_faces_are_refused(pack, photos, part):
     reasons = [refusal(pack, PARTS[part](photo)) for photo in photos]
     assert all(reasons), reasons
+
+
+def test_a_dark_face_in_a_well_exposed_picture_passes(pack, photos):
+    """As dark skin is in a photo that is not underexposed."""
+    for photo in photos:
+        image = photo.copy()
+        image[40:210, 55:195] //= 9
+        assert "darkness" not in refusal(pack, image)
 
 
 def test_profiles_are_refused_for_their_pose(pack, fairface):

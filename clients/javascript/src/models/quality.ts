@@ -10,6 +10,7 @@ const SIDE = 112;
 const MARGIN = 20;
 const SMOOTHING = 1.5;
 const SMOOTHING_RADIUS = 6;
+const EXPOSURE_SIDE = 256;
 const EYES_PER_NOSE = 1.41;
 const HEIGHT_PER_NOSE = 3.26;
 const NEUTRAL_NOSE = 0.545;
@@ -24,6 +25,8 @@ export interface Quality {
   readonly sharpness: number;
   /** Mean luma of the centre of the aligned crop, 0…255. */
   readonly brightness: number;
+  /** Luma that a twentieth of the whole picture exceeds, 0…255. */
+  readonly exposure: number;
   /** Degrees. */
   readonly yaw: number | null;
   readonly pitch: number | null;
@@ -42,6 +45,7 @@ export interface QualityLimits {
   readonly min_sharpness: number;
   readonly min_brightness: number;
   readonly max_brightness: number;
+  readonly min_exposure: number;
   readonly max_yaw: number;
   readonly max_pitch: number;
   readonly max_roll: number;
@@ -54,8 +58,9 @@ export interface QualityLimits {
 export const DEFAULT_QUALITY: QualityLimits = {
   min_face_size: 24,
   min_sharpness: 0.5,
-  min_brightness: 18,
+  min_brightness: 6,
   max_brightness: 235,
+  min_exposure: 40,
   max_yaw: 70,
   max_pitch: 55,
   max_roll: 45,
@@ -77,6 +82,7 @@ export function measure(crop: RgbImage, face: Face | undefined, image: RgbImage)
     face_size: face === undefined ? null : shorterSide(face),
     sharpness: measureSharpness(grey),
     brightness: brightness / (SIDE - 2 * MARGIN) ** 2,
+    exposure: measureExposure(image),
     yaw: pose?.yaw ?? null,
     pitch: pose?.pitch ?? null,
     roll: pose?.roll ?? null,
@@ -85,18 +91,31 @@ export function measure(crop: RgbImage, face: Face | undefined, image: RgbImage)
   };
 }
 
+function measureExposure({ data, width, height }: RgbImage): number {
+  const step = Math.max(1, Math.floor(Math.max(width, height) / EXPOSURE_SIDE));
+  const lumas: number[] = [];
+  for (let y = 0; y < height; y += step) {
+    for (let x = 0; x < width; x += step) lumas.push(luma(data, 3 * (y * width + x)));
+  }
+  lumas.sort((a, b) => a - b);
+  return lumas[Math.floor(0.95 * (lumas.length - 1))];
+}
+
+/** Luma of a pixel in OpenCV's fixed point. */
+const luma = (data: Uint8Array, at: number): number =>
+  (data[at] * 9798 + data[at + 1] * 19235 + data[at + 2] * 3735 + (1 << 14)) >> 15;
+
 function measureBorder(keypoints: readonly Point[], image: RgbImage): number {
   const [a, b] = similarityTransform(keypoints, template(SIDE));
   const distances = keypoints.flatMap(([x, y]) => [x, y, image.width - 1 - x, image.height - 1 - y]);
   return (Math.min(...distances) * Math.hypot(a, b)) / SIDE;
 }
 
-/** Luma in OpenCV's fixed point, 112 x 112. */
+/** Luma, 112 x 112. */
 function greyCrop(crop: RgbImage): Float64Array {
   const grey = new Uint8Array(crop.width * crop.height);
   for (let i = 0; i < grey.length; i++) {
-    const [red, green, blue] = crop.data.subarray(3 * i, 3 * i + 3);
-    grey[i] = (red * 9798 + green * 19235 + blue * 3735 + (1 << 14)) >> 15;
+    grey[i] = luma(crop.data, 3 * i);
   }
   if (crop.width === SIDE) return Float64Array.from(grey);
   const tripled = new Uint8Array(3 * grey.length).map((_, i) => grey[Math.floor(i / 3)]);
@@ -215,7 +234,9 @@ export function check(quality: Quality, limits: QualityLimits, recommendedScore:
   if (quality.sharpness < limits.min_sharpness) {
     failed["blur"] = measured(quality.sharpness, limits.min_sharpness);
   }
-  if (quality.brightness < limits.min_brightness) {
+  if (quality.exposure < limits.min_exposure) {
+    failed["darkness"] = measured(quality.exposure, limits.min_exposure);
+  } else if (quality.brightness < limits.min_brightness) {
     failed["darkness"] = measured(quality.brightness, limits.min_brightness);
   }
   if (quality.brightness > limits.max_brightness) {
