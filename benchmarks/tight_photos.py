@@ -125,7 +125,8 @@ def judge(
         tally.cosines.append(float(rows[0] @ rows[1]))
     try:
         main_face = select_face(faces, single=True, limits=DEFAULT_QUALITY)
-        check(measure(pack.align(picture, main_face), main_face), recommended_score=0.0)
+        crop = pack.align(picture, main_face)
+        check(measure(crop, main_face, picture), recommended_score=0.0)
         code = "accepted"
     except FaceError as error:
         code = error.code

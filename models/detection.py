@@ -48,6 +48,8 @@ class Detector(ABC):
     score_threshold: float
     recommended_score: float
     """For photos of a person who wants to be seen."""
+    clear_score: float
+    """What nearly every upright face reaches that nothing covers, and no turned one does."""
 
     def __init__(
         self,
@@ -59,7 +61,7 @@ class Detector(ABC):
     ) -> None:
         self._session = session
         self._input_name = input_name
-        self._fixed = fixed is not None
+        self.is_fixed = fixed is not None
         self.sizes = canvas_sizes(size, fixed)
 
     def canvas(self, image: NDArray[np.uint8], size: Size) -> Size:  # noqa: ARG002 - of some kinds

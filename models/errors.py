@@ -95,7 +95,8 @@ class LowQuality(FaceError):
     """The face was found and failed at least one quality limit.
 
     ``details`` maps each failed measure (``score``, ``blur``, ``darkness``, ``brightness``,
-    ``pose``) to ``{"value": measured, "limit": limit}``.
+    ``turned``) to ``{"value": measured, "limit": limit}``, and ``pose`` (``yaw``, ``pitch``) and
+    ``hidden`` (``border``, ``aspect``) to one such pair for each that failed.
     """
 
     code = "low_quality"

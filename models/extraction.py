@@ -106,7 +106,7 @@ class Extractor:
     """Embeds files with one pack.
 
     Of several faces the largest and most central is taken, since labelled sets state whom a photo
-    shows, and bystanders are common. Every face that is found will do, as in public protocols.
+    shows, and bystanders are common. Every upright face will do, as in public protocols.
 
     Parameters
     ----------
@@ -223,8 +223,7 @@ class Extractor:
             "embedder": info.embedder_sha256,
             "preprocessing": preprocessing,
             "detector": detector,
-            # Of the gate, which is open: caches of before have it.
-            "quality": None,
+            "turned": "refused",
         }
         return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).digest()
 

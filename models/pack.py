@@ -21,9 +21,10 @@ from models.errors import ImageError, ModelError, PackError
 from models.faces import FaceCrop, FaceSample
 from models.liveness import PassiveLiveness
 from models.liveness_graphs import open_liveness
+from models.orientation import require_upright
 from models.pack_file import PackFile, Triple
 from models.pack_graphs import PackGraph, locate, pick, read_graph
-from models.quality import DEFAULT_QUALITY, QualityLimits, check, measure, select_face
+from models.quality import DEFAULT_QUALITY, Quality, QualityLimits, check, measure, select_face
 from models.scrfd import Scrfd
 from models.sessions import Session
 from models.signature import Role
@@ -261,7 +262,8 @@ class ModelPack:
                 self.detect(image), single=policy is FacePolicy.SINGLE, limits=quality
             )
             crop = self.align(image, face)
-        taken = FaceCrop(crop=crop, quality=measure(crop, face), face=face)
+            require_upright(self._detector, face, crop)
+        taken = FaceCrop(crop=crop, quality=measure(crop, face, image), face=face)
         if quality is not None:
             self.require_quality(taken, quality)
         if liveness and self.liveness is not None and taken.box is not None:
@@ -280,6 +282,12 @@ class ModelPack:
         check(taken.quality, limits, recommended_score=recommended)
         if self._demo:
             require_face(taken.crop)
+
+    def is_clear(self, quality: Quality) -> bool:
+        """Whether the detector was as sure of a face as it is of one that nothing covers."""
+        if quality.score is None or self._detector is None:
+            return True
+        return quality.score >= self._detector.clear_score
 
     def embed_photo(
         self,
@@ -303,7 +311,7 @@ class ModelPack:
             ``SINGLE`` refuses a photo with several faces; ``LARGEST`` takes the
             first in rank, the largest and most central one.
         quality
-            Limits; ``None`` checks nothing but that there is a face.
+            Limits; ``None`` checks nothing but that there is an upright face.
         liveness
             Also say how live the face looks; the pack needs a liveness graph.
 

@@ -17,6 +17,8 @@ _SIDE = 112
 _MARGIN = 20
 # Detail finer than this is noise of the sensor and of JPEG, which blur does not remove.
 _SMOOTHING = 1.5
+# Exposure is read from about so many pixels in each direction.
+_EXPOSURE_SIDE = 256
 # Geometry of the mean face on the template: half the distance of the eyes over how far the nose
 # stands out of the plane of eyes and mouth; the same for the distance from eyes to mouth; and
 # where the nose lies between eyes (0) and mouth (1) when the face looks straight ahead (mean of
@@ -41,17 +43,27 @@ class Quality:
         photo, below 0.5 for one that is useless.
     brightness
         Mean luma of the centre of the aligned crop, 0...255.
+    exposure
+        Luma that a twentieth of the whole picture exceeds, 0...255. It does not depend on skin.
     yaw, pitch, roll
         Degrees, see `measure_pose`; ``None`` for crops that came aligned.
+    border
+        Least distance of the five points from the border of the picture, as a share of the aligned
+        crop's side; negative where a point lies outside; ``None`` for crops that came aligned.
+    aspect
+        Height of the detected box over its width; ``None`` for crops that came aligned.
     """
 
     score: float | None
     face_size: float | None
     sharpness: float
     brightness: float
+    exposure: float
     yaw: float | None
     pitch: float | None
     roll: float | None
+    border: float | None
+    aspect: float | None
 
     def as_dict(self) -> dict[str, float | None]:
         """JSON-able form."""
@@ -69,10 +81,13 @@ class QualityLimits:
         differ in what a value means.
     min_face_size
         Shorter side of the box in pixels.
-    min_sharpness, min_brightness, max_brightness
-        As in `Quality`.
+    min_sharpness, min_brightness, max_brightness, min_exposure
+        As in `Quality`. In an underexposed picture strangers look alike; a face that is dark in a
+        bright one is recognised down to a far lower luma.
     max_yaw, max_pitch, max_roll
         Absolute degrees.
+    min_border, max_aspect
+        As in `Quality`: what `is_partly_hidden` goes by.
     second_face_share
         A further face counts when it reaches ``min_face_size`` and its area is at least this share
         of the main face's. 0, the default, counts every such face; 0.25 ignores people in the
@@ -82,18 +97,21 @@ class QualityLimits:
     min_score: float | None = None
     min_face_size: float = 24.0
     min_sharpness: float = 0.5
-    min_brightness: float = 18.0
+    min_brightness: float = 6.0
     max_brightness: float = 235.0
+    min_exposure: float = 40.0
     max_yaw: float = 70.0
     max_pitch: float = 55.0
     max_roll: float = 45.0
+    min_border: float = 0.08
+    max_aspect: float = 1.7
     second_face_share: float = 0.0
 
 
 DEFAULT_QUALITY = QualityLimits()
 
 
-def measure(crop: NDArray[np.uint8], face: Face | None) -> Quality:
+def measure(crop: NDArray[np.uint8], face: Face | None, image: NDArray[np.uint8]) -> Quality:
     """Measure one face.
 
     Parameters
@@ -102,22 +120,44 @@ def measure(crop: NDArray[np.uint8], face: Face | None) -> Quality:
         The aligned crop, RGB uint8, shape (s, s, 3).
     face
         The detection it came from; ``None`` for crops that came aligned.
+    image
+        The picture, RGB uint8, shape (h, w, 3); of crops that came aligned, the crop.
     """
     grey = cv2.cvtColor(crop, cv2.COLOR_RGB2GRAY)
     if grey.shape != (_SIDE, _SIDE):
         grey = cv2.resize(grey, (_SIDE, _SIDE), interpolation=cv2.INTER_AREA)
-    yaw = pitch = roll = None
+    yaw = pitch = roll = border = aspect = None
     if face is not None:
         yaw, pitch, roll = measure_pose(face.keypoints)
+        border = _border(face.keypoints, image.shape)
+        aspect = face.height / face.width
     return Quality(
         score=None if face is None else face.score,
         face_size=None if face is None else min(face.width, face.height),
         sharpness=measure_sharpness(np.asarray(grey, dtype=np.uint8)),
         brightness=float(grey[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN].mean()),
+        exposure=_exposure(image),
         yaw=yaw,
         pitch=pitch,
         roll=roll,
+        border=border,
+        aspect=aspect,
     )
+
+
+def _exposure(image: NDArray[np.uint8]) -> float:
+    step = max(1, max(image.shape[:2]) // _EXPOSURE_SIDE)
+    grey = cv2.cvtColor(np.ascontiguousarray(image[::step, ::step]), cv2.COLOR_RGB2GRAY)
+    counts = np.cumsum(np.bincount(grey.ravel(), minlength=256))
+    return float(np.searchsorted(counts, int(0.95 * (grey.size - 1)), side="right"))
+
+
+def _border(keypoints: NDArray[np.floating], image_shape: tuple[int, ...]) -> float:
+    height, width = image_shape[:2]
+    far_corner = np.array([width - 1, height - 1]) - keypoints
+    matrix = similarity_transform(keypoints, template(_SIDE))
+    scale = float(np.hypot(matrix[0, 0], matrix[1, 0]))
+    return min(float(keypoints.min()), float(far_corner.min())) * scale / _SIDE
 
 
 def measure_sharpness(grey: NDArray[np.uint8]) -> float:
@@ -221,14 +261,17 @@ def check(
         failed["score"] = _measured(quality.score, min_score)
     if quality.sharpness < limits.min_sharpness:
         failed["blur"] = _measured(quality.sharpness, limits.min_sharpness)
-    if quality.brightness < limits.min_brightness:
+    if quality.exposure < limits.min_exposure:
+        failed["darkness"] = _measured(quality.exposure, limits.min_exposure)
+    elif quality.brightness < limits.min_brightness:
         failed["darkness"] = _measured(quality.brightness, limits.min_brightness)
     if quality.brightness > limits.max_brightness:
         failed["brightness"] = _measured(quality.brightness, limits.max_brightness)
+    if quality.roll is not None and abs(quality.roll) > limits.max_roll:
+        failed["turned"] = _measured(quality.roll, limits.max_roll)
     angles = {
         "yaw": (quality.yaw, limits.max_yaw),
         "pitch": (quality.pitch, limits.max_pitch),
-        "roll": (quality.roll, limits.max_roll),
     }
     pose = {
         name: _measured(value, limit)
@@ -237,6 +280,8 @@ def check(
     }
     if pose:
         failed["pose"] = pose
+    if hidden := _hidden(quality, limits):
+        failed["hidden"] = hidden
     if failed:
         remedies = " ".join(_REMEDIES[name] for name in failed)
         raise LowQuality(
@@ -244,12 +289,34 @@ def check(
         )
 
 
+def is_partly_hidden(quality: Quality, limits: QualityLimits = DEFAULT_QUALITY) -> bool:
+    """Whether part of the face is covered, or lies outside the picture.
+
+    A detector puts five points on what it sees of a face, as if all of it were there. They then
+    reach the border of the picture, and the box, which goes round what is seen, is too narrow for
+    its height. A picture that was squeezed has such a box too. What covers a face from above or
+    from below leaves the box wide enough.
+    """
+    return bool(_hidden(quality, limits))
+
+
+def _hidden(quality: Quality, limits: QualityLimits) -> dict[str, dict[str, float]]:
+    hidden = {}
+    if quality.border is not None and quality.border < limits.min_border:
+        hidden["border"] = _measured(quality.border, limits.min_border)
+    if quality.aspect is not None and quality.aspect > limits.max_aspect:
+        hidden["aspect"] = _measured(quality.aspect, limits.max_aspect)
+    return hidden
+
+
 _REMEDIES = {
     "score": "Show the face unobstructed.",
     "blur": "Hold the camera still and focus on the face.",
     "darkness": "Put more light on the face.",
     "brightness": "Put less light on the face.",
+    "turned": "Hold the photo upright.",
     "pose": "Look into the camera.",
+    "hidden": "Show the whole face, with nothing before it and some room around it.",
 }
 
 

@@ -28,6 +28,7 @@ class Scrfd(Detector):
     kind = "scrfd"
     score_threshold = 0.5
     recommended_score = 0.6
+    clear_score = 0.75
 
     def detect_once(self, image: NDArray[np.uint8], size: Size) -> list[Face]:
         """Faces found in one pass on a canvas of ``size``, in pixels of ``image``."""

@@ -26,10 +26,11 @@ class YuNet(Detector):
     kind = "yunet"
     score_threshold = 0.6
     recommended_score = 0.7
+    clear_score = 0.92
 
     def canvas(self, image: NDArray[np.uint8], size: Size) -> Size:
         """Canvas of a pass: no larger than the picture needs, unless the graph fixes it."""
-        return size if self._fixed else _trimmed(image, size)
+        return size if self.is_fixed else _trimmed(image, size)
 
     def detect_once(self, image: NDArray[np.uint8], size: Size) -> list[Face]:
         """Faces found in one pass on a canvas of ``size``, in pixels of ``image``."""

@@ -21,7 +21,7 @@ MAX_FRAMES = 12
 TURN_DEGREES = 20.0
 CLOSER = 1.25
 """Change from the first frame that a movement has at least: yaw or pitch, and scale as a factor."""
-FRONT_YAW, FRONT_PITCH = 20.0, 30.0
+FRONT_YAW, FRONT_PITCH = 25.0, 40.0
 """Degrees within which the first frame looks ahead; where 0 is differs between people."""
 STILL_FRONT = 0.5
 """Share of those changes below which a frame still looks ahead."""

@@ -8,6 +8,11 @@ from verify.challenge import LivenessFailure
 Reason: TypeAlias = Literal["match", "no_match", "liveness"]
 Liveness: TypeAlias = Literal["passed", "failed", "not_checked"]
 
+_UNCOVER = (
+    "Something may cover the face: take off a mask or dark glasses, move hair and hands away, "
+    "and take another photo."
+)
+
 
 @dataclass(frozen=True)
 class Decision:
@@ -30,6 +35,8 @@ class Decision:
         Whether a living person made the probe, where that was checked.
     liveness_failure
         Why not; for keys with the right to scores, like these.
+    advice
+        What to change in another photo, by this photo alone; only where it does not match.
     """
 
     accepted: bool
@@ -43,6 +50,14 @@ class Decision:
     score: float = field(repr=False)
     liveness: Liveness = "not_checked"
     liveness_failure: LivenessFailure | None = None
+    advice: str | None = None
+
+    def with_advice(self, *, clear: bool) -> "Decision":
+        """Return the decision on a photo of a face that is `clear`, or seems to be covered.
+
+        Nothing but the photo decides on the advice, so that it tells nobody who is enrolled.
+        """
+        return self if clear or self.reason != "no_match" else replace(self, advice=_UNCOVER)
 
     def with_liveness(self, failure: LivenessFailure | None) -> "Decision":
         """Return the decision on a probe whose liveness was checked: a failure rejects."""

@@ -26,6 +26,7 @@ MOVING = QualityLimits(
     min_sharpness=0.0,
     min_brightness=0.0,
     max_brightness=255.0,
+    min_exposure=0.0,
     max_yaw=90.0,
     max_pitch=90.0,
     max_roll=180.0,
@@ -45,11 +46,14 @@ class PhotoProbe:
         How many these are.
     failure
         Why they are not taken for a living person's; None where nothing speaks against it.
+    clear
+        Whether nothing seems to cover the face in any of them.
     """
 
     embedding: NDArray[np.float32] = field(repr=False)
     photos: int
     failure: LivenessFailure | None
+    clear: bool
 
 
 def probe_of_photos(
@@ -75,7 +79,8 @@ def probe_of_photos(
     mean = mean_embedding(rows, consistency=contract.probe_consistency)
     scores = [sample.liveness for sample in samples if sample.liveness is not None]
     failure = passive_failure(contract, scores) if passive else None
-    return PhotoProbe(mean, len(photos), failure)
+    clear = all(pack.is_clear(sample.quality) for sample in samples)
+    return PhotoProbe(mean, len(photos), failure, clear)
 
 
 def probe_of_frames(
@@ -126,7 +131,8 @@ def probe_of_frames(
     except InconsistentImages:
         mean, photos, one_person = embeddings[0], 1, False
     failures.append(None if one_person else LivenessFailure.ANOTHER_PERSON)
-    return PhotoProbe(mean, photos, next((why for why in failures if why is not None), None))
+    failure = next((why for why in failures if why is not None), None)
+    return PhotoProbe(mean, photos, failure, all(pack.is_clear(faces[i].quality) for i in ahead))
 
 
 def passive_failure(contract: Contract, scores: Sequence[float]) -> LivenessFailure | None:

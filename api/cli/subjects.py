@@ -237,7 +237,7 @@ def verify(
             probe = verifier.photo_probe(pack, data, policy=face, limits=runtime.image_limits)
         decision = verifier.decide_embedding(
             probe.embedding, template, holder_key=holder_key, level=level, photos=probe.photos
-        )
+        ).with_advice(clear=probe.clear)
         outcome = "accept" if decision.accepted else "reject"
         # Another action than the service's: what an operator tries is not counted by the lockout.
         pseudonym = runtime.store.signer.pseudonym(name, subject)
@@ -256,12 +256,15 @@ def verify(
         "fmr": decision.fmr,
         "contract_id": decision.contract_id,
         "calibration_id": decision.calibration_id,
+        **({} if decision.advice is None else {"advice": decision.advice}),
         **notice,
     }
     if as_json:
         emit(answer)
     else:
         say(f"{answer['decision']}: {subject}, level {decision.level}, FMR {decision.fmr:g}")
+        if decision.advice is not None:
+            say(decision.advice)
     if not decision.accepted:
         raise typer.Exit(1)
 

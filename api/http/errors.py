@@ -112,7 +112,9 @@ ERROR_CODES: dict[str, ErrorCode] = {
         ErrorCode("multiple_faces", 422, "The photo shows more than one face."),
         ErrorCode("face_too_small", 422, "The face is too small in the photo."),
         ErrorCode(
-            "low_quality", 422, "The photo is too blurred or too dark, or the pose too extreme."
+            "low_quality",
+            422,
+            "The photo is turned, blurred or dark, the pose extreme, or part of the face hidden.",
         ),
         ErrorCode("inconsistent_images", 422, "The photos do not all show the same person."),
         ErrorCode("uncalibrated", 422, "The contract has no calibration for what was asked."),

@@ -138,9 +138,9 @@ async def _photos(
             decision = verifier.decide_embedding(
                 probe.embedding, stored, holder_key=holder_key, level=level, photos=probe.photos
             )
-        if challenge is None and not liveness.passive:
-            return decision
-        return decision.with_liveness(probe.failure)
+        if challenge is not None or liveness.passive:
+            decision = decision.with_liveness(probe.failure)
+        return decision.with_advice(clear=probe.clear)
 
     return Probe(
         "photo" if challenge is None else "frames",

@@ -145,6 +145,11 @@ class VerifyAnswer(_Answer):
         ]
         | None
     ) = Field(None, description="Why liveness failed: only for keys with `scores`.")
+    advice: str | None = Field(
+        None,
+        description="What to change in another photo, after `no_match`: by the photo alone, "
+        "whether the subject is enrolled or not.",
+    )
 
 
 class ChallengeAnswer(_Answer):

@@ -192,6 +192,7 @@ function decision(id, answer, sent) {
     { class: `verdict ${accepted ? "accept" : "reject"}` },
     h("p", { class: "verdict-word" }, accepted ? "✓ Accepted" : "✕ Rejected"),
     h("p", {}, REASONS[answer.reason] ?? LIVENESS[sent]),
+    answer.advice ? h("p", {}, answer.advice) : null,
     facts([
       ["Person", id],
       ["Level", answer.level],

@@ -88,7 +88,9 @@ const QUALITY = {
   blur: "Blurred: hold still, and clean the lens",
   darkness: "Too dark: find more light",
   brightness: "Too bright: find softer light",
+  turned: "Not upright: hold the camera upright, or turn the photo",
   pose: "Turned away: look straight at the camera",
+  hidden: "Part of the face is hidden: show all of it, with some room around it",
 };
 
 export const qualityWords = (details) =>

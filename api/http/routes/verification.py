@@ -139,6 +139,8 @@ def _body(decision: Decision, caller: Caller) -> dict[str, Any]:
         body["distance"] = decision.distance
         if decision.liveness_failure is not None:
             body["liveness_failure"] = str(decision.liveness_failure)
+    if decision.advice is not None:
+        body["advice"] = decision.advice
     return body
 
 

@@ -86,12 +86,12 @@ test("the face that is meant is the first that is large enough", () => {
 });
 
 test("every limit that a face fails is named", () => {
-  const quality = { score: 0.3, face_size: 90, sharpness: 0.1, brightness: 250, yaw: -80, pitch: 0, roll: 0 };
+  const quality = { score: 0.3, face_size: 90, sharpness: 0.1, brightness: 250, exposure: 255, yaw: -80, pitch: 0, roll: 0, border: -1, aspect: 1 };
   assert.throws(
     () => check(quality, DEFAULT_QUALITY, 0.6),
     (error) =>
       error instanceof LowQuality &&
-      Object.keys(error.details).join() === "score,blur,brightness,pose" &&
+      Object.keys(error.details).join() === "score,blur,brightness,pose,hidden" &&
       error.details.pose.yaw.limit === 70,
   );
   const straight = measurePose(template(112));

@@ -73,6 +73,8 @@ class Decision(Answer):
     distance: float | None = None
     liveness: str = "not_checked"  # as a service that checks none would say
     liveness_failure: str | None = None
+    advice: str | None = None
+    """What to change in another photo."""
 
     @property
     def accepted(self) -> bool:

@@ -112,14 +112,17 @@ def test_aligned_crops_of_every_size(node: Node, tmp_path: Path) -> None:
 def test_photos_of_people(
     node: Node, request: pytest.FixtureRequest, pack_dir: str, lfw_photos: Path
 ) -> None:
-    """Both detectors, on photos as they are, cut tightly, turned, small in a large picture."""
+    """Both detectors, on photos as they are, cut tightly, turned, halved, small."""
     folder = request.getfixturevalue(pack_dir)
     pack = ModelPack.load(folder, threads=1)
     people = sorted(path for path in lfw_photos.iterdir() if path.is_dir())
     photos = [decode_image(next(iter(sorted(path.glob("*.jpg")))).read_bytes()) for path in people]
     images = list(photos[:20])
     images += [photo[60:190, 60:190] for photo in photos[20:23]]
-    images += [np.ascontiguousarray(np.rot90(photos[23]))]
+    images += [
+        np.ascontiguousarray(np.rot90(photo, k)) for k in (1, 2, 3) for photo in photos[40:42]
+    ]
+    images += [np.ascontiguousarray(photo[:, 125:]) for photo in photos[40:42]]
     images += [
         np.asarray(cv2.resize(photo, (900, 700), interpolation=cv2.INTER_LINEAR), np.uint8)
         for photo in photos[24:26]
@@ -128,5 +131,6 @@ def test_photos_of_people(
     answers = embedded(node, pack, folder, images)
     for image, ours in zip(images, answers, strict=True):
         compare(pack, image, ours)
+    assert any("upside down" in answer.get("message", "") for answer in answers)
     # Most of them show one usable face; the others must be refused alike.
     assert sum("code" not in answer for answer in answers) > len(images) // 2

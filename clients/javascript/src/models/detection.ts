@@ -30,6 +30,9 @@ export interface Detector {
   readonly kind: "scrfd" | "yunet";
   readonly sizes: readonly Size[];
   readonly recommendedScore: number;
+  readonly clearScore: number;
+  /** Whether the graph accepts no other canvas. */
+  readonly isFixed: boolean;
   /** The canvas that a pass of `size` really takes for `image`. */
   canvas(image: RgbImage, size: Size): Size;
   /** Faces found in one pass on a canvas of `size`, in pixels of `image`. */

@@ -6,6 +6,7 @@ import { DEFAULT_SIZE, findFaces, type Detector, type Size } from "./detection.j
 import { Embedder, PREPROCESSING_VERSION, type Preprocessing } from "./embedding.js";
 import { FaceError, ModelError, PackError } from "./errors.js";
 import { resizeArea, resizeLinear, type RgbImage } from "./image.js";
+import { requireUpright } from "./orientation.js";
 import {
   check,
   DEFAULT_QUALITY,
@@ -159,8 +160,9 @@ export class ModelPack {
     } else {
       face = selectFace(await this.detect(image), policy === "single", limits);
       crop = align(image, face.keypoints, size);
+      await requireUpright(this.detector, face, crop);
     }
-    const quality = measure(crop, face);
+    const quality = measure(crop, face, image);
     check(quality, limits, this.detector?.recommendedScore ?? 0);
     return new FaceCrop(crop, quality, face);
   }

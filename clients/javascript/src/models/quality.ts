@@ -10,6 +10,7 @@ const SIDE = 112;
 const MARGIN = 20;
 const SMOOTHING = 1.5;
 const SMOOTHING_RADIUS = 6;
+const EXPOSURE_SIDE = 256;
 const EYES_PER_NOSE = 1.41;
 const HEIGHT_PER_NOSE = 3.26;
 const NEUTRAL_NOSE = 0.545;
@@ -24,10 +25,16 @@ export interface Quality {
   readonly sharpness: number;
   /** Mean luma of the centre of the aligned crop, 0…255. */
   readonly brightness: number;
+  /** Luma that a twentieth of the whole picture exceeds, 0…255. */
+  readonly exposure: number;
   /** Degrees. */
   readonly yaw: number | null;
   readonly pitch: number | null;
   readonly roll: number | null;
+  /** Least distance of the five points from the picture's border, over the aligned crop's side. */
+  readonly border: number | null;
+  /** Height of the detected box over its width. */
+  readonly aspect: number | null;
 }
 
 /** What a face must reach: the names are those of {@link Quality}. */
@@ -38,9 +45,12 @@ export interface QualityLimits {
   readonly min_sharpness: number;
   readonly min_brightness: number;
   readonly max_brightness: number;
+  readonly min_exposure: number;
   readonly max_yaw: number;
   readonly max_pitch: number;
   readonly max_roll: number;
+  readonly min_border: number;
+  readonly max_aspect: number;
   /** A further face counts when its area is at least this share of the main face's. */
   readonly second_face_share: number;
 }
@@ -48,16 +58,19 @@ export interface QualityLimits {
 export const DEFAULT_QUALITY: QualityLimits = {
   min_face_size: 24,
   min_sharpness: 0.5,
-  min_brightness: 18,
+  min_brightness: 6,
   max_brightness: 235,
+  min_exposure: 40,
   max_yaw: 70,
   max_pitch: 55,
   max_roll: 45,
+  min_border: 0.08,
+  max_aspect: 1.7,
   second_face_share: 0,
 };
 
-/** Measure the aligned crop of a face; `face` is undefined for crops that came aligned. */
-export function measure(crop: RgbImage, face: Face | undefined): Quality {
+/** Measure the aligned crop of a face in `image`; `face` is undefined for crops that came aligned. */
+export function measure(crop: RgbImage, face: Face | undefined, image: RgbImage): Quality {
   const grey = greyCrop(crop);
   let brightness = 0;
   for (let y = MARGIN; y < SIDE - MARGIN; y++) {
@@ -69,18 +82,40 @@ export function measure(crop: RgbImage, face: Face | undefined): Quality {
     face_size: face === undefined ? null : shorterSide(face),
     sharpness: measureSharpness(grey),
     brightness: brightness / (SIDE - 2 * MARGIN) ** 2,
+    exposure: measureExposure(image),
     yaw: pose?.yaw ?? null,
     pitch: pose?.pitch ?? null,
     roll: pose?.roll ?? null,
+    border: face === undefined ? null : measureBorder(face.keypoints, image),
+    aspect: face === undefined ? null : boxHeight(face.box) / boxWidth(face.box),
   };
 }
 
-/** Luma in OpenCV's fixed point, 112 x 112. */
+function measureExposure({ data, width, height }: RgbImage): number {
+  const step = Math.max(1, Math.floor(Math.max(width, height) / EXPOSURE_SIDE));
+  const lumas: number[] = [];
+  for (let y = 0; y < height; y += step) {
+    for (let x = 0; x < width; x += step) lumas.push(luma(data, 3 * (y * width + x)));
+  }
+  lumas.sort((a, b) => a - b);
+  return lumas[Math.floor(0.95 * (lumas.length - 1))];
+}
+
+/** Luma of a pixel in OpenCV's fixed point. */
+const luma = (data: Uint8Array, at: number): number =>
+  (data[at] * 9798 + data[at + 1] * 19235 + data[at + 2] * 3735 + (1 << 14)) >> 15;
+
+function measureBorder(keypoints: readonly Point[], image: RgbImage): number {
+  const [a, b] = similarityTransform(keypoints, template(SIDE));
+  const distances = keypoints.flatMap(([x, y]) => [x, y, image.width - 1 - x, image.height - 1 - y]);
+  return (Math.min(...distances) * Math.hypot(a, b)) / SIDE;
+}
+
+/** Luma, 112 x 112. */
 function greyCrop(crop: RgbImage): Float64Array {
   const grey = new Uint8Array(crop.width * crop.height);
   for (let i = 0; i < grey.length; i++) {
-    const [red, green, blue] = crop.data.subarray(3 * i, 3 * i + 3);
-    grey[i] = (red * 9798 + green * 19235 + blue * 3735 + (1 << 14)) >> 15;
+    grey[i] = luma(crop.data, 3 * i);
   }
   if (crop.width === SIDE) return Float64Array.from(grey);
   const tripled = new Uint8Array(3 * grey.length).map((_, i) => grey[Math.floor(i / 3)]);
@@ -172,7 +207,9 @@ const REMEDIES: Readonly<Record<string, string>> = {
   blur: "Hold the camera still and focus on the face.",
   darkness: "Put more light on the face.",
   brightness: "Put less light on the face.",
+  turned: "Hold the photo upright.",
   pose: "Look into the camera.",
+  hidden: "Show the whole face, with nothing before it and some room around it.",
 };
 
 /**
@@ -197,19 +234,32 @@ export function check(quality: Quality, limits: QualityLimits, recommendedScore:
   if (quality.sharpness < limits.min_sharpness) {
     failed["blur"] = measured(quality.sharpness, limits.min_sharpness);
   }
-  if (quality.brightness < limits.min_brightness) {
+  if (quality.exposure < limits.min_exposure) {
+    failed["darkness"] = measured(quality.exposure, limits.min_exposure);
+  } else if (quality.brightness < limits.min_brightness) {
     failed["darkness"] = measured(quality.brightness, limits.min_brightness);
   }
   if (quality.brightness > limits.max_brightness) {
     failed["brightness"] = measured(quality.brightness, limits.max_brightness);
   }
+  if (quality.roll !== null && Math.abs(quality.roll) > limits.max_roll) {
+    failed["turned"] = measured(quality.roll, limits.max_roll);
+  }
   const pose: Record<string, Measured> = {};
-  for (const name of ["yaw", "pitch", "roll"] as const) {
+  for (const name of ["yaw", "pitch"] as const) {
     const angle = quality[name];
     const limit = limits[`max_${name}`];
     if (angle !== null && Math.abs(angle) > limit) pose[name] = measured(angle, limit);
   }
   if (Object.keys(pose).length > 0) failed["pose"] = pose;
+  const hidden: Record<string, Measured> = {};
+  if (quality.border !== null && quality.border < limits.min_border) {
+    hidden["border"] = measured(quality.border, limits.min_border);
+  }
+  if (quality.aspect !== null && quality.aspect > limits.max_aspect) {
+    hidden["aspect"] = measured(quality.aspect, limits.max_aspect);
+  }
+  if (Object.keys(hidden).length > 0) failed["hidden"] = hidden;
   const names = Object.keys(failed);
   if (names.length > 0) {
     const remedies = names.map((name) => REMEDIES[name]).join(" ");

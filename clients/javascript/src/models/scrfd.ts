@@ -20,6 +20,8 @@ const OVERLAP = 0.4;
 export class Scrfd implements Detector {
   readonly kind = "scrfd";
   readonly recommendedScore = 0.6;
+  readonly clearScore = 0.75;
+  readonly isFixed: boolean;
   readonly sizes: readonly Size[];
 
   constructor(
@@ -27,6 +29,7 @@ export class Scrfd implements Detector {
     size: number,
     fixed: Size | undefined,
   ) {
+    this.isFixed = fixed !== undefined;
     this.sizes = canvasSizes(size, fixed);
   }
 

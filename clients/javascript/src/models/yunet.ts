@@ -27,6 +27,8 @@ export const YUNET_OUTPUTS: readonly string[] = ["cls", "obj", "bbox", "kps"].fl
 export class YuNet implements Detector {
   readonly kind = "yunet";
   readonly recommendedScore = 0.7;
+  readonly clearScore = 0.92;
+  readonly isFixed: boolean;
   readonly sizes: readonly Size[];
 
   constructor(
@@ -34,6 +36,7 @@ export class YuNet implements Detector {
     size: number,
     private readonly fixed: Size | undefined,
   ) {
+    this.isFixed = fixed !== undefined;
     this.sizes = canvasSizes(size, fixed);
   }
 

@@ -33,6 +33,8 @@ export interface Decision extends Answer {
   readonly distance?: number;
   readonly liveness?: "passed" | "failed" | "not_checked";
   readonly liveness_failure?: string;
+  /** What to change in another photo. */
+  readonly advice?: string;
 }
 
 /** Movements to make, in their order, as the person sees them who makes them. */
