@@ -18,7 +18,7 @@ def embed_photos(
     limits: ImageLimits = DEFAULT_LIMITS,
     liveness: bool = False,
 ) -> list[FaceSample]:
-    """Embed photo files in their order; all or none.
+    """Embed photo files in their order; all or none. A file given twice is embedded once.
 
     Parameters
     ----------
@@ -30,13 +30,14 @@ def embed_photos(
     PhotoRejected
         Where one of them has no usable face, by its position.
     """
-    samples = []
+    samples: dict[bytes, FaceSample] = {}
     for index, photo in enumerate(photos):
+        if photo in samples:
+            continue
         try:
-            sample = pack.embed_photo(
+            samples[photo] = pack.embed_photo(
                 photo, policy=policy, quality=quality, limits=limits, liveness=liveness
             )
         except ModelError as error:
             raise PhotoRejected(index, error, count=len(photos)) from error
-        samples.append(sample)
-    return samples
+    return [samples[photo] for photo in photos]

@@ -15,7 +15,7 @@ from models.photos import embed_photos
 from models.quality import DEFAULT_QUALITY, QualityLimits
 from templates.contract.document import Contract
 from templates.errors import Uncalibrated
-from templates.space.agreement import InconsistentImages, mean_embedding
+from templates.space.agreement import InconsistentImages, distinct_rows, mean_embedding
 from verify.challenge import LivenessFailure, Movement, frontal_frames, movements_failure
 
 MAX_PROBE_PHOTOS = 5
@@ -42,7 +42,7 @@ class PhotoProbe:
     embedding
         Mean of the photos, of frames of those that look ahead, (n,) float32, unit norm.
     photos
-        How many these are.
+        How many these are; one that was given twice counts once.
     failure
         Why they are not taken for a living person's; None where nothing speaks against it.
     """
@@ -73,9 +73,10 @@ def probe_of_photos(
     samples = embed_photos(pack, photos, policy=policy, limits=limits, liveness=passive)
     rows = np.stack([sample.embedding for sample in samples])
     mean = mean_embedding(rows, consistency=contract.probe_consistency)
-    scores = [sample.liveness for sample in samples if sample.liveness is not None]
+    distinct = [samples[place] for place in distinct_rows(rows)]
+    scores = [sample.liveness for sample in distinct if sample.liveness is not None]
     failure = passive_failure(contract, scores) if passive else None
-    return PhotoProbe(mean, len(photos), failure)
+    return PhotoProbe(mean, len(distinct), failure)
 
 
 def probe_of_frames(
@@ -122,7 +123,8 @@ def probe_of_frames(
     consistency = contract.probe_consistency
     try:
         mean = mean_embedding(embeddings[ahead], consistency=consistency)
-        photos, one_person = len(ahead), float((embeddings @ mean).min()) >= consistency
+        photos = len(distinct_rows(embeddings[ahead]))
+        one_person = float((embeddings @ mean).min()) >= consistency
     except InconsistentImages:
         mean, photos, one_person = embeddings[0], 1, False
     failures.append(None if one_person else LivenessFailure.ANOTHER_PERSON)
