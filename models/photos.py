@@ -5,15 +5,16 @@ from collections.abc import Sequence
 from models.decoding import DEFAULT_LIMITS, ImageLimits
 from models.errors import ModelError, PhotoRejected
 from models.faces import FaceSample
-from models.pack import FacePolicy, ModelPack
+from models.pack import ModelPack
 from models.quality import DEFAULT_QUALITY, QualityLimits
+from models.selection import FacePolicy
 
 
 def embed_photos(
     pack: ModelPack,
     photos: Sequence[bytes],
     *,
-    policy: FacePolicy = FacePolicy.SINGLE,
+    policy: FacePolicy = FacePolicy.DOMINANT,
     quality: QualityLimits | None = DEFAULT_QUALITY,
     limits: ImageLimits = DEFAULT_LIMITS,
     liveness: bool = False,

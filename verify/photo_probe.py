@@ -10,9 +10,10 @@ from models.decoding import DEFAULT_LIMITS, ImageLimits
 from models.errors import FaceError, ModelError, PackError, PhotoRejected
 from models.faces import FaceCrop
 from models.head_pose import HeadPose, head_pose
-from models.pack import FacePolicy, ModelPack
+from models.pack import ModelPack
 from models.photos import embed_photos
 from models.quality import DEFAULT_QUALITY, QualityLimits
+from models.selection import FacePolicy
 from templates.contract.document import Contract
 from templates.errors import Uncalibrated
 from templates.space.agreement import InconsistentImages, distinct_rows, mean_embedding
@@ -58,7 +59,7 @@ def probe_of_photos(
     photos: Sequence[bytes],
     *,
     passive: bool,
-    policy: FacePolicy = FacePolicy.SINGLE,
+    policy: FacePolicy = FacePolicy.DOMINANT,
     limits: ImageLimits = DEFAULT_LIMITS,
 ) -> PhotoProbe:
     """Average photos of one person; with `passive`, say whether they look live on average.
@@ -86,7 +87,7 @@ def probe_of_frames(
     movements: Sequence[Movement],
     *,
     passive: bool,
-    policy: FacePolicy = FacePolicy.SINGLE,
+    policy: FacePolicy = FacePolicy.DOMINANT,
     limits: ImageLimits = DEFAULT_LIMITS,
 ) -> PhotoProbe:
     """Make one probe of the frames of a challenge, and hold them against it.

@@ -14,7 +14,8 @@ from api.cli.files import read_bounded
 from api.cli.options import AsJson
 from enroll.enroller import MAX_PHOTOS
 from models.errors import ModelError
-from models.pack import FacePolicy, ModelPack
+from models.pack import ModelPack
+from models.selection import FacePolicy
 from templates.contract import wire
 from templates.contract.binding import Binding
 from templates.contract.canonical import parse_object
@@ -85,7 +86,8 @@ def lift(
     face: Annotated[
         FacePolicy,
         typer.Option(
-            help="What several faces mean: an error, or the one that is largest and most central."
+            help="A photo with several faces: use the largest if it covers the middle and has "
+            "twice the area of every other; use the largest wherever it is; or refuse the photo."
         ),
     ] = FacePolicy.SINGLE,
     holder_key_file: Annotated[

@@ -22,7 +22,8 @@ from api.process.runtime import Runtime
 from api.settings import Settings
 from enroll.enroller import MAX_PHOTOS, Holder
 from models.errors import PhotoRejected
-from models.pack import FacePolicy, ModelPack
+from models.pack import ModelPack
+from models.selection import FacePolicy
 from templates.decoys import Attributes
 from templates.keys.holder_key import (
     new_holder_key,
@@ -41,8 +42,8 @@ Subject = Annotated[str, typer.Argument(help="Id of the person.")]
 Face = Annotated[
     FacePolicy,
     typer.Option(
-        help="A photo with several faces: refuse it, or use the first by rank (large, and "
-        "near the middle)."
+        help="A photo with several faces: use the largest if it covers the middle and has twice "
+        "the area of every other; use the largest wherever it is; or refuse the photo."
     ),
 ]
 HolderKeyFile = Annotated[

@@ -10,7 +10,7 @@ import pytest
 from api.http.app import create_app
 from api.http.schemas import VerifyAnswer
 from api.process.opening import file_sealer, open_keyring
-from models.pack import FacePolicy
+from models.selection import FacePolicy
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, deploy, images
 from tests.api.real_people import calibrated_on_lfw
