@@ -35,6 +35,11 @@ def say(text: str) -> None:
     typer.echo(text)
 
 
+def counted(number: int, noun: str) -> str:
+    """Return a number with its noun: ``1 photo``, ``2 photos``."""
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
+
+
 def table(title: str, *columns: str) -> "Table":
     """Make an empty table; numbers are the caller's to align."""
     from rich.table import Table

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from api.cli.console import demo_notice, emit, say
+from api.cli.console import counted, demo_notice, emit, say
 from api.cli.errors import CommandError, UsageError
 from api.cli.files import read_bounded
 from api.cli.options import AsJson
@@ -161,7 +161,10 @@ def lift(
     if as_json:
         emit(facts)
     else:
-        say(f"{out}: {facts['kind']} template of {len(photos)} photos, m = {m}, {len(data)} bytes.")
+        say(
+            f"{out}: {facts['kind']} template of {counted(len(photos), 'photo')}, m = {m}, "
+            f"{len(data)} bytes."
+        )
 
 
 def _signing_token(subject: str | None, level: str | None, *, asked: bool) -> str | None:

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from api.cli.console import demo_notice, emit, message, say
+from api.cli.console import counted, demo_notice, emit, message, say
 from api.cli.errors import CommandError, UsageError
 from api.cli.files import read_bounded
 from api.cli.options import LOCAL, AsJson, Tenant, takes_settings
@@ -178,7 +178,7 @@ def enroll(
         size, where = len(enrollment.wire), "stored"
         if held_template is not None:
             where = f"wrote to {held_template}, and stored none of,"
-        say(f"{done} {subject} from {len(photos)} photos; {where} {size} bytes.")
+        say(f"{done} {subject} from {counted(len(photos), 'photo')}; {where} {size} bytes.")
 
 
 @takes_settings(*LOCAL)

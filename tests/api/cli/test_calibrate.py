@@ -352,8 +352,9 @@ def test_wrong_probe_dimensions_are_refused(text):
 
 def test_aliases_are_read(tmp_path):
     file = tmp_path / "aliases.csv"
-    file.write_text("# second, first\nBill_C,William_C\n\n")
-    assert read_aliases(file) == {"Bill_C": "William_C"}
-    file.write_text("only one name\n")
-    with pytest.raises(CommandError, match="line 1"):
-        read_aliases(file)
+    file.write_text('# second, first\nBill_C,William_C\n\n"Smith, John", Smith\n')
+    assert read_aliases(file) == {"Bill_C": "William_C", "Smith, John": "Smith"}
+    for wrong in ("only one name\n", "Smith, John, Smith\n", "name,\n"):
+        file.write_text(wrong)
+        with pytest.raises(CommandError, match=r"line 1: expected .* double quotes"):
+            read_aliases(file)
