@@ -78,7 +78,17 @@ def test_ages_that_are_dates_are_refused(tmp_path, age):
         read_labels(written(tmp_path, f"path,age\na,adult\nb,{age}\n"))
 
 
-@pytest.mark.parametrize("age", ["18-30", "2.5-3.5", "married", "senior", "31", "70+", "mature"])
+@pytest.mark.parametrize(
+    ("years", "group"),
+    [("0", "0-1"), ("1", "0-1"), ("2", "2-4"), ("10", "8-10"), ("29", "18-29"),
+     ("30", "30-44"), ("59", "45-59"), ("60", "60 and more"), ("116", "60 and more")],
+)  # fmt: skip
+def test_ages_in_years_are_put_into_groups(tmp_path, years, group):
+    labels = read_labels(written(tmp_path, f"path,age\na,{years}\n"))
+    assert labels.find("a") == {"age": group}
+
+
+@pytest.mark.parametrize("age", ["18-30", "2.5-3.5", "married", "senior", "1234", "70+", "mature"])
 def test_other_ages_are_labels(tmp_path, age):
     labels = read_labels(written(tmp_path, f"path,age\na,adult\nb,{age}\n"))
     assert labels.find("b") == {"age": age}
