@@ -52,7 +52,8 @@ from benchmarks.private_client import (
 )
 from models.decoding import decode_image
 from models.errors import FaceError
-from models.pack import FacePolicy, ModelPack
+from models.pack import ModelPack
+from models.selection import FacePolicy
 from tests.clients.proxy import Proxy
 from tests.leaks import LeakSearch
 from tests.patience import PATIENCE_S

@@ -35,7 +35,8 @@ import numpy.typing as npt
 from benchmarks.deployment import database, service, settings_of, veilface
 from models.cache import EmbeddingCache
 from models.extraction import Extractor
-from models.pack import FacePolicy, ModelPack
+from models.pack import ModelPack
+from models.selection import FacePolicy
 from templates.contract.wire import encode
 from templates.decoys import DecoyGenerator
 from templates.keys.probe_signature import signed_probe

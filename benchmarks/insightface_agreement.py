@@ -29,7 +29,7 @@ from PIL import Image
 
 from models.boxes import ranked
 from models.decoding import decode_image
-from models.pack import FacePolicy, ModelPack
+from models.pack import ModelPack
 
 SQUEEZES = ((1.0, 1.0), (0.6, 1.0), (1.0, 0.55))  # across, downward
 
@@ -73,7 +73,7 @@ def main() -> None:
             right = embedder.get_feat(crop).ravel()
             right /= np.linalg.norm(right)
             cosines["one pass"].append(float(right @ pack.embed(ours[None])[0]))
-            sample = pack.embed_photo(png(image), policy=FacePolicy.LARGEST, quality=None)
+            sample = pack.embed_photo(png(image), policy=None, quality=None)
             cosines["whole way"].append(float(right @ sample.embedding))
     print(f"insightface {package.__version__}, canvas {options.size}: {pictures} pictures,")
     print(f"no face in {missed} (by both); key points differ by at most {max(points):.2g} pixels,")

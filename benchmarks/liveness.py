@@ -25,7 +25,7 @@ from attacks.impostor_presentations import verify_presentations
 from models.decoding import decode_image
 from models.errors import FaceError, ImageError
 from models.extraction import Failure
-from models.pack import FacePolicy, ModelPack
+from models.pack import ModelPack
 from templates.contract.document import Contract, Rate
 from templates.decoys import load_source
 from verify.evaluation.liveness.presentations import PresentationSet, read_presentations
@@ -105,7 +105,7 @@ def score(presented: PresentationSet, packs: list[ModelPack], times: Times) -> d
         data = presentation.path.read_bytes()
         start = time.thread_time()
         try:
-            sample = packs[0].embed_photo(data, policy=FacePolicy.LARGEST, quality=None)
+            sample = packs[0].embed_photo(data, policy=None, quality=None)
         except (FaceError, ImageError) as error:
             failures.append(Failure(presentation.path, error.code, str(error)))
             continue

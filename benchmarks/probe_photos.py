@@ -24,8 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.extraction import Extractor
-from models.pack import FacePolicy, ModelPack
+from models.pack import ModelPack
 from models.quality import Quality
+from models.selection import FacePolicy
 from templates.decoys import DecoyGenerator
 from templates.distances import Metric, pairwise_distances, similarity
 from templates.keys.randomness import Keystream

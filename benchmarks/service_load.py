@@ -40,7 +40,8 @@ from benchmarks.deployment import database, service, settings_of, veilface
 from benchmarks.end_to_end import LiftingClient, Person, enroll_photos, people_of, prepare
 from benchmarks.request_overhead import bare_inference
 from models.decoding import decode_image
-from models.pack import FacePolicy, ModelPack
+from models.pack import ModelPack
+from models.selection import FacePolicy
 from templates.keys.api_token import probe_key
 from templates.keys.probe_signature import probe_mac
 

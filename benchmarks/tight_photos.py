@@ -31,7 +31,8 @@ from models.decoding import decode_image
 from models.detection import NEAR_SIZE, RETRY_BORDER, Detector, find_faces
 from models.errors import FaceError
 from models.pack import ModelPack
-from models.quality import DEFAULT_QUALITY, check, measure, select_face
+from models.quality import DEFAULT_QUALITY, check, measure
+from models.selection import FacePolicy, select_face
 
 Picture = NDArray[np.uint8]
 Points = NDArray[np.float32]
@@ -84,7 +85,7 @@ def main() -> None:
     rules: dict[str, Rule] = {"one canvas": one_canvas, "by size": find_faces}
     tallies: dict[tuple[str, str], Tally] = defaultdict(Tally)
     passes: dict[str, list[float]] = defaultdict(list)
-    for kind, people, picture, points in pictures(detector, photos):
+    for kind, picture, points in pictures(detector, photos):
         started = time.process_time()
         detector.detect_once(picture, detector.sizes[0])
         passes[kind].append(time.process_time() - started)
@@ -93,7 +94,7 @@ def main() -> None:
             started = time.process_time()
             faces = ranked(rule(detector, picture), picture.shape)
             tally.seconds.append(time.process_time() - started)
-            judge(pack, picture, points, faces, people, tally)
+            judge(pack, picture, points, faces, tally)
     print(f"{'picture':24}{'rule':12}{'n':>5}{'off %':>7}{'wrong %':>8}{'none %':>7}", end="")
     print(f"{'refused %':>10}  {'cost':>5}  what the gate said wrongly")
     for (kind, name), tally in tallies.items():
@@ -113,58 +114,57 @@ def main() -> None:
 
 
 def judge(
-    pack: ModelPack, picture: Picture, points: Points, faces: list[Face], people: int, tally: Tally
+    pack: ModelPack, picture: Picture, points: Points, faces: list[Face], tally: Tally
 ) -> None:
     """Book the embedding's cosine to the right one, and what the gate refuses wrongly."""
     right = align(picture, points, size=pack.crop_size)
     if not faces:
         tally.cosines.append(float("nan"))
     else:
-        taken = select_face(faces, single=False, limits=DEFAULT_QUALITY)
+        taken = max(faces, key=lambda face: face.area)
         rows = pack.embed(np.stack([right, pack.align(picture, taken)]))
         tally.cosines.append(float(rows[0] @ rows[1]))
     try:
-        main_face = select_face(faces, single=True, limits=DEFAULT_QUALITY)
+        main_face = select_face(
+            faces,
+            FacePolicy.DOMINANT,
+            shape=picture.shape,
+            min_size=DEFAULT_QUALITY.min_face_size,
+        )
         crop = pack.align(picture, main_face)
         check(measure(crop, main_face, picture), recommended_score=0.0)
-        code = "accepted"
     except FaceError as error:
-        code = error.code
-    expected = "multiple_faces" if people > 1 else "accepted"
-    if code != expected:
-        tally.refusals[code] += 1
+        tally.refusals[error.code] += 1
 
 
-def pictures(
-    detector: Detector, photos: list[Picture]
-) -> Iterator[tuple[str, int, Picture, Points]]:
-    """Kind, number of people, picture and the points of the face that it is about."""
+def pictures(detector: Detector, photos: list[Picture]) -> Iterator[tuple[str, Picture, Points]]:
+    """Kind, picture and the points of the face that it is about."""
     alone = list(single_faces(detector, photos))
     for index, (photo, face) in enumerate(alone):
         stranger, other = alone[(index + 1) % len(alone)]
         patch = cut(stranger, other, margin=0.15)[0]
         patch = scaled(patch, 96 / max(patch.shape[:2]))
-        yield "photo as it is", 1, photo, face.keypoints
+        yield "photo as it is", photo, face.keypoints
         for crop in CROPS:
             # 0: the face with half of its size around it; 50 %: the box of the face alone.
             tight, points = cut(photo, face, margin=0.5 - crop)
-            yield f"crop {100 * crop:.0f} %", 1, tight, points
+            yield f"crop {100 * crop:.0f} %", tight, points
             factor = LARGE / max(tight.shape[:2])
             large, points = scaled(tight, factor), points * np.float32(factor)
-            yield f"crop {100 * crop:.0f} %, enlarged", 1, large, points
+            yield f"crop {100 * crop:.0f} %, enlarged", large, points
             if crop in (0.3, 0.5):
                 edge = LARGE // 12
                 framed = cv2.copyMakeBorder(large, edge, edge, edge, edge, cv2.BORDER_CONSTANT)
-                yield f"crop {100 * crop:.0f} %, bordered", 1, np.asarray(framed), points + edge
+                yield f"crop {100 * crop:.0f} %, bordered", np.asarray(framed), points + edge
                 pasted = large.copy()
                 down, across = index % 2, index // 2 % 2
                 y, x = (large.shape[0] - 96) * down, (large.shape[1] - patch.shape[1]) * across
                 pasted[y : y + len(patch), x : x + patch.shape[1]] = patch
-                yield f"crop {100 * crop:.0f} %, second face", 2, pasted, points
+                yield f"crop {100 * crop:.0f} %, second face", pasted, points
     for photo, face in single_faces(detector, [scaled(photo, 0.6, 1.0) for photo in photos]):
         for crop in (0.3, 0.5):
             tight, points = cut(photo, face, margin=0.5 - crop)
-            yield f"crop {100 * crop:.0f} %, squeezed", 1, tight, points
+            yield f"crop {100 * crop:.0f} %, squeezed", tight, points
 
 
 def single_faces(detector: Detector, photos: Iterable[Picture]) -> Iterator[tuple[Picture, Face]]:

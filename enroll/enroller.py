@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.decoding import DEFAULT_LIMITS, ImageLimits
-from models.pack import FacePolicy, ModelPack
+from models.pack import ModelPack
 from models.photos import embed_photos
 from models.quality import DEFAULT_QUALITY, QualityLimits
+from models.selection import FacePolicy
 from templates.contract import wire
 from templates.contract.document import Contract
 from templates.decoys import Attributes, DecoySource
@@ -131,7 +132,7 @@ class Enroller:
         *,
         attributes: Attributes | None = None,
         holder: Holder | None = None,
-        policy: FacePolicy = FacePolicy.SINGLE,
+        policy: FacePolicy = FacePolicy.DOMINANT,
         quality: QualityLimits | None = DEFAULT_QUALITY,
         limits: ImageLimits = DEFAULT_LIMITS,
     ) -> Enrollment:

@@ -18,12 +18,22 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from models.errors import ImageError
+from models.file_kinds import unread_file
 from models.lean import animated, jpeg_scans, lean
 
-FORMATS = ("JPEG", "PNG", "WEBP")
+FORMATS = ("JPEG", "PNG", "WEBP", "BMP")
 # A JPEG that carries further pictures (MPO, portrait mode of many phones) is read as the first
 # one, the photo: the index of the others is not kept.
-_READ_AS = {"JPEG": "JPEG", "PNG": "PNG", "WEBP": "WebP"}
+_READ_AS = {"JPEG": "JPEG", "PNG": "PNG", "WEBP": "WebP", "BMP": "BMP"}
+
+SMALLER = "Send a smaller copy."
+
+# Some programs forget the end marker. Pixels that are missing with it are made up of what follows,
+# so that two endings give two pictures; where all are there, both give the same.
+_JPEG_END = b"\xff\xd9"
+_OTHER_END = bytes(range(254, 0, -1)) + _JPEG_END
+# RLE8 and RLE4: Pillow unpacks them in Python, 24 megapixels of 20 kB in 7 seconds.
+_BMP_RUNS = (1, 2)
 
 # Transparent pixels are laid over white, the background of identity photos.
 BACKGROUND = 255
@@ -39,7 +49,7 @@ _metadata_lock = threading.Lock()
 # Most bytes of memory that decoding takes for a pixel (measured: 7.2, 12.0 and 16.4). Pillow holds
 # 4, the result 3. A progressive JPEG keeps its coefficients, 2 bytes a channel; the WebP decoder
 # keeps two canvases and hands out a third.
-BYTES_PER_PIXEL = {"PNG": 8, "JPEG": 13, "WebP": 17}
+BYTES_PER_PIXEL = {"BMP": 8, "PNG": 8, "JPEG": 13, "WebP": 17}
 
 # What decoding may take at a time in one process: one WebP picture of the default limit, or
 # several smaller ones. A file of 38 bytes may unpack to all the pixels that the limits admit, so
@@ -125,7 +135,7 @@ DEFAULT_LIMITS = ImageLimits()
 
 
 def decode_image(data: bytes, *, limits: ImageLimits = DEFAULT_LIMITS) -> NDArray[np.uint8]:
-    """Decode a JPEG, PNG or WebP picture.
+    """Decode a JPEG, PNG, WebP or BMP picture.
 
     The EXIF orientation is applied. Greyscale, palette, CMYK and 16-bit pictures are converted
     to 8-bit RGB (16 bits are scaled by 255/65535, not clipped); transparency is laid over white.
@@ -155,7 +165,8 @@ def decode_image(data: bytes, *, limits: ImageLimits = DEFAULT_LIMITS) -> NDArra
     if len(data) > limits.max_bytes:
         raise ImageError(
             "image_too_large",
-            f"The picture has {len(data)} bytes; at most {limits.max_bytes} are accepted.",
+            f"The picture has {len(data)} bytes; at most {limits.max_bytes} are accepted."
+            f" {SMALLER}",
         )
     try:
         return _decode(data, limits)
@@ -163,17 +174,17 @@ def decode_image(data: bytes, *, limits: ImageLimits = DEFAULT_LIMITS) -> NDArra
         raise
     except Image.DecompressionBombError:
         raise ImageError(
-            "image_too_large", "The picture states more pixels than the decoder accepts."
+            "image_too_large",
+            f"The picture states more pixels than the decoder accepts. {SMALLER}",
         ) from None
     except MemoryError:
-        raise ImageError("image_too_large", "The picture does not fit into memory.") from None
+        raise ImageError(
+            "image_too_large", f"The picture does not fit into memory. {SMALLER}"
+        ) from None
     # Parsers of damaged files raise almost anything (struct.error, KeyError, TypeError, zlib.error
     # ...), so no narrower clause would hold. The cause is dropped: it may quote the bytes.
     except Exception:
-        raise ImageError(
-            "unsupported_image",
-            "The picture is damaged or truncated; send a complete JPEG, PNG or WebP file.",
-        ) from None
+        raise _damaged() from None
 
 
 def image_size(data: bytes) -> tuple[int, int] | None:
@@ -195,14 +206,32 @@ def image_size(data: bytes) -> tuple[int, int] | None:
 def _decode(data: bytes, limits: ImageLimits) -> NDArray[np.uint8]:
     _check_webp_canvas(data, limits)
     data = lean(data)
+    if not _is_jpeg_without_end(data):
+        return _pixels(data, limits)
+    data = data.rstrip(b"\xff")  # of an end marker that was cut in two
+    pixels = _pixels(data + _JPEG_END, limits)
+    if not np.array_equal(pixels, _pixels(data + _OTHER_END, limits)):
+        raise _damaged()
+    return pixels
+
+
+def _is_jpeg_without_end(data: bytes) -> bool:
+    return data.startswith(b"\xff\xd8\xff") and data.rfind(_JPEG_END) < data.rfind(b"\xff\xda")
+
+
+def _damaged() -> ImageError:
+    return ImageError(
+        "unsupported_image", "The picture is damaged or truncated; send the complete file."
+    )
+
+
+def _pixels(data: bytes, limits: ImageLimits) -> NDArray[np.uint8]:
     with _metadata_lock, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
             image = Image.open(io.BytesIO(data), formats=FORMATS)
         except UnidentifiedImageError:
-            raise ImageError(
-                "unsupported_image", "The file is not a JPEG, PNG or WebP picture, or is damaged."
-            ) from None
+            raise ImageError("unsupported_image", unread_file(data)) from None
         name = _check_header(image, data, limits)
     with image, _turns.turn(image.width * image.height * BYTES_PER_PIXEL[name]):
         image.load()
@@ -238,7 +267,7 @@ def _check_size(width: int, height: int, limits: ImageLimits) -> None:
         raise ImageError(
             "image_too_large",
             f"The picture has {width} x {height} pixels; at most {limits.max_pixels} pixels and"
-            f" {limits.max_side} on a side are accepted.",
+            f" {limits.max_side} on a side are accepted. {SMALLER}",
         )
 
 
@@ -246,10 +275,14 @@ def _check_header(image: Image.Image, data: bytes, limits: ImageLimits) -> str:
     """Check what the header states, and return the name of the format."""
     name = _READ_AS.get(image.format or "")
     if name is None:
-        raise ImageError("unsupported_image", "The file is not a JPEG, PNG or WebP picture.")
+        raise ImageError("unsupported_image", unread_file(data))
     _check_size(image.width, image.height, limits)
     if name != "JPEG" and getattr(image, "is_animated", False):
         raise animated(name)
+    if name == "BMP" and image.info["compression"] in _BMP_RUNS:
+        raise ImageError(
+            "unsupported_image", "The BMP file is compressed; save it without, or as JPEG."
+        )
     if name == "JPEG":
         pixels = image.width * image.height
         most = min(MAX_JPEG_SCANS, limits.max_scans * limits.max_pixels // pixels)

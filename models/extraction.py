@@ -19,7 +19,7 @@ from models.alignment import align
 from models.cache import EmbeddingCache
 from models.decoding import DEFAULT_LIMITS, decode_image
 from models.errors import FaceError, ImageError
-from models.pack import FacePolicy, ModelPack
+from models.pack import ModelPack
 from models.sessions import default_workers
 
 if TYPE_CHECKING:
@@ -105,8 +105,8 @@ class Extraction:
 class Extractor:
     """Embeds files with one pack.
 
-    Of several faces the largest and most central is taken, since labelled sets state whom a photo
-    shows, and bystanders are common. Every upright face will do, as in public protocols.
+    Of several faces the most central is taken, since labelled sets state whom a photo shows, and
+    bystanders are common. Every upright face will do, as in public protocols.
 
     Parameters
     ----------
@@ -218,7 +218,7 @@ class Extractor:
         info = self._pack.info
         detector = None
         if not self._aligned and info.detector is not None:
-            detector = [info.detector.sha256, list(info.detector.input_size), FacePolicy.LARGEST]
+            detector = [info.detector.sha256, list(info.detector.input_size)]
         settings = {
             "embedder": info.embedder_sha256,
             "preprocessing": preprocessing,
@@ -248,7 +248,7 @@ class Extractor:
             elif self._aligned:
                 crop = self._pack.as_aligned(decode_image(data))
             else:
-                crop = self._pack.crop_photo(data, policy=FacePolicy.LARGEST, quality=None).crop
+                crop = self._pack.crop_photo(data, policy=None, quality=None).crop
             return _Prepared(key, crop=crop)
         except (ImageError, FaceError) as error:
             return _Prepared((), failure=Failure(path, error.code, str(error)))

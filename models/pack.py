@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from enum import StrEnum
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -24,18 +23,12 @@ from models.liveness_graphs import open_liveness
 from models.orientation import require_upright
 from models.pack_file import PackFile, Triple
 from models.pack_graphs import PackGraph, locate, pick, read_graph
-from models.quality import DEFAULT_QUALITY, Quality, QualityLimits, check, measure, select_face
+from models.quality import DEFAULT_QUALITY, Quality, QualityLimits, check, measure
 from models.scrfd import Scrfd
+from models.selection import FacePolicy, select_face
 from models.sessions import Session
 from models.signature import Role
 from models.yunet import YuNet
-
-
-class FacePolicy(StrEnum):
-    """What a photo with several faces means."""
-
-    SINGLE = "single"
-    LARGEST = "largest"
 
 
 @dataclass(frozen=True)
@@ -238,7 +231,7 @@ class ModelPack:
         self,
         data: bytes,
         *,
-        policy: FacePolicy = FacePolicy.SINGLE,
+        policy: FacePolicy | None = FacePolicy.DOMINANT,
         quality: QualityLimits | None = DEFAULT_QUALITY,
         limits: ImageLimits = DEFAULT_LIMITS,
         liveness: bool = False,
@@ -259,7 +252,10 @@ class ModelPack:
             crop = self.as_aligned(image)
         else:
             face = select_face(
-                self.detect(image), single=policy is FacePolicy.SINGLE, limits=quality
+                self.detect(image),
+                policy,
+                shape=image.shape,
+                min_size=0.0 if quality is None else quality.min_face_size,
             )
             crop = self.align(image, face)
             require_upright(self._detector, face, crop)
@@ -293,7 +289,7 @@ class ModelPack:
         self,
         data: bytes,
         *,
-        policy: FacePolicy = FacePolicy.SINGLE,
+        policy: FacePolicy | None = FacePolicy.DOMINANT,
         quality: QualityLimits | None = DEFAULT_QUALITY,
         limits: ImageLimits = DEFAULT_LIMITS,
         liveness: bool = False,
@@ -308,8 +304,8 @@ class ModelPack:
         data
             JPEG, PNG or WebP.
         policy
-            ``SINGLE`` refuses a photo with several faces; ``LARGEST`` takes the
-            first in rank, the largest and most central one.
+            Which of several faces is meant; ``None`` takes the most central one
+            (`selection.select_face`).
         quality
             Limits; ``None`` checks nothing but that there is an upright face.
         liveness

@@ -5,20 +5,21 @@ from collections.abc import Sequence
 from models.decoding import DEFAULT_LIMITS, ImageLimits
 from models.errors import ModelError, PhotoRejected
 from models.faces import FaceSample
-from models.pack import FacePolicy, ModelPack
+from models.pack import ModelPack
 from models.quality import DEFAULT_QUALITY, QualityLimits
+from models.selection import FacePolicy
 
 
 def embed_photos(
     pack: ModelPack,
     photos: Sequence[bytes],
     *,
-    policy: FacePolicy = FacePolicy.SINGLE,
+    policy: FacePolicy = FacePolicy.DOMINANT,
     quality: QualityLimits | None = DEFAULT_QUALITY,
     limits: ImageLimits = DEFAULT_LIMITS,
     liveness: bool = False,
 ) -> list[FaceSample]:
-    """Embed photo files in their order; all or none.
+    """Embed photo files in their order; all or none. A file given twice is embedded once.
 
     Parameters
     ----------
@@ -30,13 +31,14 @@ def embed_photos(
     PhotoRejected
         Where one of them has no usable face, by its position.
     """
-    samples = []
+    samples: dict[bytes, FaceSample] = {}
     for index, photo in enumerate(photos):
+        if photo in samples:
+            continue
         try:
-            sample = pack.embed_photo(
+            samples[photo] = pack.embed_photo(
                 photo, policy=policy, quality=quality, limits=limits, liveness=liveness
             )
         except ModelError as error:
             raise PhotoRejected(index, error, count=len(photos)) from error
-        samples.append(sample)
-    return samples
+    return [samples[photo] for photo in photos]

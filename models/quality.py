@@ -1,6 +1,5 @@
 """Is this face good enough to enroll or to verify? Measures, limits, and named refusals."""
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 import cv2
@@ -9,7 +8,7 @@ from numpy.typing import NDArray
 
 from models.alignment import similarity_transform, template
 from models.boxes import Face
-from models.errors import FaceTooSmall, LowQuality, MultipleFaces, NoFace
+from models.errors import FaceTooSmall, LowQuality
 
 # All measures are taken on a 112 x 112 crop without its margin, so that limits hold for every
 # embedder and hair and background do not vote.
@@ -80,7 +79,7 @@ class QualityLimits:
         Detector confidence; ``None`` takes the detector's own recommendation, since detectors
         differ in what a value means.
     min_face_size
-        Shorter side of the box in pixels.
+        Shorter side of the box in pixels. A smaller face does not count as a further one either.
     min_sharpness, min_brightness, max_brightness, min_exposure
         As in `Quality`. In an underexposed picture strangers look alike; a face that is dark in a
         bright one is recognised down to a far lower luma.
@@ -88,10 +87,6 @@ class QualityLimits:
         Absolute degrees.
     min_border, max_aspect
         As in `Quality`: what `is_partly_hidden` goes by.
-    second_face_share
-        A further face counts when it reaches ``min_face_size`` and its area is at least this share
-        of the main face's. 0, the default, counts every such face; 0.25 ignores people in the
-        background who are less than half as wide.
     """
 
     min_score: float | None = None
@@ -105,7 +100,6 @@ class QualityLimits:
     max_roll: float = 45.0
     min_border: float = 0.08
     max_aspect: float = 1.7
-    second_face_share: float = 0.0
 
 
 DEFAULT_QUALITY = QualityLimits()
@@ -322,43 +316,3 @@ _REMEDIES = {
 
 def _measured(value: float, limit: float) -> dict[str, float]:
     return {"value": round(value, 3), "limit": limit}
-
-
-def select_face(faces: Sequence[Face], *, single: bool, limits: QualityLimits | None) -> Face:
-    """The face that is meant, of faces in the order of their rank.
-
-    Parameters
-    ----------
-    single
-        Refuse when there is a second face; otherwise take the first.
-    limits
-        Say how large a further face must be to count; ``None`` counts every face.
-
-    Raises
-    ------
-    NoFace
-        If there is none.
-    MultipleFaces
-        If ``single`` and a second face counts.
-    """
-    if not faces:
-        raise NoFace("No face was found; send an upright photo of one face.")
-    # A speck in the middle outranks nobody who is large enough to be meant.
-    large_enough = [face for face in faces if limits is None or _reaches(face, limits)]
-    main = large_enough[0] if large_enough else faces[0]
-    others = [face for face in large_enough[1:] if limits is None or _counts(face, main, limits)]
-    if single and others:
-        raise MultipleFaces(
-            f"The photo shows {1 + len(others)} faces; send one that shows a single face.",
-            details={"faces": 1 + len(others)},
-        )
-    return main
-
-
-def _reaches(face: Face, limits: QualityLimits) -> bool:
-    return min(face.width, face.height) >= limits.min_face_size
-
-
-def _counts(face: Face, main: Face, limits: QualityLimits) -> bool:
-    """Whether a further face is large enough beside ``main`` to be a second person."""
-    return face.area >= limits.second_face_share * main.area

@@ -12,7 +12,7 @@ from api.process.preparation import binding_for
 from models.cache import EmbeddingCache
 from models.decoding import decode_image
 from models.extraction import Extractor
-from models.pack import FacePolicy, ModelPack
+from models.pack import ModelPack
 from templates.decoys import DecoyPool
 from templates.keys.sealing import KeyringSealer, MasterKeyring
 from templates.space.lifting import Strategy
@@ -99,7 +99,7 @@ def _files(folder: Path) -> list[Path]:
 
 
 def _photo(pack: ModelPack, data: bytes) -> Photo:
-    crop = pack.crop_photo(data, policy=FacePolicy.LARGEST, quality=None).crop
+    crop = pack.crop_photo(data, policy=None, quality=None).crop
     return Photo(data, decode_image(data), crop, pack.embed(crop[None])[0])
 
 

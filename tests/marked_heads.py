@@ -60,9 +60,9 @@ def encoded(picture: NDArray[np.uint8], form: str = "PNG") -> bytes:
 
 
 @functools.cache
-def frame(pose: str = "front", person: int = 0) -> bytes:
+def frame(pose: str = "front", person: int = 0, background: int = 120) -> bytes:
     """A file that shows a person in one of the poses of :data:`tests.heads.POSES`."""
-    return encoded(draw(head(**POSES[pose]), person))
+    return encoded(draw(head(**POSES[pose]), person, background=background))
 
 
 def write_marked_pack(folder: Path) -> Path:

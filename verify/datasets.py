@@ -1,5 +1,7 @@
 """Readers of labelled face folders: ``root/Person/photo.jpg``, as LFW is laid out."""
 
+import hashlib
+from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,7 +10,7 @@ from templates.errors import VeilfaceError
 from templates.keys.bounded_file import read_at_most
 from verify.tenfold import FOLDS, Pair
 
-SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp"})
+SUFFIXES = frozenset({".jpg", ".jpeg", ".jfif", ".png", ".webp", ".bmp"})
 MAX_PAIRS_BYTES = 16 * 2**20
 _MOST_SHOWN = 20
 
@@ -43,16 +45,33 @@ class LabelledFolder:
         return len(set(self.identities))
 
 
+def visible(folder: Path) -> list[Path]:
+    """Return what lies in a folder, sorted; hidden entries and those of file servers are left out.
+
+    A NAS puts its thumbnails into ``@eaDir``, an archive of macOS its attributes into ``__MACOSX``.
+    """
+    return sorted(
+        entry
+        for entry in folder.iterdir()
+        if not entry.name.startswith(".") and entry.name not in ("@eaDir", "__MACOSX")
+    )
+
+
+def is_photo(file: Path) -> bool:
+    """Whether a file has the suffix of a picture that is read."""
+    return file.suffix.lower() in SUFFIXES and file.is_file()
+
+
 def labelled_folder(root: Path | str) -> LabelledFolder:
     """List ``root/Person/photo.jpg``; photos are not opened here.
 
-    Hidden entries are skipped silently. Other files, such as ``pairs.txt``, are listed in
-    ``ignored``.
+    What else is :func:`visible`, such as ``pairs.txt`` or a photo beside the people's folders, is
+    listed in ``ignored``.
 
     Raises
     ------
     DatasetError
-        Listing every fault: no folder, photos beside the people's folders, empty people.
+        There is no folder, or no photo in a person's folder.
     """
     folder = Path(root)
     if not folder.is_dir():
@@ -60,35 +79,46 @@ def labelled_folder(root: Path | str) -> LabelledFolder:
     paths: list[Path] = []
     identities: list[str] = []
     ignored: list[str] = []
-    faults: list[str] = []
-    for entry in sorted(folder.iterdir()):
-        if entry.name.startswith("."):
-            continue
+    for entry in visible(folder):
         if not entry.is_dir():
-            if entry.suffix.lower() in SUFFIXES:
-                faults.append(f"photo {entry.name} lies beside the people's folders")
-            else:
-                ignored.append(entry.name)
+            ignored.append(entry.name)
             continue
-        photos = []
-        for file in sorted(entry.iterdir()):
-            if file.name.startswith("."):
-                continue
-            if file.is_file() and file.suffix.lower() in SUFFIXES:
-                photos.append(file)
-            elif file.is_dir():
-                faults.append(f"{entry.name}/{file.name} is a folder inside a person's folder")
-            else:
-                ignored.append(f"{entry.name}/{file.name}")
-        if not photos:
-            faults.append(f"{entry.name} holds no photo ({', '.join(sorted(SUFFIXES))})")
+        content = visible(entry)
+        photos = [file for file in content if is_photo(file)]
         paths += photos
         identities += [entry.name] * len(photos)
-    if not paths and not faults:
-        faults.append("there is no person's folder in it")
-    if faults:
-        raise DatasetError(faults_in(folder, "expected root/Person/photo.jpg", faults))
+        others = [f"{entry.name}/{file.name}" for file in content if file not in photos]
+        ignored += others if content else [f"{entry.name} (empty)"]
+    if not paths:
+        inner = [entry for entry in visible(folder) if entry.is_dir() and _has_people(entry)]
+        remedy = f"give {inner[0]}" if inner else f"a photo ends in {', '.join(sorted(SUFFIXES))}"
+        raise DatasetError(
+            f"{folder} has no photo in a person's folder, expected root/Person/photo.jpg: {remedy}"
+        )
     return LabelledFolder(folder, tuple(paths), tuple(identities), tuple(ignored))
+
+
+def _has_people(folder: Path) -> bool:
+    return any(
+        is_photo(file) for entry in visible(folder) if entry.is_dir() for file in visible(entry)
+    )
+
+
+def distinct_files(files: Sequence[Path]) -> list[Path]:
+    """Return the files without those whose content an earlier one has.
+
+    Only files of one size are read.
+    """
+    sizes = [file.stat().st_size for file in files]
+    shared = {size for size, count in Counter(sizes).items() if count > 1}
+    distinct: dict[tuple[int, str], Path] = {}
+    for file, size in zip(files, sizes, strict=True):
+        content = ""
+        if size in shared:
+            with file.open("rb") as stream:
+                content = hashlib.file_digest(stream, "sha256").hexdigest()
+        distinct.setdefault((size, content), file)
+    return list(distinct.values())
 
 
 @dataclass(frozen=True)
@@ -236,4 +266,5 @@ def faults_in(where: Path, expected: str, faults: Sequence[str]) -> str:
     """Word the message of a :class:`DatasetError`: the first faults, and how many more."""
     shown = "; ".join(faults[:_MOST_SHOWN])
     more = f"; and {len(faults) - _MOST_SHOWN} more" if len(faults) > _MOST_SHOWN else ""
-    return f"{where} has {len(faults)} fault(s), {expected}: {shown}{more}"
+    count = f"{len(faults)} fault{'s' if len(faults) > 1 else ''}"
+    return f"{where} has {count}, {expected}: {shown}{more}"

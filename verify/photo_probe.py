@@ -10,12 +10,13 @@ from models.decoding import DEFAULT_LIMITS, ImageLimits
 from models.errors import FaceError, ModelError, PackError, PhotoRejected
 from models.faces import FaceCrop
 from models.head_pose import HeadPose, head_pose
-from models.pack import FacePolicy, ModelPack
+from models.pack import ModelPack
 from models.photos import embed_photos
 from models.quality import DEFAULT_QUALITY, QualityLimits
+from models.selection import FacePolicy
 from templates.contract.document import Contract
 from templates.errors import Uncalibrated
-from templates.space.agreement import InconsistentImages, mean_embedding
+from templates.space.agreement import InconsistentImages, distinct_rows, mean_embedding
 from verify.challenge import LivenessFailure, Movement, frontal_frames, movements_failure
 
 MAX_PROBE_PHOTOS = 5
@@ -43,7 +44,7 @@ class PhotoProbe:
     embedding
         Mean of the photos, of frames of those that look ahead, (n,) float32, unit norm.
     photos
-        How many these are.
+        How many these are; one that was given twice counts once.
     failure
         Why they are not taken for a living person's; None where nothing speaks against it.
     clear
@@ -62,7 +63,7 @@ def probe_of_photos(
     photos: Sequence[bytes],
     *,
     passive: bool,
-    policy: FacePolicy = FacePolicy.SINGLE,
+    policy: FacePolicy = FacePolicy.DOMINANT,
     limits: ImageLimits = DEFAULT_LIMITS,
 ) -> PhotoProbe:
     """Average photos of one person; with `passive`, say whether they look live on average.
@@ -77,10 +78,11 @@ def probe_of_photos(
     samples = embed_photos(pack, photos, policy=policy, limits=limits, liveness=passive)
     rows = np.stack([sample.embedding for sample in samples])
     mean = mean_embedding(rows, consistency=contract.probe_consistency)
-    scores = [sample.liveness for sample in samples if sample.liveness is not None]
+    distinct = [samples[place] for place in distinct_rows(rows)]
+    scores = [sample.liveness for sample in distinct if sample.liveness is not None]
     failure = passive_failure(contract, scores) if passive else None
-    clear = all(pack.is_clear(sample.quality) for sample in samples)
-    return PhotoProbe(mean, len(photos), failure, clear)
+    clear = all(pack.is_clear(sample.quality) for sample in distinct)
+    return PhotoProbe(mean, len(distinct), failure, clear)
 
 
 def probe_of_frames(
@@ -90,7 +92,7 @@ def probe_of_frames(
     movements: Sequence[Movement],
     *,
     passive: bool,
-    policy: FacePolicy = FacePolicy.SINGLE,
+    policy: FacePolicy = FacePolicy.DOMINANT,
     limits: ImageLimits = DEFAULT_LIMITS,
 ) -> PhotoProbe:
     """Make one probe of the frames of a challenge, and hold them against it.
@@ -127,7 +129,8 @@ def probe_of_frames(
     consistency = contract.probe_consistency
     try:
         mean = mean_embedding(embeddings[ahead], consistency=consistency)
-        photos, one_person = len(ahead), float((embeddings @ mean).min()) >= consistency
+        photos = len(distinct_rows(embeddings[ahead]))
+        one_person = float((embeddings @ mean).min()) >= consistency
     except InconsistentImages:
         mean, photos, one_person = embeddings[0], 1, False
     failures.append(None if one_person else LivenessFailure.ANOTHER_PERSON)

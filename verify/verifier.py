@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.decoding import DEFAULT_LIMITS, ImageLimits
-from models.pack import FacePolicy, ModelPack
+from models.pack import ModelPack
+from models.selection import FacePolicy
 from templates.contract import wire
 from templates.contract.document import Calibration, Contract, Level
 from templates.distances import paired_distances, similarity
@@ -90,7 +91,7 @@ class Verifier:
         photos: Sequence[bytes],
         *,
         passive: bool = False,
-        policy: FacePolicy = FacePolicy.SINGLE,
+        policy: FacePolicy = FacePolicy.DOMINANT,
         limits: ImageLimits = DEFAULT_LIMITS,
     ) -> PhotoProbe:
         """Make one probe of 1 to 5 photo files; with `passive`, say whether they look live.
@@ -120,7 +121,7 @@ class Verifier:
         movements: Sequence[Movement],
         *,
         passive: bool = False,
-        policy: FacePolicy = FacePolicy.SINGLE,
+        policy: FacePolicy = FacePolicy.DOMINANT,
         limits: ImageLimits = DEFAULT_LIMITS,
     ) -> PhotoProbe:
         """Make one probe of the frames of a challenge, and say whether they meet it.

@@ -1,5 +1,6 @@
 """``veilface calibrate``: thresholds for stated false match rates."""
 
+import csv
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
@@ -7,13 +8,14 @@ from typing import Annotated, Any
 import typer
 
 from api.cli.calibrate_liveness import set_liveness_threshold, with_liveness_of
-from api.cli.console import demo_notice, emit, message, say, share_done, show, table
+from api.cli.console import demo_notice, emit, say, share_done, show, table
 from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, extract
 from api.cli.errors import CommandError, UsageError
 from api.cli.files import read_bounded, read_names
 from api.cli.groups import estimated_labels, group_tables, labels_of
 from api.cli.inputs import fairface_labels, load_decoys
 from api.cli.options import AsJson, takes_settings
+from api.cli.photo_folders import labelled_people
 from api.cli.verdict import improvements, shown_rate, verdict_lines
 from api.process.opening import file_sealer, open_keyring
 from api.process.preparation import (
@@ -29,7 +31,7 @@ from templates.contract.document import Calibration, Contract
 from templates.contract.liveness_policy import LivenessPolicy
 from templates.distances import Metric
 from templates.space.lifting import Strategy
-from verify import CalibrationOptions, CalibrationReport, labelled_folder
+from verify import CalibrationOptions, CalibrationReport
 from verify.evaluation.labels_file import read_labels
 from verify.expectation import Climbers
 
@@ -182,7 +184,7 @@ def calibrate(
         raise UsageError("--worst-group needs to know the groups: give --labels or --fairface")
     known = None if labels is None else read_labels(labels)
     faces = None if fairface is None else fairface_labels(fairface, "train")
-    labelled = labelled_folder(folder)
+    labelled = labelled_people(folder)
     keyring = open_keyring(settings)
     sealer = file_sealer(keyring)
     source = load_decoys(decoys or settings.resolved_decoys_file, sealer, pack)
@@ -264,16 +266,19 @@ def parse_dims(text: str) -> tuple[int, ...]:
 
 
 def read_aliases(file: Path) -> dict[str, str]:
-    """Read ``second name,first name`` lines."""
+    """Read ``second name,first name`` lines; a name with a comma stands in double quotes."""
     text = read_bounded(file, 16 * 2**20).decode("utf-8", errors="replace")
     names: dict[str, str] = {}
     for number, line in enumerate(text.splitlines(), start=1):
         if not line.strip() or line.startswith("#"):
             continue
-        second, comma, first = (part.strip() for part in line.partition(","))
-        if not (second and comma and first):
-            raise CommandError(f"{file.name}, line {number}: expected `second name,first name`")
-        names[second] = first
+        parts = [part.strip() for part in next(csv.reader([line], skipinitialspace=True))]
+        if len(parts) != 2 or not all(parts):
+            raise CommandError(
+                f"{file.name}, line {number}: expected `second name,first name`, a name with a "
+                "comma in double quotes"
+            )
+        names[parts[0]] = parts[1]
     return names
 
 
@@ -308,15 +313,8 @@ def _tell(contract: Contract, report: CalibrationReport) -> None:
         say(f"Not set: {sentence}.")
     for sentence in report.left_out:
         say(f"Not in the rule of the worst group: {sentence}.")
-    if report.suspicious:
-        say(
-            f"{len(report.suspicious)} pairs of people are suspiciously alike (cosine above "
-            f"{report.suspicious_above:g}); look at them, and name the same people in --aliases:"
-        )
-        for pair in report.suspicious[:MOST_SHOWN]:
-            say(f"  {pair.first},{pair.second}  {pair.cosine:.3f}")
-        if len(report.suspicious) > MOST_SHOWN:
-            message(f"note: {len(report.suspicious) - MOST_SHOWN} more; see --json")
+    for line in suspicious_lines(report, "name the same people in --aliases"):
+        say(line)
     if report.climbers is not None:
         say(_climbers_line(report.climbers))
     consistency = report.consistency
@@ -326,6 +324,24 @@ def _tell(contract: Contract, report: CalibrationReport) -> None:
         f"do not; {shown_rate(consistency.fmr)} of the pairs of two people do. Photos of one probe "
         f"must agree to {contract.probe_consistency:.3f}."
     )
+
+
+def suspicious_lines(report: CalibrationReport, remedy: str) -> list[str]:
+    """Name the pairs of people who may be one, most alike first, as an alias file takes them."""
+    if not report.suspicious:
+        return []
+    shown, count = report.suspicious[:MOST_SHOWN], len(report.suspicious)
+    return [
+        f"{count} {'pair of people is' if count == 1 else 'pairs of people are'} suspiciously "
+        f"alike (cosine above "
+        f"{report.suspicious_above:g}); look at them, and {remedy}:",
+        *(f"  {_quoted(pair.first)},{_quoted(pair.second)}  {pair.cosine:.3f}" for pair in shown),
+        *([f"  and {count - len(shown)} more; see --json"] if count > len(shown) else []),
+    ]
+
+
+def _quoted(name: str) -> str:
+    return '"' + name.replace('"', '""') + '"' if "," in name or '"' in name else name
 
 
 def _climbers_line(climbers: Climbers) -> str:

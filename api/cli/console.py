@@ -70,6 +70,11 @@ def drop_unwritten() -> None:
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
+def counted(number: int, noun: str) -> str:
+    """Return a number with its noun: ``1 photo``, ``2 photos``."""
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
+
+
 def table(title: str, *columns: str) -> "Table":
     """Make an empty table; numbers are the caller's to align."""
     from rich.table import Table

@@ -12,8 +12,9 @@ import typer
 from api.cli.console import demo_notice, emit, message, say
 from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, extract
 from api.cli.errors import CommandError, UsageError
-from api.cli.files import find_photos, is_left_out, read_names
+from api.cli.files import is_left_out, read_names
 from api.cli.options import AsJson, takes_settings
+from api.cli.photo_folders import find_photos
 from api.process.opening import file_sealer, open_keyring
 from api.process.preparation import (
     LikeSample,

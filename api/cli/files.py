@@ -1,10 +1,8 @@
-"""Reading files under limits, and finding the photos of a folder."""
+"""Reading files under limits, and names to leave out."""
 
 from pathlib import Path
 
 from api.cli.errors import CommandError, UsageError
-
-PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp"})
 
 
 def read_bounded(path: Path, most: int) -> bytes:
@@ -28,26 +26,6 @@ def read_photo(path: Path, most: int) -> bytes:
         return read_bounded(path, most)
     except FileNotFoundError:
         raise UsageError(f"no such photo: {path}") from None
-
-
-def find_photos(folder: Path) -> list[Path]:
-    """All JPEG, PNG and WebP files below a folder, in the order of their paths.
-
-    Raises
-    ------
-    CommandError
-        It is no folder, or has no photo.
-    """
-    if not folder.is_dir():
-        raise CommandError(f"{folder} is not a folder")
-    photos = sorted(
-        path
-        for path in folder.rglob("*")
-        if path.suffix.lower() in PHOTO_SUFFIXES and path.is_file()
-    )
-    if not photos:
-        raise CommandError(f"{folder} has no .jpg, .jpeg, .png or .webp file, at any depth")
-    return photos
 
 
 def read_names(source: Path) -> frozenset[str]:

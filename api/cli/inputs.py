@@ -8,7 +8,8 @@ from typing import Any, TypeVar
 
 from api.cli.descriptors import extract
 from api.cli.errors import CommandError, UsageError
-from api.cli.files import find_photos, read_bounded
+from api.cli.files import read_bounded
+from api.cli.photo_folders import find_photos
 from api.process.preparation import require_made_with
 from api.settings import Settings
 from attacks.further_faces import FurtherFaces

@@ -8,13 +8,14 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from api.cli.console import demo_notice, emit, say
+from api.cli.console import counted, demo_notice, emit, say
 from api.cli.errors import CommandError, UsageError
 from api.cli.files import read_bounded, read_photo
 from api.cli.options import AsJson
 from enroll.enroller import MAX_PHOTOS
 from models.errors import ModelError
-from models.pack import FacePolicy, ModelPack
+from models.pack import ModelPack
+from models.selection import FacePolicy
 from templates.contract import wire
 from templates.contract.binding import Binding
 from templates.contract.canonical import parse_object
@@ -85,7 +86,8 @@ def lift(
     face: Annotated[
         FacePolicy,
         typer.Option(
-            help="What several faces mean: an error, or the one that is largest and most central."
+            help="A photo with several faces: use the largest if it covers the middle and has "
+            "twice the area of every other; use the largest wherever it is; or refuse the photo."
         ),
     ] = FacePolicy.SINGLE,
     holder_key_file: Annotated[
@@ -159,7 +161,10 @@ def lift(
     if as_json:
         emit(facts)
     else:
-        say(f"{out}: {facts['kind']} template of {len(photos)} photos, m = {m}, {len(data)} bytes.")
+        say(
+            f"{out}: {facts['kind']} template of {counted(len(photos), 'photo')}, m = {m}, "
+            f"{len(data)} bytes."
+        )
 
 
 def _signing_token(subject: str | None, level: str | None, *, asked: bool) -> str | None:

@@ -20,7 +20,7 @@ import numpy as np
 from api.cli.errors import CommandError
 from api.settings import Settings, processors
 from models.errors import ModelError
-from models.pack import FacePolicy, ModelPack
+from models.pack import ModelPack
 from models.pack_graphs import PackGraph, locate, pick, read_graph
 from models.sessions import Optimisation, Session
 from models.synthetic import draw_face, encode_photo
@@ -34,7 +34,7 @@ _PHOTOS_EACH = 4
 # Photos that are drawn, of so many people at most: a detector does not take each for a face.
 _DRAWN, _PEOPLE = 4, 40
 # What a photo costs is asked, not whether the gate lets it pass.
-_embed = partial(ModelPack.embed_photo, policy=FacePolicy.LARGEST, quality=None)
+_embed = partial(ModelPack.embed_photo, policy=None, quality=None)
 
 
 class GraphRow(NamedTuple):

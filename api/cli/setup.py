@@ -11,14 +11,15 @@ from typing import Annotated, Any
 
 import typer
 
+from api.cli.calibrate import suspicious_lines
 from api.cli.console import demo_notice, emit, message, say, share_done
 from api.cli.decoys import like_sample, photos_of
 from api.cli.descriptors import Aligned, Flip, bulk_pack, extract
 from api.cli.errors import CommandError
-from api.cli.files import find_photos
 from api.cli.inputs import load_decoys
 from api.cli.master_keys import is_from_file
 from api.cli.options import AsJson, takes_settings
+from api.cli.photo_folders import find_photos, labelled_people
 from api.cli.setup_files import (
     api_key_file,
     keep_api_key,
@@ -30,6 +31,7 @@ from api.cli.setup_files import (
 from api.cli.verdict import verdict_lines
 from api.process.opening import file_sealer, open_contract, open_keyring, weak_privacy
 from api.process.preparation import (
+    CalibratedFolder,
     acquired,
     calibrate_folder,
     default_probe_dims,
@@ -43,7 +45,8 @@ from templates.contract.document import Contract
 from templates.decoys import DecoyGenerator, DecoySource
 from templates.keys.sealing import MasterKeyring
 from templates.space.lifting import Strategy
-from verify import CalibrationOptions, LabelledFolder, labelled_folder
+from verify import CalibrationOptions, LabelledFolder
+from verify.datasets import visible
 from verify.evaluation.attributes import resembling_rows
 from verify.own_decoys import SAME_PHOTO
 
@@ -185,7 +188,7 @@ def assign_roles(labelled: LabelledFolder, faces: Sequence[Path], like: Sequence
 
 
 def _labelled(people: Path) -> LabelledFolder:
-    if people.is_dir() and not any(entry.is_dir() for entry in people.iterdir()):
+    if people.is_dir() and not any(entry.is_dir() for entry in visible(people)):
         photos = len(find_photos(people))
         raise CommandError(
             f"{people} has {photos:,} photos and no folder for a person: nobody is labelled. "
@@ -193,7 +196,7 @@ def _labelled(people: Path) -> LabelledFolder:
             "or more; 80 people resolve a false match rate of 1 in 1,000. Unlabelled photos serve "
             "as --faces, and as --like"
         )
-    return labelled_folder(people)
+    return labelled_people(people)
 
 
 def _plan(roles: Roles, pack: ModelPack, settings: Settings) -> dict[str, Any]:
@@ -303,7 +306,10 @@ def _prepared(
         paths=tuple(calibrated_on),
         identities=tuple(known[photo] for photo in calibrated_on),
     )
-    contract = _calibrated(folder, people, pack, source)
+    done = _calibrated(folder, people, pack, source)
+    for line in suspicious_lines(done.report, "put the photos of one person into one folder"):
+        message(line)
+    contract = done.contract
     contract.save(path, sealer)
     _drop_caches(settings)
     return contract
@@ -366,7 +372,7 @@ def _fitted(
 
 def _calibrated(
     folder: LabelledFolder, extraction: Extraction, pack: ModelPack, source: DecoySource
-) -> Contract:
+) -> CalibratedFolder:
     with share_done("calibrating") as report:
         return calibrate_folder(
             folder,
@@ -377,4 +383,4 @@ def _calibrated(
             m=None,
             options=CalibrationOptions(probe_dims=(0, *default_probe_dims(None))),
             progress=lambda _what, share: report(share),
-        ).contract
+        )

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from api.cli.console import demo_notice, emit, message, say
+from api.cli.console import counted, demo_notice, emit, message, say
 from api.cli.errors import CommandError, UsageError
 from api.cli.files import read_bounded, read_photo
 from api.cli.options import LOCAL, AsJson, Tenant, takes_settings
@@ -22,7 +22,8 @@ from api.process.runtime import Runtime
 from api.settings import Settings
 from enroll.enroller import MAX_PHOTOS, Holder
 from models.errors import PhotoRejected
-from models.pack import FacePolicy, ModelPack
+from models.pack import ModelPack
+from models.selection import FacePolicy
 from templates.decoys import Attributes
 from templates.keys.holder_key import (
     new_holder_key,
@@ -41,8 +42,8 @@ Subject = Annotated[str, typer.Argument(help="Id of the person.")]
 Face = Annotated[
     FacePolicy,
     typer.Option(
-        help="A photo with several faces: refuse it, or use the first by rank (large, and "
-        "near the middle)."
+        help="A photo with several faces: use the largest if it covers the middle and has twice "
+        "the area of every other; use the largest wherever it is; or refuse the photo."
     ),
 ]
 HolderKeyFile = Annotated[
@@ -177,7 +178,7 @@ def enroll(
         size, where = len(enrollment.wire), "stored"
         if held_template is not None:
             where = f"wrote to {held_template}, and stored none of,"
-        say(f"{done} {subject} from {len(photos)} photos; {where} {size} bytes.")
+        say(f"{done} {subject} from {counted(len(photos), 'photo')}; {where} {size} bytes.")
 
 
 @takes_settings(*LOCAL)

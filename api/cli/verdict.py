@@ -31,8 +31,12 @@ def verdict_lines(verdict: Verdict | None) -> list[str]:
         f"at {basis['level']}, with {basis['enrolled_photos']} photos enrolled and "
         f"{basis['probe_photos']} shown; limit {100 * accuracy.limit:.3g} %."
         f"{_not_acquired(accuracy)}{_shortfall(accuracy)}",
-        _groups_line(verdict.groups),
+        f"{_groups_line(verdict.groups)} {_CHILDREN}",
     ]
+
+
+# As measured: docs/thresholds.md "Children".
+_CHILDREN = "Of children below about ten years no level holds that was set on adults."
 
 
 def _groups_line(groups: Judgement | None) -> str:

@@ -32,7 +32,7 @@ class Cast:
 
     enrolled: dict[str, list[Path]]
     strangers: dict[str, Path]
-    face: str = "single"
+    face: str = "dominant"
 
 
 def drawn_cast(folder: Path, scratch: Path, size: Scale) -> tuple[Cast, list[Path], LabelledFolder]:

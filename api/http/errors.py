@@ -109,7 +109,11 @@ ERROR_CODES: dict[str, ErrorCode] = {
         ErrorCode("request_too_large", 413, "The request body is too large."),
         ErrorCode("too_many_images", 413, "The request has too many photos."),
         ErrorCode("no_face", 422, "No face was found in the photo."),
-        ErrorCode("multiple_faces", 422, "The photo shows more than one face."),
+        ErrorCode(
+            "multiple_faces",
+            422,
+            "The photo shows several faces, and none is clearly the one that is meant.",
+        ),
         ErrorCode("face_too_small", 422, "The face is too small in the photo."),
         ErrorCode(
             "low_quality",

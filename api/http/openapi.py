@@ -78,10 +78,11 @@ LEVEL = _text(
     "Security level; default from the contract, or the lowest allowed.", examples=["fmr-1e-3"]
 )
 FACE = _text(
-    "Which face counts when a photo shows several: none (`single`, the default: the photo is "
-    "refused), or the first by rank (`largest`), which is large and near the middle: area − "
-    "2·distance², in pixels, the distance from the middle of the picture.",
-    enum=["single", "largest"],
+    "Which face counts when a photo shows several: the largest if it covers the middle of the "
+    "picture and has twice the area of every other (`dominant`, the default); the largest wherever "
+    "it is (`largest`), if it has 1.25 times the area; none (`single`). Otherwise the photo is "
+    "refused as `multiple_faces`.",
+    enum=["dominant", "largest", "single"],
 )
 STORAGE = _text(
     "Who keeps the sealed template: the service (`service`, the default), or whoever gets the "

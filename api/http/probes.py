@@ -36,6 +36,7 @@ from api.http.values import (
 from api.process.metrics import step
 from api.process.runtime import Runtime
 from api.settings import Settings
+from templates.space.agreement import distinct_rows
 from templates.store.lockout import Nonce
 from verify import (
     MAX_FRAMES,
@@ -232,7 +233,11 @@ async def _signed(
             rows = np.atleast_2d(sent)
             mean = verifier.average(rows)
             return verifier.decide_embedding(
-                mean, stored, holder_key=holder_key, level=level, photos=len(rows)
+                mean,
+                stored,
+                holder_key=holder_key,
+                level=level,
+                photos=len(distinct_rows(rows)),
             )
 
     return Probe(

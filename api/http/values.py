@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from api.http.bodies import base64_field, text_field
 from api.http.errors import ApiError
-from models.pack import FacePolicy
+from models.selection import FacePolicy
 from templates.errors import InvalidEmbedding
 from templates.store.subject_rows import Storage
 from verify import MAX_PROBE_PHOTOS
@@ -44,9 +44,11 @@ def face_policy(value: str | None) -> FacePolicy:
         ``validation_failed``.
     """
     if value is None:
-        return FacePolicy.SINGLE
+        return FacePolicy.DOMINANT
     if value not in list(FacePolicy):
-        raise ApiError("validation_failed", "face must be single or largest", {"field": "face"})
+        raise ApiError(
+            "validation_failed", "face must be dominant, largest or single", {"field": "face"}
+        )
     return FacePolicy(value)
 
 

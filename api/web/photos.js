@@ -259,7 +259,7 @@ export function photoPicker({ most, replaces = false, onchange }) {
       "p",
       { class: "check" },
       largest,
-      h("label", { for: largest.id }, "Others may be in the picture: use the large face near the middle"),
+      h("label", { for: largest.id }, "Others are in the picture: use the largest face, wherever it is"),
     ),
   );
   const holds = (event) =>

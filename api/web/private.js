@@ -217,7 +217,7 @@ export async function check(photo, face, signal) {
   try {
     const client = await ready();
     signal?.throwIfAborted();
-    return await client.check(photo, { face: face || "single" });
+    return await client.check(photo, { face: face || undefined });
   } catch (error) {
     throw problemOf(error);
   }
@@ -241,7 +241,7 @@ async function lifted(client, action, photos, face, until) {
   if (!kept.has(all)) {
     // Before it is waited for: another view may have the same photos meanwhile.
     for (const name of names) used.set(name, action);
-    const given = { face: face || "single" };
+    const given = { face: face || undefined };
     const lift = action === "enroll" ? client.liftEnrollment(photos, given) : client.lift(photos, given);
     kept.set(all, lift);
     lift.catch(() => {

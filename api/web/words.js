@@ -14,8 +14,8 @@ const REMEDIES = {
   image_too_large: "Send a smaller photo.",
   request_too_large: "Send fewer or smaller photos.",
   too_many_images: "Send fewer photos.",
-  no_face: "Take a photo that shows the face upright and uncovered.",
-  multiple_faces: "Take a photo of one person, or tick the box that allows others in the picture.",
+  no_face: "Come closer, and take a photo that shows the face upright and uncovered.",
+  multiple_faces: "Come closer, into the middle, or tick the box that takes the largest face.",
   face_too_small: "Move closer, or send a larger photo.",
   low_quality: "Take another photo.",
   inconsistent_images: "Remove the photos that show somebody else or look very different.",
@@ -106,9 +106,9 @@ export function guidance(check) {
       return check.box ? "Good: one face, large and clear enough." : "Good: clear enough.";
     case "no_face":
       if (DEMO) return "No cartoon face found. The demo model sees no others: choose a cartoon person.";
-      return "No face found. Face the camera, with your head upright.";
+      return "No face found. Come closer, and face the camera with your head upright.";
     case "multiple_faces":
-      return `${check.details.faces ?? "Several"} faces found. Only one person may be in view.`;
+      return `${check.details.faces ?? "Several"} faces found. Come closer, into the middle, until yours is much the largest.`;
     case "face_too_small":
       return "The face is too small. Move closer.";
     default:

@@ -320,9 +320,12 @@ class Calibration:
         for level in self.levels:
             if level.name == name:
                 return level
+        if self.mode == "s2s":
+            probe = f"a lifted probe with m = {self.probe_m}"
+        else:
+            probe = "one photo" if self.probe_photos == 1 else f"{self.probe_photos} photos"
         raise Uncalibrated(
-            f"no level of the requested name for {self.mode} {self.metric} with probe m = "
-            f"{self.probe_m} and {self.probe_photos} photo(s); calibrated are: "
+            f"the contract has no such level for {probe}: choose one of "
             + ", ".join(level.name for level in self.levels)
         )
 

@@ -56,8 +56,15 @@ def _listed(positions: Sequence[int], names: Sequence[str] | None) -> str:
     return " and ".join([", ".join(shown[:-1]), shown[-1]] if len(shown) > 1 else shown)
 
 
+def distinct_rows(rows: NDArray[np.floating]) -> list[int]:
+    """Return the positions of rows that repeat no earlier one, ascending, of (k, n)."""
+    return sorted(np.unique(rows, axis=0, return_index=True)[1].tolist())
+
+
 def mean_embedding(rows: NDArray[np.float32], *, consistency: float) -> NDArray[np.float32]:
     """Average the unit rows of one person and normalise, (k, n) to (n,).
+
+    A row that comes again, as of a photo given twice, counts once.
 
     Raises
     ------
@@ -65,12 +72,15 @@ def mean_embedding(rows: NDArray[np.float32], *, consistency: float) -> NDArray[
         Where the rows part into two groups that agree less than ``consistency``
         (:func:`weakest_split`), or cancel.
     """
-    mean = rows.astype(np.float64).mean(axis=0)
+    places = distinct_rows(rows)
+    mean = rows[places].astype(np.float64).mean(axis=0)
     norm = float(np.linalg.norm(mean))
-    if len(rows) > 1:
-        split = weakest_split(rows)
+    if len(places) > 1:
+        split = weakest_split(rows[places])
         if split.agreement < consistency or norm < _LEAST_MEAN:
-            raise InconsistentImages(split.apart, split.others)
+            raise InconsistentImages(
+                [places[row] for row in split.apart], [places[row] for row in split.others]
+            )
     return np.asarray(mean / norm, dtype=np.float32)
 
 

@@ -98,12 +98,12 @@ def lift_stream(
     contract_id : str
         Of the contract that the template will carry.
     photos : sequence of bytes
-        What was sent, in any order: the files, or the bytes of the embeddings. Not what a model
-        made of the files, which another processor rounds in another way.
+        What was sent, in any order, however often each: the files, or the bytes of the embeddings.
+        Not what a model made of the files, which another processor rounds in another way.
     holder : (tenant, subject), optional
         Whose key turns the template; not the key, which may be replaced by another one.
     """
-    digests = sorted(hashlib.sha256(photo).digest() for photo in photos)
+    digests = sorted({hashlib.sha256(photo).digest() for photo in photos})
     whose = ["lift"] if holder is None else ["lift for a holder", *holder]
     parts = encode_parts(*whose, contract_id, *digests)
     return Keystream(hmac.digest(secret, parts, hashlib.sha256))

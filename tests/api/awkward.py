@@ -47,7 +47,7 @@ def png(width: int, height: int, *, depth: int = 8, colour: int = 2, body: bytes
 def damaged(photo: NDArray[np.uint8]) -> Iterator[Case]:
     """Truncations and bit flips of each format."""
     rng = np.random.default_rng(2026)
-    for form in ("JPEG", "PNG", "WEBP"):
+    for form in ("JPEG", "PNG", "WEBP", "BMP"):
         whole = encode(photo, form)
         for share in (0.0, 0.001, 0.01, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.97):
             yield Case(f"{form} cut at {share:.1%}", whole[: int(len(whole) * share)], DAMAGED)
@@ -74,7 +74,7 @@ def no_pictures() -> Iterator[Case]:
     for size in (2, 16, 100, 10_000, 1_000_000):
         yield Case(f"{size} bytes of noise", rng.bytes(size), DAMAGED)
         yield Case(f"{size} zeros", b"\x00" * size, DAMAGED)
-    for form in ("GIF", "BMP", "TIFF", "PPM", "ICO", "TGA"):
+    for form in ("GIF", "TIFF", "PPM", "ICO", "TGA"):
         yield Case(form, encode(grey, form), DAMAGED)
     yield Case("SVG", b'<svg xmlns="http://www.w3.org/2000/svg" width="9" height="9"/>', DAMAGED)
     yield Case("EPS", b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n", DAMAGED)

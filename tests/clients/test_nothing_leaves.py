@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from models.decoding import decode_image
 from models.errors import FaceError
-from models.pack import FacePolicy, ModelPack
+from models.pack import ModelPack
+from models.selection import FacePolicy
 from tests.api.deployment import deploy
 from tests.clients.conftest import VEILFACE, started
 from tests.clients.proxy import Proxy

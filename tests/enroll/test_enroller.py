@@ -87,6 +87,16 @@ def test_the_same_photos_give_the_same_set_again_in_another_rotation(enroller: E
     assert largest_angle(*stored) > 0.9
 
 
+@pytest.mark.parametrize("rows", [[0, 0], [0, 0, 1]])
+def test_a_photo_given_twice_is_as_if_it_were_given_once(
+    enroller: Enroller, rows: list[int]
+) -> None:
+    once = enroller.from_embeddings(PHOTOS[sorted(set(rows))])
+    twice = enroller.from_embeddings(PHOTOS[rows])
+    assert largest_angle(stored_template(once), stored_template(twice)) < 1e-2
+    assert [result.index for result in twice.per_photo] == list(range(len(rows)))
+
+
 def test_other_photos_another_deployment_and_another_contract_give_other_decoys(
     contract: Contract, enroller: Enroller
 ) -> None:

@@ -1,3 +1,4 @@
+import base64
 import io
 import struct
 import warnings
@@ -40,7 +41,7 @@ def code_of(data: bytes, **limits) -> str:
     return caught.value.code
 
 
-@pytest.mark.parametrize("kind", ["PNG", "WEBP"])
+@pytest.mark.parametrize("kind", ["PNG", "WEBP", "BMP"])
 def test_lossless_rgb_is_returned_as_it_was(kind):
     data = encode(
         Image.fromarray(picture()), kind, **({"lossless": True} if kind == "WEBP" else {})
@@ -160,6 +161,11 @@ def test_cmyk_jpeg_is_converted():
     red, green, blue = decode_image(encode(image, "JPEG", quality=100))[8, 8]
     assert red > 240
     assert max(green, blue) < 20
+    # Without the marker it is read as with it, as browsers read it.
+    marked = encode(image, "JPEG", quality=100)
+    at = marked.index(b"\xff\xee")
+    bare = marked[:at] + marked[at + 2 + int.from_bytes(marked[at + 2 : at + 4]) :]
+    np.testing.assert_array_equal(decode_image(bare), decode_image(marked))
 
 
 def test_a_phone_picture_with_several_frames_gives_the_first():
@@ -195,9 +201,50 @@ def test_only_the_name_of_a_chunk_makes_a_png_animated(before):
     assert caught.value.code == "unsupported_image"
 
 
-@pytest.mark.parametrize("kind", ["GIF", "BMP", "TIFF", "PPM", "ICO", "TGA"])
-def test_other_formats_are_refused(kind):
-    assert code_of(encode(Image.fromarray(picture()), kind)) == "unsupported_image"
+def box_of(brand: bytes) -> bytes:
+    return b"\0\0\0\x18ftyp" + brand + b"\0\0\0\0mif1miaf"
+
+
+FILES = {
+    "an AVIF picture": [encode(Image.fromarray(picture()), "AVIF"), box_of(b"mif1avif")],
+    "a HEIC picture": [box_of(b"heic"), box_of(b"mif1")],
+    "a video": [box_of(b"isom"), box_of(b"qt  "), b"\x1aE\xdf\xa3\x9fB\x86"],
+    "a GIF picture": [encode(Image.fromarray(picture()), "GIF")],
+    "a TIFF or raw picture": [encode(Image.fromarray(picture()), "TIFF"), b"MM\0*\0\0\0\x08"],
+    "a JPEG 2000 picture": [
+        encode(Image.fromarray(picture()), "JPEG2000", no_jp2=bare) for bare in (False, True)
+    ],
+    "a JPEG XL picture": [b"\xff\x0a\x7a\x12", b"\0\0\0\x0cJXL \r\n\x87\n"],
+    "a PDF document": [encode(Image.fromarray(picture()), "PDF")],
+    "a ZIP archive": [b"PK\x03\x04\x14\0"],
+    "an SVG drawing": [b'<?xml version="1.0"?>\n<svg width="9"/>', b"<svg/>"],
+    "a web page": [b"\n<!DOCTYPE html><title>404</title>", b"<HTML><body>"],
+    "a picture in base64": [
+        base64.b64encode(encode(Image.fromarray(picture()), kind))
+        for kind in ("JPEG", "PNG", "WEBP")
+    ],
+    "not a JPEG, PNG, WebP or BMP picture": [
+        encode(Image.fromarray(picture()), kind) for kind in ("PPM", "ICO", "TGA")
+    ],
+}
+
+
+@pytest.mark.parametrize(("kind", "data"), [(kind, data) for kind in FILES for data in FILES[kind]])
+def test_a_file_of_another_kind_is_named(kind, data):
+    with pytest.raises(ImageError, match=f"The file is {kind},") as caught:
+        decode_image(data)
+    assert caught.value.code == "unsupported_image"
+
+
+@pytest.mark.parametrize("bits", [4, 8])
+def test_compressed_bmp_files_are_refused_before_they_are_unpacked(bits):
+    """Of 20 kB, whose runs are unpacked byte by byte to 23 megapixels."""
+    side = 4800
+    header = struct.pack("<LiiHHLLLLLL", 40, side, side, 1, bits, {8: 1, 4: 2}[bits], 0, 0, 0, 0, 0)
+    palette = bytes(4 << bits)
+    start = struct.pack("<2sLHHL", b"BM", 0, 0, 0, 14 + len(header) + len(palette))
+    with pytest.raises(ImageError, match="BMP file is compressed"):
+        decode_image(start + header + palette + b"\1\1\0\0" * side)
 
 
 @pytest.mark.parametrize(
@@ -214,6 +261,31 @@ def test_truncated_pictures_are_refused(kind, share):
     noise = np.random.default_rng(0).integers(0, 256, (80, 80, 3), dtype=np.uint8)
     data = encode(Image.fromarray(noise), kind)
     assert code_of(data[: int(len(data) * share)]) == "unsupported_image"
+
+
+JPEGS = {
+    "coarse": {"quality": 30},
+    "fine": {"quality": 100, "subsampling": 0},
+    "progressive": {"progressive": True},
+    "restarted": {"restart_marker_blocks": 2},
+}
+
+
+@pytest.mark.parametrize("options", JPEGS.values(), ids=JPEGS)
+@pytest.mark.parametrize("cut", [1, 2, 3, 4, 5, 6, 8, 12, 50])
+def test_a_jpeg_may_lack_its_end_but_no_pixel(options, cut):
+    noise = np.random.default_rng(0).integers(0, 256, (40, 40, 3), dtype=np.uint8)
+    thumbnail = encode(Image.fromarray(noise[:8, :8]), "JPEG")
+    for photo in (picture(), noise):
+        whole = encode(Image.fromarray(photo), "JPEG", exif=b"Exif\0\0II*\0" + thumbnail, **options)
+        outcome = attempt(whole[:-cut])
+        if isinstance(outcome, ImageError):
+            assert "damaged or truncated" in str(outcome)
+            assert cut > 2  # more than the marker of the end
+        else:
+            # The last bit of a progressive file refines a few pixels by a level or two.
+            assert np.abs(outcome.astype(int) - decode_image(whole)).mean() < 0.5
+            assert cut < 12
 
 
 def test_a_picture_without_pixels_is_refused():
@@ -241,6 +313,8 @@ def test_limits_on_bytes_pixels_and_sides():
     assert code_of(data, max_bytes=len(data) - 1) == "image_too_large"
     assert code_of(data, max_pixels=40 * 60 - 1) == "image_too_large"
     assert code_of(data, max_side=59) == "image_too_large"
+    with pytest.raises(ImageError, match=r"60 x 40 pixels; .* Send a smaller copy\.$"):
+        decode_image(data, limits=ImageLimits(max_side=59))
     assert decode_image(
         data, limits=ImageLimits(max_bytes=len(data), max_pixels=2400, max_side=60)
     ).shape == (40, 60, 3)
@@ -379,6 +453,8 @@ def samples() -> list[bytes]:
         encode(frames[0], "PNG", save_all=True, append_images=frames[1:]),
         encode(image, "WEBP", exif=exif),
         encode(image.convert("RGBA"), "WEBP", lossless=True),
+        encode(image, "BMP"),
+        encode(image.convert("P"), "BMP"),
     ]
 
 

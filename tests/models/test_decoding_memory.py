@@ -101,6 +101,7 @@ LARGEST = {
     "I;16": ("PNG", "PNG", {"compress_level": 1}),
     "CMYK": ("JPEG", "JPEG", {"progressive": True}),
     "RGB": ("WEBP", "WebP", {"lossless": True, "quality": 0, "method": 0}),
+    "1": ("BMP", "BMP", {}),
 }
 
 

@@ -10,7 +10,7 @@ from models import extraction
 from models.alignment import align, template
 from models.cache import EmbeddingCache
 from models.extraction import Extractor
-from models.pack import FacePolicy, ModelPack
+from models.pack import ModelPack
 from tests.models.graphs import pooled, pooling_embedder, unit, write_pack
 
 
@@ -178,10 +178,7 @@ def test_real_photos_in_bulk_equal_single_ones(mbf_pack_dir, lfw_photos, tmp_pat
     blank = tmp_path / "blank.png"
     Image.new("RGB", (100, 80), (90, 90, 90)).save(blank)
     result = Extractor(pack).extract([*paths, blank])
-    single = [
-        pack.embed_photo(p.read_bytes(), policy=FacePolicy.LARGEST, quality=None).embedding
-        for p in paths
-    ]
+    single = [pack.embed_photo(p.read_bytes(), policy=None, quality=None).embedding for p in paths]
     np.testing.assert_allclose(result.descriptors, single, atol=1e-5)
     assert result.failure_counts() == {"no_face": 1}
 

@@ -5,8 +5,9 @@ import pytest
 
 from models.decoding import decode_image
 from models.errors import FaceError
-from models.pack import FacePolicy, ModelPack
+from models.pack import ModelPack
 from models.quality import DEFAULT_QUALITY
+from models.selection import FacePolicy
 from models.synthetic import encode_photo
 
 

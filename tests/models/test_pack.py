@@ -15,9 +15,10 @@ from models.errors import (
     PackError,
     ProviderUnavailable,
 )
-from models.pack import FacePolicy, ModelPack
+from models.pack import ModelPack
 from models.pack_graphs import inspect
 from models.quality import QualityLimits
+from models.selection import FacePolicy
 from models.signature import Role
 from tests.models import graphs
 from tests.models.graphs import pooled, pooling_embedder, unit, write_pack
@@ -236,7 +237,7 @@ def test_same_and_different_people_are_far_apart(real, lfw_photos):
     """From bytes to embedding: nobody is closer to a stranger than to themselves."""
     vectors = np.array(
         [
-            [real.embed_photo(data, policy=FacePolicy.LARGEST).embedding for data in photos]
+            [real.embed_photo(data, policy=None).embedding for data in photos]
             for photos in people(lfw_photos, 12)
         ]
     )
@@ -256,7 +257,7 @@ def test_own_alignment_agrees_with_the_public_crops(real, lfw_photos, lfw_aligne
         if (lfw_aligned / path.relative_to(lfw_photos)).exists()
     ][:10]
     assert len(pairs) >= 5
-    own = [real.embed_photo(p.read_bytes(), policy=FacePolicy.LARGEST).embedding for p, _ in pairs]
+    own = [real.embed_photo(p.read_bytes(), policy=None).embedding for p, _ in pairs]
     public = real.embed(np.stack([decode_image(crop.read_bytes()) for _, crop in pairs]))
     cosines = (np.stack(own) * public).sum(axis=1)
     assert np.median(cosines) > 0.9
@@ -281,44 +282,28 @@ def test_lfw_pairs_are_told_apart(mbf_pack_dir, lfw_aligned):
     assert accepted[25:].sum() == 0
 
 
-def side_by_side(lfw_photos, shrink: int) -> bytes:
-    """Two people's photos in one picture, the second smaller by ``shrink`` and at the far side."""
+@pytest.mark.parametrize("middle", [True, False])
+@pytest.mark.parametrize("shrink", [1, 2, 3])
+def test_of_two_people_the_one_who_is_large_and_in_the_middle_is_taken(
+    real, lfw_photos, middle, shrink
+):
+    """Beside the first person stands another one, ``shrink`` times as far away."""
     first, second = (decode_image(photos[0]) for photos in people(lfw_photos, 2))
-    picture = np.zeros((250, 500, 3), np.uint8)
-    picture[:, :250] = first
+    picture = np.zeros((250, 750, 3), np.uint8)
+    left = 250 if middle else 0
+    picture[:, left : left + 250] = first
     small = second[::shrink, ::shrink]
-    picture[: len(small), 500 - len(small) :] = small
-    return png(picture)
-
-
-def test_two_people_are_refused_unless_the_largest_is_asked_for(real, lfw_photos):
-    both = side_by_side(lfw_photos, 1)
-    with pytest.raises(MultipleFaces):
-        real.embed_photo(both)
-    alone = real.embed_photo(people(lfw_photos, 2)[0][0], policy=FacePolicy.LARGEST, quality=None)
-    smaller = side_by_side(lfw_photos, 2)
-    chosen = real.embed_photo(smaller, policy=FacePolicy.LARGEST, quality=None)
-    assert chosen.embedding @ alone.embedding > 0.8
-
-
-def test_a_small_face_in_the_middle_does_not_hide_a_large_one(real, lfw_photos):
-    """The rank prefers the middle; a larger face elsewhere still counts as a second one."""
-    large, small = (decode_image(photos[0]) for photos in people(lfw_photos, 2))
-    picture = np.zeros((250, 600, 3), np.uint8)
-    picture[:, :250] = large
-    picture[60:185, 300:425] = small[::2, ::2]
-    assert real.detect(picture)[0].box[0] > 250
-    with pytest.raises(MultipleFaces):
-        real.embed_photo(png(picture))
-
-
-def test_a_small_bystander_refuses_a_photo_unless_the_limits_allow_it(real, lfw_photos):
-    photo = side_by_side(lfw_photos, 3)
-    with pytest.raises(MultipleFaces) as caught:
-        real.embed_photo(photo)
-    assert caught.value.details == {"faces": 2}
-    lenient = QualityLimits(second_face_share=0.25)
-    assert real.embed_photo(photo, quality=lenient).box[2] < 250
+    picture[: len(small), 750 - len(small) :] = small
+    alone = real.embed_photo(people(lfw_photos, 2)[0][0], policy=None, quality=None)
+    for policy in FacePolicy:
+        taken = (
+            (policy is FacePolicy.DOMINANT and middle) or policy is FacePolicy.LARGEST
+        ) and shrink > 1
+        if taken:
+            assert real.embed_photo(png(picture), policy=policy).embedding @ alone.embedding > 0.8
+        else:
+            with pytest.raises(MultipleFaces, match="2 faces"):
+                real.embed_photo(png(picture), policy=policy)
 
 
 def test_a_picture_without_a_face(real):

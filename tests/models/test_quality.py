@@ -5,10 +5,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from models.alignment import TEMPLATE_112
-from models.boxes import Face
 from models.decoding import decode_image
-from models.errors import FaceError, FaceTooSmall, LowQuality, MultipleFaces, NoFace
-from models.pack import FacePolicy, ModelPack
+from models.errors import FaceError, FaceTooSmall, LowQuality
+from models.pack import ModelPack
 from models.quality import (
     Quality,
     QualityLimits,
@@ -16,8 +15,8 @@ from models.quality import (
     measure,
     measure_pose,
     measure_sharpness,
-    select_face,
 )
+from models.selection import FacePolicy
 from models.synthetic import encode_photo
 
 # A head in millimetres: eyes, nose and mouth as the alignment template has them (1.8 mm per pixel),
@@ -171,47 +170,6 @@ def test_a_small_face_is_told_apart():
         check(Quality(**(GOOD.as_dict() | {"face_size": 12.0, "sharpness": 0.0})))
     assert caught.value.code == "face_too_small"
     assert caught.value.details == {"size": {"value": 12.0, "limit": 24.0}}
-
-
-def face(side: float) -> Face:
-    return Face(np.array([0, 0, side, side], np.float32), 0.9, np.zeros((5, 2), np.float32))
-
-
-def test_every_face_that_could_be_used_counts():
-    main, limits = face(400), QualityLimits()
-    assert select_face([main, face(23.9)], single=True, limits=limits) is main
-    with pytest.raises(MultipleFaces, match="3 faces") as caught:
-        select_face([main, face(24), face(23), face(30)], single=True, limits=limits)
-    assert caught.value.details == {"faces": 3}
-    # The main face is the first in rank, which need not be the largest.
-    with pytest.raises(MultipleFaces):
-        select_face([face(100), face(400)], single=True, limits=limits)
-    assert select_face([main, face(300)], single=False, limits=limits) is main
-    with pytest.raises(MultipleFaces):
-        select_face([main, face(1)], single=True, limits=None)
-
-
-@pytest.mark.parametrize("single", [True, False])
-def test_too_small_is_only_said_of_a_photo_that_has_no_face_large_enough(single):
-    """A speck that leads in rank neither is the face that is meant nor makes it a second one."""
-    speck, main, limits = face(11), face(400), QualityLimits()
-    assert select_face([speck, main], single=single, limits=limits) is main
-    assert select_face([speck, face(9)], single=single, limits=limits) is speck
-    with pytest.raises(MultipleFaces, match="2 faces"):
-        select_face([speck, main, face(30)], single=True, limits=limits)
-
-
-def test_a_share_of_the_area_lets_small_faces_pass():
-    main, limits = face(100), QualityLimits(second_face_share=0.25)
-    assert select_face([main, face(49)], single=True, limits=limits) is main
-    with pytest.raises(MultipleFaces, match="2 faces"):
-        select_face([main, face(51), face(40)], single=True, limits=limits)
-
-
-def test_no_face():
-    with pytest.raises(NoFace) as caught:
-        select_face([], single=False, limits=None)
-    assert caught.value.code == "no_face"
 
 
 DEGRADED = {

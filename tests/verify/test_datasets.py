@@ -3,6 +3,7 @@ from pathlib import Path
 import pytest
 
 from verify import DatasetError, labelled_folder, read_lfw_pairs
+from verify.datasets import distinct_files
 from verify.tenfold import FOLDS
 
 
@@ -26,17 +27,36 @@ def test_people_and_photos_are_listed_in_order(tmp_path: Path) -> None:
     assert (len(folder), folder.people) == (3, 2)
 
 
-def test_all_faults_are_listed_at_once(tmp_path: Path) -> None:
+def test_what_is_no_photo_of_a_person_is_left_out_and_named(tmp_path: Path) -> None:
     root = make_folder(tmp_path, {"Bob": 1, "Nobody": 0})
-    (root / "stray.png").write_bytes(b"")
-    (root / "Bob" / "more").mkdir()
-    with pytest.raises(DatasetError) as caught:
-        labelled_folder(root)
-    text = str(caught.value)
-    assert "3 fault(s)" in text
-    assert "stray.png" in text
-    assert "Nobody holds no photo" in text
-    assert "Bob/more is a folder" in text
+    for name in (
+        "stray.png",
+        "Bob/Bob.heic",
+        "Bob/more/old.jpg",
+        "Bob/scan.jfif",
+        "Bob/@eaDir/Bob.jpg/thumb.jpg",
+        "@eaDir/Bob/thumb.jpg",
+        "__MACOSX/Bob/._Bob.jpg",
+    ):
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_bytes(b"")
+    folder = labelled_folder(root)
+    assert [path.name for path in folder.paths] == ["Bob_0001.jpg", "scan.jfif"]
+    assert folder.ignored == ("Bob/Bob.heic", "Bob/more", "Nobody (empty)", "stray.png")
+
+
+def test_the_folder_of_the_people_is_named_where_another_one_is_around_it(tmp_path: Path) -> None:
+    make_folder(tmp_path / "lfw" / "lfw", {"Ann": 1, "Bob": 2})
+    with pytest.raises(DatasetError, match=rf": give {tmp_path / 'lfw' / 'lfw'}$"):
+        labelled_folder(tmp_path / "lfw")
+
+
+def test_of_copies_the_first_is_kept(tmp_path: Path) -> None:
+    contents = {"a": b"one", "b": b"two", "c": b"one", "d": b"longer", "e": b"two"}
+    files = [tmp_path / name for name in contents]
+    for file in files:
+        file.write_bytes(contents[file.name])
+    assert [file.name for file in distinct_files(files)] == ["a", "b", "d"]
 
 
 @pytest.mark.parametrize("kind", ["absent", "file", "empty"])

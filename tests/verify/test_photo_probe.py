@@ -36,6 +36,11 @@ def contract(pack: ModelPack) -> Contract:
     return make_contract(pack, make_source(pack.info.n))
 
 
+def frames_of(names: list[str]) -> list[bytes]:
+    """Frames of one person that all differ, as those of a camera do."""
+    return [frame(name, 1, background=100 + place) for place, name in enumerate(names)]
+
+
 def dark() -> bytes:
     """A frame that looks ahead, below the least brightness of a photo."""
     picture = draw(head(), 1)
@@ -46,7 +51,7 @@ def dark() -> bytes:
 
 def test_the_frames_that_look_ahead_are_averaged(pack: ModelPack, contract: Contract) -> None:
     names = performed(ASKED)
-    frames = [frame(name, 1) for name in names]
+    frames = frames_of(names)
     probe = probe_of_frames(pack, contract, frames, ASKED, passive=False)
     # Who comes closer looks ahead, too.
     ahead = [f for f, name in zip(frames, names, strict=True) if name in ("front", "come_closer")]
@@ -55,8 +60,14 @@ def test_the_frames_that_look_ahead_are_averaged(pack: ModelPack, contract: Cont
     np.testing.assert_allclose(probe.embedding, mean / np.linalg.norm(mean), atol=1e-5)
 
 
+def test_a_photo_given_twice_counts_once(pack: ModelPack, contract: Contract) -> None:
+    one, other = frame("front", 1), frame("come_closer", 1)
+    photos = [one, one, other, one]
+    assert probe_of_photos(pack, contract, photos, passive=False).photos == 2
+
+
 def test_no_more_are_averaged_than_a_probe_has(pack: ModelPack, contract: Contract) -> None:
-    frames = [frame(name, 1) for name in [*performed(ASKED), "front", "front"]]
+    frames = frames_of([*performed(ASKED), "front", "front"])
     assert probe_of_frames(pack, contract, frames, ASKED, passive=False).photos == 5
 
 
@@ -64,7 +75,7 @@ def test_a_frame_that_is_not_good_enough_is_not_compared(
     pack: ModelPack, contract: Contract
 ) -> None:
     names = performed(ASKED)
-    frames = [frame(name, 1) for name in names]
+    frames = frames_of(names)
     frames[2] = dark()
     assert names[2] == "front"
     with pytest.raises(PhotoRejected, match="not good enough"):
@@ -92,7 +103,7 @@ def test_frames_that_are_compared_pass_the_gate_of_photos_with_its_score(
     pack: ModelPack, contract: Contract, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     names = performed(ASKED)
-    frames = [frame(name, 1) for name in names]
+    frames = frames_of(names)
     unsure(monkeypatch, {0})
     with pytest.raises(PhotoRejected, match="not good enough"):
         probe_of_photos(pack, contract, frames[:1], passive=False)

@@ -306,7 +306,7 @@ def test_stored_templates_of_another_contract_are_refused(
 
 
 def test_unknown_levels_are_refused(verifier: Verifier, stored: list[Enrollment]) -> None:
-    with pytest.raises(Uncalibrated, match="calibrated are: fmr-1e-2, fmr-1e-3"):
+    with pytest.raises(Uncalibrated, match="for one photo: choose one of fmr-1e-2, fmr-1e-3"):
         verifier.decide_embedding(NEW.descriptors[0], stored[0], level="fmr-1e-9")
 
 

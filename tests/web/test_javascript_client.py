@@ -24,7 +24,8 @@ from benchmarks.browser_client import (
 )
 from benchmarks.browser_client import visit as open_page
 from benchmarks.end_to_end import Person
-from models.pack import FacePolicy, ModelPack
+from models.pack import ModelPack
+from models.selection import FacePolicy
 from tests.clients.conftest import Running
 from tests.clients.javascript.conftest import require_client
 from tests.clients.javascript.test_docs import EXAMPLE, FOR_PAGES

@@ -195,7 +195,7 @@ def test_the_same_photos_are_lifted_once(
     dialog.get_by_role("button", name="Replace").click()
     expect(page.locator(".verdict")).to_contain_text("Earlier enrollmentreplaced")
     # Chosen anew, in another order, and by another policy for faces.
-    page.get_by_label("Others may be in the picture").check()
+    page.get_by_label("Others are in the picture").check()
     choose(page, own[2], own[1])
     press(page, "Enroll")
     dialog.get_by_role("button", name="Replace").click()

@@ -7,6 +7,7 @@ suffix), or all photos of a person, by the name of the person's folder.
 
 import csv
 import re
+from bisect import bisect_right
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
 MAX_BYTES = 16 * 2**20
 MAX_GROUPS = 256
 """Different labels of one attribute; a column with more holds names or numbers, not groups."""
+YEARS = (0, 2, 5, 8, 11, 14, 18, 30, 45, 60)
+"""First year of each group of ages; below ten years a few years make much of a difference."""
 # FairFace's mark of the photos of its own service test; it says nothing about a person.
 _NO_ATTRIBUTE = "service_test"
 # A month, as spreadsheets write it in English or German, or two equal separators between numbers.
@@ -86,7 +89,10 @@ class Labels:
 
 
 def read_labels(file: Path | str) -> Labels:
-    """Read a label file. Ages of FairFace that a spreadsheet made dates of are repaired.
+    """Read a label file.
+
+    Ages in years are put into groups (`age_group`). Those of FairFace that a spreadsheet made dates
+    of are repaired.
 
     Raises
     ------
@@ -162,8 +168,18 @@ def _labels(attributes: Sequence[str], cells: Sequence[str]) -> dict[str, str]:
         if cell and attribute != _NO_ATTRIBUTE
     }
     if "age" in labels:
-        labels["age"] = repaired_age(labels["age"]) or labels["age"]
+        age = labels["age"]
+        is_years = len(age) <= 3 and age.isdecimal()
+        labels["age"] = repaired_age(age) or (age_group(int(age)) if is_years else age)
     return labels
+
+
+def age_group(years: int) -> str:
+    """Return the group of an age: ``2-4``, ``60 and more``."""
+    place = bisect_right(YEARS, years)
+    if place == len(YEARS):
+        return f"{YEARS[-1]} and more"
+    return f"{YEARS[place - 1]}-{YEARS[place] - 1}"
 
 
 def _faults_of_ages(ages: Mapping[str, int]) -> list[str]:

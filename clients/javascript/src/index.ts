@@ -2,6 +2,7 @@ export * from "./errors.js";
 export * from "./models/errors.js";
 export * from "./models/image.js";
 export * from "./models/pack.js";
+export type { FacePolicy } from "./models/selection.js";
 export type { Runtime } from "./models/runtime.js";
 export * from "./service/answers.js";
 export { Client, type ClientOptions, type EnrollOptions, type VerifyOptions } from "./service/client.js";

@@ -22,7 +22,8 @@ import {
   sha256,
   warpAffine,
 } from "../dist/index.js";
-import { check, DEFAULT_QUALITY, measurePose, selectFace } from "../dist/models/quality.js";
+import { check, DEFAULT_QUALITY, measurePose } from "../dist/models/quality.js";
+import { selectFace } from "../dist/models/selection.js";
 
 const face = (box, score = 0.9) => ({ box, score, keypoints: template(112) });
 const flat = (width, height, value) =>
@@ -77,12 +78,21 @@ test("a picture lies in the corner of its canvas, its sides cut to whole pixels"
   assert.equal(letterbox(flat(300, 200, 9), [640, 640], false).scale, 1);
 });
 
-test("the face that is meant is the first that is large enough", () => {
-  const [speck, large, other] = [[0, 0, 9, 9], [0, 0, 90, 90], [5, 5, 60, 60]].map((box) => face(box));
-  assert.equal(selectFace([speck, large], true, DEFAULT_QUALITY), large);
-  assert.throws(() => selectFace([large, other], true, DEFAULT_QUALITY), MultipleFaces);
-  assert.equal(selectFace([large, other], false, DEFAULT_QUALITY), large);
-  assert.throws(() => selectFace([], true, DEFAULT_QUALITY), NoFace);
+test("the face that is meant is the one that its policy singles out", () => {
+  const boxes = [[0, 0, 9, 9], [40, 40, 140, 140], [150, 0, 220, 70], [150, 0, 235, 85], [0, 0, 110, 110]];
+  const [speck, main, half, near, aside] = boxes.map((box) => face(box));
+  const among = (faces, policy) => selectFace(faces, policy, { width: 240, height: 240 }, 24);
+  for (const policy of ["dominant", "largest", "single"]) {
+    assert.equal(among([speck, main], policy), main);
+    assert.throws(() => among([], policy), NoFace);
+  }
+  assert.equal(among([half, main], "dominant"), main);
+  assert.throws(() => among([main, half], "single"), MultipleFaces);
+  assert.throws(() => among([main, near], "dominant"), /come closer, or send face=largest/);
+  assert.equal(among([near, main], "largest"), main);
+  assert.throws(() => among([main, aside], "largest"), /about the same size/);
+  assert.throws(() => among([aside, half], "dominant"), MultipleFaces);
+  assert.equal(among([half, aside], "largest"), aside);
 });
 
 test("every limit that a face fails is named", () => {

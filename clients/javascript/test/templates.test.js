@@ -93,6 +93,7 @@ test("photos that part into two people are named", () => {
     (error) => error instanceof InconsistentImages && error.others.join() === "0,1",
   );
   assert.ok(meanEmbedding([one, near], 0.5)[0] > 0.98);
+  assert.deepEqual(meanEmbedding([one, one, near], 0.5), meanEmbedding([one, near], 0.5));
   assert.throws(() => meanEmbedding([one, one.map((value) => -value)], -1), InconsistentImages);
 });
 

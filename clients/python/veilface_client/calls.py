@@ -20,7 +20,7 @@ from veilface_client.results import parse
 from veilface_client.signature import signed_probe
 
 T = TypeVar("T")
-Face = Literal["single", "largest"]
+Face = Literal["dominant", "largest", "single"]
 Storage = Literal["service", "holder"]
 Action = Literal["verify", "enroll"]
 

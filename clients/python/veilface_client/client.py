@@ -222,8 +222,9 @@ class Client(Session):
         attributes
             ``gender`` and ``race``, for services that lift with hybrid+; never stored.
         face
-            ``single`` (the service's default) refuses a photo with several faces; ``largest``
-            takes one that is large and central.
+            Of several faces, ``dominant`` (the service's default) takes the largest if it covers
+            the middle and has twice the area of every other; ``largest`` takes the largest wherever
+            it is; ``single`` refuses the photo.
         storage
             ``holder`` answers with the sealed template (``held_template``), which the service then
             does not keep: save it, for every verification needs it.

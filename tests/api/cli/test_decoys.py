@@ -84,7 +84,8 @@ def test_people_and_photos_are_left_out(world, veilface, labelled_source, tmp_pa
 
 
 def test_a_photo_without_a_label_is_refused_for_a_pool(world, veilface, labelled_source, tmp_path):
-    shutil.copy(labelled_source / "0.png", labelled_source / "stranger.png")
+    stranger = sorted(world.decoy_faces.rglob("*.png"))[12]
+    shutil.copy(stranger, labelled_source / "stranger.png")
     ran = veilface(
         *("decoys", "build", labelled_source, "--pack", world.pack, "--kind", "pool"),
         *("--out", tmp_path / "pool.veil"),

@@ -317,7 +317,7 @@ def test_photos_that_are_not_there_are_listed(bench, tmp_path):
         photo.unlink()
     ran = run("evaluate", folder, *bench.base, "--out", tmp_path / "out")
     assert (ran.status, ran.stdout) == (1, "")
-    assert f"has {len(lost)} fault(s)" in ran.stderr
+    assert f"has {len(lost)} faults" in ran.stderr
     for photo in lost:
         assert f"{photo.parent.name}/{photo.stem} is not there" in ran.stderr
     assert not (tmp_path / "out").exists()

@@ -1,23 +1,7 @@
 import pytest
 
 from api.cli.errors import CommandError
-from api.cli.files import find_photos, is_left_out, read_bounded, read_names
-
-
-def test_photos_are_found_at_any_depth_in_order(tmp_path):
-    for name in ("b/2.JPG", "a/deep/1.png", "a/notes.txt", "c.webp"):
-        path = tmp_path / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(b"x")
-    found = [path.relative_to(tmp_path).as_posix() for path in find_photos(tmp_path)]
-    assert found == ["a/deep/1.png", "b/2.JPG", "c.webp"]
-
-
-def test_a_folder_without_photos_is_refused(tmp_path):
-    with pytest.raises(CommandError, match=r"has no \.jpg"):
-        find_photos(tmp_path)
-    with pytest.raises(CommandError, match="is not a folder"):
-        find_photos(tmp_path / "absent")
+from api.cli.files import is_left_out, read_bounded, read_names
 
 
 def test_names_come_from_a_folder_or_a_file(tmp_path):

@@ -341,10 +341,14 @@ def test_from_nothing_to_a_contract(folders: Path, monkeypatch: pytest.MonkeyPat
     def recorded(_description: str) -> Iterator[Callable[[float], None]]:
         yield shares.append
 
+    shutil.copytree("people/person-6000", "people/Six, Thousand")
     with monkeypatch.context() as patch:
         patch.setattr(command, "_drop_caches", killed)
         patch.setattr(command, "share_done", recorded)
-        assert "error: killed" in setup("--accept-weak-privacy").stderr
+        ran = setup("--accept-weak-privacy")
+    assert "error: killed" in ran.stderr
+    assert "look at them, and put the photos of one person into one folder:" in ran.stderr
+    assert '"Six, Thousand",person-6000  1.000' in ran.stderr
     assert Path("veilface-data/contract.json").is_file()
     assert list(Path("veilface-data").glob("*.cache"))
     # The search for the dimension counts too.

@@ -136,9 +136,8 @@ def test_scenes_without_one_usable_face(real: Client, faces: list[np.ndarray[Any
 def test_the_largest_face_is_taken_when_asked_for(
     real: Client, faces: list[np.ndarray[Any, Any]]
 ) -> None:
-    # Faces are ranked by their area less their distance from the centre.
     height, width = faces[0].shape[:2]
-    small = np.asarray(Image.fromarray(faces[1]).resize((width * 2 // 3, height * 2 // 3)))
+    small = np.asarray(Image.fromarray(faces[1]).resize((width * 4 // 5, height * 4 // 5)))
     scene = np.full((height * 5 // 2, width * 5 // 2, 3), 127, np.uint8)
     top, left = height * 3 // 4, width * 3 // 4
     scene[top : top + height, left : left + width] = faces[0]

@@ -125,8 +125,9 @@ def test_a_real_face_has_its_box(tmp_path: Path, yunet_pack_dir: Path, lfw_photo
     deployment = deploy(tmp_path, pack=yunet_pack_dir)
     face = (lfw_photos / "Ashanti" / "Ashanti_0001.jpg").read_bytes()
     two = Image.new("RGB", (500, 250))
-    for left, name in ((0, "Ashanti"), (250, "Antonio_Palocci")):
-        two.paste(Image.open(lfw_photos / name / f"{name}_0001.jpg"), (left, 0))
+    for left, side, name in ((0, 250, "Ashanti"), (250, 170, "Antonio_Palocci")):
+        photo_of = Image.open(lfw_photos / name / f"{name}_0001.jpg")
+        two.paste(photo_of.resize((side, side)), (left, 0))
     out = io.BytesIO()
     two.save(out, "JPEG", quality=95)
     with Client(create_app(deployment.settings), headers=bearer(deployment.token)) as client:

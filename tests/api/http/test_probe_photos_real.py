@@ -12,7 +12,8 @@ from api.http.app import create_app
 from api.http.schemas import VerifyAnswer
 from api.process.opening import file_sealer, open_keyring
 from models.decoding import decode_image
-from models.pack import FacePolicy, ModelPack
+from models.pack import ModelPack
+from models.selection import FacePolicy
 from models.synthetic import encode_photo
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, deploy, images

@@ -88,6 +88,17 @@ def test_the_refusal_speaks_of_photos_by_name_or_counts_from_one() -> None:
     assert halves.sentence().startswith("photos 2 and 3 do not look like the person on photos 1 ")
 
 
+def test_a_photo_given_twice_counts_once_and_keeps_its_position() -> None:
+    one, near, other = unit(np.array([[1.0, 0.0, 0.0], [0.9, 1.0, 0.0], [0.0, 0.0, 1.0]]))
+    np.testing.assert_array_equal(
+        mean_embedding(np.stack([one, one, near, one]), consistency=0.5),
+        mean_embedding(np.stack([one, near]), consistency=0.5),
+    )
+    with pytest.raises(InconsistentImages, match="photos 1 and 3 do not look") as caught:
+        mean_embedding(np.stack([one, one, other]), consistency=0.5)
+    assert caught.value.photos == (0, 2)
+
+
 def test_photos_that_cancel_are_inconsistent_at_any_limit() -> None:
     opposite = unit(np.array([[3.0, 4.0], [-3.0, -4.0]]))
     with pytest.raises(InconsistentImages):

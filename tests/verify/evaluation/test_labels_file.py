@@ -78,7 +78,17 @@ def test_ages_that_are_dates_are_refused(tmp_path, age):
         read_labels(written(tmp_path, f"path,age\na,adult\nb,{age}\n"))
 
 
-@pytest.mark.parametrize("age", ["18-30", "2.5-3.5", "married", "senior", "31", "70+", "mature"])
+@pytest.mark.parametrize(
+    ("years", "group"),
+    [("0", "0-1"), ("1", "0-1"), ("2", "2-4"), ("10", "8-10"), ("29", "18-29"),
+     ("30", "30-44"), ("59", "45-59"), ("60", "60 and more"), ("116", "60 and more")],
+)  # fmt: skip
+def test_ages_in_years_are_put_into_groups(tmp_path, years, group):
+    labels = read_labels(written(tmp_path, f"path,age\na,{years}\n"))
+    assert labels.find("a") == {"age": group}
+
+
+@pytest.mark.parametrize("age", ["18-30", "2.5-3.5", "married", "senior", "1234", "70+", "mature"])
 def test_other_ages_are_labels(tmp_path, age):
     labels = read_labels(written(tmp_path, f"path,age\na,adult\nb,{age}\n"))
     assert labels.find("b") == {"age": age}
@@ -144,17 +154,17 @@ def test_all_faults_are_listed_with_their_lines(tmp_path):
     with pytest.raises(DatasetError) as caught:
         read_labels(written(tmp_path, "path,age\na\nb,12-Dec\n,3-9\nc,3-9\nc,10-19\n"))
     message = str(caught.value)
-    assert "4 fault(s)" in message
+    assert "4 faults" in message
     assert all(f"line {number}" in message for number in (2, 3, 4, 6))
     many = "path,gender\n" + ",Male\n" * 25
-    with pytest.raises(DatasetError, match=r"25 fault\(s\).*and 5 more"):
+    with pytest.raises(DatasetError, match=r"25 faults.*and 5 more"):
         read_labels(written(tmp_path, many))
 
 
 def test_a_column_of_names_is_no_attribute(tmp_path):
     # What follows the label too many is not read, whatever it is.
     rows = "".join(f"{i},{i},Male\n" for i in range(257)) + "x\n"
-    said = r"1 fault\(s\).*the column name has more than 256 different labels"
+    said = r"1 fault, .*the column name has more than 256 different labels"
     with pytest.raises(DatasetError, match=said):
         read_labels(written(tmp_path, "path,name,gender\n" + rows))
     kept = "".join(f"{i},{i % 256},Male\n" for i in range(257))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from models.errors import FaceError, ImageError
 from models.extraction import Failure
 from models.faces import FaceSample
-from models.pack import FacePolicy, ModelPack
+from models.pack import ModelPack
 from models.sessions import default_workers
 from verify.evaluation.liveness.presentations import Presentation, PresentationSet
 
@@ -72,7 +72,7 @@ def score_set(
         try:
             return pack.embed_photo(
                 presentation.path.read_bytes(),
-                policy=FacePolicy.LARGEST,
+                policy=None,
                 quality=None,
                 liveness=True,
             )

@@ -2,7 +2,7 @@
 
 import { FaceError } from "../models/errors.js";
 import { fromImageData, type RgbImage } from "../models/image.js";
-import type { FacePolicy } from "../models/pack.js";
+import type { FacePolicy } from "../models/selection.js";
 import type { Decision, Enrollment } from "../service/answers.js";
 import { Client } from "../service/client.js";
 import { ContractMismatch, PhotoRefused } from "../service/errors.js";
@@ -115,8 +115,7 @@ const Base = globalThis.HTMLElement ?? (class {} as typeof HTMLElement);
  * `veilface-result` with the decision (or enrollment) as its detail, `veilface-error` with the error.
  *
  * The attribute `service` is the service's URL, by default the page's own origin; `action` is
- * `verify` (by default) or `enroll`; `face` is `single` (by default: a second face is an error) or
- * `largest`. With the attribute `passkey` an enrollment makes one and is locked to the key that it gives,
+ * `verify` (by default) or `enroll`; `face` is a {@link FacePolicy}, by default `dominant`. With the attribute `passkey` an enrollment makes one and is locked to the key that it gives,
  * and a verification asks for it. Parts for styling: `notice`, `video`, `button`, `status`.
  *
  * With `liveness="head-movements"` a verification sends no private template: it answers a challenge, by
@@ -235,7 +234,8 @@ export class VeilfaceLogin extends Base {
   }
 
   get #face(): FacePolicy {
-    return this.getAttribute("face") === "largest" ? "largest" : "single";
+    const face = this.getAttribute("face");
+    return face === "largest" || face === "single" ? face : "dominant";
   }
 
   /**

@@ -24,6 +24,9 @@ export const boxHeight = (box: Box): number => box[3] - box[1];
 export const boxArea = (box: Box): number =>
   Math.max(boxWidth(box), 0) * Math.max(boxHeight(box), 0);
 
+export const shorterSide = (face: Face): number =>
+  Math.min(boxWidth(face.box), boxHeight(face.box));
+
 /** Rank of a face as the one that is meant: `area - 2 * ‖box centre - image centre‖²`. */
 export function centreRank(face: Face, width: number, height: number): number {
   const dx = (face.box[0] + face.box[2]) / 2 - width / 2;

@@ -68,7 +68,11 @@ export class NoFace extends FaceError {
   override name = "NoFace";
 
   constructor() {
-    super("no_face", "No face was found; send an upright photo of one face.");
+    super(
+      "no_face",
+      "No face was found: hold the photo upright, and come closer, until the face fills a good " +
+        "part of it.",
+    );
   }
 }
 
@@ -76,12 +80,8 @@ export class NoFace extends FaceError {
 export class MultipleFaces extends FaceError {
   override name = "MultipleFaces";
 
-  constructor(faces: number) {
-    super(
-      "multiple_faces",
-      `The photo shows ${faces} faces; send one that shows a single face.`,
-      { faces },
-    );
+  constructor(faces: number, remedy: string) {
+    super("multiple_faces", `The photo shows ${faces} faces${remedy}`, { faces });
   }
 }
 

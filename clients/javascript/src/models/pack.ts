@@ -11,16 +11,13 @@ import {
   check,
   DEFAULT_QUALITY,
   measure,
-  selectFace,
   type Quality,
   type QualityLimits,
 } from "./quality.js";
 import { Graph, type Runtime } from "./runtime.js";
 import { Scrfd } from "./scrfd.js";
+import { selectFace, type FacePolicy } from "./selection.js";
 import { YuNet, YUNET_OUTPUTS } from "./yunet.js";
-
-/** What a photo with several faces means: an error, or the largest and most central one. */
-export type FacePolicy = "single" | "largest";
 
 /** What a contract says of the pack: `binding` and `recorded` of `GET /v1/contract`. */
 export interface PackContract {
@@ -150,7 +147,7 @@ export class ModelPack {
   /** Find the face, align and check it: {@link embedPhoto} without the embedding. */
   async cropPhoto(
     image: RgbImage,
-    { policy = "single", limits = DEFAULT_QUALITY }: CropOptions = {},
+    { policy = "dominant", limits = DEFAULT_QUALITY }: CropOptions = {},
   ): Promise<FaceCrop> {
     const { size } = this.embedder.preprocessing;
     let face: Face | undefined;
@@ -158,7 +155,7 @@ export class ModelPack {
     if (this.detector === undefined) {
       crop = asAligned(image, size);
     } else {
-      face = selectFace(await this.detect(image), policy === "single", limits);
+      face = selectFace(await this.detect(image), policy, image, limits.min_face_size);
       crop = align(image, face.keypoints, size);
       await requireUpright(this.detector, face, crop);
     }

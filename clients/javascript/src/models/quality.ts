@@ -1,8 +1,8 @@
 /** Is this face good enough to enroll or to verify? Measures, limits, and named refusals. */
 
 import { similarityTransform, template } from "./alignment.js";
-import { boxArea, boxHeight, boxWidth, type Face, type Point } from "./boxes.js";
-import { FaceTooSmall, LowQuality, MultipleFaces, NoFace, type Measured } from "./errors.js";
+import { boxHeight, boxWidth, shorterSide, type Face, type Point } from "./boxes.js";
+import { FaceTooSmall, LowQuality, type Measured } from "./errors.js";
 import { resizeArea, type RgbImage } from "./image.js";
 
 // As in `models/quality.py`, where the reason for each number stands.
@@ -51,8 +51,6 @@ export interface QualityLimits {
   readonly max_roll: number;
   readonly min_border: number;
   readonly max_aspect: number;
-  /** A further face counts when its area is at least this share of the main face's. */
-  readonly second_face_share: number;
 }
 
 export const DEFAULT_QUALITY: QualityLimits = {
@@ -66,7 +64,6 @@ export const DEFAULT_QUALITY: QualityLimits = {
   max_roll: 45,
   min_border: 0.08,
   max_aspect: 1.7,
-  second_face_share: 0,
 };
 
 /** Measure the aligned crop of a face in `image`; `face` is undefined for crops that came aligned. */
@@ -271,22 +268,3 @@ const measured = (value: number, limit: number): Measured => ({
   value: Math.round(value * 1000) / 1000,
   limit,
 });
-
-const shorterSide = (face: Face): number => Math.min(boxWidth(face.box), boxHeight(face.box));
-
-/**
- * The face that is meant, of faces in the order of their rank.
- *
- * @param single refuse when there is a second face; otherwise take the first.
- */
-export function selectFace(faces: readonly Face[], single: boolean, limits: QualityLimits): Face {
-  if (faces.length === 0) throw new NoFace();
-  // A speck in the middle outranks nobody who is large enough to be meant.
-  const large = faces.filter((face) => shorterSide(face) >= limits.min_face_size);
-  const main = large[0] ?? faces[0];
-  const others = large
-    .slice(1)
-    .filter((face) => boxArea(face.box) >= limits.second_face_share * boxArea(main.box));
-  if (single && others.length > 0) throw new MultipleFaces(1 + others.length);
-  return main;
-}

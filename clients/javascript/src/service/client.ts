@@ -1,7 +1,8 @@
 /** The client that sends photos, and what it shares with the private one. */
 
 import type { VeilfaceError } from "../errors.js";
-import { sha256, type FacePolicy, type PackGraphs } from "../models/pack.js";
+import { sha256, type PackGraphs } from "../models/pack.js";
+import type { FacePolicy } from "../models/selection.js";
 import type { PublicContract } from "../templates/contract.js";
 import type {
   Answer,

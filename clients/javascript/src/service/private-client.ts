@@ -3,7 +3,8 @@
 import { VeilfaceError } from "../errors.js";
 import { ModelError } from "../models/errors.js";
 import { decodeImage, type RgbImage } from "../models/image.js";
-import { ModelPack, type FacePolicy, type PackGraphs, type PhotoCheck } from "../models/pack.js";
+import { ModelPack, type PackGraphs, type PhotoCheck } from "../models/pack.js";
+import type { FacePolicy } from "../models/selection.js";
 import type { Runtime } from "../models/runtime.js";
 import { liftTemplate, requireContract, type PublicContract } from "../templates/contract.js";
 import { DecoyGenerator } from "../templates/generator.js";

@@ -6,7 +6,7 @@ const LEAST_NORM = 1e-12;
 const LEAST_MEAN = 1e-6;
 
 /**
- * Average the unit embeddings of one person and normalise.
+ * Average the unit embeddings of one person and normalise; one that comes again counts once.
  *
  * @param consistency the contract's limit of how well the photos must agree.
  * @throws InconsistentImages where they part into two groups that agree less, or cancel.
@@ -15,13 +15,17 @@ export function meanEmbedding(
   embeddings: readonly Float32Array[],
   consistency: number,
 ): Float32Array {
-  const n = embeddings[0].length;
-  const mean = new Float64Array(n);
-  for (const row of embeddings) row.forEach((value, i) => (mean[i] += value / embeddings.length));
+  const same = (one: Float32Array) => (other: Float32Array) => one.every((x, i) => x === other[i]);
+  const places = embeddings.flatMap((row, i) => (embeddings.findIndex(same(row)) === i ? [i] : []));
+  const rows = places.map((i) => embeddings[i]);
+  const mean = new Float64Array(rows[0].length);
+  for (const row of rows) row.forEach((value, i) => (mean[i] += value / rows.length));
   const norm = Math.sqrt(mean.reduce((sum, value) => sum + value * value, 0));
-  if (embeddings.length > 1) {
-    const { agreement, apart, others } = weakestSplit(embeddings);
-    if (agreement < consistency || norm < LEAST_MEAN) throw new InconsistentImages(apart, others);
+  if (rows.length > 1) {
+    const { agreement, apart, others } = weakestSplit(rows);
+    if (agreement < consistency || norm < LEAST_MEAN) {
+      throw new InconsistentImages(apart.map((i) => places[i]), others.map((i) => places[i]));
+    }
   }
   return Float32Array.from(mean, (value) => value / norm);
 }

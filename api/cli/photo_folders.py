@@ -1,0 +1,79 @@
+"""Folders of photos that bulk commands are given; what is not read of them is named."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from api.cli.console import message
+from api.cli.errors import CommandError
+from verify import LabelledFolder, labelled_folder
+from verify.datasets import SUFFIXES, distinct_files, is_photo, visible
+
+_MOST_NAMED = 5
+_ENDINGS = ", ".join(sorted(SUFFIXES))
+
+
+def find_photos(folder: Path) -> list[Path]:
+    """All photos below a folder, in the order of their paths; copies of a file count once.
+
+    What else lies there is named to the person.
+
+    Raises
+    ------
+    CommandError
+        It is no folder, or has no photo.
+    """
+    if not folder.is_dir():
+        raise CommandError(f"{folder} is not a folder")
+    files = sorted(_files_below(folder))
+    photos = [file for file in files if is_photo(file)]
+    if not photos:
+        raise CommandError(f"{folder} has no file in {_ENDINGS}, at any depth")
+    others = [str(file.relative_to(folder)) for file in files if not is_photo(file)]
+    _tell_others(folder, others)
+    distinct = distinct_files(photos)
+    _tell_copies(folder, len(photos) - len(distinct))
+    return distinct
+
+
+def labelled_people(folder: Path) -> LabelledFolder:
+    """Read ``folder/Person/photo.jpg``; copies of one person's photo count once.
+
+    What is left out is named to the person.
+
+    Raises
+    ------
+    DatasetError
+        As of `verify.labelled_folder`.
+    """
+    labelled = labelled_folder(folder)
+    albums: dict[str, list[Path]] = {}
+    for path, name in zip(labelled.paths, labelled.identities, strict=True):
+        albums.setdefault(name, []).append(path)
+    kept = [(path, name) for name, album in albums.items() for path in distinct_files(album)]
+    _tell_others(folder, labelled.ignored)
+    _tell_copies(folder, len(labelled) - len(kept))
+    paths, identities = zip(*kept, strict=True)
+    return replace(labelled, paths=paths, identities=identities)
+
+
+def _files_below(folder: Path) -> Iterator[Path]:
+    for entry in visible(folder):
+        if entry.is_dir():
+            yield from _files_below(entry)
+        else:
+            yield entry
+
+
+def _tell_others(folder: Path, others: Sequence[str]) -> None:
+    if others:
+        more = ", …" if len(others) > _MOST_NAMED else ""
+        message(
+            f"note: not read in {folder}: {', '.join(others[:_MOST_NAMED])}{more} ({len(others):,} "
+            f"in all; photos end in {_ENDINGS})"
+        )
+
+
+def _tell_copies(folder: Path, copies: int) -> None:
+    if copies:
+        message(f"note: copies of another photo in {folder} do not count: {copies:,}")
