@@ -210,7 +210,7 @@ class Settings(BaseSettings):
         LivenessPolicy.OFF,
         description="What a verification must pass as a sign of a living person: `off`, `passive` "
         "(the photos look live), `active` (a challenge of head movements) or `both` "
-        "(docs/liveness.md). The contract or an API key may ask for more.",
+        "(docs/liveness.md). The contract may ask for more.",
     )
     liveness_levels: str | None = Field(
         None,

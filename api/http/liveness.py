@@ -42,37 +42,23 @@ class LivenessRules:
                 f"setting liveness_levels: the contract has no level {unknown[0]}; it has "
                 + ", ".join(sorted(known))
             )
-        self._contract, self._pack = contract, pack
         self._deployment = deployment_policy(deployment, contract)
         self._levels = dict(levels)
         self._lacking_active = _lacking_active(pack)
         asked = joined([self._deployment, *levels.values()])
         try:
-            why = self.lacking(asked)
+            # The liveness graphs are loaded only where a policy asks for them.
+            why = _lacking_passive(contract, pack) if asked.passive else None
         except PackError as error:
             why = str(error)
+        if why is None and asked.active:
+            why = self._lacking_active
         if why is not None:
             raise StartError(f"setting liveness, or the contract, asks for {asked}: {why}")
 
-    def policy(self, level: str, *, of_key: LivenessPolicy | None) -> LivenessPolicy:
-        """Return what a verification at a level with an API key must pass."""
-        return joined([self._deployment, self._levels.get(level), of_key])
-
-    def lacking(self, policy: LivenessPolicy) -> str | None:
-        """Say what the service lacks to check what a policy asks for; None where it can.
-
-        The liveness graphs are loaded only where a policy asks for them.
-
-        Raises
-        ------
-        PackError
-            Where they cannot be used.
-        """
-        if policy.passive:
-            why = _lacking_passive(self._contract, self._pack)
-            if why is not None:
-                return why
-        return self._lacking_active if policy.active else None
+    def policy(self, level: str) -> LivenessPolicy:
+        """Return what a verification at a level must pass."""
+        return joined([self._deployment, self._levels.get(level)])
 
     def require_challenges(self) -> None:
         """Refuse a challenge that the service could not hold frames against.
@@ -85,9 +71,7 @@ class LivenessRules:
         if self._lacking_active is not None:
             raise ApiError("not_found", self._lacking_active)
 
-    def require(
-        self, level: str, *, of_key: LivenessPolicy | None, photos: bool, challenge: bool
-    ) -> LivenessPolicy:
+    def require(self, level: str, *, photos: bool, challenge: bool) -> LivenessPolicy:
         """Return what is to be checked of a probe, where the probe can show it.
 
         Parameters
@@ -100,17 +84,10 @@ class LivenessRules:
         Raises
         ------
         ApiError
-            ``forbidden``: the policy cannot be met with such a probe, or by this service.
+            ``forbidden``: the policy cannot be met with such a probe.
         """
-        policy = self.policy(level, of_key=of_key)
+        policy = self.policy(level)
         details = {"liveness": str(policy)}
-        try:
-            why = self.lacking(policy)
-        except PackError:
-            # The reason names files of the server.
-            why = "the pack's liveness graphs cannot be used; `veilface models inspect` says why"
-        if why is not None:
-            raise ApiError("forbidden", f"this API key asks for liveness: {why}", details)
         if policy is not LivenessPolicy.OFF and not photos:
             raise ApiError(
                 "forbidden",

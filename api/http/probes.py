@@ -99,9 +99,7 @@ async def _photos(
     policy = face_policy(form.fields.get("face"))
     holder_key = holder_key_of(holder_key_header, form.fields)
 
-    liveness = runtime.liveness.require(
-        level, of_key=caller.liveness, photos=True, challenge=challenge_id is not None
-    )
+    liveness = runtime.liveness.require(level, photos=True, challenge=challenge_id is not None)
     challenge = None
     if challenge_id is not None:
         challenge = opened_challenge(
@@ -222,7 +220,7 @@ async def _signed(
         # It ends by this clock, and not by that of a browser, and is good once.
         nonce = caller.subject_token.nonce
     level = _level(runtime, caller, asked)
-    runtime.liveness.require(level, of_key=caller.liveness, photos=False, challenge=False)
+    runtime.liveness.require(level, photos=False, challenge=False)
     holder_key = holder_key_of(holder_key_header, body)
 
     def compare(verifier: Verifier, stored: OpenedTemplate) -> Decision:
