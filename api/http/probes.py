@@ -99,7 +99,8 @@ async def _photos(
     policy = face_policy(form.fields.get("face"))
     holder_key = holder_key_of(holder_key_header, form.fields)
 
-    liveness = runtime.liveness.require(level, photos=True, challenge=challenge_id is not None)
+    runtime.liveness.require(photos=True, challenge=challenge_id is not None)
+    passive = runtime.liveness.policy.passive
     challenge = None
     if challenge_id is not None:
         challenge = opened_challenge(
@@ -111,7 +112,7 @@ async def _photos(
 
         def embed(verifier: Verifier) -> PhotoProbe:
             return verifier.photo_probe(
-                pack, photos, passive=liveness.passive, policy=policy, limits=runtime.image_limits
+                pack, photos, passive=passive, policy=policy, limits=runtime.image_limits
             )
     else:
 
@@ -120,7 +121,7 @@ async def _photos(
                 pack,
                 photos,
                 challenge.movements,
-                passive=liveness.passive,
+                passive=passive,
                 policy=policy,
                 limits=runtime.image_limits,
             )
@@ -136,7 +137,7 @@ async def _photos(
             decision = verifier.decide_embedding(
                 probe.embedding, stored, holder_key=holder_key, level=level, photos=probe.photos
             )
-        if challenge is None and not liveness.passive:
+        if challenge is None and not passive:
             return decision
         return decision.with_liveness(probe.failure)
 
@@ -220,7 +221,7 @@ async def _signed(
         # It ends by this clock, and not by that of a browser, and is good once.
         nonce = caller.subject_token.nonce
     level = _level(runtime, caller, asked)
-    runtime.liveness.require(level, photos=False, challenge=False)
+    runtime.liveness.require(photos=False, challenge=False)
     holder_key = holder_key_of(holder_key_header, body)
 
     def compare(verifier: Verifier, stored: OpenedTemplate) -> Decision:
