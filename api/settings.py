@@ -11,6 +11,7 @@ import os
 import re
 import shlex
 import tomllib
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -26,7 +27,6 @@ from pydantic_settings import (
 
 from api.http.errors import StartError
 from templates.contract.levels import LEVEL_NAME
-from templates.contract.liveness_policy import LivenessPolicy
 
 ENV_PREFIX = "VEILFACE_"
 CONFIG_VARIABLE = "VEILFACE_CONFIG"
@@ -56,6 +56,25 @@ def config_file() -> Path | None:
             raise StartError(f"{CONFIG_VARIABLE} names {path}, which is not a file")
         return path
     return DEFAULT_CONFIG_FILE if DEFAULT_CONFIG_FILE.is_file() else None
+
+
+class LivenessPolicy(StrEnum):
+    """Which detection of presentation attacks a verification must pass."""
+
+    OFF = "off"
+    PASSIVE = "passive"
+    ACTIVE = "active"
+    BOTH = "both"
+
+    @property
+    def passive(self) -> bool:
+        """Whether the photos themselves must look live."""
+        return self in (LivenessPolicy.PASSIVE, LivenessPolicy.BOTH)
+
+    @property
+    def active(self) -> bool:
+        """Whether a challenge of head movements must be met."""
+        return self in (LivenessPolicy.ACTIVE, LivenessPolicy.BOTH)
 
 
 class Settings(BaseSettings):
@@ -208,24 +227,16 @@ class Settings(BaseSettings):
     )
     liveness: LivenessPolicy = Field(
         LivenessPolicy.OFF,
-        description="What a verification must pass as a sign of a living person: `off`, `passive` "
-        "(the photos look live), `active` (a challenge of head movements) or `both` "
-        "(docs/liveness.md). The contract or an API key may ask for more.",
+        description="What every verification must pass as a sign of a living person: `off`, "
+        "`passive` (the photos look live), `active` (a challenge of head movements) or `both` "
+        "(docs/liveness.md).",
     )
-    liveness_levels: str | None = Field(
-        None,
-        description="The same for single security levels, as `LEVEL=POLICY`, separated by commas: "
-        "what a level asks for comes on top of `liveness`. It binds no client that may choose "
-        "another level (docs/liveness.md). Unset: no level asks for more.",
-    )
-    lockout_after: int | None = Field(
-        None,
+    lockout_after: int = Field(
+        5,
         ge=0,
         le=1000,
         description="Rejected verifications of one subject in a row after which it is locked for "
-        "a while; 0: never. Unset: 5, or 10 where every verification must look live (`passive` or "
-        "`both`) and the contract's liveness calibration shows that attacks are resisted "
-        "(docs/liveness.md).",
+        "a while; 0: never.",
     )
     lockout_first_s: float = Field(
         30.0,
@@ -423,15 +434,8 @@ class Settings(BaseSettings):
     @field_validator("lockout_disable_at")
     @classmethod
     def _not_before_a_lock(cls, value: int, info: ValidationInfo) -> int:
-        if value < (info.data.get("lockout_after") or 0):
+        if value < info.data.get("lockout_after", 0):
             raise ValueError("must not be below lockout_after")
-        return value
-
-    @field_validator("liveness_levels")
-    @classmethod
-    def _known_policies(cls, value: str | None) -> str | None:
-        if value is not None:
-            _policies(value)
         return value
 
     @field_validator("master_key_variable", "master_key_command")
@@ -502,11 +506,6 @@ class Settings(BaseSettings):
         return self.decoys_file or self.data_dir / "decoys.veil"
 
     @property
-    def liveness_of_levels(self) -> dict[str, LivenessPolicy]:
-        """What single security levels ask for on top of ``liveness``."""
-        return _policies(self.liveness_levels or "")
-
-    @property
     def allowed_origins(self) -> frozenset[str]:
         """Origins of other pages that may call."""
         return frozenset() if self.cors_origins == NONE else frozenset(self.cors_origins.split(","))
@@ -515,20 +514,6 @@ class Settings(BaseSettings):
     def resolved_compute_slots(self) -> int:
         """Compute slots, with the default filled in."""
         return self.compute_slots or processors()
-
-
-def _policies(text: str) -> dict[str, LivenessPolicy]:
-    policies: dict[str, LivenessPolicy] = {}
-    for part in filter(None, (part.strip() for part in text.split(","))):
-        level, _, policy = part.partition("=")
-        known = policy in list(LivenessPolicy)
-        if not (known and LEVEL_NAME.fullmatch(level)) or level in policies:
-            raise ValueError(
-                "write LEVEL=POLICY once for each level, separated by commas; a policy is one of "
-                + ", ".join(LivenessPolicy)
-            )
-        policies[level] = LivenessPolicy(policy)
-    return policies
 
 
 def processors() -> int:

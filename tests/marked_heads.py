@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 from PIL import Image
 
-from models.alignment import similarity_transform, template
+from models.alignment import template
 from tests.api.deployment import write_pack
 from tests.heads import POSES, SIZE, Points, head
 
@@ -23,24 +23,48 @@ from tests.heads import POSES, SIZE, Points, head
 MARKS = ((255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 0), (0, 255, 255))
 _CELLS = {8: 12800, 16: 3200, 32: 800}
 _LEAST = 0.4
+# On the template, where eyes and mouth lie about the nose.
+_NOSE_RADIUS = 45.0
 
 
 def pattern(person: int) -> NDArray[np.uint8]:
-    """Grey squares, 112 x 112, in which a person differs from others."""
-    small = np.random.default_rng([17, person]).integers(30, 226, (14, 14), dtype=np.uint8)
-    return np.repeat(np.repeat(small, 8, axis=0), 8, axis=1)
+    """Grey clouds, in which a person differs from others, and squares as details, 112 x 112."""
+    rng = np.random.default_rng([17, person])
+    clouds = rng.integers(0, 256, (3, 3)).astype(np.float32)
+    clouds = cv2.resize(clouds, (112, 112), interpolation=cv2.INTER_CUBIC)
+    squares = np.kron(rng.integers(0, 256, (14, 14)), np.ones((8, 8)))
+    return np.clip(0.8 * clouds + 0.2 * squares, 0, 255).astype(np.uint8)
 
 
 def draw(
-    points: Points, person: int = 0, *, marked: bool = True, background: int = 120
+    points: Points,
+    person: int = 0,
+    *,
+    marked: bool = True,
+    background: int = 120,
+    face: Points | None = None,
 ) -> NDArray[np.uint8]:
-    """A picture, RGB, of a person whose five points are there, before a grey wall."""
-    matrix = similarity_transform(points, template(112))
-    grey = cv2.warpAffine(
+    """A picture, RGB, of a person whose five points are there, before a grey wall.
+
+    With `face`, only the marks are at the points, and the face is where those of `face` are, as
+    where a card before a face moves what a detector sees.
+    """
+    own = points if face is None else face
+    outline = [0, 1, 3, 4]
+    flat = cv2.getPerspectiveTransform(
+        own[outline].astype(np.float32), template(112)[outline].astype(np.float32)
+    )
+    place = np.stack(np.meshgrid(np.arange(SIZE), np.arange(SIZE)), axis=-1).astype(np.float64)
+    place = cv2.perspectiveTransform(place, flat)
+    nose = cv2.perspectiveTransform(own[None, 2:3].astype(np.float64), flat)[0, 0]
+    # The nose stands out of the plane of eyes and mouth, and the sides of a head lie behind it.
+    relief = 1 - np.square(place - nose).sum(axis=2, keepdims=True) / _NOSE_RADIUS**2
+    place -= np.maximum(relief, -2.5) * (nose - template(112)[2])
+    grey = cv2.remap(
         pattern(person),
-        matrix,
-        (SIZE, SIZE),
-        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+        place.astype(np.float32),
+        None,
+        cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_CONSTANT,
         borderValue=(background,),
     )

@@ -1,15 +1,15 @@
 """Active presentation attack detection: a challenge of head movements, and whether frames meet it.
 
 What is asked is drawn anew each time, so a recording meets one draw in 60. But a challenge may be
-asked for again: who holds one recording asks about 60 times, and only rate limits stand against
-that. What a picture does before a camera is no turn of a head (``models.head_pose``). What this
-does not stop is said in docs/liveness.md.
+asked for again: an attacker with one recording asks about 60 times, and only rate limits stand
+against that. What a flat picture does before a camera is no turn of a head (``models.head_pose``,
+``models.relief``). What this does not stop is said in docs/liveness.md.
 """
 
 import itertools
 import math
 import secrets
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from enum import StrEnum
 
 from models.head_pose import HeadPose
@@ -62,7 +62,7 @@ def draw_movements() -> tuple[Movement, ...]:
 
 
 def movements_failure(
-    poses: Sequence[HeadPose], movements: Sequence[Movement]
+    poses: Sequence[HeadPose], movements: Sequence[Movement], *, flat: Container[int] = ()
 ) -> LivenessFailure | None:
     """Say why frames do not show these movements and no others, in this order; None if they do.
 
@@ -70,15 +70,20 @@ def movements_failure(
     depends on a person's proportions or on how the camera is held. Of two movements in one frame
     the larger counts, by its own measure. Coming closer counts once: whoever stays near makes the
     later movements there, and those frames count by their turn. Frames between movements are free.
+
+    Parameters
+    ----------
+    flat
+        Places of the frames that a flat picture may show: none of them shows a turn.
     """
     if abs(poses[0].yaw) > FRONT_YAW or abs(poses[0].pitch) > FRONT_PITCH:
         return LivenessFailure.NOT_FRONTAL
     if any(_jumps(before, after, poses[0]) for before, after in itertools.pairwise(poses)):
         return LivenessFailure.JUMP
     shown: list[Movement] = []
-    for pose in poses:
+    for place, pose in enumerate(poses):
         movement = movement_of(pose, poses[0], near=Movement.COME_CLOSER in shown)
-        if movement is not None:
+        if movement is Movement.COME_CLOSER or (movement is not None and place not in flat):
             shown.append(movement)
     if not set(shown) - {Movement.COME_CLOSER}:
         return LivenessFailure.NO_TURN

@@ -13,11 +13,18 @@ from models.head_pose import HeadPose, head_pose
 from models.pack import ModelPack
 from models.photos import embed_photos
 from models.quality import DEFAULT_QUALITY, QualityLimits
+from models.relief import details_of, shows_relief
 from models.selection import FacePolicy
 from templates.contract.document import Contract
 from templates.errors import Uncalibrated
 from templates.space.agreement import InconsistentImages, distinct_rows, mean_embedding
-from verify.challenge import LivenessFailure, Movement, frontal_frames, movements_failure
+from verify.challenge import (
+    LivenessFailure,
+    Movement,
+    frontal_frames,
+    movement_of,
+    movements_failure,
+)
 
 MAX_PROBE_PHOTOS = 5
 """Photos, or embeddings, that one probe may be the mean of."""
@@ -33,6 +40,9 @@ MOVING = QualityLimits(
     max_roll=180.0,
 )
 """What every frame must reach; those that are compared must reach the limits of photos too."""
+
+MOVING_SHARPNESS = 0.4
+"""Sharpness of a frame that moves over that of the first: blur would hide that a face is flat."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,8 +130,9 @@ def probe_of_frames(
     ahead = [
         place for place in frontal_frames(poses) if place == 0 or _is_good(pack, faces[place])
     ][:MAX_PROBE_PHOTOS]
-    # Both before they are joined: the time would tell which one failed.
-    failures = [movements_failure(poses, movements)]
+    # All before they are joined: the time would tell which one failed.
+    flat = _flat_frames(faces, poses)
+    failures: list[LivenessFailure | None] = [movements_failure(poses, movements, flat=flat)]
     if passive:
         scores = [faces[place].liveness for place in ahead]
         failures.append(passive_failure(contract, [s for s in scores if s is not None]))
@@ -133,7 +144,8 @@ def probe_of_frames(
         one_person = float((embeddings @ mean).min()) >= consistency
     except InconsistentImages:
         mean, photos, one_person = embeddings[0], 1, False
-    failures.append(None if one_person else LivenessFailure.ANOTHER_PERSON)
+    # First: of two people's faces no details match, so that none seems to move.
+    failures.insert(0, None if one_person else LivenessFailure.ANOTHER_PERSON)
     failure = next((why for why in failures if why is not None), None)
     return PhotoProbe(mean, photos, failure, all(pack.is_clear(faces[i].quality) for i in ahead))
 
@@ -173,6 +185,20 @@ def _read(
         return taken, head_pose(taken.face.keypoints)
     except ModelError as error:
         raise PhotoRejected(place, error, count=count) from error
+
+
+def _flat_frames(faces: Sequence[FaceCrop], poses: Sequence[HeadPose]) -> set[int]:
+    """Places of the frames that turn by their points, and whose faces a flat picture may be.
+
+    So is every face that is too blurred to tell.
+    """
+    first, sharp = details_of(faces[0].crop), MOVING_SHARPNESS * faces[0].quality.sharpness
+    return {
+        place
+        for place, (face, pose) in enumerate(zip(faces, poses, strict=True))
+        if movement_of(pose, poses[0], near=True) is not None
+        and (face.quality.sharpness < sharp or not shows_relief(first, details_of(face.crop)))
+    }
 
 
 def _is_good(pack: ModelPack, face: FaceCrop) -> bool:

@@ -28,7 +28,6 @@ from api.process.preparation import (
 from api.settings import Settings
 from templates.contract.binding import MAX_M
 from templates.contract.document import Calibration, Contract
-from templates.contract.liveness_policy import LivenessPolicy
 from templates.distances import Metric
 from templates.space.lifting import Strategy
 from verify import CalibrationOptions, CalibrationReport
@@ -145,13 +144,6 @@ def calibrate(
             help="With --liveness: the share of live photos that may be taken for attacks."
         ),
     ] = 0.05,
-    liveness_policy: Annotated[
-        LivenessPolicy | None,
-        typer.Option(
-            help="With --liveness: what every verification by this contract must pass, beside what "
-            "settings and API keys ask for. Unset: what the contract file says."
-        ),
-    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed for the random choices.")] = 0,
     as_json: AsJson = False,
 ) -> None:
@@ -166,14 +158,10 @@ def calibrate(
     """
     path = out or settings.resolved_contract_file
     if liveness is not None and folder is None:
-        set_liveness_threshold(
-            liveness, path, settings, bpcer=bpcer, policy=liveness_policy, as_json=as_json
-        )
+        set_liveness_threshold(liveness, path, settings, bpcer=bpcer, as_json=as_json)
         return
     if folder is None or liveness is not None:
         raise UsageError("give the folder of labelled people, or --liveness and its photos")
-    if liveness_policy is not None:
-        raise UsageError("--liveness-policy goes with --liveness and its photos")
     dims = default_probe_dims(dim) if probe_dims is None else parse_dims(probe_dims)
     pack = bulk_pack(settings, flip=flip, why="a contract is bound to a model pack")
     if dim is not None and dim >= pack.info.n:

@@ -13,7 +13,6 @@ from api.settings import Settings
 from models.errors import PackError
 from models.pack import ModelPack
 from templates.contract.document import Contract
-from templates.contract.liveness_policy import LivenessPolicy
 from templates.errors import VeilfaceError
 from templates.keys.sealing import Sealer
 from verify.evaluation.liveness.presentations import read_presentations
@@ -21,20 +20,9 @@ from verify.evaluation.liveness.rates import calibrate_liveness
 
 
 def set_liveness_threshold(
-    data: Path,
-    file: Path,
-    settings: Settings,
-    *,
-    bpcer: float,
-    policy: LivenessPolicy | None,
-    as_json: bool,
+    data: Path, file: Path, settings: Settings, *, bpcer: float, as_json: bool
 ) -> None:
     """Set the threshold at a BPCER on live photos, and store it in a contract file.
-
-    Parameters
-    ----------
-    policy
-        What every verification by the contract must pass; None keeps what the file says.
 
     Raises
     ------
@@ -63,9 +51,6 @@ def set_liveness_threshold(
     )
     scored = score_with_progress(pack, presented)
     calibration = calibrate_liveness(scored, liveness.graphs, target=bpcer)
-    if policy is None and contract.liveness is not None:
-        policy = contract.liveness.policy
-    calibration = replace(calibration, policy=policy or LivenessPolicy.OFF)
     replace(contract, liveness=calibration).save(file, sealer)
     notice = demo_notice(pack.info.embedder_sha256, n=pack.info.n)
     if as_json:
@@ -91,7 +76,7 @@ def set_liveness_threshold(
             f"Worst species: {worst}, of which {shown_rate(calibration.apcer[worst])} pass. Other "
             "photos give other rates: `veilface evaluate liveness`."
         )
-    say(f"{file}: contract {contract.contract_id[:16]}, liveness policy {calibration.policy}.")
+    say(f"{file}: contract {contract.contract_id[:16]}.")
 
 
 def with_liveness_of(file: Path, contract: Contract, pack: ModelPack, sealer: Sealer) -> Contract:
@@ -111,8 +96,8 @@ def with_liveness_of(file: Path, contract: Contract, pack: ModelPack, sealer: Se
         return contract
     if graphs is None or liveness.graphs != graphs.graphs:
         message(
-            f"The liveness threshold and the liveness policy {liveness.policy} of {file} are "
-            "dropped: the pack has other liveness graphs. Run `veilface calibrate --liveness`."
+            f"The liveness threshold of {file} is dropped: the pack has other liveness graphs. Run "
+            "`veilface calibrate --liveness`."
         )
         return contract
     return replace(contract, liveness=liveness)

@@ -18,7 +18,6 @@ from api.http.receipts import read_receipt_keys, verify_answer
 from api.process.opening import open_contract, open_keyring
 from api.settings import Settings
 from templates.contract.canonical import parse_object
-from templates.contract.liveness_policy import LivenessPolicy
 from templates.errors import StoreError
 from templates.store.api_keys import ApiKey, Right
 from templates.store.identifiers import utc_now
@@ -59,10 +58,6 @@ def create(
             "of a larger false match rate. Unset: the setting `lowest_level`."
         ),
     ] = None,
-    liveness: Annotated[
-        LivenessPolicy,
-        typer.Option(help="What its verifications must pass beside what the settings ask for."),
-    ] = LivenessPolicy.OFF,
     as_json: AsJson = False,
 ) -> None:
     """Create an API key and show it once.
@@ -82,7 +77,6 @@ def create(
             label=label,
             expires_at=expires,
             lowest_level=lowest_level,
-            liveness=liveness,
             by=operator(),
         )
         if as_json:
@@ -110,7 +104,7 @@ def list_keys(
     if as_json:
         emit([_described(key) for key in keys])
         return
-    columns = ("prefix", "tenant", "rights", "lowest level", "liveness", "label", "state")
+    columns = ("prefix", "tenant", "rights", "lowest level", "label", "state")
     listing = table("API keys", *columns, "last used")
     for key in keys:
         listing.add_row(
@@ -118,7 +112,6 @@ def list_keys(
             key.tenant,
             ", ".join(sorted(key.rights)),
             key.lowest_level or "any",
-            str(key.liveness or LivenessPolicy.OFF),
             key.label,
             _state(key),
             "never" if key.last_used_at is None else f"{key.last_used_at:%Y-%m-%d %H:%M}",
@@ -361,7 +354,6 @@ def _described(key: ApiKey) -> dict[str, Any]:
         "tenant": key.tenant,
         "rights": sorted(key.rights),
         "lowest_level": key.lowest_level,
-        "liveness": str(key.liveness or LivenessPolicy.OFF),
         "label": key.label,
         "created_at": _iso(key.created_at),
         "expires_at": _iso(key.expires_at),

@@ -12,7 +12,6 @@ from api.http.tokens import USES, SubjectToken, opened_token, prefix_of
 from api.limits.admission import Gate
 from api.limits.rates import RateLimits
 from api.process.runtime import Runtime
-from templates.contract.liveness_policy import LivenessPolicy
 from templates.keys.api_token import is_token, probe_key
 from templates.store.api_keys import ApiKey
 
@@ -30,7 +29,7 @@ class Caller:
 
     Attributes
     ----------
-    prefix, tenant, lowest_level, liveness
+    prefix, tenant, lowest_level
         Of the API key.
     key_id
         Its row's id.
@@ -48,7 +47,6 @@ class Caller:
     rights: frozenset[str]
     token: str = field(repr=False, compare=False)
     lowest_level: str | None = None
-    liveness: LivenessPolicy | None = None
     subject_token: SubjectToken | None = None
 
     @property
@@ -123,7 +121,6 @@ async def caller(
         rights=rights,
         token=token,
         lowest_level=api_key.lowest_level,
-        liveness=api_key.liveness,
         subject_token=subject_token,
     )
     request.state.log.update(tenant=known.tenant, key_id=known.prefix)

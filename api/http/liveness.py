@@ -1,78 +1,38 @@
 """What a verification must pass as a sign of a living person, and whether the service can tell."""
 
-from collections.abc import Mapping
-
 from api.http.errors import ApiError, StartError
+from api.settings import LivenessPolicy
 from models.errors import PackError
 from models.pack import ModelPack
 from templates.contract.document import Contract
-from templates.contract.liveness_policy import LivenessPolicy, joined
 from templates.errors import Uncalibrated
 
 
 class LivenessRules:
-    """The liveness policies of a deployment, its contract and its levels.
+    """The liveness policy of a deployment, which binds every caller.
 
     Parameters
     ----------
+    policy
+        What every verification must pass.
     contract, pack
-        What the service checks with; the contract may have a policy of its own.
-    deployment
-        What every verification must pass by the settings.
-    levels
-        What those at single security levels must pass beside it.
+        What the service checks with.
 
     Raises
     ------
     StartError
-        A policy asks for what contract and pack cannot tell, or is of a level that there is not.
+        The policy asks for what contract and pack cannot tell.
     """
 
-    def __init__(
-        self,
-        contract: Contract,
-        pack: ModelPack | None,
-        *,
-        deployment: LivenessPolicy,
-        levels: Mapping[str, LivenessPolicy],
-    ) -> None:
-        known = {level.name for entry in contract.calibrations for level in entry.levels}
-        if unknown := sorted(set(levels) - known):
-            raise StartError(
-                f"setting liveness_levels: the contract has no level {unknown[0]}; it has "
-                + ", ".join(sorted(known))
-            )
-        self._contract, self._pack = contract, pack
-        self._deployment = deployment_policy(deployment, contract)
-        self._levels = dict(levels)
+    def __init__(self, policy: LivenessPolicy, contract: Contract, pack: ModelPack | None) -> None:
+        self.policy = policy
         self._lacking_active = _lacking_active(pack)
-        asked = joined([self._deployment, *levels.values()])
-        try:
-            why = self.lacking(asked)
-        except PackError as error:
-            why = str(error)
+        why = self._lacking_active if policy.active else None
+        # The liveness graphs are loaded only where the policy asks for them.
+        if why is None and policy.passive:
+            why = _lacking_passive(contract, pack)
         if why is not None:
-            raise StartError(f"setting liveness, or the contract, asks for {asked}: {why}")
-
-    def policy(self, level: str, *, of_key: LivenessPolicy | None) -> LivenessPolicy:
-        """Return what a verification at a level with an API key must pass."""
-        return joined([self._deployment, self._levels.get(level), of_key])
-
-    def lacking(self, policy: LivenessPolicy) -> str | None:
-        """Say what the service lacks to check what a policy asks for; None where it can.
-
-        The liveness graphs are loaded only where a policy asks for them.
-
-        Raises
-        ------
-        PackError
-            Where they cannot be used.
-        """
-        if policy.passive:
-            why = _lacking_passive(self._contract, self._pack)
-            if why is not None:
-                return why
-        return self._lacking_active if policy.active else None
+            raise StartError(f"setting liveness asks for {policy}: {why}")
 
     def require_challenges(self) -> None:
         """Refuse a challenge that the service could not hold frames against.
@@ -85,10 +45,8 @@ class LivenessRules:
         if self._lacking_active is not None:
             raise ApiError("not_found", self._lacking_active)
 
-    def require(
-        self, level: str, *, of_key: LivenessPolicy | None, photos: bool, challenge: bool
-    ) -> LivenessPolicy:
-        """Return what is to be checked of a probe, where the probe can show it.
+    def require(self, *, photos: bool, challenge: bool) -> None:
+        """Refuse a probe that cannot show what the policy asks for.
 
         Parameters
         ----------
@@ -100,41 +58,31 @@ class LivenessRules:
         Raises
         ------
         ApiError
-            ``forbidden``: the policy cannot be met with such a probe, or by this service.
+            ``forbidden``.
         """
-        policy = self.policy(level, of_key=of_key)
-        details = {"liveness": str(policy)}
-        try:
-            why = self.lacking(policy)
-        except PackError:
-            # The reason names files of the server.
-            why = "the pack's liveness graphs cannot be used; `veilface models inspect` says why"
-        if why is not None:
-            raise ApiError("forbidden", f"this API key asks for liveness: {why}", details)
-        if policy is not LivenessPolicy.OFF and not photos:
+        details = {"liveness": str(self.policy)}
+        if self.policy is not LivenessPolicy.OFF and not photos:
             raise ApiError(
                 "forbidden",
                 "liveness is asked for here, which embeddings and lifted probes cannot show: send "
                 "photos, with a challenge if the details say active or both",
                 details,
             )
-        if policy.active and not challenge:
+        if self.policy.active and not challenge:
             raise ApiError(
                 "forbidden",
                 "a challenge is asked for here: get one from POST /v1/challenges, and send its "
                 "challenge_id with the frames as images",
                 details,
             )
-        return policy
-
-
-def deployment_policy(setting: LivenessPolicy, contract: Contract) -> LivenessPolicy:
-    """Return what every verification must pass: what the settings or the contract ask for."""
-    return joined([setting, None if contract.liveness is None else contract.liveness.policy])
 
 
 def _lacking_passive(contract: Contract, pack: ModelPack | None) -> str | None:
-    if pack is None or pack.liveness is None:
+    try:
+        graphs = None if pack is None else pack.liveness
+    except PackError as error:
+        return str(error)
+    if graphs is None:
         return (
             "the model pack has no liveness graph, which passive needs: add one to its folder "
             "(docs/liveness.md), or choose active or off"
@@ -145,7 +93,7 @@ def _lacking_passive(contract: Contract, pack: ModelPack | None) -> str | None:
             "--liveness`, or choose active or off"
         )
     try:
-        contract.liveness.require_graphs(pack.liveness.graphs)
+        contract.liveness.require_graphs(graphs.graphs)
     except Uncalibrated as error:
         return str(error)
     return None

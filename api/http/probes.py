@@ -100,9 +100,8 @@ async def _photos(
     policy = face_policy(form.fields.get("face"))
     holder_key = holder_key_of(holder_key_header, form.fields)
 
-    liveness = runtime.liveness.require(
-        level, of_key=caller.liveness, photos=True, challenge=challenge_id is not None
-    )
+    runtime.liveness.require(photos=True, challenge=challenge_id is not None)
+    passive = runtime.liveness.policy.passive
     challenge = None
     if challenge_id is not None:
         challenge = opened_challenge(
@@ -114,7 +113,7 @@ async def _photos(
 
         def embed(verifier: Verifier) -> PhotoProbe:
             return verifier.photo_probe(
-                pack, photos, passive=liveness.passive, policy=policy, limits=runtime.image_limits
+                pack, photos, passive=passive, policy=policy, limits=runtime.image_limits
             )
     else:
 
@@ -123,7 +122,7 @@ async def _photos(
                 pack,
                 photos,
                 challenge.movements,
-                passive=liveness.passive,
+                passive=passive,
                 policy=policy,
                 limits=runtime.image_limits,
             )
@@ -139,7 +138,7 @@ async def _photos(
             decision = verifier.decide_embedding(
                 probe.embedding, stored, holder_key=holder_key, level=level, photos=probe.photos
             )
-        if challenge is not None or liveness.passive:
+        if challenge is not None or passive:
             decision = decision.with_liveness(probe.failure)
         return decision.with_advice(clear=probe.clear)
 
@@ -223,7 +222,7 @@ async def _signed(
         # It ends by this clock, and not by that of a browser, and is good once.
         nonce = caller.subject_token.nonce
     level = _level(runtime, caller, asked)
-    runtime.liveness.require(level, of_key=caller.liveness, photos=False, challenge=False)
+    runtime.liveness.require(photos=False, challenge=False)
     holder_key = holder_key_of(holder_key_header, body)
 
     def compare(verifier: Verifier, stored: OpenedTemplate) -> Decision:

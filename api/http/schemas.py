@@ -390,8 +390,8 @@ class ContractAnswer(_Answer):
     )
     liveness: dict[str, Any] | None = Field(
         default=None,
-        description="The liveness threshold with its graphs and error rates, and the policy where "
-        "the contract has one (docs/liveness.md); absent where there is none.",
+        description="The liveness threshold with its graphs and error rates (docs/liveness.md); "
+        "absent where there is none.",
     )
     photos: bool = Field(description="The service runs with a model pack.")
     generator: bool = Field(description="GET /v1/contract/generator has a generator to give.")
@@ -412,9 +412,8 @@ class KeyAnswer(_Answer):
         "deployment or the key allows.",
         examples=[["fmr-1e-3", "fmr-1e-4"]],
     )
-    liveness: dict[str, Literal["off", "passive", "active", "both"]] = Field(
-        description="What a verification at each of these levels must pass (docs/liveness.md).",
-        examples=[{"fmr-1e-3": "off", "fmr-1e-4": "active"}],
+    liveness: Literal["off", "passive", "active", "both"] = Field(
+        description="What every verification must pass (docs/liveness.md)."
     )
     expires_at: str | None = Field(examples=["2026-01-31T12:00:00Z"])
     demo: bool = Field(description="The service runs with the demo model.")

@@ -15,7 +15,6 @@ from sqlalchemy import inspect, select
 from sqlalchemy.engine import Connection, make_url
 
 from api.http.errors import DatabaseAway, StartError
-from api.http.liveness import deployment_policy
 from api.settings import Settings
 from models.errors import ModelError
 from models.pack import ModelPack
@@ -28,10 +27,6 @@ from templates.store.database import Database
 from templates.store.lockout import LockoutPolicy
 from templates.store.retention import Retention
 from templates.store.schema import MasterKeyCheckRow
-
-LOCKED_AFTER, LOCKED_AFTER_RESISTED = 5, 10
-"""Failures in a row that lock a subject unless the settings say otherwise; the second where the
-passive check is in force and known to resist attacks (NIST SP 800-63B)."""
 
 
 def database_in_use(url: str) -> bool:
@@ -136,15 +131,8 @@ def _create_or_load(path: Path) -> MasterKeyring:
         return MasterKeyring.load(path)
 
 
-def open_store(
-    settings: Settings, keyring: MasterKeyring, contract: Contract | None = None
-) -> TemplateStore:
+def open_store(settings: Settings, keyring: MasterKeyring) -> TemplateStore:
     """Open the store; :func:`prepare_database` must have run once before.
-
-    Parameters
-    ----------
-    contract
-        What verifications are decided by; it may allow more failures before a lock.
 
     Raises
     ------
@@ -157,7 +145,7 @@ def open_store(
         return TemplateStore(
             settings.resolved_database_url,
             keyring,
-            lockout=lockout_policy(settings, contract),
+            lockout=lockout_policy(settings),
         )
     except (OSError, VeilfaceError) as error:
         raise StartError(f"the database cannot be opened: {error}") from None
@@ -183,26 +171,14 @@ def retention_of(settings: Settings) -> Retention:
     return Retention(days(settings.retention_days), days(settings.retention_disuse_days))
 
 
-def lockout_policy(settings: Settings, contract: Contract | None) -> LockoutPolicy:
-    """Return what settings and contract say of failed attempts (docs/liveness.md "Policy")."""
-    after = settings.lockout_after
-    if after is None:
-        resisted = contract is not None and _resists_attacks(settings, contract)
-        after = min(
-            LOCKED_AFTER_RESISTED if resisted else LOCKED_AFTER, settings.lockout_disable_at
-        )
+def lockout_policy(settings: Settings) -> LockoutPolicy:
+    """Return what the settings say of failed attempts."""
     return LockoutPolicy(
-        after=after,
+        after=settings.lockout_after,
         first_s=settings.lockout_first_s,
         longest_s=settings.lockout_longest_s,
         disable_at=settings.lockout_disable_at,
     )
-
-
-def _resists_attacks(settings: Settings, contract: Contract) -> bool:
-    """Whether every verification must look live, by a check that is known to resist attacks."""
-    checked = deployment_policy(settings.liveness, contract).passive
-    return checked and contract.liveness is not None and contract.liveness.resists_attacks
 
 
 def prepare_database(store: TemplateStore) -> None:

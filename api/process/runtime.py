@@ -137,12 +137,7 @@ class Runtime:
 
     def __post_init__(self) -> None:
         self.levels = Levels(self.contract, lowest=self.settings.lowest_level)
-        self.liveness = LivenessRules(
-            self.contract,
-            self.pack,
-            deployment=self.settings.liveness,
-            levels=self.settings.liveness_of_levels,
-        )
+        self.liveness = LivenessRules(self.settings.liveness, self.contract, self.pack)
         self.graphs = served_graphs(self.settings, self.pack)
         self.stand_ins = StandIns(self.contract, self.keyring, key=self._stand_in_key)
 
@@ -168,7 +163,7 @@ class Runtime:
         pack = open_pack(settings, contract)
         if pack is not None:
             try_inference(pack)
-        store = open_store(settings, keyring, contract)
+        store = open_store(settings, keyring)
         prepare_database(store)
         # Obtained now, so that no request waits for it, nor fails on it.
         for name in set(SecretName) - {SecretName.CHAIN}:

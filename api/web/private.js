@@ -47,9 +47,7 @@ function whyNot(action, level) {
   if (action === "enroll") {
     return contract.template_enrollment ? null : "Private mode is off: this tenant may not enroll lifted templates.";
   }
-  if ((own.liveness[level] ?? "off") !== "off") {
-    return "Private mode cannot serve this level, which checks liveness: that takes photos.";
-  }
+  if (own.liveness !== "off") return "Private mode is off: this service checks liveness, which takes photos.";
   // The client lifts to the largest dimension that is calibrated.
   const calibrated = contract.calibrations.filter(({ mode }) => mode === "s2s");
   const most = Math.max(...calibrated.map(({ probe_m }) => probe_m));

@@ -112,7 +112,7 @@ export const levels = () =>
     .flatMap((each) => each.levels)
     .filter((each) => session.own.levels.includes(each.name));
 
-// Whether a verification at this level must answer a challenge of head movements.
-export const moves = (level) => ["active", "both"].includes(session.own.liveness[level]);
+// Whether a verification must answer a challenge of head movements.
+export const moves = () => ["active", "both"].includes(session.own.liveness);
 
 export const crops = () => !session.contract.recorded.detector;

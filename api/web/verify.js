@@ -65,7 +65,7 @@ export function verifyView(id) {
       });
   const mode = why === null ? session.mode?.offer("verify", showWhatIsAsked) : null;
   const movements = headMovements();
-  const moving = () => why === null && moves(level.value);
+  const moving = () => why === null && moves();
   const instead = h("p", { class: "hint" }, "If you cannot turn your head, ask the operator for another way.");
   const steps = [h("span", {}), h("span", {})];
 

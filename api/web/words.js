@@ -66,6 +66,7 @@ const FAILURES = {
 // For a list of facts; why it failed is told to some keys only.
 export function livenessWords({ liveness, liveness_failure: why }) {
   if (liveness === "not_checked") return null;
+  if (liveness === "passed") return "passed, as a good print, a screen or a recording may";
   return why ? `failed: ${FAILURES[why] ?? why}` : liveness;
 }
 

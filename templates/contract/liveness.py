@@ -1,4 +1,4 @@
-"""The liveness of a contract: the threshold, its graphs and error rates, and the least policy.
+"""The liveness of a contract: the threshold, its graphs and error rates.
 
 It is no part of the ``contract_id``: another threshold, or other liveness graphs, leave stored
 templates as they are.
@@ -11,14 +11,10 @@ from dataclasses import dataclass, field
 
 from templates.contract.canonical import Fields, Json, free_object
 from templates.contract.levels import SHA256_HEX, Rate
-from templates.contract.liveness_policy import LivenessPolicy
 from templates.errors import ContractError, Uncalibrated
 
 MAX_LIVENESS_GRAPHS = 8
 MAX_SPECIES = 64
-MOST_RESISTED_APCER = 0.10
-"""Upper bound of the APCER, of every species tried, at which attacks count as resisted (NIST SP
-800-63B: at least 90 %)."""
 SPECIES_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._+-]{0,63}")
 
 
@@ -43,8 +39,6 @@ class LivenessCalibration:
         Share of the attack photos of each species that pass; empty where there were none.
     calibrated_on
         The photos: names, counts, those without a face.
-    policy
-        What every verification by this contract must pass, beside what settings and keys ask for.
     """
 
     graphs: tuple[str, ...]
@@ -53,7 +47,6 @@ class LivenessCalibration:
     target_bpcer: float
     apcer: Mapping[str, Rate] = field(default_factory=dict)
     calibrated_on: Mapping[str, Json] = field(default_factory=dict)
-    policy: LivenessPolicy = LivenessPolicy.OFF
 
     def __post_init__(self) -> None:
         if not 1 <= len(self.graphs) <= MAX_LIVENESS_GRAPHS:
@@ -82,12 +75,6 @@ class LivenessCalibration:
         """Species with the highest APCER; None where no attack was tried."""
         return max(self.apcer, key=lambda name: self.apcer[name].value, default=None)
 
-    @property
-    def resists_attacks(self) -> bool:
-        """Whether the intervals of all species tried, one at least, end at an APCER of 10 %."""
-        bounds = [rate.ci_high for rate in self.apcer.values() if rate.trials]
-        return bool(bounds) and max(bounds) <= MOST_RESISTED_APCER
-
     def is_live(self, score: float) -> bool:
         """Whether a score reaches the threshold."""
         return score >= self.threshold
@@ -107,10 +94,8 @@ class LivenessCalibration:
             )
 
     def to_json(self) -> dict[str, Json]:
-        """JSON form; without ``policy`` where it asks for nothing."""
-        policy = {} if self.policy is LivenessPolicy.OFF else {"policy": str(self.policy)}
+        """JSON form."""
         return {
-            **policy,
             "graphs": list(self.graphs),
             "threshold": self.threshold,
             "bpcer": self.bpcer.to_json(),
@@ -134,13 +119,6 @@ class LivenessCalibration:
             target_bpcer=fields.number("target_bpcer"),
             apcer={name: Rate.from_json(rate) for name, rate in apcer.items()},
             calibrated_on=fields.free("calibrated_on"),
-            policy=_policy(LivenessPolicy.OFF if fields.lacks("policy") else fields.text("policy")),
         )
         fields.done()
         return calibration
-
-
-def _policy(name: str) -> LivenessPolicy:
-    if name not in list(LivenessPolicy):
-        raise ContractError(f"the liveness policy is none of {', '.join(LivenessPolicy)}")
-    return LivenessPolicy(name)

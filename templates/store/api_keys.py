@@ -22,7 +22,6 @@ import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
 from templates.contract.levels import LEVEL_NAME
-from templates.contract.liveness_policy import LivenessPolicy
 from templates.errors import StoreError, StoreUnavailable
 from templates.keys.api_token import TOKEN, probe_key
 from templates.keys.sealing import sealed_key_id
@@ -60,8 +59,6 @@ class ApiKey:
     ----------
     lowest_level
         Security level below which it does not verify; None for any.
-    liveness
-        What its verifications must pass beside what the deployment asks for; None for nothing.
     authentic
         Whether its row is as this program left it. Else it is as good as none.
     """
@@ -76,7 +73,6 @@ class ApiKey:
     revoked_at: datetime | None = None
     last_used_at: datetime | None = None
     lowest_level: str | None = None
-    liveness: LivenessPolicy | None = None
     authentic: bool = True
 
     def is_valid_at(self, time: datetime) -> bool:
@@ -102,7 +98,6 @@ class _Grant:
     label: str
     expires_at: datetime | None = None
     lowest_level: str | None = None
-    liveness: LivenessPolicy | None = None
 
 
 class ApiKeys:
@@ -120,13 +115,11 @@ class ApiKeys:
         label: str = "",
         expires_at: datetime | None = None,
         lowest_level: str | None = None,
-        liveness: LivenessPolicy = LivenessPolicy.OFF,
         by: By = PROGRAM,
     ) -> NewApiKey:
         """Make a key of an existing tenant; the audit log names it by its prefix.
 
-        `lowest_level` is the name of a security level, of whatever contract is served; `liveness`
-        what its verifications must pass, whatever the deployment asks for.
+        `lowest_level` is the name of a security level, of whatever contract is served.
 
         Raises
         ------
@@ -138,8 +131,7 @@ class ApiKeys:
             raise StoreError(f"a label has at most {MAX_LABEL} printable characters")
         if lowest_level is not None and not LEVEL_NAME.fullmatch(lowest_level):
             raise StoreError("the lowest level of a key is the name of a level, such as fmr-1e-4")
-        policy = None if liveness is LivenessPolicy.OFF else liveness
-        grant = _Grant(tenant, granted, label, expires_at, lowest_level, policy)
+        grant = _Grant(tenant, granted, label, expires_at, lowest_level)
         return self._context.write(lambda connection: self._insert(connection, grant, by))
 
     def bootstrap(
@@ -255,8 +247,8 @@ class ApiKeys:
     def replace(self, prefix: str, *, grace: timedelta, by: By = PROGRAM) -> NewApiKey | None:
         """Make a key in place of another one, which stays valid for a while.
 
-        The new key has the tenant, rights, label, expiry, lowest level and liveness of the old
-        one, so replacing a key does not prolong or widen what was granted.
+        The new key has the tenant, rights, label, expiry and lowest level of the old one,
+        so replacing a key does not prolong or widen what was granted.
 
         Parameters
         ----------
@@ -331,7 +323,6 @@ class ApiKeys:
             "expires_at": key.expires_at,
             "revoked_at": None,
             "lowest_level": key.lowest_level,
-            "liveness": None if key.liveness is None else str(key.liveness),
             "line": self._context.audit_log.append(connection, entry),
         }
         row_key = self._context.audit_log.row_key()
@@ -359,7 +350,6 @@ class ApiKeys:
     def _read(self, row: Any) -> ApiKey:
         values = {name: row._mapping[name] for name in _KEY_COLUMNS}
         values["rights"] = _granted(row.rights)
-        values["liveness"] = _asked(row.liveness)
         return ApiKey(**values, authentic=self._is_authentic(row))
 
     def note_use(self, key: ApiKey) -> None:
@@ -379,13 +369,6 @@ class ApiKeys:
         # A full or busy disk must not refuse a good key.
         with contextlib.suppress(StoreUnavailable):
             self._context.database.write(lambda connection: connection.execute(statement))
-
-
-def _asked(policy: str | None) -> LivenessPolicy | None:
-    """Return a key's liveness policy; one that this version does not know asks for everything."""
-    if policy is None or policy in list(LivenessPolicy):
-        return None if policy is None else LivenessPolicy(policy)
-    return LivenessPolicy.BOTH
 
 
 _KEY_COLUMNS = set(ApiKey.__dataclass_fields__) - {"authentic"}

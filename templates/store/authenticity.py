@@ -45,7 +45,6 @@ AUTHENTICATED: dict[type[Base], tuple[str, ...]] = {
         "revoked_at",
         "lowest_level",
         "line",
-        "liveness",
     ),
     FailedAttemptsRow: (
         "tenant_id",
@@ -59,12 +58,9 @@ AUTHENTICATED: dict[type[Base], tuple[str, ...]] = {
     ),
     KnownCalibrationsRow: ("contract_id", "position", "calibration_ids", "created_at"),
 }
-"""The columns that a MAC covers, in its order, but for those of :data:`_LATER` that are NULL.
+"""The columns that a MAC covers, in its order.
 `tenant` of a key is the name of its tenant: so the tenant's own row decides nothing about a request
 but what is asked of :class:`Tenants`."""
-
-_LATER = frozenset({"liveness"})
-"""Columns that came after rows had MACs: NULL, they are left out, so that those MACs stay true."""
 
 
 def last_line(*which: Any) -> Any:
@@ -113,9 +109,7 @@ def row_mac(key: bytes, table: type[Base], values: Mapping[str, Any]) -> bytes:
     TypeError
         For a value of a type that no such column holds.
     """
-    left_out = {name for name in _LATER if name in values and values[name] is None}
-    covered = (values[name] for name in AUTHENTICATED[table] if name not in left_out)
-    parts = ["row", table.__tablename__, *covered]
+    parts = ["row", table.__tablename__, *(values[name] for name in AUTHENTICATED[table])]
     return hmac.digest(key, _encoded(parts).encode(), hashlib.sha256)
 
 

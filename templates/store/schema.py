@@ -162,7 +162,6 @@ class ApiKeyRow(Base):
     revoked_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
     last_used_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
     lowest_level: Mapped[str | None] = mapped_column(String(64))
-    liveness: Mapped[str | None] = mapped_column(String(16))
     line: Mapped[int] = mapped_column(SERIAL, server_default="0")
     mac: Mapped[bytes | None] = mapped_column(MAC)
 

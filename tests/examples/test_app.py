@@ -15,7 +15,6 @@ from playwright.sync_api import Browser, Page, Route, expect
 from benchmarks.browser_client import faces_of, requests_in
 from benchmarks.end_to_end import Person
 from models.pack import ModelPack
-from templates.contract.liveness_policy import LivenessPolicy
 from tests.clients.conftest import Running
 from tests.clients.javascript.conftest import PACKAGE, require_client
 from tests.clients.proxy import Proxy
@@ -504,38 +503,5 @@ def test_the_page_follows_what_the_server_learned(
         page.unroute("**/face")
         told(page).to_have_text("Welcome, kim", timeout=1000 * PATIENCE_S)
         assert set(seen) == {""}, "nobody is welcome before the server says so"
-    finally:
-        context.close()
-
-
-def test_where_liveness_is_asked_for_the_page_says_that_it_sends_no_photo(
-    place: Place,
-    browser: Browser,
-    camera: FakeCamera,
-    pack: ModelPack,
-    people: dict[str, list[Path]],
-    tmp_path: Path,
-) -> None:
-    own = people[WHO][:1]
-    place.service.forget()
-    key = place.key(liveness=LivenessPolicy.ACTIVE)
-    env = place.environment(key, "strict")
-    context = browser.new_context()
-    try:
-        with running(command("app.py"), direct(place, "strict"), env, tmp_path / "app.log"):
-            page = context.new_page()
-            page.goto(place.apps["strict"].url)
-            camera.shows(own[0])
-            sign(page, "mia", "Register")
-            shown = {"camera at enrollment": stand_before(page, "Enroll")}
-            told(page).to_have_text("Welcome, mia")
-            sign(page, "mia", "Sign in")
-            shown["camera at login"] = stand_before(page, "Log in")
-            said(page).to_contain_text("This page sends none.")
-            assert status_of_account(page) == 401
-            search = faces_of(pack, [Person(WHO, own, [])], shown)
-            assert requests_in(place.service.sent)[0]["POST /v1/subjects/*/verify"]["times"] == 1
-            assert search.find(place.service.sent) == []
-            assert search.find(place.service.sent + own[0].read_bytes())
     finally:
         context.close()

@@ -18,7 +18,7 @@ from models.scrfd import Scrfd
 from templates.contract.document import Contract, LivenessCalibration
 from templates.errors import Uncalibrated
 from tests.api.deployment import RATE, make_contract, make_source
-from tests.heads import head, performed
+from tests.heads import POSES, head, performed
 from tests.marked_heads import add_liveness, draw, encoded, frame, write_marked_pack
 from verify.challenge import Movement
 from verify.photo_probe import probe_of_frames, probe_of_photos
@@ -84,6 +84,18 @@ def test_a_frame_that_is_not_good_enough_is_not_compared(
     # But the first one must be.
     with pytest.raises(PhotoRejected, match=r"photo 1 of 7: .*not good enough"):
         probe_of_frames(pack, contract, [frames[2], *frames[1:]], ASKED, passive=False)
+
+
+@pytest.mark.parametrize("covered", [{"turn_right"}, {"turn_right", "look_down"}])
+def test_points_that_move_over_a_face_that_does_not_turn_show_no_movement(
+    pack: ModelPack, contract: Contract, covered: set[str]
+) -> None:
+    frames = [
+        encoded(draw(head(**POSES[name]), 1, face=head() if name in covered else None))
+        for name in performed(ASKED)
+    ]
+    failure = probe_of_frames(pack, contract, frames, ASKED, passive=False).failure
+    assert failure == ("missing_movement" if len(covered) == 1 else "no_turn")
 
 
 def unsure(monkeypatch: pytest.MonkeyPatch, places: set[int]) -> None:

@@ -93,11 +93,11 @@ def private_service(folder: Path, pack: Path, **settings: Any) -> Iterator[Runni
 
 @contextmanager
 def moving_service(folder: Path) -> Iterator[Served]:
-    """Serve a default level that asks for head movements, and another that does not, to anna."""
+    """Serve anna, and ask for head movements."""
     pack = write_marked_pack(folder / "pack")
     deployment = deploy(folder, pack=pack)
     flags = ["--data-dir", str(folder / "data"), "--pack", str(pack)]
-    flags += ["--liveness-levels", "fmr-1e-3=active", "--lockout-after", "0"]
+    flags += ["--liveness", "active", "--lockout-after", "0"]
     with serving(folder, deployment.settings, *flags, token=deployment.token) as served:
         with served.client() as client:
             files = images(frame(person=ANNA))

@@ -1,4 +1,4 @@
-"""The page asks for head movements where the level does, and takes frames of them by the clock."""
+"""The page asks for head movements where the service does, and takes frames by the clock."""
 
 import re
 from collections.abc import Mapping
@@ -67,8 +67,6 @@ def test_who_follows_the_movements_is_accepted(open_tab: OpenTab, moving: Served
     page = tab.page
     expect(page.locator(".picker")).to_be_hidden()
     expect(page.get_by_text("cannot turn your head, ask the operator")).to_be_visible()
-    # No level is advertised as a way around.
-    expect(page.get_by_text("choose a level")).to_have_count(0)
     with page.expect_response(re.compile("/v1/challenges$")) as given:
         page.get_by_role("button", name=START).click()
     expect(page.locator(".movement")).to_be_visible()
@@ -113,21 +111,6 @@ def test_a_photo_before_the_browsers_own_camera_is_rejected(
     tab = opened(open_tab, moving)
     tab.page.get_by_role("button", name=START).click()
     expect(tab.page.locator(".verdict.reject")).to_contain_text("the head did not turn")
-
-
-def test_a_level_that_asks_for_none_takes_photos(
-    open_tab: OpenTab, moving: Served, tmp_path: Path
-) -> None:
-    photo = tmp_path / "anna.png"
-    photo.write_bytes(frame(person=ANNA))
-    tab = opened(open_tab, moving)
-    page = tab.page
-    page.get_by_label("Level").select_option("fmr-1e-2")
-    expect(page.get_by_role("button", name=START)).to_have_count(0)
-    page.get_by_label("Files").check()
-    page.get_by_label("Photos: JPEG").set_input_files(photo)
-    page.get_by_role("button", name="Verify", exact=True).click()
-    expect(page.locator(".verdict.accept")).to_contain_text("Accepted")
 
 
 def test_who_sends_photos_is_not_told_to_move(

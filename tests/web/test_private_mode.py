@@ -312,20 +312,22 @@ def test_what_private_mode_cannot_serve_goes_to_the_service_and_that_is_said(
     camera: FakeCamera,
     people: dict[str, list[Path]],
 ) -> None:
-    """A level that asks for liveness: switched off, with the reason; and on again at another."""
+    """A level that is not calibrated for it: switched off, with the reason; and on at another."""
     with served.client() as client:
         photo = {"images": people[WHO][0].read_bytes()}
         assert client.put("/v1/subjects/anna/enrollment", files=photo).is_success
     tab = open_tab(served, sign_in=None)
     page = tab.page
 
-    def passive(route: Route) -> None:
+    def without_a_level(route: Route) -> None:
         answer = route.fetch()
-        told = answer.json()
-        told["liveness"]["fmr-1e-3"] = "passive"
-        route.fulfill(response=answer, json=told)
+        contract = answer.json()
+        for entry in contract["calibrations"]:
+            if entry["mode"] == "s2s":
+                entry["levels"] = [each for each in entry["levels"] if each["name"] != "fmr-1e-3"]
+        route.fulfill(response=answer, json=contract)
 
-    page.route("**/v1/key", passive)
+    page.route("**/v1/contract", without_a_level)
     tab.sign_in(served.token)
     switch = page.get_by_role("switch", name="Private mode")
     page.get_by_label("Person's id").fill("anna")
@@ -334,9 +336,9 @@ def test_what_private_mode_cannot_serve_goes_to_the_service_and_that_is_said(
     expect(switch).to_be_disabled()
     expect(switch).not_to_be_checked()
     said = page.locator(".private [role=status]")
-    expect(said).to_contain_text("cannot serve this level, which checks liveness")
+    expect(said).to_contain_text("cannot serve this level: it is not calibrated")
     expect(said).to_contain_text("Photos are sent to the service")
-    assert_accessible(tab, "private-mode-with-liveness")
+    assert_accessible(tab, "private-mode-off")
     choose(page, people[WHO][1])
     recording.forget()
     press(page, "Verify")

@@ -33,10 +33,7 @@ async def get_own_key(
             "tenant": caller.tenant,
             "rights": [str(right) for right in Right if str(right) in caller.rights],
             "levels": levels,
-            "liveness": {
-                level: str(runtime.liveness.policy(level, of_key=caller.liveness))
-                for level in levels
-            },
+            "liveness": str(runtime.liveness.policy),
             "expires_at": None if key is None else iso_time(key.expires_at),
             "demo": runtime.settings.demo,
         },

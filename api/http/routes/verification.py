@@ -89,8 +89,8 @@ async def verify(
     A level below the lowest that the deployment or the key allows is `forbidden`.
 
     With a `challenge_id`, the photos are the 5 to 12 frames of a person who makes the movements of
-    the challenge. Where the deployment, the level or the key asks for liveness, a probe that does
-    not show it is a rejection with the reason `liveness`; one that cannot show it is `forbidden`.
+    the challenge. Where the deployment asks for liveness, a probe that does not show it
+    is a rejection with the reason `liveness`; one that cannot show it is `forbidden`.
 
     A subject that does not exist is answered as one that does not match, in the same shape and
     with the same work, and so is one that was enrolled under another contract; only keys with

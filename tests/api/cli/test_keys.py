@@ -53,18 +53,6 @@ def test_a_key_is_made_listed_and_revoked(veilface, store):
     assert "revoked" in veilface("keys", "list").stdout
 
 
-def test_liveness_is_shown_and_kept_by_a_replacement(veilface, store):
-    made = veilface("keys", "create", "--right", "verify", "--liveness", "active", "--json")
-    replaced = veilface("keys", "replace", made.json["prefix"], "--json")
-    assert made.json["liveness"] == replaced.json["liveness"] == "active"
-    assert store.api_keys.verify(replaced.json["token"]).liveness == "active"
-    free = veilface("keys", "create", "--right", "verify", "--json")
-    listed = {key["prefix"]: key["liveness"] for key in veilface("keys", "list", "--json").json}
-    assert listed[made.json["prefix"]] == "active"
-    assert listed[free.json["prefix"]] == "off"
-    assert veilface("keys", "create", "--right", "verify", "--liveness", "perhaps").status == 2
-
-
 def test_a_lowest_level_is_shown_and_kept_by_a_replacement(veilface, store):
     made = veilface("keys", "create", "--right", "verify", "--lowest-level", "fmr-1e-4", "--json")
     assert made.json["lowest_level"] == "fmr-1e-4"

@@ -98,21 +98,6 @@ def test_a_threshold_is_set_and_stays_through_the_next_calibration(
     assert (contract.liveness.bpcer.errors, contract.liveness.bpcer.trials) == (5, 25)
     assert sum(value < threshold for value in live) == 5
     assert contract.liveness.calibrated_on["attacks_without_face"] == {"copy": 0, "print": 1}
-    assert contract.liveness.policy == "off"
-
-    # A policy is kept until another one is given.
-    for given, kept in ((("--liveness-policy", "active"), "active"), ((), "active")):
-        ran = veilface(
-            *("calibrate", "--liveness", photos, "--bpcer", "0.2", "--pack", liveness_pack),
-            *given,
-        )
-        assert ran.status == 0, ran.stderr
-        contract = saved(data)
-        assert contract.liveness.policy == kept
-    misplaced = veilface("calibrate", photos, "--liveness-policy", "active")
-    assert misplaced.status == 2
-    assert "goes with --liveness" in misplaced.stderr
-
     again = veilface(
         *("calibrate", world.labelled, "--pack", liveness_pack, "--dim", "4", "--aligned"),
         *("--probe-dims", "none", "--seed", "1", "--json"),
@@ -126,7 +111,7 @@ def test_a_threshold_is_set_and_stays_through_the_next_calibration(
     assert with_liveness_of(file, before, loaded, sealer).liveness == contract.liveness
     capsys.readouterr()
     assert with_liveness_of(file, before, ModelPack.load(world.pack), sealer) is before
-    assert "liveness policy active" in capsys.readouterr().err
+    assert "is dropped" in capsys.readouterr().err
     (liveness_pack / "2.7_80x80_mean.onnx").write_bytes(mean_liveness(WEIGHTS / 2))
     assert with_liveness_of(file, before, ModelPack.load(liveness_pack), sealer) is before
     file.write_text("{}")

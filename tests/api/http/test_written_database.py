@@ -16,7 +16,6 @@ import sqlalchemy as sa
 
 from api.http.schemas import AuditLogAnswer
 from api.process.opening import open_keyring, open_store
-from templates.contract.liveness_policy import LivenessPolicy
 from templates.errors import StoreError
 from templates.keys.probe_signature import signed_probe
 from templates.keys.sealing import MasterKeyring
@@ -187,8 +186,6 @@ def test_a_key_whose_hash_was_put_in_place_of_anothers_is_none(attacked: Attacke
         "rights = 'admin,enroll,erase,export,verify'",
         "expires_at = NULL",
         "lowest_level = NULL",
-        "liveness = NULL",
-        "liveness = 'off'",
         "tenant_id = (SELECT id FROM tenants WHERE name = 'other')",
         "mac = NULL",
     ],
@@ -200,7 +197,6 @@ def test_a_key_with_a_changed_column_is_none(attacked: Attacked, change: str) ->
         ["verify"],
         expires_at=datetime.now(UTC) + timedelta(hours=1),
         lowest_level="fmr-1e-3",
-        liveness=LivenessPolicy.PASSIVE,
     )
     assert attacked.accepts(new.token)
     attacked.attacker.run(f"UPDATE api_keys SET {change} WHERE prefix = '{new.key.prefix}'")

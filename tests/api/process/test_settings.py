@@ -114,9 +114,6 @@ def test_a_slot_for_each_processor_that_the_process_may_use(
         ("lockout_first_s = 60.0\nlockout_longest_s = 30.0", "setting lockout_longest_s"),
         ("lockout_after = 9\nlockout_disable_at = 8", "setting lockout_disable_at"),
         ("liveness = 'perhaps'", "setting liveness"),
-        ("liveness_levels = 'fmr-1e-4'", "write LEVEL=POLICY"),
-        ("liveness_levels = 'fmr-1e-4=perhaps'", "one of off, passive, active, both"),
-        ("liveness_levels = 'fmr-1e-4=off,fmr-1e-4=active'", "once for each level"),
         ("retention_days = 0", "setting retention_days"),
         ("master_key_variable = 'a-b'", "setting master_key_variable"),
         ("master_key_command = '  '", "is empty"),
@@ -130,12 +127,6 @@ def test_a_wrong_file_is_one_sentence(elsewhere: Path, text: str, sentence: str)
     with pytest.raises(StartError, match=sentence) as caught:
         load_settings()
     assert "\n" not in str(caught.value)
-
-
-def test_levels_may_ask_for_liveness(elsewhere: Path) -> None:
-    assert load_settings().liveness_of_levels == {}
-    settings = load_settings(liveness_levels="fmr-1e-4=passive, fmr-1e-5=both,")
-    assert settings.liveness_of_levels == {"fmr-1e-4": "passive", "fmr-1e-5": "both"}
 
 
 def test_an_error_never_repeats_a_value(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,7 +8,6 @@ from unittest import mock
 import pytest
 import sqlalchemy as sa
 
-from templates.contract.liveness_policy import LivenessPolicy
 from templates.errors import StoreError
 from templates.keys.api_token import probe_key
 from templates.keys.sealing import MasterKeyring
@@ -267,26 +266,3 @@ def test_a_key_keeps_its_lowest_level_and_so_does_the_one_that_replaces_it(
     assert new.key.lowest_level == "fmr-1e-5"
     with pytest.raises(StoreError, match="name of a level"):
         store.api_keys.create("default", [Right.VERIFY], lowest_level="Not A Level")
-
-
-def test_a_key_keeps_its_liveness_and_so_does_the_one_that_replaces_it(
-    store: TemplateStore,
-) -> None:
-    made = store.api_keys.create("default", [Right.VERIFY], liveness=LivenessPolicy.BOTH)
-    assert made.key.liveness is LivenessPolicy.BOTH
-    assert store.api_keys.create("default", [Right.VERIFY]).key.liveness is None
-    found = store.api_keys.verify(made.token)
-    assert found is not None
-    assert found.liveness is LivenessPolicy.BOTH
-    new = store.api_keys.replace(made.key.prefix, grace=timedelta(0))
-    assert new is not None
-    assert new.key.liveness is LivenessPolicy.BOTH
-
-
-def test_a_policy_that_is_not_known_asks_for_everything(store: TemplateStore) -> None:
-    """As one of a later version would be, of which this one has no check."""
-    made = store.api_keys.create("default", [Right.VERIFY], liveness=LivenessPolicy.ACTIVE)
-    statement = sa.update(ApiKeyRow).where(ApiKeyRow.prefix == made.key.prefix)
-    store.database.write(lambda connection: connection.execute(statement.values(liveness="iris")))
-    (key,) = store.api_keys.all()
-    assert key.liveness is LivenessPolicy.BOTH

@@ -194,7 +194,6 @@ def upgrade() -> None:
         sa.Column("revoked_at", sa.DateTime(timezone=True), nullable=True),
         sa.Column("last_used_at", sa.DateTime(timezone=True), nullable=True),
         sa.Column("lowest_level", sa.String(length=64), nullable=True),
-        sa.Column("liveness", sa.String(length=16), nullable=True),
         sa.Column(
             "line",
             sa.BigInteger().with_variant(sa.Integer(), "sqlite"),
