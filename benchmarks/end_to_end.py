@@ -127,28 +127,39 @@ def impostor_attempts(people: Sequence[Person], each: int) -> Iterator[tuple[Per
 
 
 def enroll_photos(
-    client: httpx.Client, person: Person, attributes: dict[str, str] | None
+    client: httpx.Client,
+    person: Person,
+    attributes: dict[str, str] | None,
+    *,
+    face: str = FacePolicy.LARGEST,
 ) -> httpx.Response:
     """PUT the person's enrollment photos."""
     return client.put(
         f"/v1/subjects/{person.name}/enrollment",
         files=[("images", (p.name, p.read_bytes(), "image/jpeg")) for p in person.enroll],
-        data={"face": "largest"} | ({"attributes": json.dumps(attributes)} if attributes else {}),
+        data={"face": face} | ({"attributes": json.dumps(attributes)} if attributes else {}),
     )
 
 
-def verify_photos(client: httpx.Client, subject: str, photos: Photos, level: str) -> httpx.Response:
-    """POST the photos of one probe; the largest face of each is taken."""
+def verify_photos(
+    client: httpx.Client,
+    subject: str,
+    photos: Photos,
+    level: str,
+    *,
+    face: str = FacePolicy.LARGEST,
+) -> httpx.Response:
+    """POST the photos of one probe."""
     return client.post(
         f"/v1/subjects/{subject}/verify",
         files=[("images", (p.name, p.read_bytes(), "image/jpeg")) for p in photos],
-        data={"level": level, "face": "largest"},
+        data={"level": level, "face": face},
     )
 
 
 def mean_embedding(pack: ModelPack, photos: Sequence[Path]) -> npt.NDArray[np.float32]:
-    """Unit mean of the largest faces' embeddings, (n,)."""
-    faces = [pack.embed_photo(p.read_bytes(), policy=FacePolicy.LARGEST).embedding for p in photos]
+    """Unit mean of the most central faces' embeddings, (n,): no photo is refused."""
+    faces = [pack.embed_photo(p.read_bytes(), policy=None, quality=None).embedding for p in photos]
     mean: npt.NDArray[np.float32] = unit_means(np.array([faces]))[0]
     return mean
 
@@ -202,6 +213,7 @@ def attempt_all(
     people: Sequence[Person],
     *,
     level: str,
+    face: str,
     impostors: int,
     attributes: dict[str, dict[str, str]] | None,
     lifting: LiftingClient | None,
@@ -225,7 +237,8 @@ def attempt_all(
                 f"/v1/subjects/{person.name}/enrollment",
                 json={"template": lifting.template(person.enroll, lifting.m)},
             )
-        return enroll_photos(client, person, attributes[person.name] if attributes else None)
+        labels = attributes[person.name] if attributes else None
+        return enroll_photos(client, person, labels, face=face)
 
     def verify(attempt: tuple[str, Photos]) -> httpx.Response:
         subject, photos = attempt
@@ -234,7 +247,7 @@ def attempt_all(
                 f"/v1/subjects/{subject}/verify",
                 json=signed_probe(token, subject, probes[photos], level=level),
             )
-        return verify_photos(client, subject, photos, level)
+        return verify_photos(client, subject, photos, level, face=face)
 
     with ThreadPoolExecutor(clients) as pool:
         for person, answer in zip(people, pool.map(enroll, people), strict=True):
@@ -311,7 +324,7 @@ def predicted_attributes(
     for person in people:
         votes: dict[str, Counter[str]] = {"gender": Counter(), "race": Counter()}
         for photo in person.enroll:
-            sample = pack.embed_photo(photo.read_bytes(), policy=FacePolicy.LARGEST)
+            sample = pack.embed_photo(photo.read_bytes(), policy=None, quality=None)
             for index in np.argsort(gallery.descriptors @ sample.embedding)[-neighbours:]:
                 for attribute, count in votes.items():
                     count[rows[int(index)][attribute]] += 1
@@ -351,6 +364,7 @@ def main() -> None:
     parser.add_argument("--burst", type=int, default=1, help="photos of a probe")
     parser.add_argument("--database", choices=["sqlite", "postgresql"], default="sqlite")
     parser.add_argument("--level", default="fmr-1e-3")
+    parser.add_argument("--face", choices=list(FacePolicy), default=FacePolicy.DOMINANT)
     parser.add_argument("--impostors", type=int, default=20, help="other people for each probe")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--clients", type=int, default=4)
@@ -409,6 +423,7 @@ def main() -> None:
             client,
             people,
             level=args.level,
+            face=args.face,
             impostors=args.impostors,
             attributes=attributes,
             lifting=LiftingClient.connect(client, pack) if args.probe_dim else None,
@@ -426,6 +441,7 @@ def main() -> None:
             "photos": {"enrolled": args.enrolled, "shown": args.burst},
             "database": args.database,
             "level": args.level,
+            "face": args.face,
             "workers": args.workers,
             "service": counts.summary(),
             "raw": raw_outcome(

@@ -163,6 +163,7 @@ def main() -> None:
             http,
             people,
             level=args.level,
+            face="largest",
             impostors=args.impostors,
             attributes=None,
             lifting=None,

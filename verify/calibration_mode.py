@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from templates.contract.canonical import Json
 from templates.contract.document import Calibration
 from templates.contract.expectation import PointExpectation
+from templates.contract.levels import photos_in_words
 from templates.contract.nobody import Nobody
 from templates.distances import DEFAULT_STEPS, Metric
 from templates.errors import ContractError
@@ -278,7 +279,9 @@ def _calibration(
         foot_point_norm=norms,
         calibrated_on=facts,
     )
-    where = f"probe m = {probe_m}: " if probe_m else f"raw probes of {probe_photos} photo(s): "
+    where = (
+        f"probe m = {probe_m}: " if probe_m else f"raw probes of {photos_in_words(probe_photos)}: "
+    )
     return ModeResult(
         calibration,
         [where + sentence for sentence in unresolved],

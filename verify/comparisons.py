@@ -13,6 +13,7 @@ from scipy.sparse import csr_array
 
 from templates.contract import wire
 from templates.contract.expectation import PointExpectation
+from templates.contract.levels import photos_in_words
 from templates.decoys import Attributes, DecoySource
 from templates.distances import (
     DEFAULT_STEPS,
@@ -107,7 +108,7 @@ def point_trials(
     people, compared = len(plan.people), len(plan.compared)
     owners = plan.person_of[sets.photos[sets.impostor, 0]]
     scores = np.empty((len(owners), compared), dtype=np.float32)
-    what = f"comparing probes of {sets.photos.shape[1]} photo(s) with templates"
+    what = f"comparing probes of {photos_in_words(sets.photos.shape[1])} with templates"
     for start in range(0, len(owners), PROBE_TILE):
         rows = slice(start, start + PROBE_TILE)
         probes = sets.means(descriptors, sets.impostor[rows])

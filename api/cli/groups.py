@@ -9,6 +9,7 @@ from api.cli.verdict import shown_rate
 from attacks.operating_point import ADVISED_PHOTOS
 from models.extraction import Extraction
 from templates.contract.document import Contract, Level, Rate
+from templates.contract.levels import photos_in_words
 from verify.evaluation.attributes import NEIGHBOURS, voted
 from verify.evaluation.labels_file import Labels
 from verify.fairface_labels import CLASSES, Label
@@ -60,7 +61,8 @@ def _group_table(level: Level, *, photos: int) -> Any:
     from rich.markup import escape
 
     listing = table(
-        f"by group at {level.name}, probes of {photos} photo(s); * too few trials to be judged",
+        f"by group at {level.name}, probes of {photos_in_words(photos)}; "
+        "* too few trials to be judged",
         *("attribute", "group", "FMR within (95 %)", "FRR (95 %)"),
     )
     for entry in level.groups:

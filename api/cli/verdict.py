@@ -1,10 +1,11 @@
 """How the command line tells whether a contract is private, accurate, and so for every group."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 from attacks.operating_point import ACCURACY_LIMIT, OperatingPoint, rejected_as_advised
 from templates.contract.document import Contract, Rate
+from templates.contract.levels import photos_in_words
 from templates.contract.verdict import Judgement, Verdict
 
 
@@ -46,9 +47,10 @@ def _groups_line(groups: Judgement | None) -> str:
             "--fairface), or too few in every group."
         )
     basis = groups.basis
+    photos = photos_in_words(cast("int", basis["probe_photos"]))
     return (
         f"Groups:   {groups.status}. Worst is {basis['attribute']} {basis['group']}: "
-        f"{shown_rate(groups.rate)} of its impostor probes of {basis['probe_photos']} photo(s) "
+        f"{shown_rate(groups.rate)} of its impostor probes of {photos} "
         f"match at {basis['level']}; limit {100 * groups.limit:.3g} %. "
         f"Groups by {basis['groups_from']}; lifted probes are not in it."
     )

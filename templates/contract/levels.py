@@ -24,6 +24,11 @@ LEVEL_NAME = re.compile(r"[a-z0-9][a-z0-9.+-]{0,31}")
 SHA256_HEX = re.compile(r"[0-9a-f]{64}")
 
 
+def photos_in_words(count: int) -> str:
+    """Return how many photos a probe is the mean of: ``one photo``, ``3 photos``."""
+    return "one photo" if count == 1 else f"{count} photos"
+
+
 @dataclass(frozen=True)
 class Rate:
     """An error rate as it was counted, with its 95 % interval.
@@ -323,7 +328,7 @@ class Calibration:
         if self.mode == "s2s":
             probe = f"a lifted probe with m = {self.probe_m}"
         else:
-            probe = "one photo" if self.probe_photos == 1 else f"{self.probe_photos} photos"
+            probe = photos_in_words(self.probe_photos)
         raise Uncalibrated(
             f"the contract has no such level for {probe}: choose one of "
             + ", ".join(level.name for level in self.levels)

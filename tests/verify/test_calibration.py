@@ -191,7 +191,7 @@ def test_levels_fall_to_the_smallest_that_the_data_resolve(calibrated: Calibrate
     assert [level.name for level in point.levels] == ["fmr-1e-2", "fmr-1e-3"]
     assert (lifted.mode, lifted.probe_m) == ("s2s", 2)
     assert any(
-        "raw probes of 1 photo(s): FMR 0.0001 is not resolved" in s
+        "raw probes of one photo: FMR 0.0001 is not resolved" in s
         for s in calibrated.report.unresolved
     )
     for calibration in (point, lifted):

@@ -246,8 +246,8 @@ def test_labels_give_rates_by_group_and_thresholds_that_hold_in_each(
     judged = [one.fmr.value for one in level.groups if one.fmr_judged]
     assert contract.verdict.groups.rate.value == max(judged) <= 0.01
     assert contract.verdict.groups.limit == 0.02
-    assert "by group at fmr-1e-2, probes of 1 photo(s)" in ran.stdout
-    assert "rule of the worst group: raw probes of 1 photo(s): FMR 0.01 needs 1000 " in ran.stdout
+    assert "by group at fmr-1e-2, probes of one photo" in ran.stdout
+    assert "rule of the worst group: raw probes of one photo: FMR 0.01 needs 1000 " in ran.stdout
     assert "kind few (8)." in ran.stdout
     last = ran.stdout.splitlines()[-1]
     assert last.startswith("Groups:   PASS. Worst is kind ")
