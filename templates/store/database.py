@@ -61,7 +61,7 @@ class Database:
     pool_size, max_overflow
         Connections kept, and further ones under load, in each process.
     timeout
-        Seconds to wait for a connection, or for another writer (SQLite).
+        Seconds to wait for a connection, or for other writers, of whatever process (SQLite).
 
     Raises
     ------
@@ -164,9 +164,10 @@ class Database:
         def once() -> T:
             if self.is_sqlite:
                 # Threads queue here in turn; SQLite's own lock is polled and knows no order.
+                until = time.monotonic() + self._timeout
                 with process.turn_to_write(), process.engine.begin() as connection:
-                    with self._turn(self._timeout):
-                        _driver(connection).execute("BEGIN IMMEDIATE")
+                    with self._turn(until), self._patience(connection, until) as driver:
+                        driver.execute("BEGIN IMMEDIATE")
                     process.require_file()
                     return work(connection)
             with process.engine.begin() as connection:
@@ -188,15 +189,11 @@ class Database:
         with (
             contextlib.suppress(*_DATABASE_ERRORS, StoreError),
             process.turn_to_write(),
-            self._turn(PURGE_WAIT_S),
+            self._turn(time.monotonic() + PURGE_WAIT_S),
             process.engine.connect() as connection,
+            self._patience(connection, time.monotonic() + PURGE_WAIT_S) as driver,
         ):
-            driver = _driver(connection)
-            driver.execute(_busy_timeout(PURGE_WAIT_S))
-            try:
-                busy, _, _ = driver.execute(_EMPTY_LOG).fetchone()
-            finally:
-                driver.execute(_busy_timeout(self._timeout))
+            busy, _, _ = driver.execute(_EMPTY_LOG).fetchone()
             return not busy
         return False
 
@@ -223,7 +220,7 @@ class Database:
             autocommit = process.engine.execution_options(isolation_level="AUTOCOMMIT")
             with (
                 process.turn_to_write(),
-                self._turn(self._timeout),
+                self._turn(time.monotonic() + self._timeout),
                 autocommit.connect() as connection,
             ):
                 if self.is_sqlite:
@@ -260,9 +257,19 @@ class Database:
         """
         self.write_alone(lambda _: None)
 
-    def _turn(self, wait: float) -> contextlib.AbstractContextManager[None]:
+    def _turn(self, until: float) -> contextlib.AbstractContextManager[None]:
         """The turn to wait for SQLite's lock; nothing on PostgreSQL."""
-        return contextlib.nullcontext() if self._file is None else next_in_line(self._file, wait)
+        return contextlib.nullcontext() if self._file is None else next_in_line(self._file, until)
+
+    @contextlib.contextmanager
+    def _patience(self, connection: Connection, until: float) -> Iterator[Any]:
+        """SQLite's driver, which waits for locks until `until` and not for the whole timeout."""
+        driver = _driver(connection)
+        driver.execute(_busy_timeout(max(0.0, until - time.monotonic())))
+        try:
+            yield driver
+        finally:
+            driver.execute(_busy_timeout(self._timeout))
 
     def _lock_limit(self, wait: float | None) -> str:
         return str(round(1000 * (self._timeout if wait is None else wait)))

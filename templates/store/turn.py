@@ -17,11 +17,11 @@ _POLL_S = 0.001
 
 
 @contextlib.contextmanager
-def next_in_line(database: Path, timeout: float) -> Iterator[None]:
+def next_in_line(database: Path, until: float) -> Iterator[None]:
     """Hold the turn, in an empty file ``…-turn`` beside the database.
 
-    Whoever does not get it within `timeout` seconds, or cannot use the file, goes on without: it
-    spares others a wait and guards nothing.
+    A process that does not get it by `until`, of :func:`time.monotonic`, or cannot use the file,
+    goes on without: the turn spares others a wait and guards nothing.
     """
     # Not in the database's file: closing that would drop the locks that SQLite holds on it.
     file = database.with_name(f"{database.name}-turn")
@@ -32,7 +32,6 @@ def next_in_line(database: Path, timeout: float) -> Iterator[None]:
         yield
         return
     try:
-        until = time.monotonic() + timeout
         while not _try_lock(descriptor) and time.monotonic() < until:
             time.sleep(_POLL_S)
         yield

@@ -1,8 +1,10 @@
+import contextlib
 import os
 import socket
 import sqlite3
 import stat
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -16,6 +18,7 @@ from templates.keys.sealing import MasterKeyring
 from templates.store import TemplateStore
 from templates.store.database import Database
 from templates.store.schema import TenantRow
+from templates.store.turn import next_in_line
 from tests.databases import empty_database
 from tests.patience import PATIENCE_S
 from tests.templates.store.conftest import put
@@ -235,6 +238,28 @@ def test_a_write_waits_for_its_turn_in_the_process_no_longer_than_the_timeout(
 
     store.database.write(hang)
     store.tenants.create("default")
+    store.close()
+
+
+def test_a_write_waits_for_other_processes_once_and_not_for_each_of_their_locks(
+    tmp_path: Path, keyring: MasterKeyring
+) -> None:
+    path = tmp_path / "veilface.db"
+    store = TemplateStore(f"sqlite:///{path}", keyring, timeout=2.0)
+    store.upgrade()
+
+    def seconds_until_refused() -> float:
+        began = time.monotonic()
+        with pytest.raises(StoreUnavailable):
+            store.tenants.create("default")
+        return time.monotonic() - began
+
+    with contextlib.closing(sqlite3.connect(path, isolation_level=None)) as tool:
+        tool.execute("BEGIN IMMEDIATE")
+        alone = seconds_until_refused()
+        with next_in_line(path, time.monotonic()):
+            assert seconds_until_refused() < 1.6 * alone
+    assert store.tenants.create("default")
     store.close()
 
 
