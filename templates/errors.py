@@ -24,7 +24,6 @@
     │   ├── LockedOut            too many failed attempts on the subject [12]
     │   ├── Replayed             a signed probe or a token that was seen before [12]
     │   ├── BrokenAuditLog       an audit log whose head or key is missing or forged [13]
-    │   ├── ExportSuperseded     an export from before an erasure, or of a retired key [14]
     │   ├── EnrollmentConflict   another template than the one that a write may replace [17]
     │   └── TemplateNotStored    the subject's holder keeps the template, and did not send it [15]
     ├── InconsistentImages [3]   photos that do not show one and the same person
@@ -43,7 +42,7 @@ Each is defined here, or next to what raises it: [1] ``templates.store.identifie
 [5] ``verify.evaluation.plan``, [6] ``verify.evaluation.backends``, [7] ``attacks.errors``,
 [8] ``api.http.errors``, [9] ``api.process.preparation``, [10] ``api.cli.errors``,
 [11] ``templates.store.tenants``, [12] ``templates.store.lockout``,
-[13] ``templates.store.audit_log``, [14] ``templates.store.transfers``,
+[13] ``templates.store.audit_log``,
 [15] ``templates.store.subject_rows``, [16] ``templates.store.envelope``,
 [17] ``templates.store.subjects``.
 

@@ -28,7 +28,6 @@ from templates.store.lockout import LockedOut, Replayed
 from templates.store.subject_rows import TemplateNotStored
 from templates.store.subjects import EnrollmentConflict
 from templates.store.tenants import RetiredRotation
-from templates.store.transfers import ExportSuperseded
 
 
 class StartError(VeilfaceError):
@@ -92,12 +91,6 @@ ERROR_CODES: dict[str, ErrorCode] = {
             409,
             "The subject has another template than the one that `If-None-Match` or `If-Match` "
             "lets the request replace.",
-        ),
-        ErrorCode(
-            "export_superseded",
-            409,
-            "The subject was erased or enrolled again after the export was made, "
-            "or the export's key was retired.",
         ),
         ErrorCode(
             "template_not_stored",
@@ -210,7 +203,6 @@ _TABLE: tuple[tuple[type[Exception], str, str | None], ...] = (
     (Uncalibrated, "uncalibrated", None),
     (SealError, "store_unavailable", "the stored data cannot be opened with the master key"),
     (InvalidIdentifier, "validation_failed", None),
-    (ExportSuperseded, "export_superseded", None),
     (TemplateNotStored, "template_not_stored", None),
     (Replayed, "replayed", None),
     (RetiredRotation, "store_unavailable", "the tenant's rotation is being renewed; send it again"),

@@ -224,15 +224,7 @@ IMPORT_BODY = _body(
         "schema": {
             "type": "object",
             "required": ["export"],
-            "properties": {
-                "export": _text("`export` of an export call."),
-                "restore": {
-                    "type": "boolean",
-                    "default": False,
-                    "description": "Import it though the subject was erased or enrolled again "
-                    "since; needs the right `admin`.",
-                },
-            },
+            "properties": {"export": _text("`export` of an export call.")},
         },
         "examples": {"import": {"value": {"export": "VkZYMS4uLg=="}}},
     },

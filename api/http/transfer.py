@@ -10,9 +10,6 @@ It holds::
 
     length of the header (4 bytes, big-endian) | header (canonical JSON) | wire bytes
 
-The header tells when the export was made (:class:`templates.store.transfers.Stamp`), so that an old
-one does not undo an erasure or another enrollment; in exports of earlier versions it does not.
-
 The template inside is without the tenant's rotation, float32: it gets one of the importing
 tenant's, and no second rounding to half precision takes place. A holder's rotation stays, and the
 header names its salt: the enrollment needs the same key after the import.
@@ -21,18 +18,15 @@ header names its salt: the enrollment needs the same key after the import.
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from datetime import datetime
 from pathlib import Path
 
 from api.http.errors import StartError
 from templates.contract.canonical import Fields, Json, canonical_json, parse_object
 from templates.errors import ContractError, ContractMismatch, InvalidTemplate, SealError
-from templates.keys.sealing import MasterKeyring, sealed_key_id
-from templates.store.audit_chain import Anchor
+from templates.keys.sealing import MasterKeyring
 from templates.store.identifiers import InvalidIdentifier
 from templates.store.secret import Secret
 from templates.store.subject_rows import Source
-from templates.store.transfers import ExportSuperseded, Stamp
 
 MAGIC = b"VEILEXP1"
 CONTRACT_ID_BYTES = 32
@@ -52,13 +46,10 @@ class ExportKey:
         Seals with its first key, opens with all of them.
     tenant_bound
         True for the deployment's own key: one tenant's export does not open for another.
-    retired
-        Ids of the keys of the keyring that somebody may have stolen.
     """
 
     keyring: MasterKeyring
     tenant_bound: bool
-    retired: frozenset[str] = frozenset()
 
     @classmethod
     def from_file(cls, path: Path) -> "ExportKey":
@@ -76,10 +67,12 @@ class ExportKey:
 
     @classmethod
     def from_secret(cls, secret: Secret) -> "ExportKey":
-        """Make the key from a secret of the deployment."""
-        keys = [secret.value, *(before.value for before in secret.retired)]
-        keyring = MasterKeyring(keys, source="the deployment's export key")
-        return cls(keyring, tenant_bound=True, retired=frozenset(keyring.key_ids[1:]))
+        """Make the key from a secret of the deployment.
+
+        A retired value opens nothing: whoever stole it could have made the export.
+        """
+        keyring = MasterKeyring([secret.value], source="the deployment's export key")
+        return cls(keyring, tenant_bound=True)
 
     @property
     def key_id(self) -> str:
@@ -94,7 +87,7 @@ class ExportKey:
 class Exported:
     """One subject as it travels: ``wire`` is a template without the tenant's rotation.
 
-    ``stamp`` is None in an export of an earlier version, ``holder_salt`` where no key is needed.
+    ``holder_salt`` is None where no key is needed.
     """
 
     subject_id: str
@@ -102,7 +95,6 @@ class Exported:
     source: str
     photos: int
     wire: bytes = field(repr=False)
-    stamp: Stamp | None = None
     holder_salt: str | None = None
 
 
@@ -114,11 +106,6 @@ def seal_export(exported: Exported, *, key: ExportKey, tenant: str) -> bytes:
         "source": exported.source,
         "photos": exported.photos,
     }
-    if exported.stamp is not None:
-        fields |= {
-            "exported_at": exported.stamp.at.isoformat(),
-            "audit_line": str(exported.stamp.line),
-        }
     if exported.holder_salt is not None:
         fields["holder_salt"] = exported.holder_salt
     header = canonical_json(fields)
@@ -130,11 +117,9 @@ def seal_export(exported: Exported, *, key: ExportKey, tenant: str) -> bytes:
 
 
 def open_export(
-    data: bytes, *, key: ExportKey, tenant: str, contract_ids: Sequence[str], restore: bool = False
+    data: bytes, *, key: ExportKey, tenant: str, contract_ids: Sequence[str]
 ) -> Exported:
     """Decrypt an export that a client sent.
-
-    `restore` opens one that was sealed with a retired key, too.
 
     Raises
     ------
@@ -142,8 +127,6 @@ def open_export(
         If it is no export, was altered, or was sealed with another key or for another tenant.
     ContractMismatch
         If it belongs to none of ``contract_ids``, of which the first is the service's.
-    ExportSuperseded
-        If its key was retired.
     """
     start = len(MAGIC) + CONTRACT_ID_BYTES
     if len(data) < start or not data.startswith(MAGIC):
@@ -163,12 +146,6 @@ def open_export(
             "the export does not open: it was altered, or sealed with another export key or for "
             "another tenant"
         ) from None
-    if not restore and sealed_key_id(data[start:]) in key.retired:
-        raise ExportSuperseded(
-            "the key that this export was sealed with was retired, because it may have been "
-            "stolen: whoever has it could have made the export; export the subject again where it "
-            "is enrolled, or enroll it; an operator may restore an old export knowingly"
-        )
     return _parse(plain, contract_id)
 
 
@@ -186,7 +163,6 @@ def _parse(plain: bytes, contract_id: str) -> Exported:
             source=fields.text("source"),
             photos=fields.integer("photos"),
             wire=plain[LENGTH_BYTES + length :],
-            stamp=_stamp(fields) if "exported_at" in parsed else None,
             holder_salt=fields.text("holder_salt") if "holder_salt" in parsed else None,
         )
         fields.done()
@@ -199,13 +175,3 @@ def _parse(plain: bytes, contract_id: str) -> Exported:
     if exported.source not in list(Source) or not 0 <= exported.photos <= 10:
         raise InvalidTemplate("the export's header is not one of a subject")
     return exported
-
-
-def _stamp(fields: Fields) -> Stamp:
-    try:
-        at = datetime.fromisoformat(fields.text("exported_at"))
-    except ValueError:
-        raise ContractError("the export's header: 'exported_at' is not a time") from None
-    if at.tzinfo is None:
-        raise ContractError("the export's header: 'exported_at' is not a time")
-    return Stamp(at, Anchor.parse(fields.text("audit_line")))

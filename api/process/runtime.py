@@ -13,6 +13,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,7 +51,7 @@ from templates.store.audit_log import By
 from templates.store.lockout import Nonce
 from templates.store.secret import SecretName
 from templates.store.subject_rows import Source, Storage, SubjectTemplate
-from templates.store.subjects import Guard, Precondition, StoredTemplate
+from templates.store.subjects import Precondition, StoredTemplate
 from templates.store.tenants import RetiredRotation
 from verify import Verifier
 
@@ -318,12 +319,12 @@ class Runtime:
         storage: Storage = Storage.SERVICE,
         precondition: Precondition | None = None,
         nonce: Nonce | None = None,
+        action: Literal["enroll", "import"] = "enroll",
         by: By,
-        guard: Guard | None = None,
     ) -> StoredTemplate:
         """Store an enrollment in place of an earlier one.
 
-        `storage`, `precondition`, `nonce` and `guard` are those of ``Subjects.put``.
+        `storage`, `precondition`, `nonce` and `action` are those of ``Subjects.put``.
         """
         binding = self.contract.binding
         return self.store.subjects.put(
@@ -341,7 +342,7 @@ class Runtime:
             rotation_epoch=epoch,
             storage=storage,
             precondition=precondition,
-            guard=guard,
+            action=action,
             nonce=nonce,
             by=by,
         )
@@ -376,10 +377,9 @@ class Runtime:
             photos=template.record.photos,
             wire=wire.encode(plain, contract_id=self.contract.contract_id, dtype="float32"),
             holder_salt=template.holder_salt,
-            stamp=self.store.transfers.stamp(
-                tenant, subject, template_id=template.record.template_id, by=by
-            ),
         )
+        template_id = template.record.template_id
+        self.store.subjects.record_export(tenant, subject, template_id=template_id, by=by)
         return seal_export(exported, key=self.export_key, tenant=tenant)
 
     def close(self) -> None:

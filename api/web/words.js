@@ -27,7 +27,6 @@ const REMEDIES = {
   store_unavailable: "Try again in a moment. If it keeps happening, tell the operator.",
   model_unavailable: "This service cannot take photos. Ask the operator.",
   enrollment_conflict: "This person was enrolled or erased meanwhile. Look them up, and enroll them again if need be.",
-  export_superseded: "Export the person again from where they are enrolled.",
   passkey_refused: "Try again, on the device that has the passkey. If it is lost, enroll the person again.",
   passkey_unsupported: "Use another device or browser, or a key file. If a passkey was made just now, delete it.",
   passkey_of_another: "Choose the passkey that is named after the id. If it is lost, enroll the person again.",

@@ -33,7 +33,6 @@ from templates.store.schema import (
 from templates.store.subjects import Subjects
 from templates.store.tenant_erasure import TenantErasures
 from templates.store.tenants import Tenants
-from templates.store.transfers import Transfers
 
 _LOCKOUT = LockoutPolicy()
 _TRIAL_ROW = 0  # the table's one row has number 1
@@ -70,7 +69,6 @@ class TemplateStore:
         self.attempts = Attempts(context, self.nonces, lockout)
         self.erasures = Erasures(context)
         self.retention = RetentionJob(context, self.erasures)
-        self.transfers = Transfers(context)
         self.known_calibrations = KnownCalibrations(context)
         self.rerotation = Rerotation(context, self.tenants)
         self.tenant_erasures = TenantErasures(context, self.tenants, self.api_keys)

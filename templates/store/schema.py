@@ -45,9 +45,6 @@ ATTEMPT_LINES = text(
     "action IN ('verify', 'lockout-reset', 'erase') AND "
     "outcome IN ('accept', 'reject', 'reset', 'erased', 'nothing_held', 'receipt_repeated')"
 )
-ENROLLMENT_LINES = text(
-    "outcome IN ('created', 'replaced', 'erased', 'nothing_held', 'receipt_repeated')"
-)
 NONCE_LINES = text("nonce IS NOT NULL")
 
 KEY_ID = String(16)
@@ -281,7 +278,6 @@ class AuditRow(Base):
                 ("ix_audit_log_key_lines", "detail", KEY_LINES),
                 ("ix_audit_log_tenant_lines", "tenant", TENANT_LINES),
                 ("ix_audit_log_attempt_lines", "pseudonym", ATTEMPT_LINES),
-                ("ix_audit_log_enrollment_lines", "pseudonym", ENROLLMENT_LINES),
             )
         ),
         Index(

@@ -1,10 +1,9 @@
 """Subjects and their templates: put, get, describe, list."""
 
 import uuid
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
-from typing import Any
+from typing import Any, Literal
 
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
@@ -43,8 +42,6 @@ MAX_WIRE_BYTES = 4 * 1024 * 1024  # a float32 template of n = 4096, m = 192 has 
 MAX_PAGE = 1000
 
 _CURSOR_PURPOSE = "list-cursor"
-
-Guard = Callable[[Connection, Sequence[str]], Entry | None]
 
 
 class EnrollmentConflict(StoreError):
@@ -139,7 +136,7 @@ class Subjects:
         rotation_epoch: int | None = None,
         storage: Storage = Storage.SERVICE,
         precondition: Precondition | None = None,
-        guard: Guard | None = None,
+        action: Literal["enroll", "import"] = "enroll",
         nonce: Nonce | None = None,
         by: By = PROGRAM,
     ) -> StoredTemplate:
@@ -164,10 +161,8 @@ class Subjects:
             Who keeps the sealed template. A holder's is returned, and all but it is stored.
         precondition
             What may be replaced; whatever there is by default.
-        guard
-            Called in the transaction with its connection and the subject's pseudonyms, before
-            anything is written. What it raises takes the enrollment back; what it returns goes
-            into the audit log before the enrollment's own line.
+        action
+            What the line of the audit log calls it.
         nonce
             Of the token that allows the enrollment, which uses it up; None where none is needed.
         by
@@ -197,8 +192,7 @@ class Subjects:
         context = self._context
 
         def work(connection: Connection) -> StoredTemplate:
-            pseudonyms = context.signer.pseudonyms(tenant, subject_id)
-            pseudonym = pseudonyms[0]
+            pseudonym = context.signer.pseudonym(tenant, subject_id)
             owner_row = connection.execute(_TENANT.where(TenantRow.name == tenant)).one_or_none()
             if owner_row is None:
                 raise UnknownTenant.named(tenant)
@@ -212,7 +206,6 @@ class Subjects:
                 if enrolled != precondition.template_id:
                     raise EnrollmentConflict(enrolled)
             nonce_digest = None if nonce is None else self._nonces.use(connection, nonce)
-            guard_entry = None if guard is None else guard(connection, pseudonyms)
             now = context.clock()
             is_new, subject_pk = enrolled_pk is None, enrolled_pk or uuid.uuid4().hex
             owner = Owner(
@@ -239,13 +232,9 @@ class Subjects:
                     )
                     .values(known=True)
                 )
-            if guard_entry is not None:
-                context.audit_log.append(connection, guard_entry)
             outcome = "created" if is_new else "replaced"
             detail = storage.value if is_held else None
-            entry = Entry(
-                "enroll", outcome, by, tenant, pseudonym, detail=detail, nonce=nonce_digest
-            )
+            entry = Entry(action, outcome, by, tenant, pseudonym, detail=detail, nonce=nonce_digest)
             context.audit_log.append(connection, entry)
             return StoredTemplate(template_id, is_new, envelope.ciphertext if is_held else None)
 
@@ -253,6 +242,25 @@ class Subjects:
         if not stored.created:
             context.database.purge_log()
         return stored
+
+    def record_export(self, tenant: str, subject_id: str, *, template_id: str, by: By) -> None:
+        """Write the line of an export, while the template is still the subject's.
+
+        Raises
+        ------
+        StoreBusy
+            If the subject was enrolled again, or erased, since the template was read.
+        """
+        context = self._context
+
+        def work(connection: Connection) -> None:
+            if connection.execute(_EXPORTED, subject).scalar_one_or_none() != template_id:
+                raise StoreBusy("the subject was enrolled again or erased meanwhile: send it again")
+            pseudonym = context.signer.pseudonym(tenant, subject_id)
+            context.audit_log.append(connection, Entry("export", "exported", by, tenant, pseudonym))
+
+        subject = {"tenant": tenant, "subject_id": checked_subject_id(subject_id)}
+        context.write(work, lock=subject_lock(tenant, subject_id))
 
     def get(
         self, tenant: str, subject_id: str, *, held_template: bytes | None = None
@@ -344,6 +352,15 @@ class Subjects:
 
 
 _TENANT = sa.select(TenantRow.id, TenantRow.rotation_epoch)
+_EXPORTED: Any = (
+    sa.select(TemplateRow.template_id)
+    .join(SubjectRow, SubjectRow.id == TemplateRow.subject_pk)
+    .join(TenantRow, TenantRow.id == SubjectRow.tenant_id)
+    .where(
+        TenantRow.name == sa.bindparam("tenant"),
+        SubjectRow.subject_id == sa.bindparam("subject_id"),
+    )
+)
 _TEMPLATE_ID = sa.select(TemplateRow.template_id).where(
     TemplateRow.subject_pk == sa.bindparam("pk")
 )

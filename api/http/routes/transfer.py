@@ -74,7 +74,6 @@ async def export_subject(
             "forbidden",
             "invalid_template",
             "contract_mismatch",
-            "export_superseded",
             "enrollment_conflict",
         ),
     },
@@ -88,24 +87,16 @@ async def import_subject(
     gate: GateDep,
     precondition: PreconditionDep,
 ) -> Response:
-    """Right: `export`. The template gets a new id, and a rotation of the importing tenant's.
+    """Rights: `export` and `admin`. The template gets a new id, and a rotation of the tenant's.
 
-    It needs a holder's key where it did before, and the same one.
-
-    An export that is older than the subject's last enrollment or erasure is refused
-    (`export_superseded`), unless the body says `"restore": true` and the key has `admin` too.
+    It needs a holder's key where it did before, and the same one. An old export brings back who was
+    erased since, and undoes a later enrollment: the audit log has a line, with the action `import`.
     `If-None-Match` and `If-Match` say what may be replaced, as of an enrollment.
     """
+    caller.require("admin")
     settings = runtime.settings
     async with gate.admitted(caller.prefix):
-        body = await sent_json(request, settings, ("export", "restore"))
-        restore = body.get("restore", False)
-        if not isinstance(restore, bool):
-            raise ApiError(
-                "validation_failed", "restore must be true or false", {"field": "restore"}
-            )
-        if restore:
-            caller.require("admin")
+        body = await sent_json(request, settings, ("export",))
         data = base64_field(body.get("export"), "export", code="invalid_template")
         exported = await gate.query(
             lambda: open_export(
@@ -113,15 +104,10 @@ async def import_subject(
                 key=runtime.export_key,
                 tenant=caller.tenant,
                 contract_ids=runtime.contract.binding.contract_ids,
-                restore=restore,
             )
         )
         subject = checked_subject_id(exported.subject_id)
         note_subject(request, runtime.store.signer.pseudonym(caller.tenant, subject))
-
-        guard = runtime.store.transfers.guard(
-            caller.tenant, exported.stamp, restore=restore, by=by(request)
-        )
 
         def work() -> dict[str, Any]:
             epoch = runtime.epoch(caller.tenant)
@@ -142,8 +128,8 @@ async def import_subject(
                 source=Source(exported.source),
                 photos=exported.photos,
                 precondition=precondition,
+                action="import",
                 by=by(request),
-                guard=guard,
             )
             return {
                 "template_id": stored.template_id,

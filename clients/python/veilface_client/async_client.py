@@ -105,14 +105,9 @@ class AsyncSession:
         """Export a subject, encrypted."""
         return await self._send(calls.export(subject))
 
-    async def import_(
-        self,
-        exported: str | results.Export,
-        *,
-        restore: bool = False,
-    ) -> results.Imported:
-        """Import what :meth:`export` returned."""
-        return await self._send(calls.import_(exported, restore=restore))
+    async def import_(self, exported: str | results.Export) -> results.Imported:
+        """Import what :meth:`export` returned. Rights: ``export`` and ``admin``."""
+        return await self._send(calls.import_(exported))
 
     async def create_token(
         self,

@@ -281,16 +281,14 @@ def export(subject: str) -> Call[results.Export]:
     return Call("GET", path, lambda answer: parse(results.Export, answer))
 
 
-def import_(exported: str | results.Export, *, restore: bool) -> Call[results.Imported]:
+def import_(exported: str | results.Export) -> Call[results.Imported]:
     """Import what was exported."""
     text = exported.export if isinstance(exported, results.Export) else exported
-    body = {"export": text, "restore": True} if restore else {"export": text}
     return Call(
         "POST",
         "/v1/subjects/import",
         lambda answer: parse(results.Imported, answer),
-        lambda: {"json": body},
-        Resend.WHEN_NOT_DONE,  # what went in already would be refused
+        lambda: {"json": {"export": text}},
     )
 
 

@@ -120,18 +120,9 @@ class Session:
         """Export a subject, encrypted. Right: ``export``."""
         return self._send(calls.export(subject))
 
-    def import_(
-        self,
-        exported: str | results.Export,
-        *,
-        restore: bool = False,
-    ) -> results.Imported:
-        """Import what :meth:`export` returned. Right: ``export``.
-
-        One that is older than the subject's last enrollment or erasure is a :class:`Conflict`,
-        unless ``restore`` is set, which takes the right ``admin`` too.
-        """
-        return self._send(calls.import_(exported, restore=restore))
+    def import_(self, exported: str | results.Export) -> results.Imported:
+        """Import what :meth:`export` returned. Rights: ``export`` and ``admin``."""
+        return self._send(calls.import_(exported))
 
     def create_token(
         self,

@@ -198,7 +198,6 @@ FAMILIES: dict[str, type[ServiceError]] = {
     "method_not_allowed": InvalidRequest,
     "contract_mismatch": ContractMismatch,
     "enrollment_conflict": EnrollmentConflict,
-    "export_superseded": Conflict,
     "template_not_stored": Conflict,
     "image_too_large": PhotoRefused,
     "request_too_large": InvalidRequest,

@@ -90,7 +90,7 @@ def test_its_templates_are_exported_and_its_exports_imported(
     data = service.get("/v1/subjects/ann/export").json()
     assert data["contract_id"] == binding.contract_id
     assert service.delete("/v1/subjects/ann").status_code == 200
-    sent = {"export": data["export"], "restore": True}
+    sent = {"export": data["export"]}
     assert service.post("/v1/subjects/import", json=sent).status_code == 201
     assert decision(service, "ann", 1) == "accept"
     assert decision(service, "ann", 2) == "reject"

@@ -1,7 +1,6 @@
 import base64
 import json
 import os
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -37,118 +36,36 @@ def verdict(client: Client, subject: str, person: int) -> str:
     return str(answer.json()["decision"])
 
 
+def send(client: Client, data: str, token: str | None = None) -> Any:
+    headers = {} if token is None else bearer(token)
+    return client.post("/v1/subjects/import", json={"export": data}, headers=headers)
+
+
 def test_there_and_back(both: tuple[Client, Deployment]) -> None:
     client, _ = both
     data = exported(client, "travels")
     client.delete("/v1/subjects/travels")
-    restored = {"export": data, "restore": True}
-    body = assert_answer(client.post("/v1/subjects/import", json=restored), 201, ImportAnswer)
+    body = assert_answer(send(client, data), 201, ImportAnswer)
     assert (body["subject_id"], body["replaced"]) == ("travels", False)
     assert verdict(client, "travels", 1) == "accept"
     assert verdict(client, "travels", 2) == "reject"
     described = client.get("/v1/subjects/travels").json()
     assert (described["enrolled_by"], described["photos"]) == ("photos", 1)
-    again = client.post("/v1/subjects/import", json=restored)
-    assert assert_answer(again, 200, ImportAnswer)["replaced"] is True
+    assert assert_answer(send(client, data), 200, ImportAnswer)["replaced"] is True
 
 
-def send(client: Client, data: str, token: str | None = None, **more: object) -> Any:
-    headers = {} if token is None else bearer(token)
-    return client.post("/v1/subjects/import", json={"export": data, **more}, headers=headers)
-
-
-def test_an_old_export_undoes_no_erasure(both: tuple[Client, Deployment]) -> None:
-    client, _ = both
-    data = exported(client, "erased")
-    assert client.delete("/v1/subjects/erased").status_code == 200
-    for _ in range(2):
-        assert_error(send(client, data), 409, "export_superseded")
-    assert_error(client.get("/v1/subjects/erased"), 404, "not_enrolled")
-
-
-def test_an_old_export_undoes_no_enrollment(both: tuple[Client, Deployment]) -> None:
-    """The thief enrolled his face, took an export, and the subject enrolled again."""
-    client, _ = both
-    data = exported(client, "anna", person=2)
-    exported(client, "anna", person=1)
-    now = client.get("/v1/subjects/anna").json()["template_id"]
-    assert_error(send(client, data), 409, "export_superseded")
-    assert client.get("/v1/subjects/anna").json()["template_id"] == now
-    assert verdict(client, "anna", 2) == "reject"
-
-
-def test_the_export_of_what_is_enrolled_now_comes_back(both: tuple[Client, Deployment]) -> None:
-    client, _ = both
-    exported(client, "anna", person=2)
-    assert send(client, exported(client, "anna", person=1)).status_code == 200
-    assert verdict(client, "anna", 1) == "accept"
-
-
-def test_a_lock_that_was_not_there_supersedes_no_export(both: tuple[Client, Deployment]) -> None:
-    client, _ = both
-    data = exported(client, "anna", person=1)
-    assert client.delete("/v1/subjects/anna/lockout").status_code == 200
-    assert send(client, data).status_code == 200
-
-
-def test_an_erased_tenant_is_not_brought_back(both: tuple[Client, Deployment]) -> None:
-    client, deployment = both
-    token = deployment.key("enroll", "export", tenant="other")
-    client.headers.update(bearer(token))
-    data = exported(client, "anna")
-    client.app.state.runtime.store.tenant_erasures.erase("other")
-    again = deployment.key("enroll", "export", tenant="other")
-    assert_error(send(client, data, again), 409, "export_superseded")
-
-
-def test_an_operator_restores_knowingly(both: tuple[Client, Deployment]) -> None:
+def test_an_import_needs_admin_too_and_leaves_a_line(both: tuple[Client, Deployment]) -> None:
+    """An old export brings back who was erased: so the operator decides, and the log tells."""
     client, deployment = both
     data = exported(client, "anna")
     assert client.delete("/v1/subjects/anna").status_code == 200
-    mover = deployment.key("enroll", "export")
-    assert_error(send(client, data, mover, restore=True), 403, "forbidden")
-    assert_error(send(client, data, restore="yes"), 422, "validation_failed")
-    assert_error(send(client, data, mover, restore=False), 409, "export_superseded")
-    assert send(client, data, restore=True).status_code == 201
+    for rights in (("enroll", "export"), ("enroll", "admin")):
+        assert_error(send(client, data, deployment.key(*rights)), 403, "forbidden")
+    assert send(client, data, deployment.key("export", "admin")).status_code == 201
     assert verdict(client, "anna", 1) == "accept"
-    store = client.app.state.runtime.store
-    pseudonym = store.signer.pseudonym("default", "anna")
-    lines = [line for line in store.audit_log.lines() if line.pseudonym == pseudonym]
-    about = [(line.action, line.outcome) for line in lines]
-    assert about[-3:-1] == [("import", "restored"), ("enroll", "created")]
-
-
-def test_times_decide_between_deployments(tmp_path: Path) -> None:
-    """Erased in the second deployment after the export of the first, and exported again."""
-    key_file = tmp_path / "export.key"
-    MasterKeyring.create(key_file)
-    first = deploy(tmp_path / "one", export_key_file=key_file)
-    second = deploy(tmp_path / "two", export_key_file=key_file)
-    with (
-        Client(create_app(first.settings), headers=bearer(first.token)) as one,
-        Client(create_app(second.settings), headers=bearer(second.token)) as two,
-    ):
-        early = exported(one, "moves")
-        assert send(two, early).status_code == 201
-        assert two.delete("/v1/subjects/moves").status_code == 200
-        assert_error(send(two, early), 409, "export_superseded")
-        late = one.get("/v1/subjects/moves/export").json()["export"]
-        assert send(two, late).status_code == 201
-
-
-def test_an_export_without_a_time_is_older_than_anything(client: Client) -> None:
-    """One that an earlier version made: it moves in where nobody ever was."""
-    runtime: Runtime = client.app.state.runtime
-    inside = open_export(
-        base64.b64decode(exported(client, "old")),
-        key=runtime.export_key,
-        tenant="default",
-        contract_ids=runtime.contract.binding.contract_ids,
-    )
-    for subject, status in (("old", 409), ("new", 201)):
-        timeless = replace(inside, subject_id=subject, stamp=None)
-        blob = seal_export(timeless, key=runtime.export_key, tenant="default")
-        assert send(client, base64.b64encode(blob).decode()).status_code == status
+    log = client.app.state.runtime.store.audit_log.lines()
+    imports = [line.outcome for line in log if line.action == "import"][-3:]
+    assert imports == ["forbidden", "forbidden", "created"]
 
 
 def test_what_travels_is_not_rotated_and_not_what_is_stored(
@@ -177,7 +94,7 @@ def test_the_deployments_own_key_keeps_tenants_apart(
     client: Client, deployment: Deployment
 ) -> None:
     data = exported(client, "bound")
-    other = bearer(deployment.key("export", tenant="other"))
+    other = bearer(deployment.key("export", "admin", tenant="other"))
     answer = client.post("/v1/subjects/import", json={"export": data}, headers=other)
     assert_error(answer, 400, "invalid_template")
 

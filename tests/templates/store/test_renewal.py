@@ -31,7 +31,6 @@ from templates.store.schema import (
     SecretRow,
 )
 from templates.store.secret import Secret, SecretName
-from templates.store.transfers import ExportSuperseded
 from tests.patience import PATIENCE_S
 from tests.templates.store.conftest import Clock, put
 from tests.templates.store.test_attempts import attempt
@@ -385,19 +384,6 @@ def test_a_made_up_receipt_in_the_database_is_not_signed_again(deployment: Deplo
     receipt = store.erasures.erase("default", "ada").receipt
     deployment.run(sa.update(ReceiptRow).values(body=receipt.body.replace("false", "true")))
     assert deployment.renew().receipts == 0
-
-
-def test_an_export_of_before_undoes_no_enrollment_of_before(
-    deployment: Deployment,
-) -> None:
-    store = deployment.store
-    template = put(store, "ada", b"wire").template_id
-    stamp = store.transfers.stamp("default", "ada", template_id=template, by=BY)
-    put(store, "ada", b"newer")
-    deployment.renew()
-    guard = store.transfers.guard("default", stamp, restore=False, by=BY)
-    with pytest.raises(ExportSuperseded):
-        put(store, "ada", b"wire", guard=guard)
 
 
 def test_tenants_are_left_until_their_rotation_is_renewed(deployment: Deployment) -> None:

@@ -79,18 +79,6 @@ def upgrade() -> None:
         ),
     )
     op.create_index(
-        "ix_audit_log_enrollment_lines",
-        "audit_log",
-        ["pseudonym", "sequence"],
-        unique=False,
-        sqlite_where=sa.text(
-            "outcome IN ('created', 'replaced', 'erased', 'nothing_held', 'receipt_repeated')"
-        ),
-        postgresql_where=sa.text(
-            "outcome IN ('created', 'replaced', 'erased', 'nothing_held', 'receipt_repeated')"
-        ),
-    )
-    op.create_index(
         "ix_audit_log_key_lines",
         "audit_log",
         ["detail", "sequence"],
