@@ -15,6 +15,7 @@
     │   └── ForeignTemplate      a sealed template that was altered, or is another owner's [16]
     ├── StoreError
     │   ├── StoreUnavailable     the database does not answer
+    │   │   ├── DatabaseFileRemoved  its file is not the one that was opened
     │   │   └── StoreBusy        it answers, but this request not now
     │   │       └── Superseded   a decision on a template that was replaced or erased [12]
     │   ├── InvalidIdentifier    a subject id, tenant name or cursor that breaks the rules [1]

@@ -91,12 +91,6 @@ export function form(name, photos, fields = {}) {
   return data;
 }
 
-// 32 random hexadecimal digits; randomUUID is there in secure contexts only.
-export const nonce = () =>
-  Array.from(crypto.getRandomValues(new Uint8Array(16)), (each) =>
-    each.toString(16).padStart(2, "0"),
-  ).join("");
-
 export async function learn() {
   if (LIFTS) session.mode ??= await import("./private.js").catch(() => null);
   [session.own, session.contract] = await Promise.all([

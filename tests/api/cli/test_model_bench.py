@@ -144,7 +144,7 @@ def test_photos_of_ones_own_are_embedded_equally_often(
         (("--threads", "two"), 2, "--threads takes whole numbers"),
         (("--threads", "300"), 2, "--threads takes numbers from 1 to 256, not 300"),
         (("--repeats", "0"), 2, "repeats"),
-        (("--photo", "absent.png"), 1, "absent.png: No such file"),
+        (("--photo", "absent.png"), 2, "no such photo: absent.png"),
         (("--photo", __file__), 1, "test_model_bench.py: "),
     ],
 )

@@ -146,11 +146,12 @@ def test_a_lost_answer(node: Node, service: Running) -> None:
     assert first["lift"].startswith("Enrollable")
     assert again["value"]["replaced"] is True, "what the first sending wrote"
     assert (lost["error"], decided["value"]["accepted"]) == ("ConnectionFailed", True)
-    enrolled, lost = calls(
+    _, enrolled, lost = calls(
         node,
         service,
         [
-            {"call": "enroll", "args": ["js-resent", [rgb(6, 0)]], "lost": 0},
+            {"call": "prepare"},
+            {"call": "enroll", "args": ["js-resent", [rgb(6, 0)]], "lost": 1},
             {**probe, "lost": 3},
         ],
         retries={"first": 0.01},

@@ -71,7 +71,7 @@ ZERO = ROWS * np.array([[1], [0], [1]])
         ({"paths": PATHS, "descriptors": ROWS.astype(complex)}, "descriptors is of type c16"),
         ({"paths": PATHS.astype("S"), "descriptors": ROWS}, "paths is of type S1"),
         ({"paths": PATHS.astype(object), "descriptors": ROWS}, "paths is of type O8"),
-        ({"paths": PATHS, "descriptors": NAN}, r"3 fault\(s\).*embedding of 'a' is not finite"),
+        ({"paths": PATHS, "descriptors": NAN}, r"3 faults.*embedding of 'a' is not finite"),
         ({"paths": PATHS, "descriptors": ZERO}, "embedding of 'b' is zero"),
         ({"paths": np.array(["a", "b", "a"]), "descriptors": ROWS}, "'a' occurs twice"),
     ],

@@ -102,7 +102,7 @@ def test_people(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (table(HEADER, "a,b,perhaps", OTHER), r"10 fault\(s\).*line 2 has neither 1/true/yes"),
+        (table(HEADER, "a,b,perhaps", OTHER), r"10 faults.*line 2 has neither 1/true/yes"),
         (table(HEADER, "https://x.org/a.png,b,1", OTHER), "line 2 has a URL in path_a"),
         (table(HEADER, "a,file:///b,1", OTHER), "line 2 has a URL in path_b"),
         (table(HEADER, ",b,1", OTHER), "line 2 has no path in path_a"),
@@ -117,7 +117,7 @@ def test_people(tmp_path: Path) -> None:
         (HEADER, "holds no pair"),
         ("", "no column path_a"),
         (table(HEADER, SAME, SAME), "fold 1 has no impostor pair"),
-        (table(HEADER, "x.png,y.png,1", OTHER), r"2 fault\(s\).*x.png is not there; y.png is"),
+        (table(HEADER, "x.png,y.png,1", OTHER), r"2 faults.*x.png is not there; y.png is"),
     ],
 )
 def test_faults_are_listed_by_line(tmp_path: Path, text: str, message: str) -> None:
