@@ -31,7 +31,7 @@ from tests.reliability.service import ROOT, Service
 from tests.reliability.switch import Switch
 
 PAGE = (ROOT / "docs" / "deployment.md").read_text(encoding="utf-8")
-PACKAGES = ("api", "attacks", "enroll", "models", "templates", "verify")
+PACKAGES = ("api", "attacks", "enroll", "models", "templates", "veilface", "verify")
 PEOPLE = {"ann": 1, "ben": 2, "cas": 3}
 AFTER = f"{int(NEWEST) + 1:04}_serves_{NEWEST}"
 MIGRATION = f'''
@@ -78,9 +78,9 @@ def next_version(tmp_path: Path) -> Path:
     migrations = folder / "templates" / "store" / "migrations" / "versions"
     (migrations / f"{AFTER[:4]}_more.py").write_text(MIGRATION)
     (folder / "bin").mkdir()
-    for name, program in {"python": "", "veilface": "-m api.cli"}.items():
+    for name, program in {"python": "", "veilface": "-P -m veilface"}.items():
         script = folder / "bin" / name
-        script.write_text(f'#!/bin/sh\ncd {folder} && exec {sys.executable} {program} "$@"\n')
+        script.write_text(f'#!/bin/sh\nPYTHONPATH={folder} exec {sys.executable} {program} "$@"\n')
         script.chmod(0o755)
     return folder
 
