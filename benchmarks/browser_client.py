@@ -265,7 +265,7 @@ def _step_before(tab: BrowserTab, subject: str) -> Locator:
     expect(tab.page.get_by_role("switch", name="Private mode")).to_be_checked()
     tab.page.get_by_label("Person's id").fill(subject)
     # Some of these photos have others in their background.
-    tab.page.get_by_label("Others may be in the picture").check()
+    tab.page.get_by_label("Others are in the picture").check()
     tab.page.get_by_role("button", name="Start camera").click()
     guidance = tab.page.locator(".guidance")
     expect(guidance).to_have_attribute("data-state", re.compile("good|bad"))

@@ -18,6 +18,8 @@ from tests.web.served import Served
 
 pytestmark = pytest.mark.long
 
+NO_FACE = "No face found. Come closer, and face the camera with your head upright."
+
 WATCH = """
 window.tracks = [];
 window.sent = [];
@@ -180,9 +182,7 @@ def test_the_photo_that_is_sent_was_itself_checked(
     page.get_by_role("button", name="Remove photo").click()
     page.get_by_role("button", name="Start camera").click()
     page.get_by_role("button", name="Take 3 photos").click()
-    expect(page.locator(".refused")).to_have_text(
-        "None of 3 photos taken. No face found. Face the camera, with your head upright."
-    )
+    expect(page.locator(".refused")).to_have_text(f"None of 3 photos taken. {NO_FACE}")
     expect(page.locator(".tray li")).to_have_count(0)
 
 
@@ -237,9 +237,7 @@ def test_one_click_takes_three_photos_and_drops_what_would_not_do(
     page.evaluate(f"() => {{ {BLACK} }}")
     page.get_by_role("button", name="Take 3 photos").click()
     expect(page.locator(".tray .seen[data-state=good]")).to_have_count(2)
-    expect(page.locator(".refused")).to_have_text(
-        "2 of 3 photos taken. No face found. Face the camera, with your head upright."
-    )
+    expect(page.locator(".refused")).to_have_text(f"2 of 3 photos taken. {NO_FACE}")
     expect(page.get_by_role("button", name="Take 3 photos")).to_be_enabled()
     times = page.evaluate("window.shots")
     assert len(times) == 3
