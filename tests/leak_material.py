@@ -2,6 +2,7 @@
 
 import io
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from PIL import Image
 from api.process.preparation import binding_for
 from models.cache import EmbeddingCache
 from models.decoding import decode_image
+from models.errors import FaceError
 from models.extraction import Extractor
 from models.pack import ModelPack
 from templates.decoys import DecoyPool
@@ -59,7 +61,8 @@ def make_material(
     sealer = KeyringSealer(keyring)
     cache = EmbeddingCache.open_file(folder / "cache.veil", sealer)
     names = sorted(path.name for path in people.iterdir())
-    sitters, others = names[:PEOPLE], names[PEOPLE:]
+    sitters = list(islice((name for name in names if _usable(pack, people / name)), PEOPLE))
+    others = [name for name in names if name not in sitters]
 
     faces = sorted((decoys / "train").glob("*.jpg"))[::40][:110]
     pool = Extractor(pack, cache=cache).extract(faces).descriptors
@@ -96,6 +99,16 @@ def make_material(
 
 def _files(folder: Path) -> list[Path]:
     return sorted(folder.glob("*.jpg"))[: PHOTOS + 1]
+
+
+def _usable(pack: ModelPack, folder: Path) -> bool:
+    """Whether the service takes every photo: each shows one face that is clearly meant."""
+    try:
+        for path in _files(folder):
+            pack.crop_photo(path.read_bytes())
+    except FaceError:
+        return False
+    return True
 
 
 def _photo(pack: ModelPack, data: bytes) -> Photo:

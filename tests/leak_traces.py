@@ -300,18 +300,15 @@ def form(*photos: Photo, name: str = "images") -> list[tuple[str, tuple[str, byt
 def _enroll_and_verify(traces: ServiceTraces, client: httpx.Client, pid: int) -> None:
     material = traces.material
     for subject, photos in zip(traces.subjects, material.enrolled, strict=True):
-        answer = client.put(
-            f"/v1/subjects/{subject}/enrollment",
-            files=form(*photos),
-            data={"face": "largest"},
-        )
+        answer = client.put(f"/v1/subjects/{subject}/enrollment", files=form(*photos))
         assert answer.status_code == 201, answer.text
 
     def decide(kind: str, subject: str, **body: Any) -> None:
-        params = {"level": LEVEL} | ({"face": "largest"} if "json" not in body else {})
         path = f"/v1/subjects/{subject}/verify"
-        options = signed(path, f"Bearer {traces.token}", {"params": params, **body})
-        answer = client.post(path, **options)
+        for fields, sent in (("data", "files"), ("json", "json")):
+            if sent in body:
+                body[fields] = {"level": LEVEL, **body.get(fields, {})}
+        answer = client.post(path, **signed(path, f"Bearer {traces.token}", body))
         assert answer.status_code == 200, answer.text
         traces.decisions.setdefault(kind, []).append(answer.json()["decision"])
 
@@ -331,7 +328,9 @@ def _enroll_and_verify(traces: ServiceTraces, client: httpx.Client, pid: int) ->
     wire = _lifted(traces)
     decide("lifted", traces.subjects[1], json={"template": base64.b64encode(wire).decode()})
 
-    request = client.build_request("POST", "/", files=form(material.large, name="image"))
+    request = client.build_request(
+        "POST", "/", files=form(material.large, name="image"), data={"level": LEVEL}
+    )
     body = request.read()
 
     def slowly() -> Iterator[bytes]:
@@ -355,14 +354,10 @@ def _enroll_and_verify(traces: ServiceTraces, client: httpx.Client, pid: int) ->
 def _enroll_with_a_key(traces: ServiceTraces, client: httpx.Client) -> None:
     """Somebody else, whose template needs a key; it is sent in each place where it may stand."""
     key = base64.urlsafe_b64encode(traces.holder_key).decode()
-    path, largest = f"/v1/subjects/{secrets.token_hex(8)}", {"face": "largest"}
+    path = f"/v1/subjects/{secrets.token_hex(8)}"
     photos = traces.material.enrolled[1]
     header, text = {"Veilface-Holder-Key": key}, key.rstrip("=")
-    answer = client.put(
-        f"{path}/enrollment",
-        files=form(*photos),
-        data={**largest, "holder_key": text},
-    )
+    answer = client.put(f"{path}/enrollment", files=form(*photos), data={"holder_key": text})
     assert (answer.status_code, answer.json()["holder_key"]) == (201, True), answer.text
 
     def verify(**options: Any) -> httpx.Response:
@@ -372,7 +367,7 @@ def _enroll_with_a_key(traces: ServiceTraces, client: httpx.Client) -> None:
 
     numbers = photos[0].embedding.astype(float).tolist()
     answers = [
-        verify(files=form(photos[0], name="image"), data=largest, headers=header),
+        verify(files=form(photos[0], name="image"), headers=header),
         verify(json={"embedding": numbers, "holder_key": key}),
     ]
     assert [answer.json()["decision"] for answer in answers] == ["accept"] * 2
@@ -448,16 +443,14 @@ def _send_bad_requests(traces: ServiceTraces, client: httpx.Client) -> None:
     send("not_enrolled", "POST", "/v1/subjects/nobody/verify", json={"embedding": numbers})
     send("not_found", "GET", f"/v1/{traces.subjects[1]}")
     send("method_not_allowed", "POST", subject)
-    largest = {"face": "largest"}
-    enroll("inconsistent_images", files=form(photos[1], photos[2]), data=largest)
-    enroll("too_many_images", files=form(*[photos[1]] * 11), data=largest)
+    enroll("inconsistent_images", files=form(photos[1], photos[2]))
+    enroll("too_many_images", files=form(*[photos[1]] * 11))
     enroll("multiple_faces", files=both)
     enroll("no_face", files={"images": ("x.jpg", faceless.getvalue(), "image/jpeg")})
     enroll("unsupported_image", files={"images": ("x.jpg", photos[1].data[:3000], "image/jpeg")})
     enroll("malformed_request", files=form(photos[1]), data={"attributes": text})
     enroll("request_too_large", files=form(material.large, material.large, material.large))
-    enroll("enrollment_conflict", files=form(photos[1]), data=largest,
-           headers={"If-None-Match": "*"})  # fmt: skip
+    enroll("enrollment_conflict", files=form(photos[1]), headers={"If-None-Match": "*"})
 
 
 def _open_the_store(traces: ServiceTraces) -> None:
