@@ -25,7 +25,6 @@ from benchmarks.browser_client import (
 from benchmarks.browser_client import visit as open_page
 from benchmarks.end_to_end import Person
 from models.pack import ModelPack
-from models.selection import FacePolicy
 from tests.clients.conftest import Running
 from tests.clients.javascript.conftest import require_client
 from tests.clients.javascript.test_docs import EXAMPLE, FOR_PAGES
@@ -63,7 +62,7 @@ window.embedded = async (names) => {
   const samples = [];
   for (const name of names) {
     const image = await decodeImage(await (await fetch(`/photos/${name}`)).blob());
-    const { crop, embedding } = await pack.embedPhoto(image, { policy: "largest" });
+    const { crop, embedding } = await pack.embedPhoto(image, { policy: "dominant" });
     samples.push({ crop: [...crop.data], embedding: [...embedding] });
   }
   return samples;
@@ -127,7 +126,7 @@ def test_the_browser_sees_what_python_sees(
         "(names) => window.embedded(names)", list(photos)
     )
     for data, sample in zip(photos.values(), samples, strict=True):
-        taken = pack.crop_photo(data, policy=FacePolicy.LARGEST)
+        taken = pack.crop_photo(data)
         crop = np.asarray(sample["crop"]).reshape(taken.crop.shape)
         assert np.abs(crop - taken.crop.astype(int)).mean() < 1
         embedding = np.asarray(sample["embedding"], dtype=np.float32)
@@ -154,7 +153,7 @@ def test_the_page_of_the_documentation(
     sent = page.recording.sent
     assert sent.count(b'"hmac"') == 2
     data = own.read_bytes()
-    embedding = pack.embed_photo(data, policy=FacePolicy.LARGEST).embedding
+    embedding = pack.embed_photo(data).embedding
     search = LeakSearch(vectors={"embedding": embedding}, strings={"photo": data})
     assert search.find(sent) == []
     for planted in (as_bytes(embedding, "float32", little=True), base64.b64encode(data)):
