@@ -34,6 +34,7 @@ import numpy.typing as npt
 
 from benchmarks.deployment import database, service, settings_of, veilface
 from models.cache import EmbeddingCache
+from models.errors import FaceError
 from models.extraction import Extractor
 from models.pack import ModelPack
 from models.selection import FacePolicy
@@ -116,6 +117,23 @@ def people_of(folder: Path, *, enrolled: int = 3, burst: int = 1) -> list[Person
     return people
 
 
+def with_clear_faces(people: Sequence[Person], pack: ModelPack) -> list[Person]:
+    """Those of whom the service takes every photo: each shows one face that is clearly meant."""
+    return [
+        person
+        for person in people
+        if all(_is_usable(pack, photo) for photo in (*person.enroll, *person.probes))
+    ]
+
+
+def _is_usable(pack: ModelPack, photo: Path) -> bool:
+    try:
+        pack.crop_photo(photo.read_bytes())
+    except FaceError:
+        return False
+    return True
+
+
 def impostor_attempts(people: Sequence[Person], each: int) -> Iterator[tuple[Person, Photos]]:
     """``each`` other people, evenly spread over the list, for every probe."""
     count = len(people)
@@ -131,7 +149,7 @@ def enroll_photos(
     person: Person,
     attributes: dict[str, str] | None,
     *,
-    face: str = FacePolicy.LARGEST,
+    face: str = FacePolicy.DOMINANT,
 ) -> httpx.Response:
     """PUT the person's enrollment photos."""
     return client.put(
@@ -147,7 +165,7 @@ def verify_photos(
     photos: Photos,
     level: str,
     *,
-    face: str = FacePolicy.LARGEST,
+    face: str = FacePolicy.DOMINANT,
 ) -> httpx.Response:
     """POST the photos of one probe."""
     return client.post(

@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 from models.extraction import Extractor
 from models.pack import ModelPack
 from models.quality import Quality
-from models.selection import FacePolicy
 from templates.decoys import DecoyGenerator
 from templates.distances import Metric, pairwise_distances, similarity
 from templates.keys.randomness import Keystream
@@ -84,7 +83,7 @@ def main() -> None:
     pack = ModelPack.load(options.data / "packs" / options.pack, threads=1)
     folders = sorted(path for path in (options.data / "lfw" / "photos").iterdir() if path.is_dir())
     samples = [
-        pack.embed_photo(photo.read_bytes(), policy=FacePolicy.LARGEST)
+        pack.embed_photo(photo.read_bytes(), policy=None, quality=None)
         for folder in folders
         for photo in sorted(folder.glob("*.jpg"))[:PHOTOS]
     ]

@@ -29,7 +29,14 @@ import numpy.typing as npt
 from api.process.runtime import Runtime
 from api.settings import load_settings
 from benchmarks.deployment import service, veilface
-from benchmarks.end_to_end import UNLIMITED, Person, enroll_photos, people_of, verify_photos
+from benchmarks.end_to_end import (
+    UNLIMITED,
+    Person,
+    enroll_photos,
+    people_of,
+    verify_photos,
+    with_clear_faces,
+)
 from models.decoding import decode_image
 from models.pack import ModelPack
 
@@ -66,7 +73,8 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1)
     args = parser.parse_args()
     packs = args.pack or args.data / "packs" / "w600k_mbf"
-    people = people_of(args.data / "lfw" / "photos")
+    pack = ModelPack.load(packs, threads=args.threads)
+    people = with_clear_faces(people_of(args.data / "lfw" / "photos"), pack)
     clock = Clock()
     with ExitStack() as stack:
         fresh = Path(stack.enter_context(tempfile.TemporaryDirectory()))
@@ -91,7 +99,6 @@ def main() -> None:
         enrolled = people[:8]
         for person in enrolled:
             enroll_photos(client, person, None).raise_for_status()
-        pack = ModelPack.load(packs, threads=args.threads)
         attempts = [(person, photo) for person in enrolled for photo in person.probes]
         for turn in range(-10, args.rounds):
             person, photo = attempts[turn % len(attempts)]

@@ -37,11 +37,17 @@ import numpy as np
 import psutil
 
 from benchmarks.deployment import database, service, settings_of, veilface
-from benchmarks.end_to_end import LiftingClient, Person, enroll_photos, people_of, prepare
+from benchmarks.end_to_end import (
+    LiftingClient,
+    Person,
+    enroll_photos,
+    people_of,
+    prepare,
+    with_clear_faces,
+)
 from benchmarks.request_overhead import bare_inference
 from models.decoding import decode_image
 from models.pack import ModelPack
-from models.selection import FacePolicy
 from templates.keys.api_token import probe_key
 from templates.keys.probe_signature import probe_mac
 
@@ -86,7 +92,7 @@ def prepared_probes(
                 text = lifting.template([photo], dim)
                 signed, body = base64.b64decode(text), json.dumps({"template": text})[:-1].encode()
             else:
-                sample = pack.embed_photo(photo.read_bytes(), policy=FacePolicy.LARGEST)
+                sample = pack.embed_photo(photo.read_bytes())
                 signed = sample.embedding.astype(np.float64)
                 body = json.dumps({"embedding": signed.tolist()})[:-1].encode()
             made.append(Prepared(person.name, kind, body, signed, probe_key(token)))
@@ -94,12 +100,9 @@ def prepared_probes(
 
 
 def _form(photo: bytes) -> bytes:
-    fields = "".join(
-        f'--{BOUNDARY}\r\nContent-Disposition: form-data; name="{name}"\r\n\r\n{value}\r\n'
-        for name, value in (("level", LEVEL), ("face", "largest"))
-    )
     head = (
-        f'{fields}--{BOUNDARY}\r\nContent-Disposition: form-data; name="image"; '
+        f'--{BOUNDARY}\r\nContent-Disposition: form-data; name="level"\r\n\r\n{LEVEL}\r\n'
+        f'--{BOUNDARY}\r\nContent-Disposition: form-data; name="image"; '
         'filename="x.jpg"\r\nContent-Type: image/jpeg\r\n\r\n'
     )
     return head.encode() + photo + f"\r\n--{BOUNDARY}--\r\n".encode()
@@ -262,9 +265,9 @@ def main() -> None:
                 base_url=address, headers={"Authorization": f"Bearer {token}"}, timeout=120
             )
         )
-        people = people_of(args.data / "lfw" / "photos")[: args.people]
-        enrolled = [p for p in people if enroll_photos(client, p, None).status_code < 300]
         pack = ModelPack.load(args.pack, threads=1)
+        people = with_clear_faces(people_of(args.data / "lfw" / "photos")[: args.people], pack)
+        enrolled = [p for p in people if enroll_photos(client, p, None).status_code < 300]
         report: dict[str, Any] = {
             "database": args.database,
             "workers": args.workers,

@@ -44,6 +44,7 @@ from benchmarks.end_to_end import (
     people_of,
     prepare,
     verify_photos,
+    with_clear_faces,
 )
 from benchmarks.service_load import Prepared, accepted_probes, prepared_probes
 from models.pack import ModelPack
@@ -229,9 +230,10 @@ def main() -> None:
                 base_url=address, headers={"Authorization": f"Bearer {token}"}, timeout=120
             )
         )
-        people = people_of(args.data / "lfw" / "photos")[: args.people]
+        pack = ModelPack.load(args.pack, threads=1)
+        people = with_clear_faces(people_of(args.data / "lfw" / "photos")[: args.people], pack)
         load = Load(client, token, [p for p in people if enroll_photos(client, p, None).is_success])
-        load.prepare(address, ModelPack.load(args.pack, threads=1), args.probe_dim)
+        load.prepare(address, pack, args.probe_dim)
         (server,) = (p for p in psutil.Process().children() if "serve" in p.cmdline())
         rows = soak(
             load,

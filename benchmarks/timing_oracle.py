@@ -35,7 +35,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.deployment import database, service, settings_of, veilface
-from benchmarks.end_to_end import UNLIMITED, enroll_photos, people_of, prepare
+from benchmarks.end_to_end import (
+    UNLIMITED,
+    enroll_photos,
+    people_of,
+    prepare,
+    with_clear_faces,
+)
 from benchmarks.service_load import Prepared, prepared_probes
 from models.pack import ModelPack
 
@@ -134,7 +140,8 @@ def main() -> None:
         address = stack.enter_context(service(env, workers=1, log=args.work / "serve.log"))
         client = stack.enter_context(httpx.Client(base_url=address, timeout=60))
         client.headers["Authorization"] = f"Bearer {token}"
-        stranger, *people = people_of(args.data / "lfw" / "photos")
+        pack = ModelPack.load(args.pack, threads=1)
+        stranger, *people = with_clear_faces(people_of(args.data / "lfw" / "photos"), pack)
         half = len(people) // 2
         victims, keyed = people[:half], people[half : 2 * half]
         right, other = (base64.urlsafe_b64encode(os.urandom(32)).decode() for _ in range(2))
@@ -156,7 +163,6 @@ def main() -> None:
             "right key": (needing_key, right),
             "no key": (needing_key, None),
         }
-        pack = ModelPack.load(args.pack, threads=1)
         report: dict[str, Any] = {"database": args.database, "lockout": "off", "kinds": {}}
         for kind in args.kind.split(","):
             probe = prepared_probes(kind, [stranger], client, pack, asking, args.probe_dim)[0]
