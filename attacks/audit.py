@@ -1,59 +1,52 @@
 """The audit of templates: every attack on a template that we know, on people with photos."""
 
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from attacks.chosen_enrollment import chosen_enrollment
-from attacks.comparer import link_by_comparer
-from attacks.databases import link_databases
-from attacks.decision_walk import VICTIMS, reconstruct_from_decisions
 from attacks.errors import AuditError
 from attacks.further_faces import SAME_PHOTO, FurtherFaces, strangers_among
-from attacks.hill_climbing import Ask, climb_service, dictionary_outcomes
+from attacks.hill_climbing import climb_victims
 from attacks.holder_keys import (
     Guess,
     guess_from_few_decoys,
     guess_with_and_without_holder_keys,
 )
-from attacks.learned import FaceCrops, invert, reconstruct
-from attacks.learned.inverter import SECONDS, Inverter
-from attacks.likelihood import (
-    find_least_decoy_like,
-    likeliest_guess,
-    likeliest_guesses,
-    simulate_unlimited,
-)
+from attacks.learned import invert
+from attacks.learned.inverter import Inverter
 from attacks.linkage import link
 from attacks.outcomes import GENERATED, POOLED, AttackOutcome, Scheme
 from attacks.population import LEAST_FITTED, Population, draw_population, without_decoy_people
+from attacks.privacy import AttackSetup, Pairs, reduced
 from attacks.renewability import renew
 from attacks.several_templates import several_templates
 from attacks.stored import template_attacks
 from attacks.stored.foot_point import foot_points
+from attacks.stored.second_moments import (
+    ATTACK,
+    Guesser,
+    audit_setup,
+    second_moments_attack,
+)
 from attacks.system import System, enroll_victims, owners_pool
 from models.extraction import Extraction
 from models.pack import ModelPack
 from templates.contract import wire
 from templates.contract.binding import embedding_id
 from templates.contract.document import Contract
-from templates.decoys import NOISE_ENERGY, DecoyGenerator, DecoyPool, DecoySource
+from templates.decoys import DecoyGenerator, DecoyPool, DecoySource
 from templates.space.lifting import Strategy
 from verify.evaluation.attributes import resembling
+from verify.own_decoys import require_others
 
-LINKED = 120
+LINKED = 100
 """Victims whose templates are linked across tenants: every two of them are compared."""
-
-StartService = Callable[
-    [Contract, DecoySource | None, Sequence[bytes]],
-    AbstractContextManager[tuple[list[Ask], list[Ask]]],
-]
-"""Starts the service with a contract, decoys and templates (wire bytes); gives for each template
-a ``probe → answer`` callable with scores, and one with decisions only."""
+DEFAULT_SHARE = 0.83
+"""Of the decoys' variance, on the axes that are taken where nobody says how many."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,14 +54,14 @@ class AuditPlan:
     """What is attacked, and how hard.
 
     The contract of a service says its own scheme; without one, each of ``strategy`` and ``dims`` is
-    calibrated on people who are not attacked. ``comparison`` adds templates with decoys of the
-    ``owners``. ``training_seconds`` is for each network; None trains no inverter. ``decoy_faces``:
-    the number of faces that the generator was fitted to, where it is known; without it, no
-    attacker without limit is simulated.
+    calibrated on people who are not attacked. ``axes``: of the generator's; None for those that
+    hold 83 % of the variance. ``comparison`` adds templates with decoys of the ``owners``.
+    ``training_seconds`` is for the inverter; None trains none.
     """
 
     strategy: Strategy = Strategy.ADVERSARIAL
     dims: tuple[int, ...] = ()
+    axes: int | None = None
     contract: Contract | None = None
     victims: int = 300
     owners: int = 600
@@ -76,8 +69,6 @@ class AuditPlan:
     climbed: int = 10
     attempts: int = 1000
     training_seconds: float | None = 120.0
-    decoy_faces: int | None = None
-    reconstruction: bool = False
     seed: int = 0
 
 
@@ -98,8 +89,6 @@ def run_audit(
     *,
     pack: ModelPack,
     decoys: DecoySource | None,
-    aligned: bool,
-    start_service: StartService | None,
     further: Sequence[FurtherFaces] = (),
     progress: Callable[[float], None] = lambda _share: None,
 ) -> AuditResult:
@@ -109,8 +98,6 @@ def run_audit(
     ----------
     decoys
         What the service lifts with; None to fit a generator to people of no other group.
-    start_service
-        None where no service is attacked.
     further
         Faces that the attacker has beside those of ``faces``; the victims are left out.
     progress
@@ -120,6 +107,8 @@ def run_audit(
     ------
     AuditError
         There are too few people, or they are in the decoy pool.
+    ContractError
+        The decoys were made of these people.
     """
     population = draw_population(
         faces.descriptors, identities, victims=plan.victims, owners=plan.owners, seed=plan.seed
@@ -130,32 +119,27 @@ def run_audit(
             f"neither victims nor decoy owners, and needs {2 * LEAST_FITTED}: ask for fewer "
             "people (victims, owners), or give a larger folder"
         )
-    # Faces that the attacker has beside their own third: one of each person of no other part.
-    known = population.attacker[:0]
     if decoys is None:
         fitted, population = without_decoy_people(population, seed=plan.seed)
         info = pack.info
         space = embedding_id(embedder_sha256=info.embedder_sha256, preprocessing=info.preprocessing)
-        decoys = DecoyGenerator.fit(fitted, made_with=space, noise=NOISE_ENERGY / info.n)
-        plan = replace(plan, decoy_faces=len(fitted))
+        decoys = DecoyGenerator.fit(fitted, made_with=space)
     else:
-        known = population.owners.enrolled
         if isinstance(decoys, DecoyPool):
             _require_strangers(decoys, population)
+        require_others(decoys, faces.descriptors, identities)
     beside = [
         strangers_among(more, faces.descriptors, identities, population.victims.shown)
         for more in further
     ]
-    brought = np.concatenate([known[:0], *(more.descriptors for more in beside)])
     kind = " and ".join(["the audited set", *(more.name for more in beside)])
     schemes = _schemes(plan, decoys, population)
-    crops = FaceCrops(pack, faces, aligned=aligned) if plan.reconstruction else None
     result = AuditResult(
         [],
         [],
         [str(audited.scheme) for audited in schemes if audited.pool_of_owners],
         {
-            **_settings(plan, population, decoys, service=start_service is not None),
+            **_settings(plan, population, decoys),
             "further_attacker_faces": [more.to_json() for more in beside],
         },
     )
@@ -167,18 +151,32 @@ def run_audit(
             audited.source,
             embedder_sha256=pack.info.embedder_sha256,
             preprocessing=pack.info.preprocessing,
-            pool_of_owners=audited.pool_of_owners,
             contract=audited.contract,
             seed=plan.seed,
         )
         result.schemes.append({**audited.scheme.to_json(), **_operating_point(system)})
-        attacker_faces = brought if audited.pool_of_owners else np.concatenate([known, brought])
-        informed = replace(system, attacker=np.concatenate([system.attacker, attacker_faces]))
-        attacks = _attacks(plan, system, informed, population, faces, crops, start_service, kind)
+        known = _known(population, beside, with_owners=not audited.pool_of_owners)
+        victims = Pairs(population.victims.enrolled, population.victims.fresh)
+        setup = audit_setup(victims, *known, audited.source, seed=plan.seed)
+        attacks = _attacks(plan, system, setup, population, kind)
         for done, attack in enumerate(attacks, start=1):
             result.outcomes.extend(attack())
             progress((number + done / len(attacks)) / len(schemes))
     return result
+
+
+def _known(
+    population: Population, beside: Sequence[FurtherFaces], *, with_owners: bool
+) -> tuple[NDArray[np.float32], list[str]]:
+    """All photos of other people that a strong attacker has, and whose each is."""
+    rows, names = [population.known], [*population.known_names]
+    if with_owners:
+        rows += [population.owners.enrolled, population.owners.fresh]
+        names += 2 * [f"owner {number}" for number in range(len(population.owners))]
+    for more in beside:
+        rows.append(more.descriptors)
+        names += more.people
+    return np.concatenate(rows), names
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,13 +191,17 @@ class _AuditedScheme:
 
 def _schemes(plan: AuditPlan, source: DecoySource, population: Population) -> list[_AuditedScheme]:
     """The schemes to audit, and those to compare them with."""
-    strategy, dims = plan.strategy, plan.dims
+    strategy, dims, axes = plan.strategy, plan.dims, plan.axes
     if plan.contract is not None:
-        strategy, dims = plan.contract.binding.strategy, (plan.contract.binding.m,)
+        binding = plan.contract.binding
+        strategy, dims, axes = binding.strategy, (binding.m,), binding.axes
+    if isinstance(source, DecoyGenerator):
+        source = reduced(source, axes or source.axes_for(DEFAULT_SHARE))
     kind = POOLED if isinstance(source, DecoyPool) else GENERATED
     decoys = kind if strategy.needs_decoys else None
+    on = source.k if source.k < source.n else None
     schemes = [
-        _AuditedScheme(Scheme(strategy, decoys, m), source, False, plan.contract) for m in dims
+        _AuditedScheme(Scheme(strategy, decoys, m, on), source, False, plan.contract) for m in dims
     ]
     if plan.comparison and decoys == GENERATED:
         pool = owners_pool(population, source.made_with)
@@ -226,9 +228,7 @@ def _operating_point(system: System) -> dict[str, Any]:
     }
 
 
-def _settings(
-    plan: AuditPlan, population: Population, decoys: DecoySource, *, service: bool
-) -> dict[str, Any]:
+def _settings(plan: AuditPlan, population: Population, decoys: DecoySource) -> dict[str, Any]:
     return {
         "victims": plan.victims,
         "decoy_owners": plan.owners,
@@ -237,93 +237,46 @@ def _settings(
         "calibration": "of the people" if plan.contract is None else "of the contract",
         "contract_id": None if plan.contract is None else plan.contract.contract_id,
         "decoy_source_id": decoys.source_id,
-        "decoy_faces": plan.decoy_faces,
-        "service": service,
-        "attempts": plan.attempts if service else None,
+        "attempts": plan.attempts,
         "training_seconds": plan.training_seconds,
-        "reconstruction": plan.reconstruction,
         "seed": plan.seed,
     }
 
 
 def _attacks(
-    plan: AuditPlan,
-    system: System,
-    informed: System,
-    population: Population,
-    faces: Extraction,
-    crops: FaceCrops | None,
-    start_service: StartService | None,
-    kind: str,
+    plan: AuditPlan, system: System, setup: AttackSetup, population: Population, kind: str
 ) -> list[Callable[[], list[AttackOutcome]]]:
-    """All attacks on a scheme, in the order of the report; ``informed`` has all known faces."""
+    """All attacks on a scheme, in the order of the report."""
     inverters: dict[str, Inverter] = {}
-    likeliest = cache(lambda: likeliest_guesses(informed))
+    guesser = cache(lambda: _informed(system, setup))
     seconds = plan.training_seconds
-
-    def likelihood() -> list[AttackOutcome]:
-        outcomes = find_least_decoy_like(informed, likeliest(), kind=kind)
-        return outcomes + simulate_unlimited(
-            informed, kind=kind, fitted_to=plan.decoy_faces, measured=outcomes
-        )
 
     def learned() -> list[AttackOutcome]:
         if seconds is None:
             return []
-        inverter, outcomes = invert(informed, seconds=seconds, seed=plan.seed)
+        inverter, outcomes = invert(system, seconds=seconds, seed=plan.seed)
         inverters["inverter"] = inverter
         return outcomes
 
     def holders() -> list[AttackOutcome]:
-        guesses: dict[str, Guess] = {
-            "foot-point": foot_points,
-            "decoy-likelihood": likeliest_guess(informed),
-        }
+        guesses: dict[str, Guess] = {"foot-point": foot_points, ATTACK: guesser()}
         outcomes = guess_with_and_without_holder_keys(system, guesses | inverters)
-        return outcomes + guess_from_few_decoys(informed)
-
-    def drawn() -> list[AttackOutcome]:
-        if crops is None:
-            return []
-        guesses = dict(likeliest())
-        for name, inverter in inverters.items():
-            guesses[name] = inverter(system.templates)
-        return reconstruct(
-            system,
-            crops.of(population.rows),
-            faces.descriptors[population.rows],
-            crops.of(system.victims.shown),
-            embed=crops.embed,
-            guesses=guesses,
-            seconds=SECONDS if seconds is None else seconds,
-            seed=plan.seed,
-        )
-
-    def climbs() -> list[AttackOutcome]:
-        if start_service is None:
-            return []
-        templates = [
-            wire.encode(template, contract_id=system.contract.contract_id)
-            for template in system.templates[: plan.climbed]
-        ]
-        with start_service(system.contract, system.source, templates) as (scored, deciding):
-            return climb_service(
-                system, scored, deciding, most_attempts=plan.attempts, seed=plan.seed
-            )
+        return outcomes + guess_from_few_decoys(system)
 
     return [
-        likelihood,
+        lambda: second_moments_attack(system, setup, kind=kind),
         lambda: template_attacks(system),
         learned,
         holders,
-        lambda: several_templates(system, population.albums, likeliest_guess(informed)),
-        drawn,
-        lambda: link(system, liftings=3, most_people=LINKED),
-        lambda: link_by_comparer(system, population.mates),
-        lambda: link_databases(system, most_people=LINKED),
-        lambda: renew(system, guesses=likeliest()),
-        lambda: chosen_enrollment(system),
-        lambda: dictionary_outcomes(system),
-        lambda: reconstruct_from_decisions(system.first(VICTIMS)),
-        climbs,
+        lambda: several_templates(system, population.albums, guesser()),
+        lambda: link(system, liftings=2, most_people=LINKED),
+        lambda: renew(system, guesses={ATTACK: guesser()(system.templates)}),
+        lambda: climb_victims(
+            system.first(plan.climbed), most_attempts=plan.attempts, seed=plan.seed
+        ),
     ]
+
+
+def _informed(system: System, setup: AttackSetup) -> Guesser:
+    """The guess of the attacker with all faces, of those that know no victim's moments."""
+    return Guesser(replace(system, attacker=system.source.project(setup.counted[-1][1])))

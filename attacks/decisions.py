@@ -5,7 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from templates.contract.document import Calibration, Contract, Level
+from templates.contract.document import Calibration, Level
+from templates.contract.nobody import Nobody
 from templates.distances import paired_distances, pairwise_distances, similarity
 from templates.space.subspace import SubspaceBatch
 from verify.cohort import Probes, cohort_statistics, expected_similarity
@@ -25,7 +26,7 @@ class Scores(NamedTuple):
 def score(
     probes: Probes,
     templates: SubspaceBatch,
-    contract: Contract,
+    nobody: Nobody,
     calibration: Calibration,
     *,
     paired: bool = False,
@@ -38,10 +39,12 @@ def score(
 
     Parameters
     ----------
-    probes : (P, n) float32, or SubspaceBatch of P
+    probes : (P, k) float32, or SubspaceBatch of P
     templates : SubspaceBatch of T
     paired
         Probe i meets template i only.
+    nobody
+        Of the contract.
     cohort
         Instead of the contract's, which is secret, for lifted probes: an attacker tries with one of
         their own.
@@ -55,7 +58,7 @@ def score(
         )
     else:
         means, spreads = expected_similarity(
-            probes, contract, metric=calibration.metric, steps=calibration.steps
+            probes, nobody, metric=calibration.metric, steps=calibration.steps
         )
     if not paired:
         means, spreads = means[:, None], spreads[:, None]
@@ -65,7 +68,7 @@ def score(
 def decide(
     probes: Probes,
     templates: SubspaceBatch,
-    contract: Contract,
+    nobody: Nobody,
     calibration: Calibration,
     level: Level,
     *,
@@ -73,5 +76,5 @@ def decide(
     cohort: SubspaceBatch | None = None,
 ) -> NDArray[np.bool_]:
     """Decide at one level; see :func:`score`."""
-    scores = score(probes, templates, contract, calibration, paired=paired, cohort=cohort)
+    scores = score(probes, templates, nobody, calibration, paired=paired, cohort=cohort)
     return scores.at(level)

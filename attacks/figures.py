@@ -8,7 +8,6 @@ from matplotlib.figure import Figure
 
 from attacks.attributes.figure import attribute_figure
 from attacks.outcomes import Scheme
-from verify.evaluation.figures.frontier import frontier_figure
 from verify.evaluation.figures.style import (
     DASHES,
     HUES,
@@ -23,26 +22,21 @@ from verify.evaluation.figures.style import (
 )
 
 Row = Mapping[str, Any]
-NAMES = ("figure", "frontier", "linkage", "oracle")
+NAMES = ("figure", "linkage", "oracle")
 LINKAGE = "linkage"
 ORACLE = "oracle"
 PANEL_INCHES = (4.8, 3.4)
 HEADER_INCHES = 1.3
 
 
-def write_figures(
-    report: Row, out: Path, *, evaluation: Mapping[str, Any] | None = None
-) -> list[Path]:
+def write_figures(report: Row, out: Path) -> list[Path]:
     """Write the figures that the report has data for, as PNG and SVG; return their files.
 
     ``figure`` is the paper's, ``linkage`` the local D(s) of two tenants' templates, ``oracle`` the
-    paper's oracle curve, ``frontier`` accuracy over what leaks, where an evaluation is given.
+    paper's oracle curve.
     """
     drawings: dict[str, Callable[[], Figure | None]] = {
         "figure": lambda: attribute_figure(report["rows"]) if report["rows"] else None,
-        "frontier": lambda: (
-            frontier_figure(evaluation, report) if evaluation and report["rows"] else None
-        ),
         "linkage": lambda: linkage_figure(report["outcomes"]),
         "oracle": lambda: oracle_figure(report["outcomes"]),
     }

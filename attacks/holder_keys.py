@@ -8,16 +8,16 @@ both, on templates of so few decoys that it must succeed, what shows that it is 
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from attacks.likelihood import likeliest_guess
 from attacks.linkage import holder_rotations_of, turned, turned_back
 from attacks.outcomes import CONTROL, AttackOutcome, Knowledge, Leaked, judged_by_controls
 from attacks.recovery import recovery_outcome
 from attacks.stored.foot_point import foot_points
+from attacks.stored.second_moments import ATTACK, Guesser
 from attacks.system import System
 from templates.space.subspace import SubspaceBatch
 from verify.comparisons import through_wire
@@ -106,16 +106,15 @@ def guess_from_few_decoys(system: System) -> list[AttackOutcome]:
     Returns
     -------
     list of AttackOutcome
-        Foot point and likelihood, with the key kept and stolen; none where the system's own
+        Foot point and second moments, with the key kept and stolen; none where the system's own
         templates are of no more dimensions.
     """
-    scheme = replace(system.scheme, dim=CONTROL_DIM)
     if system.scheme.dim <= CONTROL_DIM:
         return []
     templates = system.lift(system.victims.enrolled, "few decoys", m=CONTROL_DIM)
     guesses: dict[str, Guess] = {
         "foot-point": foot_points,
-        "decoy-likelihood": likeliest_guess(replace(system, scheme=scheme)),
+        ATTACK: Guesser(system),
     }
     return [
         recovery_outcome(

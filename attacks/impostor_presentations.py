@@ -49,10 +49,10 @@ def verify_presentations(
         embedder_sha256=info.embedder_sha256, preprocessing=info.preprocessing, n=info.n
     )
     with Keystream.seeded("impostor presentations", seed) as stream:
-        rotation = TenantRotation(stream.token(KEY_BYTES), info.n)
+        rotation = TenantRotation(stream.token(KEY_BYTES), source.k)
         lift_secret = stream.token(KEY_BYTES)
     enroller = Enroller(contract, source, rotation=rotation, lift_secret=lift_secret)
-    verifier = Verifier(contract, rotation=rotation)
+    verifier = Verifier(contract, source, rotation=rotation)
     name = level or contract.default_level
     operating = contract.calibration("p2s", level=name).level(name)
 

@@ -3,10 +3,8 @@
 Without a secret, templates link by what they are for (docs/method.md §4.9). A rotation of each,
 drawn by the Haar measure, leaves of a template nothing but its foot point's length: two affine
 subspaces of one dimension are images of each other under a rotation exactly if their feet are
-equally long. Ours are taken to be as good, so that ``foot lengths`` is all that an attacker without
-a tenant's key can compare. With the key every rotation is derived, and undone: the control of
-every other score, which tells nothing of rotations where it links nobody without them.
-``attacks.databases`` has both whole databases.
+equally long. So the lengths are all that an attacker without a tenant's key can compare. With the
+key every rotation is derived, and undone.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -21,8 +19,7 @@ from attacks.unlinkability import Unlinkability, unlinkability
 from templates.contract.canonical import Json
 from templates.distances import Metric, pairwise_distances, similarity
 from templates.keys.randomness import KEY_BYTES, Keystream
-from templates.keys.rotation import Rotation, TenantRotation, holder_rotation
-from templates.space.embedding import normalised
+from templates.keys.rotation import SignedCosineRotation, TenantRotation, holder_rotation
 from templates.space.subspace import SubspaceBatch, Turn
 
 Array64 = NDArray[np.float64]
@@ -35,23 +32,13 @@ def nearest_similarities(left: SubspaceBatch, right: SubspaceBatch) -> Array64:
     return np.asarray(similarity(distances), dtype=np.float64)
 
 
-def foot_cosines(left: SubspaceBatch, right: SubspaceBatch) -> Array64:
-    """Cosines of the foot points, (T, U)."""
-    first, second = (normalised(batch.feet.astype(np.float64)) for batch in (left, right))
-    return np.asarray(first @ second.T)
-
-
 def foot_lengths(left: SubspaceBatch, right: SubspaceBatch) -> Array64:
     """−|‖p‖ − ‖q‖|, (T, U): the only score of two templates that no rotation changes."""
     return -np.abs(left.foot_norms[:, None] - right.foot_norms)
 
 
-LENGTHS = "foot lengths"
-SCORES: Mapping[str, Score] = {
-    "nearest points": nearest_similarities,
-    "foot points": foot_cosines,
-    LENGTHS: foot_lengths,
-}
+LENGTHS, NEAREST = "foot lengths", "nearest points"
+SCORES: Mapping[str, Score] = {NEAREST: nearest_similarities, LENGTHS: foot_lengths}
 
 
 @dataclass(frozen=True)
@@ -59,7 +46,7 @@ class _Setting:
     name: str
     leaked: Leaked
     assumption: str
-    scores: Sequence[str] = tuple(SCORES)
+    score: str = LENGTHS
 
 
 _SUCCESS = "; success is D_sys of the templates of the same people"
@@ -88,25 +75,27 @@ _SETTINGS = (
         Leaked.HOLDER_KEYS,
         assumption="One rotated template of each of two tenants, and the rotation keys of both"
         + _SUCCESS,
+        score=NEAREST,
     ),
     _Setting(
         _ONE_SET,
         Leaked.MASTER_KEY,
         assumption="One template of each of two tenants, the same set in two rotations, which its "
         "length must tell (a control)" + _SUCCESS,
-        scores=(LENGTHS,),
     ),
 )
 
 
-def rotations_of(system: System, tenant: str, templates: str, count: int) -> list[Rotation]:
+def rotations_of(
+    system: System, tenant: str, templates: str, count: int
+) -> list[SignedCosineRotation]:
     """Return the rotations of some templates of a tenant of the experiment, one for each."""
     with Keystream.seeded("audit", system.seed, "tenant key", tenant) as stream:
         rotation = TenantRotation(stream.token(KEY_BYTES), system.templates.n)
     return [rotation.of(f"{templates} {number}") for number in range(count)]
 
 
-def holder_rotations_of(system: System, enrollment: str, count: int) -> list[Rotation]:
+def holder_rotations_of(system: System, enrollment: str, count: int) -> list[SignedCosineRotation]:
     """Return the rotations of an enrollment of some people, each under a key of their own."""
     with Keystream.seeded("audit", system.seed, "holder keys") as stream:
         keys = [stream.token(KEY_BYTES) for _ in range(count)]
@@ -116,12 +105,12 @@ def holder_rotations_of(system: System, enrollment: str, count: int) -> list[Rot
     ]
 
 
-def turned(batch: SubspaceBatch, rotations: Sequence[Rotation]) -> SubspaceBatch:
+def turned(batch: SubspaceBatch, rotations: Sequence[SignedCosineRotation]) -> SubspaceBatch:
     """Turn each template by its rotation."""
     return _each_turned(batch, [rotation.turned for rotation in rotations])
 
 
-def turned_back(batch: SubspaceBatch, rotations: Sequence[Rotation]) -> SubspaceBatch:
+def turned_back(batch: SubspaceBatch, rotations: Sequence[SignedCosineRotation]) -> SubspaceBatch:
     """Undo :func:`turned`."""
     return _each_turned(batch, [rotation.turned_back for rotation in rotations])
 
@@ -131,7 +120,9 @@ def _each_turned(batch: SubspaceBatch, turns: Sequence[Turn]) -> SubspaceBatch:
     return SubspaceBatch.of([template.turned_by(turn) for template, turn in pairs])
 
 
-def turned_points(points: NDArray[np.floating], rotations: Sequence[Rotation]) -> Array64:
+def turned_points(
+    points: NDArray[np.floating], rotations: Sequence[SignedCosineRotation]
+) -> Array64:
     """Turn each point, (V, n), by its rotation."""
     pairs = zip(points, rotations, strict=True)
     return np.concatenate([rotation.turned(point[None]) for point, rotation in pairs])
@@ -182,39 +173,33 @@ def link(system: System, *, liftings: int, most_people: int = 400) -> list[Attac
     Returns
     -------
     list of AttackOutcome
-        A row for each setting and score, named ``linkage``. Those in secret rotations are judged
-        where the same score links un-rotated templates; lengths, where they link one set in two
-        rotations, a control that is the last row.
+        A row for each setting, named ``linkage``. Those in secret rotations are judged where
+        lengths link one set in two rotations, a control that is the last row.
     """
     enrolled = system.victims.enrolled[:most_people]
     fresh = system.victims.fresh[:most_people]
-    scores: dict[tuple[str, str], list[Array64]] = {}
+    scores: dict[str, list[Array64]] = {setting.name: [] for setting in _SETTINGS}
     for number in range(liftings):
         sides = _sides(system, enrolled, fresh, number)
         for setting in _SETTINGS:
-            for name in setting.scores:
-                score = SCORES[name](*sides[setting.name])
-                scores.setdefault((setting.name, name), []).append(score)
+            scores[setting.name].append(SCORES[setting.score](*sides[setting.name]))
     rows = {
-        (setting.name, name): linkage_outcome(
+        setting.name: linkage_outcome(
             system,
-            unlinkability(np.stack(scores[setting.name, name]), seed=system.seed),
+            unlinkability(np.stack(scores[setting.name]), seed=system.seed),
             attack="linkage",
-            variant=f"{setting.name}, {name}",
+            variant=f"{setting.name}, {setting.score}",
             leaked=setting.leaked,
             assumption=setting.assumption,
             unjudged=CONTROL if setting.name == _ONE_SET else None,
             details={"liftings": liftings},
         )
         for setting in _SETTINGS
-        for name in setting.scores
     }
-    unproven_by = {name: unproven(rows[_OPEN, name], "un-rotated templates") for name in SCORES} | {
-        LENGTHS: unproven(rows[_ONE_SET, LENGTHS], "one set in two rotations")
-    }
+    proven = unproven(rows[_ONE_SET], "one set in two rotations")
     return [
-        row if setting in (_OPEN, _ONE_SET) else replace(row, unjudged=unproven_by[name])
-        for (setting, name), row in rows.items()
+        row if name in (_OPEN, _ONE_SET) else replace(row, unjudged=proven)
+        for name, row in rows.items()
     ]
 
 

@@ -1,21 +1,58 @@
-"""The dimension of templates: the smallest at which they are private."""
+"""The axes and the dimension of templates: of the pairs that are private, the cheapest.
+
+They are chosen on one half of the victims and judged on the other.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
-from attacks.privacy import Privacy
+import numpy as np
+from numpy.typing import NDArray
+
+from attacks.privacy import (
+    LEAST_FACES,
+    LEAST_VICTIMS,
+    AttackSetup,
+    Pairs,
+    TestBed,
+    Theft,
+    all_thefts,
+    reduced,
+)
+from templates.contract.binding import MAX_M
+from templates.contract.canonical import Json
 from templates.contract.document import Contract
 from templates.contract.levels import Level, Rate
+from templates.contract.nobody import Nobody
 from templates.contract.verdict import Judgement
+from templates.decoys import DecoyGenerator, DecoySource, client_source
+from templates.distances import Metric
+from templates.keys.randomness import KEY_BYTES, Keystream
+from templates.space.lifting import Strategy, lift, plain_strategy
+from templates.space.subspace import SubspaceBatch
+from verify.metrics import rate, threshold_at_fmr
 
-DIMS = (32, 48, 64, 96, 128, 160, 192)
-"""Dimensions that are tried. Below 32 the foot point alone gives too many faces away."""
+SHARES_OF_VARIANCE = (0.76, 0.83, 0.90)
+"""Of the decoys' variance on the leading axes that are tried."""
+FEW_AXES = 256
+"""Embeddings of no more numbers are tried whole too: they have no idle axes."""
+RATIOS = (0.28, 0.41, 0.54)
+"""Dimensions that are measured, as shares of the axes; theft between them is interpolated."""
+MOST_BYTES = 60_000
+"""Of a stored template, in half precision."""
+STEP = 4
+"""Between dimensions that may be chosen."""
+AIM = 0.04
+"""Theft to aim at when choosing: below the limit, because other people are judged by it, and the
+standard error of such a share of 300 people is 1.1 %."""
 PRIVACY_LIMIT = 0.05
 """Most templates, as a share, that may give the strongest attacker a match for a fresh photo."""
-LEAST_VICTIMS = 100
-LEAST_FACES = 1_000
-"""Of people and of the attacker's faces; with fewer, attacks that are known to work do not. On LFW
-at m = 128, 194 faces found 13 of 40 people, and 3,512 more found 32 of the same."""
+PRIVACY_BOUND = 0.10
+"""Most that the one-sided 95 % upper bound of that share may be."""
+MOST_PROBES = 600
+PRICED_AT = 1e-3
+"""FMR at which the price in accuracy is estimated."""
 ACCURACY_LIMIT = 0.02
 """Largest false rejection rate of the default level, with the advised photos."""
 GROUP_LIMIT = 2.0
@@ -25,83 +62,260 @@ LAXEST_JUDGED = 1e-3
 ADVISED_PHOTOS = 3
 """Photos to enroll, and photos of a probe, that are advised: a camera takes them with one click."""
 
+Advance: TypeAlias = Callable[[float], None]
+
+
+@dataclass(frozen=True)
+class Tried:
+    """A pair of axes and dimension that was considered.
+
+    Parameters
+    ----------
+    theft
+        Share of templates that the strongest attacker is expected to open.
+    rejected
+        Single genuine photos that are rejected at FMR 1e-3, by a quick estimate; None where that
+        was not estimated: the pair is not private, or nobody has two photos.
+    """
+
+    axes: int
+    m: int
+    theft: float
+    rejected: Rate | None = None
+
+    def to_json(self) -> dict[str, Json]:
+        """JSON form."""
+        return {
+            "axes": self.axes,
+            "m": self.m,
+            "predicted_theft": round(self.theft, 4),
+            "rejected": None if self.rejected is None else self.rejected.to_json(),
+        }
+
 
 @dataclass(frozen=True)
 class OperatingPoint:
-    """A dimension, and what was measured at it and on the way to it.
+    """The pair of axes and dimension, why it was chosen, and how private it is.
 
     Parameters
     ----------
-    dim
-        The smallest that passes, and where none does, the one that was asked for instead.
+    axes, dim
+        k and m.
+    chosen
+        Why these: a few words.
     tried
-        Privacy by dimension, in rising order.
+        What was considered, each with what it would cost.
+    privacy
+        Of people who had no part in the choice.
     """
 
+    axes: int
     dim: int
-    tried: dict[int, Judgement]
+    chosen: str
+    tried: tuple[Tried, ...]
+    privacy: Judgement
 
 
-def smallest_private(
-    judge: Callable[[int], Judgement], dims: Sequence[int], *, otherwise: int
+def choose_and_judge(
+    setup: AttackSetup,
+    *,
+    strategy: Strategy,
+    axes: int | None = None,
+    m: int | None = None,
+    uncovered: str | None = None,
+    progress: Advance = lambda _share: None,
 ) -> OperatingPoint:
-    """Find the smallest of some dimensions whose templates are private, by bisection.
-
-    More decoys conceal better, so that a dimension above one that passes is taken to pass too.
+    """Choose axes and dimension on one half of the victims, and judge them on the other.
 
     Parameters
     ----------
-    otherwise
-        The dimension to take where none passes; measured as well.
+    axes, m
+        What is not to be chosen. With both, all victims are judged.
+    uncovered
+        As in :func:`judge_privacy`.
+    progress
+        Called with the share that is done.
     """
-    tried: dict[int, Judgement] = {}
-
-    def passes(dim: int) -> bool:
-        if dim not in tried:
-            tried[dim] = judge(dim)
-        return tried[dim].status == "PASS"
-
-    low, high = 0, len(dims)
-    while low < high:
-        middle = (low + high) // 2
-        if passes(dims[middle]):
-            high = middle
-        else:
-            low = middle + 1
-    dim = dims[low] if low < len(dims) else otherwise
-    if dim not in tried:
-        tried[dim] = judge(dim)
-    return OperatingPoint(dim, dict(sorted(tried.items())))
+    if axes is not None and m is not None:
+        chosen, judged = "asked for", setup
+        tried: tuple[Tried, ...] = ()
+    else:
+        choosing, judged = setup.halves()
+        axes, m, chosen, tried = choose(
+            choosing, strategy=strategy, axes=axes, m=m, progress=lambda one: progress(0.8 * one)
+        )
+    thefts = all_thefts(judged, strategy, axes=axes, m=m)
+    progress(1.0)
+    judgement = judge_privacy(thefts, axes=axes, m=m, uncovered=uncovered)
+    return OperatingPoint(axes, m, chosen, tried, judgement)
 
 
-def judge_privacy(privacy: Privacy, *, uncovered: str | None = None) -> Judgement:
-    """Hold what the strongest attacker gets against its limit.
+def choose(
+    setup: AttackSetup,
+    *,
+    strategy: Strategy,
+    axes: int | None = None,
+    m: int | None = None,
+    progress: Advance = lambda _share: None,
+) -> tuple[int, int, str, tuple[Tried, ...]]:
+    """Choose, of the pairs that are private, the one that rejects the fewest genuine probes.
+
+    Theft is measured on the victims and on drawn people, and the larger counts. Where nobody has
+    two photos, the smallest share of directions in the axes is taken instead: at equal shares
+    about as many are rejected.
+
+    Returns
+    -------
+    axes, m : int
+    chosen : str
+    tried : tuple of Tried
+    """
+    grid = axes_to_try(setup.source) if axes is None else (axes,)
+    grid = tuple(k for k in grid if m is None or m < k)
+    curves = []
+    for number, k in enumerate(grid):
+        dims = dims_to_try(k) if m is None else (m,)
+        curves.append((k, dims, _predicted(setup, strategy, k, dims)))
+        progress((number + 1) / (len(grid) + 1))
+    private = []
+    tried: list[Tried] = []
+    for k, dims, predicted in curves:
+        passing = [dim for dim in _between(dims) if predicted(dim) <= AIM]
+        if passing:
+            dim = passing[0]
+            rejected = _rejected(setup, strategy, k, dim)
+            private.append(Tried(k, dim, predicted(dim), rejected))
+        tried += [Tried(k, dim, predicted(dim)) for dim in dims]
+    if not private:
+        least = min(tried, key=lambda one: one.theft)
+        return least.axes, least.m, "the least theft, as nothing is private", tuple(tried)
+    best = min(private, key=_price)
+    why = "fewest probes rejected" if best.rejected is not None else "smallest share of directions"
+    measured = {_place(one) for one in private}
+    tried = [one for one in tried if _place(one) not in measured] + private
+    return best.axes, best.m, f"{why} of what is private", tuple(sorted(tried, key=_place))
+
+
+def axes_to_try(source: DecoySource) -> tuple[int, ...]:
+    """Numbers of axes in rising order; of a pool all."""
+    if not isinstance(source, DecoyGenerator):
+        return (source.k,)
+    grid = {_rounded(source.axes_for(share)) for share in SHARES_OF_VARIANCE}
+    grid = {min(axes, source.k) for axes in grid}
+    return tuple(sorted(grid | ({source.k} if source.k <= FEW_AXES else set())))
+
+
+def dims_to_try(axes: int) -> tuple[int, ...]:
+    """Dimensions in rising order that theft is measured at."""
+    most = min(axes - 1, MOST_BYTES // (2 * axes) - 1, MAX_M)
+    return tuple(sorted({max(1, min(most, _rounded(ratio * axes))) for ratio in RATIOS}))
+
+
+def judge_privacy(
+    thefts: Sequence[Theft], *, axes: int, m: int, uncovered: str | None = None
+) -> Judgement:
+    """Hold what the strongest attacker gets, and its upper bound, against the limits.
 
     Parameters
     ----------
+    thefts
+        Of :func:`attacks.privacy.all_thefts`.
     uncovered
         What an attacker of such templates has and none of these had, in a sentence; None: nothing.
     """
-    strongest = privacy.strongest
-    faces = max(theft.faces or 0 for theft in privacy.thefts)
+    strongest = max(thefts, key=lambda theft: theft.found.value)
+    faces = max(theft.faces or 0 for theft in thefts)
+    victims = min(theft.found.trials for theft in thefts if theft.faces is not None)
     shortfall = uncovered
-    if shortfall is None and (faces < LEAST_FACES or strongest.found.trials < LEAST_VICTIMS):
+    if shortfall is None and (faces < LEAST_FACES or victims < LEAST_VICTIMS):
         shortfall = (
-            f"{strongest.found.trials} people attacked with {faces} faces show little: calibrate "
-            f"on so many that {LEAST_VICTIMS} are attacked with {LEAST_FACES:,} faces of the others"
+            f"{victims} people attacked with {faces} faces show little: calibrate on so many that "
+            f"{LEAST_VICTIMS} are attacked with {LEAST_FACES:,} faces of the others"
         )
     return Judgement(
         strongest.found,
         PRIVACY_LIMIT,
         {
-            "m": privacy.m,
+            "axes": axes,
+            "m": m,
             "attack": strongest.attack,
-            "attacker_faces": strongest.faces,
-            "attacks": [theft.to_json() for theft in privacy.thefts],
-            "extrapolated": privacy.extrapolated,
+            "attacker_faces": "unlimited" if strongest.faces is None else strongest.faces,
+            "counted": strongest.counted,
+            "victims": victims,
+            "attacks": [theft.to_json() for theft in thefts],
         },
         shortfall,
+        PRIVACY_BOUND,
     )
+
+
+def _predicted(
+    setup: AttackSetup, strategy: Strategy, axes: int, dims: Sequence[int]
+) -> Callable[[int], float]:
+    """Measure theft at some dimensions, and lay a curve through it.
+
+    The logit of the share that the strongest attacker opens is taken for a line in m. Each point
+    weighs as many trials as it has.
+    """
+    bed = setup.along(axes, quick=True)
+    drawn = setup.simulated(bed)
+    beds = [one for one in (bed, drawn) if one is not None and len(one.victims)]
+    lines = [_line(one, strategy, dims) for one in beds]
+    return lambda m: max(float(1 / (1 + np.exp(-line[0] - line[1] * m))) for line in lines)
+
+
+def _line(bed: TestBed, strategy: Strategy, dims: Sequence[int]) -> tuple[float, float]:
+    best = [max(one.found.errors for one in bed.thefts(strategy, m)) for m in dims]
+    shares = (np.array(best) + 0.5) / (len(bed.victims) + 1)
+    logits = np.log(shares / (1 - shares))
+    if len(dims) == 1:
+        return float(logits[0]), 0.0
+    slope, start = np.polyfit(dims, logits, 1, w=np.sqrt(shares * (1 - shares)))
+    return float(start), min(float(slope), 0.0)
+
+
+def _rejected(setup: AttackSetup, strategy: Strategy, axes: int, m: int) -> Rate | None:
+    """Estimate how many single photos are rejected at FMR 1e-3; None where nobody has two."""
+    people = Pairs(
+        np.concatenate([setup.victims.enrolled, setup.mates.enrolled])[:MOST_PROBES],
+        np.concatenate([setup.victims.fresh, setup.mates.fresh])[:MOST_PROBES],
+    )
+    if len(people) < 2 or np.allclose(people.enrolled, people.fresh, atol=1e-5):
+        return None
+    source = reduced(setup.source, axes)
+    pairs = people.along(source)
+    plain = plain_strategy(strategy)
+    with Keystream.seeded("price", setup.seed, axes, m) as stream:
+        templates = lift(pairs.enrolled, strategy=plain, m=m, source=source, stream=stream)
+    nobody = Nobody(client_source(source), plain, m, bytes(KEY_BYTES))
+    means, spreads = nobody.statistics(pairs.fresh, Metric.SPHERICAL)
+    scores = (_similarities(pairs.fresh, templates) - means[:, None]) / spreads[:, None]
+    same = np.eye(len(pairs), dtype=np.bool_)
+    threshold = threshold_at_fmr(scores[~same], PRICED_AT)
+    return rate(int(np.count_nonzero(scores[same] < threshold)), len(pairs))
+
+
+def _similarities(probes: NDArray[np.float32], templates: SubspaceBatch) -> NDArray[np.float64]:
+    """Spherical similarities (P, T) of points to templates."""
+    inside = np.stack([np.linalg.norm(probes @ basis.T, axis=1) for basis in templates.bases], 1)
+    return np.asarray(probes @ templates.feet.T + templates.radii * inside, dtype=np.float64)
+
+
+def _between(dims: Sequence[int]) -> list[int]:
+    """All dimensions from the first to the last that may be chosen."""
+    return sorted({*range(dims[0], dims[-1] + 1, STEP), *dims})
+
+
+def _price(one: Tried) -> tuple[float, float, int]:
+    return (one.m / one.axes if one.rejected is None else one.rejected.value, one.theft, -one.axes)
+
+
+def _place(one: Tried) -> tuple[int, int]:
+    return one.axes, one.m
+
+
+def _rounded(number: float) -> int:
+    return max(STEP, STEP * round(number / STEP))
 
 
 def judge_accuracy(contract: Contract, *, photos: int, not_acquired: int) -> Judgement:

@@ -73,12 +73,15 @@ class Scheme:
     decoys
         ``pool`` or ``generator``; None where the strategy takes none.
     dim
-        m; 0 for raw descriptors.
+        m; 0 for raw embeddings.
+    axes
+        Numbers of what is lifted, k; None where embeddings are not projected.
     """
 
     strategy: str
     decoys: str | None
     dim: int
+    axes: int | None = None
 
     @property
     def order(self) -> tuple[str, str, int]:
@@ -89,15 +92,22 @@ class Scheme:
         if self.strategy == RAW:
             return "raw embeddings"
         source = {GENERATED: ", generated decoys", POOLED: ", decoys of a pool"}
-        return f"{self.strategy}, m = {self.dim}{source.get(self.decoys or '', '')}"
+        axes = "" if self.axes is None else f" of {self.axes} axes"
+        return f"{self.strategy}, m = {self.dim}{axes}{source.get(self.decoys or '', '')}"
 
     @classmethod
     def of(cls, row: Mapping[str, Any]) -> "Scheme":
-        """Return the scheme of a row that has the three fields."""
-        return cls(str(row["strategy"]), row["decoys"], int(row["dim"]))
+        """Return the scheme of a row that has the fields."""
+        axes = row.get("axes")
+        return cls(
+            str(row["strategy"]),
+            row["decoys"],
+            int(row["dim"]),
+            None if axes is None else int(axes),
+        )
 
     def to_json(self) -> dict[str, Json]:
-        """Return the three fields."""
+        """Return the fields."""
         return asdict(self)
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attacks.errors import AuditError
+from templates.decoys import DecoySource
 from templates.space.embedding import normalised, unit_descriptors
 
 ENROLLED_PHOTOS = 3
@@ -52,6 +53,12 @@ class Subjects:
             self.enrolled[:count], self.fresh[:count], self.photos[:count], self.shown[:count]
         )
 
+    def along(self, source: DecoySource) -> "Subjects":
+        """Take the embeddings to the coordinates that templates have."""
+        return replace(
+            self, enrolled=source.project(self.enrolled), fresh=source.project(self.fresh)
+        )
+
     def mismatched(self) -> "Subjects":
         """Give each the next one's fresh photo: the control of an attack."""
         return replace(self, fresh=np.roll(self.fresh, 1, axis=0))
@@ -72,12 +79,12 @@ class Population:
         All photos of the people who calibrate.
     names
         Their C names.
-    rows : (C,) int64
-        Their rows of the folder's descriptors.
+    known : (B, n) float32
+        All photos of everybody but victims and owners: what a strong attacker has.
+    known_names
+        Their B names.
     albums
-        Descriptors of all photos, (k, n), of each victim who has three or more.
-    mates
-        Those of the attacker's people with two photos or more, as victims are enrolled.
+        Embeddings of all photos, (k, n), of each victim who has three or more.
     """
 
     victims: Subjects
@@ -85,9 +92,9 @@ class Population:
     attacker: NDArray[np.float32]
     calibration: NDArray[np.float32]
     names: tuple[str, ...]
-    rows: NDArray[np.int64]
+    known: NDArray[np.float32]
+    known_names: tuple[str, ...]
     albums: tuple[NDArray[np.float32], ...]
-    mates: Subjects
 
 
 def draw_population(
@@ -136,20 +143,17 @@ def draw_population(
             "least: ask for fewer people (victims, owners), or give a larger folder"
         )
     chosen = np.concatenate([photos[person] for person in calibrating])
+    others_photos = np.concatenate([photos[person] for person in others])
     return Population(
         victims=_people(rows, [rng.permutation(photos[i]) for i in attacked], ENROLLED_PHOTOS),
         owners=_people(rows, [rng.permutation(photos[i]) for i in owning], 1),
         attacker=rows[[rng.choice(photos[i]) for i in known]].astype(np.float32),
         calibration=rows[chosen].astype(np.float32),
         names=tuple(str(people[person]) for person in person_of[chosen]),
-        rows=chosen.astype(np.int64),
+        known=rows[others_photos].astype(np.float32),
+        known_names=tuple(str(people[person]) for person in person_of[others_photos]),
         albums=tuple(
             rows[photos[i]].astype(np.float32) for i in attacked if len(photos[i]) >= LEAST_ALBUM
-        ),
-        mates=_people(
-            rows,
-            [rng.permutation(photos[i]) for i in known if len(photos[i]) > 1],
-            ENROLLED_PHOTOS,
         ),
     )
 
@@ -167,12 +171,16 @@ def without_decoy_people(
         Without them among those who calibrate.
     """
     people = np.random.default_rng([seed, 1]).permutation(np.unique(population.names))
-    fitted = np.isin(population.names, people[: len(people) // 2])
+    fitted, also = (
+        np.isin(names, people[: len(people) // 2])
+        for names in (population.names, population.known_names)
+    )
     kept = replace(
         population,
         calibration=population.calibration[~fitted],
         names=tuple(np.asarray(population.names)[~fitted].tolist()),
-        rows=population.rows[~fitted],
+        known=population.known[~also],
+        known_names=tuple(np.asarray(population.known_names)[~also].tolist()),
     )
     return np.concatenate(
         [population.calibration[fitted], population.owners.enrolled, population.owners.fresh]

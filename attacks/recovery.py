@@ -76,7 +76,7 @@ def score_guesses(
     probes = np.ascontiguousarray(unit, dtype=np.float32)
     matched: dict[str, Rate] = {}
     accepted: dict[str, Rate] = {}
-    scores = score(probes, renewed, system.contract, system.points, paired=True)
+    scores = score(probes, renewed, system.nobody, system.points, paired=True)
     for level in system.levels:
         hits = to_fresh >= system.raw_thresholds[level.name]
         matched[level.name] = rate(int(np.count_nonzero(hits)), len(hits))

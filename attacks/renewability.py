@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attacks.decisions import decide
-from attacks.likelihood import likeliest_guesses
 from attacks.linkage import rotations_of, turned, turned_points
 from attacks.outcomes import AttackOutcome, Knowledge, Leaked, Property, judged_by_controls
 from attacks.recovery import fmr_of
@@ -32,16 +31,13 @@ SAME, NEW = "same photos", "new photos"
 _SECRET, _LEAKED = "old rotation secret", "old rotation leaked"
 
 
-def renew(
-    system: System, *, guesses: Mapping[str, NDArray[np.floating]] | None = None
-) -> list[AttackOutcome]:
+def renew(system: System, *, guesses: Mapping[str, NDArray[np.floating]]) -> list[AttackOutcome]:
     """Attack the victims' renewed templates with the old ones.
 
     Parameters
     ----------
     guesses
-        Guesses of the victims' descriptors from the old templates alone, by name, (V, n); those
-        of :func:`attacks.likelihood.likeliest_guesses` where None.
+        Guesses of the victims' embeddings from the old templates alone, by name, (V, k).
 
     Returns
     -------
@@ -50,10 +46,9 @@ def renew(
         the guesses, and the old template as a lifted probe. With the old rotation secret a row is
         judged where the same probe is accepted once that leaked.
     """
-    known = likeliest_guesses(system) if guesses is None else guesses
     renewed = {SAME: system.templates, NEW: system.renewed}
     outcomes = [
-        outcome for name, new in renewed.items() for outcome in _replays(system, new, known, name)
+        outcome for name, new in renewed.items() for outcome in _replays(system, new, guesses, name)
     ]
     return judged_by_controls(outcomes, _SECRET, _LEAKED)
 
@@ -108,7 +103,7 @@ def _replay(
     )
     if level is None:
         return []
-    decided = decide(probes, new, system.contract, calibration, level, paired=True)
+    decided = decide(probes, new, system.nobody, calibration, level, paired=True)
     accepted = decided & passed
     return [
         AttackOutcome(

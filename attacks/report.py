@@ -9,11 +9,11 @@ from attacks.verdict import LIMITS, headlines, judge
 RESULTS = {
     True: "PASSED",
     False: "FAILED: a limit is exceeded.",
-    None: "NEITHER PASSED NOR FAILED: of a scheme no attack was judged.",
+    None: "NOT SHOWN: no limit is exceeded, and not every one is shown to hold.",
 }
 """The first line of a report, by ``passed``."""
 FORMAT = "veilface audit"
-VERSION = 2
+VERSION = 3
 Document = dict[str, Any]
 
 
@@ -64,7 +64,7 @@ def document(
 
 
 def _passed(schemes: Sequence[bool | None]) -> bool | None:
-    """Say how an audit of some schemes ended; None where none failed, and one was not judged."""
+    """Say how an audit of some schemes ended; None where none failed, and one is not shown."""
     if False in schemes:
         return False
     return None if not schemes or None in schemes else True

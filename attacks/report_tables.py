@@ -39,10 +39,8 @@ def markdown(report: Mapping[str, Any]) -> str:
         _result(report),
         *_verdicts(report),
         *_attributes(report["rows"]),
-        *_frontier(report),
         *_operating(report),
         *_outcomes(report["outcomes"]),
-        *_cost(report),
         _settings(report),
     ]
     return "\n\n".join(part for part in parts if part) + "\n"
@@ -61,9 +59,9 @@ def _verdicts(report: Row) -> Iterable[str]:
     yield "## Verdict"
     yield (
         "Each cell is the strongest attack that was made: its measure with the 95 % interval, what "
-        "guessing would reach, and how it stands against the limit. *Unresolved*: only the upper "
-        "bound exceeds the limit. Where a cell is empty, no attack of ours fits it. The "
-        "columns say what leaked."
+        "guessing would reach, and how it stands against the limit. *Not shown*: the sample is too "
+        "small, so that the upper bound exceeds twice the limit. Where a cell is empty, no attack "
+        "of ours fits it. The columns say what leaked."
     )
     yield (
         "The database alone holds ciphertext only: no attack begins there, and what stands in its "
@@ -169,43 +167,6 @@ def _attributes(rows: Sequence[Row]) -> Iterable[str]:
         )
 
 
-def _frontier(report: Row) -> Iterable[str]:
-    frontier = report.get("frontier")
-    if not frontier:
-        return
-    yield "## Accuracy against privacy"
-    yield plain(frontier["statement"])
-    attributes = list(
-        dict.fromkeys(name for point in frontier["points"] for name in point["leaks"])
-    )
-    yield table(
-        [
-            "scheme",
-            f"accuracy % ({frontier['mode']}, {frontier['metric']})",
-            *(f"{name}: strongest %" for name in attributes),
-            "recommended",
-        ],
-        [
-            [
-                plain(str(Scheme.of(point))),
-                percent(point["accuracy"]),
-                *(_leak(point["leaks"].get(name)) for name in attributes),
-                "yes" if point["recommended"] else "",
-            ]
-            for point in frontier["points"]
-        ],
-        [True, False, *([False] * len(attributes)), True],
-    )
-
-
-def _leak(leak: Row | None) -> str:
-    if leak is None:
-        return MISSING
-    return (
-        f"{percent(leak['accuracy'])} ({plain(leak['attacker'])}; chance {percent(leak['chance'])})"
-    )
-
-
 def _operating(report: Row) -> Iterable[str]:
     schemes = report.get("schemes")
     if not schemes:
@@ -292,30 +253,6 @@ def _measured(row: Row) -> str:
     return (
         f"{fixed(measured['value'], 3)} [{fixed(measured['ci_low'], 3)}, "
         f"{fixed(measured['ci_high'], 3)}]"
-    )
-
-
-def _cost(report: Row) -> Iterable[str]:
-    costs = report.get("cost")
-    if not costs:
-        return
-    yield "## Cost"
-    yield (
-        "Nearest-neighbour search of templates among the attacker's faces, seconds as measured "
-        "here, and the estimate for the paper's full size (76,744 faces, 10,954 templates)."
-    )
-    yield table(
-        ["scheme", "pairs searched", "seconds", "paper's size, minutes"],
-        [
-            [
-                plain(str(Scheme.of(cost))),
-                count(cost["pairs"]),
-                fixed(cost["seconds"], 2),
-                fixed(cost["full_size_seconds"] / 60, 1),
-            ]
-            for cost in costs
-        ],
-        [True, False, False, False],
     )
 
 

@@ -9,22 +9,20 @@ from numpy.typing import NDArray
 
 from attacks.errors import AuditError
 from attacks.outcomes import POOLED, Scheme
-from attacks.population import ENROLLED_PHOTOS, Population, Subjects
+from attacks.population import Population, Subjects
 from templates.contract.canonical import Json
 from templates.contract.document import Binding, Calibration, Contract, Level
-from templates.decoys import DecoyPool, DecoySource
+from templates.contract.nobody import Nobody
+from templates.decoys import Attributes, DecoyPool, DecoySource
 from templates.distances import Metric
 from templates.errors import Uncalibrated
-from templates.keys.randomness import Keystream
+from templates.keys.randomness import KEY_BYTES, Keystream
 from templates.keys.rotation import ROTATION_VERSION
-from templates.space.embedding import normalised
-from templates.space.lifting import Strategy
+from templates.space.lifting import Strategy, lift
 from templates.space.subspace import SubspaceBatch
 from verify import CalibrationOptions, calibrate
-from verify.cohort import client_source, people_like
-from verify.comparisons import Lifter
+from verify.comparisons import through_wire
 from verify.metrics import most_errors, threshold_at_fmr
-from verify.strangers import make_nobody
 
 LIFTED_PROBE_DIM = 8
 """Dimension of the lifted probes that wolves are tried with, the best of docs/method.md §4.7."""
@@ -33,7 +31,7 @@ _TILE = 1024
 
 @dataclass(frozen=True, eq=False, repr=False)
 class System:
-    """What attacks on templates act on.
+    """What attacks on templates act on, all of it in the coordinates that templates have.
 
     Nothing is rotated: a probe is turned as the template that it is compared with, and no distance
     changes. Attacks on what is stored, by who lacks the tenant's key, rotate by themselves.
@@ -42,33 +40,42 @@ class System:
     ----------
     contract
         Calibrated on people who are neither victims, nor decoys, nor the attacker's.
-    lifter
-        Lifts as the service does, through the wire format (float16).
+    source
+        The decoys of the deployment, on as many axes as its templates have. A scheme without
+        decoys takes none of them.
     victims
         Who is attacked; ``victims.enrolled`` is the truth that an attack wants.
     templates : SubspaceBatch of V
         One template of each victim.
-    source
-        The scheme's decoys; None where it takes none.
-    owners
-        The people whose ``enrolled`` descriptors are the entries of the pool, in its order; None
-        where no fresh photos of them are at hand.
-    attacker : (A, n) float32
-        Faces of other people, which the attacker has.
+    attacker : (A, k) float32
+        Faces of other people, which the attacker has, one of each.
     raw_thresholds
-        By level, the cosine at which raw descriptors of the calibration have the level's FMR.
+        By level, the cosine at which projected embeddings of the calibration have the level's FMR.
     """
 
     scheme: Scheme
     contract: Contract
-    lifter: Lifter
+    source: DecoySource
     victims: Subjects
     templates: SubspaceBatch
-    source: DecoySource | None
-    owners: Subjects | None
     attacker: NDArray[np.float32]
     raw_thresholds: Mapping[str, float]
     seed: int
+
+    @property
+    def strategy(self) -> Strategy:
+        """How templates are lifted."""
+        return Strategy(self.scheme.strategy)
+
+    @property
+    def decoys(self) -> int:
+        """Number of decoys in one template."""
+        return self.strategy.decoys(self.scheme.dim)
+
+    @property
+    def nobody(self) -> Nobody:
+        """Templates of nobody under the contract."""
+        return self.contract.nobody(self.source)
 
     @property
     def levels(self) -> tuple[Level, ...]:
@@ -107,11 +114,20 @@ class System:
         return replace(self, victims=self.victims.first(count), templates=self.templates[:count])
 
     def lift(
-        self, descriptors: NDArray[np.float32], purpose: str, *, m: int | None = None
+        self, points: NDArray[np.float32], purpose: str, *, m: int | None = None
     ) -> SubspaceBatch:
-        """Lift further descriptors, (N, n), with randomness of this purpose only."""
+        """Lift further points, (N, k), as they are stored; with randomness of this purpose only."""
+        plus = self.strategy is Strategy.HYBRID_PLUS
         with Keystream.seeded("audit", self.seed, str(self.scheme), purpose) as stream:
-            return self.lifter.lift(descriptors, m=m or self.scheme.dim, stream=stream)
+            lifted = lift(
+                points,
+                strategy=self.strategy,
+                m=m or self.scheme.dim,
+                source=self.source,
+                stream=stream,
+                attributes=[Attributes()] * len(points) if plus else None,
+            )
+        return through_wire(lifted, contract_id=self.contract.contract_id)
 
 
 def raw_thresholds(
@@ -121,7 +137,7 @@ def raw_thresholds(
 
     Parameters
     ----------
-    descriptors : (N, n) float32
+    descriptors : (N, k) float32
     """
     person = np.unique(np.asarray(names), return_inverse=True)[1]
     upper: list[NDArray[np.float32]] = []
@@ -151,7 +167,6 @@ def enroll_victims(
     *,
     embedder_sha256: str,
     preprocessing: Mapping[str, Json],
-    pool_of_owners: bool,
     contract: Contract | None = None,
     lifted_probes: bool = True,
     seed: int,
@@ -161,8 +176,7 @@ def enroll_victims(
     Parameters
     ----------
     source
-        Of ``scheme.decoys``; its pool's entries are ``population.owners.enrolled`` where
-        ``pool_of_owners``.
+        Of ``scheme.decoys``, on the scheme's axes.
     contract
         The contract that a service uses; it must be of this scheme and source.
     lifted_probes
@@ -171,11 +185,10 @@ def enroll_victims(
     Raises
     ------
     AuditError
-        The contract is of another scheme, or the scheme is of raw descriptors.
+        The contract is of another scheme, or the scheme is of raw embeddings.
     ContractMismatch
         The contract is of another model or other decoys.
     """
-    n = population.victims.enrolled.shape[1]
     strategy = Strategy(scheme.strategy)
     if scheme.decoys is not None and source is None:
         raise AuditError(f"{scheme} needs decoys")
@@ -183,7 +196,8 @@ def enroll_victims(
     binding = Binding(
         embedder_sha256=embedder_sha256,
         preprocessing=dict(preprocessing),
-        n=n,
+        n=chosen.n,
+        axes=chosen.k,
         strategy=strategy,
         m=scheme.dim,
         decoy_source_id=chosen.source_id,
@@ -196,9 +210,6 @@ def enroll_victims(
             "the contract is of another scheme, model or decoy source than the audit's: give the "
             "pack and the decoys that `calibrate` was given"
         )
-    lifter = Lifter(strategy, chosen, contract.contract_id)
-    with Keystream.seeded("audit", seed, str(scheme), "victims") as stream:
-        templates = lifter.lift(population.victims.enrolled, m=scheme.dim, stream=stream)
     levels = {
         level.name: level.target_fmr
         for level in contract.calibration("p2s").levels
@@ -208,18 +219,22 @@ def enroll_victims(
         raise Uncalibrated(
             f"an audit judges by a level with a target FMR, and {contract.default_level} has none"
         )
-    return System(
+    victims = population.victims.along(chosen)
+    system = System(
         scheme=scheme,
         contract=contract,
-        lifter=lifter,
-        victims=population.victims,
-        templates=templates,
-        source=None if scheme.decoys is None else chosen,
-        owners=population.owners if pool_of_owners and scheme.decoys == POOLED else None,
-        attacker=population.attacker,
-        raw_thresholds=raw_thresholds(population.calibration, population.names, levels),
+        source=chosen,
+        victims=victims,
+        templates=SubspaceBatch(
+            np.empty((0, chosen.k), np.float32), np.empty((0, scheme.dim, chosen.k), np.float32)
+        ),
+        attacker=chosen.project(population.attacker),
+        raw_thresholds=raw_thresholds(
+            chosen.project(population.calibration), population.names, levels
+        ),
         seed=seed,
     )
+    return replace(system, templates=system.lift(victims.enrolled, "victims"))
 
 
 def _calibrated(
@@ -230,19 +245,9 @@ def _calibrated(
     lifted_probes: bool,
     seed: int,
 ) -> Contract:
-    """Calibrate as a service does, with strangers of a seed: audits give the same figures twice."""
-    person = np.unique(population.names, return_inverse=True)[1]
-    means = np.stack(
-        [
-            population.calibration[np.flatnonzero(person == one)[:ENROLLED_PHOTOS]].mean(axis=0)
-            for one in range(person.max() + 1)
-        ]
-    )
-    people = normalised(means).astype(np.float32)
-    generator = client_source(source)
-    with Keystream.seeded("audit", seed, binding.strategy, binding.m, "strangers") as stream:
-        strangers = people_like(generator, people)
-        nobody = make_nobody(generator, strangers=(strangers,), stream=stream)
+    """Calibrate as a service does, with a cohort of a seed: audits give the same figures twice."""
+    with Keystream.seeded("audit", seed, binding.strategy, binding.m, "cohort") as stream:
+        cohort_seed = stream.token(KEY_BYTES)
     options = CalibrationOptions(
         probe_dims=(0, min(LIFTED_PROBE_DIM, binding.m)) if lifted_probes else (0,),
         probe_photos=(1,),
@@ -257,10 +262,16 @@ def _calibrated(
         binding=binding,
         source=source,
         options=options,
-        nobody=nobody,
+        cohort_seed=cohort_seed,
     ).contract
 
 
 def owners_pool(population: Population, made_with: str | None) -> DecoyPool:
     """Return the pool of real people that the decoy owners make up."""
     return DecoyPool(population.owners.enrolled, made_with=made_with)
+
+
+def of_pool(system: System) -> DecoyPool | None:
+    """Return the pool that a scheme's decoys are drawn from; None of another scheme."""
+    pooled = system.scheme.decoys == POOLED and isinstance(system.source, DecoyPool)
+    return system.source if pooled and isinstance(system.source, DecoyPool) else None

@@ -1,15 +1,17 @@
 """The verdict: what an attacker achieves at best, by property, theft and knowledge, against limits.
 
 Every cell of the table holds the strongest attack that was made: the one that exceeds chance most.
-A cell fails where its measure exceeds the limit that the operator set, and is *unresolved* where
-only the upper bound of its interval does: the sample is too small to show that the limit holds.
-A scheme none of whose attacks is judged has no cell, and neither passes nor fails.
+A cell fails where its measure exceeds the limit that the operator set. It is *not shown* where only
+the one-sided 95 % upper bound exceeds twice the limit, or where the attacker had too little to show
+anything: the sample is too small. A scheme none of whose attacks is judged has no cell, and neither
+passes nor fails.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
+from attacks.operating_point import PRIVACY_LIMIT
 from attacks.outcomes import (
     COMPARED,
     CONTROL,
@@ -20,18 +22,22 @@ from attacks.outcomes import (
     Scheme,
 )
 from templates.contract.canonical import Json
+from templates.contract.levels import Rate
+from templates.contract.verdict import upper_bound
 
 
 class Status(StrEnum):
-    """How a cell stands against its limit; ``unresolved`` does not fail an audit, and is said."""
+    """How a cell stands; an audit with a cell that is not shown has not passed."""
 
     PASS = "pass"  # noqa: S105 - a word of the report
     FAIL = "fail"
-    UNRESOLVED = "unresolved"
+    NOT_SHOWN = "not shown"
     UNLIMITED = "no limit"
 
 
-_GRAVITY = (Status.UNLIMITED, Status.PASS, Status.UNRESOLVED, Status.FAIL)
+_GRAVITY = (Status.UNLIMITED, Status.PASS, Status.NOT_SHOWN, Status.FAIL)
+_BOUND = 2.0
+"""Most that an upper bound may be, in multiples of the limit."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +60,6 @@ class Limit:
 
 
 FOOT_POINT = "foot-point-success"
-CLIMBING = "climbing-success"
 WITH_KEY, WITHOUT_KEY = "success-with-key", "success-without-key"
 LIMITS: tuple[Limit, ...] = (
     Limit(
@@ -64,7 +69,7 @@ LIMITS: tuple[Limit, ...] = (
     ),
     Limit(
         "recovery-success",
-        0.1,
+        PRIVACY_LIMIT,
         "share of templates from which any other attack recovers a match for a fresh photo",
     ),
     Limit(
@@ -79,8 +84,9 @@ LIMITS: tuple[Limit, ...] = (
     ),
     Limit(
         "attribute-leakage",
-        0.1,
-        "distance of the strongest attacker's accuracy from chance, in either direction",
+        0.25,
+        "distance of the strongest attacker's accuracy from chance, in either direction, as a "
+        "share of what raw embeddings gain over the largest class",
     ),
     Limit(
         "false-acceptance",
@@ -88,16 +94,10 @@ LIMITS: tuple[Limit, ...] = (
         "share of templates that accept a probe made without the victim, checks included",
     ),
     Limit(
-        CLIMBING,
-        0.1,
-        "share of templates opened by trying faces, or of embeddings recovered from decisions, "
-        "within a lockout's 5 or 50 attempts",
-    ),
-    Limit(
         WITH_KEY,
         1.0,
-        "what no template withstands: success by a right to scores or thousands of decisions, or "
-        "where every key leaked and templates are linked, replayed, or several of one person",
+        "what no template withstands: success by a right to scores, or where every key leaked and "
+        "templates are linked, replayed, or several of one person",
     ),
     Limit(
         WITHOUT_KEY,
@@ -124,8 +124,8 @@ _BY_DESIGN = {
     Property.IMPERSONATION: "an un-rotated template holds vectors that it accepts",
 }
 """Why no template can hold what is without a limit."""
-_BY_ANSWERS = "answers tell what a template is near to, and no lock ends them once one was accepted"
-_BY_ATTACK = {"foot-point": FOOT_POINT, "hill-climbing": CLIMBING}
+_BY_ANSWERS = "scores tell what a template is near to, and no lock ends them once one was accepted"
+_BY_ATTACK = {"foot-point": FOOT_POINT}
 """Attacks with a limit of their own, and so a cell of their own."""
 
 
@@ -136,7 +136,7 @@ class Cell:
     Parameters
     ----------
     excess, low, high
-        What is compared with the limit, and its interval.
+        What is compared with the limit, its lower bound, and its one-sided upper bound.
     """
 
     outcome: AttackOutcome
@@ -148,12 +148,13 @@ class Cell:
 
     @property
     def status(self) -> Status:
-        """Pass, fail, unresolved, or no limit."""
+        """Pass, fail, not shown, or no limit."""
         if self.most >= 1:
             return Status.UNLIMITED
         if self.excess > self.most:
             return Status.FAIL
-        return Status.UNRESOLVED if self.high > self.most else Status.PASS
+        shown = self.high <= _BOUND * self.most and self.outcome.details.get("too_few") is None
+        return Status.PASS if shown else Status.NOT_SHOWN
 
     @property
     def reason(self) -> str | None:
@@ -221,8 +222,11 @@ class Verdict:
 
     @property
     def passed(self) -> bool | None:
-        """Whether no cell exceeds its limit; None where nothing was judged."""
-        return not self.failed if self.cells else None
+        """Whether every cell holds; None where none fails, and not all are shown to hold."""
+        if self.failed:
+            return False
+        unshown = any(cell.status is Status.NOT_SHOWN for cell in self.cells)
+        return None if unshown or not self.cells else True
 
     def to_json(self) -> dict[str, Json]:
         """Return an entry of ``verdicts`` of the report."""
@@ -296,8 +300,12 @@ def cell_of(outcome: AttackOutcome, most: Mapping[str, float]) -> Cell:
     name = _limit_of(outcome)
     measured = outcome.measured
     value, low, high = measured.value, measured.ci_low, measured.ci_high
+    if isinstance(measured, Rate) and measured.interval == "wilson":
+        high = upper_bound(measured.errors, measured.trials)
     if outcome.breaks is Property.CONFIDENTIALITY:
-        value, low, high = _distance(outcome.chance, value, low, high)
+        low, high = measured.ci_low, measured.ci_high
+        gain = float(str(outcome.details["raw_gain"]))
+        value, low, high = (one / gain for one in _distance(outcome.chance, value, low, high))
     elif outcome.breaks is Property.UNLINKABILITY:
         # D_sys below its null is chance, and tells nothing.
         value, low, high = (max(0.0, bound - outcome.chance) for bound in (value, low, high))
@@ -307,8 +315,6 @@ def cell_of(outcome: AttackOutcome, most: Mapping[str, float]) -> Cell:
 def _limit_of(outcome: AttackOutcome) -> str:
     several = outcome.knowledge is Knowledge.TEMPLATES
     of_a_template = outcome.breaks in _OF_A_TEMPLATE and not several
-    if outcome.details.get("lockout") is not None:
-        return CLIMBING
     if outcome.knowledge is Knowledge.RIGHT:
         return WITH_KEY
     if outcome.leaked is Leaked.HOLDER_KEYS and not of_a_template:
@@ -332,10 +338,10 @@ NOTHING_JUDGED = "no attack was judged, so it neither passed nor failed"
 
 
 def headlines(verdicts: Sequence[Verdict]) -> list[str]:
-    """Say what fails, what is not judged, what succeeds without a limit, what is not resolved."""
+    """Say what fails, what is not judged, what succeeds without a limit, what is not shown."""
     lines: list[str] = []
     for verdict in verdicts:
-        unresolved = [cell for cell in verdict.cells if cell.status is Status.UNRESOLVED]
+        unshown = [cell for cell in verdict.cells if cell.status is Status.NOT_SHOWN]
         broken = [
             cell for cell in verdict.cells if cell.status is Status.UNLIMITED and cell.excess > 0.1
         ]
@@ -344,9 +350,9 @@ def headlines(verdicts: Sequence[Verdict]) -> list[str]:
             *map(_sentence, verdict.failed),
             *_not_judged(verdict),
             *map(_sentence, broken),
-            *map(_sentence, unresolved),
+            *map(_sentence, unshown),
         ]
-        if verdict.passed and not unresolved:
+        if verdict.passed:
             sentences.append("no attack that was made exceeds its limit.")
         lines += [f"{verdict.scheme}: {sentence}" for sentence in sentences]
     return lines
@@ -370,7 +376,7 @@ def _not_judged(verdict: Verdict) -> list[str]:
 _SAID = {
     Status.FAIL: "fails",
     Status.UNLIMITED: "is broken, and no limit is set on it",
-    Status.UNRESOLVED: "is not shown to hold: the sample is too small",
+    Status.NOT_SHOWN: "is not shown to hold: the sample is too small",
 }
 
 

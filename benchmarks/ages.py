@@ -57,7 +57,8 @@ def main() -> None:
     """Calibrate, and print a row for each age of each set."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--dim", type=int, default=160)
+    parser.add_argument("--dim", type=int, default=96)
+    parser.add_argument("--axes", type=int, default=224)
     parser.add_argument("--adapt", type=int, default=600, help="photos of LFW for the decoys")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
@@ -75,7 +76,7 @@ def main() -> None:
         extraction(*read(folder / "fairface_more.npz")),
         pack,
         like=adapted if len(like) else None,
-    )
+    ).reduced(options.axes)
     contract = calibrate(
         people[rest],
         names[rest].tolist(),
@@ -85,7 +86,7 @@ def main() -> None:
             probe_photos=(1,), most_cells=2_000_000, most_templates=1_000, seed=options.seed
         ),
     ).contract
-    calibration, expectation = contract.calibration("p2s"), contract.expectation
+    calibration, nobody = contract.calibration("p2s"), contract.nobody(source)
     rng = np.random.default_rng(options.seed)
     print(f"| set | age | people | {' | '.join(LEVELS)} |\n|{'---|' * (3 + len(LEVELS))}")
     for name in ("utkface", "allagefaces"):
@@ -95,9 +96,9 @@ def main() -> None:
             chosen = rng.permutation(np.flatnonzero(groups == group))[:MOST]
             if len(chosen) < 50:
                 continue
-            probes = rows[chosen]
+            probes = source.project(rows[chosen])
             scores = np.empty((len(probes), len(probes)), np.float32)
-            means, spreads = expectation.statistics(probes)
+            means, spreads = nobody.statistics(probes, calibration.metric)
             for start in range(0, len(probes), TILE):
                 with Keystream.seeded(name, group, start, options.seed) as stream:
                     templates = lift(
@@ -107,7 +108,7 @@ def main() -> None:
                         source=source,
                         stream=stream,
                     )
-                distances = pairwise_distances(probes, templates, metric=expectation.metric)
+                distances = pairwise_distances(probes, templates, metric=calibration.metric)
                 scores[:, start : start + TILE] = (
                     similarity(distances) - means[:, None]
                 ) / spreads[:, None]

@@ -36,7 +36,7 @@ from typing import Any
 import numpy as np
 from playwright.sync_api import BrowserContext, Locator, expect, sync_playwright
 
-from benchmarks.deployment import VEILFACE, service
+from benchmarks.deployment import service
 from benchmarks.end_to_end import (
     AttemptCounts,
     Person,
@@ -411,9 +411,7 @@ def main() -> None:
         # Each tab has noted every request of the browser.
         here = (served.url, recording.url, "blob:", "data:")
         strays = sorted({each for each in first.tab.requests if not each.startswith(here)})
-        with PrivateClient(
-            address, key, pack=args.pack, command=VEILFACE, dim=args.probe_dim
-        ) as client:
+        with PrivateClient(address, key, pack=args.pack, dim=args.probe_dim) as client:
             python, _ = private_outcome(
                 client, people, level=args.level, impostors=impostors, at_once=1
             )

@@ -1,116 +1,229 @@
-"""What each way of lifting costs in accuracy, and what the strongest theft of one template gives.
+"""What privacy costs: axes, dimension, theft and false rejections by the number of spared photos.
 
-People of LFW are enrolled, half of them calibrate. Decoys come from a generator fitted to FairFace
-(another kind of photos), from one fitted to other people of LFW, or from a pool of other people of
-LFW that stays secret. The rows of docs/privacy-templates.md "The operating point" are what this
-prints.
+People of LFW are parted by chance into a sample that decoys are adapted to, people to choose axes
+and dimension by, and people to judge. Decoys are fitted to FairFace, UTKFace and All-Age-Faces. The
+attackers have all other photos of LFW. The last rows have nobody's photos: decoys, thresholds and
+privacy of FairFace alone, and the accuracy of LFW beside.
 
 Example
 -------
 ::
 
     python -m benchmarks.operating_point --data ../shared/data
+    python -m benchmarks.operating_point --spared 600 --splits 1
 """
 
 import argparse
-from pathlib import Path
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePath
 
-from attacks.likelihood import find_least_decoy_like, likeliest_guesses
-from attacks.outcomes import GENERATED, POOLED, AttackOutcome, Scheme
-from attacks.population import Population, draw_population, without_decoy_people
-from attacks.stored.foot_point import foot_point_attack
-from attacks.stored.nearest_neighbour import nearest_neighbour_attack
-from attacks.system import enroll_victims, owners_pool
-from models.cache import EmbeddingCache
+import numpy as np
+from numpy.typing import NDArray
+
+from attacks.operating_point import OperatingPoint, choose_and_judge
+from attacks.privacy import AttackSetup, Pairs
 from models.extraction import Extractor
 from models.pack import ModelPack
-from templates.decoys import DecoyGenerator, DecoySource
-from templates.keys.sealing import KeyringSealer, MasterKeyring
-from verify import labelled_folder
+from templates.contract.document import Binding, Contract
+from templates.decoys import DecoyGenerator
+from templates.distances.blas import single_threaded
+from templates.errors import Uncalibrated
+from templates.keys.rotation import ROTATION_VERSION
+from templates.space.embedding import normalised
+from templates.space.lifting import Strategy
+from verify import CalibrationOptions, calibrate, labelled_folder
 
-VICTIMS, OWNERS = 400, 600
-GRID = (
-    ("random", None, (16,)),
-    ("hybrid", GENERATED, (32, 64)),
-    ("adversarial", GENERATED, (16, 32, 48, 64, 96)),
-    ("adversarial", POOLED, (16, 32, 64)),
-)
+SETS = {"w600k_mbf": "emb_mbf", "yunet_mobilefacenet128": "emb_y1"}
+FACES = ("fairface_more", "utkface", "allagefaces")
+LEVELS = ("fmr-1e-3", "fmr-1e-4")
+PHOTOS = 3
+PROBE_M = 4
 
-
-def rows_of(
-    population: Population, kind: str, source: DecoySource, pack: ModelPack, seed: int
-) -> list[str]:
-    """Lines of the table for one source of decoys."""
-    lines = []
-    pooled = kind.startswith("pool")
-    for strategy, decoys, dims in GRID:
-        if (decoys == POOLED) != pooled or (decoys is None and kind != "FairFace"):
-            continue
-        for m in dims:
-            system = enroll_victims(
-                population,
-                Scheme(strategy, decoys, m),
-                None if decoys is None else source,
-                embedder_sha256=pack.info.embedder_sha256,
-                preprocessing=pack.info.preprocessing,
-                pool_of_owners=pooled,
-                lifted_probes=False,
-                seed=seed,
-            )
-            level = system.level
-            outcomes = [*foot_point_attack(system), *nearest_neighbour_attack(system)]
-            outcomes += find_least_decoy_like(system, likeliest_guesses(system), kind="LFW")
-            judged = [outcome for outcome in outcomes if outcome.judged]
-            best = max(judged, key=lambda outcome: outcome.measured.value)
-            foot = next(outcome for outcome in judged if outcome.attack == "foot-point")
-            named = "none" if decoys is None else kind
-            lines.append(
-                f"| {strategy} | {named} | {m} | {100 * level.fnmr.value:.2f} "
-                f"({level.fnmr.errors}/{level.fnmr.trials}) | {shown(foot)} | {shown(best)}, "
-                f"{best.attack} |"
-            )
-            print(lines[-1], flush=True)
-    return lines
+Array = NDArray[np.float32]
 
 
-def shown(outcome: AttackOutcome) -> str:
-    """Success in per cent with its interval."""
-    measured = outcome.measured
-    return f"{100 * measured.value:.1f} ({100 * measured.ci_low:.1f}-{100 * measured.ci_high:.1f})"
+@dataclass(frozen=True, eq=False, repr=False)
+class People:
+    """Embeddings (N, n), and whose each is (N,)."""
+
+    rows: Array
+    person: NDArray[np.int64]
+
+    def __getitem__(self, chosen: NDArray[np.bool_]) -> "People":
+        return People(self.rows[chosen], self.person[chosen])
+
+    def of(self, people: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Tell which rows are of some people."""
+        return np.isin(self.person, people)
 
 
-def main() -> None:
-    """Embed, split, lift, attack, print."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
-    parser.add_argument("--pack", type=Path, help="default: DATA/packs/w600k_mbf")
-    parser.add_argument("--cache", type=Path, help="folder of sealed embeddings: lfw, fair")
-    parser.add_argument("--master-key", type=Path, help="the key file that the caches belong to")
-    parser.add_argument("--seed", type=int, default=0)
-    args = parser.parse_args()
-    caches: dict[str, EmbeddingCache | None] = {"lfw": None, "fair": None}
-    if args.cache and args.master_key:
-        sealer = KeyringSealer(MasterKeyring.load(args.master_key))
-        caches = {
-            name: EmbeddingCache.open_file(args.cache / f"{name}.cache", sealer) for name in caches
-        }
-    pack = ModelPack.load(args.pack or args.data / "packs" / "w600k_mbf")
-    crops = labelled_folder(args.data / "lfw" / "aligned112")
-    lfw = Extractor(pack, aligned=True, cache=caches["lfw"]).extract(crops.paths).descriptors
-    photos = sorted((args.data / "fairface").glob("*/*.jpg"))
-    fairface = Extractor(pack, cache=caches["fair"]).extract(photos).descriptors
-    population = draw_population(
-        lfw, crops.identities, victims=VICTIMS, owners=OWNERS, seed=args.seed
+def stored(data: Path, name: str, pack: str) -> tuple[Array, list[str]]:
+    """Read embeddings that are kept beside the photos, and the folder of each."""
+    with np.load(data / "embeddings" / f"{name}.npz") as arrays:
+        rows = normalised(arrays[SETS[pack]].astype(np.float64)).astype(np.float32)
+        return rows, [PurePath(path).parent.name for path in arrays["paths"].tolist()]
+
+
+def lfw(data: Path, pack: str, cached: Path | None) -> People:
+    """Embed the aligned crops of LFW, and add the photos that are kept as embeddings."""
+    if cached is not None:
+        with np.load(cached) as arrays:
+            rows = arrays["emb"]
+            names = [PurePath(path).parent.name for path in arrays["paths"].tolist()]
+    else:
+        folder = labelled_folder(data / "lfw" / "aligned112")
+        extractor = Extractor(ModelPack.load(data / "packs" / pack), aligned=True)
+        extraction = extractor.extract(list(folder.paths), progress=False)
+        rows, names = extraction.descriptors, [path.parent.name for path in extraction.paths]
+    more, of_more = stored(data, "lfw_rest", pack)
+    person = np.unique([*names, *of_more], return_inverse=True)[1]
+    return People(np.concatenate([rows, more]), person.astype(np.int64))
+
+
+def split(people: People, spared: int, victims: int, rng: np.random.Generator) -> Iterator[People]:
+    """Part into a sample of people with one photo, people to choose by, to judge, and others."""
+    counts = np.bincount(people.person)
+    single = rng.permutation(np.flatnonzero(counts == 1))[:spared]
+    several = rng.permutation(np.flatnonzero(counts > 1))
+    yield people[people.of(single)]
+    for chosen in (several[:victims], several[victims : 2 * victims]):
+        yield people[people.of(chosen)]
+    yield people[~people.of(np.concatenate([single, several[: 2 * victims]]))]
+
+
+def pairs(people: People, rng: np.random.Generator) -> Pairs:
+    """Enroll up to three photos of each, and keep another one fresh."""
+    return Pairs.of(people.rows, people.person, np.unique(people.person), photos=PHOTOS, rng=rng)
+
+
+def measured(
+    source: DecoyGenerator,
+    by: People,
+    judged: People,
+    others: People,
+    accuracy_of: People,
+    rng: np.random.Generator,
+) -> tuple[OperatingPoint, Contract]:
+    """Choose by some people, judge others, and calibrate on people on whom nothing was chosen."""
+    first, second = pairs(by, rng), pairs(judged, rng)
+    setup = AttackSetup.of(
+        Pairs(
+            np.concatenate([first.enrolled, second.enrolled]),
+            np.concatenate([first.fresh, second.fresh]),
+        ),
+        others.rows,
+        source,
+        owners=others.person,
+        photos=PHOTOS,
     )
-    own, calibrating = without_decoy_people(population, seed=args.seed)
-    print("| strategy | decoys | m | FNMR % at FMR 1e-3 | foot point % | strongest theft % |")
-    print("|---|---|---|---|---|---|")
-    for kind, source in (
-        ("FairFace", DecoyGenerator.fit(fairface)),
-        (f"{len(own):,} photos of LFW", DecoyGenerator.fit(own)),
-        (f"pool of {OWNERS} of LFW", owners_pool(population, None)),
-    ):
-        rows_of(calibrating, kind, source, pack, args.seed)
+    point = choose_and_judge(setup, strategy=Strategy.ADVERSARIAL)
+    return point, calibrated(accuracy_of, source.reduced(point.axes), point.dim)
+
+
+def calibrated(people: People, source: DecoyGenerator, m: int) -> Contract:
+    """Set thresholds on some people for templates of dimension m, as `veilface calibrate` does."""
+    return calibrate(
+        people.rows,
+        [str(one) for one in people.person],
+        binding=Binding(
+            embedder_sha256="00" * 32,
+            preprocessing={},
+            n=source.n,
+            axes=source.k,
+            strategy=Strategy.ADVERSARIAL,
+            m=m,
+            decoy_source_id=source.source_id,
+            rotation_version=ROTATION_VERSION,
+        ),
+        source=source,
+        options=CalibrationOptions(probe_dims=(0, PROBE_M), probe_photos=(1, 2, 3)),
+    ).contract
+
+
+def rejected(contract: Contract, *, enrolled: int, shown: int, lifted: bool = False) -> str:
+    """FNMR in % at both levels."""
+    parts = []
+    for name in LEVELS:
+        try:
+            calibration = (
+                contract.calibration("s2s", probe_m=PROBE_M)
+                if lifted
+                else contract.calibration("p2s", probe_photos=shown, level=name)
+            )
+            rate = calibration.level(name).fnmr_by_photos[enrolled]
+        except (Uncalibrated, KeyError):
+            parts.append("–")
+            continue
+        known = calibration.probe_photos == shown
+        parts.append(f"{100 * rate.value:.2g}" if known else "–")
+    return " / ".join(parts)
+
+
+def show(name: str, number: int, point: OperatingPoint, contract: Contract) -> None:
+    """Print one row of the table."""
+    privacy = point.privacy
+    size = 2 * point.axes * (point.dim + 1) / 1000
+    columns = (
+        name,
+        str(number),
+        f"{point.axes}, {point.dim}",
+        f"{100 * privacy.rate.value:.2g} ({privacy.rate.errors}/{privacy.rate.trials}), "
+        f"≤ {100 * (privacy.upper or 1):.2g}",
+        f"{privacy.basis['attacker_faces']}, {privacy.basis['counted']}",
+        privacy.status,
+        rejected(contract, enrolled=3, shown=1),
+        rejected(contract, enrolled=1, shown=1),
+        rejected(contract, enrolled=3, shown=2),
+        rejected(contract, enrolled=3, shown=3),
+        rejected(contract, enrolled=3, shown=1, lifted=True),
+        f"{size:.0f}",
+    )
+    print("| " + " | ".join(columns) + " |", flush=True)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Measure, and print a table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
+    parser.add_argument("--pack", choices=sorted(SETS), default="w600k_mbf")
+    parser.add_argument("--spared", type=int, nargs="*", default=[100, 300, 600, 1200, 2400])
+    parser.add_argument("--splits", type=int, default=3)
+    parser.add_argument("--victims", type=int, default=400, help="to judge; as many to choose by")
+    parser.add_argument("--no-alone", dest="alone", action="store_false")
+    parser.add_argument("--embeddings", type=Path, help="of the crops, embedded before")
+    given = parser.parse_args(arguments)
+    people = lfw(given.data, given.pack, given.embeddings)
+    sets = [stored(given.data, name, given.pack)[0] for name in FACES]
+    many = np.concatenate(sets)
+    print(f"{len(people.rows):,} photos of LFW, {len(many):,} faces; theft in % (one-sided bound);")
+    print("false non-matches in % at FMR 1e-3 / 1e-4, of photos shown to photos enrolled\n")
+    head = (
+        "spared | split | axes, m | theft | strongest attacker | verdict | 1 to 3 | 1 to 1 | "
+        "2 to 3 | 3 to 3 | lifted, m = 4 | kB"
+    )
+    print(f"| {head} |\n|{'---|' * 12}")
+    with single_threaded():
+        for spared in given.spared:
+            for number in range(given.splits):
+                rng = np.random.default_rng([spared, number])
+                sample, by, judged, others = split(people, spared, given.victims, rng)
+                names = [str(one) for one in sample.person]
+                source = DecoyGenerator.adapt(many, sample.rows, names)
+                rest = People(
+                    np.concatenate([judged.rows, others.rows]),
+                    np.concatenate([judged.person, others.person]),
+                )
+                show(f"{spared:,}", number, *measured(source, by, judged, others, rest, rng))
+        for number in range(given.splits if given.alone else 0):
+            rng = np.random.default_rng([7, number])
+            order = rng.permutation(len(sets[0]))
+            strangers = People(sets[0][order[:2_400]], np.arange(2_400))
+            group = np.minimum(strangers.person // given.victims, 2)
+            by, judged, others = (strangers[group == part] for part in range(3))
+            source = DecoyGenerator.fit(sets[0][order[2_400:7_400]])
+            row = measured(source, by, judged, others, people, rng)
+            show("FairFace alone", number, *row)
 
 
 if __name__ == "__main__":

@@ -3,9 +3,9 @@
 One contract, two services. The first has the model pack: photos 1-3 of every person are sent to it,
 then photos 4-5 against the person (genuine) and against other people (impostor), as in
 ``benchmarks.end_to_end``. The second has no pack at all: ``veilface_client.PrivateClient`` embeds
-and lifts the same photos on the client's side through the installed command, once each, and sends
-templates. A probe is verified against all its subjects, so the attempts are the same. An
-enrollment that is refused counts as failed genuine attempts.
+and lifts the same photos on the client's side, once each, and sends templates. A probe is verified
+against all its subjects, so the attempts are the same. An enrollment that is refused counts as
+failed genuine attempts.
 
 Example
 -------
@@ -27,7 +27,7 @@ from typing import TypeVar
 
 import httpx
 
-from benchmarks.deployment import VEILFACE, database, service, veilface
+from benchmarks.deployment import database, service, veilface
 from benchmarks.end_to_end import (
     UNLIMITED,
     AttemptCounts,
@@ -176,9 +176,7 @@ def main() -> None:
         log = args.work / "private.log"
         address = stack.enter_context(service(packless, workers=1, log=log))
         client = stack.enter_context(
-            PrivateClient(
-                address, key_of(packless), pack=args.pack, command=VEILFACE, dim=args.probe_dim
-            )
+            PrivateClient(address, key_of(packless), pack=args.pack, dim=args.probe_dim)
         )
         if client.contract().photos:
             raise SystemExit("the server of the private client has a pack: this measures nothing")

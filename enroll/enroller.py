@@ -28,7 +28,7 @@ from templates.keys.rotation import HolderKey, TenantRotation, holder_rotation
 from templates.space.agreement import mean_embedding
 from templates.space.embedding import unit_rows
 from templates.space.lifting import Strategy, lift, lift_stream
-from templates.space.subspace import AffineSubspace
+from templates.space.subspace import AffineSubspace, SubspaceBatch
 
 MAX_PHOTOS = 10
 WIRE_DTYPE: wire.WireDtype = "float16"
@@ -113,17 +113,17 @@ class Enroller:
         rotation: TenantRotation,
         lift_secret: bytes,
     ) -> None:
-        contract.binding.require_source(source_id=source.source_id)
-        n = contract.binding.n
-        if source.n != n or rotation.n != n:
+        binding = contract.binding
+        if (source.n, source.k, rotation.n) != (binding.n, binding.axes, binding.axes):
             raise ContractMismatch(
-                f"the contract is for embeddings of {n} numbers; the decoy source gives "
-                f"{source.n}, the rotation turns {rotation.n}"
+                f"the contract is for {binding.n} numbers on {binding.axes} axes; the decoy source "
+                f"has {source.n} and {source.k}, the rotation turns {rotation.n}"
             )
         self._contract = contract
         self._source = source
         self._rotation = rotation
         self._lift_secret = lift_secret
+        self._nobody = contract.nobody(source)
 
     def from_photos(
         self,
@@ -220,7 +220,7 @@ class Enroller:
             holder=None if holder is None else (holder.tenant, holder.subject),
         ) as stream:
             lifted = lift(
-                descriptor[None],
+                self._source.project(descriptor[None]),
                 strategy=binding.strategy,
                 m=binding.m,
                 source=self._source,
@@ -250,9 +250,9 @@ class Enroller:
             Where the template belongs to another contract.
         """
         contract, subspace = self._contract, self._received(data)
-        score = contract.nobody.score(subspace, contract.expectation)
+        near = float(self._nobody.stranger_similarity(SubspaceBatch.of([subspace]))[0])
         # NaN is not below the limit either.
-        if not score <= contract.template_stranger_score:
+        if not near <= contract.template_stranger_similarity:
             raise InvalidTemplate(
                 "the template lies nearer to strangers than the contract recorded of honest ones: "
                 "lift photos of one person with the contract's decoys"
@@ -279,10 +279,10 @@ class Enroller:
         received = wire.decode(data)
         binding.require_contract(received.contract_id, what="the template")
         subspace = received.subspace
-        if (subspace.n, subspace.m) != (binding.n, binding.m):
+        if (subspace.n, subspace.m) != (binding.axes, binding.m):
             raise InvalidTemplate(
-                f"a template of this contract has n = {binding.n} and m = {binding.m}, "
-                f"not n = {subspace.n} and m = {subspace.m}"
+                f"a template of this contract has {binding.axes} numbers and m = {binding.m}, "
+                f"not {subspace.n} and m = {subspace.m}"
             )
         low, high = self._contract.template_foot_point_norm
         if not low <= subspace.foot_norm <= high:
@@ -306,7 +306,7 @@ class Enroller:
         if holder is None:
             return subspace, None
         salt = secrets.token_hex(16)
-        rotation = holder_rotation(holder.key, salt, self._contract.binding.n)
+        rotation = holder_rotation(holder.key, salt, self._contract.binding.axes)
         return subspace.turned_by(rotation.turned), salt
 
     def _finish(
@@ -317,7 +317,7 @@ class Enroller:
         holder_salt: str | None,
     ) -> Enrollment:
         contract_id, template_id = self._contract.contract_id, secrets.token_hex(16)
-        rotation = self._rotation.of(template_id, self._contract.binding.rotation_version)
+        rotation = self._rotation.of(template_id)
         turned = subspace.turned_by(rotation.turned)
         return Enrollment(
             wire=wire.encode(turned, contract_id=contract_id, dtype=WIRE_DTYPE),

@@ -29,7 +29,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from templates.contract.wire import decode, encode
-from templates.keys.rotation import Rotation, TenantRotation
+from templates.decoys import client_source
+from templates.keys.rotation import SignedCosineRotation, TenantRotation
 from templates.keys.sealing import MasterKeyring
 from templates.space.lifting import Strategy, lift
 from templates.store import TemplateStore
@@ -44,7 +45,6 @@ from tests.leak_places import (
     written_log,
 )
 from tests.patience import PATIENCE_S
-from verify.cohort import client_source
 
 ROOT = Path(__file__).resolve().parent.parent
 LEVEL = "fmr-1e-2"
@@ -81,7 +81,7 @@ class OpenedTemplate:
     """The arrays of a decrypted template as they are on the wire: foot point, then basis."""
 
     rows: NDArray[np.float64] = field(repr=False)
-    rotation: Rotation = field(repr=False)
+    rotation: SignedCosineRotation = field(repr=False)
 
 
 @dataclass(repr=False)

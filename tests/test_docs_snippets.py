@@ -47,8 +47,6 @@ WHOLE_PAGES = {
     ("docs/tutorial.md", "sh"): "tests/test_tutorial.py",
     ("docs/client.md", "sh"): "tests/clients/test_docs.py",
     ("docs/client.md", "python"): "tests/clients/test_docs.py",
-    ("docs/private-client.md", "sh"): "tests/clients/test_docs.py",
-    ("docs/private-client.md", "python"): "tests/clients/test_docs.py",
     ("docs/login.md", "js"): "tests/examples/test_login.py",
     ("docs/javascript.md", "js"): "tests/clients/javascript/test_docs.py",
     ("docs/backups.md", "sh"): "tests/test_backup.py",
@@ -136,8 +134,6 @@ PARSED = {
         OWN_DATA
     ),
     ("docs/cli.md", "veilface bench distances"): OWN_DATA,
-    ("docs/design-measurements.md", "python -m benchmarks.decoy_generators --data ../shared/data "
-     "--part separation"): OWN_DATA,
     ("docs/evaluation.md", "PACK=~/.insightface/models/buffalo_l"): SETTINGS_ALONE,
     ("docs/evaluation.md", "veilface evaluate $BENCH/lfw.bin --pack $PACK --strategy raw,raw+flip "
      "--out raw"): OWN_DATA,
@@ -150,7 +146,7 @@ PARSED = {
     ("docs/evaluation.md", "veilface decoys build $FACES --pack $PACK --out generator.veil"): (
         OWN_DATA
     ),
-    ("docs/evaluation-columns.md", "veilface evaluate ~/lfw --pack $PACK --labels labels.csv "
+    ("docs/evaluation.md", "veilface evaluate ~/lfw --pack $PACK --labels labels.csv "
      "--strategy raw,random --out groups"): OWN_DATA,
     (
         "docs/evaluation.md",
@@ -166,8 +162,7 @@ PARSED = {
      "--out pool.veil"): OWN_DATA,
     ("docs/operations.md", "veilface serve --host 0.0.0.0 --tls-certificate chain.pem "
      "--tls-key key.pem"): "tests/api/process/test_operations.py starts a service with TLS",
-    ("docs/privacy-measurement.md", "veilface audit fairface fairface --pack $PACK --lifting 1500 "
-     "--attack 3500 --attacked 1500"): OWN_DATA,
+    ("docs/privacy.md", "python -m benchmarks.operating_point --data ../shared/data"): OWN_DATA,
 }  # fmt: skip
 # Blocks that nothing executes, and why. docs/README.md names these pages.
 NOT_EXECUTED = {
@@ -183,7 +178,7 @@ DRAWINGS = {
     ("docs/architecture.md", "set ─▶ reader"),
     ("docs/distances.md", "__init__ ──▶ tiles"),
     ("docs/distances.md", "probes, templates ──stack──▶"),
-    ("docs/oidc.md", "application ──/authorize──▶"),
+    ("docs/login.md", "application ──/authorize──▶"),
     ("docs/rest.md", "veilface-probe-1"),
 }
 PACKAGES = ("templates", "models", "enroll", "verify", "attacks", "api")
@@ -537,7 +532,7 @@ def fail_once(deployment: Deployment, subject: str) -> None:
         subject,
         accepted=False,
         template_id=held.template_id,
-        contract_ids=[held.contract_id],
+        contract_id=held.contract_id,
         level="fmr-1e-3",
         nonce=None,
         by=By(),

@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 
 from templates.contract.canonical import Json
 from templates.contract.document import Binding, Calibration, Contract
-from templates.contract.expectation import PointExpectation
 from templates.contract.nobody import Nobody
-from templates.decoys import Attributes, DecoySource
+from templates.decoys import Attributes, DecoySource, client_source
 from templates.errors import ContractError
-from templates.keys.randomness import Keystream
+from templates.keys.randomness import KEY_BYTES, Keystream
 from templates.space.embedding import unit_descriptors
 from templates.space.lifting import plain_strategy
+from templates.space.subspace import SubspaceBatch
 from verify.calibration_mode import (
     CalibrationOptions,
     CalibrationRun,
@@ -23,13 +23,10 @@ from verify.calibration_mode import (
     calibrate_points,
     point_sets,
 )
-from verify.cohort import client_source, people_like
 from verify.comparisons import Lifter, Progress, honest_norms
 from verify.consistency import Consistency, photo_consistency
-from verify.expectation import Climbers, ExpectationFit, fit_expectation
 from verify.group_rates import PeopleGroups, PhotoLabels, people_groups
 from verify.raw_pairs import SuspiciousPair, suspicious_pairs
-from verify.strangers import honest_score, make_nobody, strangers_like
 from verify.tenfold import Pair, TenFold, pair_arrays, random_pairs, require_folds
 from verify.trials import ProbeSets, TrialPlan, chosen_photos, enrolled_means, plan_trials
 
@@ -49,13 +46,11 @@ class CalibrationReport:
         Sentences about the groups whose trials are too few for ``worst_group`` to heed them.
     suspicious
         People who may be one person under two names: look at them before believing a threshold
-        at FMR 1e-4 or below, then name them in ``aliases`` (docs/design-measurements.md §1.3).
+        at FMR 1e-4 or below, then name them in ``aliases`` (docs/thresholds.md "One person under
+        two names").
     ten_folds
         Results of the ten-fold protocol, one per calibration in the contract's order; empty
         under protocol ``fmr``.
-    climbers
-        How often templates of nobody accept embeddings that climbed against the expectation; None
-        where an expectation was kept.
     """
 
     consistency: Consistency
@@ -64,7 +59,6 @@ class CalibrationReport:
     suspicious: tuple[SuspiciousPair, ...]
     suspicious_above: float
     ten_folds: tuple[TenFold, ...]
-    climbers: Climbers | None
 
 
 @dataclass(frozen=True)
@@ -75,8 +69,10 @@ class Calibrated:
     report: CalibrationReport
 
 
-_FITTED = 0.7
-"""Share of the time that has passed, on LFW, once people are enrolled and expectations fitted."""
+_ENROLLED = 0.3
+"""Share of the time that has passed, on LFW, once people are enrolled."""
+DEVIATIONS = 6.0
+"""Of similarities to strangers, above the mean of honest templates: the largest that passes."""
 
 
 def part_of(progress: Progress, first: float, last: float) -> Progress:
@@ -100,8 +96,7 @@ def calibrate(
     attributes: Sequence[Attributes] | None = None,
     labels: PhotoLabels | None = None,
     pairs: Sequence[Pair] | None = None,
-    expectation: PointExpectation | None = None,
-    nobody: Nobody | None = None,
+    cohort_seed: bytes | None = None,
     recorded: Mapping[str, Json] | None = None,
     dataset: str = "labelled folder",
     progress: Callable[[str, float], None] = _silent,
@@ -112,7 +107,7 @@ def calibrate(
     passed through the wire format as in the service; of many people, ``most_templates``. Genuine
     probes are the photos that were left out. Impostor trials are all cross-identity pairs or a
     random subset of them, as the contract states. A level's threshold is the smallest score at
-    which the FMR is at most the target (docs/decision.md §2).
+    which the FMR is at most the target (docs/method.md "Scores").
 
     Parameters
     ----------
@@ -127,10 +122,8 @@ def calibrate(
     pairs
         Pairs of the ten-fold protocol, as positions in ``descriptors``; balanced random pairs
         where None. Pairs of excluded people are left out.
-    expectation
-        A contract's, to keep it; by default it is fitted to what is drawn afresh.
-    nobody
-        A contract's strangers, to keep them with their cohort; by default new ones are drawn.
+    cohort_seed
+        A contract's, to keep its cohort; by default a new one is drawn.
     recorded
         Facts for the contract file, such as the pack's name and detector.
     progress
@@ -140,8 +133,7 @@ def calibrate(
     ------
     ContractError
         Where the data are too few for a single level, or do not fit the binding; where
-        ``worst_group`` is asked for and nobody is labelled; where the
-        similarity to templates of nobody does not follow its closed form.
+        ``worst_group`` is asked for and nobody is labelled.
     ContractMismatch
         Where ``source`` is not the binding's.
     """
@@ -154,10 +146,8 @@ def calibrate(
             f"shape ({len(identities)}, {binding.n}), not {unit.shape}"
         )
     kept, names = chosen_photos(identities, exclude=exclude, aliases=aliases or {})
-    if len(set(names)) < 2 or len(set(names)) == len(names):
-        raise ContractError(
-            "a calibration needs at least two people, and one with at least two photos"
-        )
+    if len(set(names)) < 2:
+        raise ContractError("a calibration needs at least two people")
     data = np.ascontiguousarray(unit[kept], dtype=np.float32)
     rng = np.random.default_rng(options.seed)
     plan = plan_trials(
@@ -175,14 +165,13 @@ def calibrate(
     consistency = photo_consistency(
         data, plan.person_of, photos=options.photos_per_enrollment, rng=rng
     )
-    run, fit = _lay_out(
+    run = _lay_out(
         data,
         plan,
         binding=binding,
         source=source,
         options=options,
-        expectation=expectation,
-        nobody=nobody,
+        cohort_seed=cohort_seed,
         attributes=None if attributes is None else [attributes[index] for index in kept],
         pairs=placed,
         groups=groups,
@@ -201,13 +190,14 @@ def calibrate(
         },
         progress=progress,
     )
+    progress("comparing probes with templates", _ENROLLED)
     results: list[ModeResult] = []
     sets = point_sets(run, rng) if 0 in options.probe_dims else []
     dims = [dim for dim in options.probe_dims if dim]
     kinds: list[ProbeSets | int] = [*sets, *dims]
     for number, kind in enumerate(kinds):
         first, last = (
-            _FITTED + (1 - _FITTED) * place / len(kinds) for place in (number, number + 1)
+            _ENROLLED + (1 - _ENROLLED) * place / len(kinds) for place in (number, number + 1)
         )
         part = replace(run, progress=part_of(progress, first, last))
         results.append(
@@ -216,9 +206,6 @@ def calibrate(
             else calibrate_points(part, kind)
         )
     calibrations = [result.calibration for result in results]
-    climbers = None if fit is None or not sets else fit.climbers_at(calibrations[0].levels[0])
-    if climbers is not None:
-        recorded = {**(recorded or {}), "climbing_probes": climbers.to_json()}
     contract = _contract(run, binding, calibrations, recorded or {})
     return Calibrated(
         contract,
@@ -231,7 +218,6 @@ def calibrate(
             ),
             suspicious_above=options.suspicious_above,
             ten_folds=tuple(one.folds for one in results if one.folds is not None),
-            climbers=climbers,
         ),
     )
 
@@ -255,15 +241,15 @@ def _contract(
         photo_consistency=consistency.threshold,
         probe_consistency=consistency.probe_threshold,
         template_foot_point_norm=honest_norms(run.templates.foot_norms),
-        template_stranger_score=honest_score(
-            run.nobody,
-            run.expectation,
-            run.templates,
-            people=run.plan.compared if run.halves else None,
-        ),
-        expectation=run.expectation,
-        nobody=run.nobody,
+        template_stranger_similarity=_honest_similarity(run.nobody, run.templates),
+        cohort_seed=run.nobody.cohort_seed,
     )
+
+
+def _honest_similarity(nobody: Nobody, templates: SubspaceBatch) -> float:
+    """Largest similarity to strangers of an honest template, with a margin."""
+    near = nobody.stranger_similarity(templates)
+    return float(near.mean() + DEVIATIONS * near.std())
 
 
 def _lay_out(
@@ -273,16 +259,15 @@ def _lay_out(
     binding: Binding,
     source: DecoySource,
     options: CalibrationOptions,
-    expectation: PointExpectation | None,
-    nobody: Nobody | None,
+    cohort_seed: bytes | None,
     attributes: Sequence[Attributes] | None,
     pairs: tuple[Pair, ...],
     groups: tuple[PeopleGroups, ...],
     consistency: Consistency,
     facts: Mapping[str, Json],
     progress: Progress,
-) -> tuple[CalibrationRun, ExpectationFit | None]:
-    """Enroll everybody; fit the expectation and draw the strangers where none are given."""
+) -> CalibrationRun:
+    """Enroll everybody; draw the seed of a cohort where none is given."""
     service = Lifter(binding.strategy, source, binding.contract_id)
     generator = client_source(source)
     client = Lifter(plain_strategy(binding.strategy), generator, binding.contract_id)
@@ -296,36 +281,14 @@ def _lay_out(
             attributes=attributes
             and [attributes[plan.enrolled[person][0]] for person in plan.compared],
         )
-    halves = False
-    if expectation is None or nobody is None:
-        hidden = people_like(generator, means)
-    fit = None
-    if expectation is None:
-        fitting = part_of(progress, 0.0, _FITTED)
-        with Keystream.seeded("expectation", options.seed) as stream:
-            fit = fit_expectation(
-                generator,
-                hidden,
-                strategy=client.strategy,
-                m=binding.m,
-                metric=options.metric,
-                stream=stream,
-                progress=lambda share: fitting("fitting expected similarities", share),
-            )
-        expectation = fit.expectation
-    if nobody is None:
-        progress("drawing strangers", _FITTED)
-        sources = strangers_like(generator, hidden, data, plan.person_of)
-        halves = len(sources) == 2
+    if cohort_seed is None:
         with Keystream.fresh() as stream:
-            nobody = make_nobody(generator, strangers=sources, stream=stream)
-    run = CalibrationRun(
+            cohort_seed = stream.token(KEY_BYTES)
+    return CalibrationRun(
         descriptors=data,
         plan=plan,
         templates=templates,
-        expectation=expectation,
-        nobody=nobody,
-        halves=halves,
+        nobody=Nobody(generator, binding.strategy, binding.m, cohort_seed),
         service=service,
         client=client,
         pairs=pairs,
@@ -335,7 +298,6 @@ def _lay_out(
         facts=facts,
         progress=progress,
     )
-    return run, fit
 
 
 def _protocol_pairs(

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -10,15 +9,13 @@ from numpy.typing import NDArray
 
 from templates.contract.canonical import Json
 from templates.contract.document import Calibration
-from templates.contract.expectation import PointExpectation
 from templates.contract.levels import photos_in_words
 from templates.contract.nobody import Nobody
 from templates.distances import DEFAULT_STEPS, Metric
 from templates.errors import ContractError
 from templates.keys.randomness import Keystream
-from templates.space.rounded import RoundedBatch
 from templates.space.subspace import SubspaceBatch
-from verify.cohort import cohort_statistics
+from verify.cohort import Probes, expected_similarity
 from verify.comparisons import (
     Lifter,
     Progress,
@@ -139,15 +136,13 @@ class ModeResult:
 class CalibrationRun:
     """Everything that the calibrations of one run share.
 
-    ``halves``: the strangers are of two sources (:func:`verify.strangers.strangers_like`).
+    ``descriptors`` are embeddings, (N, n); templates are in the coordinates of the axes.
     """
 
     descriptors: NDArray[np.float32]
     plan: TrialPlan
     templates: SubspaceBatch
-    expectation: PointExpectation
     nobody: Nobody
-    halves: bool
     service: Lifter
     client: Lifter
     pairs: tuple[Pair, ...]
@@ -156,11 +151,6 @@ class CalibrationRun:
     options: CalibrationOptions
     facts: Mapping[str, Json]
     progress: Progress
-
-    @cached_property
-    def cohort(self) -> RoundedBatch:
-        """The cohort of the contract that is being made."""
-        return self.nobody.cohort(strategy=self.client.strategy, m=self.templates.m)
 
 
 def point_sets(run: CalibrationRun, rng: np.random.Generator) -> list[ProbeSets]:
@@ -185,8 +175,9 @@ def calibrate_points(run: CalibrationRun, sets: ProbeSets) -> ModeResult:
         run.descriptors,
         run.plan,
         run.templates,
-        run.expectation,
+        run.nobody,
         sets,
+        metric=run.options.metric,
         consistency=run.consistency.probe_threshold,
         progress=run.progress,
     )
@@ -201,7 +192,7 @@ def calibrate_lifted(run: CalibrationRun, probe_m: int, rng: np.random.Generator
             run.descriptors,
             run.plan,
             run.templates,
-            run.cohort,
+            run.nobody.cohort,
             run.client,
             probe_m=probe_m,
             metric=options.metric,
@@ -322,7 +313,9 @@ def _ten_fold(run: CalibrationRun, probe_m: int) -> TenFold:
     with Keystream.seeded("ten folds", options.seed, probe_m) as stream:
         templates = run.service.lift(run.descriptors[enrolled], m=run.templates.m, stream=stream)
         raw = run.descriptors[probing]
-        probes = run.client.lift(raw, m=probe_m, stream=stream) if probe_m else raw
+        probes: Probes = run.nobody.generator.project(raw)
+        if probe_m:
+            probes = run.client.lift(raw, m=probe_m, stream=stream)
     close = pair_similarities(
         probes,
         templates,
@@ -331,11 +324,6 @@ def _ten_fold(run: CalibrationRun, probe_m: int) -> TenFold:
         metric=options.metric,
         steps=options.steps,
     )
-    if isinstance(probes, SubspaceBatch):
-        statistics = cohort_statistics(
-            probes, run.cohort, metric=options.metric, steps=options.steps
-        )
-    else:
-        statistics = run.expectation.statistics(probes)
+    statistics = expected_similarity(probes, run.nobody, metric=options.metric, steps=options.steps)
     means, spreads = (part[positions] for part in statistics)
     return ten_fold((close - means) / spreads, *pair_arrays(run.pairs))

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from templates.contract import wire
-from templates.contract.expectation import PointExpectation
 from templates.contract.levels import photos_in_words
+from templates.contract.nobody import Nobody
 from templates.decoys import Attributes, DecoySource
 from templates.distances import (
     DEFAULT_STEPS,
@@ -24,7 +24,6 @@ from templates.distances import (
 )
 from templates.keys.randomness import Keystream
 from templates.space.lifting import Strategy, lift
-from templates.space.rounded import RoundedBatch
 from templates.space.subspace import SubspaceBatch
 from verify.cohort import Probes, cohort_statistics
 from verify.thresholds import Genuine, Impostors
@@ -60,12 +59,12 @@ class Lifter:
         stream: Keystream,
         attributes: Sequence[Attributes] | None = None,
     ) -> SubspaceBatch:
-        """Lift, encode and decode; hybrid+ without attributes takes any decoys."""
+        """Project embeddings, lift, encode, decode; hybrid+ without attributes takes any decoys."""
         named = None
         if self.strategy is Strategy.HYBRID_PLUS:
             named = attributes or [Attributes()] * len(descriptors)
         lifted = lift(
-            descriptors,
+            self.source.project(descriptors),
             strategy=self.strategy,
             m=m,
             source=self.source,
@@ -89,9 +88,10 @@ def point_trials(
     descriptors: NDArray[np.float32],
     plan: TrialPlan,
     templates: SubspaceBatch,
-    expectation: PointExpectation,
+    nobody: Nobody,
     sets: ProbeSets,
     *,
+    metric: Metric,
     consistency: float,
     progress: Progress,
 ) -> tuple[Impostors, Genuine]:
@@ -111,22 +111,26 @@ def point_trials(
     what = f"comparing probes of {photos_in_words(sets.photos.shape[1])} with templates"
     for start in range(0, len(owners), PROBE_TILE):
         rows = slice(start, start + PROBE_TILE)
-        probes = sets.means(descriptors, sets.impostor[rows])
-        distances = pairwise_distances(probes, templates, metric=expectation.metric)
-        means, spreads = expectation.statistics(probes)
+        probes = nobody.generator.project(sets.means(descriptors, sets.impostor[rows]))
+        distances = pairwise_distances(probes, templates, metric=metric)
+        means, spreads = nobody.statistics(probes, metric)
         scores[rows] = (similarity(distances) - means[:, None]) / spreads[:, None]
         progress(what, min(1.0, (start + PROBE_TILE) / len(owners)))
     with_template = np.flatnonzero(plan.template_of[owners] >= 0)
     scores[with_template, plan.template_of[owners[with_template]]] = -np.inf
     own = plan.person_of[sets.photos[: sets.genuine, 0]]
     probes = sets.means(descriptors, slice(sets.genuine))
-    means, spreads = expectation.statistics(probes)
+    if len(probes):
+        probes = nobody.generator.project(probes)
+    else:
+        probes = np.empty((0, templates.n), dtype=np.float32)
+    means, spreads = nobody.statistics(probes, metric)
     close = pair_similarities(
         probes,
         templates,
         np.arange(len(own)),
         plan.template_of[own],
-        metric=expectation.metric,
+        metric=metric,
         steps=DEFAULT_STEPS,
     )
     genuine = Genuine(
@@ -176,7 +180,7 @@ def lifted_trials(
     descriptors: NDArray[np.float32],
     plan: TrialPlan,
     templates: SubspaceBatch,
-    cohort: SubspaceBatch | RoundedBatch,
+    cohort: SubspaceBatch,
     lifter: Lifter,
     *,
     probe_m: int,

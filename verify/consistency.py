@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from templates.contract.document import Rate
-from templates.errors import ContractError
 from templates.space.agreement import weakest_split
 from verify.metrics import most_errors, rate, threshold_at_fmr
 from verify.raw_pairs import impostor_cosines
@@ -67,7 +66,7 @@ def photo_consistency(
     It is the smaller of two values: the raw cosine at FMR 1e-6, and the agreement that all but
     2 % of the genuine sets of ``photos`` photos reach. It is at least the raw cosine at FMR 1e-3,
     so that mislabelled photos among the genuine sets cannot lower it further. A probe's limit is
-    that raw cosine at FMR 1e-3.
+    that raw cosine at FMR 1e-3, and so is an enrollment's where nobody has two photos.
 
     Parameters
     ----------
@@ -83,7 +82,7 @@ def photo_consistency(
     Raises
     ------
     ContractError
-        Where there is no pair of photos of different people, or none of one person.
+        Where there is no pair of photos of different people.
 
     Notes
     -----
@@ -97,8 +96,10 @@ def photo_consistency(
     tail = impostor_tail(impostor)
     lax, strict = tail.lax, tail.at(STRICTEST_FMR)
     genuine = np.sort(_genuine_agreements(descriptors, person_of, photos=photos, rng=rng))
-    allowed = max(0, int(MOST_REFUSED * (len(genuine) + 1)) - 1)
-    threshold = max(lax, min(strict, float(genuine[allowed])))
+    threshold = lax
+    if len(genuine):
+        allowed = max(0, int(MOST_REFUSED * (len(genuine) + 1)) - 1)
+        threshold = max(lax, min(strict, float(genuine[allowed])))
     return Consistency(
         threshold=threshold,
         probe_threshold=lax,
@@ -152,8 +153,6 @@ def _genuine_agreements(
     size = max(2, photos)
     while size > 2 and sum(len(own) >= size for own in people) < LEAST_PEOPLE:
         size -= 1
-    if all(len(own) < size for own in people):
-        raise ContractError("photo consistency needs a person with two photos or more")
     return np.array(
         [
             weakest_split(descriptors[rng.permutation(own)[:size]]).agreement

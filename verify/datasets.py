@@ -98,6 +98,12 @@ def labelled_folder(root: Path | str) -> LabelledFolder:
     return LabelledFolder(folder, tuple(paths), tuple(identities), tuple(ignored))
 
 
+def photos_alone(root: Path, photos: Sequence[Path]) -> LabelledFolder:
+    """Take each of some photos for a person of its own: of faces that nobody labelled."""
+    paths = tuple(sorted(photos))
+    return LabelledFolder(root, paths, tuple(str(path.relative_to(root)) for path in paths), ())
+
+
 def _has_people(folder: Path) -> bool:
     return any(
         is_photo(file) for entry in visible(folder) if entry.is_dir() for file in visible(entry)

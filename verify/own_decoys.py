@@ -2,7 +2,7 @@
 
 Such decoys resemble the enrolled people more than those of a deployment resemble its users: the
 calibration then measures something that nobody will see. A generator holds no descriptor and names
-nobody, but its axes and their variances fit the faces that it was made of better than any others.
+nobody, but along its axes the faces that it was made of do not correlate, and others do.
 """
 
 from collections.abc import Sequence
@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from templates.decoys import DecoyGenerator, DecoyPool, DecoySource
-from templates.decoys.statistics import DescriptorStatistics
 from templates.errors import ContractError
 from verify.consistency import impostor_tail
 from verify.evaluation.attributes import resembling_rows
@@ -20,8 +19,6 @@ from verify.raw_pairs import impostor_cosines
 
 LEAST_DEVIATIONS = 4
 """Standard deviations below chance from which on axes correlate too little."""
-LEAST_ENERGY = 0.6
-"""Faces of one kind seen on axes of another, also of one gender, race and age, have more."""
 MOST_PEOPLE = 0.02
 SAME_PHOTO = 0.999
 """Cosine of a photo to itself, encoded again."""
@@ -35,38 +32,28 @@ _REMEDY = (
 
 @dataclass(frozen=True)
 class Memory:
-    """How descriptors look in a generator's coordinates; both are low for those of its fit.
+    """How embeddings correlate along the principal axes of a generator's decoys.
 
     Parameters
     ----------
     correlation
-        Mean squared correlation of two axes, times the number of descriptors. The axes are those
-        along which the descriptors of the fit do not correlate at all; those of other people
-        correlate by chance alone to 1, of several photos each or of another kind to more.
+        Mean squared correlation of two axes, times the number of embeddings. Those of the fit do
+        not correlate at all; those of other people correlate by chance alone to 1, and by more
+        where they are of another kind or several photos of one person.
     least
         What chance alone reaches all but surely.
-    energy
-        Mean square on the axes of the third quarter, by the generator's own variance there. That
-        variance was estimated on descriptors that had no part in the axes, so that it is 1 for new
-        people of the same kind, and more for most of another. Along the axes of the fit, which
-        were chosen for having little, its own descriptors have less.
     """
 
     correlation: float
     least: float
-    energy: float
 
 
-def memory(statistics: DescriptorStatistics, descriptors: NDArray[np.floating]) -> Memory:
-    """Measure what a generator remembers of (N, n) unit descriptors."""
-    axes = statistics.axes.astype(np.float64)
-    deviations = np.maximum(np.linalg.norm(axes, axis=1), 1e-12)
-    centred = np.asarray(descriptors, dtype=np.float64) - statistics.mean
-    scores = centred @ (axes / deviations[:, None] ** 2).T
-    n = statistics.n
-    energy = float(np.mean(scores[:, n // 2 : 3 * n // 4] ** 2))
+def memory(generator: DecoyGenerator, descriptors: NDArray[np.floating]) -> Memory:
+    """Measure what a generator remembers of (N, n) unit embeddings."""
+    turn = np.linalg.eigh(generator.covariance)[1][:, ::-1]
+    scores = np.asarray(descriptors, dtype=np.float64) @ generator.axes.astype(np.float64) @ turn
     # The leading axes carry clusters, such as gender, which correlate in any part of the people.
-    scores = scores[:, n // 4 :]
+    scores = scores[:, generator.k // 4 :]
     scores -= scores.mean(axis=0)
     scores /= np.maximum(np.linalg.norm(scores, axis=0), 1e-12)
     squares = (scores.T @ scores) ** 2
@@ -74,7 +61,7 @@ def memory(statistics: DescriptorStatistics, descriptors: NDArray[np.floating]) 
     between = float(squares.sum() - np.trace(squares)) / pairs
     # Of each unordered pair, a square of variance 2 where the mean is 1.
     least = 1 - LEAST_DEVIATIONS * float(np.sqrt(2 / (pairs / 2)))
-    return Memory(correlation=len(scores) * between, least=least, energy=energy)
+    return Memory(correlation=len(scores) * between, least=least)
 
 
 def require_others(
@@ -94,16 +81,12 @@ def require_others(
         people have a pool entry that is as alike as two photos of one person are. Also where there
         are no two people to compare.
 
-    Notes
-    -----
-    docs/decoys.md "Decoys of the people themselves" has the measurements behind the limits.
     """
     names, person = np.unique(np.asarray(identities, dtype=np.str_), return_inverse=True)
     firsts = np.unique(person, return_index=True)[1]
     if isinstance(source, DecoyGenerator):
-        seen = [memory(source.statistics, rows) for rows in (descriptors, descriptors[firsts])]
-        unmixed = any(trace.correlation < trace.least for trace in seen)
-        if unmixed or seen[0].energy < LEAST_ENERGY:
+        seen = [memory(source, rows) for rows in (descriptors, descriptors[firsts])]
+        if any(trace.correlation < trace.least for trace in seen):
             raise ContractError(
                 "the decoys were made of the photos of these people, or of most of them: " + _REMEDY
             )

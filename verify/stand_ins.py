@@ -1,20 +1,18 @@
 """What a subject that does not exist is decided against, so that its answer looks like any other.
 
-A keyed digest of the subject seeds the lifting of one of the contract's strangers with fresh
-decoys, as a real person was lifted with fresh decoys, so that
+A keyed digest of the subject seeds the lifting of a face of nobody with fresh decoys, as a real
+person was lifted with fresh decoys, so that
 
 - the same unknown subject always gives the same distances, as an enrolled one does;
 - two unknown subjects give different distances: equal ones would tell that both are unknown;
-- the distances are those of impostors, each alone and several together: strangers are spread as
-  enrolled people are, and no two stand-ins share a decoy, whose sampling error a patient attacker
-  could learn (docs/threat-model.md).
+- the distances are those of impostors, each alone and several together: no two stand-ins share a
+  decoy, whose sampling error a patient attacker could learn (docs/threat-model.md).
 """
 
 from dataclasses import dataclass, field
 
-from templates.contract.document import Contract
+from templates.contract.nobody import Nobody
 from templates.keys.randomness import Keystream
-from templates.space.lifting import plain_strategy
 from templates.space.subspace import AffineSubspace
 
 
@@ -41,14 +39,14 @@ class StandIn:
     holder_salt: str | None = None
 
 
-def lift_stand_in(contract: Contract, digest: bytes) -> AffineSubspace:
+def lift_stand_in(nobody: Nobody, digest: bytes) -> AffineSubspace:
     """Lift the template of a stand-in.
 
     Parameters
     ----------
     digest
-        32 bytes that only the deployment can compute, and that name the subject: with them, and
-        the contract's strangers, a distance would tell an unknown subject.
+        32 bytes that only the deployment can compute, and that name the subject: with them, a
+        distance would tell an unknown subject.
 
     Notes
     -----
@@ -57,8 +55,5 @@ def lift_stand_in(contract: Contract, digest: bytes) -> AffineSubspace:
     """
     if len(digest) != 32:
         raise ValueError(f"a digest has 32 bytes, this has {len(digest)}")
-    binding = contract.binding
-    with Keystream.seeded("stand-in", digest.hex()) as stream:
-        return contract.nobody.lift(
-            strategy=plain_strategy(binding.strategy), m=binding.m, stream=stream
-        )
+    with Keystream(digest) as stream:
+        return nobody.lift(stream)

@@ -18,6 +18,10 @@ EXPECTED_ERRORS = 10.0
 (3 / N), which suits a rate that is only read: a threshold is *set* on these trials, and with k of
 them beyond it the relative standard error of the true rate is about 1/√k, a third for 10."""
 
+MOST_OVER = 2.0
+"""Largest 95 % bound of a level's FMR, in multiples of its target."""
+RESAMPLES = 200
+
 Scores = NDArray[np.float32]
 Array64 = NDArray[np.float64]
 
@@ -69,26 +73,54 @@ class Genuine:
 
 
 def resolved_targets(
-    impostors: Impostors, targets: Sequence[float] = TARGETS
+    impostors: Impostors, targets: Sequence[float] = TARGETS, *, seed: int = 0
 ) -> tuple[list[float], list[str]]:
     """Split targets into those the trials resolve and sentences about those they do not.
 
     A target needs ``EXPECTED_ERRORS`` expected false matches among the trials, and by the rule of
     three no fewer than 3 / target distinct pairs of people, since trials of one pair of people
-    repeat each other.
+    repeat each other. Of these, the 95 % bound of its FMR (:func:`bound_when_set_anew`) must be at
+    most ``MOST_OVER`` times the target.
     """
     kept, refused = [], []
     for target in sorted(targets, reverse=True):
         enough = resolvable(target, impostors.trials, expected_errors=EXPECTED_ERRORS)
-        if enough and resolvable(target, impostors.person_pairs):
-            kept.append(target)
-        else:
+        if not enough or not resolvable(target, impostors.person_pairs):
             refused.append(
                 f"FMR {target:g} is not resolved by {impostors.trials} impostor trials of "
                 f"{impostors.person_pairs} pairs of people: it needs "
                 f"{EXPECTED_ERRORS / target:.0f} trials and {3 / target:.0f} pairs"
             )
+        elif (bound := bound_when_set_anew(impostors, target, seed=seed)) > MOST_OVER * target:
+            refused.append(
+                f"FMR {target:g} is not resolved by {impostors.people} people: a threshold set on "
+                f"others like them may let {bound:.2g} pass, and {MOST_OVER * target:g} is the most"
+            )
+        else:
+            kept.append(target)
     return kept, refused
+
+
+def bound_when_set_anew(impostors: Impostors, target: float, *, seed: int = 0) -> float:
+    """95 % bound of the FMR on these trials of a threshold that is set on people like these.
+
+    Every resample draws people with replacement and sets the threshold on their trials; the FMR of
+    all trials at that threshold is what others would see.
+    """
+    count = min(len(impostors.scores), 4 * most_errors(target, impostors.trials) + 1_000)
+    highest = np.argpartition(impostors.scores, len(impostors.scores) - count)[-count:]
+    highest = highest[np.isfinite(impostors.scores[highest])]
+    highest = highest[np.argsort(-impostors.scores[highest], kind="stable")]
+    first, second = impostors.people_of(highest).T
+    rng = np.random.default_rng(seed)
+    rates = np.empty(RESAMPLES)
+    for number in range(RESAMPLES):
+        drawn = rng.integers(impostors.people, size=impostors.people)
+        weights = np.bincount(drawn, minlength=impostors.people).astype(np.float64)
+        allowed = target * impostors.weighted_trials(weights)
+        passed = np.cumsum(weights[first] * weights[second])
+        rates[number] = np.searchsorted(passed, allowed, side="right") / impostors.trials
+    return float(np.quantile(rates, 0.95))
 
 
 def highest_scores(impostors: Impostors, targets: Sequence[float]) -> Scores:

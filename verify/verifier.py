@@ -13,6 +13,7 @@ from models.pack import ModelPack
 from models.selection import FacePolicy
 from templates.contract import wire
 from templates.contract.document import Calibration, Contract, Level
+from templates.decoys import DecoySource
 from templates.distances import paired_distances, similarity
 from templates.errors import ContractMismatch, InvalidTemplate
 from templates.keys.randomness import KEY_BYTES
@@ -59,29 +60,35 @@ class _Rule:
 class Verifier:
     """Decides for one contract and one tenant. Holds no state between calls; threads may share it.
 
-    A probe is accepted where its score reaches the level's threshold (docs/decision.md §1). Each
-    stored template is in a rotation of its own, templates of nobody are in none, so the probe is
-    turned for the stored one only. The holder's rotation is derived and applied for every probe,
+    A probe is accepted where its score reaches the level's threshold (docs/method.md "Scores").
+    Each stored template is in a rotation of its own, templates of nobody are in none, so the probe
+    is turned for the stored one only. The holder's rotation is derived and applied for every probe,
     whether a key was sent, or is needed, or not: the time tells neither.
 
     Parameters
     ----------
+    source
+        The contract's decoys, reduced to its axes.
     rotation
         What gives each template of the tenant its rotation.
 
     Raises
     ------
     ContractMismatch
-        Where the rotation is of another dimension.
+        Where the decoys are others, or the rotation is of another dimension.
     """
 
-    def __init__(self, contract: Contract, *, rotation: TenantRotation) -> None:
-        n = contract.binding.n
-        if rotation.n != n:
+    def __init__(
+        self, contract: Contract, source: DecoySource, *, rotation: TenantRotation
+    ) -> None:
+        axes = contract.binding.axes
+        if rotation.n != axes:
             raise ContractMismatch(
-                f"the contract is for embeddings of {n} numbers, the rotation turns {rotation.n}"
+                f"templates of the contract have {axes} numbers, the rotation turns {rotation.n}"
             )
         self._contract = contract
+        self._source = source
+        self._nobody = contract.nobody(source)
         self._rotation = rotation
         self._nobodys_key = secrets.token_bytes(KEY_BYTES)
 
@@ -188,7 +195,7 @@ class Verifier:
         name = level or self._contract.default_level
         calibration = self._contract.calibration("p2s", probe_photos=photos, level=name)
         rule = _Rule(calibration, calibration.level(name))
-        probe = unit_rows(embedding, n=self._contract.binding.n, most=1)
+        probe = self._source.project(unit_rows(embedding, n=self._contract.binding.n, most=1))
         template, turn = self._opened(stored, holder_key, read=wire.decode_as_stored)
         turned = turn(probe.astype(np.float64)).astype(np.float32)
         return self._decide(rule, probe, turned, template, stored, has_key=holder_key is not None)
@@ -218,8 +225,10 @@ class Verifier:
         received = wire.decode(probe)
         binding.require_contract(received.contract_id, what="the lifted probe")
         subspace = received.subspace
-        if subspace.n != binding.n:
-            raise InvalidTemplate(f"a lifted probe must have n = {binding.n}, not {subspace.n}")
+        if subspace.n != binding.axes:
+            raise InvalidTemplate(
+                f"a lifted probe must have {binding.axes} numbers, not {subspace.n}"
+            )
         calibration = self._contract.calibration("s2s", probe_m=subspace.m)
         rule = _Rule(calibration, calibration.level(level or self._contract.default_level))
         self._require_honest_foot(subspace, calibration)
@@ -248,15 +257,15 @@ class Verifier:
         """Decode a template; returns it with what probes are turned by, a stand-in's too."""
         binding = self._contract.binding
         received = read(stored.wire)
-        version = binding.require_contract(received.contract_id, what="the stored template")
+        binding.require_contract(received.contract_id, what="the stored template")
         subspace = received.subspace
-        if (subspace.n, subspace.m) != (binding.n, binding.m):
+        if (subspace.n, subspace.m) != (binding.axes, binding.m):
             raise InvalidTemplate("the stored template has dimensions other than the contract's")
         if isinstance(stored, StandIn) and stored.lifted is not None:
             subspace = stored.lifted
-        by_tenant = self._rotation.of(stored.template_id, version)
+        by_tenant = self._rotation.of(stored.template_id)
         by_holder = holder_rotation(
-            holder_key or self._nobodys_key, stored.holder_salt or _NO_SALT, binding.n
+            holder_key or self._nobodys_key, stored.holder_salt or _NO_SALT, binding.axes
         )
         needs_key = stored.holder_salt is not None
 
@@ -290,7 +299,7 @@ class Verifier:
         distance = float(distances[0])
         close = float(np.asarray(similarity(distances), dtype=np.float64)[0])
         means, spreads = expected_similarity(
-            probe, self._contract, metric=calibration.metric, steps=calibration.steps
+            probe, self._nobody, metric=calibration.metric, steps=calibration.steps
         )
         score = (close - float(means[0])) / float(spreads[0])
         # NaN reaches no threshold, so no input is accepted by an exception. A stand-in never is,

@@ -2,16 +2,17 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from api.cli.audit_report import Out, Seed, conclude, model_json, share_once_begun, takes_limits
 from api.cli.console import message
 from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, extract
-from api.cli.errors import CommandError, UsageError, require_extra
-from api.cli.inputs import fairface_labels, listed_dims, listed_names, named_file, read_json
+from api.cli.errors import UsageError, require_extra
+from api.cli.inputs import fairface_labels, listed_dims, listed_names, load_decoys
 from api.cli.options import PROCESSOR, AsJson, Device, chosen_device, quick, takes_settings
+from api.process.opening import file_sealer, open_keyring
 from api.process.preparation import DEFAULT_DIM, acquired_json
 from api.settings import Settings
 from attacks.attributes.attackers import TRAINED
@@ -23,11 +24,14 @@ from attacks.attributes.audit import (
     run_attribute_audit,
 )
 from attacks.attributes.plan import OUR_DIMS, PAPER_DIMS, AttributePlan, schemes_of
-from attacks.frontier import frontier, verification_accuracy
-from attacks.outcomes import GENERATED, Scheme
+from attacks.outcomes import GENERATED, RAW_SCHEME, Scheme
 from attacks.population import LEAST_FITTED
 from attacks.report import document
+from models.pack import ModelPack
+from templates.contract.document import Binding, Contract
+from templates.decoys import DecoyGenerator
 from templates.distances import on_device
+from templates.errors import VeilfaceError
 from templates.space.lifting import Strategy
 from verify.fairface_labels import CLASSES
 
@@ -83,7 +87,7 @@ def fairface(
         str,
         typer.Option(
             help="Dimensions of adversarial lifting with generated decoys, as the service does "
-            "by default. --service-dim is among them."
+            "by default, beside --service-dim."
         ),
     ] = ",".join(map(str, OUR_DIMS)),
     attackers: Annotated[str, typer.Option(help="Who attacks; `knn` is the paper's.")] = ",".join(
@@ -99,29 +103,30 @@ def fairface(
             "FairFace has near-duplicates.",
         ),
     ] = None,
-    evaluation: Annotated[
+    decoys: Annotated[
         Path | None,
         typer.Option(
-            help="A `results.json` of `veilface evaluate`: adds accuracy against privacy, and the "
-            "operating point that it recommends."
+            help="The decoy generator that the service uses. Unset: `decoys.veil` in `data_dir` "
+            "where it is one of this pack, else one that is fitted to the lifting database."
         ),
     ] = None,
-    max_accuracy_loss: Annotated[
-        float,
+    axes: Annotated[
+        int | None,
         typer.Option(
-            min=0.0,
-            max=1.0,
-            help="With --evaluation: most of the raw accuracy that a recommended scheme loses.",
+            min=2,
+            help="Axes of faces that embeddings are projected on for generated decoys. Unset: as "
+            "by the contract in `data_dir` where it is of these decoys, else all.",
         ),
-    ] = 0.01,
+    ] = None,
     service_dim: Annotated[
-        int,
+        int | None,
         typer.Option(
             min=1,
             help="The dimension that the verdict is on, of adversarial lifting with generated "
-            "decoys; the other schemes are compared with it.",
+            "decoys; the other schemes are compared with it. Unset: that of the contract in "
+            f"`data_dir` where it is of these decoys, else {DEFAULT_DIM}.",
         ),
-    ] = DEFAULT_DIM,
+    ] = None,
     seed: Seed = 0,
     aligned: Aligned = False,
     flip: Flip = False,
@@ -136,8 +141,9 @@ def fairface(
     """Infer gender, race and age from templates: the paper's experiment, and stronger attackers.
 
     Writes report.json, report.md, figures, the paper's among them, and report.html, which has all
-    to read in one file, to --out. Exit status 1: the strongest attacker exceeds the limit.
-    docs/privacy-templates.md explains every figure.
+    to read in one file, to --out. Exit status 1: the strongest attacker exceeds the limit. Exit
+    status 3: none does, and too few faces show it.
+    docs/privacy.md explains every figure.
 
     Example: `veilface audit fairface fairface --pack buffalo_l --out audit`
     """
@@ -151,25 +157,28 @@ def fairface(
             "hybrid+ chooses decoys by gender and race: add both to --attributes, or leave hybrid+ "
             "out of --strategy"
         )
+    generator, served = _deployed(decoys, settings, pack)
+    if served is not None:
+        axes, service_dim = axes or served.axes, service_dim or served.m
+    service_dim = service_dim or DEFAULT_DIM
+    if generator is not None:
+        generator = generator.reduced(axes or generator.k)
+    n = axes or pack.info.n
+    ours = listed_dims(generated_dim, "--generated-dim", n=n, example="16,32")
+    if service_dim >= n:
+        raise UsageError(f"--service-dim must be below the {n} numbers of what is lifted")
     grid = schemes_of(
         dims=listed_dims(dim, "--dim", n=pack.info.n, example="2,4"),
-        generated_dims=listed_dims(
-            generated_dim, "--generated-dim", n=pack.info.n, example="16,32"
-        ),
+        generated_dims=tuple(dict.fromkeys((*ours, service_dim))),
+        axes=axes,
     )
     schemes = [
-        scheme for scheme in grid if scheme.decoys == GENERATED or scheme.strategy in strategies
+        scheme
+        for scheme in grid
+        if scheme.decoys == GENERATED or scheme.strategy in {*strategies, RAW_SCHEME.strategy}
     ]
     trained = [name for name in listed_names(attackers, ATTACKERS, "--attackers") if name != KNN]
-    results = None if evaluation is None else _read_results(evaluation)
-    audited = Scheme(str(Strategy.ADVERSARIAL), GENERATED, service_dim)
-    if audited not in schemes:
-        raise UsageError(
-            f"the verdict is on dimension {service_dim} with generated decoys: add it to "
-            "--generated-dim, or name another with --service-dim"
-        )
-    if results is not None:
-        verification_accuracy(results, schemes)
+    audited = Scheme(str(Strategy.ADVERSARIAL), GENERATED, service_dim, axes)
     labels = fairface_labels(root, "train"), fairface_labels(root, "val")
     plan = AttributeAuditPlan(
         schemes=tuple(schemes),
@@ -178,6 +187,7 @@ def fairface(
         lifting=default_lifting(len(labels[0])) if lifting is None else lifting,
         attack=attack,
         attacked=attacked,
+        axes=axes,
         drop_duplicates=drop_duplicates,
         seed=seed,
     )
@@ -188,7 +198,7 @@ def fairface(
         photos.append(extraction)
         faces.append(labelled_faces(extraction, part, wanted))
     with share_once_begun("attacking templates") as report_share, on_device(torch_device):
-        audit = run_attribute_audit(plan, *faces, progress=report_share)
+        audit = run_attribute_audit(plan, *faces, generator=generator, progress=report_share)
     if drop_duplicates is not None:
         message(f"note: {audit.duplicates} faces resemble a training face and are not attacked")
     report = document(
@@ -201,26 +211,38 @@ def fairface(
             "root": root.resolve().name,
             **audit.settings(),
             "k": neighbours,
-            "decoys": "of the lifting faces",
+            "decoys": "of the lifting faces" if generator is None else generator.source_id,
             "audited": str(audited),
-            "evaluation": named_file(evaluation),
             "flip": flip,
             "device": device,
             "seed": seed,
         },
-        cost=audit.cost,
         failure_to_acquire={
             "train": acquired_json(photos[0]),
             "val": acquired_json(photos[1]),
         },
     )
-    if results is not None:
-        report["frontier"] = frontier(results, report["rows"], most_lost=max_accuracy_loss)
-    conclude(report, out, pack, as_json=as_json, evaluation=results)
+    conclude(report, out, pack, as_json=as_json)
 
 
-def _read_results(file: Path) -> Any:
-    results = read_json(file)
-    if not isinstance(results, dict) or results.get("format") != "veilface evaluation":
-        raise CommandError(f"{file.name} is not a results.json of `veilface evaluate`")
-    return results
+def _deployed(
+    decoys: Path | None, settings: Settings, pack: ModelPack
+) -> tuple[DecoyGenerator | None, Binding | None]:
+    """Return the service's generator, and its scheme where the contract is of these decoys.
+
+    Neither is needed: without a generator the audit fits one.
+    """
+    path = decoys or settings.resolved_decoys_file
+    if decoys is None and not path.is_file():
+        return None, None
+    sealer = file_sealer(open_keyring(settings))
+    source = load_decoys(path, sealer, pack)
+    if not isinstance(source, DecoyGenerator):
+        raise UsageError(f"{path.name} is a decoy pool; --decoys takes a generator")
+    try:
+        binding = Contract.load(settings.resolved_contract_file, sealer).binding
+        own = source.reduced(binding.axes)
+        binding.require_source(source_id=own.source_id, made_with=own.made_with)
+    except VeilfaceError:
+        return source, None
+    return source, binding

@@ -3,7 +3,7 @@
 import functools
 import inspect
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -25,9 +25,10 @@ from templates.keys.private_file import make_folder, replace_public
 Out = Annotated[Path, typer.Option(help="Folder of the report.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed for everything random.")]
 
+NOT_SHOWN = 3
+"""Exit status where nothing fails, and not everything is shown to hold."""
 CAPTIONS = {
     "figure": "Attributes inferred from templates, by dimension",
-    "frontier": "Accuracy over what the strongest attackers learn",
     "linkage": "Local linkability D(s) of the templates of two tenants",
     "oracle": "What the paper's oracle gets",
 }
@@ -91,9 +92,7 @@ def share_once_begun(description: str) -> Iterator[Callable[[float], None]]:
         yield report
 
 
-def write_report(
-    report: Document, out: Path, *, evaluation: Mapping[str, Any] | None = None
-) -> list[Path]:
+def write_report(report: Document, out: Path) -> list[Path]:
     """Write the document, its Markdown, its figures and its HTML; return their files."""
     # Imported here: drawing loads a library that nothing else needs.
     from attacks.figures import write_figures
@@ -104,7 +103,7 @@ def write_report(
     replace_public(files[0], text.encode())
     written = markdown(report)
     replace_public(files[1], written.encode())
-    figures = write_figures(report, out, evaluation=evaluation)
+    figures = write_figures(report, out)
     return [*files, *figures, write_html(out / "report.html", written, figures, CAPTIONS)]
 
 
@@ -113,17 +112,10 @@ def model_json(pack: ModelPack) -> dict[str, Any]:
     return {**recorded_of(pack), "embedder_sha256": pack.info.embedder_sha256}
 
 
-def conclude(
-    report: Document,
-    out: Path,
-    pack: ModelPack,
-    *,
-    as_json: bool,
-    evaluation: Mapping[str, Any] | None = None,
-) -> None:
-    """Write the report, say first how it ended; leave with status 1 where it did not pass."""
+def conclude(report: Document, out: Path, pack: ModelPack, *, as_json: bool) -> None:
+    """Write the report, say first how it ended; leave with status 1 or 3 where it did not pass."""
     notice = demo_notice(pack.info.embedder_sha256, n=pack.info.n)
-    files = write_report(report, out, evaluation=evaluation)
+    files = write_report(report, out)
     if as_json:
         emit({**notice, "out": str(out), "files": [path.name for path in files], **report})
     else:
@@ -136,7 +128,7 @@ def conclude(
         say(f"{out}: {', '.join(path.name for path in files)}.")
         say(f"To read it: {out / 'report.html'}")
     if not report["passed"]:
-        raise typer.Exit(FAILED)
+        raise typer.Exit(NOT_SHOWN if report["passed"] is None else FAILED)
 
 
 def verdict_tables(report: Document) -> list[Table]:

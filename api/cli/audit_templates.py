@@ -7,7 +7,6 @@ from typing import Annotated
 
 import typer
 
-from api.cli.attacked_service import attacked_service
 from api.cli.audit_report import Out, Seed, conclude, model_json, share_once_begun, takes_limits
 from api.cli.console import message
 from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, extract
@@ -20,6 +19,7 @@ from api.settings import Settings
 from attacks.audit import AuditPlan, run_audit
 from attacks.learned.extra import need
 from attacks.population import LEAST_FITTED
+from attacks.privacy import reduced
 from attacks.report import document
 from templates.contract.document import Binding, Contract
 from templates.decoys import DecoySource
@@ -37,7 +37,6 @@ from verify import labelled_folder
     "linkability",
     "renewed-success",
     "false-acceptance",
-    "climbing-success",
     "success-with-key",
     "success-without-key",
 )
@@ -89,6 +88,15 @@ def templates(
             f"the contract in `data_dir` where it is of these decoys, else {DEFAULT_DIM}."
         ),
     ] = None,
+    axes: Annotated[
+        int | None,
+        typer.Option(
+            min=2,
+            help="Axes of faces that embeddings are projected on; not with --contract. Unset: as "
+            "by the contract in `data_dir` where it is of these decoys, else those with 83 % of "
+            "the decoys' variance.",
+        ),
+    ] = None,
     victims: Annotated[int, typer.Option(min=20, help="People who are attacked.")] = 300,
     owners: Annotated[
         int,
@@ -104,12 +112,8 @@ def templates(
             "that the attacks work."
         ),
     ] = True,
-    service: Annotated[
-        bool,
-        typer.Option(help="Start the service, and climb towards a victim over its REST interface."),
-    ] = True,
     climbed: Annotated[
-        int, typer.Option(min=1, help="Victims that climbers attack over the REST interface.")
+        int, typer.Option(min=1, help="Victims whose template is climbed by scores.")
     ] = 10,
     attempts: Annotated[
         int, typer.Option(min=50, help="Most attempts of a climber on one victim.")
@@ -123,31 +127,14 @@ def templates(
         ),
     ] = None,
     training_seconds: Annotated[
-        float, typer.Option(min=1, help="Most seconds of training, for each network.")
+        float, typer.Option(min=1, help="Most seconds of training.")
     ] = 120.0,
-    reconstruction: Annotated[
-        bool,
-        typer.Option(
-            "--reconstruct",
-            help="Train a decoder from embedding to face picture on the people who are not "
-            "attacked, and try to reconstruct the victims' faces. No picture is written.",
-        ),
-    ] = False,
     attacker_faces: Annotated[
         list[Path] | None,
         typer.Option(
             help="Further faces that the attacker has: a folder of photos, or a `.npz` with "
             "`paths` and `descriptors` of the same pack. May be given several times. Photos of "
             "victims, and people who are named like them, are left out."
-        ),
-    ] = None,
-    decoy_faces: Annotated[
-        int | None,
-        typer.Option(
-            min=LEAST_FITTED,
-            help="Number of faces that the file of --decoys was fitted to: an attacker with "
-            "unlimited faces is then simulated. --fit-decoys knows it. Unset, as for decoys that "
-            "were adapted with --like: estimated with the decoys as they are, and not judged.",
         ),
     ] = None,
     seed: Seed = 0,
@@ -165,7 +152,8 @@ def templates(
 
     Writes report.json, report.md, figures and report.html, which has all to read in one file, to
     --out. Every attack says what the attacker is assumed to have. Exit status 1: an attack exceeds
-    its limit, or none was judged. docs/privacy.md leads to what each attack is.
+    its limit. Exit status 3: none does, and too few people or faces show it. docs/privacy.md leads
+    to what each attack is.
 
     Example: `veilface audit templates lfw --pack buffalo_l --decoys decoys.veil --out audit`
     """
@@ -173,7 +161,7 @@ def templates(
     torch_device = chosen_device(device)
     if fit_decoys and (decoys is not None or contract is not None):
         raise UsageError("--fit-decoys fits decoys of its own: give no --decoys and no --contract")
-    if learned or reconstruction:
+    if learned:
         need("torch")
     train = find_spec("torch") is not None if learned is None else learned
     if not train:
@@ -181,23 +169,24 @@ def templates(
     pack = bulk_pack(settings, flip=flip, why="an audit attacks embeddings of a model pack")
     sealer = file_sealer(open_keyring(settings))
     loaded = None if contract is None else Contract.load(contract, sealer)
-    if loaded is not None:
-        loaded.binding.require_rotation_version()
-    if loaded is not None and (strategy is not None or dim is not None):
+    if loaded is not None and any(one is not None for one in (strategy, dim, axes)):
         raise UsageError(
-            "a contract says its strategy and dimension: leave out --strategy and --dim"
+            "a contract says its strategy, dimension and axes: leave out --strategy, --dim, --axes"
         )
     source = (
         None if fit_decoys else load_decoys(decoys or settings.resolved_decoys_file, sealer, pack)
     )
     if loaded is not None and source is not None:
-        loaded.binding.require_source(source_id=source.source_id, made_with=source.made_with)
-    if loaded is None and (dim is None or strategy is None):
+        own = reduced(source, loaded.binding.axes)
+        loaded.binding.require_source(source_id=own.source_id, made_with=own.made_with)
+    if loaded is None and (dim is None or strategy is None or axes is None):
         served = _served(settings, sealer, source)
         if dim is None:
             dim = str(DEFAULT_DIM if served is None else served.m)
         if strategy is None:
             strategy = Strategy.ADVERSARIAL if served is None else served.strategy
+        if axes is None and served is not None:
+            axes = served.axes
         if served is not None:
             path = settings.resolved_contract_file
             message(
@@ -207,7 +196,8 @@ def templates(
     dim, strategy = dim or str(DEFAULT_DIM), strategy or Strategy.ADVERSARIAL
     plan = AuditPlan(
         strategy=strategy,
-        dims=listed_dims(dim, "--dim", n=pack.info.n, example="16,32"),
+        dims=listed_dims(dim, "--dim", n=axes or pack.info.n, example="16,32"),
+        axes=axes,
         contract=loaded,
         victims=victims,
         owners=owners,
@@ -215,8 +205,6 @@ def templates(
         climbed=climbed,
         attempts=attempts,
         training_seconds=training_seconds if train else None,
-        decoy_faces=decoy_faces,
-        reconstruction=reconstruction,
         seed=seed,
     )
     labelled = labelled_folder(people)
@@ -233,8 +221,6 @@ def templates(
             [name_of[path] for path in faces.paths],
             pack=pack,
             decoys=source,
-            aligned=aligned,
-            start_service=attacked_service if service else None,
             further=further,
             progress=report_share,
         )
@@ -270,4 +256,7 @@ def _served(settings: Settings, sealer: Sealer, source: DecoySource | None) -> B
     except VeilfaceError as error:
         message(f"note: not auditing as the contract in `data_dir` has it: {error}")
         return None
-    return binding if binding.decoy_source_id == source.source_id else None
+    fits = binding.axes <= source.k and (
+        binding.decoy_source_id == reduced(source, binding.axes).source_id
+    )
+    return binding if fits else None

@@ -9,13 +9,13 @@ import typer
 
 from api.cli.calibrate_liveness import set_liveness_threshold, with_liveness_of
 from api.cli.console import demo_notice, emit, say, share_done, show, table
-from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, extract
+from api.cli.descriptors import BULK, Aligned, Cache, Flip, bulk_pack, each_person_once, extract
 from api.cli.errors import CommandError, UsageError
 from api.cli.files import read_bounded, read_names
 from api.cli.groups import estimated_labels, group_tables, labels_of
 from api.cli.inputs import fairface_labels, load_decoys
 from api.cli.options import AsJson, takes_settings
-from api.cli.photo_folders import labelled_people
+from api.cli.photo_folders import people_or_faces
 from api.cli.verdict import improvements, shown_rate, verdict_lines
 from api.process.opening import file_sealer, open_keyring
 from api.process.preparation import (
@@ -32,7 +32,6 @@ from templates.distances import Metric
 from templates.space.lifting import Strategy
 from verify import CalibrationOptions, CalibrationReport
 from verify.evaluation.labels_file import read_labels
-from verify.expectation import Climbers
 
 MOST_SHOWN = 20
 
@@ -50,7 +49,8 @@ def calibrate(
         Path | None,
         typer.Argument(
             help="Labelled faces: one subfolder for each person, with photos in it (as LFW has "
-            "them). Not with --liveness."
+            "them). Or faces that nobody labelled, in no subfolder: each photo is taken for "
+            "another person. Not with --liveness."
         ),
     ] = None,
     *,
@@ -73,7 +73,16 @@ def calibrate(
         typer.Option(
             min=1,
             max=MAX_M,
-            help="Dimension m of stored templates. Unset: the smallest at which privacy passes.",
+            help="Dimension m of stored templates. Unset: with --axes, what rejects the fewest "
+            "genuine probes of all that is private.",
+        ),
+    ] = None,
+    axes: Annotated[
+        int | None,
+        typer.Option(
+            min=2,
+            help="Leading axes of faces that embeddings are projected on before they are lifted. "
+            "Unset: chosen with --dim.",
         ),
     ] = None,
     probe_dims: Annotated[
@@ -151,7 +160,8 @@ def calibrate(
 
     Needs: a model pack, a decoys file, and photos of people with two photos or more each. 80
     people resolve FMR 1e-2 and 1e-3; lower targets need more people, and those that the data
-    cannot resolve are refused. The contract file belongs to the master key that is in force.
+    cannot resolve are refused. Of faces that nobody labelled, thresholds and privacy are measured
+    and rejections are not. The contract file belongs to the master key that is in force.
 
     Example: `veilface calibrate lfw --pack buffalo_l --decoys decoys.veil --out contract.json
     --strategy adversarial`
@@ -166,19 +176,23 @@ def calibrate(
     pack = bulk_pack(settings, flip=flip, why="a contract is bound to a model pack")
     if dim is not None and dim >= pack.info.n:
         raise UsageError(f"--dim must be below the {pack.info.n} numbers of an embedding")
+    if axes is not None and not (dim or 1) < axes <= pack.info.n:
+        raise UsageError(f"--axes must lie above --dim, and be at most {pack.info.n}")
     if labels is not None and fairface is not None:
         raise UsageError("give --labels or --fairface, not both: labels are better than estimates")
     if worst_group and labels is None and fairface is None:
         raise UsageError("--worst-group needs to know the groups: give --labels or --fairface")
     known = None if labels is None else read_labels(labels)
     faces = None if fairface is None else fairface_labels(fairface, "train")
-    labelled = labelled_people(folder)
+    labelled = people_or_faces(folder)
     keyring = open_keyring(settings)
     sealer = file_sealer(keyring)
     source = load_decoys(decoys or settings.resolved_decoys_file, sealer, pack)
     exclude = frozenset() if exclude_people is None else read_names(exclude_people)
     known_as = {} if aliases is None else read_aliases(aliases)
     extraction = extract(pack, labelled.paths, aligned=aligned, settings=settings, cache=cache)
+    if labelled.people == len(labelled):
+        extraction = each_person_once(extraction)
     groups = None if known is None else labels_of(extraction, known, labelled.root)
     if faces is not None:
         # FairFace's own photos are no aligned crops, whatever those of the people are.
@@ -191,6 +205,7 @@ def calibrate(
             pack=pack,
             source=source,
             strategy=strategy,
+            axes=axes,
             m=dim,
             options=CalibrationOptions(
                 protocol="ten-fold" if protocol is Protocol.TEN_FOLD else "fmr",
@@ -215,9 +230,8 @@ def calibrate(
                 **notice,
                 "contract": contract.public(),
                 "failure_to_acquire": acquired_json(extraction),
-                "privacy_by_dimension": {
-                    str(m): judgement.to_json() for m, judgement in done.point.tried.items()
-                },
+                "chosen": done.point.chosen,
+                "tried": [one.to_json() for one in done.point.tried],
                 **_report_json(done.report),
             }
         )
@@ -303,8 +317,6 @@ def _tell(contract: Contract, report: CalibrationReport) -> None:
         say(f"Not in the rule of the worst group: {sentence}.")
     for line in suspicious_lines(report, "name the same people in --aliases"):
         say(line)
-    if report.climbers is not None:
-        say(_climbers_line(report.climbers))
     consistency = report.consistency
     say(
         f"Default level: {contract.default_level}. Photos of one enrollment must agree to "
@@ -330,22 +342,6 @@ def suspicious_lines(report: CalibrationReport, remedy: str) -> list[str]:
 
 def _quoted(name: str) -> str:
     return '"' + name.replace('"', '""') + '"' if "," in name or '"' in name else name
-
-
-def _climbers_line(climbers: Climbers) -> str:
-    """Say what embeddings that climb gain, which nobody sends without the right to."""
-    unfitted = (
-        ""
-        if climbers.fitted
-        else " The expected similarity does not follow such probes; give the right `embeddings` "
-        "to nobody who may attack."
-    )
-    return (
-        f"Hostile embeddings: {climbers.probes} that climb are accepted by "
-        f"{100 * climbers.accepted:.2g} % of {climbers.templates:,} templates of nobody at "
-        f"{climbers.level}, the strongest of them by {100 * climbers.most:.2g} %; not judged."
-        f"{unfitted}"
-    )
 
 
 def _report_json(report: CalibrationReport) -> dict[str, Any]:

@@ -9,7 +9,7 @@ import typer
 from api.cli.console import message
 from api.cli.errors import CommandError, UsageError
 from api.process.opening import file_sealer, open_keyring
-from api.process.preparation import acquired
+from api.process.preparation import acquired, without_lookalikes
 from api.settings import Settings
 from models.cache import EmbeddingCache
 from models.extraction import Extraction, Extractor
@@ -88,3 +88,12 @@ def extract(
     if extraction.failures:
         message(f"note: {acquired(extraction)}")
     return extraction
+
+
+def each_person_once(extraction: Extraction) -> Extraction:
+    """Leave out photos that look like an earlier one, and say how many, where nobody is named."""
+    kept = without_lookalikes(extraction)
+    total, left = len(extraction.paths), len(kept.paths)
+    if left < total:
+        message(f"note: {total - left} of {total} photos look like another one, and are left out")
+    return kept

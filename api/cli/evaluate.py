@@ -72,6 +72,15 @@ def evaluate(
         ),
     ] = None,
     dim: Annotated[str, typer.Option(help="Subspace dimensions m.")] = ",".join(map(str, DIMS)),
+    axes: Annotated[
+        int | None,
+        typer.Option(
+            min=2,
+            help="Leading axes of faces that embeddings are projected on where decoys are of a "
+            "generator. Unset: all, as in the paper.",
+            show_default=False,
+        ),
+    ] = None,
     mode: Annotated[
         str, typer.Option(help="`p2s` lifts one photo of a pair, `s2s` both.")
     ] = "p2s,s2s",
@@ -155,7 +164,7 @@ def evaluate(
         names = listed(strategy, str, "--strategy", expected="names of strategies")
     raw_flip = wants_raw_flip(names, embeddings, flip=flip)
     embedder = open_embedder(settings, embeddings, flip=flip, raw_flip=raw_flip, aligned=aligned)
-    sources = open_sources(decoys or [], settings, embedder)
+    sources = open_sources(decoys or [], settings, embedder, axes=axes)
     decoy_sources = [facts.source for facts in sources]
     try:
         plan = EvaluationPlan(
@@ -188,6 +197,7 @@ def evaluate(
         backend=where,
         options={
             "flip": flip,
+            "axes": axes,
             "backend": "local" if where.scheduler is None else "dask",
             "labels": named_file(labels),
             "audit": named_file(audit),

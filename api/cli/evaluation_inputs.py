@@ -106,9 +106,9 @@ def open_embedder(
 
 
 def open_sources(
-    files: Sequence[Path], settings: Settings, embedder: Embedder
+    files: Sequence[Path], settings: Settings, embedder: Embedder, *, axes: int | None = None
 ) -> list[SourceFacts]:
-    """Load decoy files, and check that they fit.
+    """Load decoy files, reduce generators to so many axes, and check that they fit.
 
     Raises
     ------
@@ -129,6 +129,8 @@ def open_sources(
             if is_pool
             else DecoyGenerator.load(file)
         )
+        if axes is not None and not is_pool:
+            source = source.reduced(axes)
         if source.n != embedder.model.n:
             raise CommandError(
                 f"{file.name} has decoys of {source.n} numbers each, the embeddings have "

@@ -205,9 +205,8 @@ def rotate_tenant(
 
     Nobody has to enroll again, and the service may run meanwhile; the old key is dropped at the
     end. Only a template that its holder keeps cannot be turned: its subject is listed, and keeps
-    the old key until it is enrolled again. That is enough if only that key may have leaked. It also
-    gives templates from before an upgrade a rotation each, once the deployment is calibrated anew.
-    A stolen template stays a credential whatever happens to ours: with `--stolen`, only people
+    the old key until it is enrolled again. That is enough if only that key may have leaked. A
+    stolen template stays a credential whatever happens to ours: with `--stolen`, only people
     enrolled from now on get the new key; the others are listed, and verified as before until they
     enroll again with new photos. Run it with `--stolen --finish` to see who is left, and again when
     nobody is: `--finish` alone would turn the stolen templates too. Needs: the database, the key

@@ -13,21 +13,17 @@ from api.cli.errors import CommandError, UsageError
 from api.cli.files import read_bounded, read_photo
 from api.cli.options import AsJson
 from enroll.enroller import MAX_PHOTOS
+from enroll.public_contract import PublicContract
 from models.errors import ModelError
 from models.pack import ModelPack
 from models.selection import FacePolicy
-from templates.contract import wire
-from templates.contract.binding import Binding
 from templates.contract.canonical import parse_object
 from templates.decoys import DecoyGenerator
-from templates.errors import ContractError
 from templates.keys.api_token import is_token
 from templates.keys.holder_key import encode_holder_key, read_holder_key
 from templates.keys.private_file import replace_private
 from templates.keys.probe_signature import signed_probe
-from templates.keys.randomness import Keystream
-from templates.space.agreement import InconsistentImages, mean_embedding
-from templates.space.lifting import lift as lift_descriptors
+from templates.space.agreement import InconsistentImages
 
 TOKEN_VARIABLE = "VEILFACE_API_KEY"  # noqa: S105 - a name, not a secret
 MAX_CONTRACT_BYTES = 256 * 2**20
@@ -104,7 +100,7 @@ def lift(
     files. Send the result as `{"template": …}`; the key needs the right `embeddings`, and to enroll
     it the tenant must allow templates (`veilface db template-enrollment`). Several photos of one
     person are averaged before they are lifted. Never lift the same photo twice for enrollment: two
-    templates of one descriptor give it away.
+    templates of one embedding give it away.
 
     A probe on stdout is signed for one request, with the API key in the variable
     `VEILFACE_API_KEY`; send it within a minute.
@@ -121,26 +117,23 @@ def lift(
             raise UsageError("--holder-key-file goes with --out -: a template's file has no key")
         holder_key = {"holder_key": encode_holder_key(read_holder_key(holder_key_file))}
     public = read_contract(contract)
-    binding = public.binding
-    m = public.dimension(probe=probe, dim=dim)
-    consistency = public.consistency(probe=probe)
-    source = DecoyGenerator.load(generator)
-    binding.require_source(source_id=source.source_id, made_with=source.made_with)
-    models = ModelPack.load(pack, threads=1, flip=bool(binding.preprocessing.get("flip")))
+    if probe:
+        m = public.probe_dimension(dim)
+    elif dim not in (None, public.binding.m):
+        raise UsageError(
+            f"an enrollment under this contract has dimension {public.binding.m}; add --probe to "
+            "make a probe of another one"
+        )
+    else:
+        m = public.binding.m
+    decoys = public.require_decoys(DecoyGenerator.load(generator))
+    models = public.load_pack(pack)
     info = models.info
-    binding.require_embedder(
-        embedder_sha256=info.embedder_sha256, preprocessing=info.preprocessing, n=info.n
-    )
     rows = np.stack([embed_file(models, photo, policy=face) for photo in photos])
     try:
-        descriptor = mean_embedding(rows, consistency=consistency)
+        data = public.lift(rows, decoys, m=m, probe=probe)
     except InconsistentImages as error:
         raise CommandError(error.sentence([photo.name for photo in photos])) from None
-    with Keystream.fresh() as stream:
-        batch = lift_descriptors(
-            descriptor[None], strategy=binding.strategy, m=m, source=source, stream=stream
-        )
-    data = wire.encode(batch[0], contract_id=binding.contract_id)
     notice = demo_notice(info.embedder_sha256, n=info.n)
     if str(out) == "-":
         if token is None or subject is None:
@@ -155,7 +148,7 @@ def lift(
         "kind": "probe" if probe else "enrollment",
         "m": m,
         "photos": len(photos),
-        "contract_id": binding.contract_id,
+        "contract_id": public.contract_id,
         **notice,
     }
     if as_json:
@@ -190,77 +183,6 @@ def embed_file(pack: ModelPack, photo: Path, *, policy: FacePolicy) -> np.ndarra
         return pack.embed_photo(data, policy=policy).embedding
     except ModelError as error:
         raise CommandError(f"{photo.name}: {error}") from None
-
-
-class PublicContract:
-    """What a client may know of a contract.
-
-    Parameters
-    ----------
-    document
-        The JSON object of ``GET /v1/contract``, or of the contract file.
-
-    Raises
-    ------
-    ContractError
-        It is no contract, or contradicts itself.
-    """
-
-    def __init__(self, document: dict[str, Any]) -> None:
-        self.binding = Binding.from_json(document.get("binding"))
-        if document.get("contract_id") != self.binding.contract_id:
-            raise ContractError("the contract_id is not the hash of the binding")
-        self._document = document
-        entries = document.get("calibrations")
-        if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-            raise ContractError("the contract lacks its calibrations")
-        self.probe_dimensions: list[int] = sorted(
-            {
-                int(entry["probe_m"])
-                for entry in entries
-                if entry.get("mode") == "s2s" and isinstance(entry.get("probe_m"), int)
-            }
-        )
-
-    def consistency(self, *, probe: bool) -> float:
-        """Return the least agreement of the photos of one probe, or of one enrollment.
-
-        Raises
-        ------
-        ContractError
-            The contract lacks it.
-        """
-        name = "probe_consistency" if probe else "photo_consistency"
-        consistency = self._document.get(name)
-        if not isinstance(consistency, int | float) or not -1 <= consistency <= 1:
-            raise ContractError(f"the contract lacks its {name}")
-        return float(consistency)
-
-    def dimension(self, *, probe: bool, dim: int | None) -> int:
-        """Choose the dimension of the lift.
-
-        Raises
-        ------
-        UsageError
-            The contract does not take templates of the dimension.
-        """
-        if not probe:
-            if dim not in (None, self.binding.m):
-                raise UsageError(
-                    f"an enrollment under this contract has dimension {self.binding.m}; add "
-                    "--probe to make a probe of another one"
-                )
-            return self.binding.m
-        known = ", ".join(map(str, self.probe_dimensions))
-        if not self.probe_dimensions:
-            raise CommandError(
-                "the contract takes no lifted probes; calibrate it with --probe-dims"
-            )
-        if dim is None:
-            return self.probe_dimensions[-1]
-        if dim not in self.probe_dimensions:
-            raise UsageError(f"the contract takes lifted probes of dimension {known}, not {dim}")
-        return dim
 
 
 def read_contract(path: Path) -> PublicContract:

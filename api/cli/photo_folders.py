@@ -7,7 +7,7 @@ from pathlib import Path
 from api.cli.console import message
 from api.cli.errors import CommandError
 from verify import LabelledFolder, labelled_folder
-from verify.datasets import SUFFIXES, distinct_files, is_photo, visible
+from verify.datasets import SUFFIXES, distinct_files, is_photo, photos_alone, visible
 
 _MOST_NAMED = 5
 _ENDINGS = ", ".join(sorted(SUFFIXES))
@@ -55,6 +55,13 @@ def labelled_people(folder: Path) -> LabelledFolder:
     _tell_copies(folder, len(labelled) - len(kept))
     paths, identities = zip(*kept, strict=True)
     return replace(labelled, paths=paths, identities=identities)
+
+
+def people_or_faces(folder: Path) -> LabelledFolder:
+    """:func:`labelled_people`; or, of a folder without subfolders, each photo as a person."""
+    if not folder.is_dir() or any(entry.is_dir() for entry in visible(folder)):
+        return labelled_people(folder)
+    return photos_alone(folder, find_photos(folder))
 
 
 def _files_below(folder: Path) -> Iterator[Path]:

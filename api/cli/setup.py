@@ -5,7 +5,6 @@ import shlex
 import sys
 import time
 from collections.abc import Collection, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,8 +13,8 @@ import typer
 from api.cli.calibrate import suspicious_lines
 from api.cli.console import demo_notice, emit, message, say, share_done
 from api.cli.decoys import like_sample, photos_of
-from api.cli.descriptors import Aligned, Flip, bulk_pack, extract
-from api.cli.errors import CommandError
+from api.cli.descriptors import Aligned, Flip, bulk_pack, each_person_once, extract
+from api.cli.errors import CommandError, UsageError
 from api.cli.inputs import load_decoys
 from api.cli.master_keys import is_from_file
 from api.cli.options import AsJson, takes_settings
@@ -37,7 +36,14 @@ from api.process.preparation import (
     default_probe_dims,
     make_generator,
 )
-from api.process.roles import Albums, Roles, promises, resolved_rates, split_people, with_several
+from api.process.roles import (
+    Roles,
+    promises,
+    resolved_rates,
+    split_faces,
+    split_people,
+    with_several,
+)
 from api.settings import DEFAULT_CONFIG_FILE, Settings, config_file
 from models.extraction import Extraction
 from models.pack import ModelPack
@@ -56,12 +62,14 @@ CACHES = "setup-*.cache"
 @takes_settings("pack", "providers", "data_dir", "master_key_file", "accept_weak_privacy")
 def setup(
     people: Annotated[
-        Path,
+        Path | None,
         typer.Argument(
             help="Labelled photos of people like those who will be enrolled, but never enrolled "
-            "themselves: one subfolder for each person."
+            "themselves: one subfolder for each person. Unset: thresholds are set on a part of "
+            "--faces, each photo taken for another person.",
+            show_default=False,
         ),
-    ],
+    ] = None,
     *,
     settings: Settings,
     faces: Annotated[
@@ -91,6 +99,9 @@ def setup(
 ) -> None:
     """Prepare a service from a model pack and folders of photos, and judge it.
 
+    With --faces alone nobody has to be labelled. Thresholds then assume that users look like those
+    faces, and how many genuine photos are rejected is not measured.
+
     Makes the master key apart from the data, splits the people by the names of their folders so
     that no name is in two roles, builds the decoys, calibrates, makes an API key, and writes
     `veilface.toml`, which `veilface serve` reads. What is there already is kept: a run that was
@@ -98,10 +109,12 @@ def setup(
     are not private, and `serve` will refuse them without --accept-weak-privacy; or a settings
     file of somebody else has `serve` start another service.
 
-    Example: `veilface setup lfw --faces fairface/train --pack buffalo_l`
+    Example: `veilface setup --faces fairface/train --pack buffalo_l`
     """
     pack = bulk_pack(settings, flip=flip, why="a service embeds faces with a model pack")
-    labelled = _labelled(people)
+    if people is None and like:
+        raise UsageError("--like adapts the decoys to people like those of PEOPLE: give PEOPLE too")
+    labelled = None if people is None else _labelled(people)
     roles = assign_roles(labelled, faces, like or [])
     can, cannot = promises(roles, n=pack.info.n)
     plan = {**_plan(roles, pack, settings), "can": can, "cannot": cannot}
@@ -111,7 +124,9 @@ def setup(
     elif dry_run or not resolves:
         emit(plan)
     if not resolves:
-        raise CommandError(f"there is nothing to serve: {people} resolves no false match rate")
+        raise CommandError(
+            f"there is nothing to serve: {people or faces[0]} resolves no rate of false matches"
+        )
     if dry_run:
         return
     made: dict[str, str] = {}
@@ -157,20 +172,28 @@ def setup(
         os.execv(sys.executable, [sys.executable, "-P", "-m", "veilface", "serve"])  # noqa: S606
 
 
-def assign_roles(labelled: LabelledFolder, faces: Sequence[Path], like: Sequence[Path]) -> Roles:
+def assign_roles(
+    labelled: LabelledFolder | None, faces: Sequence[Path], like: Sequence[Path]
+) -> Roles:
     """Give every photo one role; people are told apart by the names of their folders.
+
+    Without ``labelled`` each of the faces is a person of its own.
 
     Raises
     ------
     CommandError
         No face is left to fit decoys to, or no photo of ``like``.
     """
+    if labelled is None:
+        kept, calibration = split_faces(photos_of(faces, frozenset())[0])
+        if not kept:
+            raise CommandError("--faces has too few photos to fit decoys to")
+        return Roles(kept, (), calibration)
     albums: dict[str, list[Path]] = {}
     for path, name in zip(labelled.paths, labelled.identities, strict=True):
         albums.setdefault(name, []).append(path)
     names, left_out = frozenset(albums), 0
     sample: Sequence[Path]
-    calibration: Albums
     if like:
         sample, left_out = photos_of(like, names)
         calibration = albums
@@ -231,7 +254,8 @@ def _tell_plan(plan: dict[str, Any]) -> None:
     say(f"Pack:       {pack['name']}, {pack['n']} numbers per embedding, detector {detector}")
     adapted = f", adapted to {plan['sample']:,} photos" if plan["sample"] else ""
     say(f"Decoys:     {plan['faces']:,} faces{adapted}")
-    say(f"Thresholds: {plan['people']:,} people, {plan['photos']:,} photos")
+    alone = "" if plan["people_with_several_photos"] else ", each of --faces taken for a person"
+    say(f"Thresholds: {plan['people']:,} people, {plan['photos']:,} photos{alone}")
     if plan["left_out"]:
         say(f"Left out:   {plan['left_out']:,} photos of people who have another role")
     files = [path for name, path in plan.items() if name.endswith("_file") and path is not None]
@@ -259,7 +283,7 @@ def _tell_calls(service: str, key_file: Path) -> None:
 
 
 def _prepared(
-    labelled: LabelledFolder,
+    labelled: LabelledFolder | None,
     roles: Roles,
     pack: ModelPack,
     keyring: MasterKeyring,
@@ -279,7 +303,8 @@ def _prepared(
         contract = open_contract(settings, keyring)
         if source is None:
             raise CommandError(f"{path} has lost its decoys; remove it to make both anew")
-        contract.binding.require_source(source_id=source.source_id, made_with=source.made_with)
+        served = source.reduced(contract.binding.axes)
+        contract.binding.require_source(source_id=served.source_id, made_with=source.made_with)
         _drop_caches(settings)
         return contract
     # Sealed, and only while this runs: so that a run that is stopped goes on.
@@ -295,17 +320,17 @@ def _prepared(
     speed = (extraction.attempts - extraction.cached) / seconds
     before = f", {extraction.cached:,} embedded before" if extraction.cached else ""
     message(f"... {acquired(extraction)}{before}, {speed:.0f} photos a second")
+    if labelled is None:
+        extraction = each_person_once(extraction)
     people = part_of(extraction, calibrated_on)
     if source is None:
-        source = _fitted(extraction, roles, people, pack, folders=like or [labelled.root])
+        folders = like or ([] if labelled is None else [labelled.root])
+        source = _fitted(extraction, roles, people, pack, folders=folders)
         source.save(settings.resolved_decoys_file)
     report_step(made, "contract", path)
-    known = dict(zip(labelled.paths, labelled.identities, strict=True))
-    folder = replace(
-        labelled,
-        paths=tuple(calibrated_on),
-        identities=tuple(known[photo] for photo in calibrated_on),
-    )
+    names = [name for name, album in roles.calibration.items() for _ in album]
+    root = settings.data_dir if labelled is None else labelled.root
+    folder = LabelledFolder(root, tuple(calibrated_on), tuple(names), ())
     done = _calibrated(folder, people, pack, source)
     for line in suspicious_lines(done.report, "put the photos of one person into one folder"):
         message(line)
@@ -380,7 +405,6 @@ def _calibrated(
             pack=pack,
             source=source,
             strategy=Strategy.ADVERSARIAL,
-            m=None,
             options=CalibrationOptions(probe_dims=(0, *default_probe_dims(None))),
             progress=lambda _what, share: report(share),
         )

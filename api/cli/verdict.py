@@ -1,7 +1,6 @@
 """How the command line tells whether a contract is private, accurate, and so for every group."""
 
-from collections.abc import Mapping
-from typing import Any, cast
+from typing import cast
 
 from attacks.operating_point import ACCURACY_LIMIT, OperatingPoint, rejected_as_advised
 from templates.contract.document import Contract, Rate
@@ -11,6 +10,8 @@ from templates.contract.verdict import Judgement, Verdict
 
 def shown_rate(rate: Rate) -> str:
     """Write a rate with its counts and interval."""
+    if not rate.trials:
+        return "not measured"
     return (
         f"{100 * rate.value:.3g} % ({rate.errors}/{rate.trials}; "
         f"{100 * rate.ci_low:.2g}-{100 * rate.ci_high:.2g} %)"
@@ -21,19 +22,35 @@ def verdict_lines(verdict: Verdict | None) -> list[str]:
     """Say in a line each how private and how accurate a contract is, also in the worst group."""
     if verdict is None:
         return ["Privacy:  not measured.", "Accuracy: not judged.", "Groups:   not measured."]
-    privacy, accuracy = verdict.privacy, verdict.accuracy
-    m, basis = privacy.basis["m"], accuracy.basis
     return [
-        f"Privacy:  {privacy.status}. A thief with {_attacker(privacy)} finds a match for "
-        f"{shown_rate(privacy.rate)} of the templates at m = {m}; limit "
-        f"{100 * privacy.limit:.3g} %.{_unlimited(privacy)}{_shortfall(privacy)}"
-        f"{_default_dim(privacy)}",
+        _privacy_line(verdict.privacy),
+        _accuracy_line(verdict.accuracy),
+        f"{_groups_line(verdict.groups)} {_CHILDREN}",
+    ]
+
+
+def _privacy_line(privacy: Judgement) -> str:
+    basis = privacy.basis
+    upper = "" if privacy.upper is None else f", and at most {100 * privacy.upper:.2g} % by chance"
+    most = "" if privacy.bound is None else f" and {100 * privacy.bound:.3g} %"
+    return (
+        f"Privacy:  {privacy.status}. The strongest thief, with {_attacker(privacy)}, finds a "
+        f"match for {shown_rate(privacy.rate)} of the templates at m = {basis['m']} of "
+        f"{basis['axes']} axes{upper}; limits {100 * privacy.limit:.3g}{most}"
+        f"{'' if most else ' %'}.{_shortfall(privacy)}"
+    )
+
+
+def _accuracy_line(accuracy: Judgement | None) -> str:
+    if accuracy is None:
+        return "Accuracy: not measured: nobody has two photos."
+    basis = accuracy.basis
+    return (
         f"Accuracy: {accuracy.status}. {shown_rate(accuracy.rate)} of genuine probes are rejected "
         f"at {basis['level']}, with {basis['enrolled_photos']} photos enrolled and "
         f"{basis['probe_photos']} shown; limit {100 * accuracy.limit:.3g} %."
-        f"{_not_acquired(accuracy)}{_shortfall(accuracy)}",
-        f"{_groups_line(verdict.groups)} {_CHILDREN}",
-    ]
+        f"{_not_acquired(accuracy)}{_shortfall(accuracy)}"
+    )
 
 
 # As measured: docs/thresholds.md "Children".
@@ -79,36 +96,40 @@ def private_mode_weakness(contract: Contract) -> str | None:
 
 def improvements(contract: Contract, point: OperatingPoint) -> list[str]:
     """Say what more photos and more decoys bought, and what would help where a verdict fails."""
-    by_dim = ", ".join(
-        f"{100 * judgement.rate.value:.3g} % at {m}" for m, judgement in point.tried.items()
+    tried = "; ".join(
+        f"m = {one.m} of {one.axes} axes {100 * one.theft:.2g} %"
+        + ("" if one.rejected is None else f", rejected {100 * one.rejected.value:.3g} %")
+        for one in point.tried
     )
     by_photos = ", ".join(
         f"{100 * level.fnmr.value:.3g} % with {calibration.probe_photos}"
         for calibration in contract.calibrations
         if calibration.mode == "p2s"
         for level in calibration.levels
-        if level.name == contract.default_level
+        if level.name == contract.default_level and level.fnmr.trials
     )
-    lines = [
-        f"False non-matches at {contract.default_level} by photos of a probe: {by_photos}.",
-        f"Templates that a thief finds a match for, by dimension: {by_dim}.",
-    ]
-    if contract.verdict is not None:
-        lines += [*_more_faces(contract.verdict.privacy), *_more_photos(contract)]
-    if contract.verdict is not None and contract.verdict.privacy.status == "FAIL":
+    lines = [f"m = {point.dim} of {point.axes} axes: {point.chosen}."]
+    if by_photos:
+        lines.append(
+            f"False non-matches at {contract.default_level} by photos of a probe: {by_photos}."
+        )
+    if tried:
+        lines.append(f"Templates that a thief is expected to find a match for: {tried}.")
+    verdict = contract.verdict
+    if verdict is None:
+        return lines
+    lines += _more_photos(contract)
+    if verdict.privacy.status == "FAIL":
         lines.append(
             "To make it private: build the decoys from more photos, of people like these "
-            "(`veilface decoys build … --like PEOPLE`)"
-            + ("; no dimension that was tried is private" if len(point.tried) > 1 else "")
-            + "."
+            "(`veilface decoys build … --like PEOPLE`)."
         )
-    if contract.verdict is not None and contract.verdict.accuracy.status == "FAIL":
+    if verdict.accuracy is not None and verdict.accuracy.status == "FAIL":
         lines.append(
             "To make it accurate: enroll and verify with more photos; decoys that are more like "
             "these people allow a smaller dimension."
         )
-    groups = None if contract.verdict is None else contract.verdict.groups
-    if groups is not None and groups.status == "FAIL":
+    if verdict.groups is not None and verdict.groups.status == "FAIL":
         held = any(each.calibrated_on.get("worst_group") for each in contract.calibrations)
         lines.append(
             "That group has too few trials for --worst-group to heed it: calibrate on more people "
@@ -120,27 +141,12 @@ def improvements(contract: Contract, point: OperatingPoint) -> list[str]:
     return lines
 
 
-def _more_faces(privacy: Judgement) -> list[str]:
-    """Say what decoys of more faces would leave to a thief, as ``attacks.more_faces`` measured."""
-    measured: Any = privacy.basis.get("decoys_of_these_people")
-    share: Any = privacy.basis.get("twice_the_decoy_faces")
-    if not measured or share is None:
-        return []
-    rows = [(row["decoy_faces"], Rate.from_json(row["found"])) for row in measured]
-    faces, twice = " and ".join(f"{number:,}" for number, _ in rows), 2 * rows[-1][0]
-    return [
-        f"More faces: decoys of {faces} photos of people like these instead of yours leave "
-        + " and ".join(f"{100 * rate.value:.3g}" for _, rate in rows)
-        + f" % of the templates to a thief with {measured[0]['thief_faces']:,} others; "
-        f"{twice:,} would leave about {100 * share:.2g} %, by extrapolation."
-    ]
-
-
 def _more_photos(contract: Contract) -> list[str]:
     """Say what photos bought, of an enrollment and of a probe, where accuracy is close."""
-    if contract.verdict is None or not contract.verdict.accuracy.close:
+    accuracy = None if contract.verdict is None else contract.verdict.accuracy
+    if accuracy is None or not accuracy.close:
         return []
-    basis = contract.verdict.accuracy.basis
+    basis = accuracy.basis
     rates = {
         (enrolled, calibration.probe_photos): rate.value
         for calibration in contract.calibrations
@@ -163,27 +169,6 @@ def _more_photos(contract: Contract) -> list[str]:
     ]
 
 
-def _default_dim(privacy: Judgement) -> str:
-    """Say that nothing speaks for the dimension."""
-    if privacy.basis.get("m_is") != "default, as none passes":
-        return ""
-    return " No dimension that was tried passes, so m is a default, no result of these people."
-
-
-def _unlimited(privacy: Judgement) -> str:
-    """Say what unlimited faces find, or that nobody looked."""
-    if privacy.shortfall is not None or not isinstance(privacy.basis.get("attacker_faces"), int):
-        return ""
-    estimate = privacy.basis.get("unlimited")
-    if isinstance(estimate, Mapping):
-        share = Rate.from_json(estimate["found"]).value
-        return f" Unlimited faces: about {100 * share:.2g} %, on drawn people; not judged."
-    return (
-        " Unlimited faces are not simulated: that is done where the share is above half of "
-        "its limit."
-    )
-
-
 def _not_acquired(accuracy: Judgement) -> str:
     failures, photos = (accuracy.basis.get(name) for name in ("photos_not_acquired", "photos"))
     if not (isinstance(failures, int) and isinstance(photos, int) and failures):
@@ -196,5 +181,7 @@ def _shortfall(judgement: Judgement) -> str:
 
 
 def _attacker(privacy: Judgement) -> str:
-    faces = privacy.basis.get("attacker_faces")
-    return f"{faces:,} faces of other people" if isinstance(faces, int) else "unlimited faces"
+    faces = privacy.basis["attacker_faces"]
+    if not isinstance(faces, int):
+        return "unlimited faces (on drawn people)"
+    return f"{faces:,} faces of other people" if faces else "nothing else"

@@ -194,6 +194,7 @@ def _calibrate(
         pack=pack,
         source=generator,
         strategy=Strategy.ADVERSARIAL,
+        axes=generator.k,
         m=m,
         options=CalibrationOptions(
             photos_per_enrollment=ENROLLED_PHOTOS, probe_dims=(0, *default_probe_dims(m))

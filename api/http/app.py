@@ -67,6 +67,7 @@ from api.process.supervised import end_with_supervisor, is_supervised, open_pati
 from api.settings import NO_PROXIES, Settings
 from models.errors import ModelError
 from templates.contract.document import Contract
+from templates.contract.nobody import Nobody
 from templates.distances import warm_up
 from templates.distances.blas import single_threaded
 from templates.errors import VeilfaceError
@@ -157,9 +158,9 @@ def _document(*, with_health: bool) -> dict[str, Any]:
     return describe([*_built(*API), *health_routes], version=VERSION)
 
 
-def _lift_cohort(contract: Contract) -> None:
+def _lift_cohort(nobody: Nobody) -> None:
     try:
-        _ = contract.cohort
+        _ = nobody.cohort
     except Exception as error:
         # The next lifted probe tries again.
         log("cohort not lifted", severity=logging.ERROR, error_type=type(error).__name__)
@@ -258,7 +259,7 @@ async def _open(
     tasks.start_soon(readiness.watch)
     if runtime.contract.takes_lifted_probes:
         # No lifted probe but one that comes now waits for it; an end of the process does not.
-        threading.Thread(target=_lift_cohort, args=(runtime.contract,), daemon=True).start()
+        threading.Thread(target=_lift_cohort, args=(runtime.nobody,), daemon=True).start()
     if is_supervised():
         tasks.start_soon(end_with_supervisor)
     if settings.operations_port is not None:

@@ -44,7 +44,7 @@ class AuditReport:
 
     document: Mapping[str, Any]
 
-    def reduced(self, contract: Contract, decoys: str | None = None) -> dict[str, Any]:
+    def reduced(self, contract: Contract, decoys: str) -> dict[str, Any]:
         """Return what is told of it to whoever has a key: the part on the contract's scheme.
 
         Parameters
@@ -52,7 +52,7 @@ class AuditReport:
         contract
             The contract in force.
         decoys
-            The kind of its decoys, as :func:`kind_of_decoys` says; None: not known.
+            The kind of its decoys, as :func:`kind_of_decoys` says.
 
         Notes
         -----
@@ -91,21 +91,20 @@ class AuditReport:
             "command": COMMAND,
         }
 
-    def _verdict(self, binding: Binding, decoys: str | None) -> Mapping[str, Any] | None:
+    def _verdict(self, binding: Binding, decoys: str) -> Mapping[str, Any] | None:
         """Find what was found of a contract's scheme; what was there to compare with is not it."""
         for verdict in self.document["verdicts"]:
-            same = (verdict["strategy"], verdict["dim"]) == (str(binding.strategy), binding.m)
-            differs = None not in (decoys, verdict["decoys"]) and verdict["decoys"] != decoys
+            scheme = (verdict["strategy"], verdict["dim"], verdict.get("axes") or binding.n)
+            same = scheme == (str(binding.strategy), binding.m, binding.axes)
+            differs = verdict["decoys"] not in (None, decoys)
             if same and not differs and not verdict.get("comparison"):
                 return dict(verdict)
         return None
 
 
-def kind_of_decoys(source: object) -> str | None:
-    """Name a deployment's source of decoys as a report does; None where it has none at hand."""
-    if isinstance(source, DecoyGenerator):
-        return GENERATED
-    return POOLED if isinstance(source, DecoyPool) else None
+def kind_of_decoys(source: DecoyPool | DecoyGenerator) -> str:
+    """Name a deployment's source of decoys as a report does."""
+    return POOLED if isinstance(source, DecoyPool) else GENERATED
 
 
 NOT_AUDITED: dict[str, Any] = {

@@ -377,12 +377,8 @@ class ContractAnswer(_Answer):
     default_level: str
     photo_consistency: float
     probe_consistency: float
-    template_stranger_score: float
+    template_stranger_similarity: float
     template_foot_point_norm: list[float]
-    nobody_id: str = Field(
-        description="Of what scores are computed from: it changes with every calibration.",
-        examples=[HEX],
-    )
     verdict: dict[str, Any] | None = Field(
         description="How private and how accurate the calibration found it, and, where people were "
         "labelled, the `groups` with their worst; each with a status, `PASS` or `FAIL`; null: not "

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 from enroll.enroller import WIRE_DTYPE
 from templates.contract import wire
-from templates.contract.document import Contract
+from templates.contract.nobody import Nobody
 from templates.errors import SealError
 from templates.keys.sealing import MasterKeyring, encode_parts
 from templates.space.subspace import AffineSubspace
@@ -21,8 +21,10 @@ class StandIns:
 
     Parameters
     ----------
-    contract
-        Whose strangers they are lifted from.
+    nobody
+        What they are lifted from.
+    contract_id
+        Of the contract in force.
     keyring
         What seals the template that is opened for all of them, as the store keeps real ones.
     key
@@ -31,39 +33,45 @@ class StandIns:
     """
 
     def __init__(
-        self, contract: Contract, keyring: MasterKeyring, *, key: Callable[[], bytes]
+        self,
+        nobody: Nobody,
+        keyring: MasterKeyring,
+        *,
+        contract_id: str,
+        key: Callable[[], bytes],
     ) -> None:
-        self._contract = contract
+        self._nobody = nobody
+        self._contract_id = contract_id
         self._keyring = keyring
         self._key = key
-        self._nobody = Owner("", "stand-in", "", contract.contract_id, "", 0)
+        self._owner = Owner("", "stand-in", "", contract_id, "", 0)
         self._sealed = self._seal()
 
     def lift(self, tenant: str, subject: str) -> AffineSubspace:
         """Lift the template that an unknown subject's distances are told of."""
         digest = hmac.digest(self._key(), encode_parts(tenant, subject), hashlib.sha256)
-        return lift_stand_in(self._contract, digest)
+        return lift_stand_in(self._nobody, digest)
 
     def open(self, lifted: AffineSubspace | None) -> StandIn:
         """Decrypt a template of nobody: the work that a stored one would have cost."""
         try:
-            plain = open_envelope(self._sealed, self._nobody, self._keyring)
+            plain = open_envelope(self._sealed, self._owner, self._keyring)
         except SealError:
             # The master key that it was sealed with was retired since.
             self._sealed = self._seal()
-            plain = open_envelope(self._sealed, self._nobody, self._keyring)
+            plain = open_envelope(self._sealed, self._owner, self._keyring)
         return StandIn(plain, lifted)
 
     def open_in_vain(self, held_template: bytes) -> None:
         """Try a held template that no enrollment waits for: the work that another one costs."""
         foreign = Envelope(self._sealed.wrapped_key, held_template)
         with contextlib.suppress(SealError):
-            open_envelope(foreign, self._nobody, self._keyring)
+            open_envelope(foreign, self._owner, self._keyring)
 
     def _seal(self) -> Envelope:
-        lifted = lift_stand_in(self._contract, secrets.token_bytes(32))
-        data = wire.encode(lifted, contract_id=self._contract.contract_id, dtype=WIRE_DTYPE)
-        return close_envelope(data, self._nobody, self._keyring)
+        lifted = lift_stand_in(self._nobody, secrets.token_bytes(32))
+        data = wire.encode(lifted, contract_id=self._contract_id, dtype=WIRE_DTYPE)
+        return close_envelope(data, self._owner, self._keyring)
 
     def __repr__(self) -> str:
         return "StandIns()"

@@ -116,9 +116,7 @@ def seal_export(exported: Exported, *, key: ExportKey, tenant: str) -> bytes:
     return MAGIC + bytes.fromhex(exported.contract_id) + sealed
 
 
-def open_export(
-    data: bytes, *, key: ExportKey, tenant: str, contract_ids: Sequence[str]
-) -> Exported:
+def open_export(data: bytes, *, key: ExportKey, tenant: str, contract_id: str) -> Exported:
     """Decrypt an export that a client sent.
 
     Raises
@@ -126,16 +124,16 @@ def open_export(
     InvalidTemplate
         If it is no export, was altered, or was sealed with another key or for another tenant.
     ContractMismatch
-        If it belongs to none of ``contract_ids``, of which the first is the service's.
+        If it belongs to another contract.
     """
     start = len(MAGIC) + CONTRACT_ID_BYTES
     if len(data) < start or not data.startswith(MAGIC):
         raise InvalidTemplate("this is not an export of Veilface")
-    contract_id = data[len(MAGIC) : start].hex()
-    if contract_id not in contract_ids:
+    named = data[len(MAGIC) : start].hex()
+    if named != contract_id:
         raise ContractMismatch(
-            f"the export belongs to contract {contract_id[:16]}, the service to "
-            f"{contract_ids[0][:16]}; the subject must enroll again"
+            f"the export belongs to contract {named[:16]}, the service to {contract_id[:16]}; the "
+            "subject must enroll again"
         )
     try:
         plain = key.keyring.open(

@@ -205,8 +205,7 @@ def open_contract(settings: Settings, keyring: MasterKeyring) -> Contract:
     Raises
     ------
     StartError
-        If the file is absent, broken, sealed with another master key, or of an earlier rotation
-        version.
+        If the file is absent, broken, or sealed with another master key.
     """
     path = settings.resolved_contract_file
     if not path.is_file():
@@ -216,7 +215,6 @@ def open_contract(settings: Settings, keyring: MasterKeyring) -> Contract:
         )
     try:
         contract = Contract.load(path, file_sealer(keyring))
-        contract.binding.require_rotation_version()
     except (OSError, VeilfaceError) as error:
         raise StartError(f"the contract file {path} cannot be used: {error}") from error
     return contract
@@ -229,12 +227,17 @@ def weak_privacy(contract: Contract) -> str | None:
     privacy = contract.verdict.privacy
     if privacy.status == "PASS":
         return None
-    if privacy.rate.value <= privacy.limit:
-        return str(privacy.shortfall)
+    within = privacy.rate.value <= privacy.limit
+    if within and privacy.shortfall is not None:
+        return privacy.shortfall
     return (
         f"a thief of a template gets a match for the face from {100 * privacy.rate.value:.3g} % of "
-        f"them ({privacy.rate.errors} of {privacy.rate.trials}), and {100 * privacy.limit:.3g} % "
-        "is the most that passes"
+        f"them ({privacy.rate.errors} of {privacy.rate.trials}), "
+        + (
+            f"which shows no more than that it is below {100 * (privacy.upper or 1.0):.3g} %"
+            if within
+            else f"and {100 * privacy.limit:.3g} % is the most that passes"
+        )
     )
 
 
@@ -258,22 +261,23 @@ def require_privacy(contract: Contract, settings: Settings) -> str | None:
 
 def open_decoys(
     settings: Settings, keyring: MasterKeyring, contract: Contract
-) -> DecoyPool | DecoyGenerator | None:
-    """Load the decoy source that the contract is bound to; None when none is set.
+) -> DecoyPool | DecoyGenerator:
+    """Load the decoy source that the contract is bound to, reduced to the contract's axes.
 
     Raises
     ------
     StartError
-        If a named file is absent or broken, is another source than the contract's, or was made
+        If the file is absent or broken, is another source than the contract's, or was made
         with another model or preprocessing.
     """
     path = settings.resolved_decoys_file
     if not path.is_file():
-        if settings.decoys_file is None:
-            return None
-        raise StartError(f"there is no decoys file {path} (setting decoys_file)")
+        raise StartError(
+            f"there is no decoys file {path}; `veilface decoys build` writes one "
+            "(setting decoys_file)"
+        )
     try:
-        source = load_source(path, file_sealer(keyring))
+        source = load_source(path, file_sealer(keyring)).reduced(contract.binding.axes)
     except (OSError, VeilfaceError) as error:
         raise StartError(f"the decoys file {path} cannot be used: {error}") from error
     try:

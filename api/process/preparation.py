@@ -5,29 +5,25 @@ The commands ``decoys build`` and ``calibrate`` and the demo are callers of thes
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import count
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from attacks.more_faces import more_faces
 from attacks.operating_point import (
-    DIMS,
     OperatingPoint,
+    choose_and_judge,
     judge_accuracy,
     judge_groups,
-    judge_privacy,
-    smallest_private,
 )
-from attacks.privacy import AttackSetup, privacy_of
+from attacks.privacy import AttackSetup
 from models.extraction import Extraction
 from models.pack import ModelPack
 from templates.contract.binding import embedding_id
 from templates.contract.canonical import Json
 from templates.contract.document import Binding, Contract
-from templates.contract.verdict import Judgement, Verdict
-from templates.decoys import NOISE_ENERGY, Attributes, DecoyGenerator, DecoyPool, DecoySource
+from templates.contract.verdict import Verdict
+from templates.decoys import Attributes, DecoyGenerator, DecoyPool, DecoySource
 from templates.distances.blas import single_threaded
 from templates.errors import ContractMismatch, VeilfaceError
 from templates.keys.rotation import ROTATION_VERSION
@@ -41,25 +37,17 @@ from verify import (
 )
 from verify.calibration import part_of
 from verify.comparisons import Progress
-from verify.consistency import match_cosine
 from verify.evaluation.attributes import resembling_rows
 from verify.group_rates import PhotoLabels
 from verify.own_decoys import SAME_PHOTO, require_others
 from verify.trials import chosen_photos
 
 DEFAULT_DIM = 64
-"""Dimension of stored templates where a search finds none that is private, and of an audit; of
-embeddings below 256 numbers a quarter of these: of 80 people with 128 numbers each, 20 of 160
-single probes are rejected at FMR 1e-3 with m = 64, and 3 with 32 (docs/thresholds.md)."""
-
-
+"""Dimension that an audit attacks where it is told none."""
 DEFAULT_PROBE_DIM = 4
-"""Dimension of the lifted probes that a calibration takes. On LFW at m = 64, 5 % of genuine ones
-are rejected, 7 % at 8 and 15 % at 16 (docs/measurements.md); at 2 the FMR was above its target."""
-
-
-_SEARCHED = 0.2
-"""Share of a calibration's time that has passed, on LFW, once its dimension is found."""
+"""Dimension of the lifted probes that a calibration takes."""
+_SEARCHED = 0.6
+"""Share of a calibration's time that has passed, on LFW, once axes and dimension are chosen."""
 
 
 class PreparationError(VeilfaceError):
@@ -117,6 +105,27 @@ def require_made_with(source: DecoySource, pack: ModelPack) -> None:
         )
 
 
+LOOKALIKE = 0.5
+"""Raw cosine from which on two photos that nobody labelled are taken for one person."""
+
+
+def without_lookalikes(extraction: Extraction) -> Extraction:
+    """Drop photos that resemble an earlier one, of faces of which each shows another person."""
+    rows = extraction.descriptors
+    kept: list[int] = []
+    alike = np.zeros(len(rows), dtype=np.bool_)
+    for row in range(len(rows)):
+        if not alike[row]:
+            kept.append(row)
+            alike[row + 1 :] |= rows[row + 1 :] @ rows[row] >= LOOKALIKE
+    return Extraction(
+        rows[kept],
+        [extraction.paths[row] for row in kept],
+        extraction.failures,
+        cached=extraction.cached,
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class LikeSample:
     """Descriptors of a few faces of the kind that will be enrolled, and K names of the people."""
@@ -135,10 +144,10 @@ def make_generator(
     PreparationError
         Photos of ``like`` are also among those that are adapted to it.
     """
-    rows, made, noise = extraction.descriptors, made_with(pack), NOISE_ENERGY / pack.info.n
+    rows, made = extraction.descriptors, made_with(pack)
     if like is None:
         with single_threaded():  # as below, in calibrate_folder
-            return DecoyGenerator.fit(rows, made_with=made, noise=noise)
+            return DecoyGenerator.fit(rows, made_with=made)
     sample = like.extraction.descriptors
     twice = len(resembling_rows(sample, rows, cosine=SAME_PHOTO))
     if twice:
@@ -148,7 +157,7 @@ def make_generator(
             "or leave them out"
         )
     with single_threaded():
-        return DecoyGenerator.adapt(rows, sample, like.people, made_with=made, noise=noise)
+        return DecoyGenerator.adapt(rows, sample, like.people, made_with=made)
 
 
 def make_pool(
@@ -194,6 +203,7 @@ def binding_for(pack: ModelPack, source: DecoySource, *, strategy: Strategy, m: 
         embedder_sha256=info.embedder_sha256,
         preprocessing=info.preprocessing,
         n=info.n,
+        axes=source.k,
         strategy=strategy,
         m=m,
         decoy_source_id=source.source_id,
@@ -219,7 +229,8 @@ def calibrate_folder(
     pack: ModelPack,
     source: DecoySource,
     strategy: Strategy,
-    m: int | None,
+    axes: int | None = None,
+    m: int | None = None,
     options: CalibrationOptions,
     exclude: Collection[str] = (),
     aliases: Mapping[str, str] | None = None,
@@ -232,8 +243,11 @@ def calibrate_folder(
 
     Parameters
     ----------
-    m
-        Dimension of the templates; None for the smallest at which they are private.
+    source
+        With all of its axes.
+    axes, m
+        Axes that embeddings are projected on, and dimension of the templates; None: what rejects
+        the fewest genuine probes of all that is private.
     labels
         Of the photos of ``extraction``, for rates by group of people.
     progress
@@ -255,8 +269,8 @@ def calibrate_folder(
     # most of its time waiting. The distances have threads of their own.
     with single_threaded():
         return _calibrated(
-            folder, extraction, pack, source, strategy, m, options, exclude, aliases or {}, labels,
-            progress,
+            folder, extraction, pack, source, strategy, axes, m, options, exclude, aliases or {},
+            labels, progress,
         )  # fmt: skip
 
 
@@ -266,6 +280,7 @@ def _calibrated(
     pack: ModelPack,
     source: DecoySource,
     strategy: Strategy,
+    axes: int | None,
     m: int | None,
     options: CalibrationOptions,
     exclude: Collection[str],
@@ -288,10 +303,12 @@ def _calibrated(
         staying,
         source,
         strategy=strategy,
+        axes=axes,
         m=m,
         options=options,
         progress=part_of(progress, 0.0, _SEARCHED),
     )
+    source = source.reduced(point.axes)
     done = calibrate(
         extraction.descriptors,
         names,
@@ -309,10 +326,12 @@ def _calibrated(
         progress=part_of(progress, _SEARCHED, 1.0),
     )
     verdict = Verdict(
-        privacy=point.tried[point.dim],
+        privacy=point.privacy,
         accuracy=judge_accuracy(
             done.contract, photos=extraction.attempts, not_acquired=len(extraction.failures)
-        ),
+        )
+        if len(set(staying)) < len(staying)
+        else None,
         groups=judge_groups(done.contract),
     )
     return CalibratedFolder(replace(done.contract, verdict=verdict), done.report, point)
@@ -324,20 +343,16 @@ def _operating_point(
     source: DecoySource,
     *,
     strategy: Strategy,
+    axes: int | None,
     m: int | None,
     options: CalibrationOptions,
     progress: Progress,
 ) -> OperatingPoint:
-    """Measure privacy: of one dimension, or of those on the way to the smallest that passes."""
+    """Choose what is not asked for, and judge how private it is."""
     what = "attacking templates"
     progress(what, 0.0)
     setup = AttackSetup.of_people(
-        descriptors,
-        names,
-        source,
-        match_cosine=match_cosine(descriptors, names, seed=options.seed),
-        photos=options.photos_per_enrollment,
-        seed=options.seed,
+        descriptors, names, source, photos=options.photos_per_enrollment, seed=options.seed
     )
     plain = plain_strategy(strategy)
     uncovered = None
@@ -345,32 +360,14 @@ def _operating_point(
         uncovered = "who has the pool finds the decoys, and no attack of a calibration has it"
     elif plain is not strategy:
         uncovered = f"the attacks are on {plain} lifting, not on what {strategy} chooses by"
-    # With decoys in most of the dimensions little is left of a face for anybody.
-    dims = [dim for dim in DIMS if dim <= 3 * source.n // 4] if m is None else []
-    otherwise = min(DEFAULT_DIM, source.n // 4) if m is None else m
-    # The attackers are made, then a bisection and at most one dimension more is judged.
-    steps, done = 2 + len(dims).bit_length(), count(1)
-
-    def judge(dim: int) -> Judgement:
-        progress(what, next(done) / steps)
-        return judge_privacy(privacy_of(setup, strategy=strategy, m=dim), uncovered=uncovered)
-
-    point = smallest_private(
-        judge,
-        dims,
-        otherwise=otherwise,
+    return choose_and_judge(
+        setup,
+        strategy=strategy,
+        axes=axes,
+        m=m,
+        uncovered=uncovered,
+        progress=lambda share: progress(what, share),
     )
-    progress(what, (steps - 1) / steps)
-    judgement = point.tried[point.dim]
-    chosen = "asked for"
-    if m is None:
-        chosen = "smallest that passes" if judgement.status == "PASS" else "default, as none passes"
-    basis = {
-        **judgement.basis,
-        "m_is": chosen,
-        **more_faces(setup, judgement, strategy=strategy, m=point.dim),
-    }
-    return OperatingPoint(point.dim, {**point.tried, point.dim: replace(judgement, basis=basis)})
 
 
 def recorded_of(pack: ModelPack) -> dict[str, Json]:

@@ -11,12 +11,8 @@
 import contextlib
 import threading
 from collections import OrderedDict
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
-
-import numpy as np
-from numpy.typing import NDArray
 
 from api.http.errors import ApiError
 from api.http.levels import Levels
@@ -41,10 +37,9 @@ from models.decoding import ImageLimits
 from models.pack import ModelPack
 from templates.contract import wire
 from templates.contract.document import Contract
-from templates.decoys import Attributes, DecoyGenerator, DecoyPool
-from templates.errors import DecoyError, StoreBusy
-from templates.keys.randomness import Keystream
-from templates.keys.rotation import HAAR_VERSION, TenantRotation
+from templates.decoys import DecoyGenerator, DecoyPool
+from templates.errors import StoreBusy
+from templates.keys.rotation import TenantRotation
 from templates.keys.sealing import MasterKeyring
 from templates.store import TemplateStore
 from templates.store.audit_log import By
@@ -76,8 +71,7 @@ SUPERSEDED_CALIBRATIONS = (
 )
 
 TENANTS_KEPT = 64
-"""Tenants and epochs whose rotations a process keeps: 2 MB each where n = 512, for the matrix of
-version 1."""
+"""Tenants and epochs whose rotations a process keeps."""
 
 
 def _lacking(what: str) -> ApiError:
@@ -87,28 +81,6 @@ def _lacking(what: str) -> ApiError:
         {},
         {"Retry-After": "60"},
     )
-
-
-class NoDecoys:
-    """The decoy source of a service that has none: it enrolls clients' templates only."""
-
-    def __init__(self, contract: Contract) -> None:
-        self.source_id = contract.binding.decoy_source_id
-        self.n = contract.binding.n
-        self.made_with: str | None = None
-        self.noise = 0.0
-
-    def draw(
-        self,
-        rows: int,  # noqa: ARG002 - the protocol's
-        k: int,  # noqa: ARG002
-        *,
-        stream: Keystream,  # noqa: ARG002
-        unlike: Sequence[Attributes] | None = None,  # noqa: ARG002
-        sub_databases: int | None = None,  # noqa: ARG002
-    ) -> NDArray[np.float32]:
-        """Refuse: photos cannot be lifted without decoys."""
-        raise DecoyError("the service has no decoys file, so it cannot enroll photos")
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +100,7 @@ class Runtime:
     keyring: MasterKeyring
     store: TemplateStore
     contract: Contract
-    source: DecoyPool | DecoyGenerator | None
+    source: DecoyPool | DecoyGenerator
     pack: ModelPack | None
     operators_export_key: ExportKey | None
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
@@ -140,7 +112,13 @@ class Runtime:
         self.levels = Levels(self.contract, lowest=self.settings.lowest_level)
         self.liveness = LivenessRules(self.settings.liveness, self.contract, self.pack)
         self.graphs = served_graphs(self.settings, self.pack)
-        self.stand_ins = StandIns(self.contract, self.keyring, key=self._stand_in_key)
+        self.nobody = self.contract.nobody(self.source)
+        self.stand_ins = StandIns(
+            self.nobody,
+            self.keyring,
+            contract_id=self.contract.contract_id,
+            key=self._stand_in_key,
+        )
 
     @classmethod
     def open(cls, settings: Settings, *, contract: Contract | None = None) -> "Runtime":
@@ -240,35 +218,22 @@ class Runtime:
                 return kept
         # Outside of the lock: it takes a query and a QR decomposition.
         key = self.store.tenants.rotation_key(tenant, epoch=epoch).key
-        rotation = TenantRotation(key, self.contract.binding.n)
-        # Made at its first use, the matrix of version 1 would tell that somebody is enrolled.
-        rotation.of("", HAAR_VERSION)
+        rotation = TenantRotation(key, self.contract.binding.axes)
         made = InRotation(
             rotation=rotation,
             enroller=Enroller(
                 self.contract,
-                self.source or NoDecoys(self.contract),
+                self.source,
                 rotation=rotation,
                 lift_secret=self.store.secrets.get(SecretName.LIFTS).value,
             ),
-            verifier=Verifier(self.contract, rotation=rotation),
+            verifier=Verifier(self.contract, self.source, rotation=rotation),
         )
         with self._lock:
             self._tenants[named] = made
             while len(self._tenants) > TENANTS_KEPT:
                 self._tenants.popitem(last=False)
         return made
-
-    def require_decoys(self) -> None:
-        """Refuse to lift where there are no decoys and the strategy needs some.
-
-        Raises
-        ------
-        ApiError
-            ``model_unavailable``.
-        """
-        if self.source is None and self.contract.binding.strategy.needs_decoys:
-            raise _lacking("decoys file")
 
     def require_template_enrollment(self, tenant: str) -> None:
         """Refuse a template that a client made, unless the operator lets the tenant enroll them.
@@ -332,7 +297,7 @@ class Runtime:
             subject,
             enrollment.wire,
             contract_id=enrollment.contract_id,
-            n=binding.n,
+            n=binding.axes,
             m=binding.m,
             dtype=WIRE_DTYPE,
             source=source,
@@ -366,9 +331,9 @@ class Runtime:
             return None
         template, in_rotation = read
         binding = self.contract.binding
-        version = binding.require_contract(template.record.contract_id, what="the stored template")
-        stored = wire.decode(template.wire, max_n=binding.n, max_m=binding.m)
-        rotation = in_rotation.rotation.of(template.template_id, version)
+        binding.require_contract(template.record.contract_id, what="the stored template")
+        stored = wire.decode(template.wire, max_n=binding.axes, max_m=binding.m)
+        rotation = in_rotation.rotation.of(template.template_id)
         plain = stored.subspace.turned_by(rotation.turned_back)
         exported = Exported(
             subject_id=subject,

@@ -1,7 +1,7 @@
 """The server process, and the supervisor of its workers where there are several.
 
-Workers are forks of the supervisor. What it has loaded, the contract and its cohort, the kernels
-and all modules, is in memory once, and a worker in place of one that died starts at once.
+Workers are forks of the supervisor. What it has loaded, the contract, the kernels and all modules,
+is in memory once, and a worker in place of one that died starts at once.
 """
 
 import contextlib
@@ -57,7 +57,6 @@ def run_server(
     if contract.takes_lifted_probes:
         with single_threaded():
             warm_up()
-            _ = contract.cohort
     configure(settings.log_level)
     # What workers share stays shared while nobody writes to it: the collector would.
     gc.collect()

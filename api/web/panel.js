@@ -81,7 +81,7 @@ export function serviceView() {
         ["Contract", h("code", {}, contract.contract_id)],
         ["Model pack", String(contract.recorded.pack ?? "not recorded")],
         ["Accepts photos", contract.photos ? "yes" : "no: there is no model pack"],
-        ["Lifting", `${contract.binding.strategy}, m = ${contract.binding.m}, n = ${contract.binding.n}`],
+        ["Lifting", `${contract.binding.strategy}, m = ${contract.binding.m} of ${contract.binding.axes} axes, n = ${contract.binding.n}`],
         ["Decoys", h("code", {}, contract.binding.decoy_source_id)],
         ["Default level", contract.default_level],
         ["Receipt key", h("code", {}, contract.receipt_key.public_key)],

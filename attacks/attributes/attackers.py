@@ -21,7 +21,6 @@ Scores = NDArray[np.float64]
 _LOGISTIC_CS = (1e-3, 1e-2, 1e-1)
 _KERNEL_WIDTHS = (0.1, 0.3, 1.0)
 _RIDGE = 1.0
-_BOOSTING_ROUNDS = 40
 _KERNEL_ROWS = 2048
 
 
@@ -44,7 +43,6 @@ class TrainingSet:
     held_out_features: Features
     held_out_labels: Mapping[str, Codes]
     classes: Mapping[str, int]
-    seed: int
 
 
 class Logistic:
@@ -74,31 +72,6 @@ class Logistic:
     def scores(self, features: Features) -> dict[str, Scores]:
         """Score every class, by attribute (P, classes); the highest is the prediction."""
         return _probabilities(self._models, self._scale(features.derived), self._classes)
-
-
-class Boosting:
-    """Gradient-boosted trees on the derived features."""
-
-    def __init__(self, training: TrainingSet) -> None:
-        from sklearn.ensemble import HistGradientBoostingClassifier
-
-        self._classes = training.classes
-        self._models = {
-            name: HistGradientBoostingClassifier(
-                max_iter=_BOOSTING_ROUNDS,
-                learning_rate=0.08,
-                max_leaf_nodes=8,
-                max_bins=63,
-                early_stopping=False,
-                random_state=training.seed,
-            ).fit(training.features.derived, codes)
-            for name, codes in training.labels.items()
-            if len(np.unique(codes)) > 1
-        }
-
-    def scores(self, features: Features) -> dict[str, Scores]:
-        """Score every class, by attribute (P, classes); the highest is the prediction."""
-        return _probabilities(self._models, features.derived, self._classes)
 
 
 class KernelMachine:
@@ -164,10 +137,9 @@ class KernelMachine:
         return np.hstack([features.foot / np.float32(self._length), derived]).astype(np.float32)
 
 
-TRAINED: Mapping[str, type[Logistic | Boosting | KernelMachine]] = {
+TRAINED: Mapping[str, type[Logistic | KernelMachine]] = {
     "logistic": Logistic,
     "svm": KernelMachine,
-    "boosting": Boosting,
 }
 """Attackers by their names in the report."""
 

@@ -3,12 +3,10 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from attacks.attributes.cost import measure_cost
-from attacks.attributes.experiment import run_scheme, work_of
+from attacks.attributes.experiment import run_scheme
 from attacks.attributes.faces import (
     LabelledFaces,
     Split,
@@ -22,9 +20,20 @@ from attacks.attributes.plan import (
     require_folds,
 )
 from attacks.attributes.rows import AttributeRow, strongest
-from attacks.outcomes import COMPARED, AttackOutcome, Knowledge, Leaked, Property, Scheme
+from attacks.errors import AuditError
+from attacks.outcomes import (
+    COMPARED,
+    GENERATED,
+    RAW_SCHEME,
+    AttackOutcome,
+    Knowledge,
+    Leaked,
+    Property,
+    Scheme,
+)
 from attacks.population import LEAST_FITTED
 from models.extraction import Extraction
+from templates.decoys import DecoyGenerator
 from verify.evaluation.attributes import resembling_rows
 from verify.fairface_labels import CLASSES, Label
 
@@ -76,6 +85,8 @@ class AttributeAuditPlan:
     attack, attacked
         Most training faces that the attacker has, and most validation faces that are attacked;
         None for all.
+    axes
+        That faces are projected on for generated decoys; None for all.
     drop_duplicates
         Cosine from which an attacked face resembles a training face too much; None to keep all.
     """
@@ -86,6 +97,7 @@ class AttributeAuditPlan:
     lifting: int
     attack: int | None = None
     attacked: int | None = None
+    axes: int | None = None
     drop_duplicates: float | None = None
     seed: int = 0
 
@@ -131,10 +143,9 @@ class AttributeAuditPlan:
 
 @dataclass(frozen=True, eq=False)
 class AttributeAudit:
-    """What an audit found; ``cost`` has the time of the neighbour search for each dimension."""
+    """What an audit found."""
 
     rows: list[AttributeRow]
-    cost: list[dict[str, Any]]
     split: Split
     duplicates: int
 
@@ -153,12 +164,16 @@ def run_attribute_audit(
     train: LabelledFaces,
     validation: LabelledFaces,
     *,
+    generator: DecoyGenerator | None = None,
     progress: Callable[[float], None] = lambda _share: None,
 ) -> AttributeAudit:
     """Infer attributes from the templates of validation faces.
 
     Parameters
     ----------
+    generator
+        The deployment's own, on the plan's axes. Without one, a generator is fitted to the lifting
+        faces.
     progress
         Called with the share of the attacks that is done, which rises to 1.
 
@@ -183,25 +198,18 @@ def run_attribute_audit(
         attacked_most=plan.attacked,
         seed=plan.seed,
     )
-    setup = prepare(parts, plan=plan.attackers, seed=plan.seed)
-    total = sum(work_of(setup, scheme) for scheme in plan.schemes)
-    done = 0
-    progress(0.0)
-
-    def advance(work: int) -> None:
-        nonlocal done
-        done += work
-        progress(done / total)
-
+    if generator is None:
+        generator = DecoyGenerator.fit(parts.lifting.descriptors)
+        generator = generator.reduced(plan.axes or generator.k)
+    whole = prepare(parts, plan=plan.attackers, seed=plan.seed)
+    ours = prepare(parts.along(generator), plan=plan.attackers, seed=plan.seed, generator=generator)
+    setups = [ours if scheme.decoys == GENERATED else whole for scheme in plan.schemes]
     rows: list[AttributeRow] = []
-    for scheme in plan.schemes:
-        rows += run_scheme(setup, scheme, progress=advance)
-    # One scheme of each dimension: the search takes the same time whatever the decoys.
-    timed = {scheme.dim: scheme for scheme in plan.schemes if scheme.dim}.values()
-    cost = [
-        {**scheme.to_json(), **measure_cost(n=train.n, m=scheme.dim).to_json()} for scheme in timed
-    ]
-    return AttributeAudit(rows, cost, parts, duplicates)
+    progress(0.0)
+    for number, (setup, scheme) in enumerate(zip(setups, plan.schemes, strict=True), start=1):
+        rows += run_scheme(setup, scheme)
+        progress(number / len(setups))
+    return AttributeAudit(rows, parts, duplicates)
 
 
 def attribute_outcomes(rows: Sequence[AttributeRow], *, audited: Scheme) -> list[AttackOutcome]:
@@ -209,31 +217,53 @@ def attribute_outcomes(rows: Sequence[AttributeRow], *, audited: Scheme) -> list
 
     The strongest is chosen on faces of the attacker's own (see ``attributes.rows.strongest``).
     Chance is what its very predictions would score dealt out at random: an attacker who knows
-    nothing stays below the majority's share, and would seem to know something.
+    nothing stays below the majority's share, and would seem to know something. What is left to it
+    is judged by what raw embeddings gain over the majority's share.
 
     Parameters
     ----------
+    rows
+        Of raw embeddings too.
     audited
         The scheme that is judged; the others are reported to compare with.
+
+    Raises
+    ------
+    AuditError
+        There is no row of raw embeddings.
     """
-    return [
-        AttackOutcome(
-            attack=ATTACK,
-            variant=f"{attribute} by {row.attacker}",
-            breaks=Property.CONFIDENTIALITY,
-            leaked=Leaked.HOLDER_KEYS,
-            knowledge=knowledge,
-            assumption=f"{_HAS[knowledge]}; success is the right {attribute}.",
-            scheme=scheme,
-            measured=row.measures.accuracy,
-            chance=row.chance_of_predictions,
-            unjudged=None if scheme == audited else COMPARED,
-            details={
-                "majority": row.chance,
-                "balanced_accuracy": row.measures.balanced_accuracy,
-                "leakage": str(row.measures.leakage),
-                "chosen_among": "the attacker's own held-out faces",
-            },
+    best = strongest(rows)
+    gains = {
+        attribute: row.accuracy - row.chance
+        for (scheme, attribute, _), row in best.items()
+        if scheme == RAW_SCHEME
+    }
+    if not gains:
+        raise AuditError("what templates tell is judged by what raw embeddings tell: add `raw`")
+    outcomes = []
+    for (scheme, attribute, knowledge), row in best.items():
+        unjudged = None if scheme == audited else COMPARED
+        if unjudged is None and gains[attribute] <= 0:
+            unjudged = "raw embeddings do not tell it either"
+        outcomes.append(
+            AttackOutcome(
+                attack=ATTACK,
+                variant=f"{attribute} by {row.attacker}",
+                breaks=Property.CONFIDENTIALITY,
+                leaked=Leaked.HOLDER_KEYS,
+                knowledge=knowledge,
+                assumption=f"{_HAS[knowledge]}; success is the right {attribute}.",
+                scheme=scheme,
+                measured=row.measures.accuracy,
+                chance=row.chance_of_predictions,
+                unjudged=unjudged,
+                details={
+                    "majority": row.chance,
+                    "raw_gain": gains[attribute],
+                    "balanced_accuracy": row.measures.balanced_accuracy,
+                    "leakage": str(row.measures.leakage),
+                    "chosen_among": "the attacker's own held-out faces",
+                },
+            )
         )
-        for (scheme, attribute, knowledge), row in strongest(rows).items()
-    ]
+    return outcomes

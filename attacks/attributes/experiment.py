@@ -1,6 +1,5 @@
 """The attribute attacks on one scheme: lift, attack, measure."""
 
-import threading
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -15,11 +14,8 @@ from attacks.attributes.measures import InferenceMeasures, measure
 from attacks.attributes.observations import (
     ByAttribute,
     Codes,
-    Progress,
     observe_attacked,
     observe_own,
-    own_templates,
-    search_work,
 )
 from attacks.attributes.plan import Setup
 from attacks.attributes.rows import AttributeRow
@@ -28,15 +24,10 @@ from templates.distances import Metric
 
 ByClass = Mapping[str, NDArray[np.float64]]
 
-_KNN, _LIKELIHOOD, _STRIP, _RULE = "knn", "likelihood", "strip", "rule"
-# Products of two descriptors that take as long as one attacker's training on one template: of the
-# order of a millisecond, and of the progress only.
-_TRAINING_WORK = 30_000
+_KNN, _SECOND, _STRIP, _RULE = "knn", "second moments", "strip", "rule"
 
 
-def run_scheme(
-    setup: Setup, scheme: Scheme, *, progress: Progress = lambda _work: None
-) -> list[AttributeRow]:
+def run_scheme(setup: Setup, scheme: Scheme) -> list[AttributeRow]:
     """Attack one scheme with every attacker of the plan, for every attribute.
 
     Parameters
@@ -44,9 +35,6 @@ def run_scheme(
     scheme
         Raw descriptors, or a strategy with the pool of the lifting faces or the generator. hybrid+
         lifts the attacked faces by their true labels, as the paper does.
-    progress
-        Called with the work that was just done; `work_of` says how much there is. Never called by
-        two threads at once.
 
     Returns
     -------
@@ -68,10 +56,8 @@ def run_scheme(
     had a part in the axes or in the gallery that it is judged by. The generator it has.
     Memory holds the templates of one tile at a time.
     """
-    advance = _one_at_a_time(progress)
-    training_work = _TRAINING_WORK * own_templates(setup, scheme)
-    own, is_held_out = observe_own(setup, scheme, advance)
-    victims = observe_attacked(setup, scheme, advance)
+    own, is_held_out = observe_own(setup, scheme)
+    victims = observe_attacked(setup, scheme)
     training, validation = (
         own.take(np.flatnonzero(~is_held_out)),
         own.take(np.flatnonzero(is_held_out)),
@@ -87,9 +73,8 @@ def run_scheme(
         attacked, held_out, seconds = _trained(setup, name, features, truths)
         choices = _chosen(attacked), _chosen(held_out)
         predictions.append(_Predictions(name, None, Knowledge.ALGORITHM, *choices, seconds))
-        advance(training_work)
     if not (victims.guessed is None or training.guessed is None or validation.guessed is None):
-        name, knowledge = _LIKELIHOOD, Knowledge.ALGORITHM
+        name, knowledge = _SECOND, Knowledge.ALGORITHM
         if scheme.decoys == POOLED:
             name, knowledge = _STRIP, Knowledge.DECOYS
         features = training.guessed, validation.guessed, victims.guessed
@@ -99,28 +84,11 @@ def run_scheme(
         if victims.absent:
             choices = _among(attacked, victims.absent), _among(held_out, validation.absent)
             predictions.append(_Predictions(_RULE, None, knowledge, *choices, seconds))
-        advance(training_work)
     rows: list[AttributeRow] = []
     for prediction in predictions:
         held_out_truth = own.truth if prediction.attacker == _KNN else validation.truth
         rows += _rows(setup, scheme, prediction, victims.truth, held_out_truth)
     return rows
-
-
-def work_of(setup: Setup, scheme: Scheme) -> int:
-    """Work that `run_scheme` reports as progress, in products of two descriptors."""
-    trained = len(setup.plan.attackers) + (scheme.decoys is not None)
-    return search_work(setup, scheme) + trained * _TRAINING_WORK * own_templates(setup, scheme)
-
-
-def _one_at_a_time(progress: Progress) -> Progress:
-    lock = threading.Lock()
-
-    def advance(work: int) -> None:
-        with lock:
-            progress(work)
-
-    return advance
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -159,7 +127,6 @@ def _trained(
             held_out,
             truths[1],
             {name: len(classes) for name, classes in setup.split.attack.classes.items()},
-            setup.seed,
         )
     )
     return model.scores(attacked), model.scores(held_out), time.perf_counter() - start

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attacks.errors import AuditError
-from templates.decoys.source import Attributes
+from templates.decoys.source import Attributes, DecoySource
 from templates.space.embedding import unit_descriptors
 
 Array32 = NDArray[np.float32]
@@ -87,6 +87,10 @@ class LabelledFaces:
         labels = {name: codes[indices] for name, codes in self.labels.items()}
         return LabelledFaces(self.descriptors[indices], labels, self.classes)
 
+    def along(self, source: DecoySource) -> "LabelledFaces":
+        """Take the embeddings to the coordinates that templates have."""
+        return LabelledFaces(source.project(self.descriptors), self.labels, self.classes)
+
     def names(self, attribute: str) -> list[str]:
         """Return the class of every face."""
         classes = self.classes[attribute]
@@ -118,6 +122,10 @@ class Split:
     lifting: LabelledFaces
     attack: LabelledFaces
     attacked: LabelledFaces
+
+    def along(self, source: DecoySource) -> "Split":
+        """Take all faces to the coordinates that templates have."""
+        return Split(*(part.along(source) for part in (self.lifting, self.attack, self.attacked)))
 
 
 def split(

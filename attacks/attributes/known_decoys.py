@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from attacks.attributes.neighbours import Advance, nearest_neighbours
+from attacks.attributes.neighbours import nearest_neighbours
 from templates.distances import Metric
 from templates.space.embedding import normalised
 from templates.space.subspace import SubspaceBatch
@@ -41,7 +41,6 @@ def find_decoys(
     *,
     most: int,
     skip: Codes | None = None,
-    progress: Advance | None = None,
 ) -> Decoys:
     """Find the entries of the pool that lie in each template.
 
@@ -59,7 +58,6 @@ def find_decoys(
         k=min(most, len(pool) - (skip is not None)),
         metrics=(Metric.EUCLIDEAN,),
         skip=skip,
-        progress=progress,
     )[Metric.EUCLIDEAN]
     return Decoys(nearest.indices, nearest.distances < TOUCH)
 

@@ -4,7 +4,7 @@ A template and a face are compared by the point-to-subspace distance, as
 ``templates.distances.nearest`` does it: memory does not grow with the number of pairs.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +17,6 @@ Array32 = NDArray[np.float32]
 Codes = NDArray[np.int64]
 Attacked = Array32 | SubspaceBatch
 """Raw descriptors (P, n), or templates of P faces."""
-Advance = Callable[[int], None]
-"""Called with a number of (template, face) pairs that are done."""
 
 METRICS = (Metric.EUCLIDEAN, Metric.SPHERICAL)
 _BYTES = 32 << 20
@@ -34,7 +32,6 @@ def nearest_neighbours(
     k: int,
     metrics: Sequence[Metric] = METRICS,
     skip: Codes | None = None,
-    progress: Advance | None = None,
 ) -> Mapping[Metric, Neighbours]:
     """Search the gallery for the faces nearest to each template.
 
@@ -49,8 +46,6 @@ def nearest_neighbours(
     skip : (P,) int64, optional
         Position in the gallery that each template does not find: that of the face in it, where the
         attacker lifted faces of the gallery. The gallery must have more than ``k`` faces then.
-    progress
-        Called with numbers of pairs that were compared by all metrics; they add up to P · G.
 
     Returns
     -------
@@ -74,10 +69,9 @@ def nearest_neighbours(
             f"faces of {gallery.shape[1]} numbers; K must be 1 to {_MOST}"
         )
     if not isinstance(attacked, SubspaceBatch):
-        nearest_points = _nearest_points(attacked, gallery, k, skip, progress)
+        nearest_points = _nearest_points(attacked, gallery, k, skip)
         return dict.fromkeys(metrics, nearest_points)
     labels = None if skip is None else (np.arange(len(gallery), dtype=np.int64), skip)
-    advance = None if progress is None else _in_parts(progress, len(metrics))
     return {
         metric: nearest(
             gallery,
@@ -86,28 +80,12 @@ def nearest_neighbours(
             metric=metric,
             of_templates=True,
             labels=labels,
-            progress=advance,
         )
         for metric in metrics
     }
 
 
-def _in_parts(progress: Advance, parts: int) -> Advance:
-    """Pass on what every part reports so that all parts together make the whole."""
-    done = 0
-
-    def advance(count: int) -> None:
-        nonlocal done
-        before = done // parts
-        done += count
-        progress(done // parts - before)
-
-    return advance
-
-
-def _nearest_points(
-    attacked: Array32, gallery: Array32, k: int, skip: Codes | None, progress: Advance | None
-) -> Neighbours:
+def _nearest_points(attacked: Array32, gallery: Array32, k: int, skip: Codes | None) -> Neighbours:
     indices = np.empty((len(attacked), k), dtype=np.int64)
     distances = np.empty((len(attacked), k), dtype=np.float32)
     step = max(1, _BYTES // (12 * len(gallery) + 8 * k * gallery.shape[1]))
@@ -123,8 +101,6 @@ def _nearest_points(
         order = np.lexsort((candidates, near), axis=1)
         indices[rows] = np.take_along_axis(candidates, order, 1)
         distances[rows] = np.take_along_axis(near, order, 1)
-        if progress is not None:
-            progress(far.size)
     return Neighbours(indices, distances)
 
 

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from attacks.attributes.faces import LabelledFaces
 from attacks.attributes.features import Features, features_of
 from attacks.attributes.known_decoys import Flags, find_decoys, never_seen, strip
-from attacks.attributes.likely_points import guesses
 from attacks.attributes.neighbours import METRICS, Attacked, merged, nearest_neighbours, vote
 from attacks.attributes.plan import Setup, Side
 from attacks.errors import AuditError
-from attacks.outcomes import GENERATED, POOLED, RAW_SCHEME, Scheme
+from attacks.outcomes import GENERATED, RAW_SCHEME, Scheme
+from attacks.second_order import likeliest_embeddings
 from templates.distances import Metric
 from templates.distances.blas import single_threaded
 from templates.keys.randomness import Keystream
@@ -30,7 +30,6 @@ from templates.space.subspace import SubspaceBatch
 
 Codes = NDArray[np.int64]
 ByAttribute = dict[str, Codes]
-Progress = Callable[[int], None]
 
 _TILE_BYTES = 64 << 20
 _TILE_ROWS = 256
@@ -44,8 +43,8 @@ class Observations:
     votes: dict[Metric, ByAttribute]
     """Predictions of the paper's attacker."""
     guessed: Features | None
-    """Features of the guesses at the descriptors, of attackers who know the decoys: the foot points
-    without the pool's, or the points least like the generator's; None where there are none."""
+    """Features of the guesses at the embeddings, of attackers who know the decoys: the foot points
+    without the pool's, or the points likeliest by second moments; None where there are none."""
     absent: dict[str, Flags]
     """Classes that no decoy has (hybrid+)."""
     truth: ByAttribute
@@ -77,26 +76,21 @@ class Observations:
         )
 
 
-def observe_attacked(setup: Setup, scheme: Scheme, progress: Progress) -> Observations:
-    """Lift the attacked faces with the deployment's decoys, and look at their templates.
-
-    ``progress`` is called with the work that was just done; see `search_work`.
-    """
+def observe_attacked(setup: Setup, scheme: Scheme) -> Observations:
+    """Lift the attacked faces with the deployment's decoys, and look at their templates."""
     stream = Keystream.seeded("attributes", setup.seed, "attacked", *_parts(scheme))
-    observer = _Observer(setup, scheme, setup.side, True, progress)
+    observer = _Observer(setup, scheme, setup.side, True)
     return _observe(observer, setup.split.attacked, stream)
 
 
-def observe_own(
-    setup: Setup, scheme: Scheme, progress: Progress
-) -> tuple[Observations, NDArray[np.bool_]]:
+def observe_own(setup: Setup, scheme: Scheme) -> tuple[Observations, NDArray[np.bool_]]:
     """Lift the attacker's own faces, fold by fold; which of them are held out.
 
     They are searched among the nearby faces only.
     """
     parts, held_out = [], []
     for number, fold in enumerate(setup.folds):
-        observer = _Observer(setup, scheme, fold.side, False, progress)
+        observer = _Observer(setup, scheme, fold.side, False)
         for turn in range(_lifts(setup, scheme)):
             stream = Keystream.seeded(
                 "attributes", setup.seed, "own", number, turn, *_parts(scheme)
@@ -106,37 +100,8 @@ def observe_own(
     return Observations.stack(parts), np.concatenate(held_out)
 
 
-def search_work(setup: Setup, scheme: Scheme) -> int:
-    """Work of the searches for one scheme: (template, face) pairs, each as often as rows meet.
-
-    A pair of a face and a template of dimension m is m + 1 products of two descriptors; of two
-    points, one.
-    """
-    victims = len(setup.split.attacked) * _work_of_one(scheme, setup.side, len(setup.side.gallery))
-    own = sum(
-        len(fold.own) * _work_of_one(scheme, fold.side, len(fold.side.nearby))
-        for fold in setup.folds
-    )
-    return victims + _lifts(setup, scheme) * own
-
-
-def own_templates(setup: Setup, scheme: Scheme) -> int:
-    """Number of templates that the attacker lifts."""
-    return _lifts(setup, scheme) * sum(len(fold.own) for fold in setup.folds)
-
-
 def _lifts(setup: Setup, scheme: Scheme) -> int:
     return 1 if scheme == RAW_SCHEME else setup.plan.lifts_of(len(setup.split.attack))
-
-
-def _work_of_one(scheme: Scheme, side: Side, gallery: int) -> int:
-    """Work on one template."""
-    work = (scheme.dim + 1) * gallery
-    if scheme.decoys is not None:
-        work += len(side.nearby)
-    if scheme.decoys == POOLED:
-        work += (scheme.dim + 1) * len(side.entries)
-    return work
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -147,11 +112,6 @@ class _Observer:
     scheme: Scheme
     side: Side
     whole: bool
-    progress: Progress
-
-    def advance(self, products: int) -> Progress:
-        """Return a callback that counts a pair as so many products."""
-        return lambda pairs: self.progress(products * pairs)
 
 
 def _observe(
@@ -189,13 +149,11 @@ def _observe_tile(
 ) -> Observations:
     plan, side = observer.setup.plan, observer.side
     metrics = METRICS if observer.scheme != RAW_SCHEME else METRICS[:1]
-    advance = observer.advance(observer.scheme.dim + 1)
     near = nearest_neighbours(
         attacked,
         side.nearby.descriptors,
         k=plan.neighbours,
         metrics=metrics,
-        progress=advance,
     )
     features = features_of(attacked, side.axes, near, side.nearby, ks=plan.feature_ks)
     after = len(side.nearby)
@@ -205,7 +163,6 @@ def _observe_tile(
             side.gallery.descriptors[after:],
             k=min(plan.k, len(side.gallery) - after),
             metrics=metrics,
-            progress=advance,
         )
         near = {m: merged(near[m], beyond[m], after=after, k=plan.k) for m in metrics}
     votes = {
@@ -258,9 +215,10 @@ def _guessed(
     if scheme.decoys is None or not isinstance(attacked, SubspaceBatch):
         return None, {}
     if scheme.decoys == GENERATED:
-        if side.form is None:
+        known = observer.setup.decoys
+        if side.faces is None or known is None:
             raise AuditError("schemes with generated decoys need a decoy generator")
-        points = guesses(attacked, side.form)
+        points = likeliest_embeddings(attacked, side.faces, known).astype(np.float32)
         point_features = _features_of_points(observer, points)
         return Features(points, np.hstack([point_features.derived, features.derived])), {}
     strategy = Strategy(scheme.strategy)
@@ -270,7 +228,6 @@ def _guessed(
         entries.descriptors,
         most=strategy.decoys(scheme.dim),
         skip=own,
-        progress=observer.advance(scheme.dim + 1),
     )
     point_features = _features_of_points(observer, strip(attacked, entries.descriptors, decoys))
     if strategy is not Strategy.HYBRID_PLUS:
@@ -289,7 +246,6 @@ def _features_of_points(observer: _Observer, points: NDArray[np.float32]) -> Fea
         side.nearby.descriptors,
         k=max(ks),
         metrics=METRICS[:1],
-        progress=observer.advance(1),
     )
     return features_of(points, side.axes, near, side.nearby, ks=ks)
 

@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 
 from attacks.attributes.faces import LabelledFaces, Split
 from attacks.attributes.features import Axes
-from attacks.attributes.likely_points import Form, contrast, decoy_precision
 from attacks.errors import AuditError
 from attacks.outcomes import GENERATED, POOLED, RAW_SCHEME, Scheme
-from attacks.population import LEAST_FITTED
-from templates.decoys import NOISE_ENERGY, DecoyGenerator, DecoyPool
+from attacks.second_order import Moments, decoy_moment, drawn_towards
+from templates.decoys import DecoyGenerator, DecoyPool
 from templates.decoys.source import DecoySource
 from templates.space.lifting import Strategy
 from verify.fairface_labels import Label
@@ -33,8 +32,7 @@ class AttributePlan:
     Parameters
     ----------
     attackers
-        Of `attackers.TRAINED`. Boosting is left out by default: on FairFace it finds as much as the
-        other two, in ten times their time.
+        Of `attackers.TRAINED`.
     lifts
         Times that the attacker lifts each of its own faces to train on. None for as many as
         ``training_most`` allows, 1 to 3: labels are scarce, and lifting is free.
@@ -95,8 +93,9 @@ class Side:
         Labelled faces to search for neighbours, in random order.
     nearby
         The first of them, at most as many as the plan says.
-    form
-        What tells the gallery's faces from generated decoys; None without a generator.
+    faces
+        Second moments of the gallery's faces, as far as so many tell them; None without a
+        generator.
     """
 
     entries: LabelledFaces
@@ -104,7 +103,7 @@ class Side:
     gallery: LabelledFaces
     nearby: LabelledFaces
     axes: Axes
-    form: Form | None
+    faces: Moments | None
 
     @classmethod
     def of(
@@ -113,15 +112,17 @@ class Side:
         gallery: LabelledFaces,
         *,
         nearby: int,
-        against: Form | None,
+        decoys: Moments | None,
     ) -> "Side":
-        """Make the pool, and find the axes and the form; ``against`` is the decoys' precision."""
+        """Make the pool, and find the axes and moments; ``decoys`` are the generator's."""
         labelled = {"gender", "race"} <= set(entries.attributes)
         labels = entries.decoy_attributes() if labelled else None
         pool = DecoyPool(entries.descriptors, labels=labels)
-        form = None if against is None else contrast(against, gallery.descriptors)
+        faces = None
+        if decoys is not None:
+            faces = Moments.of(drawn_towards(gallery.descriptors, decoys.moment))
         near = gallery.take(np.arange(min(nearby, len(gallery))))
-        return cls(entries, pool, gallery, near, Axes.fit(gallery), form)
+        return cls(entries, pool, gallery, near, Axes.fit(gallery), faces)
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,6 +160,7 @@ class Setup:
     seed: int
     side: Side
     generator: DecoyGenerator | None
+    decoys: Moments | None
     folds: tuple[Fold, ...]
 
     def source(self, scheme: Scheme, side: Side) -> DecoySource | None:
@@ -184,20 +186,16 @@ def prepare(
     Parameters
     ----------
     generator
-        The one of the deployment that is audited, which clients have. Without one it is fitted to
-        the lifting faces, of which there must be 100 or more; where there are fewer, schemes with
-        generated decoys cannot be run.
+        The one of the deployment that is audited, which clients have, on the axes that the faces
+        are projected on. Without one, schemes with generated decoys cannot be run.
 
     Raises
     ------
     AuditError
         The attacker has too few faces for the plan.
     """
-    if generator is None and len(parts.lifting) >= LEAST_FITTED:
-        rows = parts.lifting.descriptors
-        generator = DecoyGenerator.fit(rows, noise=NOISE_ENERGY / rows.shape[1])
-    against = None if generator is None else decoy_precision(generator, seed=seed)
-    side_of = partial(Side.of, nearby=plan.gallery_most, against=against)
+    decoys = None if generator is None else Moments.of(decoy_moment(generator))
+    side_of = partial(Side.of, nearby=plan.gallery_most, decoys=decoys)
     require_folds(len(parts.attack), plan)
     rng = np.random.default_rng([seed, 1])
     order = rng.permutation(len(parts.attack))
@@ -215,7 +213,7 @@ def prepare(
         held_out[rng.permutation(len(own))[: round(plan.held_out * len(own))]] = True
         folds.append(Fold(own, entries, held_out, side_of(part, gallery)))
     side = side_of(parts.lifting, parts.attack.take(order))
-    return Setup(parts, plan, seed, side, generator, tuple(folds))
+    return Setup(parts, plan, seed, side, generator, decoys, tuple(folds))
 
 
 def require_folds(faces: int, plan: AttributePlan) -> None:
@@ -294,9 +292,14 @@ def _least_unlike(labels: Sequence[Label]) -> float:
 
 
 def schemes_of(
-    *, dims: Sequence[int] = PAPER_DIMS, generated_dims: Sequence[int] = OUR_DIMS
+    *,
+    dims: Sequence[int] = PAPER_DIMS,
+    generated_dims: Sequence[int] = OUR_DIMS,
+    axes: int | None = None,
 ) -> list[Scheme]:
     """Return the default grid: raw, the paper's strategies with a pool, ours with a generator.
+
+    ``axes`` are those that ours is projected on; the paper's are not.
 
     hybrid+ needs labels of gender and race, and m ≥ 2 as hybrid does.
     """
@@ -311,5 +314,5 @@ def schemes_of(
             if strategy.decoys(m) or not strategy.needs_decoys:
                 source = POOLED if strategy.needs_decoys else None
                 schemes.append(Scheme(str(strategy), source, m))
-    schemes += [Scheme(str(Strategy.ADVERSARIAL), GENERATED, m) for m in generated_dims]
+    schemes += [Scheme(str(Strategy.ADVERSARIAL), GENERATED, m, axes) for m in generated_dims]
     return schemes

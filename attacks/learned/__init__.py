@@ -1,10 +1,9 @@
-"""Attacks that train networks on faces of the attacker: needs the ``torch`` extra.
+"""Attacks that learn: a network from template to embedding. They need the extra ``torch``.
 
-Nothing here imports torch before an attack is made.
+A network is trained on the attacker's own faces, lifted as the service lifts, and meets the
+victims' templates once, at the end.
 """
 
-from attacks.learned.crops import FaceCrops
 from attacks.learned.inverter import invert
-from attacks.learned.reconstruction import reconstruct
 
-__all__ = ["FaceCrops", "invert", "reconstruct"]
+__all__ = ["invert"]

@@ -2,8 +2,6 @@
 
 from attacks.outcomes import AttackOutcome
 from attacks.stored.foot_point import foot_point_attack
-from attacks.stored.impersonation import impersonation_attack
-from attacks.stored.intersection import same_descriptor
 from attacks.stored.known_database import known_database_attack
 from attacks.stored.nearest_neighbour import nearest_neighbour_attack
 from attacks.stored.oracle import oracle_attack
@@ -12,8 +10,6 @@ from attacks.system import System
 
 SOME = 150
 """Victims of the oracle, whose curve needs no more."""
-FEW = 60
-"""Victims whose descriptor is lifted again and again: it is recovered in every trial or in none."""
 
 
 def template_attacks(system: System) -> list[AttackOutcome]:
@@ -23,7 +19,5 @@ def template_attacks(system: System) -> list[AttackOutcome]:
         *known_database_attack(system),
         *nearest_neighbour_attack(system),
         *oracle_attack(system.first(SOME)),
-        *same_descriptor(system.first(FEW)),
-        *impersonation_attack(system),
         *presentation_attack(system),
     ]

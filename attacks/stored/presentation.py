@@ -29,20 +29,19 @@ from attacks.stored.honest_probes import (
     honest_lift,
     points_inside,
 )
+from attacks.stored.point_ascent import ascend_points
 from attacks.stored.wolf_ascent import Ground, ascend_subspaces
 from attacks.stored.wolves import ALONG_MEAN, CENTRAL, axis_wolves, canonical
 from attacks.system import System
 from templates.contract.canonical import Json
-from templates.contract.document import Calibration, Contract, Level, Rate
-from templates.contract.nobody import COHORT_SIZE
-from templates.decoys import DecoyGenerator
-from templates.keys.randomness import Keystream
-from templates.space.lifting import lift, plain_strategy
+from templates.contract.document import Calibration, Level, Rate
+from templates.contract.nobody import Nobody
+from templates.decoys import client_source
+from templates.keys.randomness import KEY_BYTES, Keystream
 from templates.space.subspace import SubspaceBatch
-from verify.cohort import Probes, people_like
+from verify.cohort import Probes
 from verify.comparisons import through_wire
 from verify.metrics import rate
-from verify.point_ascent import ascend_points
 
 TARGETS = 150
 """Templates that the attacker lifts to climb on; as many again to choose among the ends."""
@@ -77,25 +76,17 @@ class OwnTemplates:
 def lift_own_templates(system: System) -> OwnTemplates:
     """Lift the attacker's faces, and a cohort with the generator that clients have.
 
-    The cohort of a pool's service is made with a generator; the attacker fits one to their own
-    faces. Templates are lifted with the scheme's decoys: see ``wolf_knowledge``.
+    Templates are lifted with the scheme's decoys: see ``wolf_knowledge``.
     """
     faces = np.random.default_rng(system.seed).permutation(system.attacker)[: 2 * TARGETS]
-    source = system.lifter.source
-    known = source if isinstance(source, DecoyGenerator) else DecoyGenerator.fit(system.attacker)
     half = len(faces) // 2
     with Keystream.seeded("audit", system.seed, str(system.scheme), "attacker's cohort") as stream:
-        cohort = lift(
-            people_like(known, system.attacker).draw(COHORT_SIZE, 1, stream=stream)[:, 0],
-            strategy=plain_strategy(system.lifter.strategy),
-            m=system.scheme.dim,
-            source=known,
-            stream=stream,
-        )
+        seed = stream.token(KEY_BYTES)
+    generator = client_source(system.source)
     return OwnTemplates(
         targets=system.lift(faces[:half], "attacker's targets"),
         held_out=system.lift(faces[half:], "attacker's held-out targets"),
-        cohort=cohort,
+        cohort=Nobody(generator, system.strategy, system.scheme.dim, seed).cohort,
     )
 
 
@@ -147,14 +138,12 @@ def _raw(system: System, own: OwnTemplates) -> list[AttackOutcome]:
 
     def wolf(variant: str, does: str, made: Callable[[Level], NDArray[np.float32]]) -> Trial:
         candidates = made(level)
-        shares = accepted_shares(candidates, own, system.contract, calibration, level)
+        shares = accepted_shares(candidates, own, system.nobody, calibration, level)
         best = candidates[[int(np.argmax(shares))]]
         return Trial(variant, does, best, wolf_knowledge(system))
 
     def climbed(level: Level) -> NDArray[np.float32]:
-        return ascend_points(
-            starts, own.targets, system.contract.expectation, threshold=level.threshold
-        )
+        return ascend_points(starts, own.targets, system.nobody, threshold=level.threshold)
 
     trials = [
         Trial("zero embedding", "sends the zero vector", zero),
@@ -199,7 +188,7 @@ def _lifted(system: System, calibration: Calibration, own: OwnTemplates) -> list
     as_stored = turned(inside, rotations_of(system, "replay", "template", len(inside)))
 
     def shares(probes: SubspaceBatch, level: Level) -> NDArray[np.float64]:
-        return accepted_shares(probes, own, system.contract, calibration, level)
+        return accepted_shares(probes, own, system.nobody, calibration, level)
 
     def wolf(variant: str, does: str, made: Callable[[Level], SubspaceBatch]) -> Trial:
         received = through_wire(made(level), contract_id=system.contract.contract_id)
@@ -267,14 +256,14 @@ def _plain_wolves(faces: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def accepted_shares(
-    probes: Probes, own: OwnTemplates, contract: Contract, calibration: Calibration, level: Level
+    probes: Probes, own: OwnTemplates, nobody: Nobody, calibration: Calibration, level: Level
 ) -> NDArray[np.float64]:
     """Share of the attacker's held-out templates that accept each probe.
 
     Lifted probes are held against the attacker's own cohort, for the service's is secret. Ties,
     such as where none accepts, are broken by the mean similarity.
     """
-    scores = score(probes, own.held_out, contract, calibration, cohort=own.cohort)
+    scores = score(probes, own.held_out, nobody, calibration, cohort=own.cohort)
     # Similarities lie in [-1, 1]: their mean, scaled, never outweighs one acceptance.
     tie = scores.similarities.mean(axis=1) / (4 * len(own.held_out))
     return np.asarray(scores.at(level).mean(axis=1) + tie, dtype=np.float64)
@@ -328,8 +317,8 @@ def _passed(probes: Probes, calibration: Calibration) -> NDArray[np.bool_]:
 def _scored(system: System, probes: Probes, calibration: Calibration) -> Scores:
     """One trial a victim: probe i meets template i, or the only probe meets all; (V,) each."""
     if len(probes) > 1:
-        return score(probes, system.templates, system.contract, calibration, paired=True)
-    every = score(probes, system.templates, system.contract, calibration)
+        return score(probes, system.templates, system.nobody, calibration, paired=True)
+    every = score(probes, system.templates, system.nobody, calibration)
     return Scores(every.similarities[0], every.scores[0])
 
 

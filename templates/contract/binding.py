@@ -1,13 +1,13 @@
 """What makes two templates comparable: the part of a contract that its id hashes."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 from templates.contract.canonical import Fields, Json, digest, free_object
 from templates.contract.levels import SHA256_HEX
 from templates.errors import ContractError, ContractMismatch
-from templates.keys.rotation import HAAR_VERSION, ROTATION_VERSION
+from templates.keys.rotation import ROTATION_VERSION
 from templates.space.lifting import Strategy
 
 MAX_N = 4096
@@ -52,11 +52,14 @@ class Binding:
     preprocessing
         Its version, alignment template, size, channel order, mean, scale and flip.
     n
-        Descriptor dimension.
+        Numbers of an embedding.
+    axes
+        Leading axes of faces that embeddings are projected on: numbers of what is lifted and
+        compared. ``n`` where nothing is projected.
     strategy, m
         Lifting strategy and subspace dimension of stored templates.
     decoy_source_id
-        SHA-256 of the decoy source's canonical content.
+        SHA-256 of the canonical content of the decoy source, reduced to the axes.
     rotation_version
         Version of the derivation that turns stored templates.
     """
@@ -64,6 +67,7 @@ class Binding:
     embedder_sha256: str
     preprocessing: Mapping[str, Json]
     n: int
+    axes: int
     strategy: Strategy
     m: int
     decoy_source_id: str
@@ -76,10 +80,12 @@ class Binding:
             raise ContractError("the decoy source's id must be 64 lower-case hexadecimal digits")
         if not 2 <= self.n <= MAX_N:
             raise ContractError(f"the embedding dimension must lie in 2 to {MAX_N}")
-        if not 1 <= self.m <= min(MAX_M, self.n - 1):
-            raise ContractError(f"the subspace dimension must lie in 1 to min({MAX_M}, n - 1)")
-        if not 1 <= len(self.rotation_version) <= 64:
-            raise ContractError("the rotation version must be a text of 1 to 64 characters")
+        if not 2 <= self.axes <= self.n:
+            raise ContractError("the number of axes must lie in 2 to the embedding dimension")
+        if not 1 <= self.m <= min(MAX_M, self.axes - 1):
+            raise ContractError(f"the subspace dimension must lie in 1 to min({MAX_M}, axes - 1)")
+        if self.rotation_version != ROTATION_VERSION:
+            raise ContractError(f"this program turns templates by {ROTATION_VERSION!r} only")
         preprocessing = free_object(self.preprocessing, what="the preprocessing")
         object.__setattr__(self, "preprocessing", preprocessing)
         object.__setattr__(self, "strategy", Strategy(self.strategy))
@@ -88,21 +94,6 @@ class Binding:
     def contract_id(self) -> str:
         """SHA-256 of the canonical JSON, 64 hexadecimal digits; computed once."""
         return digest(self.to_json())
-
-    @cached_property
-    def rotation_versions(self) -> dict[str, str]:
-        """Rotation version by the ids of contracts whose stored templates this one serves.
-
-        This contract's own comes first, then that of the one which differs from it in the earlier
-        rotation version only. A rotation changes no distance, so the calibrations hold for both.
-        """
-        earlier = replace(self, rotation_version=HAAR_VERSION)
-        return {self.contract_id: self.rotation_version, earlier.contract_id: HAAR_VERSION}
-
-    @property
-    def contract_ids(self) -> tuple[str, ...]:
-        """The keys of :attr:`rotation_versions`."""
-        return tuple(self.rotation_versions)
 
     @property
     def embedding_id(self) -> str:
@@ -115,6 +106,7 @@ class Binding:
             "embedder_sha256": self.embedder_sha256,
             "preprocessing": dict(self.preprocessing),
             "n": self.n,
+            "axes": self.axes,
             "strategy": str(self.strategy),
             "m": self.m,
             "decoy_source_id": self.decoy_source_id,
@@ -184,38 +176,18 @@ class Binding:
                 f"is {source_id[:16]}…; use the file that the contract was calibrated with"
             )
 
-    def require_contract(self, contract_id: str, *, what: str) -> str:
-        """Refuse a template of another contract; return its rotation version.
+    def require_contract(self, contract_id: str, *, what: str) -> None:
+        """Refuse a template of another contract.
 
         Raises
         ------
         ContractMismatch
             Naming both sides.
         """
-        version = self.rotation_versions.get(contract_id)
-        if version is None:
+        if contract_id != self.contract_id:
             raise ContractMismatch(
                 f"{what} belongs to the contract {contract_id[:16]}…, the service runs "
                 f"{self.contract_id[:16]}…; enroll or lift again under the service's contract"
-            )
-        return version
-
-    def require_rotation_version(self) -> None:
-        """Refuse a contract that was made before templates had rotations of their own.
-
-        It is not converted: its calibrations carry its id, and the seal of its file covers both.
-
-        Raises
-        ------
-        ContractMismatch
-            Naming both versions.
-        """
-        if self.rotation_version != ROTATION_VERSION:
-            raise ContractMismatch(
-                f"the contract turns templates by {self.rotation_version!r}, this program by "
-                f"{ROTATION_VERSION!r}: run `veilface calibrate --strategy {self.strategy} "
-                f"--dim {self.m}` with the same pack, decoys and --flip; stored templates stay "
-                "valid then, and `veilface keys rotate-tenant` turns them"
             )
 
     @classmethod
@@ -229,6 +201,7 @@ class Binding:
             embedder_sha256=fields.text("embedder_sha256"),
             preprocessing=fields.free("preprocessing"),
             n=fields.integer("n"),
+            axes=fields.integer("axes"),
             strategy=Strategy(strategy),
             m=fields.integer("m"),
             decoy_source_id=fields.text("decoy_source_id"),

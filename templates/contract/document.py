@@ -1,35 +1,24 @@
 """The contract: what a template and a threshold belong to, and the file that carries it.
 
 ``contract_id`` is the SHA-256 of the canonical JSON of the binding. Every stored template carries
-it, and a template of another contract is refused (docs/contract.md). Recalibrating changes the
-calibrations, their ids and perhaps the strangers, never the ``contract_id``.
+it, and a template of another contract is refused (docs/formats.md). Recalibrating changes the
+calibrations, their ids and perhaps the cohort, never the ``contract_id``.
 
-The file is JSON. The strangers whom templates of clients are held against, and the seed of the
-cohort that lifted probes are held against, are secrets: who has them can search for what passes
-those tests. They are sealed inside the file with what a point's expected similarity is computed
-from, and the seal's context holds the digest of everything else in the file, so that an edited
-threshold is refused as well.
+The file is JSON. The seed of the cohort that lifted probes are held against is a secret, because
+with it one can search for what the cohort passes. It is sealed inside the file. The seal's context
+holds the digest of everything else in the file, so that an edited threshold is refused as well.
 """
 
 import base64
 import binascii
-import hashlib
 import json
 import math
-import threading
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
-
-import numpy as np
-import safetensors
-import safetensors.numpy
-from numpy.typing import NDArray
 
 from templates.contract.binding import Binding
 from templates.contract.canonical import Fields, Json, digest, free_object, parse_object
-from templates.contract.expectation import EXPECTATION_TENSORS, PointExpectation
 from templates.contract.levels import (
     LEVEL_NAME,
     Calibration,
@@ -40,15 +29,15 @@ from templates.contract.levels import (
     norm_range,
 )
 from templates.contract.liveness import LivenessCalibration
-from templates.contract.nobody import NOBODY_TENSORS, Nobody
+from templates.contract.nobody import Nobody
 from templates.contract.verdict import Verdict
+from templates.decoys import DecoySource, client_source
 from templates.distances import Metric
-from templates.errors import ContractError, DecoyError, SealError, Uncalibrated
+from templates.errors import ContractError, SealError, Uncalibrated
 from templates.keys.bounded_file import read_at_most
 from templates.keys.private_file import replace_private
+from templates.keys.randomness import KEY_BYTES
 from templates.keys.sealing import Sealer
-from templates.space.lifting import plain_strategy
-from templates.space.rounded import RoundedBatch
 
 __all__ = [
     "Binding",
@@ -61,22 +50,14 @@ __all__ = [
 ]
 
 FORMAT = "veilface-contract"
-VERSION = 2
-MAX_FILE_BYTES = 128 * 2**20
+VERSION = 3
+MAX_FILE_BYTES = 8 * 2**20
 MAX_CALIBRATIONS = 64
-_EXPECTATION, _NOBODY = "expectation.", "nobody."
-_LIFTING = threading.Lock()
-SEALED = frozenset(
-    {
-        *(_EXPECTATION + name for name in EXPECTATION_TENSORS),
-        *(_NOBODY + name for name in NOBODY_TENSORS),
-    }
-)
 
 
 @dataclass(frozen=True, eq=False)
 class Contract:
-    """A binding with its calibrations and limits, and what scores are computed from.
+    """A binding with its calibrations and limits, and the seed of the cohort.
 
     Parameters
     ----------
@@ -94,12 +75,10 @@ class Contract:
         (``templates.space.agreement``).
     template_foot_point_norm
         Range of ‖p‖ that an honest template of this contract has.
-    template_stranger_score
-        Largest ``Nobody.score`` that an honest template of this contract has.
-    expectation
-        What a point's similarity to a template of nobody is expected to be.
-    nobody
-        Strangers who do not exist. Secret.
+    template_stranger_similarity
+        Largest ``Nobody.stranger_similarity`` that an honest template of this contract has.
+    cohort_seed
+        32 bytes that the cohort of lifted probes is lifted from. Secret.
     verdict
         How private and how accurate the calibration found it; None where that was not measured.
     liveness
@@ -118,9 +97,8 @@ class Contract:
     photo_consistency: float
     probe_consistency: float
     template_foot_point_norm: tuple[float, float]
-    template_stranger_score: float
-    expectation: PointExpectation = field(repr=False)
-    nobody: Nobody = field(repr=False)
+    template_stranger_similarity: float
+    cohort_seed: bytes = field(repr=False)
     verdict: Verdict | None = None
     liveness: LivenessCalibration | None = None
 
@@ -133,10 +111,10 @@ class Contract:
         if not LEVEL_NAME.fullmatch(self.default_level):
             raise ContractError("the default level's name must match " + LEVEL_NAME.pattern)
         check_norm_range(self.template_foot_point_norm)
-        if not math.isfinite(self.template_stranger_score):
-            raise ContractError("template_stranger_score is not a finite number")
-        self.expectation.check(self.binding.n)
-        self.nobody.check(self.binding.n)
+        if not math.isfinite(self.template_stranger_similarity):
+            raise ContractError("template_stranger_similarity is not a finite number")
+        if len(self.cohort_seed) != KEY_BYTES:
+            raise ContractError(f"the cohort's seed must have {KEY_BYTES} bytes")
         self._check_calibrations()
 
     def _check_calibrations(self) -> None:
@@ -149,18 +127,14 @@ class Contract:
         if len(keys) != len(self.calibrations):
             raise ContractError("two calibrations share mode, metric, probe m and probe photos")
         points = {entry.metric for entry in self.calibrations if entry.mode == "p2s"}
-        if not points <= {self.expectation.metric}:
-            raise ContractError("the expectation is not of the metric that points are decided by")
-        if any(entry.probe_m >= self.binding.n for entry in self.calibrations):
-            raise ContractError("a calibration's probe m is not below the embedding dimension")
+        if len(points) > 1:
+            raise ContractError("points are decided by one metric")
+        if any(entry.probe_m >= self.binding.axes for entry in self.calibrations):
+            raise ContractError("a calibration's probe m is not below the number of axes")
         names = {level.name for entry in self.calibrations for level in entry.levels}
         if self.default_level not in names:
             raise ContractError("no calibration has the default level")
-        contract_id, nobody_id = self.contract_id, self.nobody_id
-        identified = tuple(
-            entry.identified(contract_id=contract_id, nobody_id=nobody_id)
-            for entry in self.calibrations
-        )
+        identified = tuple(entry.identified(self.contract_id) for entry in self.calibrations)
         for given, computed in zip(self.calibrations, identified, strict=True):
             if given.calibration_id not in ("", computed.calibration_id):
                 raise ContractError("a calibration_id is not the hash of its calibration")
@@ -171,29 +145,34 @@ class Contract:
         """SHA-256 of the binding's canonical JSON."""
         return self.binding.contract_id
 
-    @cached_property
-    def nobody_id(self) -> str:
-        """SHA-256 over all that scores are computed from: the expectation and the strangers."""
-        return hashlib.sha256(self.expectation.digest + self.nobody.digest).hexdigest()
-
     @property
     def takes_lifted_probes(self) -> bool:
         """Whether it has a calibration for them."""
         return any(entry.mode == "s2s" for entry in self.calibrations)
 
-    @property
-    def cohort(self) -> RoundedBatch:
-        """Templates of nobody that lifted probes are normalised by; lifted at the first use.
+    def nobody(self, source: DecoySource) -> Nobody:
+        """Templates of nobody under this contract, with the decoys that lifting clients take.
 
-        That takes seconds, and several times the memory: one thread does it, and others wait.
+        They are made once: enrollers and verifiers of all tenants share the cohort.
+
+        Parameters
+        ----------
+        source
+            The contract's, reduced to its axes.
+
+        Raises
+        ------
+        ContractMismatch
+            Where it is another one.
         """
-        with _LIFTING:
-            return self._cohort
-
-    @cached_property
-    def _cohort(self) -> RoundedBatch:
-        strategy = plain_strategy(self.binding.strategy)
-        return self.nobody.cohort(strategy=strategy, m=self.binding.m)
+        binding = self.binding
+        binding.require_source(source_id=source.source_id, made_with=source.made_with)
+        made = self.__dict__.get("_nobody")
+        if made is None:
+            made = Nobody(client_source(source), binding.strategy, binding.m, self.cohort_seed)
+            self.__dict__["_nobody"] = made
+        nobody: Nobody = made
+        return nobody
 
     def calibration(
         self,
@@ -241,7 +220,7 @@ class Contract:
         raise Uncalibrated(f"no calibration for {wanted}; calibrated are: {', '.join(have)}")
 
     def public(self) -> dict[str, Json]:
-        """Everything but the expectation and the strangers, as JSON values."""
+        """Everything but the seed of the cohort, as JSON values."""
         facts: dict[str, Json] = {
             "contract_id": self.contract_id,
             "binding": self.binding.to_json(),
@@ -251,11 +230,9 @@ class Contract:
             "photo_consistency": self.photo_consistency,
             "probe_consistency": self.probe_consistency,
             "template_foot_point_norm": list(self.template_foot_point_norm),
-            "template_stranger_score": self.template_stranger_score,
-            "nobody_id": self.nobody_id,
+            "template_stranger_similarity": self.template_stranger_similarity,
             "verdict": None if self.verdict is None else self.verdict.to_json(),
         }
-        # Absent where there is none, as in files that were written before it existed.
         if self.liveness is not None:
             facts["liveness"] = self.liveness.to_json()
         return facts
@@ -263,14 +240,10 @@ class Contract:
     def save(self, path: Path | str, sealer: Sealer) -> None:
         """Write the contract file atomically, readable by its owner only (mode 0600).
 
-        ``public()`` returns the same facts for readers who may not know the strangers.
+        ``public()`` returns the same facts for readers who may not know the seed.
         """
         document: dict[str, Json] = {"format": FORMAT, "version": VERSION, **self.public()}
-        tensors = {
-            **{_EXPECTATION + name: part for name, part in self.expectation.tensors().items()},
-            **{_NOBODY + name: part for name, part in self.nobody.tensors().items()},
-        }
-        sealed = sealer.seal(safetensors.numpy.save(tensors), context=_seal_context(document))
+        sealed = sealer.seal(self.cohort_seed, context=_seal_context(document))
         document["sealed"] = base64.b64encode(sealed).decode("ascii")
         replace_private(Path(path), _render(document))
 
@@ -290,11 +263,10 @@ class Contract:
         )
         if fields.text("format") != FORMAT:
             raise ContractError(f"the file is not a {FORMAT}")
-        earlier = fields.lacks("probe_consistency") or "cohort" in fields.remaining()
-        if fields.integer("version") != VERSION or earlier:
+        if fields.integer("version") != VERSION:
             raise ContractError(
-                "the contract file was written by an earlier version of this program, or by a "
-                "later one: run `veilface calibrate` again; templates stay valid"
+                "the contract file was written by another version of this program: run "
+                "`veilface calibrate` again"
             )
         text = fields.take("sealed")
         if not isinstance(text, str):
@@ -310,7 +282,6 @@ class Contract:
             raise ContractError("a calibration has no calibration_id")
         verdict = fields.take("verdict")
         liveness = None if fields.lacks("liveness") else fields.take("liveness")
-        expectation, nobody = _open_sealed(text, sealer, document)
         contract = cls(
             binding=binding,
             recorded=fields.free("recorded"),
@@ -319,60 +290,32 @@ class Contract:
             photo_consistency=fields.number("photo_consistency"),
             probe_consistency=fields.number("probe_consistency"),
             template_foot_point_norm=norm_range(fields.take("template_foot_point_norm")),
-            template_stranger_score=fields.number("template_stranger_score"),
-            expectation=expectation,
-            nobody=nobody,
+            template_stranger_similarity=fields.number("template_stranger_similarity"),
+            cohort_seed=_open_sealed(text, sealer, document),
             verdict=None if verdict is None else Verdict.from_json(verdict),
             liveness=None if liveness is None else LivenessCalibration.from_json(liveness),
         )
-        if fields.text("nobody_id") != contract.nobody_id:
-            raise ContractError("the nobody_id is not the hash of what scores are computed from")
         fields.done()
         return contract
 
 
 def _seal_context(document: Mapping[str, object]) -> str:
     """Context of the seal: the contract id and the digest of all that is not sealed."""
-    return f"contract-nobody:{document['contract_id']}:{digest(document)}"
+    return f"contract-cohort:{document['contract_id']}:{digest(document)}"
 
 
-def _open_sealed(
-    text: str, sealer: Sealer, document: Mapping[str, object]
-) -> tuple[PointExpectation, Nobody]:
+def _open_sealed(text: str, sealer: Sealer, document: Mapping[str, object]) -> bytes:
     try:
         sealed = base64.b64decode(text, validate=True)
     except (binascii.Error, ValueError):
         raise ContractError("the contract file's sealed part is not base64 text") from None
     try:
-        plain = sealer.open(sealed, context=_seal_context(document))
+        return sealer.open(sealed, context=_seal_context(document))
     except SealError as error:
         raise SealError(
             "the contract does not open: the master key is not the one that sealed it, or the file "
             "was edited; use the right key file, or run the calibration again"
         ) from error
-    try:
-        tensors = safetensors.numpy.load(plain)
-    except (safetensors.SafetensorError, ValueError, KeyError):
-        raise ContractError("the contract's sealed part is not a safetensors container") from None
-    if set(tensors) != SEALED:
-        raise ContractError("the contract's sealed part holds other arrays than it must")
-    try:
-        return (
-            PointExpectation.from_tensors(_part(tensors, _EXPECTATION)),
-            Nobody.from_tensors(_part(tensors, _NOBODY)),
-        )
-    except DecoyError:
-        raise ContractError("the contract's generator of decoys of nobody is broken") from None
-
-
-def _part(
-    tensors: Mapping[str, NDArray[np.generic]], prefix: str
-) -> dict[str, NDArray[np.generic]]:
-    return {
-        name.removeprefix(prefix): array
-        for name, array in tensors.items()
-        if name.startswith(prefix)
-    }
 
 
 def _read_bounded(path: Path) -> bytes:

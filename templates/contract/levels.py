@@ -157,7 +157,7 @@ class Level:
     """A security level: its threshold, and the errors seen on the calibration data.
 
     A probe is accepted where its score reaches ``threshold``: the similarity less what is expected
-    of this probe against templates of nobody, in units of its spread (docs/decision.md §1).
+    of this probe against templates of nobody, in units of its spread (docs/method.md "Scores").
 
     Parameters
     ----------
@@ -273,8 +273,7 @@ class Calibration:
     calibrated_on
         What was measured: data, people, counts, protocol, seed; how the levels were set.
     calibration_id
-        SHA-256 of all of the above, the contract id and the contract's ``nobody_id``; empty until
-        ``identified``.
+        SHA-256 of all of the above and the contract id; empty until ``identified``.
     """
 
     mode: Mode
@@ -334,11 +333,11 @@ class Calibration:
             + ", ".join(level.name for level in self.levels)
         )
 
-    def identified(self, *, contract_id: str, nobody_id: str) -> "Calibration":
+    def identified(self, contract_id: str) -> "Calibration":
         """Compute the id for one contract."""
         body: dict[str, Json] = self.to_json()
         del body["calibration_id"]
-        bound = {"calibration": body, "contract_id": contract_id, "nobody_id": nobody_id}
+        bound: dict[str, Json] = {"calibration": body, "contract_id": contract_id}
         return replace(self, calibration_id=digest(bound))
 
     def to_json(self) -> dict[str, Json]:

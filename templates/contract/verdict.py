@@ -1,14 +1,39 @@
 """The verdict of a calibration: what a thief of a template gets, who is turned away or let in."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
+
+import numpy as np
 
 from templates.contract.canonical import Fields, Json, free_object
 from templates.contract.levels import Rate
 from templates.errors import ContractError
 
-Status: TypeAlias = Literal["PASS", "FAIL"]
+Status: TypeAlias = Literal["PASS", "FAIL", "NOT SHOWN"]
+CONFIDENCE = 0.95
+_BISECTIONS = 50
+_MOST_TRIALS = 10_000
+"""Of a rate that a bound is held against: people who were attacked."""
+
+
+def upper_bound(errors: int, trials: int, *, confidence: float = CONFIDENCE) -> float:
+    """One-sided upper bound of a proportion, after Clopper and Pearson; 1 where all went wrong.
+
+    The share at which as few errors as were seen, or fewer, have the probability
+    1 − ``confidence``.
+    """
+    if errors >= trials:
+        return 1.0
+    seen = np.arange(errors + 1)
+    ways = np.append(0.0, np.cumsum(np.log((trials - seen[:-1]) / (seen[:-1] + 1))))
+    low, high = errors / trials, 1.0
+    for _ in range(_BISECTIONS):
+        share = (low + high) / 2
+        logs = ways + seen * math.log(share) + (trials - seen) * math.log1p(-share)
+        low, high = (share, high) if np.exp(logs).sum() > 1 - confidence else (low, share)
+    return high
 
 
 @dataclass(frozen=True)
@@ -20,42 +45,64 @@ class Judgement:
     rate
         What was counted, with its interval.
     limit
-        Most that passes. The measured rate is compared, not the end of its interval.
+        Most that passes.
+    bound
+        Most that the one-sided 95 % upper bound of the rate may be; None where it is not held
+        against anything.
     basis
         What it was measured with: the strongest attack and its faces, or the level and photos.
     shortfall
         What the data were too few for, or the attacks do not cover, in a sentence; such a rate
-        shows nothing, and does not pass.
+        shows nothing.
     """
 
     rate: Rate
     limit: float
     basis: Mapping[str, Json] = field(default_factory=dict)
     shortfall: str | None = None
+    bound: float | None = None
 
     def __post_init__(self) -> None:
         if not 0.0 < self.limit < 1.0:
             raise ContractError("the limit of a verdict must lie between 0 and 1")
+        if self.bound is not None and not self.limit <= self.bound < 1.0:
+            raise ContractError("the bound of a verdict must lie between its limit and 1")
+        if self.bound is not None and self.rate.trials > _MOST_TRIALS:
+            raise ContractError(f"a verdict with a bound counts at most {_MOST_TRIALS:,} trials")
         if not self.rate.trials:
             raise ContractError("a verdict without a trial says nothing")
         object.__setattr__(self, "basis", free_object(self.basis, what="the basis of a verdict"))
 
     @property
+    def upper(self) -> float | None:
+        """The one-sided 95 % upper bound of the rate; None without a bound to hold it against."""
+        if self.bound is None:
+            return None
+        return round(upper_bound(self.rate.errors, self.rate.trials), 6)
+
+    @property
     def status(self) -> Status:
-        """``PASS`` where the measured rate is at most the limit, and shows something."""
-        return "PASS" if self.shortfall is None and self.rate.value <= self.limit else "FAIL"
+        """``PASS`` where the rate and its upper bound are within limits, and the data show it."""
+        if self.shortfall is not None:
+            return "NOT SHOWN"
+        if self.rate.value > self.limit:
+            return "FAIL"
+        upper, bound = self.upper, self.bound
+        return "NOT SHOWN" if upper is not None and upper > (bound or 0.0) else "PASS"
 
     @property
     def close(self) -> bool:
         """Whether the rate is more than half of the limit, or nothing passes."""
-        return self.status == "FAIL" or self.rate.value > self.limit / 2
+        return self.status != "PASS" or self.rate.value > self.limit / 2
 
     def to_json(self) -> dict[str, Json]:
-        """JSON form; ``status`` and ``value`` are there for readers, and follow from the rest."""
+        """JSON form; ``status``, ``value`` and ``upper`` follow from the rest, for readers."""
         return {
             "status": self.status,
             "value": self.rate.value,
             "limit": self.limit,
+            "upper": self.upper,
+            "bound": self.bound,
             "rate": self.rate.to_json(),
             "basis": dict(self.basis),
             "shortfall": self.shortfall,
@@ -70,11 +117,15 @@ class Judgement:
             limit=fields.number("limit"),
             basis=fields.free("basis"),
             shortfall=None if fields.take_null("shortfall") else fields.text("shortfall"),
+            bound=None if fields.take_null("bound") else fields.number("bound"),
         )
         if fields.text("status") != judgement.status:
             raise ContractError("a verdict's status does not follow from its rate and limit")
         if fields.number("value") != judgement.rate.value:
             raise ContractError("a verdict's value is not that of its rate")
+        upper = None if fields.take_null("upper") else fields.number("upper")
+        if upper != judgement.upper:
+            raise ContractError("a verdict's upper bound is not that of its rate")
         fields.done()
         return judgement
 
@@ -88,22 +139,22 @@ class Verdict:
     privacy
         Share of templates from which the strongest attacker gets a match for a fresh photo.
     accuracy
-        False rejection rate of the default level, with the advised number of photos.
+        False rejection rate of the default level, with the advised number of photos; None where
+        nobody has two photos.
     groups
         False match rate of the default level within the group of people where it is highest; None
         where that was not measured.
     """
 
     privacy: Judgement
-    accuracy: Judgement
+    accuracy: Judgement | None = None
     groups: Judgement | None = None
 
     def to_json(self) -> dict[str, Json]:
-        """JSON form; without ``groups`` where they were not measured, as in older files."""
-        value: dict[str, Json] = {
-            "privacy": self.privacy.to_json(),
-            "accuracy": self.accuracy.to_json(),
-        }
+        """JSON form, without what was not measured."""
+        value: dict[str, Json] = {"privacy": self.privacy.to_json()}
+        if self.accuracy is not None:
+            value["accuracy"] = self.accuracy.to_json()
         if self.groups is not None:
             value["groups"] = self.groups.to_json()
         return value
@@ -112,11 +163,10 @@ class Verdict:
     def from_json(cls, value: object) -> "Verdict":
         """Parse hostile JSON."""
         fields = Fields(value, what="the verdict")
-        unmeasured = fields.lacks("groups")
-        verdict = cls(
-            privacy=Judgement.from_json(fields.take("privacy")),
-            accuracy=Judgement.from_json(fields.take("accuracy")),
-            groups=None if unmeasured else Judgement.from_json(fields.take("groups")),
+        accuracy, groups = (
+            None if fields.lacks(name) else Judgement.from_json(fields.take(name))
+            for name in ("accuracy", "groups")
         )
+        verdict = cls(Judgement.from_json(fields.take("privacy")), accuracy, groups)
         fields.done()
         return verdict

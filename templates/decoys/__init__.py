@@ -4,15 +4,15 @@ A source is either a secret pool of real descriptors or a generator of descripto
 """
 
 from templates.decoys.generator import DecoyGenerator
-from templates.decoys.loading import load_source
+from templates.decoys.loading import client_source, load_source
 from templates.decoys.pool import DecoyPool
-from templates.decoys.source import NOISE_ENERGY, Attributes, DecoySource
+from templates.decoys.source import Attributes, DecoySource
 
 __all__ = [
-    "NOISE_ENERGY",
     "Attributes",
     "DecoyGenerator",
     "DecoyPool",
     "DecoySource",
+    "client_source",
     "load_source",
 ]

@@ -1,10 +1,9 @@
-"""Decoys that belong to nobody, spread like real descriptors.
+"""Decoys that belong to nobody, spread like real embeddings, and the axes they are drawn along.
 
-The generator holds moments, not descriptors, and is given to clients that lift on their own
+The generator holds moments, not embeddings, and is given to clients that lift on their own
 (docs/rest.md "The generator"). The moments still tell who holds a photo whether that person was in
-the fit, better than chance (docs/design-measurements.md "Whether it remembers people"). Every draw
-is fresh, so no decoy exists outside its one template, and it does not depend on the subject
-(docs/method.md §4.2 to §4.5). docs/design-measurements.md says how it was chosen.
+the fit, better than chance. Every draw is fresh, so no decoy exists outside its one template. It
+does not depend on the subject (docs/method.md "The decoys").
 """
 
 import hashlib
@@ -13,128 +12,104 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from templates.decoys import container
-from templates.decoys.adaptation import adapted_statistics
 from templates.decoys.files import read_bounded, write_private
-from templates.decoys.fitting import fit_statistics
-from templates.decoys.source import (
-    MAX_DIMENSION,
-    Attributes,
-    checked_made_with,
-    checked_noise,
-    take_made_with,
-)
-from templates.decoys.statistics import (
-    MAX_COMPONENTS,
-    DescriptorStatistics,
-    band_edges,
-    feature_count,
-    leading_axes,
-)
-from templates.errors import DecoyError
+from templates.decoys.fitting import Moments, adapted_moments, fit_moments
+from templates.decoys.source import MAX_DIMENSION, Attributes, checked_made_with, take_made_with
+from templates.errors import DecoyError, InvalidEmbedding
 from templates.keys.randomness import Keystream
+from templates.space.embedding import unit_descriptors
 
 GENERATOR_FORMAT = "veilface decoy generator"
-GENERATOR_VERSION = 1
-_Q = feature_count(MAX_DIMENSION)
-MAX_GENERATOR_BYTES = (
-    4 * (MAX_DIMENSION * (MAX_DIMENSION + 1) + MAX_COMPONENTS * (1 + _Q + _Q * _Q))
-    + container.MAX_HEADER
-    + 8
-)
-_PARTS = ("mean", "axes", "weights", "centres", "spreads")
+GENERATOR_VERSION = 2
+MAX_GENERATOR_BYTES = 4 * MAX_DIMENSION * (2 * MAX_DIMENSION + 1) + container.MAX_HEADER + 8
+_PARTS = ("axes", "mean", "root")
 _CHUNK = 2048
 """Decoys made at once: bounds the float64 scratch memory at some 20 MB for n = 512."""
 _SMALLEST_NORM = 1e-4
+_LARGEST = 1e3
+_ORTHONORMAL = 1e-3
+# Decoys in a small subspace leave the hidden embedding the only direction outside it. Fits of real
+# faces measure 0.52 k and more; so k / 8 refuses no real fit.
+_SMALLEST_SHARE = 1 / 8
+_CHECKED_FROM = 64
+_FLOOR = 1e-9
 
 
 class DecoyGenerator:
-    """Draws descriptors of nobody from the statistics of real descriptors.
+    """Draws embeddings of nobody from a Gaussian, in the coordinates of leading axes of faces.
+
+    Embeddings have n numbers. What is lifted, stored and compared are their coordinates along k
+    axes, scaled to length 1 (:meth:`project`): the axes of least variance tell people apart hardly
+    at all, and are where decoys fit worst.
 
     Parameters
     ----------
-    statistics
-        As `fit` finds them.
+    axes
+        Shape (n, k). Orthonormal columns, of the largest variance of faces first.
+    mean
+        Shape (k,). Mean of the coordinates of faces.
+    root
+        Shape (k, k). Lower Cholesky factor of their covariance.
     made_with
-        `templates.contract.binding.embedding_id` of the pack that gave the descriptors of the fit.
-    noise
-        Variance of the noise that every number of a decoy gets, and of a lifted descriptor.
+        `templates.contract.binding.embedding_id` of the pack that gave the embeddings of the fit.
 
     Raises
     ------
     DecoyError
-        `made_with` is not 64 lower-case hexadecimal digits, or `noise` is out of range.
+        Shapes that do not fit, values that are not finite or out of range, axes that are not
+        orthonormal, `made_with` that is not 64 lower-case hexadecimal digits, or, from 64 axes on,
+        deviations on so few axes that the decoys hide nothing.
 
     Notes
     -----
-    A decoy is x / ‖x‖ with x = mean + z · axes + e, and e the noise. A component of the Gaussian
-    mixture is chosen, and gives the leading coordinates of z and the log energy of each band;
-    inside a band z has a uniform direction and that energy. See `templates.decoys.statistics` for
-    why.
-
-    References
-    ----------
-    docs/method.md §4.5: independence of the subject's attributes; docs/design-measurements.md
-    §1.3: a Gaussian with full covariance, which this refines. The bands are a Gaussian scale
-    mixture: S. Lyu & E. P. Simoncelli, "Modeling multiscale subbands of photographic images with
-    fields of Gaussian scale mixtures", PAMI 2009.
+    A decoy is x / ‖x‖ with x = mean + root · z and z standard normal. Its parameters are float32,
+    read-only.
     """
 
     def __init__(
         self,
-        statistics: DescriptorStatistics,
+        axes: NDArray[np.floating],
+        mean: NDArray[np.floating],
+        root: NDArray[np.floating],
         *,
         made_with: str | None = None,
-        noise: float = 0.0,
     ) -> None:
-        self._statistics = statistics
-        self.noise: float = checked_noise(repr(float(noise)))
+        self.axes, self.mean, self.root = (_frozen(part) for part in (axes, mean, root))
+        self._check()
+        self.n, self.k = self.axes.shape
         self.made_with: str | None = None if made_with is None else checked_made_with(made_with)
-        self.n: int = statistics.n
         self.source_id: str = hashlib.sha256(self.to_bytes()).hexdigest()
-        self._cumulative = np.cumsum(statistics.weights.astype(np.float64))
-        self._spreads = np.ascontiguousarray(statistics.spreads.transpose(0, 2, 1), np.float64)
 
     def __repr__(self) -> str:
-        return f"DecoyGenerator(n={self.n}, id {self.source_id[:12]})"
-
-    def without_noise(self) -> "DecoyGenerator":
-        """Return what draws faces as they are before lifting, not decoys."""
-        return DecoyGenerator(self._statistics, made_with=self.made_with)
-
-    @property
-    def statistics(self) -> DescriptorStatistics:
-        """The fitted statistics."""
-        return self._statistics
+        return f"DecoyGenerator(n={self.n}, k={self.k}, id {self.source_id[:12]})"
 
     @classmethod
-    def fit(
-        cls,
-        descriptors: NDArray[np.floating],
-        *,
-        made_with: str | None = None,
-        noise: float = 0.0,
-    ) -> Self:
-        """Fit to real descriptors.
+    def fit(cls, descriptors: NDArray[np.floating], *, made_with: str | None = None) -> Self:
+        """Fit to real embeddings.
 
         Parameters
         ----------
         descriptors
             float32, shape (N, n), unit rows, N ≥ 100; several thousand give good decoys.
         made_with
-            `templates.contract.binding.embedding_id` of the pack that gave them.
-        noise
             As for the class.
+
+        Returns
+        -------
+        DecoyGenerator
+            Of all n axes; :meth:`reduced` takes the leading ones. The same for the same embeddings
+            on one machine; another processor or number of threads rounds differently, and so gives
+            another `source_id`.
 
         Raises
         ------
         DecoyError
-            Too few descriptors, or descriptors that are not finite unit vectors or lie in a small
-            subspace.
+            Too few embeddings, or embeddings that are not finite unit vectors or hardly vary.
         """
-        return cls(fit_statistics(descriptors), made_with=made_with, noise=noise)
+        return cls._of(fit_moments(descriptors), made_with)
 
     @classmethod
     def adapt(
@@ -144,9 +119,8 @@ class DecoyGenerator:
         people: Sequence[str],
         *,
         made_with: str | None = None,
-        noise: float = 0.0,
     ) -> Self:
-        """Fit to many descriptors of any kind, adapted to few of the kind that is enrolled.
+        """Fit to many embeddings of any kind, adapted to few of the kind that is enrolled.
 
         Parameters
         ----------
@@ -158,18 +132,92 @@ class DecoyGenerator:
         people
             K names of those people.
         made_with
-            `templates.contract.binding.embedding_id` of the pack that gave all of them.
-        noise
             As for the class.
 
         Raises
         ------
         DecoyError
-            Too few of either, or descriptors that are not finite unit vectors or lie in a small
-            subspace.
+            Too few of either, or embeddings that are not finite unit vectors or hardly vary.
         """
-        statistics = adapted_statistics(descriptors, like, people)
-        return cls(statistics, made_with=made_with, noise=noise)
+        return cls._of(adapted_moments(descriptors, like, people), made_with)
+
+    @classmethod
+    def _of(cls, moments: Moments, made_with: str | None) -> Self:
+        variances = np.diag(moments.covariance)
+        floor = _FLOOR * variances.max() * np.eye(len(variances))
+        root = np.linalg.cholesky(moments.covariance + floor)
+        return cls(moments.axes, moments.mean, root, made_with=made_with)
+
+    def in_coordinates_of_embeddings(self) -> Self:
+        """The same decoys with the unit axes: nothing is projected (k = n)."""
+        axes = self.axes.astype(np.float64)
+        if self.k != self.n:
+            raise DecoyError("a generator of fewer axes has no form without them")
+        turned = axes @ self.root
+        root = np.asarray(np.linalg.qr(turned.T, mode="r")).T
+        root = root * np.sign(np.diag(root))
+        return type(self)(np.eye(self.n), axes @ self.mean, np.tril(root), made_with=self.made_with)
+
+    def reduced(self, k: int) -> Self:
+        """The generator of the leading ``k`` axes; itself where it has no more.
+
+        Raises
+        ------
+        DecoyError
+            It has fewer axes, or ``k`` is below 2.
+        """
+        if not 2 <= k <= self.k:
+            raise DecoyError(f"the decoys have {self.k} axes; {k} were asked for")
+        if k == self.k:
+            return self
+        return type(self)(
+            self.axes[:, :k], self.mean[:k], self.root[:k, :k], made_with=self.made_with
+        )
+
+    def axes_for(self, share: float) -> int:
+        """Number of leading axes that hold this share of the decoys' variance, at least 2."""
+        variances = np.sum(self.root.astype(np.float64) ** 2, axis=1)
+        shares = np.cumsum(variances) / variances.sum()
+        return int(np.clip(np.searchsorted(shares, share) + 1, 2, self.k))
+
+    @property
+    def covariance(self) -> NDArray[np.float64]:
+        """Covariance (k, k) of what is drawn, before it is scaled to length 1."""
+        root = self.root.astype(np.float64)
+        return np.asarray(root @ root.T)
+
+    @property
+    def second_moment(self) -> NDArray[np.float64]:
+        """Second moment (k, k) about the origin of what is drawn, before it is scaled."""
+        mean = self.mean.astype(np.float64)
+        return self.covariance + np.outer(mean, mean)
+
+    def project(self, descriptors: ArrayLike) -> NDArray[np.float32]:
+        """Take embeddings to the coordinates that templates have.
+
+        Parameters
+        ----------
+        descriptors : array_like, shape (N, n)
+            Unit rows.
+
+        Returns
+        -------
+        float32, shape (N, k)
+            Unit rows.
+
+        Raises
+        ------
+        InvalidEmbedding
+            A row is no finite unit vector, or has no part along the axes.
+        """
+        points = unit_descriptors(descriptors)
+        if points.shape[1] != self.n:
+            raise InvalidEmbedding(f"an embedding has {self.n} numbers, not {points.shape[1]}")
+        along = points @ self.axes.astype(np.float64)
+        norms = np.linalg.norm(along, axis=1, keepdims=True)
+        if not (norms > _SMALLEST_NORM).all():
+            raise InvalidEmbedding("an embedding has no part along the axes of faces")
+        return np.asarray(along / norms, dtype=np.float32)
 
     def draw(
         self,
@@ -186,8 +234,7 @@ class DecoyGenerator:
         ------
         DecoyError
             `unlike` or `sub_databases` is asked for: both are choices among labelled real
-            descriptors, and choosing by the subject's attributes would leak them (docs/method.md
-            §4.5).
+            embeddings, and choosing by the subject's attributes would leak them (docs/method.md).
         """
         if rows < 0 or k < 0:
             raise DecoyError(f"rows and k must not be negative; seen {rows} and {k}")
@@ -198,40 +245,16 @@ class DecoyGenerator:
             )
         if sub_databases is not None:
             raise DecoyError("a decoy generator has no sub-databases; use a decoy pool")
-        decoys = np.empty((rows * k, self.n), dtype=np.float32)
+        mean, root = self.mean.astype(np.float64), self.root.astype(np.float64)
+        decoys = np.empty((rows * k, self.k), dtype=np.float32)
         for start in range(0, len(decoys), _CHUNK):
             stop = min(start + _CHUNK, len(decoys))
-            decoys[start:stop] = self._sample(stop - start, stream)
-        return decoys.reshape(rows, k, self.n)
-
-    def _sample(self, count: int, stream: Keystream) -> NDArray[np.float32]:
-        statistics = self._statistics
-        lead, edges = leading_axes(self.n), band_edges(self.n)
-        uniform = stream.uniform((count,))
-        # The weights may add up to slightly less than 1, hence the minimum.
-        chosen = np.minimum(
-            np.searchsorted(self._cumulative, uniform, side="right"), len(self._cumulative) - 1
-        )
-        noise = stream.normal((count, feature_count(self.n)))
-        features = statistics.centres[chosen].astype(np.float64)
-        for component in range(len(self._cumulative)):
-            drawn = chosen == component
-            features[drawn] += noise[drawn] @ self._spreads[component]
-        z = np.empty((count, self.n), dtype=np.float32)
-        z[:, :lead] = features[:, :lead]
-        directions = stream.normal((count, self.n - lead))
-        widths = np.diff(edges)
-        squares = np.add.reduceat(directions**2, edges[:-1] - lead, axis=1) / widths
-        # Clipped, because a hostile generator could make the exponential overflow.
-        sizes = np.exp(np.clip(features[:, lead:], -20.0, 20.0)) / np.sqrt(squares)
-        z[:, lead:] = directions * np.repeat(sizes, widths, axis=1)
-        x = statistics.mean + z @ statistics.axes
-        if self.noise:
-            x = x + np.sqrt(self.noise) * stream.normal((count, self.n))
-        norms = np.linalg.norm(x.astype(np.float64), axis=1, keepdims=True)
-        if not (norms > _SMALLEST_NORM).all() or not np.isfinite(norms).all():
-            raise DecoyError("the decoy generator makes vectors without a direction; fit it anew")
-        return np.asarray(x / norms, dtype=np.float32)
+            x = mean + stream.normal((stop - start, self.k)) @ root.T
+            norms = np.linalg.norm(x, axis=1, keepdims=True)
+            if not (norms > _SMALLEST_NORM).all() or not np.isfinite(norms).all():
+                raise DecoyError("the decoy generator makes vectors without a direction")
+            decoys[start:stop] = x / norms
+        return decoys.reshape(rows, k, self.k)
 
     def to_bytes(self) -> bytes:
         """Serialise; equal generators give equal bytes, and `source_id` is their SHA-256."""
@@ -241,9 +264,7 @@ class DecoyGenerator:
         }
         if self.made_with is not None:
             fields["made_with"] = self.made_with
-        if self.noise:
-            fields["noise"] = repr(self.noise)
-        return container.encode(fields, {name: getattr(self._statistics, name) for name in _PARTS})
+        return container.encode(fields, {name: getattr(self, name) for name in _PARTS})
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
@@ -258,19 +279,21 @@ class DecoyGenerator:
             data, what="decoy generator", max_bytes=MAX_GENERATOR_BYTES
         )
         made_with = take_made_with(fields)
-        noise = checked_noise(fields.pop("noise", "0.0"))
         if fields != {"format": GENERATOR_FORMAT, "version": GENERATOR_VERSION}:
-            raise DecoyError(f"this is not a decoy generator of version {GENERATOR_VERSION}")
+            raise DecoyError(
+                f"this is not a decoy generator of version {GENERATOR_VERSION}: build it with "
+                "`veilface decoys build`"
+            )
         if set(arrays) != set(_PARTS) or any(a.dtype != np.float32 for a in arrays.values()):
             raise DecoyError("the decoy generator has missing or unknown parts")
-        parts = {name: array.astype(np.float32) for name, array in arrays.items()}
-        return cls(DescriptorStatistics(**parts), made_with=made_with, noise=noise)
+        parts = (arrays[name].astype(np.float32) for name in _PARTS)
+        return cls(*parts, made_with=made_with)
 
     def save(self, path: Path) -> None:
         """Write the generator as a plain file, which clients may have.
 
-        It holds no descriptor, but tells who holds a photo whether that person was in the fit,
-        better than chance (docs/design-measurements.md).
+        It holds no embedding, but tells who holds a photo whether that person was in the fit,
+        better than chance.
 
         Raises
         ------
@@ -289,3 +312,39 @@ class DecoyGenerator:
             The file cannot be read or is no decoy generator.
         """
         return cls.from_bytes(read_bounded(path, MAX_GENERATOR_BYTES))
+
+    def _check(self) -> None:
+        n, k = self.axes.shape if self.axes.ndim == 2 else (0, 0)
+        if not 2 <= k <= n <= MAX_DIMENSION:
+            raise DecoyError(
+                f"a decoy generator has 2 to {MAX_DIMENSION} numbers and at most as many axes; "
+                f"seen axes of shape {self.axes.shape}"
+            )
+        if self.mean.shape != (k,) or self.root.shape != (k, k):
+            raise DecoyError(
+                f"{k} axes need a mean of shape ({k},) and a root of shape ({k}, {k}); seen "
+                f"{self.mean.shape} and {self.root.shape}"
+            )
+        if not all(np.isfinite(part).all() for part in (self.axes, self.mean, self.root)):
+            raise DecoyError("the decoy generator holds values that are not finite")
+        if max(float(np.abs(self.mean).max()), float(np.abs(self.root).max())) > _LARGEST:
+            raise DecoyError("the decoy generator holds values far from those of unit embeddings")
+        if np.triu(self.root, 1).any() or float(np.diag(self.root).min()) <= 0:
+            raise DecoyError("the root of the decoy generator is no lower Cholesky factor")
+        products = self.axes.T.astype(np.float64) @ self.axes
+        if float(np.abs(products - np.eye(k)).max()) > _ORTHONORMAL:
+            raise DecoyError("the axes of the decoy generator are not orthonormal")
+        # The sum of the deviations along principal axes is at least the trace of any root.
+        root = self.root.astype(np.float64)
+        spread = float(np.trace(root)) ** 2 / float(np.sum(root**2))
+        if k >= _CHECKED_FROM and spread < _SMALLEST_SHARE * k:
+            raise DecoyError(
+                f"the decoys would spread over {spread:.0f} of {k} axes, and would hide nothing; "
+                f"at least {_SMALLEST_SHARE * k:.0f} are needed"
+            )
+
+
+def _frozen(part: NDArray[np.floating]) -> NDArray[np.float32]:
+    array = np.array(part, dtype="<f4", order="C", copy=True)
+    array.flags.writeable = False
+    return array

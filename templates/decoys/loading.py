@@ -4,6 +4,7 @@ from pathlib import Path
 
 from templates.decoys.generator import DecoyGenerator
 from templates.decoys.pool import POOL_MAGIC, DecoyPool
+from templates.decoys.source import DecoySource
 from templates.errors import DecoyError
 from templates.keys.sealing import Sealer
 
@@ -24,3 +25,20 @@ def load_source(path: Path, sealer: Sealer) -> DecoyPool | DecoyGenerator:
     except OSError as error:
         raise DecoyError(f"cannot read {path.name}: {error.strerror}") from error
     return DecoyPool.load(path, sealer) if start == POOL_MAGIC else DecoyGenerator.load(path)
+
+
+def client_source(source: DecoySource) -> DecoyGenerator:
+    """Return the generator that lifting clients receive, never a pool.
+
+    A generator is returned as it is; to a pool one is fitted, always the same for the same pool.
+
+    Raises
+    ------
+    DecoyError
+        It is neither.
+    """
+    if isinstance(source, DecoyPool):
+        return source.fitted
+    if not isinstance(source, DecoyGenerator):
+        raise DecoyError("clients lift with a decoy generator, and this source is none")
+    return source

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from templates.decoys import container
 from templates.decoys.files import read_bounded, write_private
@@ -22,6 +22,7 @@ from templates.decoys.source import MAX_DIMENSION, Attributes, checked_made_with
 from templates.errors import DecoyError
 from templates.keys.randomness import Keystream
 from templates.keys.sealing import Sealer
+from templates.space.embedding import unit_rows
 
 POOL_MAGIC = b"VEILFACE DECOY POOL 1\n"
 POOL_CONTEXT = "veilface decoy pool 1"
@@ -84,8 +85,8 @@ class DecoyPool:
         self._descriptors = array
         self._labels = None if labels is None else tuple(labels)
         self.n: int = array.shape[1]
+        self.k: int = self.n
         self.made_with: str | None = None if made_with is None else checked_made_with(made_with)
-        self.noise = 0.0
         self.source_id: str = hashlib.sha256(self._encode()).hexdigest()
 
     def __len__(self) -> int:
@@ -98,7 +99,30 @@ class DecoyPool:
     @cached_property
     def fitted(self) -> DecoyGenerator:
         """A generator fitted to the entries, always the same for the same pool."""
-        return DecoyGenerator.fit(self._descriptors[np.lexsort(self._descriptors.T)])
+        ordered = self._descriptors[np.lexsort(self._descriptors.T)]
+        return DecoyGenerator.fit(ordered).in_coordinates_of_embeddings()
+
+    def reduced(self, k: int) -> Self:
+        """Return the pool itself: its templates have all n numbers.
+
+        Raises
+        ------
+        DecoyError
+            Fewer axes are asked for.
+        """
+        if k != self.n:
+            raise DecoyError(f"a pool has no axes: its templates have {self.n} numbers, not {k}")
+        return self
+
+    def project(self, descriptors: ArrayLike) -> NDArray[np.float32]:
+        """Return unit rows (N, n) as they are: templates with decoys of a pool have all n numbers.
+
+        Raises
+        ------
+        InvalidEmbedding
+            A row is no finite unit vector of n numbers.
+        """
+        return unit_rows(np.asarray(descriptors), n=self.n, most=len(np.asarray(descriptors)))
 
     @property
     def labelled(self) -> bool:

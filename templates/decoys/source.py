@@ -3,22 +3,16 @@
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Protocol, Self, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from templates.errors import DecoyError
 from templates.keys.randomness import Keystream
 
 MAX_DIMENSION = 4096
 """Largest descriptor dimension a source may have; the same bound as the wire format's."""
-NOISE_ENERGY = 0.1
-"""Energy of the noise that a deployment's decoys and descriptors get, beside that of a unit vector:
-with less, the axes along which faces hardly differ give more faces away; with more, more people
-are turned away (docs/decoys.md "Noise")."""
-LARGEST_NOISE = 0.1
-"""Variance of noise in one number; no unit vector of more than ten numbers is left of with more."""
 _SHA256_HEX = re.compile(r"[0-9a-f]{64}")
 
 
@@ -31,23 +25,6 @@ def take_made_with(fields: dict[str, object]) -> str | None:
         It is there, and is not 64 lower-case hexadecimal digits.
     """
     return checked_made_with(fields.pop("made_with")) if "made_with" in fields else None
-
-
-def checked_noise(value: object) -> float:
-    """Give back a variance of noise that is one, from a file that may be hostile.
-
-    Raises
-    ------
-    DecoyError
-        It is no number from 0 to ``LARGEST_NOISE``, or not written as Python writes it.
-    """
-    try:
-        noise = float(value) if isinstance(value, str) else -1.0
-    except ValueError:
-        noise = -1.0
-    if not 0 <= noise <= LARGEST_NOISE or repr(noise) != value:
-        raise DecoyError(f"the noise of decoys must be a variance from 0 to {LARGEST_NOISE}")
-    return noise
 
 
 def checked_made_with(value: object) -> str:
@@ -86,19 +63,27 @@ class DecoySource(Protocol):
     source_id
         SHA-256, in hex, of the canonical content. Part of the contract.
     n
-        Dimension of the descriptors.
+        Numbers of an embedding.
+    k
+        Axes of faces that embeddings are projected on: numbers of what is lifted, and of a decoy.
+        Of a pool, n.
     made_with
         `templates.contract.binding.embedding_id` of the pack whose descriptors the source was made
         of; None where the maker did not say. Part of the canonical content.
-    noise
-        Variance, in each number, of the noise that decoys have and that lifting gives to the
-        descriptor too; 0 for none. Part of the canonical content.
     """
 
     source_id: str
     n: int
+    k: int
     made_with: str | None
-    noise: float
+
+    def reduced(self, k: int) -> Self:
+        """Return the source of the leading ``k`` axes."""
+        ...
+
+    def project(self, descriptors: ArrayLike) -> NDArray[np.float32]:
+        """Take embeddings, unit rows (N, n), to the coordinates that templates have, (N, k)."""
+        ...
 
     def draw(
         self,
@@ -124,7 +109,7 @@ class DecoySource(Protocol):
 
         Returns
         -------
-        float32, shape (rows, k, n)
+        float32, shape (rows, k, number of axes)
             Unit rows, C-contiguous; no decoy twice inside one row.
 
         Raises

@@ -27,7 +27,6 @@ from templates.distances.metric import (
     similarity,
 )
 from templates.errors import InvalidEmbedding, InvalidTemplate, TemplateError
-from templates.space.rounded import RoundedBatch
 from templates.space.subspace import SubspaceBatch, is_finite
 
 __all__ = [
@@ -46,8 +45,6 @@ __all__ = [
 ]
 
 Probes = NDArray[np.float32] | NDArray[np.float64] | SubspaceBatch
-_FEW_ROWS = 129
-"""Of lifted probes, m + 1 each, that a `RoundedBatch` need not be restored for."""
 _DEVICE: ContextVar[str | None] = ContextVar("device", default=None)
 
 
@@ -89,7 +86,7 @@ def require_device(device: str) -> None:
 
 def pairwise_distances(
     probes: Probes,
-    templates: SubspaceBatch | RoundedBatch,
+    templates: SubspaceBatch,
     *,
     metric: Metric | str,
     steps: int = DEFAULT_STEPS,
@@ -103,13 +100,13 @@ def pairwise_distances(
     probes : ndarray of float, shape (P, n), or SubspaceBatch of P
         Raw descriptors or lifted probes. The spherical metric sees only the direction of a raw
         descriptor; a zero vector has similarity 0.
-    templates : SubspaceBatch or RoundedBatch of T
+    templates : SubspaceBatch of T
     metric : Metric
     steps : int
         Of the spherical subspace-to-subspace iteration; unused otherwise.
     dtype : float32 or float64
         Precision of the bulk work. Distances below 0.1 and nearly singular pairs are computed in
-        float64 in any case. In float64 the bases of a `RoundedBatch` are made orthonormal again.
+        float64 in any case.
     threads : int, optional
         At most; by default as many as the matrix library would use. Their number does not change
         the result. Float64 uses the library's.
@@ -134,12 +131,6 @@ def pairwise_distances(
     probes = _checked(probes, templates, dtype)
     distances: Floats
     device = _DEVICE.get()
-    if isinstance(templates, RoundedBatch):
-        lifted = isinstance(probes, SubspaceBatch) and len(probes) * (probes.m + 1) <= _FEW_ROWS
-        if lifted and device is None and np.dtype(dtype) == np.float32:
-            distances = _tiles().to_rounded(probes, templates, **options)
-            return distances
-        templates = templates.restored()
     if np.dtype(dtype) == np.float64:
         distances = exact.pairwise(probes, templates, **options)
     elif device is not None:
@@ -336,7 +327,7 @@ def _options(metric: Metric | str, steps: int, threads: int | None = None) -> di
     return {"metric": Metric(metric), "steps": steps}
 
 
-def _checked(probes: Any, templates: SubspaceBatch | RoundedBatch, dtype: DTypeLike) -> Probes:
+def _checked(probes: Any, templates: SubspaceBatch, dtype: DTypeLike) -> Probes:
     kind = np.dtype(dtype)
     if kind not in (np.float32, np.float64):
         raise TemplateError(f"distances are computed in float32 or float64, not {kind}")
@@ -360,7 +351,7 @@ def _checked(probes: Any, templates: SubspaceBatch | RoundedBatch, dtype: DTypeL
     return points
 
 
-def _check_finite(batch: SubspaceBatch | RoundedBatch) -> None:
+def _check_finite(batch: SubspaceBatch) -> None:
     if not batch.is_finite:
         raise InvalidTemplate("a template holds a number that is not finite")
 

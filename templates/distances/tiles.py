@@ -20,7 +20,6 @@ from templates.distances.blas import single_threaded
 from templates.distances.kernels.arguments import Array32, Options, Result, Tile
 from templates.distances.kernels.euclidean import scratch_size as euclidean_scratch
 from templates.distances.kernels.lanes import LANES
-from templates.distances.kernels.rounded import rounded_products
 from templates.distances.kernels.selection import count_within, keep_nearest
 from templates.distances.kernels.spherical import scratch_size as spherical_scratch
 from templates.distances.kernels.tiles import Grid, Sides, Space, compute, pack, solve, square
@@ -36,7 +35,6 @@ from templates.distances.metric import (
     parts,
 )
 from templates.distances.threads import share
-from templates.space.rounded import RoundedBatch
 from templates.space.subspace import SubspaceBatch
 
 Probes = Array32 | SubspaceBatch
@@ -145,18 +143,6 @@ def paired(
     return out
 
 
-def to_rounded(
-    probes: SubspaceBatch, templates: RoundedBatch, *, metric: Metric, steps: int
-) -> Array32:
-    """Distances of a few probes to all templates, (P, T), on the calling thread."""
-    out = np.empty((len(probes), len(templates)), dtype=np.float32)
-    solver = _Solver(probes, templates, metric, steps)
-    with single_threaded():
-        for i in range(len(probes)):
-            out[i] = solver.to_rounded(i)
-    return out
-
-
 def warm_up() -> None:
     """Compile every kernel, or load it from its cache."""
     rng = np.random.default_rng(0)
@@ -165,7 +151,6 @@ def warm_up() -> None:
     options: dict[str, Any] = {"metric": Metric.EUCLIDEAN, "steps": DEFAULT_STEPS}
     pairwise(batch.feet, batch, threads=1, **options)
     paired(batch, batch, **options)
-    to_rounded(batch[:1], RoundedBatch.of(batch), **options)
     nearest(batch, batch, 1, of_templates=False, labels=None, threads=1, **options)
     counts_within(batch, batch, np.ones(1), labels=None, threads=1, **options)
 
@@ -328,7 +313,7 @@ class _Solver:
     def __init__(
         self,
         probes: Probes,
-        templates: SubspaceBatch | RoundedBatch,
+        templates: SubspaceBatch,
         metric: Metric,
         steps: int,
     ) -> None:
@@ -461,43 +446,9 @@ class _Solver:
             out[again] = self._exact(again + part.start, again + part.start)
         return out[:count]
 
-    def to_rounded(self, i: int) -> Array32:
-        """Distances of a probe to all templates."""
-        probes, batch = self._probes, self._templates
-        assert isinstance(probes, SubspaceBatch)  # noqa: S101
-        assert isinstance(batch, RoundedBatch)  # noqa: S101
-        count, m_d, m_e = len(batch), self._m, batch.m
-        wide = _whole(count)
-        stacked = np.empty((1, m_d + 1, batch.n), dtype=np.float32)
-        self._stack(probes[i : i + 1], stacked)
-        feet, steps = batch.feet, batch.steps
-        if self._options.spherical:
-            scales, radii = (part.astype(np.float32) for part in exact.spheres(feet))
-            feet, steps = feet * scales[:, None], steps * radii[:, None]
-        product = np.zeros((m_d + 1, m_e + 1, wide), dtype=np.float32)
-        squares, out = np.zeros(wide, dtype=np.float32), np.empty(wide, dtype=np.float32)
-        squares[:count] = _squares(batch.feet)
-        # Of the feet the numbers are as they are; those of the bases lack their scales.
-        scaled = stacked[0] * batch.scales
-        sides = _locked(feet), batch.numbers, _locked(steps)
-        rounded_products(stacked[0], scaled, *sides, product)
-        tile = Tile(product.reshape(-1), _squares(probes.feet[i : i + 1]), squares, m_d, m_e)
-        work = np.zeros(self._scratch, dtype=np.float32)
-        if solve(tile, self._options, work, Result(out, wide, count)):
-            again = np.flatnonzero(out[:count] < 0)
-            out[again] = self._exact(np.full(len(again), i), again)
-        return out[:count]
-
     def _exact(self, i: Indices, j: Indices) -> NDArray[np.float64]:
         options: dict[str, Any] = {"metric": self._metric, "steps": self._options.steps}
-        templates = self._templates
-        if isinstance(templates, SubspaceBatch):
-            return exact.pairs(self._probes, templates, i, j, **options)
-        out = np.empty(len(i))
-        for part in parts(len(i), LANES):
-            some = templates.restored(j[part])
-            out[part] = exact.pairs(self._probes, some, i[part], np.arange(len(some)), **options)
-        return out
+        return exact.pairs(self._probes, self._templates, i, j, **options)
 
 
 def _squares(rows: Array32) -> Array32:

@@ -9,8 +9,6 @@ can be renewed, or undone for an export, without the holder's key.
 """
 
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 from cryptography.hazmat.primitives.hashes import SHA256
@@ -18,16 +16,13 @@ from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 from numpy.typing import NDArray
 from scipy.fft import dct, idct
 
-from templates.keys.randomness import KEY_BYTES, Keystream
+from templates.keys.randomness import KEY_BYTES
 from templates.keys.sealing import encode_parts
 
 ROTATION_VERSION = "signs-cosine-2"
 """Names how a key and a template's id become a rotation; part of the contract."""
 HOLDER_VERSION = "signs-cosine-2"
 """Names how a holder's key and the salt of an enrollment become a rotation."""
-HAAR_VERSION = "haar-1"
-"""Of templates from before: one matrix for all that a tenant has in one epoch."""
-
 TRANSFORMS = 4
 """Cosine transforms of one rotation. After k of them the variance of any entry of R x over the keys
 is 1/n for every unit vector x, to a relative n^(1 − k/2): with four, 1/n (docs/method.md §4.9)."""
@@ -35,18 +30,6 @@ is 1/n for every unit vector x, to a relative n^(1 − k/2): with four, 1/n (doc
 Array64 = NDArray[np.float64]
 HolderKey = bytes | bytearray
 """The 32 secret bytes that the holder of an enrollment keeps, and the service does not."""
-
-
-class Rotation(Protocol):
-    """An orthogonal map R of descriptors."""
-
-    def turned(self, points: NDArray[np.floating]) -> Array64:
-        """Return R x for every row x of ``points``, shape (k, n), in float64."""
-        ...
-
-    def turned_back(self, points: NDArray[np.floating]) -> Array64:
-        """Return Rᵀ x for every row x of ``points``, shape (k, n), in float64."""
-        ...
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -78,21 +61,6 @@ class SignedCosineRotation:
         return np.asarray(turned)
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class MatrixRotation:
-    """An orthogonal (n, n) matrix."""
-
-    matrix: Array64
-
-    def turned(self, points: NDArray[np.floating]) -> Array64:
-        """Return R x for every row."""
-        return np.asarray(points.astype(np.float64) @ self.matrix.T)
-
-    def turned_back(self, points: NDArray[np.floating]) -> Array64:
-        """Return Rᵀ x for every row."""
-        return np.asarray(points.astype(np.float64) @ self.matrix)
-
-
 class TenantRotation:
     """Gives each template that a tenant has in one epoch its rotation.
 
@@ -115,15 +83,13 @@ class TenantRotation:
     def __repr__(self) -> str:
         return f"TenantRotation(n={self.n})"
 
-    def of(self, template_id: str, version: str = ROTATION_VERSION) -> Rotation:
+    def of(self, template_id: str) -> SignedCosineRotation:
         """Return the rotation of one template. Equal on every machine to rounding.
 
         Parameters
         ----------
         template_id
             Random, and another one for each enrollment: two templates never share a rotation.
-        version
-            Of the contract that the template belongs to.
 
         Notes
         -----
@@ -131,25 +97,8 @@ class TenantRotation:
         the whole secret of this rotation, so who finds the rotation of their own template out has
         nothing of another's.
         """
-        if version == HAAR_VERSION:
-            return self._haar
-        if version != ROTATION_VERSION:
-            raise ValueError(f"this program does not know the rotation version {version!r}")
-        info = encode_parts("template rotation", version, self.n, template_id)
+        info = encode_parts("template rotation", ROTATION_VERSION, self.n, template_id)
         return _derived(self._key, info, self.n)
-
-    @cached_property
-    def _haar(self) -> MatrixRotation:
-        """The one matrix of version 1, by a QR decomposition; made when it is first asked for.
-
-        HKDF-SHA-256 turns key and n into a ChaCha20 key, whose stream fills a Gaussian matrix. Its
-        Q factor is Haar-distributed when R has a positive diagonal (Mezzadri, Notices AMS 2007).
-        """
-        info = f"veilface tenant rotation {HAAR_VERSION} n={self.n}".encode()
-        derived = HKDF(algorithm=SHA256(), length=KEY_BYTES, salt=None, info=info).derive(self._key)
-        with Keystream(derived) as stream:
-            q, r = np.linalg.qr(stream.normal((self.n, self.n)))
-        return MatrixRotation(np.ascontiguousarray(q * np.where(np.diagonal(r) < 0, -1.0, 1.0)))
 
 
 def holder_rotation(key: HolderKey, salt: str, n: int) -> SignedCosineRotation:

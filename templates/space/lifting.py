@@ -14,7 +14,7 @@ from templates.errors import LiftingError
 from templates.keys.randomness import Keystream
 from templates.keys.sealing import encode_parts
 from templates.space.embedding import unit_descriptors
-from templates.space.subspace import SubspaceBatch, span_basis
+from templates.space.subspace import SubspaceBatch
 
 SUB_DATABASES = 16
 """Parts that the sub-strategies split the database into (paper §4.2)."""
@@ -88,8 +88,8 @@ def lift_stream(
 
     Only a template that its holder's key turns is told apart by tenant and subject: nobody sees two
     of those meet without the keys, and one set would show by the length of its foot point, which
-    no rotation hides, that two enrollments are of the same photos (docs/privacy-leaks.md "What
-    leaked").
+    no rotation hides, that two enrollments are of the same photos (docs/privacy.md "Attacker
+    by attacker").
 
     Parameters
     ----------
@@ -165,48 +165,6 @@ def lift(
     return SubspaceBatch(feet, bases)
 
 
-def lift_of_nobody(
-    descriptors: ArrayLike,
-    *,
-    strategy: Strategy,
-    m: int,
-    source: DecoySource,
-    stream: Keystream,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Lift, but leave the bases as they come: the first rows of one tell which points made it.
-
-    Faster than :func:`lift`, in one piece of (N, m, n) float64, and only for descriptors that are
-    nobody's. Parameters and errors are those of :func:`lift`; there is no hybrid+ here.
-
-    Returns
-    -------
-    feet, bases : ndarray of float64, shapes (N, n) and (N, m, n)
-    """
-    points = with_noise(unit_descriptors(descriptors), strategy, source, stream)
-    bases = span_basis(
-        draw_directions(points, strategy=strategy, m=m, source=source, stream=stream)
-    )
-    inside = np.einsum("tmi,ti->tm", bases, points)
-    return points - np.einsum("tm,tmi->ti", inside, bases), bases
-
-
-def with_noise(
-    points: NDArray[np.float64],
-    strategy: Strategy,
-    source: DecoySource | None,
-    stream: Keystream,
-) -> NDArray[np.float64]:
-    """Give unit descriptors (N, n) the noise that the source's decoys have; unit rows again.
-
-    Embedders leave axes along which faces hardly differ. Decoys cannot be fitted there well enough
-    to hide a descriptor: noise on both does (docs/decoys.md "Noise").
-    """
-    if not strategy.needs_decoys or source is None or not source.noise:
-        return points
-    moved = points + np.sqrt(source.noise) * stream.normal(points.shape)
-    return np.asarray(moved / np.linalg.norm(moved, axis=1, keepdims=True))
-
-
 def draw_directions(
     descriptors: ArrayLike,
     *,
@@ -218,7 +176,7 @@ def draw_directions(
 ) -> NDArray[np.float64]:
     """Draw the directions that span the subspaces, before they are orthonormalised.
 
-    See :func:`lift` for the parameters and errors; noise is not added here. Whoever holds the
+    See :func:`lift` for the parameters and errors. Whoever holds the
     directions knows the descriptor: they do not leave memory.
 
     Returns
@@ -251,8 +209,8 @@ def _check(
             raise LiftingError(f"{strategy} lifting with m = {m} has no decoy: use m >= 2")
         if source is None:
             raise LiftingError(f"{strategy} lifting needs a decoy source")
-        if source.n != n:
-            raise LiftingError(f"decoys of {source.n} numbers do not fit embeddings of {n}")
+        if source.k != n:
+            raise LiftingError(f"decoys of {source.k} numbers do not fit embeddings of {n}")
     if strategy is Strategy.HYBRID_PLUS:
         if attributes is None or len(attributes) != count:
             raise LiftingError("hybrid+ lifting needs the attributes of every embedding")
@@ -276,9 +234,8 @@ def _lift(
     for first in range(0, count, step):
         tile = slice(first, min(first + step, count))
         chosen = None if attributes is None else attributes[tile]
-        hidden = with_noise(points[tile], strategy, source, stream)
-        directions = _directions(hidden, strategy, m, source, stream, chosen)
-        batch = SubspaceBatch.through(hidden, directions, stream=stream)
+        directions = _directions(points[tile], strategy, m, source, stream, chosen)
+        batch = SubspaceBatch.through(points[tile], directions, stream=stream)
         feet[tile], bases[tile] = batch.feet, batch.bases
     return SubspaceBatch(feet, bases)
 

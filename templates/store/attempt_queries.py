@@ -136,9 +136,9 @@ _LOGGED_NONCE = sa.select(AuditRow.sequence).where(AuditRow.nonce == sa.bindpara
 def before(count: int) -> Any:
     """All that is looked at before a decision; one row where there is the tenant.
 
-    Of `tenant`, :func:`named` for so many pseudonyms, `subject_id`, `contract_id`,
-    `earlier_contract_id`, `key_prefix`, `nonce_hash`, `nonce_digest` and `place`. The columns of
-    the template are NULL where the subject has none of either contract.
+    Of `tenant`, :func:`named` for so many pseudonyms, `subject_id`, `contract_id`, `key_prefix`,
+    `nonce_hash`, `nonce_digest` and `place`. The columns of the template are NULL where the subject
+    has none of the contract.
 
     Where no ciphertext of the subject is stored, `stand_in` is that of whoever comes next after
     `place`, by the ids of their rows: a template's bytes take a time that would tell who is
@@ -163,9 +163,7 @@ def before(count: int) -> Any:
             TemplateRow,
             sa.and_(
                 _TEMPLATE,
-                TemplateRow.contract_id.in_(
-                    [sa.bindparam("contract_id"), sa.bindparam("earlier_contract_id")]
-                ),
+                TemplateRow.contract_id == sa.bindparam("contract_id"),
             ),
         )
         .where(_TENANT)

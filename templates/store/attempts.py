@@ -8,7 +8,7 @@ from its table changes nothing.
 """
 
 import contextlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import timedelta
 from functools import partial
@@ -94,7 +94,7 @@ class Attempts:
         tenant: str,
         subject_id: str,
         *,
-        contract_ids: Sequence[str],
+        contract_id: str,
         nonce: Nonce | None = None,
         held_template: bytes | None = None,
     ) -> Attempt:
@@ -107,9 +107,9 @@ class Attempts:
         ----------
         tenant, subject_id
             Whom the probe is to be compared with.
-        contract_ids
-            One or two. A template of another contract is as good as none: nothing of it is read or
-            decrypted, so that it costs what a subject costs that does not exist.
+        contract_id
+            A template of another contract is as good as none: nothing of it is read or decrypted,
+            so that it costs what a subject costs that does not exist.
         nonce
             Of a signed probe; None for a photo.
         held_template
@@ -122,7 +122,7 @@ class Attempts:
         SealError
             If the row was altered or moved, or its master key is missing.
         """
-        asked = partial(self._asked, tenant, subject_id, nonce, contract_ids)
+        asked = partial(self._asked, tenant, subject_id, nonce, contract_id)
         row = self._context.read(lambda connection: self._before(connection, asked()))
         return self._opened(row, held_template)
 
@@ -133,7 +133,7 @@ class Attempts:
         *,
         accepted: bool,
         template_id: str | None,
-        contract_ids: Sequence[str] | None = None,
+        contract_id: str | None = None,
         level: str,
         nonce: Nonce | None,
         by: By,
@@ -156,7 +156,7 @@ class Attempts:
         template_id
             Id of the template that was decided on, or that its holder did not send; None for a
             subject that was not enrolled.
-        contract_ids
+        contract_id
             As of :meth:`begin`; None where any template counts.
         level
             Security level of the decision, for the audit log.
@@ -177,7 +177,7 @@ class Attempts:
         """
 
         def work(connection: Connection) -> LockedOut | Replayed | None:
-            asked = self._asked(tenant, subject_id, nonce, contract_ids)
+            asked = self._asked(tenant, subject_id, nonce, contract_id)
             return self._record(connection, asked, accepted, template_id, nonce, level, by)
 
         refusal = self._context.write(work, lock=subject_lock(tenant, subject_id))
@@ -190,7 +190,7 @@ class Attempts:
         subject_id: str,
         decide: Callable[[Attempt], D],
         *,
-        contract_ids: Sequence[str],
+        contract_id: str,
         nonce: Nonce | None,
         held_template: bytes | None = None,
         by: By,
@@ -209,7 +209,7 @@ class Attempts:
         """
 
         def work(connection: Connection) -> D | LockedOut | Replayed:
-            asked = self._asked(tenant, subject_id, nonce, contract_ids)
+            asked = self._asked(tenant, subject_id, nonce, contract_id)
             attempt = self._opened(self._before(connection, asked), held_template)
             decided = decide(attempt)
             refusal = self._record(
@@ -284,7 +284,7 @@ class Attempts:
         tenant: str,
         subject_id: str,
         nonce: Nonce | None = None,
-        contract_ids: Sequence[str] | None = None,
+        contract_id: str | None = None,
     ) -> dict[str, Any]:
         """Parameters of :func:`before` and :func:`standing`, and ``pseudonyms``.
 
@@ -297,8 +297,7 @@ class Attempts:
             "pseudonyms": pseudonyms,
             **named(pseudonyms),
             "place": pseudonyms[0][:32],
-            "contract_id": None if contract_ids is None else contract_ids[0],
-            "earlier_contract_id": None if contract_ids is None else contract_ids[-1],
+            "contract_id": contract_id,
             "key_prefix": None if nonce is None else nonce.key_prefix,
             "nonce_hash": None if nonce is None else nonce.hash,
             "nonce_digest": None if nonce is None else self._nonces.digest(nonce),
@@ -343,7 +342,6 @@ class Attempts:
     ) -> LockedOut | Replayed | None:
         row = _one(connection, standing, asked)
         status = self._status(connection, row, asked)
-        contract_ids = asked["contract_id"], asked["earlier_contract_id"]
         if accepted and template_id is None:
             raise ValueError("a subject that is not enrolled cannot be accepted")
         outcome = "accept" if accepted else "reject"
@@ -353,7 +351,7 @@ class Attempts:
             if nonce is not None:
                 spend(connection, nonce, key_id=row.api_key_id, used=row.used)
             self._standing.refuse_locked(status)
-            of_contract = contract_ids[0] is None or row.contract_id in contract_ids
+            of_contract = asked["contract_id"] in (None, row.contract_id)
             if (row.template_id if of_contract else None) != template_id:
                 raise Superseded
             if accepted:

@@ -7,10 +7,9 @@
     retire   the keys of the older epochs go, when nothing needs them
 
 A template of the old rotation R is turned by R' Rᵀ, which is R' x for every x that was R x, so
-nobody has to enroll again. Its id stays, and with the new key gives another rotation. A template of
-the earlier rotation version becomes one of the contract's own. It protects what is stored from now
-on. A copy of the database that was taken before, with its rotation key and master key, keeps what
-it had.
+nobody has to enroll again. Its id stays, and with the new key gives another rotation. It protects
+what is stored from now on. A copy of the database that was taken before, with its rotation key and
+master key, keeps what it had.
 
 Each move rounds to the stored precision once more. In half precision at n = 512 and m = 16 the
 distance of a probe to the template then differs from the one before by 1.3·10⁻⁵ in the root mean
@@ -104,9 +103,8 @@ class Rerotation:
         tenant
             Whose templates.
         binding
-            Of the contract that they will belong to: those of it, and of the one that differs from
-            it in the earlier rotation version only, are moved. Which rotation a template of any
-            other has is not known here, and it is left to be enrolled again.
+            Of the contract that they belong to. Templates of any other are left to be enrolled
+            again.
         batch
             Templates in one transaction, and in memory.
         progress
@@ -132,7 +130,7 @@ class Rerotation:
             moved, left, after = 0, 0, ""
             broken_before, broken = broken, set()
             while rows := database.read(
-                partial(_old_templates, owner.id, binding.contract_ids, after, batch)
+                partial(_old_templates, owner.id, binding.contract_id, after, batch)
             ):
                 after = rows[-1].subject_pk
                 rotated = self._rotate_all(rotations, rows, broken)
@@ -281,12 +279,10 @@ class _Rotations:
         """Turn the wire bytes of a row's template as the contract's templates of an epoch are."""
         binding, template = self._binding, wire.decode(stored)
         shape = template.subspace.n, template.subspace.m
-        if template.contract_id != row.contract_id or shape != (binding.n, binding.m):
+        if template.contract_id != row.contract_id or shape != (binding.axes, binding.m):
             raise InvalidTemplate("a stored template is not of the contract that its row names")
-        old = self._of(row.rotation_epoch).of(
-            row.template_id, binding.rotation_versions[row.contract_id]
-        )
-        new = self._of(epoch).of(row.template_id, binding.rotation_version)
+        old = self._of(row.rotation_epoch).of(row.template_id)
+        new = self._of(epoch).of(row.template_id)
         turned = template.subspace.turned_by(lambda points: new.turned(old.turned_back(points)))
         owner = replace(owner_of(row), contract_id=binding.contract_id, rotation_epoch=epoch)
         data = wire.encode(turned, contract_id=binding.contract_id, dtype=template.dtype)
@@ -295,7 +291,7 @@ class _Rotations:
     def _of(self, epoch: int) -> TenantRotation:
         if epoch not in self._of_epochs:
             key = self._tenants.rotation_key(self._tenant, epoch=epoch).key
-            self._of_epochs[epoch] = TenantRotation(key, self._binding.n)
+            self._of_epochs[epoch] = TenantRotation(key, self._binding.axes)
         return self._of_epochs[epoch]
 
 
@@ -331,7 +327,7 @@ def _old_subjects(tenant_id: str, after: str, batch: int, connection: Connection
 
 
 def _old_templates(
-    tenant_id: str, contract_ids: Sequence[str], after: str, batch: int, connection: Connection
+    tenant_id: str, contract_id: str, after: str, batch: int, connection: Connection
 ) -> Sequence[Any]:
     query = (
         sa.select(*TEMPLATE_COLUMNS)
@@ -339,7 +335,7 @@ def _old_templates(
         .where(
             _is_old(tenant_id),
             TemplateRow.ciphertext.is_not(None),
-            TemplateRow.contract_id.in_(contract_ids),
+            TemplateRow.contract_id == contract_id,
             SubjectRow.id > after,
         )
         .order_by(SubjectRow.id)

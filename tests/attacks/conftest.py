@@ -10,7 +10,7 @@ from templates.contract.binding import Binding
 from templates.decoys import DecoyPool, DecoySource
 from templates.keys.rotation import ROTATION_VERSION
 from templates.space.lifting import Strategy
-from tests.verify.synthetic import N, draw_people, make_generator
+from tests.verify.synthetic import K, draw_people, make_generator
 from verify import CalibrationOptions, calibrate
 
 EMBEDDER = "ab" * 32
@@ -32,7 +32,6 @@ def small_system(
     source: DecoySource | None,
     *,
     options: CalibrationOptions = OPTIONS,
-    pool_of_owners: bool = False,
     seed: int = 4,
 ) -> System:
     """Enroll with a contract of fewer comparisons than the audit's own, for the tests' time."""
@@ -40,7 +39,8 @@ def small_system(
     binding = Binding(
         embedder_sha256=EMBEDDER,
         preprocessing=PREPROCESSING,
-        n=N,
+        n=chosen.n,
+        axes=chosen.k,
         strategy=Strategy(scheme.strategy),
         m=scheme.dim,
         decoy_source_id=chosen.source_id,
@@ -55,7 +55,6 @@ def small_system(
         source,
         embedder_sha256=EMBEDDER,
         preprocessing=PREPROCESSING,
-        pool_of_owners=pool_of_owners,
         contract=contract,
         seed=seed,
     )
@@ -75,6 +74,6 @@ def weak_system(small_population: Population) -> System:
 
 @pytest.fixture(scope="session")
 def strangers() -> np.ndarray:
-    """Unit rows that have nothing to do with anybody, (40, 64)."""
-    rows = np.random.default_rng(99).normal(size=(40, N))
+    """Unit rows on the axes that have nothing to do with anybody, (40, 60)."""
+    rows = np.random.default_rng(99).normal(size=(40, K))
     return np.asarray(rows / np.linalg.norm(rows, axis=1, keepdims=True), dtype=np.float32)

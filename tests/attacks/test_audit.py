@@ -1,4 +1,3 @@
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -9,62 +8,74 @@ import pytest
 from attacks import audit
 from attacks.audit import AuditPlan, run_audit
 from attacks.further_faces import FurtherFaces
-from attacks.system import System
+from attacks.outcomes import Scheme
 from models.extraction import Extraction
 from models.pack import ModelPack
-from templates.distances.kernels.arguments import Array32
-from tests.attacks.stored.systems import OWNERS, VICTIMS, M, generator, system_of
+from templates.decoys import DecoyGenerator
+from templates.errors import ContractError
+from tests.attacks.stored.systems import OWNERS, VICTIMS, M, generator
 from tests.verify.synthetic import draw_people
 
+PEOPLE = draw_people(900, photos=(4, 2, 3), noise=0.35, seed=3)
+FACES = Extraction(PEOPLE.descriptors, [Path(str(i)) for i in range(len(PEOPLE.names))], [], 0)
+PACK = cast(
+    "ModelPack", SimpleNamespace(info=SimpleNamespace(embedder_sha256="ab" * 32, preprocessing={}))
+)
+PLAN = AuditPlan(
+    dims=(M,),
+    axes=60,
+    victims=VICTIMS,
+    owners=OWNERS,
+    climbed=2,
+    attempts=50,
+    training_seconds=None,
+)
 
-def test_an_audit_of_two_schemes_reports_its_progress(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The people are real to the audit; its systems and attacks are small ones."""
-    people = draw_people(900, photos=(4, 2, 3), noise=0.35, seed=3)
-    faces = Extraction(people.descriptors, [Path(str(i)) for i in range(len(people.names))], [], 0)
-    pack = SimpleNamespace(info=SimpleNamespace(embedder_sha256="ab" * 32, preprocessing={}))
-    schemes: list[Any] = []
 
-    def enroll(_population: object, scheme: Any, *_: object, **options: Any) -> Any:
-        schemes.append((str(scheme), options["pool_of_owners"]))
-        return system_of("generator")
-
-    monkeypatch.setattr(audit, "enroll_victims", enroll)
-    given: list[int] = []
-
-    def attacks(*arguments: Any) -> list[Any]:
-        given.append(len(arguments[2].attacker) - len(arguments[1].attacker))
-        return [list, list, list]
-
-    monkeypatch.setattr(audit, "_attacks", attacks)
+@pytest.mark.long
+def test_an_audit_of_two_schemes_is_on_their_axes_and_reports_its_progress() -> None:
     shares: list[float] = []
     result = run_audit(
-        AuditPlan(dims=(M,), victims=VICTIMS, owners=OWNERS),
-        faces,
-        people.names,
-        pack=cast("ModelPack", pack),
+        PLAN,
+        FACES,
+        PEOPLE.names,
+        pack=PACK,
         decoys=generator(),
-        aligned=True,
-        start_service=None,
-        further=[FurtherFaces("more", faces.descriptors[:7], people.names[:7])],
+        further=[FurtherFaces("more", FACES.descriptors[:7], tuple(PEOPLE.names[:7]))],
         progress=shares.append,
     )
     assert shares == sorted(shares)
-    assert (len(shares), shares[0], shares[-1]) == (7, 0, 1)
-    assert [name for name, compared in schemes if compared] == result.comparisons
-    assert len(schemes) == len(result.schemes) == 2
-    assert result.settings["victims"] == VICTIMS
-    assert not result.settings["service"]
+    assert (shares[0], shares[-1]) == (0, 1)
+    ours, compared = Scheme("adversarial", "generator", M, 60), Scheme("adversarial", "pool", M)
+    assert {row.scheme for row in result.outcomes} == {ours, compared}
+    assert result.comparisons == [str(compared)]
+    attacks = {row.attack for row in result.outcomes if row.scheme == ours}
+    assert attacks == {
+        "foot-point", "hill-climbing", "linkage", "nearest-neighbour", "oracle", "presentation",
+        "renewal-replay", "second-moments", "several-templates",
+    }  # fmt: skip
     (more,) = result.settings["further_attacker_faces"]
     assert more["faces"] + more["left_out"] == 7
-    assert given == [OWNERS + more["faces"], more["faces"]]
 
 
-def test_attacks_that_use_faces_have_the_further_ones(system: System, strangers: Array32) -> None:
-    informed = replace(system, attacker=np.concatenate([system.attacker, strangers]))
-    unused: Any = None
-    plan = AuditPlan(training_seconds=0.1)
-    attacks = audit._attacks(plan, system, informed, *[unused] * 4, "a test")
-    outcomes = {attack.__name__: attack for attack in attacks}
-    known = len(system.attacker) + len(strangers)
-    assert outcomes["likelihood"]()[1].details["faces"] == known
-    assert outcomes["learned"]()[0].details["faces"] == known
+def test_the_attacker_knows_everybody_but_the_victims(monkeypatch: pytest.MonkeyPatch) -> None:
+    given: list[Any] = []
+
+    def attacks(*arguments: Any) -> list[Any]:
+        given.append(arguments[2])
+        return [list]
+
+    monkeypatch.setattr(audit, "_attacks", attacks)
+    run_audit(PLAN, FACES, PEOPLE.names, pack=PACK, decoys=generator())
+    ours, pool = given
+    shown = np.isclose(PEOPLE.descriptors @ ours.victims.fresh.T, 1.0, atol=1e-5).any(axis=1)
+    victims = np.isin(PEOPLE.names, np.asarray(PEOPLE.names)[shown])
+    # Of a pool's owners two photos each are known where they are no decoys.
+    assert len(ours.faces) == len(pool.faces) + 2 * OWNERS
+    assert not np.isclose(PEOPLE.descriptors[victims] @ ours.faces.T, 1.0, atol=1e-5).any()
+
+
+def test_decoys_of_the_judged_people_are_refused() -> None:
+    own = DecoyGenerator.fit(PEOPLE.descriptors)
+    with pytest.raises(ContractError, match="made of the photos of these people"):
+        run_audit(PLAN, FACES, PEOPLE.names, pack=PACK, decoys=own)

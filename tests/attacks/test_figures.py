@@ -75,19 +75,6 @@ ATTRIBUTES = [
     attribute_row("raw", None, 0, 0.9),
     attribute_row("adversarial", "generator", 16, 0.6),
 ]
-EVALUATION = {
-    "rows": [
-        {
-            **{"dataset": "lfw", "strategy": strategy, "decoys": decoys, "dim": dim},
-            **{"mode": mode, "metric": metric, "threshold_search": "exact"},
-            "accuracy_mean": accuracy,
-        }
-        for strategy, decoys, dim, mode, metric, accuracy in (
-            ("raw", None, 0, "p2p", "euclidean", 0.99),
-            ("adversarial", "generator", 16, "p2s", "spherical", 0.98),
-        )
-    ]
-}
 OTHER = {**SCHEMES[0], "attack": "foot-point", "variant": "", "details": {}}
 
 
@@ -158,13 +145,13 @@ def test_there_is_no_figure_without_data(tmp_path: Path) -> None:
     assert linkage_figure([]) is None
     assert oracle_figure([]) is None
     assert write_figures(document([], [OTHER]), tmp_path) == []
-    assert write_figures(document([], []), tmp_path, evaluation=EVALUATION) == []
+    assert write_figures(document([], []), tmp_path) == []
     assert list(tmp_path.iterdir()) == []
 
 
 def test_what_has_data_is_written_and_what_an_earlier_run_drew_is_gone(tmp_path: Path) -> None:
     whole = document(ATTRIBUTES, [*linkage_rows()[:6], *oracle_rows()])
-    files = write_figures(whole, tmp_path, evaluation=EVALUATION)
+    files = write_figures(whole, tmp_path)
     expected = [f"{name}.{end}" for name in NAMES for end in ("png", "svg")]
     assert [file.name for file in files] == expected
     assert sorted(file.name for file in tmp_path.iterdir()) == sorted(expected)
@@ -175,12 +162,6 @@ def test_what_has_data_is_written_and_what_an_earlier_run_drew_is_gone(tmp_path:
         assert ET.parse(tmp_path / f"{name}.svg").getroot().tag.endswith("svg")
     kept = tmp_path / "report.json"
     kept.write_text("{}")
-    fewer = write_figures(document([], oracle_rows()), tmp_path, evaluation=EVALUATION)
+    fewer = write_figures(document([], oracle_rows()), tmp_path)
     assert sorted(tmp_path.iterdir()) == sorted([kept, *fewer])
     assert [file.name for file in fewer] == ["oracle.png", "oracle.svg"]
-
-
-def test_an_evaluation_of_other_schemes_gives_no_frontier(tmp_path: Path) -> None:
-    other = {"rows": [row for row in EVALUATION["rows"] if row["strategy"] == "raw"]}
-    files = write_figures(document(ATTRIBUTES, []), tmp_path, evaluation=other)
-    assert [file.name for file in files] == ["figure.png", "figure.svg"]

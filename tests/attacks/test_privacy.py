@@ -5,26 +5,28 @@ import pytest
 
 from attacks.errors import AuditError
 from attacks.privacy import (
+    MEANS,
+    ONE_PHOTO,
+    PHOTOS,
+    SPHERE_SHARES,
     AttackSetup,
-    SimulatedPeople,
+    Pairs,
     Theft,
-    extrapolate,
+    all_thefts,
     face_counts,
-    privacy_of,
+    reduced,
 )
 from templates.decoys import DecoyGenerator
 from templates.space.lifting import Strategy
-from tests.verify.synthetic import unit
-from verify.metrics import rate
+from tests.verify.synthetic import make_pool, unit
 
 N = 48
-COSINE = 0.6
 FACES = np.linspace(1.0, 0.3, N)
 OTHER = np.roll(FACES, N // 2)
 
 
 def rows(count: int, deviations: np.ndarray, seed: int) -> np.ndarray:
-    return unit(np.random.default_rng(seed).normal(size=(count, N)) * deviations)
+    return unit(np.random.default_rng(seed).normal(size=(count, N)) * deviations).astype(np.float32)
 
 
 @functools.cache
@@ -35,123 +37,118 @@ def generator(kind: tuple[float, ...]) -> DecoyGenerator:
 def setup_with(kind: np.ndarray, *, shuffled: bool = False) -> AttackSetup:
     """Two photos of each of 120 people, 1,500 other faces, and a generator of a kind."""
     enrolled = rows(120, FACES, 1)
-    fresh = unit(enrolled + 0.6 * rows(120, FACES, 2))
-    return AttackSetup.of(
-        enrolled,
-        np.roll(fresh, 1, axis=0) if shuffled else fresh,
-        rows(1_500, FACES, 3),
-        generator(tuple(kind)),
-        match_cosine=COSINE,
-    )
+    fresh = unit(enrolled + 0.6 * rows(120, FACES, 2)).astype(np.float32)
+    victims = Pairs(enrolled, np.roll(fresh, 1, axis=0) if shuffled else fresh)
+    return AttackSetup.of(victims, rows(1_500, FACES, 3), generator(tuple(kind)))
 
 
-@pytest.fixture(scope="module")
-def of_another_kind() -> AttackSetup:
-    return setup_with(OTHER)
+def best(thefts: tuple[Theft, ...]) -> Theft:
+    return max(thefts, key=lambda theft: theft.found.value)
 
 
-def test_decoys_of_another_kind_and_random_lifting_fail(of_another_kind: AttackSetup) -> None:
-    for strategy, m in ((Strategy.ADVERSARIAL, 8), (Strategy.RANDOM, 8)):
-        privacy = privacy_of(of_another_kind, strategy=strategy, m=m)
-        assert privacy.strongest.found.value > 0.9, strategy
-        assert privacy.strongest.found.trials == 120
+@pytest.mark.parametrize("axes", [N, 40])
+def test_decoys_of_another_kind_and_random_lifting_fail(axes: int) -> None:
+    bed = setup_with(OTHER).along(axes)
+    assert bed.victims.enrolled.shape == (120, axes)
+    for strategy in (Strategy.ADVERSARIAL, Strategy.HYBRID, Strategy.RANDOM):
+        strongest = best(bed.thefts(strategy, 8))
+        assert strongest.found.value > 0.7, strategy
+        assert strongest.found.trials == 120
 
 
 def test_more_decoys_of_the_same_kind_hide_more() -> None:
-    setup = setup_with(FACES)
-    few, many = (
-        privacy_of(setup, strategy=Strategy.ADVERSARIAL, m=m).strongest.found for m in (2, 16)
-    )
+    bed = setup_with(FACES).along(N)
+    few, many = (best(bed.thefts(Strategy.ADVERSARIAL, m)).found for m in (2, 20))
     assert many.value < few.value - 0.3
 
 
 def test_photos_of_other_people_are_matched_by_chance() -> None:
-    setup = setup_with(OTHER, shuffled=True)
-    privacy = privacy_of(setup, strategy=Strategy.ADVERSARIAL, m=8)
-    assert privacy.strongest.found.value < 0.05
-    assert max(theft.control.value for theft in privacy.thefts) < 0.05
+    thefts = setup_with(OTHER, shuffled=True).along(N).thefts(Strategy.ADVERSARIAL, 8)
+    assert best(thefts).found.value < 0.05
+    assert max(theft.control.value for theft in thefts) < 0.05
 
 
-def test_attackers_are_named_by_their_faces() -> None:
-    setup = setup_with(FACES)
-    thefts = privacy_of(setup, strategy=Strategy.HYBRID, m=4).thefts
-    named = [(theft.attack, theft.faces) for theft in thefts]
+def test_attackers_are_named_by_their_faces_and_how_they_count_them() -> None:
+    thefts = setup_with(FACES).along(N).thefts(Strategy.HYBRID, 4)
+    named = [(theft.attack, theft.faces, theft.share) for theft in thefts]
     assert named == [
-        ("foot point", 0),
-        ("second moments", 1_000),
-        ("second moments", 1_500),
+        ("foot point", 0, 1.0),
+        *(("second moments", faces, share) for share in SPHERE_SHARES for faces in (1_000, 1_500)),
     ]
     assert face_counts(900) == (900,)
     assert face_counts(9_000) == (1_000, 5_000, 9_000)
 
 
-def test_a_generator_fitted_to_few_is_worse_for_who_knows_the_people() -> None:
-    """The relative error of a covariance from N faces is √(n/N), whatever the covariance is."""
-    genuine = np.full(150, 0.8)
-    found = {
-        fitted: SimulatedPeople.draw(
-            np.zeros(N), np.diag(FACES**2), genuine, fitted_to=fitted, seed=0
-        ).theft(Strategy.ADVERSARIAL, 6, match_cosine=COSINE, seed=0)
-        for fitted in (100, 5_000)
-    }
-    assert found[100].found.value > found[5_000].found.value + 0.15
-    assert max(theft.control.value for theft in found.values()) < 0.05
-    assert found[100].to_json()["faces"] == "unlimited, simulated"
+def test_a_person_of_many_photos_counts_once_where_people_are_counted() -> None:
+    base = setup_with(FACES)
+    owners = np.r_[np.zeros(500, dtype=np.int64), np.arange(1, 1_001)]
+    setup = AttackSetup.of(base.victims, rows(1_500, FACES, 3), base.source, owners=owners)
+    counted = dict(setup.counted)
+    assert {name: len(faces) for name, faces in counted.items()} == {
+        PHOTOS: 1_500, ONE_PHOTO: 1_001, MEANS: 1_001,
+    }  # fmt: skip
+    many = setup.faces[setup.owners == 0][: setup.photos].mean(axis=0)
+    assert np.isclose(counted[MEANS] @ many / np.linalg.norm(many), 1.0, atol=1e-5).sum() == 1
 
 
-def test_simulated_fresh_photos_are_as_near_as_real_ones() -> None:
-    genuine = np.linspace(0.4, 0.9, 60)
-    people = SimulatedPeople.draw(np.zeros(N), np.diag(FACES**2), genuine, fitted_to=200, seed=3)
-    seen = np.einsum("ij,ij->i", people.enrolled, people.fresh)
-    np.testing.assert_allclose(seen, genuine, atol=1e-5)
-
-
-def test_extrapolation_continues_a_line_of_logits() -> None:
-    def share(faces: float) -> float:
-        return float(1 / (1 + np.exp(0.5 + 1_200 / faces)))
-
-    trials = 1_000_000
-    points = [(a, rate(round(trials * share(a)), trials)) for a in (1_000, 5_000, 20_000)]
-    assert extrapolate(points) == pytest.approx(share(np.inf), abs=1e-3)
-    assert extrapolate(points[:1]) is None
+def test_an_attacker_without_limit_finds_more_where_decoys_fit_worse() -> None:
+    found = []
+    for kind in (FACES, OTHER):
+        setup = setup_with(kind)
+        drawn = setup.simulated(setup.along(N))
+        assert drawn is not None
+        seen = np.einsum("ij,ij->i", drawn.victims.enrolled, drawn.victims.fresh)
+        real = np.einsum("ij,ij->i", setup.victims.enrolled, setup.victims.fresh)
+        assert np.isclose(np.sort(real)[:, None], seen, atol=1e-5).any(axis=0).all()
+        found.append(drawn.thefts(Strategy.ADVERSARIAL, 12)[1])
+    assert found[1].found.value > found[0].found.value + 0.2
+    assert found[0].to_json()["faces"] == "unlimited, simulated"
+    assert [theft.faces for theft in all_thefts(setup, Strategy.ADVERSARIAL, axes=N, m=12)] == [
+        0, 1_000, 1_500, None,
+    ]  # fmt: skip
 
 
 def test_of_people_splits_them_without_overlap() -> None:
     names = [f"p{i // 3}" for i in range(300)]
     photos = rows(300, FACES, 6)
-    options = {"match_cosine": COSINE, "photos": 3, "seed": 0}
-    setup = AttackSetup.of_people(photos, names, DecoyGenerator.fit(rows(500, FACES, 7)), **options)
-    assert len(setup.enrolled) == 50
-    ((faces, _),) = setup.attackers
-    assert faces == 150
-    shown = np.argmax(photos @ setup.fresh.T, axis=0)
-    people = {names[row] for row in shown}
-    assert len(people) == 50
-    with pytest.raises(AuditError, match="two photos"):
-        AttackSetup.of_people(photos, [str(i) for i in range(300)], setup.source, **options)
+    source = generator(tuple(FACES))
+    setup = AttackSetup.of_people(photos, names, source, photos=3, seed=0)
+    assert (len(setup.victims), len(setup.faces), len(setup.mates)) == (50, 150, 50)
+    shown = {names[row] for row in np.argmax(photos @ setup.victims.fresh.T, axis=0)}
+    others = {names[row] for row in np.argmax(photos @ setup.faces.T, axis=0)}
+    mates = {names[row] for row in np.argmax(photos @ setup.mates.fresh.T, axis=0)}
+    assert len(shown) == 50
+    assert mates <= others
+    assert not shown & others
 
 
-def test_arrays_that_do_not_fit_are_refused(of_another_kind: AttackSetup) -> None:
-    source = of_another_kind.source
-    with pytest.raises(AuditError, match="dimensions"):
-        AttackSetup.of(
-            np.eye(8, dtype=np.float32),
-            np.eye(8, dtype=np.float32),
-            np.eye(8, dtype=np.float32),
-            source,
-            match_cosine=COSINE,
-        )
+def test_where_nobody_has_two_photos_the_enrolled_one_must_be_matched() -> None:
+    photos = rows(300, FACES, 6)
+    names = [str(i) for i in range(300)]
+    setup = AttackSetup.of_people(photos, names, generator(tuple(FACES)), photos=3, seed=0)
+    np.testing.assert_allclose(setup.victims.enrolled, setup.victims.fresh, atol=1e-6)
+    assert (len(setup.victims), len(setup.faces), len(setup.mates)) == (150, 150, 0)
+
+
+@pytest.mark.parametrize(("victims", "chosen_by"), [(80, 0), (120, 20), (600, 300)])
+def test_a_verdict_has_its_hundred_victims_before_a_choice_has_any(
+    victims: int, chosen_by: int
+) -> None:
+    people = rows(victims, FACES, 1)
+    faces = rows(200, FACES, 3)
+    setup = AttackSetup.of(Pairs(people, people), faces, generator(tuple(FACES)))
+    choosing, judged = setup.halves()
+    assert (len(choosing.victims), len(judged.victims)) == (chosen_by, victims - chosen_by)
+
+
+def test_what_does_not_fit_is_refused() -> None:
+    setup = setup_with(FACES)
+    small = np.eye(8, dtype=np.float32)
+    with pytest.raises(AuditError, match="of 48 numbers"):
+        AttackSetup.of(Pairs(small, small), small, setup.source)
     with pytest.raises(AuditError, match="fresh photo"):
         AttackSetup.of(
-            of_another_kind.enrolled,
-            of_another_kind.fresh[:3],
-            of_another_kind.fresh,
-            source,
-            match_cosine=COSINE,
+            Pairs(setup.victims.enrolled, setup.victims.fresh[:3]), setup.faces, setup.source
         )
-
-
-def test_the_strongest_is_the_one_that_opens_most(of_another_kind: AttackSetup) -> None:
-    privacy = privacy_of(of_another_kind, strategy=Strategy.ADVERSARIAL, m=8)
-    assert isinstance(privacy.strongest, Theft)
-    assert privacy.strongest.found.value == max(t.found.value for t in privacy.thefts)
+    with pytest.raises(AuditError, match="have all 64 numbers"):
+        reduced(make_pool(), 60)

@@ -6,13 +6,16 @@ from attacks.errors import AuditError
 from attacks.second_order import (
     RIDGE,
     Moments,
+    as_far_as_faces,
+    decoy_moment,
     drawn_towards,
-    likeliest_descriptors,
+    likeliest_embeddings,
+    moment_on_sphere,
     second_moment,
 )
 from templates.keys.randomness import Keystream
 from templates.space.subspace import SubspaceBatch
-from tests.verify.synthetic import unit
+from tests.verify.synthetic import make_generator, make_pool, unit
 
 N = 32
 
@@ -42,9 +45,9 @@ FACES = np.linspace(1.0, 0.2, N)
 WIDER = np.where(np.arange(N) < N // 2, 1.0, 4.0) * FACES
 
 
-def test_decoys_that_vary_more_than_faces_give_the_descriptor_away() -> None:
+def test_decoys_that_vary_more_than_faces_give_the_embedding_away() -> None:
     templates, people = templates_of(FACES, WIDER, k=6)
-    guesses = likeliest_descriptors(templates, exact(FACES), exact(WIDER), count=6)
+    guesses = likeliest_embeddings(templates, exact(FACES), exact(WIDER))
     np.testing.assert_allclose(np.linalg.norm(guesses, axis=1), 1.0, atol=1e-9)
     found = cosines(guesses, people)
     assert np.median(found) > templates.foot_norms.mean() + 0.4
@@ -53,14 +56,14 @@ def test_decoys_that_vary_more_than_faces_give_the_descriptor_away() -> None:
 
 def test_decoys_of_the_same_spread_do_not() -> None:
     templates, people = templates_of(FACES, FACES, k=6)
-    guesses = likeliest_descriptors(templates, exact(FACES), exact(FACES), count=6)
+    guesses = likeliest_embeddings(templates, exact(FACES), exact(FACES))
     assert cosines(guesses, people).mean() < templates.foot_norms.mean() + 0.05
 
 
 def test_no_point_of_the_span_is_likelier() -> None:
     """Against a general optimiser, on the two densities as they are written."""
     templates, _ = templates_of(FACES, WIDER, k=4, count=5)
-    guesses = likeliest_descriptors(templates, exact(FACES), exact(WIDER), count=4)
+    guesses = likeliest_embeddings(templates, exact(FACES), exact(WIDER))
     of_faces, of_decoys = (
         np.diag(1 / (spread**2 + RIDGE * (spread**2).max())) for spread in (FACES, WIDER)
     )
@@ -82,16 +85,15 @@ def test_no_point_of_the_span_is_likelier() -> None:
         np.testing.assert_allclose(inside, guesses[row], atol=1e-5)
 
 
-def test_random_directions_are_removed() -> None:
-    """Faces hardly vary along a third of the axes, where random directions stand out."""
+def test_random_directions_stand_out_where_faces_hardly_vary() -> None:
     thin = np.where(np.arange(N) < 20, 1.0, 1e-2)
     alone, people = templates_of(thin, thin, k=0, random=6)
-    guesses = likeliest_descriptors(alone, exact(thin), None, count=0)
+    guesses = likeliest_embeddings(alone, exact(thin), exact(thin).with_sphere(0.0))
     assert cosines(guesses, people).min() > 0.98
     wider = np.where(np.arange(N) < 10, 1.0, 4.0) * thin
     mixed, people = templates_of(thin, wider, k=3, random=3)
-    stripped = likeliest_descriptors(mixed, exact(thin), exact(wider), count=3)
-    assert cosines(stripped, people).mean() > mixed.foot_norms.mean() + 0.3
+    guesses = likeliest_embeddings(mixed, exact(thin), exact(wider).with_sphere(0.5))
+    assert cosines(guesses, people).mean() > mixed.foot_norms.mean() + 0.3
 
 
 def test_few_faces_are_drawn_towards_the_decoys() -> None:
@@ -103,9 +105,40 @@ def test_few_faces_are_drawn_towards_the_decoys() -> None:
     np.testing.assert_allclose(drawn_towards(many, prior), np.diag(FACES**2), atol=0.02)
 
 
-def test_decoys_of_unknown_spread_are_refused() -> None:
-    templates, _ = templates_of(FACES, FACES, k=2, count=2)
-    with pytest.raises(AuditError, match="unknown spread"):
-        likeliest_descriptors(templates, exact(FACES), None, count=2)
+def test_the_moment_of_normalised_draws_is_that_of_many_draws() -> None:
+    rng = np.random.default_rng(1)
+    root = rng.normal(size=(8, 8)) * np.linspace(1.0, 0.1, 8)
+    mean = rng.normal(size=8)
+    drawn = unit(mean + rng.normal(size=(400_000, 8)) @ root.T)
+    np.testing.assert_allclose(
+        moment_on_sphere(mean, root @ root.T), second_moment(drawn), atol=4e-3
+    )
+    with pytest.raises(AuditError, match="no spread"):
+        moment_on_sphere(np.zeros(4), np.zeros((4, 4)))
+
+
+@pytest.mark.parametrize("source", [make_generator(), make_pool()])
+def test_the_moment_of_decoys_is_that_of_what_is_drawn(source: object) -> None:
+    generator = getattr(source, "fitted", source)
+    with Keystream.seeded("moment of decoys") as stream:
+        drawn = generator.draw(1, 60_000, stream=stream)[0]
+    np.testing.assert_allclose(decoy_moment(source), second_moment(drawn), atol=2e-3)
+
+
+def test_people_are_as_far_from_decoys_as_faces_are_without_their_sampling_error() -> None:
+    """Of decoys that fit, few faces seem to differ by what only their number explains."""
+    rng = np.random.default_rng(2)
+    decoys = Moments.of(np.eye(N) / N)
+
+    def distance(moment: np.ndarray) -> float:
+        return float(np.linalg.norm(N * moment - np.eye(N)))
+
+    fitting, other = unit(rng.normal(size=(200, N))), unit(rng.normal(size=(200, N)) * FACES)
+    true = distance(second_moment(unit(rng.normal(size=(400_000, N)) * FACES)))
+    assert distance(as_far_as_faces(fitting, decoys)) < 0.5 * distance(second_moment(fitting))
+    assert distance(as_far_as_faces(other, decoys)) == pytest.approx(true, rel=0.1)
+
+
+def test_moments_of_nothing_are_refused() -> None:
     with pytest.raises(AuditError, match="no spread"):
         Moments.of(np.zeros((N, N)))

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import pytest
 
@@ -14,6 +15,7 @@ from attacks.outcomes import (
     Scheme,
 )
 from attacks.verdict import LIMITS, Cell, Status, headlines, judge
+from templates.contract.verdict import upper_bound
 from verify.metrics import rate, wilson
 
 SCHEME = Scheme("adversarial", "generator", 16)
@@ -29,7 +31,7 @@ def outcome(
     attack: str = "some attack",
     unjudged: str | None = None,
     scheme: Scheme = SCHEME,
-    lockout: int | None = None,
+    gain: float = 0.4,
 ) -> AttackOutcome:
     return AttackOutcome(
         attack=attack,
@@ -41,7 +43,7 @@ def outcome(
         measured=measured,
         chance=chance,
         unjudged=unjudged,
-        details={} if lockout is None else {"lockout": lockout},
+        details={"raw_gain": gain} if breaks is Property.CONFIDENTIALITY else {},
     )
 
 
@@ -53,20 +55,33 @@ def only_cell(*outcomes: AttackOutcome, limits: dict[str, float] | None = None) 
 
 @pytest.mark.parametrize(
     ("hits", "trials", "status"),
-    [(0, 1000, Status.PASS), (12, 100, Status.FAIL), (9, 100, Status.UNRESOLVED)],
+    [
+        (0, 1000, Status.PASS),
+        (15, 300, Status.PASS),
+        (6, 100, Status.FAIL),
+        (5, 100, Status.NOT_SHOWN),
+    ],
 )
 def test_a_recovery_is_compared_with_its_limit(hits: int, trials: int, status: Status) -> None:
     cell = only_cell(outcome(Property.IRREVERSIBILITY, rate(hits, trials)))
     assert cell.limit == "recovery-success"
-    assert cell.most == 0.1
+    assert cell.most == 0.05
     assert cell.excess == hits / trials
-    assert (cell.low, cell.high) == wilson(hits, trials)
+    assert (cell.low, cell.high) == (wilson(hits, trials)[0], upper_bound(hits, trials))
     assert cell.status is status
+
+
+def test_what_an_attacker_had_too_little_for_is_not_shown() -> None:
+    few = outcome(Property.IRREVERSIBILITY, rate(0, 1000))
+    few = replace(few, details={"too_few": "it takes 100 victims"})
+    (verdict,) = judge([few])
+    assert (verdict.cells[0].status, verdict.passed) == (Status.NOT_SHOWN, None)
+    assert "is not shown to hold" in headlines([verdict])[0]
 
 
 def test_the_strongest_attack_fills_the_cell_and_unjudged_ones_do_not() -> None:
     weak = outcome(Property.IRREVERSIBILITY, rate(1, 100), attack="weak")
-    strong = outcome(Property.IRREVERSIBILITY, rate(5, 100), attack="strong")
+    strong = outcome(Property.IRREVERSIBILITY, rate(3, 100), attack="strong")
     oracle = outcome(
         Property.IRREVERSIBILITY, rate(99, 100), attack="oracle", unjudged="nobody has it"
     )
@@ -89,9 +104,9 @@ def test_the_foot_point_has_a_limit_and_a_cell_of_its_own() -> None:
 def test_accuracy_fails_on_either_side_of_chance(correct: int) -> None:
     cell = only_cell(outcome(Property.CONFIDENTIALITY, rate(correct, 1000), chance=0.5))
     low, high = wilson(correct, 1000)
-    assert cell.excess == pytest.approx(0.2)
-    assert cell.low == pytest.approx(min(abs(low - 0.5), abs(high - 0.5)))
-    assert cell.high == pytest.approx(max(abs(low - 0.5), abs(high - 0.5)))
+    assert cell.excess == pytest.approx(0.2 / 0.4)  # of what raw embeddings gain
+    assert cell.low == pytest.approx(min(abs(low - 0.5), abs(high - 0.5)) / 0.4)
+    assert cell.high == pytest.approx(max(abs(low - 0.5), abs(high - 0.5)) / 0.4)
     assert cell.status is Status.FAIL
 
 
@@ -118,23 +133,6 @@ def test_a_d_sys_below_its_null_tells_nothing() -> None:
     assert cell.status is Status.PASS
 
 
-def test_what_a_lockout_bounds_has_a_limit_and_a_cell_of_its_own() -> None:
-    """Decisions without end have none; those before a lockout are judged as faces tried are."""
-    endless, bounded = (
-        outcome(
-            Property.IRREVERSIBILITY,
-            rate(hits, 100),
-            leaked=Leaked.DATABASE,
-            knowledge=Knowledge.RIGHT,
-            lockout=lockout,
-        )
-        for hits, lockout in ((90, None), (11, 50))
-    )
-    (verdict,) = judge([endless, bounded])
-    by_limit = {cell.limit: cell.status for cell in verdict.cells}
-    assert by_limit == {"climbing-success": Status.FAIL, "success-with-key": Status.UNLIMITED}
-
-
 def test_a_level_that_is_too_lax_for_a_limit_is_named() -> None:
     """At FMR 1e-2 fifty faces open 39.5 % of any templates; where chance is below, nothing is.
 
@@ -146,10 +144,9 @@ def test_a_level_that_is_too_lax_for_a_limit_is_named() -> None:
             rate(hits, 100),
             leaked=Leaked.DATABASE,
             chance=chance,
-            attack="hill-climbing",
         )
         cell = only_cell(tried)
-        assert (cell.limit, cell.status) == ("climbing-success", Status.FAIL)
+        assert (cell.limit, cell.status) == ("false-acceptance", Status.FAIL)
         assert (cell.reason is not None) == named
         (line,) = headlines(judge([tried]))
         assert ("It cannot hold: the false match rate of " in line) == named
@@ -163,7 +160,7 @@ def test_a_doubt_is_not_hidden_behind_a_small_success() -> None:
     for order in ((known, doubtful), (doubtful, known)):
         cell = only_cell(*order)
         assert cell.outcome.attack == "measured on few"
-        assert cell.status is Status.UNRESOLVED
+        assert cell.status is Status.NOT_SHOWN
     assert not any("no attack" in line for line in headlines(judge([known, doubtful])))
 
 
@@ -254,7 +251,7 @@ def test_what_fails_is_said_first() -> None:
     )
     lines = headlines(verdicts)
     assert "irreversibility fails: recovers" in lines[0]
-    assert "limit 0.1" in lines[0]
+    assert "limit 0.05" in lines[0]
     assert "impersonation is broken, and no limit is set on it" in lines[1]
     assert not any("no attack" in line for line in lines)
     assert headlines(judge([outcome(Property.IRREVERSIBILITY, rate(0, 1000))])) == [

@@ -65,53 +65,6 @@ def packless(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
         yield running
 
 
-REMEMBERING = """#!{python} -IS
-import hashlib, json, os, pathlib, subprocess, sys
-at = sys.argv.index("--")
-options, photos = sys.argv[1:at], []
-for name in sys.argv[at + 1 :]:
-    with open(name, "rb") as file:
-        photos.append(file.read())
-paths = ("--pack=", "--contract=", "--generator=")
-asked = [each for each in options if not each.startswith(paths)]
-asked += [pathlib.Path(each).stem for each in options if each.startswith("--contract=")]
-asked += [hashlib.sha256(photo).hexdigest() for photo in photos]
-kept = pathlib.Path({folder!r}, hashlib.sha256(json.dumps(asked).encode()).hexdigest())
-if not kept.exists():
-    ends = []
-    for photo in photos:
-        assert len(photo) < 65536, "a pipe takes it at once"
-        reading, writing = os.pipe()
-        os.write(writing, photo)
-        os.close(writing)
-        ends.append(reading)
-    names = [f"/dev/fd/{{end}}" for end in ends]
-    done = subprocess.run(
-        [{veilface!r}, *options, "--", *names], pass_fds=ends, stdout=subprocess.PIPE, check=True
-    )
-    kept.write_bytes(done.stdout)
-sys.stdout.write(kept.read_text())
-"""
-
-
-@pytest.fixture(scope="session")
-def remembering(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """``veilface lift`` that lifts the same photos under the same contract once, then repeats it.
-
-    Its first lift is a real one, by pipes; a process of the real command takes seconds.
-    """
-    folder = tmp_path_factory.mktemp("remembering")
-    (folder / "lifts").mkdir()
-    command = folder / "veilface"
-    command.write_text(
-        REMEMBERING.format(
-            python=sys.executable, folder=str(folder / "lifts"), veilface=str(VEILFACE)
-        )
-    )
-    command.chmod(0o755)
-    return command
-
-
 @pytest.fixture
 def token(service: Running) -> str:
     """The bootstrap key: all rights."""

@@ -14,10 +14,7 @@ from veilface_client import Client
 from veilface_client.errors import FAMILIES
 
 ROOT = Path(__file__).resolve().parents[2]
-CLIENT, PRIVATE, DISTRIBUTION = PAGES = (
-    *("docs/client.md", "docs/private-client.md"),
-    "clients/python/README.md",
-)
+CLIENT, DISTRIBUTION = PAGES = ("docs/client.md", "clients/python/README.md")
 EXAMPLE = "http://127.0.0.1:8421"
 
 
@@ -49,10 +46,9 @@ def newcomer(service: Running, token: str, tmp_path: Path) -> tuple[Path, dict[s
 
 @pytest.mark.parametrize("block", PYTHON)
 def test_a_snippet_prints_what_it_says(
-    block: str, service: Running, newcomer: tuple[Path, dict[str, str]], remembering: Path
+    block: str, service: Running, newcomer: tuple[Path, dict[str, str]]
 ) -> None:
     folder, env = newcomer
-    env["PATH"] = f"{remembering.parent}:{env['PATH']}"
     assert EXAMPLE in block
     done = subprocess.run(
         [sys.executable, "-W", "error", "-c", block.replace(EXAMPLE, service.url)],
@@ -70,7 +66,7 @@ def test_a_snippet_prints_what_it_says(
 def test_the_same_from_the_shell(service: Running, newcomer: tuple[Path, dict[str, str]]) -> None:
     folder, env = newcomer
     install = blocks(CLIENT, "sh")[0]
-    (script,) = blocks(PRIVATE, "sh")
+    script = blocks(CLIENT, "sh")[-1]
     assert install == "pip install ./clients/python\n"
     assert (ROOT / "clients" / "python" / "pyproject.toml").exists()
     done = subprocess.run(

@@ -1,83 +1,79 @@
-"""How the private client calls its command, and what it does when contracts change.
+"""What the private client does when contracts change, and when what it lifts with is no use.
 
-A spy stands in for ``veilface lift``, and a scripted service answers: for what real ones do not
-show. ``test_private.py`` has the real ones.
+A scripted service answers: for what real ones do not show. ``test_private.py`` has the real ones.
 """
 
 import asyncio
 import dataclasses
-import errno
 import json
-import os
-import shutil
-import stat
 import subprocess
 import sys
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import httpx
+import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from tests.patience import wait_until
+from models.pack import ModelPack
+from templates.contract import wire
+from templates.contract.binding import Binding
+from templates.decoys import DecoyGenerator
+from templates.keys.rotation import ROTATION_VERSION
+from templates.space.lifting import Strategy
+from tests.api.deployment import make_source, photo, write_pack
 from veilface_client import (
     AsyncPrivateClient,
     ConnectionFailed,
     ContractMismatch,
     Enrollable,
     LiftFailed,
-    LiftTimeout,
     LiftUnavailable,
     PrivateClient,
     Probe,
     Retries,
     Unavailable,
     UnexpectedAnswer,
+    results,
 )
-from veilface_client import child as child_process
+from veilface_client.calls import Face
+from veilface_client.lifting import Lifter
 
 TOKEN = f"vf_{'0' * 12}_{'5e' * 32}"
 CONTRACTS = ("a" * 64, "b" * 64)
 
-SPY = """#!{python} -IS
-import base64, json, os, sys
-said = {{
-    "argv": sys.argv[1:],
-    "pid": os.getpid(),
-    "environment": dict(os.environ),
-    "folder": os.getcwd(),
-    "photos": [],
-    "descriptors": sorted(int(fd) for fd in os.listdir("/proc/self/fd")),
-}}
-for name in sys.argv[sys.argv.index("--") + 1 :]:
-    with open(name, "rb") as file:
-        said["photos"].append(base64.b64encode(file.read()).decode())
-with open({log!r}, "a") as log:
-    log.write(json.dumps(said) + "\\n")
-contract = next(a for a in sys.argv if a.startswith("--contract=")).split("=", 1)[1]
-lifted = json.load(open(contract))["contract_id"].encode()
-{then}
-print(json.dumps({{"template": base64.b64encode(lifted).decode(), "hmac": "x"}}))
-"""
+
+@dataclasses.dataclass
+class Inputs:
+    """What lifting under a contract would need."""
+
+    contract_id: str
 
 
-class Spy:
-    """The command, and its calls."""
+class Lifts:
+    """Stands in for lifting: each lift is the contract's id and its own number."""
 
-    def __init__(self, folder: Path, then: str = "") -> None:
-        self.command, self._log = folder / "spy", folder / "spy.log"
-        self.command.write_text(SPY.format(python=sys.executable, log=str(self._log), then=then))
-        self.command.chmod(0o755)
+    def __init__(self) -> None:
+        self.inputs: Inputs | None = None
+        self.made: list[tuple[str, list[bytes], Face | None]] = []
 
-    @property
-    def calls(self) -> list[dict[str, Any]]:
-        """How it was called."""
-        if not self._log.exists():
-            return []
-        return [json.loads(line) for line in self._log.read_text().splitlines()]
+    def keep(self, contract: results.Contract, generator: results.Generator) -> Inputs:
+        self.inputs = Inputs(contract.contract_id)
+        return self.inputs
+
+    def enrollment(
+        self, inputs: Inputs, photos: Sequence[bytes], *, face: Face | None
+    ) -> Enrollable:
+        return Enrollable.of(self._lifted("enrollment", photos, face), inputs.contract_id)
+
+    def probe(self, inputs: Inputs, photos: Sequence[bytes], *, face: Face | None) -> Probe:
+        return Probe.of(self._lifted("probe", photos, face), inputs.contract_id)
+
+    def _lifted(self, kind: str, photos: Sequence[bytes], face: Face | None) -> bytes:
+        self.made.append((kind, list(photos), face))
+        return f"lift {len(self.made)}".encode()
 
 
 @dataclasses.dataclass
@@ -150,20 +146,27 @@ Make = Callable[..., PrivateClient]
 
 
 @pytest.fixture
-def make(tmp_path: Path) -> Iterator[Make]:
+def lifts(monkeypatch: pytest.MonkeyPatch) -> Lifts:
+    """What clients of this test lift with."""
+    made = Lifts()
+    for module in ("client", "async_client"):
+        monkeypatch.setattr(f"veilface_client.{module}.Lifter", lambda pack, *, dim: made)
+    return made
+
+
+@pytest.fixture
+def make() -> Iterator[Make]:
     """Private clients of a scripted service, closed at the end."""
     made: list[PrivateClient] = []
 
-    def client(service: Changing, command: Path, **options: Any) -> PrivateClient:
+    def client(service: Callable[[httpx.Request], httpx.Response]) -> PrivateClient:
         made.append(
             PrivateClient(
                 "http://service.test",
                 TOKEN,
-                pack=tmp_path / "pack",
-                command=command,
+                pack="pack",
                 transport=httpx.MockTransport(service),
                 retries=Retries(first_s=0.0),
-                **options,
             )
         )
         return made[-1]
@@ -173,69 +176,12 @@ def make(tmp_path: Path) -> Iterator[Make]:
         each.close()
 
 
-def test_how_the_command_is_called(
-    tmp_path: Path, make: Make, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("VEILFACE_API_KEY", TOKEN)
-    monkeypatch.setenv("VEILFACE_MASTER_KEY_FILE", "/secret")
-    monkeypatch.setenv("PYTHONPATH", "/thief")
-    spy = Spy(tmp_path)
-    client = make(Changing(), spy.command, dim=4, lift_environment={"EXTRA": "1"})
-    large = os.urandom(3 * 2**20)
-    client.enroll("anna", [b"one", large], face="largest")
-    client.verify("anna", b"probe", level="fmr-1e-2")
-    enrollment, probe = spy.calls
-    photos = enrollment["argv"][-2:]
-    assert all(name.startswith("/dev/fd/") for name in photos)
-    assert enrollment["argv"][:-2] == [
-        "lift",
-        "--out=-",
-        f"--pack={tmp_path / 'pack'}",
-        f"--contract={client.folder / (CONTRACTS[0] + '.json')}",
-        f"--generator={client.folder / (CONTRACTS[0] + '.generator')}",
-        "--face=largest",
-        "--",
-    ]
-    assert [len(each) for each in enrollment["photos"]] == [4, 4 * 2**20]
-    assert enrollment["folder"] == str(client.folder)
-    assert len(enrollment["descriptors"]) == 3 + len(photos) + 1, "and that of the listing"
-    assert probe["argv"][1:6] == ["--probe", "--subject", "unsigned", "--dim", "4"]
-    for call in (enrollment, probe):
-        environment = call["environment"]
-        assert environment["EXTRA"] == "1"
-        assert not {"VEILFACE_MASTER_KEY_FILE", "PYTHONPATH"} & environment.keys()
-        assert TOKEN not in json.dumps(call)
-        assert "5e" * 32 not in json.dumps(call)
-    assert "VEILFACE_API_KEY" not in enrollment["environment"]
-    assert probe["environment"]["VEILFACE_API_KEY"].startswith("vf_")
-
-
-def test_photos_are_in_no_file(tmp_path: Path, make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Everything below the temporary folder, while the command runs."""
-    seen = tmp_path / "seen"
-    monkeypatch.setenv("TMPDIR", str(tmp_path / "tmp"))
-    (tmp_path / "tmp").mkdir()
-    monkeypatch.setattr("tempfile.tempdir", None)
-    spy = Spy(
-        tmp_path,
-        then=f"""
-import pathlib
-found = [p for p in pathlib.Path({str(tmp_path / "tmp")!r}).rglob("*") if p.is_file()]
-open({str(seen)!r}, "wb").write(b"|".join(p.read_bytes() for p in found))
-""",
-    )
-    make(Changing(), spy.command).enroll("anna", b"marked-photo-bytes")
-    assert CONTRACTS[0].encode() in seen.read_bytes(), "it looked where the client writes"
-    assert b"marked-photo-bytes" not in seen.read_bytes()
-
-
-def test_a_contract_that_changed_is_fetched_once_more(tmp_path: Path, make: Make) -> None:
-    spy = Spy(tmp_path)
+def test_a_contract_that_changed_is_fetched_once_more(make: Make, lifts: Lifts) -> None:
     service = Changing(changes=1)
-    client = make(service, spy.command)
+    client = make(service)
     assert client.enroll("anna", b"photo").contract_id == CONTRACTS[1]
     assert service.paths.count("/v1/contract") == 2
-    assert len(spy.calls) == 2
+    assert len(lifts.made) == 2
     service.changes = 1
     assert client.verify("anna", b"photo").contract_id == CONTRACTS[0]
     assert service.paths.count("/v1/contract") == 3
@@ -243,38 +189,35 @@ def test_a_contract_that_changed_is_fetched_once_more(tmp_path: Path, make: Make
     service.changes = 2
     with pytest.raises(ContractMismatch):
         client.enroll("anna", b"photo")
-    assert len(spy.calls) == 6
+    assert len(lifts.made) == 6
 
 
-def test_no_second_lift_where_the_contract_is_the_same(tmp_path: Path, make: Make) -> None:
+def test_no_second_lift_where_the_contract_is_the_same(make: Make, lifts: Lifts) -> None:
     """The subject's stored template is of another contract: lifting again heals nothing."""
-    spy = Spy(tmp_path)
     service = Changing(refuse_always=True)
-    client = make(service, spy.command)
+    client = make(service)
     for call in (lambda: client.enroll("anna", b"p"), lambda: client.verify("anna", b"p")):
         with pytest.raises(ContractMismatch):
             call()
-    assert len(spy.calls) == 2
+    assert len(lifts.made) == 2
 
 
-def test_a_resend_repeats_the_template_and_never_lifts_again(tmp_path: Path, make: Make) -> None:
-    spy = Spy(tmp_path)
+def test_a_resend_repeats_the_template_and_never_lifts_again(make: Make, lifts: Lifts) -> None:
     service = Changing(lost=2)
-    make(service, spy.command).enroll("anna", b"photo")
+    make(service).enroll("anna", b"photo")
     assert len(service.bodies) == 3
     assert service.bodies[0] == service.bodies[1] == service.bodies[2]
-    assert len(spy.calls) == 1
+    assert len(lifts.made) == 1
 
 
-def test_a_probe_is_signed_anew_for_each_sending(tmp_path: Path, make: Make) -> None:
-    spy = Spy(tmp_path)
+def test_a_probe_is_signed_anew_for_each_sending(make: Make, lifts: Lifts) -> None:
     service = Changing(overloaded=2)
-    client = make(service, spy.command)
+    client = make(service)
     assert client.verify("anna", b"photo")
     assert len({body["nonce"] for body in service.bodies}) == 3
     assert len({body["hmac"] for body in service.bodies}) == 3
     assert len({body["template"] for body in service.bodies}) == 1
-    assert len(spy.calls) == 1
+    assert len(lifts.made) == 1
 
     service.bodies.clear()
     service.lost = 1
@@ -283,10 +226,9 @@ def test_a_probe_is_signed_anew_for_each_sending(tmp_path: Path, make: Make) -> 
     assert len(service.bodies) == 1, "it may have been decided"
 
 
-def test_after_a_lost_answer_the_lift_is_repeated(tmp_path: Path, make: Make) -> None:
-    spy = Spy(tmp_path)
+def test_after_a_lost_answer_the_lift_is_repeated(make: Make, lifts: Lifts) -> None:
     service = Changing(lost=4)
-    client = make(service, spy.command)
+    client = make(service)
     with pytest.raises(ConnectionFailed) as failed:
         client.enroll("anna", b"photo")
     lift = failed.value.lift
@@ -295,7 +237,7 @@ def test_after_a_lost_answer_the_lift_is_repeated(tmp_path: Path, make: Make) ->
     assert client.enroll("anna", lift)
     assert len(service.bodies) == 5
     assert all(body == service.bodies[0] for body in service.bodies)
-    assert len(spy.calls) == 1
+    assert len(lifts.made) == 1
 
     service.lost = 1
     with pytest.raises(ConnectionFailed) as failed:
@@ -304,19 +246,17 @@ def test_after_a_lost_answer_the_lift_is_repeated(tmp_path: Path, make: Make) ->
     assert isinstance(probe, Probe)
     assert client.verify("anna", probe)
     assert service.bodies[-1]["template"] == service.bodies[-2]["template"]
-    assert len(spy.calls) == 2
+    assert len(lifts.made) == 2
 
 
-def test_the_same_asynchronously(tmp_path: Path) -> None:
-    spy = Spy(tmp_path)
+def test_the_same_asynchronously(lifts: Lifts) -> None:
     service = Changing(lost=2)
 
     async def scenario() -> None:
         async with AsyncPrivateClient(
             "http://service.test",
             TOKEN,
-            pack=tmp_path / "pack",
-            command=spy.command,
+            pack="pack",
             transport=httpx.MockTransport(service),
             retries=Retries(sendings=1),
         ) as client:
@@ -329,18 +269,15 @@ def test_the_same_asynchronously(tmp_path: Path) -> None:
 
     asyncio.run(scenario())
     assert len(service.bodies) == 3
-    assert len(spy.calls) == 1
+    assert len(lifts.made) == 1
 
 
-def test_a_lift_is_sent_as_often_as_it_must_and_never_made_again(
-    tmp_path: Path, make: Make
-) -> None:
-    spy = Spy(tmp_path)
+def test_a_lift_is_sent_as_often_as_it_must_and_never_made_again(make: Make, lifts: Lifts) -> None:
     service = Changing()
-    client = make(service, spy.command)
+    client = make(service)
     lift = client.lift_enrollment([b"one", b"two"], face="largest")
     assert service.bodies == [], "nothing of it is sent"
-    assert "--face=largest" in spy.calls[0]["argv"]
+    assert lifts.made == [("enrollment", [b"one", b"two"], "largest")]
     for subject in ("anna", "anna", "bert"):
         client.enroll(subject, lift)
     assert len({body["template"] for body in service.bodies}) == 1
@@ -351,267 +288,147 @@ def test_a_lift_is_sent_as_often_as_it_must_and_never_made_again(
     with pytest.raises(ContractMismatch) as failed:
         client.enroll("anna", lift)
     assert failed.value.lift is None, "repeating it heals nothing"
-    assert len(spy.calls) == 1
+    assert len(lifts.made) == 1
 
 
-def test_what_was_not_done_is_repeated_with_the_lift_too(tmp_path: Path, make: Make) -> None:
-    spy = Spy(tmp_path)
+def test_what_was_not_done_is_repeated_with_the_lift_too(make: Make, lifts: Lifts) -> None:
     service = Changing(overloaded=4)
-    client = make(service, spy.command)
+    client = make(service)
     with pytest.raises(Unavailable) as failed:
         client.verify("anna", b"photo")
     assert isinstance(failed.value.lift, Probe)
     assert client.verify("anna", failed.value.lift)
-    assert len(spy.calls) == 1
+    assert len(lifts.made) == 1
 
 
-def test_files_that_are_gone_are_fetched_again(tmp_path: Path, make: Make) -> None:
-    """Cleaners of /tmp remove what is old, and then the folder."""
-    service = Changing()
-    client = make(service, Spy(tmp_path).command)
-    client.lift(b"photo")
-    next(client.folder.glob("*.generator")).unlink()
-    client.lift(b"photo")
-    assert service.paths.count("/v1/contract") == 2
-
-    first = client.folder
-    shutil.rmtree(first)
-    client.lift(b"photo")
-    assert service.paths.count("/v1/contract") == 3
-    assert stat.S_IMODE(client.folder.stat().st_mode) == 0o700
-
-    # The same name, but not the folder that the client made.
-    second = client.folder
-    shutil.copytree(second, tmp_path / "copy")
-    shutil.rmtree(second)
-    shutil.copytree(tmp_path / "copy", second)
-    second.chmod(0o755)
-    client.lift(b"photo")
-    assert service.paths.count("/v1/contract") == 4
-    third = client.folder
-    assert third != second
-    client.close()
-    assert not third.exists()
-    shutil.rmtree(second)
+def test_a_generator_of_another_contract(make: Make, lifts: Lifts) -> None:
+    make(Changing(stale_generators=2)).enroll("anna", b"photo")
+    lifts.inputs = None
+    with pytest.raises(UnexpectedAnswer, match="generator"):
+        make(Changing(stale_generators=3)).enroll("anna", b"photo")
+    assert len(lifts.made) == 1
 
 
-def test_a_forked_child_leaves_the_folder_to_its_parent(tmp_path: Path) -> None:
-    script = f"""
-import os, sys
-from veilface_client import PrivateClient
-client = PrivateClient("http://service.test", {TOKEN!r}, pack="pack")
-child = os.fork()
-if child == 0:
-    client.close()
-    sys.exit()
-os.waitpid(child, 0)
-print(client.folder, client.folder.exists())
+SOURCE = make_source()
+
+
+@pytest.fixture(scope="module")
+def pack(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The pack of :func:`answers`."""
+    return write_pack(tmp_path_factory.mktemp("lifting") / "tiny")
+
+
+def answers(
+    pack: Path, *, dims: Sequence[int] = (2, 4), **changes: Any
+) -> tuple[results.Contract, results.Generator]:
+    """Contract and generator of 40 axes, as a service answers them."""
+    info = ModelPack.load(pack, threads=1).info
+    decoys = SOURCE.reduced(40)
+    binding = Binding(
+        **{
+            "embedder_sha256": info.embedder_sha256,
+            "preprocessing": info.preprocessing,
+            "n": info.n,
+            "axes": decoys.k,
+            "strategy": Strategy.ADVERSARIAL,
+            "m": 8,
+            "decoy_source_id": decoys.source_id,
+            "rotation_version": ROTATION_VERSION,
+            **changes,
+        }
+    )
+    body = contract_answer(binding.contract_id) | {
+        "binding": binding.to_json(),
+        "calibrations": [{"mode": "s2s", "probe_m": m} for m in dims],
+        "photo_consistency": 0.2,
+        "probe_consistency": 0.1,
+    }
+    raw = json.dumps(body).encode()
+    contract = results.Contract.model_validate_json(raw).model_copy(update={"raw": raw})
+    return contract, results.Generator(data=decoys.to_bytes(), source_id=decoys.source_id)
+
+
+def test_lifts_hold_the_projection_of_the_photos_mean(pack: Path) -> None:
+    lifter = Lifter(pack, dim=None)
+    contract, generator = answers(pack)
+    inputs = lifter.keep(contract, generator)
+    assert lifter.keep(contract, generator) is inputs
+    photos = [photo(1, 0), photo(1, 1)]
+    models = ModelPack.load(pack, threads=1)
+    mean = sum(models.embed_photo(each).embedding for each in photos)
+    point = SOURCE.reduced(40).project((mean / np.linalg.norm(mean))[None])
+    lifted = [lifter.enrollment(inputs, photos, face=None), lifter.probe(inputs, photos, face=None)]
+    lifted.append(Lifter(pack, dim=2).probe(inputs, photos, face="largest"))
+    for lift, m in zip(lifted, (8, 4, 2), strict=True):
+        received = wire.decode(lift.template)
+        assert received.contract_id == lift.contract_id == contract.contract_id
+        assert (received.subspace.n, received.subspace.m) == (40, m)
+        assert received.subspace.contains(point, tol=2e-3).all()
+
+
+def test_what_does_not_serve_is_said_without_a_lift(pack: Path, tmp_path: Path) -> None:
+    contract, generator = answers(pack)
+    broken = contract.model_copy(update={"raw": contract.raw.replace(b'"m": 8', b'"m": 7')})
+    fewer = SOURCE.reduced(39)
+    other = DecoyGenerator(SOURCE.axes, -SOURCE.mean, SOURCE.root)
+    foreign, short = (
+        results.Generator(data=each.to_bytes(), source_id=each.source_id) for each in (other, fewer)
+    )
+    cases = [
+        (pack, broken, generator, "contract_id"),
+        (pack, contract, foreign, "bound to the decoy source"),
+        (pack, contract, short, "40 were asked for"),
+        (pack, contract, results.Generator(data=b"G", source_id="s"), "truncated"),
+        (pack, *answers(pack, n=65), "the pack gives 64"),
+        (tmp_path / "absent", contract, generator, "absent"),
+    ]
+    for folder, public, decoys, said in cases:
+        with pytest.raises(LiftFailed, match=said):
+            Lifter(folder, dim=None).keep(public, decoys)
+
+    def refused(photos: Sequence[bytes], dim: int | None = None, **changes: Any) -> str:
+        lifter = Lifter(pack, dim=dim)
+        with pytest.raises(LiftFailed) as failed:
+            lifter.probe(lifter.keep(*answers(pack, **changes)), photos, face=None)
+        return failed.value.message
+
+    assert "of dimension 2, 4, not 5" in refused([photo(1)], 5)
+    assert "no lifted probes" in refused([photo(1)], dims=())
+    assert refused([photo(1), b"no picture"]).startswith("photo 2 of 2: ")
+    assert refused([photo(1), photo(2)]).startswith("photos 1 and 2 do not look like")
+    assert "1 to 10 photos, not 11" in refused([photo(1, shot) for shot in range(11)])
+
+
+def test_without_the_library(monkeypatch: pytest.MonkeyPatch, pack: Path) -> None:
+    monkeypatch.setitem(sys.modules, "enroll.public_contract", None)
+    with pytest.raises(LiftUnavailable, match="call no package of yours"):
+        Lifter(pack, dim=None).keep(*answers(pack))
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(LiftUnavailable, match=r"veilface-client\[private\]"):
+        PrivateClient("http://service.test", TOKEN, pack=pack)
+
+
+def test_a_program_s_own_package_of_the_same_name_is_told(tmp_path: Path) -> None:
+    (tmp_path / "models.py").write_text("")
+    script = """
+import models
+from veilface_client import LiftUnavailable, results
+from veilface_client.lifting import Lifter
+contract = results.Contract.model_construct(contract_id="c", raw=b"{}")
+try:
+    Lifter("pack", dim=None).keep(contract, results.Generator(data=b"", source_id="s"))
+except LiftUnavailable as error:
+    print(error)
 """
     done = subprocess.run(
-        [sys.executable, "-c", script],
-        env={**os.environ, "TMPDIR": str(tmp_path)},
-        capture_output=True,
-        text=True,
+        [sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
-    folder, existed = done.stdout.split()
-    assert existed == "True"
-    assert not Path(folder).exists(), "the parent removes it at its end"
+    assert "call no package of yours enroll, models or templates" in done.stdout
 
 
-def test_a_generator_of_another_contract(tmp_path: Path, make: Make) -> None:
-    spy = Spy(tmp_path)
-    make(Changing(stale_generators=2), spy.command).enroll("anna", b"photo")
-    with pytest.raises(UnexpectedAnswer, match="generator"):
-        make(Changing(stale_generators=3), spy.command).enroll("anna", b"photo")
-    assert len(spy.calls) == 1
-
-
-@pytest.mark.parametrize(
-    ("then", "options", "kind", "said"),
-    [
-        ("sys.exit('error: no face was found')", {}, LiftFailed, "no face was found"),
-        ("sys.exit('Traceback: vf_secret')", {}, LiftFailed, "did not say why"),
-        ("print('[]'); sys.exit()", {}, LiftFailed, "something else"),
-        ("print('{\"template\": 3}'); sys.exit()", {}, LiftFailed, "something else"),
-        (
-            "import time; time.sleep(100000)",
-            {"lift_limit_s": 0.5},
-            LiftTimeout,
-            "longer than 0.5 s",
-        ),
-        ("while True: print('x' * 65536)", {}, LiftFailed, "did not say why"),
-    ],
-)
-def test_a_command_that_fails(
-    then: str,
-    options: dict[str, float],
-    kind: type[LiftFailed],
-    said: str,
-    tmp_path: Path,
-    make: Make,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(child_process, "MOST_OUTPUT", 2**20)
-    with pytest.raises(LiftFailed, match=said) as failed:
-        make(Changing(), Spy(tmp_path, then).command, **options).enroll("anna", b"photo")
-    assert type(failed.value) is kind
-    assert "vf_secret" not in str(failed.value)
-
-
-GRANDCHILD = """
-import subprocess
-other = subprocess.Popen(["sleep", "100000"], {options})
-open({file!r}, "w").write(str(other.pid))
-"""
-
-
-def runs(pid: int) -> bool:
-    """Whether a process is there and has not ended."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] not in "ZX"
-    except (FileNotFoundError, ProcessLookupError):
-        return False
-
-
-def test_the_limit_is_that_of_everything_that_the_command_started(
-    tmp_path: Path, make: Make
-) -> None:
-    """The command has ended, and somebody else holds its output."""
-    file = tmp_path / "grandchild"
-    spy = Spy(tmp_path, GRANDCHILD.format(options="", file=str(file)))
-    for limit in (1, 10, 100):
-        with pytest.raises(LiftTimeout, match=f"longer than {limit} s"):
-            make(Changing(), spy.command, lift_limit_s=limit).lift(b"photo")
-        if file.exists() and file.read_text():
-            break  # else this machine is so busy that the command was ended before it came so far
-    wait_until(lambda: not runs(int(file.read_text())), what="the end of the grandchild")
-
-
-def test_nothing_that_the_command_started_outlives_it(tmp_path: Path, make: Make) -> None:
-    file = tmp_path / "grandchild"
-    options = "stdin=-3, stdout=-3, stderr=-3"
-    spy = Spy(tmp_path, GRANDCHILD.format(options=options, file=str(file)))
-    assert make(Changing(), spy.command).lift(b"photo")
-    wait_until(lambda: not runs(int(file.read_text())), what="the end of the grandchild")
-
-
-def test_a_thread_that_cannot_start(
-    tmp_path: Path, make: Make, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    spy = Spy(tmp_path, "import time; time.sleep(100000)")
-    client = make(Changing(), spy.command)
-    start = threading.Thread.start
-    made: list[threading.Thread] = []
-
-    def third_fails(self: threading.Thread) -> None:
-        made.append(self)
-        if len(made) == 3:
-            raise RuntimeError("can't start new thread")
-        start(self)
-
-    before = len(list(Path("/proc/self/fd").iterdir()))
-    monkeypatch.setattr(threading.Thread, "start", third_fails)
-    with pytest.raises(RuntimeError, match="new thread"):
-        client.lift_enrollment([b"photo", b"another"])
-    assert len(list(Path("/proc/self/fd").iterdir())) == before
-
-
-@pytest.mark.parametrize("failing", [1, 2, 3])
-def test_too_many_open_files(
-    failing: int, tmp_path: Path, make: Make, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    client = make(Changing(), Spy(tmp_path).command)
-    pipe, made = os.pipe, []
-
-    def some() -> tuple[int, int]:
-        made.append(None)
-        if len(made) == failing:
-            raise OSError(errno.EMFILE, "Too many open files")
-        return pipe()
-
-    before = len(list(Path("/proc/self/fd").iterdir()))
-    monkeypatch.setattr(os, "pipe", some)
-    with pytest.raises(LiftUnavailable, match="Too many open files"):
-        client.lift_enrollment([b"photo", b"another"])
-    assert len(list(Path("/proc/self/fd").iterdir())) == before
-
-
-def test_a_lift_that_nobody_waits_for_is_ended(tmp_path: Path) -> None:
-    spy = Spy(tmp_path, "import time; time.sleep(100000)")
-
-    async def scenario() -> None:
-        async with AsyncPrivateClient(
-            "http://service.test",
-            TOKEN,
-            pack=tmp_path / "pack",
-            command=spy.command,
-            transport=httpx.MockTransport(Changing()),
-        ) as client:
-            calls = [client.lift(b"photo"), client.lift_enrollment(b"photo")]
-            tasks = [asyncio.ensure_future(each) for each in calls]
-            while len(spy.calls) < 2:
-                await asyncio.sleep(0.05)
-            for task in tasks:
-                task.cancel()
-                with pytest.raises(asyncio.CancelledError):
-                    await task
-
-    asyncio.run(scenario())
-    # The end of the loop has waited for its threads, and those for the command.
-    wait_until(
-        lambda: not any(runs(call["pid"]) for call in spy.calls), what="the end of the lifts"
-    )
-
-
-def test_a_lift_that_is_given_up_before_it_starts(tmp_path: Path) -> None:
-    canceller = child_process.Canceller()
-    canceller.cancel()
-    done = child_process.run(
-        lambda names: ["sleep", "100000"],
-        [],
-        environment=os.environ,
-        folder=str(tmp_path),
-        limit_s=60,
-        canceller=canceller,
-    )
-    assert done.status == -9
-
-
-def test_a_command_that_never_reads(tmp_path: Path, make: Make) -> None:
-    """The photo is larger than a pipe: writing it must end with the command."""
-    command = tmp_path / "deaf"
-    command.write_text("#!/bin/sh\necho 'error: not today' >&2\nexit 3\n")
-    command.chmod(0o755)
-    with pytest.raises(LiftFailed, match="not today") as failed:
-        make(Changing(), command).enroll("anna", bytes(2**21))
-    assert failed.value.status == 3
-
-
-def test_no_command(tmp_path: Path, make: Make) -> None:
-    with pytest.raises(LiftUnavailable, match="there is no command"):
-        make(Changing(), tmp_path / "absent").enroll("anna", b"photo")
-    broken = tmp_path / "broken"
-    broken.write_text("#!/there/is/no/interpreter\n")
-    broken.chmod(0o755)
-    with pytest.raises(LiftUnavailable, match="cannot be started"):
-        make(Changing(), broken).enroll("anna", b"photo")
-
-
-def test_no_descriptors_are_left_open(tmp_path: Path, make: Make) -> None:
-    client = make(Changing(), Spy(tmp_path).command)
-    client.enroll("anna", b"photo")
-    before = len(list(Path("/proc/self/fd").iterdir()))
-    for _ in range(3):
-        client.enroll("anna", [b"photo", b"another"])
-    (tmp_path / "spy").write_text("#!/there/is/no/interpreter\n")
-    with pytest.raises(LiftUnavailable):
-        client.enroll("anna", b"photo")
-    assert len(list(Path("/proc/self/fd").iterdir())) == before
-
-
-def test_only_a_key_of_the_service_signs(tmp_path: Path) -> None:
+def test_only_a_key_of_the_service_signs(pack: Path) -> None:
     with pytest.raises(ValueError, match="API key") as refused:
-        PrivateClient("http://service.test", "some-other-token", pack=tmp_path)
+        PrivateClient("http://service.test", "some-other-token", pack=pack)
     assert "some-other-token" not in str(refused.value)
     assert repr(Probe(template=b"12345", contract_id="c")) == "<Probe of 5 bytes>"

@@ -21,7 +21,7 @@ from models.errors import FaceError
 from models.pack import ModelPack
 from models.selection import FacePolicy
 from tests.api.deployment import deploy
-from tests.clients.conftest import VEILFACE, started
+from tests.clients.conftest import started
 from tests.clients.proxy import Proxy
 from tests.leaks import LeakSearch, as_bytes
 from veilface_client import Client, PrivateClient, Unavailable
@@ -71,9 +71,7 @@ def traffic(
         started(dataclasses.replace(deployment, settings=settings), folder) as service,
         Proxy(service.port) as proxy,
     ):
-        with PrivateClient(
-            proxy.url, deployment.token, pack=mbf_pack_dir, command=VEILFACE
-        ) as client:
+        with PrivateClient(proxy.url, deployment.token, pack=mbf_pack_dir) as client:
             client.enroll("someone", files[:ENROLLED])
             decided = client.verify("someone", files[ENROLLED]).reason
             client.page()

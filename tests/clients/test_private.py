@@ -2,7 +2,6 @@
 
 import asyncio
 import io
-import stat
 import time
 from pathlib import Path
 
@@ -11,12 +10,11 @@ import pytest
 
 from templates.keys.probe_signature import sign_probe
 from tests.api.deployment import photo
-from tests.clients.conftest import VEILFACE, Running
+from tests.clients.conftest import Running
 from tests.clients.proxy import Proxy
 from veilface_client import (
     AsyncPrivateClient,
     ConnectionFailed,
-    LiftFailed,
     PrivateClient,
     Retries,
     new_holder_key,
@@ -26,9 +24,7 @@ from veilface_client.signature import signed_probe
 TOKEN = f"vf_{'0' * 12}_{'5e' * 32}"
 
 
-def test_enrolled_and_verified_without_a_photo_leaving(
-    packless: Running, remembering: Path, tmp_path: Path
-) -> None:
+def test_enrolled_and_verified_without_a_photo_leaving(packless: Running, tmp_path: Path) -> None:
     path = tmp_path / "anna.png"
     path.write_bytes(photo(1, 1))
     with (
@@ -37,7 +33,6 @@ def test_enrolled_and_verified_without_a_photo_leaving(
             proxy.url,
             packless.deployment.token,
             pack=packless.pack,
-            command=remembering,
             retries=Retries(first_s=0.01),
         ) as client,
     ):
@@ -54,20 +49,14 @@ def test_enrolled_and_verified_without_a_photo_leaving(
         held = client.enroll("anna", [photo(1, 0), path], storage="holder").held_template
         assert client.verify("anna", probe, held_template=held)
         assert not client.verify("anna", probe)
-
-        kept = sorted(path.name.split(".")[-1] for path in client.folder.iterdir())
-        assert kept == ["generator", "json"]
-        assert stat.S_IMODE(client.folder.stat().st_mode) == 0o700
-        folder = client.folder
         sent = proxy.sent
-    assert not folder.exists()
     assert sent.count(b"GET /v1/contract/generator") == 1, "fetched once, and kept"
 
 
-def test_asynchronously(packless: Running, remembering: Path) -> None:
-    async def scenario() -> Path:
+def test_asynchronously(packless: Running) -> None:
+    async def scenario() -> None:
         async with AsyncPrivateClient(
-            packless.url, packless.deployment.token, pack=packless.pack, command=remembering
+            packless.url, packless.deployment.token, pack=packless.pack
         ) as client:
             key, probe = new_holder_key(), await client.lift(photo(1, 2))
             enrolled = await client.enroll("emil", [photo(1, 0), photo(1, 1)], holder_key=key)
@@ -75,18 +64,16 @@ def test_asynchronously(packless: Running, remembering: Path) -> None:
             assert await client.verify("emil", probe, holder_key=key)
             assert not await client.verify("emil", probe)
             assert (await client.erase("emil")).held
-            return client.folder
 
-    assert not asyncio.run(scenario()).exists()
+    asyncio.run(scenario())
 
 
-def test_an_enrollment_is_repeated_with_its_lift(packless: Running, remembering: Path) -> None:
+def test_an_enrollment_is_repeated_with_its_lift(packless: Running) -> None:
     with Proxy(packless.port) as proxy:
         client = PrivateClient(
             proxy.url,
             packless.deployment.token,
             pack=packless.pack,
-            command=remembering,
             retries=Retries(sendings=1),
         )
         with client:
@@ -105,18 +92,6 @@ def test_an_enrollment_is_repeated_with_its_lift(packless: Running, remembering:
             assert not client.enroll("once", lift).replaced, "erased: it is a new write"
 
 
-def test_what_the_command_refuses_is_its_sentence(packless: Running) -> None:
-    with (
-        PrivateClient(
-            packless.url, packless.deployment.token, pack=packless.pack, command=VEILFACE
-        ) as client,
-        pytest.raises(LiftFailed) as failed,
-    ):
-        client.enroll("fritz", [photo(4), b"no picture"])
-    assert failed.value.status == 1
-    assert failed.value.message.startswith("photo 2: ")
-
-
 @pytest.mark.parametrize("level", [None, "fmr-1e-3"])
 def test_signatures_are_those_of_the_service(level: str | None) -> None:
     begun = time.time()
@@ -129,11 +104,11 @@ def test_signatures_are_those_of_the_service(level: str | None) -> None:
     assert signed_probe(TOKEN, "anna", b"template")["nonce"] != body["nonce"]
 
 
-def test_a_captured_probe_is_of_no_use(packless: Running, remembering: Path) -> None:
+def test_a_captured_probe_is_of_no_use(packless: Running) -> None:
     """The service refuses the very request that it has decided."""
     with Proxy(packless.port) as proxy:
         token = packless.deployment.token
-        client = PrivateClient(proxy.url, token, pack=packless.pack, command=remembering)
+        client = PrivateClient(proxy.url, token, pack=packless.pack)
         with client:
             client.enroll("dora", [photo(1, 0), photo(1, 1)])
             proxy.forget()

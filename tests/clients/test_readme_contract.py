@@ -10,7 +10,6 @@ import pytest
 from benchmarks.deployment import service
 from models.demo import build_demo_pack
 from tests.api.cli.conftest import draw
-from tests.clients.conftest import VEILFACE
 from tests.test_readme import BLOCKS, with_values
 from veilface_client import Client, PrivateClient
 
@@ -50,7 +49,7 @@ def test_who_is_enrolled_by_photos_is_verified_without_sending_one(tmp_path: Pat
     with service(serving, workers=1, log=tmp_path / "serve.log") as url:
         with Client(url, key) as client:
             client.enroll("anna", photos[:3])
-        with PrivateClient(url, lifting, pack=pack, command=VEILFACE) as client:
+        with PrivateClient(url, lifting, pack=pack) as client:
             # Lifted probes are rejected more often, now and then one at the laxest level too.
             decisions = [
                 client.verify("anna", photo, level="fmr-1e-2").decision for photo in photos[3:]

@@ -10,20 +10,22 @@ from enroll import Enroller, Enrollment, Holder
 from models.errors import NoFace, PhotoRejected
 from templates.contract import wire
 from templates.contract.document import Contract
-from templates.decoys import Attributes, DecoyPool
+from templates.decoys import Attributes, DecoyGenerator, DecoyPool
 from templates.errors import ContractMismatch, InvalidEmbedding, InvalidTemplate, VeilfaceError
-from templates.keys.rotation import holder_rotation
+from templates.keys.rotation import TenantRotation, holder_rotation
 from templates.space.agreement import InconsistentImages
 from templates.space.lifting import Strategy, lift
 from templates.space.subspace import AffineSubspace
 from tests.verify.synthetic import (
     LIFT_SECRET,
+    K,
     M,
     N,
     calibrate_people,
     draw_people,
     make_binding,
     make_generator,
+    projected,
     tenant_rotation,
     unit,
 )
@@ -31,6 +33,7 @@ from verify import CalibrationOptions, calibrate
 
 ROTATION = tenant_rotation()
 PHOTOS = draw_people(4, photos=(4,), noise=0.4, seed=55).descriptors
+POINTS = make_generator().project(PHOTOS)
 
 
 @pytest.fixture(scope="module")
@@ -44,10 +47,10 @@ def enroller(contract: Contract) -> Enroller:
     return Enroller(contract, make_generator(), rotation=ROTATION, lift_secret=LIFT_SECRET)
 
 
-def stored_template(enrollment: Enrollment) -> AffineSubspace:
-    """Un-rotated, as the descriptors are."""
+def stored_template(enrollment: Enrollment, rotation: TenantRotation = ROTATION) -> AffineSubspace:
+    """Un-rotated, as the decoys are."""
     return wire.decode(enrollment.wire).subspace.turned_by(
-        ROTATION.of(enrollment.template_id).turned_back
+        rotation.of(enrollment.template_id).turned_back
     )
 
 
@@ -55,14 +58,13 @@ def test_the_template_holds_the_mean_of_the_photos_and_is_rotated(
     contract: Contract, enroller: Enroller
 ) -> None:
     enrollment = enroller.from_embeddings(PHOTOS[:3])
-    mean = PHOTOS[:3].astype(np.float64).mean(axis=0)
-    mean /= np.linalg.norm(mean)
+    mean = projected(unit(PHOTOS[:3].mean(axis=0)))[None]
     template = stored_template(enrollment)
-    assert template.m == M
-    assert template.contains(mean[None], tol=2e-3).all()
-    assert not template.contains(PHOTOS[:3], tol=0.05).any()
+    assert (template.n, template.m) == (K, M)
+    assert template.contains(mean, tol=2e-3).all()
+    assert not template.contains(POINTS[:3], tol=0.05).any()
     rotated = wire.decode(enrollment.wire)
-    assert not rotated.subspace.contains(mean[None], tol=0.3).any()
+    assert not rotated.subspace.contains(mean, tol=0.3).any()
     assert rotated.contract_id == enrollment.contract_id == contract.contract_id
     assert rotated.dtype == "float16"
     assert [result.index for result in enrollment.per_photo] == [0, 1, 2]
@@ -118,14 +120,14 @@ def test_other_photos_another_deployment_and_another_contract_give_other_decoys(
     ):
         second = stored_template(enrollment)
         shared = first.basis.astype(np.float64) @ second.basis.T
-        # Shared decoys would give principal angles of 0; generic 6-spaces of 64 numbers do not.
+        # Shared decoys would give principal angles of 0; generic 6-spaces of 60 numbers do not.
         assert np.linalg.svd(shared, compute_uv=False).max() < 0.99
 
 
 def without_key(enrollment: Enrollment, key: bytes) -> AffineSubspace:
     """Un-rotated, as the descriptors are: what opens it has the holder's key as well."""
     assert enrollment.holder_salt is not None
-    rotation = holder_rotation(key, enrollment.holder_salt, N)
+    rotation = holder_rotation(key, enrollment.holder_salt, K)
     return stored_template(enrollment).turned_by(rotation.turned_back)
 
 
@@ -201,7 +203,7 @@ class FakePack:
 def test_photos_are_embedded_and_enrolled(contract: Contract, enroller: Enroller) -> None:
     enrollment = enroller.from_photos(FakePack(contract), [b"\x00", b"\x01"])  # type: ignore[arg-type]
     assert [(r.index, r.quality) for r in enrollment.per_photo] == [(0, "good"), (1, "good")]
-    mean = unit((PHOTOS[0] + PHOTOS[1])[None])
+    mean = projected(unit(PHOTOS[0] + PHOTOS[1]))[None]
     assert stored_template(enrollment).contains(mean, tol=2e-3).all()
 
 
@@ -233,7 +235,8 @@ def test_another_pack_is_refused_naming_both_sides(
 
 
 def test_another_source_or_rotation_is_refused(contract: Contract) -> None:
-    other = DecoyPool(PHOTOS)
+    people = draw_people(400, photos=(1,), seed=102).descriptors
+    other = DecoyGenerator.fit(people).reduced(K)
     with pytest.raises(ContractMismatch, match=other.source_id[:16]):
         Enroller(contract, other, rotation=ROTATION, lift_secret=LIFT_SECRET)
     with pytest.raises(ContractMismatch, match="turns 8"):
@@ -241,15 +244,15 @@ def test_another_source_or_rotation_is_refused(contract: Contract) -> None:
 
 
 def client_template(contract: Contract, *, m: int = M) -> AffineSubspace:
-    return lift(PHOTOS[:1], strategy=contract.binding.strategy, m=m, source=make_generator())[0]
+    return lift(POINTS[:1], strategy=contract.binding.strategy, m=m, source=make_generator())[0]
 
 
 def test_a_clients_template_is_rotated_and_kept(contract: Contract, enroller: Enroller) -> None:
     sent = client_template(contract)
     enrollment = enroller.from_template(wire.encode(sent, contract_id=contract.contract_id))
     assert enrollment.per_photo == ()
-    assert stored_template(enrollment).contains(PHOTOS[:1], tol=3e-3).all()
-    assert not wire.decode(enrollment.wire).subspace.contains(PHOTOS[:1], tol=0.3).any()
+    assert stored_template(enrollment).contains(POINTS[:1], tol=3e-3).all()
+    assert not wire.decode(enrollment.wire).subspace.contains(POINTS[:1], tol=0.3).any()
 
 
 def test_a_clients_basis_is_replaced_by_a_random_one_of_the_same_set(
@@ -275,9 +278,9 @@ def test_clients_templates_that_break_the_contract_are_refused(
     good = client_template(contract)
     with pytest.raises(ContractMismatch, match="the template belongs to the contract dddd"):
         enroller.from_template(wire.encode(good, contract_id="d" * 64))
-    with pytest.raises(InvalidTemplate, match="m = 6, not n = 64 and m = 5"):
+    with pytest.raises(InvalidTemplate, match="60 numbers and m = 6, not 60 and m = 5"):
         enroller.from_template(wire.encode(client_template(contract, m=5), contract_id=contract_id))
-    central = AffineSubspace(np.zeros(N, dtype=np.float32), good.basis)
+    central = AffineSubspace(np.zeros(K, dtype=np.float32), good.basis)
     with pytest.raises(InvalidTemplate, match="foot point is outside the range"):
         enroller.from_template(wire.encode(central, contract_id=contract_id))
     with pytest.raises(InvalidTemplate):
@@ -308,17 +311,19 @@ def test_hybrid_plus_takes_attributes_and_does_without() -> None:
     result = calibrate(
         people.descriptors,
         people.names,
-        binding=make_binding(pool.source_id, strategy=Strategy.HYBRID_PLUS),
+        binding=make_binding(pool.source_id, strategy=Strategy.HYBRID_PLUS, axes=N),
         source=pool,
         options=CalibrationOptions(targets=(1e-1,)),
         attributes=[labels[0]] * len(people.names),
     )
     contract = dataclasses.replace(result.contract, photo_consistency=-1.0)
-    enroller = Enroller(contract, pool, rotation=ROTATION, lift_secret=LIFT_SECRET)
+    rotation = tenant_rotation(N)
+    enroller = Enroller(contract, pool, rotation=rotation, lift_secret=LIFT_SECRET)
     entries = draw_people(200, photos=(1,), seed=101).descriptors
 
     def decoys(attributes: Attributes | None) -> list[Attributes]:
-        template = stored_template(enroller.from_embeddings(PHOTOS[:3], attributes=attributes))
+        enrollment = enroller.from_embeddings(PHOTOS[:3], attributes=attributes)
+        template = stored_template(enrollment, rotation)
         inside = np.flatnonzero(template.contains(entries, tol=5e-3))
         assert len(inside) == M // 2  # the decoys; the other directions are random
         return [labels[i % 2] for i in inside.tolist()]

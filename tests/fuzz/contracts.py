@@ -10,7 +10,7 @@ from templates.contract.document import Contract, _seal_context
 from templates.errors import ContractError
 from tests.fuzz.documents import deep, hostile, twisted, written
 from tests.fuzz.mutations import mutated
-from tests.fuzz.tensors import SEALER, hostile_tensors, repeatable
+from tests.fuzz.tensors import SEALER, repeatable
 from tests.templates.contract.test_contract import make_contract
 
 
@@ -55,7 +55,7 @@ class Contracts:
             document = changed if isinstance(changed, dict) else document
         inside = self.plain
         if rng.random() < 0.7:
-            inside = hostile_tensors(rng, inside, [inside])
+            inside = mutated(rng, inside, [inside])
         try:
             plain = json.loads(written(rng, document))
             context = _seal_context(plain)

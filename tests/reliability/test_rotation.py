@@ -13,8 +13,9 @@ import pytest
 
 from api.process.opening import open_keyring, open_store
 from api.process.runtime import Runtime
+from templates.store import Source
+from templates.store.audit_log import By
 from tests.api.deployment import Deployment, bearer, deploy, images, photo
-from tests.api.earlier_rotation import enroll_earlier
 from tests.patience import PATIENCE_S
 from tests.ports import free_port
 from tests.reliability.service import ROOT, Service
@@ -130,7 +131,18 @@ def test_a_running_service_is_moved_by_one_command_killed_ten_times(
     )
     runtime = Runtime.open(deployment.settings)
     try:
-        enroll_earlier(runtime, PEOPLE)
+        enroller = runtime.enroller("default", 1)
+        for name, person in PEOPLE.items():
+            enrollment = enroller.from_photos(runtime.required_pack(), [photo(person)])
+            runtime.put(
+                "default",
+                name,
+                1,
+                enrollment,
+                source=Source.PHOTOS,
+                photos=1,
+                by=By("an operator"),
+            )
     finally:
         runtime.close()
     store = open_store(deployment.settings, open_keyring(deployment.settings))

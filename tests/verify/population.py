@@ -10,12 +10,10 @@ from templates.decoys import DecoyGenerator
 from templates.keys.randomness import Keystream
 from templates.keys.rotation import ROTATION_VERSION
 from templates.space.lifting import Strategy, lift
-from templates.space.subspace import SubspaceBatch
+from templates.space.subspace import AffineSubspace, SubspaceBatch
 from verify import CalibrationOptions, calibrate
-from verify.cohort import people_like
-from verify.strangers import make_nobody
 
-N, M = 64, 8
+N, K, M = 64, 56, 8
 PHOTOS = 3
 PEOPLE = 400
 Floats = NDArray[np.float32]
@@ -42,20 +40,18 @@ def enrolled(people: int, *, seed: int) -> Floats:
 
 @functools.cache
 def decoys() -> DecoyGenerator:
-    return DecoyGenerator.fit(photos_of(800, 1, seed=1)[:, 0])
+    return DecoyGenerator.fit(photos_of(800, 1, seed=1)[:, 0]).reduced(K)
 
 
 def templates_of(descriptors: Floats, *, seed: int) -> SubspaceBatch:
+    points = decoys().project(descriptors)
     with Keystream.seeded("population", seed) as stream:
-        return lift(descriptors, strategy=Strategy.ADVERSARIAL, m=M, source=decoys(), stream=stream)
+        return lift(points, strategy=Strategy.ADVERSARIAL, m=M, source=decoys(), stream=stream)
 
 
 @functools.cache
 def contract() -> Contract:
-    """A contract, calibrated as `veilface calibrate` does; its secrets are drawn of a seed."""
-    hidden = people_like(decoys(), enrolled(PEOPLE, seed=2))
-    with Keystream.seeded("population", "secrets") as stream:
-        nobody = make_nobody(decoys(), strangers=(hidden,), stream=stream)
+    """A contract, calibrated as `veilface calibrate` does; its secret is a constant."""
     return calibrate(
         photos_of(PEOPLE, PHOTOS + 1, seed=2).reshape(-1, N),
         [f"p{i}" for i in range(PEOPLE) for _ in range(PHOTOS + 1)],
@@ -63,12 +59,23 @@ def contract() -> Contract:
             embedder_sha256="ab" * 32,
             preprocessing={"size": 112},
             n=N,
+            axes=K,
             strategy=Strategy.ADVERSARIAL,
             m=M,
             decoy_source_id=decoys().source_id,
             rotation_version=ROTATION_VERSION,
         ),
         source=decoys(),
-        nobody=nobody,
+        cohort_seed=bytes(range(32)),
         options=CalibrationOptions(targets=(1e-2, 1e-3), most_cells=100_000),
     ).contract
+
+
+def wolf() -> AffineSubspace:
+    """The leading axes of faces, with a foot point along their mean, as honest templates have."""
+    mean = decoys().mean.astype(np.float64)
+    axes = np.eye(K)[:M]
+    foot = mean - axes.T @ (axes @ mean)
+    low, high = contract().template_foot_point_norm
+    foot *= (low + high) / 2 / np.linalg.norm(foot)
+    return AffineSubspace(foot.astype(np.float32), axes.astype(np.float32))

@@ -1,5 +1,6 @@
 """Synthetic people: descriptors that cluster by person, and contracts calibrated on them."""
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,8 @@ from templates.space.lifting import Strategy
 from verify import Calibrated, CalibrationOptions, calibrate
 
 N = 64
+K = 60
+"""Axes that embeddings are projected on."""
 M = 6
 LIFT_SECRET = bytes(range(32))
 
@@ -44,8 +47,10 @@ def draw_people(
     return People(rows, [f"person-{seed}-{i:04d}" for i in owner])
 
 
-def make_generator(n: int = N) -> DecoyGenerator:
-    return DecoyGenerator.fit(draw_people(400, photos=(1,), n=n, seed=101).descriptors)
+@functools.cache
+def make_generator(n: int = N, k: int = K) -> DecoyGenerator:
+    people = draw_people(400, photos=(1,), n=n, seed=101)
+    return DecoyGenerator.fit(people.descriptors).reduced(min(n, k))
 
 
 def make_pool(n: int = N) -> DecoyPool:
@@ -53,12 +58,13 @@ def make_pool(n: int = N) -> DecoyPool:
 
 
 def make_binding(
-    source_id: str, *, strategy: Strategy = Strategy.ADVERSARIAL, m: int = M
+    source_id: str, *, strategy: Strategy = Strategy.ADVERSARIAL, m: int = M, axes: int = K
 ) -> Binding:
     return Binding(
         embedder_sha256="ab" * 32,
         preprocessing={"size": 112, "mean": [127.5, 127.5, 127.5], "flip": False},
         n=N,
+        axes=axes,
         strategy=strategy,
         m=m,
         decoy_source_id=source_id,
@@ -89,12 +95,22 @@ def calibrate_people(
     )
 
 
-def tenant_rotation(n: int = N, seed: int = 5) -> TenantRotation:
+def tenant_rotation(n: int = K, seed: int = 5) -> TenantRotation:
     """Gives the templates of one tenant their rotations."""
     return TenantRotation(seed.to_bytes(32), n)
 
 
-def random_rotation(n: int = N, seed: int = 5) -> NDArray[np.float64]:
+def random_rotation(n: int = K, seed: int = 5) -> NDArray[np.float64]:
     """Haar-distributed orthogonal matrix, by QR."""
     q, r = np.linalg.qr(np.random.default_rng(seed).normal(size=(n, n)))
     return np.asarray(q * np.sign(np.diagonal(r)))
+
+
+def embeddings_of(points: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Embeddings (P, n) whose coordinates along the axes of :func:`make_generator` are given."""
+    return np.asarray(points @ make_generator().axes.T, dtype=np.float32)
+
+
+def projected(descriptor: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Coordinates (K,) of one embedding."""
+    return make_generator().project(descriptor[None])[0]

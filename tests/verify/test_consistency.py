@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from templates.errors import ContractError
 from templates.space.agreement import weakest_split
 from tests.verify.synthetic import People, draw_people
 from verify.consistency import Consistency, match_cosine, photo_consistency
@@ -48,9 +47,10 @@ def test_strangers_set_it_where_photos_of_one_person_are_all_alike() -> None:
     assert found.refused.errors == 0
 
 
-def test_a_photo_that_everybody_has_only_once_gives_no_limit() -> None:
-    with pytest.raises(ContractError, match="two photos"):
-        limit(draw_people(20, photos=(1,)))
+def test_where_nobody_has_two_photos_strangers_set_the_limit() -> None:
+    found = limit(draw_people(60, photos=(1,)))
+    assert found.threshold == found.probe_threshold
+    assert found.refused.trials == 0
 
 
 def test_people_with_two_photos_do_where_nobody_has_three() -> None:

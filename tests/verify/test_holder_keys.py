@@ -11,10 +11,19 @@ import verify.verifier
 from enroll import Enroller, Enrollment, Holder
 from templates.contract import wire
 from templates.contract.document import Contract
+from templates.distances import Metric
 from templates.keys.rotation import SignedCosineRotation, holder_rotation
 from templates.space.lifting import lift
 from templates.space.subspace import AffineSubspace
-from tests.verify.synthetic import N, draw_people, make_generator, tenant_rotation, unit
+from tests.verify.synthetic import (
+    K,
+    draw_people,
+    embeddings_of,
+    make_generator,
+    projected,
+    tenant_rotation,
+    unit,
+)
 from verify import Calibrated, Decision, StandIn, Verifier, lift_stand_in
 
 KEY, OTHER = bytes(range(32)), bytes(range(1, 33))
@@ -36,7 +45,7 @@ def contract(calibrated: Calibrated) -> Contract:
         for entry in made.calibrations
     )
     return dataclasses.replace(
-        made, calibrations=strict, photo_consistency=-1.0, template_stranger_score=99.0
+        made, calibrations=strict, photo_consistency=-1.0, template_stranger_similarity=99.0
     )
 
 
@@ -47,7 +56,7 @@ def enroller(contract: Contract) -> Enroller:
 
 @pytest.fixture(scope="module")
 def verifier(contract: Contract) -> Verifier:
-    return Verifier(contract, rotation=ROTATION)
+    return Verifier(contract, make_generator(), rotation=ROTATION)
 
 
 @pytest.fixture(scope="module")
@@ -56,9 +65,9 @@ def keyed(enroller: Enroller) -> Enrollment:
 
 
 def lifted_by_a_client(contract: Contract, descriptor: NDArray[np.float32], m: int) -> bytes:
-    template = lift(
-        descriptor[None], strategy=contract.binding.strategy, m=m, source=make_generator()
-    )
+    source = make_generator()
+    points = source.project(descriptor[None])
+    template = lift(points, strategy=contract.binding.strategy, m=m, source=source)
     return wire.encode(template[0], contract_id=contract.contract_id)
 
 
@@ -69,7 +78,7 @@ def without_tenant(enrollment: Enrollment) -> AffineSubspace:
 
 def without_both(enrollment: Enrollment, key: bytes) -> AffineSubspace:
     assert enrollment.holder_salt is not None
-    rotation = holder_rotation(key, enrollment.holder_salt, N)
+    rotation = holder_rotation(key, enrollment.holder_salt, K)
     return without_tenant(enrollment).turned_by(rotation.turned_back)
 
 
@@ -80,7 +89,7 @@ def spherical(probe: NDArray[np.floating], template: AffineSubspace) -> float:
 
 
 def test_the_tenants_key_alone_does_not_turn_a_template_back(keyed: Enrollment) -> None:
-    face = PEOPLE[:1].astype(np.float64)
+    face = projected(PEOPLE[0])[None].astype(np.float64)
     assert not without_tenant(keyed).contains(face, tol=0.3).any()
     assert not without_both(keyed, OTHER).contains(face, tol=0.3).any()
     assert without_both(keyed, KEY).contains(face, tol=3e-3).all()
@@ -90,7 +99,11 @@ def test_two_enrollments_under_one_key_are_turned_differently(enroller: Enroller
     first, second = (enroller.from_embeddings(PEOPLE[:1], holder=HOLDER) for _ in range(2))
     assert first.holder_salt != second.holder_salt
     exchanged = dataclasses.replace(first, holder_salt=second.holder_salt)
-    assert not without_both(exchanged, KEY).contains(PEOPLE[:1].astype(float), tol=0.3).any()
+    assert (
+        not without_both(exchanged, KEY)
+        .contains(projected(PEOPLE[0])[None].astype(float), tol=0.3)
+        .any()
+    )
 
 
 def test_the_key_accepts_and_another_or_none_does_not(
@@ -100,8 +113,9 @@ def test_the_key_accepts_and_another_or_none_does_not(
     right = verifier.decide_embedding(probe, keyed, holder_key=bytearray(KEY))
     assert (right.accepted, right.reason) == (True, "match")
     # Against the definition: the template turned back, and what is expected of the probe as it is.
-    similarity = spherical(probe, without_both(keyed, KEY))
-    means, spreads = contract.expectation.statistics(probe[None])
+    similarity = spherical(projected(probe), without_both(keyed, KEY))
+    nobody = contract.nobody(make_generator())
+    means, spreads = nobody.statistics(projected(probe)[None], Metric.SPHERICAL)
     assert right.similarity == pytest.approx(similarity, abs=1e-4)
     assert right.score == pytest.approx((similarity - means[0]) / spreads[0], abs=1e-2)
     for key in (OTHER, None):
@@ -115,8 +129,8 @@ def test_without_the_key_no_score_is_enough(verifier: Verifier, keyed: Enrollmen
     """Not even that of a probe made to lie in the template as it is turned without a key."""
     template = without_tenant(keyed)
     inside = unit((template.foot + template.radius * template.basis[0])[None])[0]
-    unturned = verify.verifier.holder_rotation(verifier._nobodys_key, str(keyed.holder_salt), N)
-    probe = unit(unturned.turned_back(inside[None].astype(np.float64)))[0]
+    unturned = verify.verifier.holder_rotation(verifier._nobodys_key, str(keyed.holder_salt), K)
+    probe = embeddings_of(unit(unturned.turned_back(inside[None].astype(np.float64))))[0]
     decision = verifier.decide_embedding(probe, keyed)
     assert decision.similarity > 0.99
     assert (decision.accepted, decision.reason) == (False, "no_match")
@@ -128,7 +142,7 @@ def test_a_thief_who_may_send_embeddings_chooses_a_key(
     """What the key does not protect from: template and rotation key were stolen."""
     template, salt = without_tenant(keyed), str(keyed.holder_salt)
     inside = unit((template.foot + template.radius * template.basis[0])[None])
-    probe = holder_rotation(OTHER, salt, N).turned_back(inside.astype(np.float64))[0]
+    probe = embeddings_of(holder_rotation(OTHER, salt, K).turned_back(inside.astype(np.float64)))[0]
     assert verifier.decide_embedding(probe, keyed, holder_key=OTHER).accepted
 
 
@@ -148,7 +162,7 @@ def test_clients_templates_and_lifted_probes_need_it_too(
     data = lifted_by_a_client(contract, PEOPLE[0], contract.binding.m)
     enrollment = enroller.from_template(data, holder=HOLDER)
     turned_back = without_both(enrollment, KEY)
-    assert turned_back.contains(PEOPLE[:1].astype(float), tol=3e-3).all()
+    assert turned_back.contains(projected(PEOPLE[0])[None].astype(float), tol=3e-3).all()
     probe = lifted_by_a_client(contract, PEOPLE[0], 2)
     keyless = enroller.from_template(data)
     as_before = verifier.decide_template(probe, keyless)
@@ -197,7 +211,7 @@ def test_the_holders_rotation_is_derived_and_applied_always(
 
     monkeypatch.setattr(verify.verifier, "holder_rotation", counted)
     probe = lifted_by_a_client(contract, PEOPLE[0], 2)
-    nobody = StandIn(keyed.wire, lift_stand_in(contract, bytes(32)))
+    nobody = StandIn(keyed.wire, lift_stand_in(contract.nobody(make_generator()), bytes(32)))
     answers: set[tuple[bool, str]] = set()
 
     def note(decision: Decision) -> None:

@@ -71,9 +71,9 @@ def test_a_part_of_the_people_of_the_fit_is_refused_where_faces_are_few() -> Non
 def test_people_of_the_fit_do_not_correlate_along_its_axes() -> None:
     """The axes are the eigenvectors of their covariance; by chance the measure is 1."""
     people, others = drawn(200), drawn(200, photos=1, seed=3)
-    statistics = DecoyGenerator.fit(people.descriptors).statistics
-    assert memory(statistics, people.descriptors).correlation < 0.01
-    assert memory(statistics, others.descriptors).correlation > 1.0
+    generator = DecoyGenerator.fit(people.descriptors)
+    assert memory(generator, people.descriptors).correlation < 0.01
+    assert memory(generator, others.descriptors).correlation > 1.0
 
 
 def test_a_pool_that_holds_the_people_is_refused_by_other_photos_of_them_too() -> None:

@@ -46,6 +46,7 @@ def test_real_people_are_told_apart(mbf_pack_dir: Path, lfw_aligned: Path, m: in
             embedder_sha256=pack.info.embedder_sha256,
             preprocessing=pack.info.preprocessing,
             n=pack.info.n,
+            axes=source.k,
             strategy=Strategy.ADVERSARIAL,
             m=m,
             decoy_source_id=source.source_id,

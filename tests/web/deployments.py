@@ -25,7 +25,7 @@ from tests.web.served import Served, serving
 DECOY_FACES = 110
 PEOPLE = 32
 SMALL = Scale(
-    enrolled=2, strangers=1, decoy_people=110, calibration_people=28, calibration_photos=4
+    enrolled=2, strangers=1, decoy_people=110, calibration_people=50, calibration_photos=4
 )
 WHO, OTHER = "Ashanti", "Antonio_Palocci"
 ANNA = 1

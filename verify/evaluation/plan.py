@@ -113,6 +113,9 @@ def units_of(plan: EvaluationPlan, sources: Sequence[Source], *, n: int) -> list
         else:
             strategy = Strategy(name)
             _check_dims(strategy, plan.dims, n)
+            places = _fitting(strategy, sources, plan)
+            for place in places:
+                _check_dims(strategy, plan.dims, n if place is None else sources[place].k)
             units += [
                 LiftUnit(
                     strategy=strategy,
@@ -125,7 +128,7 @@ def units_of(plan: EvaluationPlan, sources: Sequence[Source], *, n: int) -> list
                     device=plan.device,
                     seed=seed,
                 )
-                for source in _fitting(strategy, sources, plan)
+                for source in places
                 for m in plan.dims
                 for seed in seeds
             ]

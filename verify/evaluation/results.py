@@ -233,6 +233,7 @@ def contract_id(model: Model, cell: Cell, source: Source | None) -> str | None:
         embedder_sha256=model.embedder_sha256,
         preprocessing=model.preprocessing,
         n=model.n,
+        axes=source.k,
         strategy=Strategy(cell.strategy),
         m=cell.dim,
         decoy_source_id=source.source_id,

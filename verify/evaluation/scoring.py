@@ -136,7 +136,12 @@ def _lifted(
     ):
         for rows in _tiles(len(material), unit.m):
             photos = material.first[rows], material.second[rows]
-            points = tuple(material.descriptors[side] for side in photos)
+            points = tuple(
+                material.descriptors[photo]
+                if source is None
+                else source.project(material.descriptors[photo])
+                for photo, source in zip(photos, decoys, strict=True)
+            )
             batches = tuple(
                 lift(
                     points[side],

@@ -128,7 +128,7 @@ HOW_TO_READ = """## How to read this
 - FNMR at FMR: the threshold lets at most that share of impostor pairs through on all folds together; in brackets the 95 % interval (bootstrap by subject where the people are known, else bootstrap of pairs, both never narrower than Wilson's), in parentheses errors (mean over runs) of trials.
 - p-to-s compares a raw probe with a lifted template, s-to-s two lifted ones; p-to-s rows average the metrics of lifting either side. m is the dimension of the subspace; the spherical distance uses that descriptors have norm 1.
 - Collision floor: the share of impostor pairs expected to share decoys and so to be at distance 0; no threshold brings the FMR below it. Collisions are impostor pairs seen closer than 1e-3.
-- Rows of mlp-hash are of a reconstruction from the published description (docs/evaluation-columns.md).
+- Rows of mlp-hash are of a reconstruction from the published description (docs/evaluation.md).
 - Failures to acquire are in none of these rates; FAR and FRR, which count them, thresholds per fold and full precision are in results.csv, single runs in results.json. "-" means not measured."""  # noqa: E501
 
 

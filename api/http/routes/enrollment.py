@@ -101,7 +101,6 @@ async def enroll(
     async with gate.admitted(caller.prefix):
         if is_form(request):
             runtime.required_pack()
-            runtime.require_decoys()
             form = await sent_form(
                 request, settings, field="images", max_images=settings.max_images
             )

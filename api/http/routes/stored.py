@@ -65,7 +65,7 @@ async def get_stored(
     form, norm = read
     record = form.template.record
     binding = runtime.contract.binding
-    strategy, current = binding.strategy, record.contract_id in binding.contract_ids
+    strategy, current = binding.strategy, record.contract_id == binding.contract_id
     return answer(
         request,
         {

@@ -121,7 +121,7 @@ def _described(record: SubjectRecord, binding: Binding) -> dict[str, Any]:
         "subject_id": record.subject_id,
         "template_id": record.template_id,
         "contract_id": record.contract_id,
-        "current": record.contract_id in binding.contract_ids,
+        "current": record.contract_id == binding.contract_id,
         "enrolled_by": str(record.source),
         "photos": record.photos,
         "storage": str(record.storage),

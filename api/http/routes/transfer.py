@@ -103,7 +103,7 @@ async def import_subject(
                 data,
                 key=runtime.export_key,
                 tenant=caller.tenant,
-                contract_ids=runtime.contract.binding.contract_ids,
+                contract_id=runtime.contract.contract_id,
             )
         )
         subject = checked_subject_id(exported.subject_id)

@@ -148,7 +148,7 @@ def _decide_and_record(
     runtime: Runtime, caller: Caller, subject: str, probe: Probe, who: By
 ) -> Decision:
     """Decide and record; a template that was replaced or erased meanwhile accepts nobody."""
-    attempts, contract_ids = runtime.store.attempts, runtime.contract.binding.contract_ids
+    attempts, contract_id = runtime.store.attempts, runtime.contract.contract_id
 
     def compare(attempt: Attempt) -> Decision:
         return _decided(probe, _opened(runtime, caller, subject, attempt))
@@ -161,7 +161,7 @@ def _decide_and_record(
                 attempt = attempts.begin(
                     caller.tenant,
                     subject,
-                    contract_ids=contract_ids,
+                    contract_id=contract_id,
                     nonce=probe.nonce,
                     held_template=probe.held_template,
                 )
@@ -173,7 +173,7 @@ def _decide_and_record(
                     subject,
                     accepted=decision.accepted,
                     template_id=attempt.template_id,
-                    contract_ids=contract_ids,
+                    contract_id=contract_id,
                     level=decision.level,
                     nonce=probe.nonce,
                     by=who,
@@ -183,7 +183,7 @@ def _decide_and_record(
         caller.tenant,
         subject,
         compare,
-        contract_ids=contract_ids,
+        contract_id=contract_id,
         nonce=probe.nonce,
         held_template=probe.held_template,
         by=who,

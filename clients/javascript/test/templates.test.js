@@ -9,41 +9,45 @@ import {
   encode,
   float16,
   InconsistentImages,
-  Keystream,
   LiftingError,
   meanEmbedding,
+  Randomness,
   weakestSplit,
 } from "../dist/index.js";
 import { orthonormalised, rowsOf, templateThrough } from "../dist/templates/subspace.js";
 
 const dot = (a, b) => a.reduce((sum, value, i) => sum + value * b[i], 0);
 
-test("the keystream is ChaCha20 (RFC 8439, appendix A.1, test vector 1)", () => {
-  const stream = new Keystream(new Uint8Array(32));
-  const word = Number(BigInt("0x903df1a0ade0b876") >> 11n) * 2 ** -53; // its first eight bytes
-  const [first] = stream.uniform(1);
-  // 76 b8 e0 ad a0 f1 3d 90, little-endian
-  assert.equal(first, word);
+/** Random bits that come again: a linear congruential generator (Numerical Recipes, 1992, §7.1). */
+function repeating(seed) {
+  let state = seed;
+  return new Randomness((words) => {
+    for (let i = 0; i < words.length; i++) words[i] = state = (Math.imul(state, 1664525) + 1013904223) >>> 0;
+  });
+}
+
+test("samples are made of all 53 bits, and fit their distributions at the edges", () => {
+  const all = (word) => new Randomness((words) => words.fill(word));
+  assert.equal(all(0).uniform(1, -1)[0], -1);
+  assert.equal(all(0xffffffff).uniform(1)[0], 1 - 2 ** -53);
+  assert.equal(all(0).normal(1)[0], -0);
+  assert.ok(Math.abs(all(0xffffffff).normal(1)[0] - Math.sqrt(106 * Math.LN2)) < 1e-12);
 });
 
-test("streams of the platform's generator differ, and end when they are destroyed", () => {
-  const [one, other] = [Keystream.fresh(), Keystream.fresh()];
-  assert.notEqual(one.uniform(1)[0], other.uniform(1)[0]);
-  assert.ok(!/[0-9]{3}/.test(inspect(one, { depth: 9 })), "its key is not printed");
-  one.destroy();
-  assert.throws(() => one.uniform(1), /destroyed/, "also what was left of its last block");
-  assert.throws(() => new Keystream(new Uint8Array(31)), RangeError);
+test("samples are of the platform's generator, also more than one call of it gives", () => {
+  const samples = new Randomness().uniform(20_000, -1, 1);
+  assert.equal(new Set(samples).size, samples.length);
+  assert.notEqual(new Randomness().normal(1)[0], new Randomness().normal(1)[0]);
 });
 
 test("a template contains its point, is orthonormal, and hides which directions made it", () => {
   const n = 24;
-  const draw = () => rowsOf(new Keystream(new Uint8Array(32).fill(3)).normal(6 * n), n);
-  const [point, ...directions] = draw();
+  const [point, ...directions] = rowsOf(repeating(3).normal(6 * n), n);
   const mixed = directions.map((row, i) =>
     i === 0 ? row : row.map((value, j) => value + 2 * directions[0][j]),
   );
   const templates = [directions, mixed].map((rows) =>
-    templateThrough(point, rows, new Keystream(new Uint8Array(32).fill(9))),
+    templateThrough(point, rows, repeating(9)),
   );
   const rows = rowsOf(Float64Array.from(templates[0].basis), n);
   rows.forEach((row, i) =>

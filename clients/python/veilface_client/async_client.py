@@ -4,7 +4,6 @@ import asyncio
 import os
 import ssl
 from collections.abc import AsyncIterator, Iterable, Mapping
-from pathlib import Path
 from types import TracebackType
 from typing import Self, TypeVar
 
@@ -160,12 +159,8 @@ class AsyncSession:
             case Wait(seconds):
                 await asyncio.sleep(seconds)
                 return None
-            case Work(function, stop):
-                try:
-                    return await asyncio.to_thread(function)
-                except asyncio.CancelledError:
-                    stop()
-                    raise
+            case Work(function):
+                return await asyncio.to_thread(function)
 
 
 class AsyncClient(AsyncSession):
@@ -235,36 +230,17 @@ class AsyncPrivateClient(AsyncSession):
         token: str,
         *,
         pack: str | os.PathLike[str],
-        command: str | os.PathLike[str] = "veilface",
         dim: int | None = None,
-        lift_limit_s: float = 120.0,
-        lift_environment: Mapping[str, str] | None = None,
         timeout: httpx.Timeout | float = DEFAULT_TIMEOUT,
         retries: Retries = DEFAULT_RETRIES,
         verify: ssl.SSLContext | bool = True,
         transport: httpx.AsyncBaseTransport | None = None,
     ) -> None:
         self._token = signing_token(token)
+        self._lifter = Lifter(pack, dim=dim)
         super().__init__(
             url, token, timeout=timeout, retries=retries, verify=verify, transport=transport
         )
-        self._lifter = Lifter(
-            pack,
-            command=command,
-            dim=dim,
-            limit_s=lift_limit_s,
-            environment=lift_environment,
-        )
-
-    @property
-    def folder(self) -> Path:
-        """Where contract and generator are kept until :meth:`close`."""
-        return self._lifter.folder
-
-    async def close(self) -> None:
-        """Close the connections, and remove the folder."""
-        self._lifter.close()
-        await super().close()
 
     async def enroll(
         self,

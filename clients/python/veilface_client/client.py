@@ -4,7 +4,6 @@ import os
 import ssl
 import time
 from collections.abc import Iterable, Iterator, Mapping
-from pathlib import Path
 from types import TracebackType
 from typing import Self, TypeVar
 
@@ -176,7 +175,6 @@ class Session:
                 time.sleep(seconds)
                 return None
             case Work(function):
-                # An interrupt reaches the function itself: nobody else must stop it.
                 return function()
 
 
@@ -287,7 +285,9 @@ class Client(Session):
 
 
 class PrivateClient(Session):
-    """Embeds and lifts on this machine, and sends private templates only.
+    """Embeds and lifts in this process, and sends private templates only.
+
+    Needs the extra ``private``; :class:`LiftUnavailable` where it is not installed.
 
     Parameters
     ----------
@@ -295,14 +295,8 @@ class PrivateClient(Session):
         As for :class:`Session`. The key needs the right ``embeddings``.
     pack
         The model pack of the service's contract.
-    command
-        The executable ``veilface``; a bare name is looked for on the path.
     dim
         Dimension of probes; None: the largest that the contract takes.
-    lift_limit_s
-        The longest that one lift may take, in seconds.
-    lift_environment
-        Variables that the command gets beside the few that every program needs.
     """
 
     def __init__(
@@ -311,36 +305,17 @@ class PrivateClient(Session):
         token: str,
         *,
         pack: str | os.PathLike[str],
-        command: str | os.PathLike[str] = "veilface",
         dim: int | None = None,
-        lift_limit_s: float = 120.0,
-        lift_environment: Mapping[str, str] | None = None,
         timeout: httpx.Timeout | float = DEFAULT_TIMEOUT,
         retries: Retries = DEFAULT_RETRIES,
         verify: ssl.SSLContext | bool = True,
         transport: httpx.BaseTransport | None = None,
     ) -> None:
         self._token = signing_token(token)
+        self._lifter = Lifter(pack, dim=dim)
         super().__init__(
             url, token, timeout=timeout, retries=retries, verify=verify, transport=transport
         )
-        self._lifter = Lifter(
-            pack,
-            command=command,
-            dim=dim,
-            limit_s=lift_limit_s,
-            environment=lift_environment,
-        )
-
-    @property
-    def folder(self) -> Path:
-        """Where contract and generator are kept until :meth:`close`."""
-        return self._lifter.folder
-
-    def close(self) -> None:
-        """Close the connections, and remove the folder."""
-        self._lifter.close()
-        super().close()
 
     def enroll(
         self,

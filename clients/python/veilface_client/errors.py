@@ -19,9 +19,8 @@
     │       └── Unavailable     no pack, no database, or too much to do
     ├── ConnectionFailed        no answer: .sent says whether the request may have been done
     ├── UnexpectedAnswer        an answer that is not the service's
-    └── LiftFailed              ``veilface lift`` on this machine: .status, .message
-        ├── LiftUnavailable     it cannot be started
-        └── LiftTimeout         it took too long
+    └── LiftFailed              no template was made on this machine: .message
+        └── LiftUnavailable     what makes it is not installed
 
 A code that this version does not know gives the class of its status. No error repeats the API key,
 a photo, or a template.
@@ -161,28 +160,21 @@ class UnexpectedAnswer(VeilfaceError):
 
 
 class LiftFailed(VeilfaceError):
-    """``veilface lift`` did not make a template.
+    """No template was made: photos, pack, contract or decoys do not serve.
 
     Attributes
     ----------
     message
-        The sentence that it wrote to stderr.
-    status
-        Its exit status; None where it gave none.
+        What is wrong, and the remedy.
     """
 
-    def __init__(self, message: str, *, status: int | None = None) -> None:
+    def __init__(self, message: str) -> None:
         super().__init__(message)
         self.message = message
-        self.status = status
 
 
 class LiftUnavailable(LiftFailed):
-    """The command cannot be started."""
-
-
-class LiftTimeout(LiftFailed):
-    """The command took longer than its limit."""
+    """The package ``veilface`` is not installed, or cannot be imported in this process."""
 
 
 FAMILIES: dict[str, type[ServiceError]] = {

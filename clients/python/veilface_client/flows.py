@@ -5,7 +5,7 @@ result::
 
     Send(call's request) ─▶ httpx.Response, or an httpx error thrown into the flow
     Wait(seconds)        ─▶ None
-    Work(function)       ─▶ what it returns; it blocks (files, the child process)
+    Work(function)       ─▶ what it returns; it blocks (files, lifting)
 
 ``client.py`` and ``async_client.py`` are its two drivers.
 """
@@ -44,10 +44,9 @@ class Wait:
 
 @dataclass(frozen=True, repr=False)
 class Work:
-    """Something that blocks, and what ends it from another thread when nobody waits any more."""
+    """Something that blocks."""
 
     function: Callable[[], Any]
-    stop: Callable[[], None] = lambda: None
 
 
 Flow = Generator[Send | Wait | Work, Any, T]

@@ -9,7 +9,7 @@ Photo = bytes | bytearray | memoryview | str | os.PathLike[str] | BinaryIO
 """The bytes of a picture file, its path, or a file that is open for reading in binary mode."""
 
 MAX_PHOTO_BYTES = 64 * 2**20
-"""The most that is read of one photo: what ``veilface lift`` takes; services take less."""
+"""The most that is read of one photo; services take less."""
 
 
 def read_photo(photo: Photo) -> bytes:

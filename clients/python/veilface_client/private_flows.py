@@ -6,7 +6,6 @@ from typing import TypeVar
 
 from veilface_client import calls, results
 from veilface_client.calls import Call, Face, Storage
-from veilface_client.child import Canceller
 from veilface_client.errors import ContractMismatch, UnexpectedAnswer, VeilfaceError
 from veilface_client.flows import Flow, Work, read_held_template, send
 from veilface_client.held_templates import HeldTemplate
@@ -113,18 +112,14 @@ def verify(
 def _probe(
     pictures: list[bytes], lifter: Lifter, inputs: LiftInputs, face: Face | None
 ) -> Flow[Probe]:
-    canceller = Canceller()
-    lift = partial(lifter.probe, inputs, pictures, face=face, canceller=canceller)
-    probe: Probe = yield Work(lift, canceller.cancel)
+    probe: Probe = yield Work(partial(lifter.probe, inputs, pictures, face=face))
     return probe
 
 
 def _enrollable(
     pictures: list[bytes], lifter: Lifter, inputs: LiftInputs, face: Face | None
 ) -> Flow[Enrollable]:
-    canceller = Canceller()
-    lift = partial(lifter.enrollment, inputs, pictures, face=face, canceller=canceller)
-    enrollable: Enrollable = yield Work(lift, canceller.cancel)
+    enrollable: Enrollable = yield Work(partial(lifter.enrollment, inputs, pictures, face=face))
     return enrollable
 
 

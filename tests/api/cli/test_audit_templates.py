@@ -5,7 +5,6 @@ import re
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -21,7 +20,6 @@ from api.process.opening import file_sealer, open_keyring
 from api.process.preparation import DEFAULT_DIM
 from api.settings import Settings
 from attacks.audit import AuditPlan, AuditResult
-from attacks.databases import link_databases
 from attacks.outcomes import Knowledge, Property
 from attacks.population import Population
 from attacks.stored import presentation
@@ -66,11 +64,6 @@ def on_small_material(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(attacks.system, "calibrate", fewer)
     patch.setattr(presentation, "TARGETS", 40)
     patch.setattr(presentation, "STARTS", 2)
-    patch.setattr(
-        attacks.audit,
-        "link_databases",
-        partial(link_databases, accounts=(30,), strangers=150, permutations=200),
-    )
 
 
 @pytest.fixture(scope="module")
@@ -83,6 +76,7 @@ def people(world: World, tmp_path_factory: pytest.TempPathFactory) -> Iterator[T
         *("audit", "templates", root / "people", "--pack", world.pack, "--data-dir", world.data),
         *("--aligned", "--cache", root / "people.cache", "--victims", "20", "--owners", "100"),
         *("--contract", world.data / "contract.json", "--no-learned"),
+        *("--climbed", "1", "--attempts", "50"),
     )
     populations: list[Population] = []
     systems: list[System] = []
@@ -105,8 +99,8 @@ def people(world: World, tmp_path_factory: pytest.TempPathFactory) -> Iterator[T
         patch.setattr(attacks.audit, "draw_population", recorded_population)
         patch.setattr(attacks.audit, "enroll_victims", recorded_enrollment)
         first = run(
-            *asked, "--no-comparison", "--climbed", "1", "--attempts", "50",
-            "--max-success-with-key", "0", "--out", root / "out", "--json",
+            *asked, "--no-comparison", "--max-success-with-key", "0",
+            "--out", root / "out", "--json",
         )  # fmt: skip
         assert "error: " not in first.stderr, first.stderr
         left = list((root / "temporary").iterdir())
@@ -136,13 +130,11 @@ def test_an_audit_of_templates_writes_report_and_figures(
 def is_as_documented(report: Any) -> None:
     members = documented()
     missing = members.keys() - report.keys()
-    assert missing <= {
-        name for name in members if re.match("`fairface`|with `--evaluation`", members[name])
-    }
+    assert missing <= {name for name in members if re.match("`fairface`", members[name])}
     assert report.keys() <= members.keys()
     assert (report["kind"], report["rows"]) == ("templates", [])
     assert report["limits"].keys() == {limit.name for limit in LIMITS}
-    scheme = {"strategy", "decoys", "dim"}
+    scheme = {"strategy", "decoys", "dim", "axes"}
     outcome_names = named_in("An outcome has") - {"errors"}
     for outcome in report["outcomes"]:
         assert outcome_names <= outcome.keys() | outcome["measured"].keys()
@@ -201,7 +193,7 @@ def test_what_two_attacks_found_becomes_report_verdict_and_status(
         (["--dim", "3"], ((3,), "hybrid"), "auditing hybrid templates of m = 3"),
         (["--strategy", "random"], ((DIM,), "random"), f"auditing random templates of m = {DIM}"),
         ([], ((DIM,), "hybrid"), f"auditing hybrid templates of m = {DIM}"),
-        (["--dim", "3", "--strategy", "random"], ((3,), "random"), None),
+        (["--dim", "3", "--strategy", "random", "--axes", "90"], ((3,), "random"), None),
     ],
 )
 def test_what_is_not_set_is_the_contracts(
@@ -213,7 +205,7 @@ def test_what_is_not_set_is_the_contracts(
     said: str | None,
 ) -> None:
     def served(*_: Any) -> Any:
-        return SimpleNamespace(m=DIM, strategy=Strategy.HYBRID)
+        return SimpleNamespace(m=DIM, strategy=Strategy.HYBRID, axes=100)
 
     monkeypatch.setattr(audit_templates, "_served", served)
     assert planned(world, tmp_path, monkeypatch, *given) == (plan, said)
@@ -230,7 +222,7 @@ def test_a_contract_that_cannot_be_read_stops_no_audit(
     assert said is not None
     assert said.startswith("not auditing as the contract")
     # Where nothing of it is needed, nothing is said of it.
-    every = ("--dim", "3", "--strategy", "random")
+    every = ("--dim", "3", "--strategy", "random", "--axes", "90")
     assert planned(world, tmp_path, monkeypatch, *every) == (((3,), "random"), None)
 
 
@@ -269,16 +261,9 @@ def test_a_contract_of_other_decoys_says_no_dimension(world: World) -> None:
 
 
 @pytest.mark.long
-def test_every_property_is_attacked_and_the_service_was_climbed(people_report: Any) -> None:
-    mine = [row for row in people_report["outcomes"] if row["decoys"] == "generator"]
-    properties = {row["property"] for row in mine}
+def test_every_property_is_attacked(people_report: Any) -> None:
+    properties = {row["property"] for row in people_report["outcomes"]}
     assert properties == set(map(str, Property)) - {str(Property.CONFIDENTIALITY)}
-    over_rest = [row for row in mine if row["variant"].endswith("over REST")]
-    assert {row["variant"].split(",")[0] for row in over_rest} == {
-        *("dictionary", "gradient", "regression"),
-    }
-    assert all(row["measured"]["trials"] == 1 for row in over_rest)
-    assert not any(row["judged"] for row in over_rest if row["variant"].startswith("dictionary"))
 
 
 @pytest.mark.long
@@ -294,9 +279,9 @@ def test_an_attack_that_exceeds_its_limit_is_status_1(
 
 @pytest.fixture(scope="module")
 def compared(people: TemplateAudit) -> Ran:
-    """The same without the service, beside decoys of real people, and with no limit."""
+    """The same beside decoys of real people, and with no limit."""
     most = [f"--max-{limit.name}=1" for limit in LIMITS if limit.name != "attribute-leakage"]
-    return run(*people.asked, "--no-service", *most, "--out", people.root / "compared")
+    return run(*people.asked, *most, "--out", people.root / "compared")
 
 
 @pytest.fixture(scope="module")
@@ -312,18 +297,8 @@ def test_the_seed_gives_the_outcomes_and_kept_limits_are_status_0(
     assert compared.status == 0
     assert compared.stdout.splitlines()[0] == "PASSED"
     assert f"{people.root / 'compared'}: report.json, report.md, linkage.png" in compared.stdout
-    expected = [
-        row for row in people_report["outcomes"] if not row["variant"].endswith("over REST")
-    ]
     found = [row for row in compared_report["outcomes"] if row["decoys"] == "generator"]
-
-    def drawn_by_seed(rows: list[Any]) -> list[Any]:
-        # The enroller's templates have random ids, which turn them before they are rounded.
-        return [row for row in rows if row["attack"] != "several-templates"]
-
-    assert drawn_by_seed(found) == drawn_by_seed(expected)
-    assert [row["variant"] for row in found] == [row["variant"] for row in expected]
-    assert len(found) < len(people_report["outcomes"])
+    assert found == people_report["outcomes"]
 
 
 @pytest.mark.long
@@ -331,12 +306,9 @@ def test_pools_are_compared_with_and_do_not_decide(compared: Ran, compared_repor
     audited, other = compared_report["verdicts"]
     assert (audited["decoys"], audited["comparison"]) == ("generator", False)
     assert (other["decoys"], other["comparison"]) == ("pool", True)
-    found: dict[str, list[float]] = {"generator": [], "pool": []}
-    for row in compared_report["outcomes"]:
-        if row["attack"] == "known-database" and (row["judged"] or "draws" in row["variant"]):
-            found[row["decoys"]].append(row["measured"]["value"])
-    assert max(found["pool"]) > 0.9
-    assert max(found["generator"]) < 0.2
+    (known,) = [row for row in compared_report["outcomes"] if row["attack"] == "known-database"]
+    assert known["decoys"] == "pool"
+    assert known["measured"]["value"] > 0.9
     assert "For comparison: " in compared.stdout
 
 
@@ -349,6 +321,7 @@ def test_the_service_of_the_contract_is_audited(people_report: Any, world: World
     schemes = {(row["strategy"], row["decoys"], row["dim"]) for row in people_report["outcomes"]}
     assert schemes == {(binding["strategy"], "generator", binding["m"])}
     levels = {level["name"] for each in known["calibrations"] for level in each["levels"]}
+    levels |= {"fmr-1e-3"}  # a match for second moments, whatever the contract resolves
     assert {row["level"] for row in people_report["outcomes"]} - {None} <= levels
 
 

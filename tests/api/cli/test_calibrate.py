@@ -6,13 +6,13 @@ from api.cli.calibrate import parse_dims, read_aliases
 from api.cli.errors import CommandError, UsageError
 from api.cli.verdict import improvements, verdict_lines
 from api.process.opening import file_sealer
-from attacks.operating_point import OperatingPoint
+from attacks.operating_point import OperatingPoint, Tried
 from models.demo import DEMO_NOTICE
 from templates.contract.document import Contract
 from templates.contract.verdict import Judgement, Verdict
 from templates.decoys import DecoyGenerator
 from templates.keys.sealing import MasterKeyring
-from tests.api.cli.conftest import DIM, PROBE_DIM, key_file, run
+from tests.api.cli.conftest import AXES, DIM, PROBE_DIM, key_file, run
 from verify.metrics import rate
 
 
@@ -21,9 +21,11 @@ def test_the_contract_is_what_serve_loads(world):
         world.data / "contract.json", file_sealer(MasterKeyring.load(key_file(world.data)))
     )
     assert contract.contract_id == world.calibrated["contract"]["contract_id"]
-    assert contract.binding.m == DIM
+    assert (contract.binding.axes, contract.binding.m) == (AXES, DIM)
     assert str(contract.binding.strategy) == "adversarial"
-    assert contract.binding.decoy_source_id == world.built["source_id"]
+    decoys = DecoyGenerator.load(world.data / "decoys.veil")
+    assert decoys.source_id == world.built["source_id"]
+    assert contract.binding.decoy_source_id == decoys.reduced(AXES).source_id
     assert [(entry.mode, entry.probe_m) for entry in contract.calibrations] == [
         ("p2s", 0),
         ("s2s", PROBE_DIM),
@@ -46,19 +48,20 @@ def test_people_who_are_left_out_are_not_attacked_either(world, veilface, tmp_pa
     listing = tmp_path / "names.txt"
     listing.write_text("person-6000\nperson-6001\n")
     ran = veilface(
-        *("calibrate", world.labelled, "--pack", world.pack, "--dim", "4", "--probe-dims", "none"),
-        *("--exclude-people", listing, "--out", tmp_path / "contract.json", "--json"),
+        *("calibrate", world.labelled, "--pack", world.pack, "--axes", "32", "--dim", "4"),
+        *("--probe-dims", "none", "--exclude-people", listing),
+        *("--out", tmp_path / "contract.json", "--json"),
     )
     assert ran.status == 0, ran.stderr
     for calibrated, people in ((world.calibrated, 25), (ran.json, 24)):
-        assert calibrated["contract"]["verdict"]["privacy"]["rate"]["trials"] == people
+        assert calibrated["contract"]["verdict"]["privacy"]["basis"]["victims"] == people
 
 
 def test_people_are_left_out_and_ten_fold_adds_a_level(world, veilface, data, tmp_path):
     listing = tmp_path / "names.txt"
     listing.write_text("person-6000\nperson-6001\n")
     ran = veilface(
-        *("calibrate", world.labelled, "--pack", world.pack, "--dim", "4"),
+        *("calibrate", world.labelled, "--pack", world.pack, "--axes", "32", "--dim", "4"),
         *("--exclude-people", listing, "--protocol", "ten-fold", "--strategy", "hybrid"),
         *("--out", tmp_path / "contract.json", "--photos", "2"),
     )
@@ -66,7 +69,7 @@ def test_people_are_left_out_and_ten_fold_adds_a_level(world, veilface, data, tm
     assert "accuracy" in ran.stdout
     assert DEMO_NOTICE in ran.stderr
     # Hybrid lifting with m = 4 has two decoys.
-    assert "\nPrivacy:  FAIL. A thief with " in ran.stdout
+    assert "\nPrivacy:  NOT SHOWN. The strongest thief, with " in ran.stdout
     contract = Contract.load(
         tmp_path / "contract.json", file_sealer(MasterKeyring.load(key_file(data)))
     )
@@ -91,9 +94,10 @@ def test_decoys_of_another_space_are_refused(world, veilface, data, tmp_path):
     ran = veilface(*base, "--flip")
     assert ran.status == 1
     assert "build the decoys with this pack and the same --flip" in " ".join(ran.stderr.split())
-    statistics = DecoyGenerator.load(data / "decoys.veil").statistics
+    decoys = DecoyGenerator.load(data / "decoys.veil")
+    parts = decoys.axes, decoys.mean, decoys.root
     for made_with, said in (("5a" * 32, "another model"), (None, "do not say which model")):
-        DecoyGenerator(statistics, made_with=made_with).save(tmp_path / "decoys.veil")
+        DecoyGenerator(*parts, made_with=made_with).save(tmp_path / "decoys.veil")
         ran = veilface(*base, "--decoys", tmp_path / "decoys.veil")
         assert ran.status == 1
         assert said in " ".join(ran.stderr.split())
@@ -118,16 +122,16 @@ def test_decoys_of_the_people_themselves_are_refused(world, veilface, tmp_path, 
     assert not (tmp_path / "contract.json").exists()
 
 
-def test_the_verdict_of_few_dimensions_is_a_fail(world):
-    """Half of the 50 people are attacked; at m = 8 half of a face is left."""
+def test_the_verdict_of_few_people_shows_nothing(world):
+    """Half of the 50 people are attacked; what was asked for was not chosen."""
     privacy = world.calibrated["contract"]["verdict"]["privacy"]
-    assert privacy["status"] == "FAIL"
-    assert privacy["rate"]["trials"] == 25
-    assert list(world.calibrated["privacy_by_dimension"]) == [str(DIM)]
+    assert privacy["status"] == "NOT SHOWN"
+    assert privacy["basis"]["victims"] == 25
+    assert (world.calibrated["chosen"], world.calibrated["tried"]) == ("asked for", [])
 
 
 @pytest.mark.long
-def test_the_dimension_is_searched_and_the_verdict_told_last(world, veilface, data, tmp_path):
+def test_axes_and_dimension_are_chosen_and_the_verdict_told_last(world, veilface, data, tmp_path):
     path = tmp_path / "contract.json"
     ran = veilface(
         *("calibrate", world.labelled, "--pack", world.pack, "--out", path),
@@ -135,64 +139,70 @@ def test_the_dimension_is_searched_and_the_verdict_told_last(world, veilface, da
     )
     assert ran.status == 0, ran.stderr
     contract = Contract.load(path, file_sealer(MasterKeyring.load(key_file(data))))
-    verdict, m = contract.verdict, contract.binding.m
+    verdict, binding = contract.verdict, contract.binding
     privacy, accuracy, groups = ran.stdout.splitlines()[-3:]
     shown = f"({verdict.privacy.rate.errors}/{verdict.privacy.rate.trials};"
-    assert privacy.startswith(f"Privacy:  {verdict.privacy.status}. A thief with ")
+    assert privacy.startswith("Privacy:  NOT SHOWN. The strongest thief, with ")
     assert shown in privacy
-    assert f"at m = {m}; limit 5 %. Not enough to pass: 25 people attacked with 100 " in privacy
+    assert f"at m = {binding.m} of {binding.axes} axes, and at most " in privacy
+    assert "limits 5 and 10 %. Not enough to pass: 25 people attacked with 100 " in privacy
     assert accuracy.startswith(f"Accuracy: {verdict.accuracy.status}. ")
     assert "limit 2 %." in accuracy
     assert groups.startswith("Groups:   not measured: ")
-    # So few people show nothing of any dimension.
-    (tried,) = [line for line in ran.stdout.splitlines() if "by dimension" in line]
-    assert "% at 192" in tried
-    assert m == 64
+    assert f"\nm = {binding.m} of {binding.axes} axes: " in ran.stdout
+    (tried,) = [line for line in ran.stdout.splitlines() if "is expected to find" in line]
+    assert f"m = {binding.m} of {binding.axes} axes " in tried
+
+
+def test_faces_that_nobody_labelled_set_thresholds_and_show_no_accuracy(
+    world, veilface, data, tmp_path
+):
+    faces, path = tmp_path / "faces", tmp_path / "contract.json"
+    faces.mkdir()
+    for number, photo in enumerate(sorted(world.labelled.glob("*/0.png"))):
+        (faces / f"{number}.png").write_bytes(photo.read_bytes())
+    (faces / "twice.png").write_bytes(sorted(world.labelled.glob("*/1.png"))[0].read_bytes())
+    ran = veilface(
+        *("calibrate", faces, "--pack", world.pack, "--axes", "32", "--dim", "8"),
+        *("--probe-dims", "none", "--out", path),
+    )
+    assert ran.status == 0, ran.stderr
+    contract = Contract.load(path, file_sealer(MasterKeyring.load(key_file(data))))
+    (calibration,) = contract.calibrations
+    # Some drawn people look alike, and one photo is of a person who is there already.
+    left = calibration.calibrated_on["people"]
+    assert 40 <= left <= 50
+    assert f"note: {51 - left} of 51 photos look like another one, and are left out" in ran.stderr
+    assert [level.fnmr.trials for level in calibration.levels] == [0] * len(calibration.levels)
+    assert contract.verdict.accuracy is None
+    assert contract.verdict.privacy.basis["victims"] == left // 2
+    assert "Accuracy: not measured: nobody has two photos." in ran.stdout
 
 
 def test_a_failed_verdict_says_what_would_help(world, data):
     contract = Contract.load(
         world.data / "contract.json", file_sealer(MasterKeyring.load(key_file(world.data)))
     )
-    bad = Judgement(rate(80, 400), 0.05, {**contract.verdict.privacy.basis, "attacker_faces": None})
-    weak = replace(
-        contract, verdict=Verdict(bad, replace(bad, basis=contract.verdict.accuracy.basis))
-    )
-    said = improvements(weak, OperatingPoint(8, tried={8: bad, 192: bad}))
-    assert "Templates that a thief finds a match for, by dimension: 20 % at 8, 20 % at 192." in said
-    assert any("--like PEOPLE`); no dimension that was tried is private." in line for line in said)
+    bad = Judgement(rate(80, 400), 0.05, {**contract.verdict.privacy.basis, "attacker_faces": 900})
+    accuracy = replace(bad, basis=contract.verdict.accuracy.basis)
+    weak = replace(contract, verdict=Verdict(bad, accuracy))
+    tried = (Tried(AXES, DIM, 0.2), Tried(AXES, 64, 0.04, rate(3, 50)))
+    point = OperatingPoint(AXES, DIM, "asked for", tried, bad)
+    said = improvements(weak, point)
+    assert said[0] == "m = 8 of 192 axes: asked for."
+    assert (
+        "Templates that a thief is expected to find a match for: m = 8 of 192 axes 20 %; "
+        "m = 64 of 192 axes 4 %, rejected 6 %."
+    ) in said
+    assert any("--like PEOPLE`)." in line for line in said)
     assert any("enroll and verify with more photos" in line for line in said)
     assert not any("--worst-group" in line for line in said)
-    assert not any(line.startswith("More faces") for line in said)
     (photos,) = [line for line in said if line.startswith("More photos: of ")]
     default = contract.calibration("p2s").level(contract.default_level)
     assert (
         f"{100 * max(default.fnmr_by_photos.values(), key=lambda one: one.trials).value:.3g} %"
         in photos
     )
-    bought = {
-        "attacker_faces": 2000,
-        "unlimited": {"found": rate(100, 400).to_json()},
-        "decoys_of_these_people": [
-            {"decoy_faces": 500, "thief_faces": 1000, "found": rate(50, 400).to_json()},
-            {"decoy_faces": 1000, "thief_faces": 1000, "found": rate(30, 400).to_json()},
-        ],
-        "twice_the_decoy_faces": 0.0432,
-    }
-    near = replace(weak.verdict, privacy=replace(bad, basis={**bad.basis, **bought}))
-    (faces,) = [
-        line
-        for line in improvements(replace(weak, verdict=near), OperatingPoint(8, tried={8: bad}))
-        if line.startswith("More faces")
-    ]
-    assert faces == (
-        "More faces: decoys of 500 and 1,000 photos of people like these instead of yours leave "
-        "12.5 and 7.5 % of the templates to a thief with 1,000 others; 2,000 would leave about "
-        "4.3 %, by extrapolation."
-    )
-    assert "Unlimited faces: about 25 %, on drawn people; not judged." in verdict_lines(near)[0]
-    plain = replace(near, privacy=replace(bad, basis={**bad.basis, "attacker_faces": 2000}))
-    assert " Unlimited faces are not simulated: " in verdict_lines(plain)[0]
     groups = replace(
         bad,
         basis={
@@ -204,7 +214,7 @@ def test_a_failed_verdict_says_what_would_help(world, data):
         },
     )
     uneven = replace(weak, verdict=replace(weak.verdict, groups=groups))
-    said = improvements(uneven, OperatingPoint(8, tried={8: bad}))
+    said = improvements(uneven, point)
     assert "--worst-group" in said[-1]
     assert verdict_lines(uneven.verdict)[-1].startswith("Groups:   FAIL. Worst is race x: 20 % (80")
     privacy, accuracy, _ = verdict_lines(weak.verdict)
@@ -215,7 +225,8 @@ def test_a_failed_verdict_says_what_would_help(world, data):
         " Not counted: 7 of 2,000 photos without a usable face."
     )
     assert privacy.startswith(
-        "Privacy:  FAIL. A thief with unlimited faces finds a match for 20 % (80/400;"
+        "Privacy:  FAIL. The strongest thief, with 900 faces of other people, finds a match for "
+        "20 % (80/400;"
     )
 
 
@@ -227,7 +238,8 @@ def test_labels_give_rates_by_group_and_thresholds_that_hold_in_each(
     (tmp_path / "labels.csv").write_text("\n".join(["path,kind", *rows]) + "\n")
     out = tmp_path / "contract.json"
     ran = veilface(
-        *("calibrate", world.labelled, "--pack", world.pack, "--dim", "8", "--probe-dims", "none"),
+        *("calibrate", world.labelled, "--pack", world.pack, "--axes", "32", "--dim", "8"),
+        *("--probe-dims", "none"),
         *("--labels", tmp_path / "labels.csv", "--worst-group", "--out", out),
     )
     assert ran.status == 0, ran.stderr
@@ -263,7 +275,8 @@ def test_groups_are_estimated_by_the_nearest_faces_of_fairface(world, veilface, 
         lines.append(f"train/{i}.png,{'20-29' if i % 2 else '3-9'},Female,Indian,True")
     (root / "fairface_label_train.csv").write_text("\n".join(lines) + "\n")
     ran = veilface(
-        *("calibrate", world.labelled, "--pack", world.pack, "--dim", "8", "--probe-dims", "none"),
+        *("calibrate", world.labelled, "--pack", world.pack, "--axes", "32", "--dim", "8"),
+        *("--probe-dims", "none"),
         *("--fairface", root, "--out", tmp_path / "contract.json", "--json"),
     )
     assert ran.status == 0, ran.stderr
@@ -316,8 +329,8 @@ def test_what_photos_of_one_enrollment_must_agree_to_is_told(world):
 def test_lifted_probes_are_left_out_where_they_are_not_wanted(world, veilface, data, tmp_path):
     path = tmp_path / "contract.json"
     ran = veilface(
-        *("calibrate", world.labelled, "--pack", world.pack, "--dim", "8", "--out", path),
-        *("--probe-dims", "none"),
+        *("calibrate", world.labelled, "--pack", world.pack, "--axes", "32", "--dim", "8"),
+        *("--probe-dims", "none", "--out", path),
     )
     assert ran.status == 0, ran.stderr
     contract = Contract.load(path, file_sealer(MasterKeyring.load(key_file(data))))

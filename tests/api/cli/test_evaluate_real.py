@@ -143,7 +143,7 @@ def test_crops_are_recognised_as_aligned(part: Part) -> None:
 
 
 def test_lifted_rows_have_the_order_of_the_paper(part: Part) -> None:
-    """More decoys cost accuracy, most where both are (docs/design-measurements.md §1.1)."""
+    """More decoys cost accuracy, most where both are."""
     auc = {
         (row["strategy"], row["dim"], row["mode"], row["metric"]): row["auc"]
         for row in part.ran.json["rows"]

@@ -84,7 +84,7 @@ def test_the_first_start_prints_a_key_once_and_sigterm_stops_it(world, data, tmp
     assert again.status == 0
     assert "vf_" not in again.stdout
     assert not warnings(again)
-    assert "Privacy:  FAIL. A thief with" in again.stderr
+    assert "Privacy:  NOT SHOWN. The strongest thief, with" in again.stderr
 
 
 @pytest.mark.parametrize(("rejected", "warned"), [(2, False), (3, True)])

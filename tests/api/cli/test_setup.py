@@ -86,7 +86,7 @@ def test_people_who_are_not_labelled_or_too_few_are_refused_with_the_reason(fold
     refused = run("setup", "few", "--faces", "faces", "--pack", "pack")
     assert refused.status == 1
     assert "Cannot be promised: any false match rate" in refused.stdout
-    assert "few resolves no false match rate" in refused.stderr
+    assert "few resolves no rate of false matches" in refused.stderr
     for more in ((), ("--dry-run",)):
         refused = run("setup", "few", "--faces", "faces", "--pack", "pack", "--json", *more)
         assert (refused.status, refused.json["people"], refused.json["can"]) == (1, 3, [])
@@ -163,7 +163,7 @@ def test_what_is_there_is_kept_and_the_rest_is_made(
     assert again.stderr.count("is there and kept") == 4
     assert "These are promises of a contract made anew." in again.stdout
     privacy, accuracy, _key, start, page, enroll, verify = again.stdout.splitlines()[-7:]
-    assert privacy.startswith("Privacy:  FAIL.")
+    assert privacy.startswith("Privacy:  NOT SHOWN.")
     assert accuracy.startswith("Accuracy: ")
     assert start == "Start it: veilface serve"
     assert page.endswith(f"open http://127.0.0.1:8421/ and sign in with the key in {token}")
@@ -341,6 +341,8 @@ def test_from_nothing_to_a_contract(folders: Path, monkeypatch: pytest.MonkeyPat
     def recorded(_description: str) -> Iterator[Callable[[float], None]]:
         yield shares.append
 
+    # So many that a threshold set on them holds for others.
+    draw(folders / "people", range(6025, 6050), range(2))
     shutil.copytree("people/person-6000", "people/Six, Thousand")
     with monkeypatch.context() as patch:
         patch.setattr(command, "_drop_caches", killed)
@@ -351,10 +353,10 @@ def test_from_nothing_to_a_contract(folders: Path, monkeypatch: pytest.MonkeyPat
     assert '"Six, Thousand",person-6000  1.000' in ran.stderr
     assert Path("veilface-data/contract.json").is_file()
     assert list(Path("veilface-data").glob("*.cache"))
-    # The search for the dimension counts too.
+    # The search for axes and dimension counts too: it takes the first 60 %.
     assert shares == sorted(shares)
     assert (shares[0], shares[-1]) == (0.0, 1.0)
-    assert len([share for share in shares if 0 < share < 0.2]) >= 3
+    assert len([share for share in shares if 0 < share < 0.6]) >= 3
     ran = setup("--accept-weak-privacy")
     assert ran.status == 0, ran.stderr
     assert "Start it: veilface serve" in ran.stdout

@@ -20,7 +20,7 @@ from tests.api.cli.conftest import run
 # Strangers come last. With four, no single one that is accepted by chance keeps both of the first
 # two subjects from five rejections in a row.
 SMALL = Scale(
-    enrolled=3, strangers=4, decoy_people=150, calibration_people=30, calibration_photos=4
+    enrolled=3, strangers=4, decoy_people=150, calibration_people=50, calibration_photos=4
 )
 
 

@@ -23,7 +23,8 @@ def deployment(tmp_path_factory: pytest.TempPathFactory) -> Deployment:
 
 
 def made(made_with: str | None) -> DecoyGenerator:
-    return DecoyGenerator(make_source().statistics, made_with=made_with)
+    source = make_source()
+    return DecoyGenerator(source.axes, source.mean, source.root, made_with=made_with)
 
 
 def bound_to(deployment: Deployment, source: DecoyGenerator) -> Contract:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from attacks.stored.intersection import nearest_common_points
+from attacks.several_templates import nearest_common_points
 from models.pack import ModelPack
 from models.photos import embed_photos
 from templates.contract import wire
@@ -16,7 +16,7 @@ from templates.keys.rotation import holder_rotation
 from templates.space.agreement import mean_embedding
 from templates.space.subspace import AffineSubspace, SubspaceBatch
 from tests.api.client import Client
-from tests.api.deployment import Deployment, M, N, images, photo
+from tests.api.deployment import AXES, Deployment, M, images, photo
 
 PEOPLE = range(30, 42)
 KEY, OTHER = os.urandom(32), os.urandom(32)
@@ -41,7 +41,7 @@ def stolen(
     opened = wire.decode(template.wire).subspace.turned_by(rotation.turned_back)
     if key is None:
         return opened
-    return opened.turned_by(holder_rotation(key, template.holder_salt, N).turned_back)
+    return opened.turned_by(holder_rotation(key, template.holder_salt, AXES).turned_back)
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +50,8 @@ def descriptors(deployment: Deployment) -> NDArray[np.float64]:
     pack = ModelPack.load(deployment.settings.pack, threads=1)
     samples = [embed_photos(pack, photos_of(person)) for person in PEOPLE]
     rows = [np.stack([one.embedding for one in of_person]) for of_person in samples]
-    return np.stack([mean_embedding(of_person, consistency=-1.0) for of_person in rows])
+    means = np.stack([mean_embedding(of_person, consistency=-1.0) for of_person in rows])
+    return deployment.source.project(means).astype(np.float64)
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ def lifted(deployment: Deployment, *, seed: int = 0, m: int = M, contract_id: st
     """A client's template of a random descriptor."""
     descriptor = unit(np.random.default_rng([5, seed]).normal(size=(1, N)))
     batch = lift(
-        descriptor,
+        deployment.source.project(descriptor),
         strategy=Strategy.ADVERSARIAL,
         m=m,
         source=deployment.source,

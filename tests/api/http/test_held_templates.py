@@ -223,8 +223,9 @@ def test_template_and_key_can_both_be_held(client: Client) -> None:
 def _lifted(deployment: Deployment) -> bytes:
     assert deployment.settings.pack is not None
     pack = ModelPack.load(deployment.settings.pack, threads=1)
-    point = pack.embed_photo(photo(1)).embedding
-    template = lift(point[None], strategy="adversarial", m=M, source=deployment.source)[0]
+    source = deployment.source
+    points = source.project(pack.embed_photo(photo(1)).embedding[None])
+    template = lift(points, strategy="adversarial", m=M, source=source)[0]
     return wire.encode(template, contract_id=deployment.contract.contract_id, dtype="float32")
 
 

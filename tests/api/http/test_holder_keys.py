@@ -78,7 +78,8 @@ def lifted(runtime: Runtime, m: int, person: int = 1) -> str:
     assert pack is not None
     assert source is not None
     rows = pack.embed_photo(photo(person)).embedding[None]
-    template = lift(rows, strategy=contract.binding.strategy, m=m, source=source)[0]
+    points = source.project(rows)
+    template = lift(points, strategy=contract.binding.strategy, m=m, source=source)[0]
     return base64.b64encode(wire.encode(template, contract_id=contract.contract_id)).decode()
 
 

@@ -26,8 +26,8 @@ from tests.verify.population import (
     enrolled,
     photos_of,
     templates_of,
+    wolf,
 )
-from tests.verify.test_strangers import wolf
 
 PEOPLE = M + 1
 """As many as a template's affine span can hold."""
@@ -76,7 +76,7 @@ def decision(client: Client, subject: str, embedding: NDArray[np.float32]) -> st
 
 def many_people(photos: NDArray[np.float32]) -> AffineSubspace:
     """The affine span of one photo each of M + 1 people, (M + 1, n)."""
-    points = photos.astype(np.float64)
+    points = decoys().project(photos).astype(np.float64)
     return canonical(points[0], points[1:] - points[0])
 
 

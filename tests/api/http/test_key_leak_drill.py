@@ -17,6 +17,7 @@ from api.http.app import create_app
 from api.http.stand_ins import StandIns
 from api.http.transfer import ExportKey, open_export
 from templates.contract import wire
+from templates.decoys import DecoySource, client_source
 from templates.errors import InvalidTemplate, SealError, StoreError
 from templates.keys.probe_signature import signed_probe
 from templates.keys.rotation import TenantRotation
@@ -32,7 +33,7 @@ from templates.store.schema import ApiKeyRow, AuditHeadRow, AuditRow
 from templates.store.secret import SecretName
 from tests.api.cli.conftest import run
 from tests.api.client import Client
-from tests.api.deployment import Deployment, N, bearer, deploy, images, photo, picture
+from tests.api.deployment import AXES, Deployment, bearer, deploy, images, photo, picture
 from tests.api.shapes import assert_error
 
 PEOPLE = {"alice": 1, "bob": 2}
@@ -60,7 +61,7 @@ class Thief:
         found = self.store.subjects.get("default", subject)
         assert found is not None
         key = self.store.tenants.rotation_key("default", epoch=found.record.rotation_epoch).key
-        rotation = TenantRotation(key, N).of(found.template_id)
+        rotation = TenantRotation(key, AXES).of(found.template_id)
         return wire.decode(found.wire).subspace.turned_by(rotation.turned_back)
 
     @staticmethod
@@ -124,15 +125,19 @@ def _write(database: Database, statement: str, values: dict[str, Any]) -> None:
     database.write(lambda connection: connection.execute(sa.text(statement), values))
 
 
-def unit_vectors(template: AffineSubspace, face: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Unit vectors of a template, each at distance 0 from it: (M, N).
+def unit_vectors(
+    template: AffineSubspace, embedding: NDArray[np.float32], source: DecoySource
+) -> NDArray[np.float64]:
+    """Embeddings whose projections are of a template, each at distance 0 from it: (M, N).
 
     The first is the one most like the face; of the others the face has what the foot point has.
     """
+    face = source.project(embedding[np.newaxis])[0]
     basis = template.basis.astype(np.float64)
     _, _, directions = np.linalg.svd((basis @ face)[np.newaxis])
     directions[0] *= np.sign(directions[0] @ basis @ face)
-    return template.foot + np.sqrt(1 - template.foot_norm**2) * (directions @ basis)
+    points = template.foot + np.sqrt(1 - template.foot_norm**2) * (directions @ basis)
+    return np.asarray(points @ client_source(source).axes.T, dtype=np.float64)
 
 
 def decision(client: Client, subject: str, token: str, shot: int) -> str:
@@ -193,7 +198,9 @@ def test_the_drill(tmp_path: Path) -> None:
         thief = Thief(deployment, deployment.token, tmp_path / "loot")
         pack = client.app.state.runtime.pack
         faces = {who: pack.embed(picture(PEOPLE[who], 9)[np.newaxis])[0] for who in PEOPLE}
-        forged = {who: unit_vectors(thief.stolen(who), faces[who]) for who in PEOPLE}
+        forged = {
+            who: unit_vectors(thief.stolen(who), faces[who], deployment.source) for who in PEOPLE
+        }
         # The theft is one: every vector of the template is accepted.
         assert set(thief.decisions(client, "alice", thief.token, forged["alice"])) == {"accept"}
 
@@ -233,17 +240,18 @@ def test_the_drill(tmp_path: Path) -> None:
 
         stolen_key = ExportKey.from_secret(thief.secrets[SecretName.EXPORT])
         opening = {"key": stolen_key, "tenant": "default"}
-        contract_ids = [deployment.contract.contract_id]
-        open_export(backup, contract_ids=contract_ids, **opening)
+        contract_id = deployment.contract.contract_id
+        open_export(backup, contract_id=contract_id, **opening)
         with pytest.raises(InvalidTemplate):
-            open_export(exported(client, "bob", token), contract_ids=contract_ids, **opening)
+            open_export(exported(client, "bob", token), contract_id=contract_id, **opening)
         assert_error(imported(client, backup, token), 400, "invalid_template")
 
         runtime = client.app.state.runtime
         stand_in = runtime.stand_ins.lift("default", "nobody")
         stolen_stand_in = StandIns(
-            deployment.contract,
+            deployment.contract.nobody(deployment.source),
             runtime.keyring,
+            contract_id=deployment.contract.contract_id,
             key=lambda: thief.secrets[SecretName.STAND_INS].value,
         ).lift("default", "nobody")
         assert (stand_in.foot != stolen_stand_in.foot).any()
@@ -297,11 +305,11 @@ def test_a_rotation_that_leaked_alone_costs_nobody_an_enrollment(tmp_path: Path)
         for subject in PEOPLE:
             assert enroll(client, subject, deployment.token, 0, 1) == 201
         store = client.app.state.runtime.store
-        old = TenantRotation(store.tenants.rotation_key("default").key, N)
+        old = TenantRotation(store.tenants.rotation_key("default").key, AXES)
         before = {name: store.subjects.get("default", name) for name in PEOPLE}
         done = operator(deployment, "keys", "rotate-tenant")
         assert (done["moved"], done["enroll_again"], done["rotations_dropped"]) == (2, [], 1)
-        new = TenantRotation(store.tenants.rotation_key("default").key, N)
+        new = TenantRotation(store.tenants.rotation_key("default").key, AXES)
         for name, stolen in before.items():
             subspace = wire.decode(stolen.wire).subspace
             after = wire.decode(store.subjects.get("default", name).wire).subspace

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import httpx
-import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -69,7 +68,7 @@ def probes(deployment: Deployment) -> dict[str, dict[str, Any]]:
     pack = ModelPack.load(deployment.settings.pack, threads=1)
     embedding = pack.embed_photo(photo(1, 2), quality=None).embedding
     lifted = lift(
-        embedding[None].astype(np.float64),
+        deployment.source.project(embedding[None]),
         strategy=deployment.contract.binding.strategy,
         m=PROBE_M,
         source=deployment.source,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from api.http.app import create_app
-from api.http.audit_report import AuditReport, kind_of_decoys, open_audit_report
+from api.http.audit_report import open_audit_report
 from api.http.errors import StartError
 from api.http.schemas import AuditAnswer, StoredAnswer
 from api.process.runtime import open_keyring, open_store
@@ -17,7 +17,7 @@ from models.pack import ModelPack
 from templates.contract import wire
 from templates.errors import StoreUnavailable
 from tests.api.client import Client
-from tests.api.deployment import Deployment, M, N, bearer, deploy, images, photo
+from tests.api.deployment import AXES, Deployment, M, bearer, deploy, images, photo
 from tests.api.shapes import assert_answer, assert_error
 
 
@@ -32,7 +32,7 @@ def test_the_numbers_are_those_of_the_database(client: Client, deployment: Deplo
     finally:
         store.close()
     assert found is not None
-    assert (body["n"], body["m"], body["decoys"]) == (N, M, M)
+    assert (body["n"], body["m"], body["decoys"]) == (AXES, M, M)
     assert (body["wire_bytes"], body["sealed_bytes"]) == (len(found.wire), len(sealed))
     assert body["dtype"] == "float16"
     assert body["current"] is True
@@ -61,7 +61,8 @@ def _turned(deployment: Deployment, template_id: str, descriptor: Any) -> Any:
         key = store.tenants.rotation_key("default").key
     finally:
         store.close()
-    return TenantRotation(key, N).of(template_id).turned(descriptor[None])[0]
+    points = deployment.source.project(descriptor[None])
+    return TenantRotation(key, AXES).of(template_id).turned(points)[0]
 
 
 def test_no_byte_of_the_template_is_told(client: Client, deployment: Deployment) -> None:
@@ -170,12 +171,13 @@ GENDER = cell(
     value=0.63, ci_low=0.58, ci_high=0.68, chance=0.51,
     compared=0.12, compared_low=0.07, compared_high=0.17, limit="attribute-leakage",
 )  # fmt: skip
-SCHEME = f"adversarial, m = {M}, generated decoys"
+SCHEME = f"adversarial, m = {M} of {AXES} axes, generated decoys"
 
 
 def report(dim: int = M, **changes: Any) -> dict[str, Any]:
     verdict = {
-        "strategy": "adversarial", "decoys": "generator", "dim": dim, "passed": False,
+        "strategy": "adversarial", "decoys": "generator", "dim": dim, "axes": AXES,
+        "passed": False,
         "comparison": False,
         "cells": [
             cell(attack="foot-point", knowledge="template", value=0.05, compared=0.05),
@@ -188,8 +190,8 @@ def report(dim: int = M, **changes: Any) -> dict[str, Any]:
     }  # fmt: skip
     compared = {**verdict, "decoys": "pool", "comparison": True, "cells": [cell(value=0.99)]}
     return {
-        "format": "veilface audit", "version": 2, "kind": "templates", "passed": False,
-        "headlines": [f"adversarial, m = {dim}, generated decoys: irreversibility fails."],
+        "format": "veilface audit", "version": 3, "kind": "templates", "passed": False,
+        "headlines": [f"{SCHEME.replace(f'm = {M} ', f'm = {dim} ')}: irreversibility fails."],
         "comparison_headlines": [],
         "limits": {"recovery-success": 0.1}, "verdicts": [compared, verdict],
         "model": {"embedder_sha256": "0" * 64}, "settings": {"contract_id": None},
@@ -281,15 +283,6 @@ def test_of_several_schemes_only_this_one_is_told(audited: Any) -> None:
     assert body["strongest"]["value"] == 0.01
     # Decoys of a pool are another scheme.
     assert answer({**several, "verdicts": [pooled, wider]})["fits"] == "nothing"
-
-
-def test_a_service_without_decoys_at_hand_takes_either_kind(tmp_path: Path) -> None:
-    contract = deploy(tmp_path).contract
-    document = report(settings={"contract_id": contract.contract_id})
-    for kind in ("pool", "generator"):
-        document["verdicts"][1]["decoys"] = kind
-        told = AuditReport(document).reduced(contract, kind_of_decoys(None))
-        assert told["fits"] == "contract"
 
 
 def test_what_a_report_leaves_open_is_null(audited: Any) -> None:

@@ -77,16 +77,16 @@ def test_what_travels_is_not_rotated_and_not_what_is_stored(
         data,
         key=runtime.export_key,
         tenant="default",
-        contract_ids=[deployment.contract.contract_id],
+        contract_id=deployment.contract.contract_id,
     )
     plain = wire.decode(inside.wire).subspace
     pack = runtime.pack
     assert pack is not None
-    own = pack.embed_photo(photo(1)).embedding
-    assert plain.contains(own[None], tol=0.02).all()
+    own = deployment.source.project(pack.embed_photo(photo(1)).embedding[None])
+    assert plain.contains(own, tol=0.02).all()
     stored = runtime.store.subjects.get("default", "plain")
     assert stored is not None
-    assert not wire.decode(stored.wire).subspace.contains(own[None], tol=0.02).any()
+    assert not wire.decode(stored.wire).subspace.contains(own, tol=0.02).any()
     assert inside.wire not in data
 
 
@@ -172,16 +172,16 @@ def test_what_the_key_holder_sealed_is_still_checked(
 def test_export_key_binds_contract_and_tenant() -> None:
     key = ExportKey.from_secret(Secret(os.urandom(32)))
     blob = seal_export(Exported("s", CONTRACT, "photos", 1, b"wire"), key=key, tenant="t")
-    opened = open_export(blob, key=key, tenant="t", contract_ids=[CONTRACT])
+    opened = open_export(blob, key=key, tenant="t", contract_id=CONTRACT)
     assert opened == Exported("s", CONTRACT, "photos", 1, b"wire")
     assert "wire" not in repr(opened).replace("Exported", "").split("photos")[-1]
     with pytest.raises(InvalidTemplate):
-        open_export(blob, key=key, tenant="u", contract_ids=[CONTRACT])
+        open_export(blob, key=key, tenant="u", contract_id=CONTRACT)
     with pytest.raises(ContractMismatch):
-        open_export(blob, key=key, tenant="t", contract_ids=["cd" * 32])
+        open_export(blob, key=key, tenant="t", contract_id="cd" * 32)
     moved = MAGIC + bytes.fromhex("cd" * 32) + blob[len(MAGIC) + 32 :]
     with pytest.raises(InvalidTemplate):
-        open_export(moved, key=key, tenant="t", contract_ids=["cd" * 32])
+        open_export(moved, key=key, tenant="t", contract_id="cd" * 32)
 
 
 def test_a_bad_export_key_file_stops_the_start(tmp_path: Path) -> None:

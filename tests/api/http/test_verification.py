@@ -15,7 +15,7 @@ from templates.keys.sealing import MasterKeyring
 from templates.space.lifting import Strategy, lift
 from templates.space.subspace import AffineSubspace
 from tests.api.client import Client
-from tests.api.deployment import PROBE_M, Deployment, N, bearer, deploy, images, photo
+from tests.api.deployment import AXES, PROBE_M, Deployment, N, bearer, deploy, images, photo
 from tests.api.http.test_enrollment import b64
 from tests.api.shapes import assert_answer, assert_error
 
@@ -57,7 +57,7 @@ def embedding(client: Client, person: int, shot: int = 5) -> list[float]:
 
 def probe(deployment: Deployment, descriptor: list[float], *, m: int = PROBE_M) -> bytes:
     batch = lift(
-        np.array([descriptor]),
+        deployment.source.project(np.array([descriptor], dtype=np.float32)),
         strategy=Strategy.ADVERSARIAL,
         m=m,
         source=deployment.source,
@@ -166,12 +166,19 @@ def test_distances_do_not_tell_who_is_unknown(client: Client, deployment: Deploy
     # Other tenants and other deployments give the same name another stand-in.
     assert distance("unknown-0", tenant="elsewhere") != distances[0]
     keyring, foreign = client.app.state.runtime.keyring, os.urandom(32)
-    other = StandIns(deployment.contract, keyring, key=lambda: foreign)
+    contract = deployment.contract
+    other = StandIns(
+        contract.nobody(deployment.source),
+        keyring,
+        contract_id=contract.contract_id,
+        key=lambda: foreign,
+    )
     own = client.app.state.runtime.stand_ins
     told, elsewhere = (each.lift("default", "unknown-0") for each in (own, other))
     assert (told.foot != elsewhere.foot).any()
+    point = deployment.source.project(np.array([descriptor], dtype=np.float32))[0]
     assert np.sqrt(
-        2 - 2 * (told.foot @ descriptor + told.radius * np.linalg.norm(told.basis @ descriptor))
+        2 - 2 * (told.foot @ point + told.radius * np.linalg.norm(told.basis @ point))
     ) == pytest.approx(distances[0], abs=1e-4)
 
 
@@ -237,8 +244,8 @@ def test_hostile_lifted_probes(client: Client, sender: str, deployment: Deployme
     descriptor = embedding(client, 1)
     whole = probe(deployment, descriptor)
     rng = np.random.default_rng(0)
-    basis = np.linalg.qr(rng.normal(size=(N, PROBE_M)))[0].T
-    central = AffineSubspace(np.zeros(N), basis)
+    basis = np.linalg.qr(rng.normal(size=(AXES, PROBE_M)))[0].T
+    central = AffineSubspace(np.zeros(AXES), basis)
     for data in (
         b"",
         whole[:10],
@@ -250,7 +257,7 @@ def test_hostile_lifted_probes(client: Client, sender: str, deployment: Deployme
         assert_error(ask(client, sender, json={"template": b64(data)}), 400, "invalid_template")
     other_m = probe(deployment, descriptor, m=PROBE_M + 1)
     assert_error(ask(client, sender, json={"template": b64(other_m)}), 422, "uncalibrated")
-    other = AffineSubspace(basis[0] * 0.0 + np.eye(N)[0] * 0, basis)
+    other = AffineSubspace(basis[0] * 0.0 + np.eye(AXES)[0] * 0, basis)
     foreign = wire.encode(other, contract_id="0" * 64)
     assert_error(ask(client, sender, json={"template": b64(foreign)}), 409, "contract_mismatch")
 

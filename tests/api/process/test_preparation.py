@@ -1,30 +1,44 @@
-"""The dimension that a calibration takes, and what its verdict says of the choice."""
+"""Axes and dimension that a calibration takes, and faces of which nobody knows who they are."""
 
+from pathlib import Path
+
+import numpy as np
 import pytest
 
 from api.cli.verdict import verdict_lines
-from api.process.preparation import _operating_point
+from api.process.preparation import _operating_point, without_lookalikes
+from models.extraction import Extraction
 from templates.contract.verdict import Verdict
 from templates.space.lifting import Strategy
-from tests.verify.population import N, decoys, photos_of
+from tests.verify.population import N, decoys, photos_of, unit
 from verify import CalibrationOptions
 
 
 @pytest.mark.parametrize("asked", [None, 8])
-def test_few_people_get_a_quarter_of_the_numbers_and_are_told(asked: int | None) -> None:
-    """Half of them would leave little of a face, and so few people show nothing of any m."""
+def test_so_few_people_show_nothing_of_any_dimension(asked: int | None) -> None:
     point = _operating_point(
         photos_of(30, 2, seed=4).reshape(-1, N),
         [str(number // 2) for number in range(60)],
         decoys(),
         strategy=Strategy.ADVERSARIAL,
+        axes=None,
         m=asked,
         options=CalibrationOptions(),
         progress=lambda _what, _share: None,
     )
-    assert point.dim == (asked or N // 4)
-    privacy = point.tried[point.dim]
-    assert privacy.status == "FAIL"
-    accuracy = {"level": "fmr-1e-3", "enrolled_photos": 3, "probe_photos": 3}
-    said = verdict_lines(Verdict(privacy, type(privacy)(privacy.rate, 0.02, accuracy)))[0]
-    assert said.endswith("so m is a default, no result of these people.") == (asked is None)
+    assert asked in (None, point.dim)
+    assert (point.axes, point.dim) in [(one.axes, one.m) for one in point.tried]
+    assert point.privacy.status == "NOT SHOWN"
+    (said, accuracy, _) = verdict_lines(Verdict(point.privacy))
+    assert said.startswith("Privacy:  NOT SHOWN. ")
+    assert "Not enough to pass: 15 people attacked with 30 faces show little" in said
+    assert accuracy == "Accuracy: not measured: nobody has two photos."
+
+
+def test_of_faces_that_look_alike_the_first_stays() -> None:
+    rows = unit(np.random.default_rng(8).normal(size=(4, N)))
+    rows[2] = unit(rows[0] + 0.5 * rows[3])
+    paths = [Path(f"{number}.jpg") for number in range(4)]
+    kept = without_lookalikes(Extraction(rows, paths, [], cached=0))
+    assert [path.name for path in kept.paths] == ["0.jpg", "1.jpg", "3.jpg"]
+    np.testing.assert_array_equal(kept.descriptors, rows[[0, 1, 3]])

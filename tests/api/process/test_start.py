@@ -277,23 +277,6 @@ def test_without_a_pack_templates_and_embeddings_work(fresh: Deployment) -> None
         assert answer.json()["decision"] == "accept"
 
 
-def test_without_decoys_photos_are_verified_and_not_enrolled(fresh: Deployment) -> None:
-    with Client(create_app(fresh.settings), headers=bearer(fresh.token)) as client:
-        client.put("/v1/subjects/a/enrollment", files=images(photo(1)))
-    fresh.settings.resolved_decoys_file.unlink()
-    with Client(create_app(fresh.settings), headers=bearer(fresh.token)) as client:
-        assert_error(
-            client.put("/v1/subjects/b/enrollment", files=images(photo(1))),
-            503,
-            "model_unavailable",
-        )
-        probe = client.post("/v1/subjects/a/verify", files=images(photo(1), name="image"))
-        assert probe.json()["decision"] == "accept"
-        fresh.allow_templates()
-        put = client.put("/v1/subjects/b/enrollment", json={"template": b64(lifted(fresh))})
-        assert put.status_code == 201
-
-
 def test_a_failed_start_is_logged_in_one_sentence(
     fresh: Deployment, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -487,9 +470,9 @@ def test_weak_privacy_is_served_only_knowingly(fresh: Deployment, measured: bool
 
 def test_the_cohort_is_lifted_before_a_probe_asks_for_it(fresh: Deployment) -> None:
     with Client(create_app(fresh.settings)) as client:
-        contract = client.app.state.runtime.contract
-        assert contract.takes_lifted_probes
-        wait_until(lambda: "_cohort" in vars(contract), what="a cohort")
+        runtime = client.app.state.runtime
+        assert runtime.contract.takes_lifted_probes
+        wait_until(lambda: "_cohort" in vars(runtime.nobody), what="a cohort")
 
 
 def test_a_cohort_that_could_not_be_lifted_stops_nothing(
@@ -499,9 +482,9 @@ def test_a_cohort_that_could_not_be_lifted_stops_nothing(
         raise MemoryError
 
     with monkeypatch.context() as context:
-        context.setattr(Nobody, "cohort", fails)
+        context.setattr(Nobody, "cohort", property(fails))
         with Client(create_app(fresh.settings)) as client:
             wait_until(lambda: "cohort not lifted" in capsys.readouterr().err, what="a log line")
             assert client.get("/health/ready").status_code == 200
             context.undo()
-            assert len(client.app.state.runtime.contract.cohort) > 0
+            assert len(client.app.state.runtime.nobody.cohort) > 0

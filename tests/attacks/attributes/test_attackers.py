@@ -31,7 +31,6 @@ def training(signal: bool) -> tuple[TrainingSet, Features, np.ndarray]:
             held,
             {"side": held_codes, "noise": third},
             {"side": 2, "noise": 4},
-            seed=1,
         ),
         unseen,
         truth,

@@ -18,10 +18,13 @@ VICTIMS = faces(30, seed=2, n=256).descriptors
 class Watched:
     """The pool, and what was drawn from it."""
 
-    source_id, made_with, n, noise = POOL.source_id, None, POOL.n, 0.0
+    source_id, made_with, n, k = POOL.source_id, None, POOL.n, POOL.n
 
     def __init__(self) -> None:
         self.drawn: list[np.ndarray] = []
+
+    def project(self, embeddings: np.ndarray) -> np.ndarray:
+        return POOL.project(embeddings)
 
     def draw(self, rows: int, k: int, **options: object) -> np.ndarray:
         decoys = POOL.draw(rows, k, **options)  # type: ignore[arg-type]

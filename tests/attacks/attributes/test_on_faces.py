@@ -1,4 +1,4 @@
-"""Claims of docs/design-measurements.md §1.2 and docs/method.md §4.5 on real faces, in small."""
+"""Claims of docs/privacy.md "Gender, race and age" and docs/method.md on real faces, in small."""
 
 from pathlib import Path
 

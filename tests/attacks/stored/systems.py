@@ -35,7 +35,6 @@ def system_of(decoys: str, strategy: str = "adversarial", m: int = M) -> System:
         Scheme(strategy, decoys, m),
         source,
         options=options,
-        pool_of_owners=decoys == "pool",
         seed=0,
     )
 

@@ -7,7 +7,7 @@ from attacks.outcomes import Knowledge
 from attacks.stored.foot_point import foot_point_attack, foot_points
 from templates.keys.randomness import Keystream
 from templates.space.lifting import lift
-from tests.attacks.stored.systems import VICTIMS, counts, noise, number, population, system_of
+from tests.attacks.stored.systems import VICTIMS, counts, noise, number, system_of
 
 
 def test_the_cosine_is_the_norm_of_the_foot_point() -> None:
@@ -22,7 +22,7 @@ def test_the_cosine_is_the_norm_of_the_foot_point() -> None:
 def test_random_lifting_hides_nothing() -> None:
     system = system_of("generator")
     with Keystream.seeded("random") as stream:
-        plain = lift(population().victims.enrolled, strategy="random", m=2, stream=stream)
+        plain = lift(system.victims.enrolled, strategy="random", m=2, stream=stream)
     (outcome,) = foot_point_attack(replace(system, templates=plain))
     assert counts(outcome) == (VICTIMS, VICTIMS)
 

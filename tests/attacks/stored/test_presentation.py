@@ -12,6 +12,7 @@ from attacks.stored.honest_probes import (
     honest_lift,
     points_inside,
 )
+from attacks.stored.point_ascent import ascend_points
 from attacks.stored.presentation import (
     COHORT_CLIMBED,
     lift_own_templates,
@@ -22,7 +23,6 @@ from attacks.stored.wolves import axis_wolves
 from templates.distances import paired_distances
 from templates.space.subspace import SubspaceBatch
 from tests.attacks.stored.systems import VICTIMS, counts, noise, share, system_of
-from verify.point_ascent import ascend_points
 
 
 @cache
@@ -112,8 +112,7 @@ def test_climbing_raises_the_share_that_accepts() -> None:
     rule = replace(system.level, threshold=1.5)  # where there is something to gain
     own = lift_own_templates(system)
     starts = noise(4, system.templates.n)
-    expectation = system.contract.expectation
-    ends = ascend_points(starts, own.targets, expectation, threshold=rule.threshold)
+    ends = ascend_points(starts, own.targets, system.nobody, threshold=rule.threshold)
     assert np.linalg.norm(ends, axis=1) == pytest.approx(1, abs=1e-5)
 
     def accepted(probes: np.ndarray | SubspaceBatch, lifted: bool) -> float:
@@ -122,7 +121,7 @@ def test_climbing_raises_the_share_that_accepts() -> None:
         # Climbed on: templates and cohort of the attacker's own.
         cohort = own.cohort[:COHORT_CLIMBED]
         return float(
-            decide(probes, own.targets, system.contract, calibration, rule, cohort=cohort).mean()
+            decide(probes, own.targets, system.nobody, calibration, rule, cohort=cohort).mean()
         )
 
     assert accepted(ends, False) > accepted(starts, False)

@@ -13,11 +13,8 @@ def test_all_attacks_run_in_order() -> None:
     names = [outcome.attack for outcome in outcomes]
     assert list(dict.fromkeys(names)) == [
         "foot-point",
-        "known-database",
         "nearest-neighbour",
         "oracle",
-        "intersection",
-        "impersonation",
         "presentation",
     ]
     assert len({(outcome.attack, outcome.variant) for outcome in outcomes}) == len(outcomes)
@@ -36,7 +33,6 @@ def test_one_seed_makes_one_system() -> None:
             generator(),
             embedder_sha256="ab" * 32,
             preprocessing={"size": 112},
-            pool_of_owners=False,
             seed=3,
         )
         for _ in range(2)

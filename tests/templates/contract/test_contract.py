@@ -8,14 +8,11 @@ import hashlib
 import json
 import os
 import stat
-import threading
-import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import safetensors.numpy
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -29,17 +26,13 @@ from templates.contract.document import (
     Level,
     Rate,
 )
-from templates.contract.expectation import PointExpectation
 from templates.contract.levels import MAX_LEVELS
-from templates.contract.nobody import Nobody
 from templates.decoys import DecoyGenerator
 from templates.distances import Metric
 from templates.errors import ContractError, ContractMismatch, SealError, Uncalibrated
-from templates.keys.rotation import HAAR_VERSION, ROTATION_VERSION
+from templates.keys.rotation import ROTATION_VERSION
 from templates.keys.sealing import KeyringSealer, MasterKeyring
 from templates.space.lifting import Strategy
-from templates.space.rounded import RoundedBatch
-from verify.strangers import STRANGERS
 
 N, M = 16, 3
 SEALER = KeyringSealer(MasterKeyring([os.urandom(32)]))
@@ -51,6 +44,7 @@ def make_binding(**changes: Any) -> Binding:
         "embedder_sha256": "ab" * 32,
         "preprocessing": {"size": 112, "mean": (127.5, 127.5, 127.5), "flip": False},
         "n": N,
+        "axes": N - 2,
         "strategy": Strategy.RANDOM,
         "m": M,
         "decoy_source_id": "cd" * 32,
@@ -60,26 +54,10 @@ def make_binding(**changes: Any) -> Binding:
 
 
 @functools.cache
-def make_nobody(n: int = N, *, seed: int = 0) -> Nobody:
-    rows = np.random.default_rng(4).normal(size=(200, n)).astype(np.float32)
+def make_source() -> DecoyGenerator:
+    rows = np.random.default_rng(4).normal(size=(200, N)).astype(np.float32)
     rows /= np.linalg.norm(rows, axis=1, keepdims=True)
-    return Nobody.of(rows[:6], DecoyGenerator.fit(rows), seed=bytes([seed]) * 32)
-
-
-@functools.cache
-def make_expectation(n: int = N, m: int = M) -> PointExpectation:
-    """That of templates in all directions alike: √(m/n), with a spread of 0.1."""
-    return PointExpectation(
-        metric=Metric.SPHERICAL,
-        projector=np.eye(n, dtype=np.float32) * np.float32(m / n),
-        foot=np.zeros(n, dtype=np.float32),
-        mean=np.array([1.0, 0, 0, 0, 0, 0]),
-        log_spread=np.array([0, 0, 0, 0, 0, np.log(0.1)]),
-    )
-
-
-def changed(**fields: Any) -> PointExpectation:
-    return dataclasses.replace(make_expectation(), **fields)
+    return DecoyGenerator.fit(rows).reduced(N - 2)
 
 
 def make_calibration(**changes: Any) -> Calibration:
@@ -110,9 +88,8 @@ def make_contract(**changes: Any) -> Contract:
         "photo_consistency": 0.25,
         "probe_consistency": 0.2,
         "template_foot_point_norm": (0.1, 0.8),
-        "template_stranger_score": 1.5,
-        "expectation": make_expectation(),
-        "nobody": make_nobody(),
+        "template_stranger_similarity": 0.7,
+        "cohort_seed": bytes(range(32)),
     }
     return Contract(**{**fields, **changes})
 
@@ -122,7 +99,11 @@ def make_contract(**changes: Any) -> Contract:
 
 def test_contract_id_is_the_hash_of_the_canonical_json() -> None:
     written = (
-        '{"decoy_source_id":"' + "cd" * 32 + '","embedder_sha256":"' + "ab" * 32 + '","m":3,"n":16,'
+        '{"axes":14,"decoy_source_id":"'
+        + "cd" * 32
+        + '","embedder_sha256":"'
+        + "ab" * 32
+        + '","m":3,"n":16,'
         '"preprocessing":{"flip":false,"mean":[127.5,127.5,127.5],"size":112},'
         '"rotation_version":"signs-cosine-2","strategy":"random"}'
     )
@@ -141,10 +122,10 @@ def test_contract_id_depends_on_values_not_on_how_they_are_written() -> None:
         {"embedder_sha256": "ac" * 32},
         {"preprocessing": {"size": 112, "mean": (127.5, 127.5, 127.5), "flip": True}},
         {"n": 17},
+        {"axes": 15},
         {"strategy": Strategy.HYBRID},
         {"m": 4},
         {"decoy_source_id": "ce" * 32},
-        {"rotation_version": "2"},
     ],
     ids=lambda changes: next(iter(changes)),
 )
@@ -152,41 +133,13 @@ def test_every_part_of_the_binding_changes_the_id(changes: dict[str, Any]) -> No
     assert make_binding(**changes).contract_id != make_binding().contract_id
 
 
-def test_templates_of_the_earlier_rotation_version_are_served_and_no_others() -> None:
-    binding = make_binding()
-    earlier = make_binding(rotation_version=HAAR_VERSION)
-    assert binding.contract_ids == (binding.contract_id, earlier.contract_id)
-    for served in (binding, earlier):
-        version = binding.require_contract(served.contract_id, what="the template")
-        assert version == served.rotation_version
-    for other in ({"m": 4}, {"rotation_version": "2"}, {"m": 4, "rotation_version": HAAR_VERSION}):
-        with pytest.raises(ContractMismatch, match="the template belongs to the contract"):
-            binding.require_contract(make_binding(**other).contract_id, what="the template")
-    # Nothing is served the other way round.
-    assert earlier.contract_ids == (earlier.contract_id,)
-
-
-def test_a_contract_of_the_earlier_rotation_version_is_refused_with_the_remedy() -> None:
-    make_binding().require_rotation_version()
-    with pytest.raises(
-        ContractMismatch, match=r"'haar-1'.* run `veilface calibrate --strategy"
-    ) as no:
-        make_binding(rotation_version=HAAR_VERSION).require_rotation_version()
-    assert f"--strategy {make_binding().strategy} --dim {make_binding().m}`" in str(no.value)
-
-
 def test_recalibrating_keeps_the_contract_id_and_changes_the_calibration_id() -> None:
     first = make_contract()
     levels = (Level("fmr-1e-2", 1e-2, 2.1, RATE, RATE),)
     again = make_contract(calibrations=(make_calibration(levels=levels),))
-    others = [
-        make_contract(nobody=make_nobody(seed=1)),
-        make_contract(expectation=changed(mean=np.array([1.0, 0, 0, 0, 0, 1e-9]))),
-        make_contract(expectation=changed(projector=make_expectation(m=M + 1).projector)),
-    ]
-    ids = {entry.calibrations[0].calibration_id for entry in (first, again, *others)}
-    assert len(ids) == 5
-    assert len({entry.contract_id for entry in (first, again, *others)}) == 1
+    ids = {entry.calibrations[0].calibration_id for entry in (first, again)}
+    assert len(ids) == 2
+    assert len({entry.contract_id for entry in (first, again)}) == 1
     assert make_contract().calibrations[0].calibration_id in ids
 
 
@@ -252,24 +205,14 @@ def test_impossible_calibrations_are_refused(changes: dict[str, Any]) -> None:
         {"photo_consistency": 1.5},
         {"probe_consistency": -1.5},
         {"template_foot_point_norm": (0.8, 0.1)},
-        {"template_stranger_score": float("nan")},
-        {"nobody": dataclasses.replace(make_nobody(), halves=make_nobody().halves[:1])},
-        {"nobody": dataclasses.replace(make_nobody(), halves=2 * make_nobody().halves)},
-        {"nobody": dataclasses.replace(make_nobody(), halves=np.nan * make_nobody().halves)},
-        {"nobody": dataclasses.replace(make_nobody(), seed=b"short")},
-        {"nobody": make_nobody(N + 1)},
+        {"template_stranger_similarity": float("nan")},
+        {"cohort_seed": b"short"},
         {"default_level": "fmr-1e-9"},
         {"calibrations": ()},
         {"calibrations": (make_calibration(), make_calibration(steps=9))},
         {"calibrations": (make_calibration(calibration_id="0" * 64),)},
-        {"expectation": make_expectation(N + 1)},
-        {"expectation": changed(metric=Metric.EUCLIDEAN)},
-        {"expectation": changed(foot=np.full(N, np.nan, dtype=np.float32))},
-        {"expectation": changed(foot=np.full(N, 1.1, dtype=np.float32))},
-        {"expectation": changed(projector=np.triu(np.full((N, N), 0.1, dtype=np.float32)))},
-        {"expectation": changed(mean=np.full(6, np.inf))},
-        {"expectation": changed(mean=np.full(6, 1e7))},
-        {"expectation": changed(log_spread=np.zeros(5))},
+        {"calibrations": (make_calibration(), make_calibration(metric=Metric.EUCLIDEAN))},
+        {"calibrations": (make_calibration(**LIFTED | {"probe_m": N - 2}),)},
     ],
 )
 def test_contradictions_are_refused(changes: dict[str, Any]) -> None:
@@ -350,16 +293,7 @@ def test_a_file_keeps_everything(tmp_path: Path) -> None:
     assert loaded.public() == contract.public()
     assert loaded.calibrations == contract.calibrations
     assert loaded.binding == contract.binding
-    assert loaded.nobody_id == contract.nobody_id
-    np.testing.assert_array_equal(loaded.nobody.people, contract.nobody.people)
-    np.testing.assert_array_equal(loaded.expectation.projector, contract.expectation.projector)
-    points = contract.nobody.people
-    np.testing.assert_array_equal(
-        loaded.expectation.statistics(points), contract.expectation.statistics(points)
-    )
-    # Lifted from the seed, and not kept in the file.
-    np.testing.assert_array_equal(loaded.cohort.feet, contract.cohort.feet)
-    np.testing.assert_array_equal(loaded.cohort.numbers, contract.cohort.numbers)
+    assert loaded.cohort_seed == contract.cohort_seed
 
 
 def test_the_file_is_private_and_alone(tmp_path: Path) -> None:
@@ -385,29 +319,28 @@ def test_a_failed_write_leaves_the_old_file(
     assert len(list(tmp_path.iterdir())) == 1
 
 
-def test_strangers_and_seed_are_sealed_and_never_public(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_seed_of_the_cohort_is_sealed_and_never_public(tmp_path: Path) -> None:
     contract = make_contract()
     text = saved(tmp_path, contract).read_bytes()
-    with monkeypatch.context() as context:
-        context.setattr("templates.contract.nobody.RoundedBatch.of", lambda lifted: lifted)
-        unrounded = make_contract().cohort
-    patterns = [
-        array[0].astype(dtype).tobytes()
-        for array in (unrounded.feet, unrounded.bases, contract.nobody.people)
-        for dtype in ("<f4", "<f2", "<f8")
-    ] + [contract.cohort.numbers[0].tobytes(), contract.nobody.seed]
     raw = text + base64.b64decode(json.loads(text)["sealed"])
-    assert not any(pattern in raw for pattern in patterns)
-    # Positive control: the same search finds a number that was planted.
-    assert any(pattern in raw + contract.cohort.feet.tobytes() for pattern in patterns)
+    seed = contract.cohort_seed
+    for form in (seed, seed.hex().encode(), base64.b64encode(seed)):
+        assert form not in raw
+        # Positive control: the same search finds a seed that was planted.
+        assert form in raw + form
     public = json.dumps(contract.public())
     assert "sealed" not in contract.public()
-    assert repr(float(contract.nobody.people[0, 0])) not in public
-    assert contract.nobody.seed.hex() not in public
-    assert "nobody=" not in repr(contract)
-    assert repr(contract.nobody).startswith("<")
+    assert seed.hex() not in public
+    assert "seed" not in repr(contract)
+
+
+def test_nobody_is_made_once_of_the_contracts_decoys() -> None:
+    source = make_source()
+    contract = make_contract(binding=make_binding(decoy_source_id=source.source_id))
+    assert contract.nobody(source) is contract.nobody(source)
+    assert "seed" not in repr(contract.nobody(source))
+    with pytest.raises(ContractMismatch, match="bound to the decoy source"):
+        make_contract().nobody(source)
 
 
 def test_another_master_key_does_not_open_it(tmp_path: Path) -> None:
@@ -428,9 +361,7 @@ def test_edited_thresholds_do_not_load(tmp_path: Path) -> None:
     with pytest.raises(SealError, match="the file was edited"):
         reloaded(path, document)
     # An attacker can recompute the public ids, but not the seal over them.
-    edited = Calibration.from_json(document["calibrations"][0]).identified(
-        contract_id=document["contract_id"], nobody_id=document["nobody_id"]
-    )
+    edited = Calibration.from_json(document["calibrations"][0]).identified(document["contract_id"])
     document["calibrations"][0] = edited.to_json()
     with pytest.raises(SealError, match="the file was edited"):
         reloaded(path, document)
@@ -451,15 +382,14 @@ MUTATIONS: list[tuple[str, Any]] = [
     ("sealed", "!!!"),
     ("sealed", 3),
     ("sealed", ""),
-    ("nobody_id", "0" * 64),
     ("photo_consistency", "0.25"),
     ("photo_consistency", 1e400),
     ("photo_consistency", None),
     ("probe_consistency", None),
     ("template_foot_point_norm", [0.1]),
     ("template_foot_point_norm", [0.1, True]),
-    ("template_stranger_score", "1.5"),
-    ("template_stranger_score", 1e400),
+    ("template_stranger_similarity", "1.5"),
+    ("template_stranger_similarity", 1e400),
     ("calibrations", {}),
     ("calibrations", [[]]),
     ("binding", []),
@@ -565,53 +495,19 @@ def test_a_sealed_part_that_is_no_such_part_is_refused(tmp_path: Path) -> None:
     sealed = document.pop("sealed")
     context = contract_module._seal_context(document)
     good = SEALER.open(base64.b64decode(sealed), context=context)
-    whole = safetensors.numpy.load(good)
-
-    def with_(name: str, array: Any) -> bytes:
-        return safetensors.numpy.save(whole | {name: np.ascontiguousarray(array)})
-
-    triangle, axes = whole["expectation.projector"], whole["nobody.axes"]
-    for plain in (
-        b"",
-        good[:-1],
-        safetensors.numpy.save({"nobody.people": whole["nobody.people"]}),
-        with_("more", triangle),
-        with_("nobody.people", whole["nobody.people"].astype(np.float32)),
-        with_("nobody.people", whole["nobody.people"][0]),
-        with_("nobody.people", whole["nobody.people"][:5]),
-        with_("nobody.seed", whole["nobody.seed"][:-1]),
-        with_("nobody.seed", whole["nobody.seed"].astype(np.float32)),
-        with_("nobody.axes", axes[:-1]),
-        with_("nobody.axes", np.full_like(axes, np.inf)),
-        with_("expectation.projector", triangle[:-1]),
-        with_("expectation.projector", triangle.astype(np.float16)),
-        with_("expectation.projector", np.full_like(triangle, 3e38)),
-        with_("expectation.foot", np.float32(1)),
-        with_("expectation.mean", whole["expectation.mean"][:-1]),
-        with_("expectation.log_spread", np.full(6, np.nan)),
-        with_("expectation.metric", np.frombuffer(b"cosine", dtype=np.uint8)),
-        with_("expectation.metric", np.frombuffer(b"euclidean", dtype=np.uint8)),
-        # Sound, but not what the rest of the document names.
-        with_("expectation.foot", whole["expectation.foot"] + np.float32(1e-3)),
-        with_("nobody.seed", whole["nobody.seed"] + np.uint8(1)),
-    ):
+    for plain in (b"", good[:-1], good + b"0"):
         text = base64.b64encode(SEALER.seal(plain, context=context)).decode()
-        with pytest.raises(ContractError):
+        with pytest.raises(ContractError, match="32 bytes"):
             reloaded(path, document | {"sealed": text})
     text = base64.b64encode(SEALER.seal(good, context=context)).decode()
-    assert reloaded(path, document | {"sealed": text}).nobody_id == document["nobody_id"]
+    assert reloaded(path, document | {"sealed": text}).cohort_seed == good
 
 
-def test_the_layout_of_an_earlier_version_is_refused_with_the_remedy(tmp_path: Path) -> None:
+def test_the_layout_of_another_version_is_refused_with_the_remedy(tmp_path: Path) -> None:
     path = saved(tmp_path)
     document = json.loads(path.read_text())
-    level = document["calibrations"][0]["levels"][0]
-    level |= {"similarity_threshold": 0.35, "cohort_threshold": level.pop("score_threshold")}
-    earlier = document | {"cohort": document["sealed"], "cohort_size": 400, "cohort_id": "0" * 64}
-    del earlier["sealed"], earlier["nobody_id"]
-    for old in (earlier, document | {"version": 1}):
-        with pytest.raises(ContractError, match="run `veilface calibrate` again"):
-            reloaded(path, old)
+    with pytest.raises(ContractError, match="run `veilface calibrate` again"):
+        reloaded(path, document | {"version": 2})
 
 
 def test_the_calibration_of_the_most_photos_that_are_not_more_serves() -> None:
@@ -635,30 +531,6 @@ def test_the_calibration_of_the_most_photos_that_are_not_more_serves() -> None:
     assert contract.calibration("s2s", None, 2, 3).probe_photos == 1
     with pytest.raises(Uncalibrated):
         contract.calibration("p2s", probe_photos=0)
-
-
-def test_a_contract_of_faces_takes_less_than_three_megabytes(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    n, m = 512, 64
-    rows = rng.normal(size=(600, n)).astype(np.float32)
-    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
-    people = np.concatenate([rows, -rows[:400]])
-    levels = tuple(
-        Level(f"fmr-1e-{k}", 10.0**-k, 3.0, RATE, RATE, {1: RATE, 2: RATE, 3: RATE})
-        for k in range(2, 7)
-    )
-    square = rng.normal(size=(n, n)).astype(np.float32) / 100
-    contract = make_contract(
-        binding=make_binding(n=n, m=m),
-        calibrations=(
-            *(make_calibration(levels=levels, probe_photos=photos) for photos in (1, 2, 3, 5)),
-            *(make_calibration(**LIFTED | {"probe_m": k}, levels=levels) for k in (2, 4, 8, 16)),
-        ),
-        expectation=dataclasses.replace(make_expectation(n, m), projector=square + square.T),
-        nobody=Nobody.of(people, DecoyGenerator.fit(rows), seed=bytes(32)),
-    )
-    assert len(people) == STRANGERS
-    assert saved(tmp_path, contract).stat().st_size < 3_000_000
 
 
 def test_frozen() -> None:
@@ -689,40 +561,11 @@ def test_the_largest_contract_has_fewer_values_than_are_read() -> None:
         make_calibration(mode="s2s", probe_m=m, foot_point_norm=(0.2, 0.9), levels=levels)
         for m in range(1, MAX_CALIBRATIONS + 1)
     )
-    binding = make_binding(n=MAX_CALIBRATIONS + 2)
+    binding = make_binding(n=MAX_CALIBRATIONS + 2, axes=MAX_CALIBRATIONS + 2)
     largest = make_contract(
         binding=binding,
         calibrations=entries,
-        expectation=make_expectation(binding.n),
-        nobody=make_nobody(binding.n),
         default_level="level-0",
         recorded={str(i): i for i in range(MAX_ITEMS)},
     )
     assert not too_many_parts(json.dumps(largest.public()).encode(), MAX_PARTS // 2)
-
-
-def test_one_thread_lifts_the_cohort(monkeypatch: pytest.MonkeyPatch) -> None:
-    """From Python 3.12 on a cached property has no lock of its own."""
-    contract = make_contract()
-    lift, lifts = Nobody.cohort, []
-    asked = threading.Barrier(4)
-
-    def slowly(*args: Any, **options: Any) -> RoundedBatch:
-        lifts.append(threading.get_ident())
-        time.sleep(0.2)  # The others ask meanwhile.
-        return lift(*args, **options)
-
-    def ask() -> None:
-        asked.wait()
-        seen.append(contract.cohort)
-
-    seen: list[RoundedBatch] = []
-    monkeypatch.setattr(Nobody, "cohort", slowly)
-    threads = [threading.Thread(target=ask) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert len(lifts) == 1
-    assert len(seen) == 4
-    assert all(each is seen[0] for each in seen)

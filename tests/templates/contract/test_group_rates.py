@@ -21,8 +21,6 @@ from tests.templates.contract.test_contract import (
     make_binding,
     make_calibration,
     make_contract,
-    make_expectation,
-    make_nobody,
 )
 
 RATE = Rate(1, 1000, 0.0, 0.01)
@@ -114,12 +112,10 @@ def test_the_largest_contract_with_groups_is_read() -> None:
         make_calibration(**LIFTED | {"probe_m": m}, levels=tuple(plain))
         for m in range(1, MAX_CALIBRATIONS + 1 - len(points))
     ]
-    binding = make_binding(n=MAX_CALIBRATIONS + 2)
+    binding = make_binding(n=MAX_CALIBRATIONS + 2, axes=MAX_CALIBRATIONS + 2)
     largest = make_contract(
         binding=binding,
         calibrations=(*points, *lifted),
-        expectation=make_expectation(binding.n),
-        nobody=make_nobody(binding.n),
         default_level="level-0",
         recorded={str(i): i for i in range(MAX_ITEMS)},
     )

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from templates.contract.document import Contract, Rate
-from templates.contract.verdict import Judgement, Verdict
+from templates.contract.verdict import Judgement, Verdict, upper_bound
 from templates.errors import ContractError, SealError
 from tests.templates.contract.test_contract import SEALER, make_contract
 
@@ -28,6 +28,34 @@ def test_a_rate_at_its_limit_passes_and_one_above_fails(verdict: Verdict) -> Non
     assert verdict.privacy.status == "PASS"
     assert replace(verdict.privacy, rate=rate(21)).status == "FAIL"
     assert verdict.accuracy.status == "FAIL"
+
+
+@pytest.mark.parametrize(
+    ("errors", "trials", "bound"),
+    # Clopper and Pearson's: scipy.stats.beta.ppf(0.95, errors + 1, trials - errors).
+    [(0, 100, 0.029513), (5, 100, 0.102253), (15, 300, 0.075949), (400, 5000, 0.086594), (3, 3, 1)],
+)
+def test_the_upper_bound_is_exact(errors: int, trials: int, bound: float) -> None:
+    assert upper_bound(errors, trials) == pytest.approx(bound, abs=1e-6)
+
+
+def test_a_rate_within_its_limit_is_not_shown_where_its_bound_is_not() -> None:
+    bounded = Judgement(rate(5, 100), 0.05, bound=0.1)
+    assert (bounded.status, bounded.close) == ("NOT SHOWN", True)
+    assert replace(bounded, rate=rate(15, 300)).status == "PASS"
+    assert replace(bounded, rate=rate(0, 300), shortfall="few faces").status == "NOT SHOWN"
+    assert Judgement.from_json(bounded.to_json()) == bounded
+    for broken in ({"upper": 0.05}, {"upper": None}, {"bound": None}, {"bound": 0.04}):
+        with pytest.raises(ContractError):
+            Judgement.from_json({**bounded.to_json(), **broken})
+    with pytest.raises(ContractError, match="at most 10,000"):
+        replace(bounded, rate=rate(0, 10_001))
+
+
+def test_a_verdict_without_accuracy_is_kept(verdict: Verdict) -> None:
+    alone = Verdict(privacy=verdict.privacy)
+    assert Verdict.from_json(alone.to_json()) == alone
+    assert alone.to_json().keys() == {"privacy"}
 
 
 def test_a_contract_keeps_its_verdict(tmp_path: Path, verdict: Verdict) -> None:

@@ -173,7 +173,7 @@ def test_documented_sizes_are_true():
     example = re.search(r"```json\n(.*?)```", text, re.DOTALL)
     assert example is not None
     documented = json.loads(example.group(1).replace("<64 lower-case hex digits>", CONTRACT))
-    assert documented == parts(encode(template(512, 32), contract_id=CONTRACT))[0]
+    assert documented == parts(encode(template(228, 120), contract_id=CONTRACT))[0]
 
 
 def test_what_cannot_be_written_is_refused():

@@ -34,7 +34,7 @@ def divergence(source: DecoyGenerator, people: Rows) -> float:
     """Kullback and Leibler's, of the decoys' covariance from that of people, in nats."""
     with Keystream.seeded("faces") as stream:
         decoys = np.cov(source.draw(10_000, 1, stream=stream)[:, 0], rowvar=False)
-    ratio = np.linalg.solve(decoys, np.cov(people, rowvar=False))
+    ratio = np.linalg.solve(decoys, np.cov(source.project(people), rowvar=False))
     return 0.5 * float(np.trace(ratio) - len(ratio) - np.linalg.slogdet(ratio)[1])
 
 

@@ -6,7 +6,6 @@ import sys
 import threading
 import tracemalloc
 from pathlib import Path
-from typing import Any
 
 import numba.core.caching as caching
 import numpy as np
@@ -28,10 +27,9 @@ from templates.distances import (
     warm_up,
 )
 from templates.distances.kernels import lanes
-from templates.errors import InvalidEmbedding, InvalidTemplate, TemplateError
+from templates.errors import InvalidEmbedding, TemplateError
 from templates.keys.randomness import Keystream
 from templates.space.lifting import lift
-from templates.space.rounded import RoundedBatch
 from templates.space.subspace import SubspaceBatch
 from tests.patience import PATIENCE_S
 
@@ -136,89 +134,6 @@ def test_spherical_agrees_with_the_reference(n: int, shape: tuple[int, int]) -> 
         above = (seen**2 - expected**2) / 2
         assert above.max() < 2e-5, name
         assert np.quantile(-above, 0.9) < 1e-5, name
-
-
-@pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("metric", METRICS)
-def test_rounded_templates_give_what_they_give_restored(
-    metric: Metric, shape: tuple[int, int]
-) -> None:
-    for name, (a, b) in relations(200, *shape).items():
-        b = SubspaceBatch(np.float32(2.5) * b.feet if name == "random" else b.feet, b.bases)
-        rounded = RoundedBatch.of(b)
-        # Parallel sets that were rounded are a problem that 50 steps do not finish.
-        options = {"metric": metric, "steps": 400}
-        seen = tiles.to_rounded(a, rounded, **options)
-        expected = tiles.pairwise(a, rounded.restored(), **options)
-        # What is computed in float64 on one way and not on the other is at the limit of both.
-        np.testing.assert_allclose(seen, expected, rtol=1e-4, atol=1e-5, err_msg=name)
-
-
-def test_few_lifted_probes_go_the_way_of_rounded_templates_and_nothing_else_does(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    rounded = RoundedBatch.of(lifted(faces(30, 64), 5, "templates"))
-    probes = lifted(faces(200, 64, "probes"), 3, "probes")
-    asked: list[int] = []
-    to_rounded = tiles.to_rounded
-
-    def noted(some: SubspaceBatch, *rest: RoundedBatch, **options: Any) -> np.ndarray:
-        asked.append(len(some))
-        return to_rounded(some, *rest, **options)
-
-    monkeypatch.setattr(tiles, "to_rounded", noted)
-    for metric in METRICS:
-        asked.clear()
-        for some in (probes[:0], probes[:1], probes[:9], probes, probes.feet):
-            seen = pairwise_distances(some, rounded, metric=metric)
-            expected = pairwise_distances(some, rounded.restored(), metric=metric)
-            np.testing.assert_allclose(seen, expected, rtol=1e-5)
-        assert asked == [0, 1, 9]
-        precise = pairwise_distances(probes[:1], rounded, metric=metric, dtype=np.float64)
-        assert precise.dtype == np.float64
-        assert asked == [0, 1, 9]
-
-
-@pytest.mark.parametrize("quiet", [1.0, 1e-3])
-def test_rounding_moves_a_similarity_by_far_less_than_templates_differ(quiet: float) -> None:
-    """Nor where some coordinates hardly differ, and a probe lies in these."""
-    scales = np.where(np.arange(512) < 128, quiet, 1.0)
-    people, strangers = (faces(400, 512, seed) * scales for seed in ("people", "strangers"))
-    people, strangers = (
-        rows / np.linalg.norm(rows, axis=1, keepdims=True) for rows in (people, strangers)
-    )
-    cohort = lifted(people[:100], 64, "cohort", decoys=people)
-    honest = lifted(strangers[:30], 4, "honest", decoys=strangers)
-    axes = np.eye(512, dtype=np.float32)[:120].reshape(30, 4, 512)
-    inside = SubspaceBatch(np.float32(0.3) * axes[::-1, 0], axes)
-    rounded = RoundedBatch.of(cohort)
-    for probes in (honest, inside):
-        exact, seen = (
-            similarity(pairwise_distances(probes, side, metric="spherical").astype(np.float64))
-            for side in (cohort, rounded.restored())
-        )
-        spread = exact.std(axis=1)
-        assert (np.abs(seen - exact).max(axis=1) < 0.3 * spread).all()
-        assert (np.abs(seen.mean(axis=1) - exact.mean(axis=1)) < 0.03 * spread).all()
-        np.testing.assert_allclose(seen.std(axis=1), spread, rtol=0.03)
-
-
-def test_arrays_of_rounded_templates_fit_each_other_and_cannot_be_written() -> None:
-    rounded = RoundedBatch.of(lifted(faces(6, 64), 5))
-    parts = {
-        "feet": rounded.feet,
-        "numbers": rounded.numbers,
-        "steps": rounded.steps,
-        "scales": rounded.scales,
-    }
-    assert not any(array.flags.writeable for array in parts.values())
-    assert np.abs(rounded.numbers.astype(int)).max() == 127
-    for name in ("feet", "steps", "scales"):
-        with pytest.raises(InvalidTemplate, match=name):
-            RoundedBatch(**{**parts, name: parts[name][:-1]})
-    broken = RoundedBatch(**{**parts, "scales": np.full(64, np.nan)})
-    with pytest.raises(InvalidTemplate, match="not finite"):
-        pairwise_distances(rounded.restored(), broken, metric="spherical")
 
 
 def test_a_large_dimension() -> None:
@@ -551,7 +466,6 @@ import numpy as np
 from numba.core import event
 from templates.distances import nearest, paired_distances, pairwise_distances, count_within, warm_up
 from templates.space.lifting import lift
-from templates.space.rounded import RoundedBatch
 
 warm_up()
 compiled = []
@@ -578,7 +492,6 @@ for m, k in ((1, 1), (2, 9), (16, 16), (20, 7)):
             nearest(probes, b, k=3, metric=metric, of_templates=True, labels=labels)
             count_within(probes, b, [0.5], metric=metric)
         paired_distances(a, b, metric=metric)
-        pairwise_distances(a[:1], RoundedBatch.of(b), metric=metric)
 print(compiled)
 """
 

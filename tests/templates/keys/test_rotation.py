@@ -4,7 +4,6 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-import scipy.linalg
 from numpy.typing import NDArray
 from scipy import stats
 from scipy.fft import dct
@@ -12,10 +11,7 @@ from scipy.fft import dct
 from templates.distances import Metric, pairwise_distances
 from templates.keys.randomness import Keystream
 from templates.keys.rotation import (
-    HAAR_VERSION,
-    ROTATION_VERSION,
     TRANSFORMS,
-    Rotation,
     SignedCosineRotation,
     TenantRotation,
     holder_rotation,
@@ -24,7 +20,6 @@ from templates.keys.sealing import encode_parts
 from templates.space.lifting import lift
 
 KNOWN = [0.29210510032827836, 0.14434577434, 5.805401994660683, -3.454763042292888, -3.04232787677]
-VERSIONS = [HAAR_VERSION, ROTATION_VERSION]
 
 
 def units(stream: Keystream, count: int, n: int) -> np.ndarray:
@@ -42,11 +37,11 @@ def expanded(key: bytes, info: bytes, length: int) -> bytes:
     return out[:length]
 
 
-def matrix(rotation: Rotation, n: int) -> NDArray[np.float64]:
+def matrix(rotation: SignedCosineRotation, n: int) -> NDArray[np.float64]:
     return rotation.turned(np.eye(n)).T
 
 
-def rotations(count: int, n: int) -> Callable[[str], Rotation]:
+def rotations(count: int, n: int) -> Callable[[str], SignedCosineRotation]:
     """The rotation of a template id, under the first of `count` keys."""
     return TenantRotation(count.to_bytes(32), n).of
 
@@ -77,22 +72,9 @@ def test_a_known_answer() -> None:
     np.testing.assert_allclose(found[0], KNOWN, atol=1e-9)
 
 
-def test_version_1_follows_from_the_key_as_documented() -> None:
-    key, n = b"k" * 32, 24
-    derived = expanded(key, f"veilface tenant rotation haar-1 n={n}".encode(), 32)
-    words = np.frombuffer(Keystream(derived).token(8 * n * n), dtype=np.uint64)
-    gaussian = stats.norm.ppf(words / 2.0**64).reshape(n, n)
-    q, r = scipy.linalg.qr(gaussian)
-    expected = q * np.sign(np.diag(r))
-    tenant = TenantRotation(key, n)
-    np.testing.assert_allclose(matrix(tenant.of("a", HAAR_VERSION), n), expected, atol=1e-9)
-    assert tenant.of("b", HAAR_VERSION) is tenant.of("a", HAAR_VERSION)
-
-
-@pytest.mark.parametrize("version", VERSIONS)
 @pytest.mark.parametrize("n", [2, 7, 64, 127, 512])
-def test_rotations_are_orthogonal_and_undone(n: int, version: str) -> None:
-    rotation = TenantRotation(b"a" * 32, n).of("template", version)
+def test_rotations_are_orthogonal_and_undone(n: int) -> None:
+    rotation = TenantRotation(b"a" * 32, n).of("template")
     found = matrix(rotation, n)
     np.testing.assert_allclose(found @ found.T, np.eye(n), atol=1e-12)
     np.testing.assert_allclose(rotation.turned_back(np.eye(n)), found, atol=1e-12)
@@ -101,7 +83,7 @@ def test_rotations_are_orthogonal_and_undone(n: int, version: str) -> None:
     np.testing.assert_allclose(rotation.turned(points), points @ found.T, atol=1e-12)
     np.testing.assert_array_equal(points, kept)
     np.testing.assert_allclose(rotation.turned_back(rotation.turned(points)), points, atol=1e-12)
-    again = TenantRotation(b"a" * 32, n).of("template", version)
+    again = TenantRotation(b"a" * 32, n).of("template")
     np.testing.assert_allclose(matrix(again, n), found, atol=1e-12)
 
 
@@ -115,7 +97,6 @@ def test_another_key_id_or_dimension_gives_an_unrelated_rotation() -> None:
         base.of(""),
         TenantRotation(b"b" * 32, n).of("template"),
         TenantRotation(b"a" * 31 + b"b", n).of("template"),
-        base.of("template", HAAR_VERSION),
     ]
     for other in others:
         assert abs(np.vdot(one, matrix(other, n))) < 8
@@ -167,40 +148,23 @@ def _signs(count: int, rows: int, n: int) -> NDArray[np.float64]:
     return np.where(Keystream.seeded("signs").uniform((count, rows, n)) < 0.5, -1.0, 1.0)
 
 
-def test_version_1_is_distributed_by_the_haar_measure() -> None:
-    n = 6
-    found = np.stack(
-        [matrix(TenantRotation(i.to_bytes(32), n).of("", HAAR_VERSION), n) for i in range(1500)]
-    )
-    # The square of any entry is Beta(1/2, (n - 1)/2); without the sign fix the diagonal is not.
-    for row, column in ((0, 0), (5, 5), (2, 4)):
-        entries = found[:, row, column]
-        assert stats.kstest(entries**2, "beta", (0.5, (n - 1) / 2)).pvalue > 1e-3
-        assert stats.binomtest(int((entries > 0).sum()), 1500).pvalue > 1e-3
-    assert stats.binomtest(int((np.linalg.det(found) > 0).sum()), 1500).pvalue > 1e-3
-
-
-@pytest.mark.parametrize("version", VERSIONS)
 @pytest.mark.parametrize("metric", list(Metric))
-def test_a_probe_that_is_turned_as_the_template_is_as_far_from_it(
-    metric: Metric, version: str
-) -> None:
+def test_a_probe_that_is_turned_as_the_template_is_as_far_from_it(metric: Metric) -> None:
     stream = Keystream.seeded("tenant")
     points, others = units(stream, 9, 40), units(stream, 7, 40)
     a = lift(points, strategy="random", m=12, stream=stream)
     b = lift(others, strategy="random", m=7, stream=stream)
-    turned = TenantRotation(b"r" * 32, 40).of("template", version).turned
+    turned = TenantRotation(b"r" * 32, 40).of("template").turned
     for probes, moved in ((points, turned(points)), (a, a.turned_by(turned))):
         before = pairwise_distances(probes, b, metric=metric, dtype=np.float64)
         after = pairwise_distances(moved, b.turned_by(turned), metric=metric, dtype=np.float64)
         np.testing.assert_allclose(after, before, atol=1e-6)
 
 
-@pytest.mark.parametrize("version", VERSIONS)
-def test_turning_before_lifting_is_turning_after(version: str) -> None:
+def test_turning_before_lifting_is_turning_after() -> None:
     stream = Keystream.seeded("order")
     points = units(stream, 5, 30)
-    rotation = TenantRotation(b"r" * 32, 30).of("template", version)
+    rotation = TenantRotation(b"r" * 32, 30).of("template")
     templates = lift(points, strategy="random", m=4, stream=stream).turned_by(rotation.turned)
     for template, point in zip(templates, rotation.turned(points), strict=True):
         template.validate(1e-6)
@@ -209,14 +173,12 @@ def test_turning_before_lifting_is_turning_after(version: str) -> None:
     assert all(t.contains(p) for t, p in zip(back, points, strict=True))
 
 
-def test_key_dimension_and_version_are_checked_and_the_key_is_not_shown() -> None:
+def test_key_and_dimension_are_checked_and_the_key_is_not_shown() -> None:
     with pytest.raises(ValueError, match="32 bytes, not 31"):
         TenantRotation(bytes(31), 8)
     with pytest.raises(ValueError, match="dimension"):
         TenantRotation(bytes(32), 0)
     tenant = TenantRotation(b"secret" * 5 + b"xy", 8)
-    with pytest.raises(ValueError, match="rotation version 'another'"):
-        tenant.of("template", "another")
     assert repr(tenant) == "TenantRotation(n=8)"
 
 

@@ -33,10 +33,9 @@ class Listed:
     """A source that gives the listed decoys and records what it was asked."""
 
     source_id = "0" * 64
-    noise = 0.0
 
     def __init__(self, *draws: np.ndarray) -> None:
-        self.n = draws[0].shape[-1]
+        self.n = self.k = draws[0].shape[-1]
         self.draws = list(draws)
         self.asked: list[tuple[int, int, Sequence[Attributes] | None, int | None]] = []
         self.streams: list[Keystream] = []

@@ -3,7 +3,7 @@
 import os
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from datetime import timedelta
 from typing import Any, TextIO
@@ -71,7 +71,7 @@ def test_a_subject_without_a_template_costs_as_many_bytes(store: TemplateStore) 
 
     def read(subject: str) -> list[bytes]:
         """The long values of the one row that an attempt reads."""
-        asked = store.attempts._asked("default", subject, None, [CONTRACT])
+        asked = store.attempts._asked("default", subject, None, CONTRACT)
         query = before(len(asked["pseudonyms"]))
         row = store.database.read(lambda connection: connection.execute(query, asked).one())
         return [bytes(value) for value in row if isinstance(value, bytes) and len(value) > 1000]
@@ -94,7 +94,7 @@ def conclude(
     decided_on: str | None,
     *,
     accepted: bool = True,
-    contract_ids: Sequence[str] | None = None,
+    contract_id: str | None = None,
     nonce: Nonce | None = None,
     tenant: str = "default",
 ) -> None:
@@ -104,7 +104,7 @@ def conclude(
         "ada",
         accepted=accepted,
         template_id=decided_on,
-        contract_ids=contract_ids,
+        contract_id=contract_id,
         level="high",
         nonce=nonce,
         by=BY,
@@ -113,7 +113,7 @@ def conclude(
 
 def begin(store: TemplateStore, *, tenant: str = "default", nonce: Nonce | None = None) -> Attempt:
     """Begin an attempt on ada."""
-    return store.attempts.begin(tenant, "ada", contract_ids=[CONTRACT], nonce=nonce)
+    return store.attempts.begin(tenant, "ada", contract_id=CONTRACT, nonce=nonce)
 
 
 def status(store: TemplateStore, subject: str = "ada") -> AttemptsStatus:
@@ -412,19 +412,16 @@ def test_a_rejection_of_nobody_who_is_enrolled_meanwhile_is_taken_back(
     assert ada.attempts.status("default", "ada") is None
 
 
-@pytest.mark.parametrize("served", [[CONTRACT], [CONTRACT, "e" * 64], ["e" * 64, CONTRACT]])
-def test_a_template_of_another_contract_is_as_good_as_none(
-    ada: TemplateStore, served: list[str]
-) -> None:
-    conclude(ada, None, accepted=False, contract_ids=["d" * 64])
+def test_a_template_of_another_contract_is_as_good_as_none(ada: TemplateStore) -> None:
+    conclude(ada, None, accepted=False, contract_id="d" * 64)
     assert status(ada).consecutive == 1
     with pytest.raises(Superseded):
-        conclude(ada, None, accepted=False, contract_ids=served)
+        conclude(ada, None, accepted=False, contract_id=CONTRACT)
     with pytest.raises(Superseded):
-        conclude(ada, template_id(ada, "ada"), contract_ids=["d" * 64, "e" * 64])
-    conclude(ada, template_id(ada, "ada"), contract_ids=served)
+        conclude(ada, template_id(ada, "ada"), contract_id="d" * 64)
+    conclude(ada, template_id(ada, "ada"), contract_id=CONTRACT)
     assert status(ada).consecutive == 0
-    found = ada.attempts.begin("default", "ada", contract_ids=served)
+    found = ada.attempts.begin("default", "ada", contract_id=CONTRACT)
     assert found.template_id == template_id(ada, "ada")
 
 
@@ -467,7 +464,7 @@ def test_an_attempt_on_nobody_and_on_another_contract_has_no_template(
 ) -> None:
     monkeypatch.setattr("templates.store.attempts.opened_template", None)  # nothing is decrypted
     for subject, contract in (("nobody", CONTRACT), ("ada", "d" * 64)):
-        found = ada.attempts.begin("default", subject, contract_ids=[contract, "e" * 64])
+        found = ada.attempts.begin("default", subject, contract_id=contract)
         assert found.template is None
         assert found.template_id is None
         assert found.rotation_epoch == 1
@@ -482,7 +479,7 @@ def alone(
     store: TemplateStore, decide: Callable[[Attempt], Says], *, nonce: Nonce | None = None
 ) -> Says:
     return store.attempts.decide_alone(
-        "default", "ada", decide, contract_ids=[CONTRACT], nonce=nonce, by=BY
+        "default", "ada", decide, contract_id=CONTRACT, nonce=nonce, by=BY
     )
 
 

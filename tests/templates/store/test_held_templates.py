@@ -35,7 +35,7 @@ def hold(store: TemplateStore, subject: str = "ada", **more: str) -> bytes:
 def opens(store: TemplateStore, held_template: bytes, subject: str = "ada") -> bool:
     """Whether a verification would be decided by the template that is sent."""
     attempt = store.attempts.begin(
-        "default", subject, contract_ids=[CONTRACT], held_template=held_template
+        "default", subject, contract_id=CONTRACT, held_template=held_template
     )
     assert attempt.template is None or attempt.template.wire == WIRE
     return attempt.template is not None
@@ -96,9 +96,7 @@ def test_no_other_template_opens(store: TemplateStore) -> None:
     # One that nobody waits for is handed on: the caller still owes the work of trying it.
     put(store, "stored", WIRE)
     for subject in ("nobody", "stored"):
-        attempt = store.attempts.begin(
-            "default", subject, contract_ids=[CONTRACT], held_template=held
-        )
+        attempt = store.attempts.begin("default", subject, contract_id=CONTRACT, held_template=held)
         assert attempt.untried == held
         assert (attempt.template is None) == (subject == "nobody")
 
@@ -128,14 +126,14 @@ def test_a_decision_without_it_is_counted(store: TemplateStore) -> None:
     hold(store)
     record = store.subjects.describe("default", "ada")
     assert record is not None
-    attempt = store.attempts.begin("default", "ada", contract_ids=[CONTRACT])
+    attempt = store.attempts.begin("default", "ada", contract_id=CONTRACT)
     assert (attempt.template, attempt.template_id) == (None, record.template_id)
     store.attempts.conclude(
         "default",
         "ada",
         accepted=False,
         template_id=attempt.template_id,
-        contract_ids=[CONTRACT],
+        contract_id=CONTRACT,
         level="fmr-1e-3",
         nonce=None,
         by=By("key:x"),
@@ -162,7 +160,7 @@ def test_a_decision_under_the_lock_has_it_too(store: TemplateStore) -> None:
             "default",
             "ada",
             decide,
-            contract_ids=[CONTRACT],
+            contract_id=CONTRACT,
             nonce=None,
             held_template=sent,
             by=By("key:x"),
@@ -199,7 +197,7 @@ def test_a_renewal_of_the_rotations_leaves_it_where_it_is(store: TemplateStore) 
 
     def read() -> bytes | None:
         attempt = store.attempts.begin(
-            "default", "s001", contract_ids=[contract_id], held_template=held
+            "default", "s001", contract_id=contract_id, held_template=held
         )
         assert attempt.template is not None
         assert attempt.template.record.rotation_epoch == 1

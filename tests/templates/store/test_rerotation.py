@@ -21,7 +21,7 @@ from templates.contract.binding import Binding
 from templates.distances import Metric, pairwise_distances
 from templates.errors import StoreError, StoreUnavailable
 from templates.keys.randomness import Keystream
-from templates.keys.rotation import HAAR_VERSION, ROTATION_VERSION, Rotation, TenantRotation
+from templates.keys.rotation import ROTATION_VERSION, SignedCosineRotation, TenantRotation
 from templates.keys.sealing import MasterKeyring
 from templates.space.lifting import Strategy, lift
 from templates.space.subspace import AffineSubspace, SubspaceBatch
@@ -40,8 +40,8 @@ N, M = 48, 4
 OPERATOR = By("operator:kim", "request-1")
 
 
-def binding(n: int = N, m: int = M, version: str = ROTATION_VERSION) -> Binding:
-    return Binding("ab" * 32, {}, n, Strategy.RANDOM, m, "cd" * 32, version)
+def binding(n: int = N, m: int = M) -> Binding:
+    return Binding("ab" * 32, {}, n, n, Strategy.RANDOM, m, "cd" * 32, ROTATION_VERSION)
 
 
 def units(stream: Keystream, count: int, n: int = N) -> NDArray[np.float64]:
@@ -50,10 +50,7 @@ def units(stream: Keystream, count: int, n: int = N) -> NDArray[np.float64]:
 
 
 class People:
-    """Subjects with a template each, enrolled as the service does it: lifted, then turned.
-
-    `version` is that of the service that enrolls, whose contract follows from it.
-    """
+    """Subjects with a template each, enrolled as the service does it: lifted, then turned."""
 
     def __init__(
         self,
@@ -62,7 +59,6 @@ class People:
         *,
         n: int = N,
         m: int = M,
-        version: str = ROTATION_VERSION,
     ) -> None:
         self._store = store
         self.names = [f"s{number:03}" for number in range(count)]
@@ -71,7 +67,7 @@ class People:
         self.templates = lift(self.points, strategy="random", m=m, stream=stream)
         self._stream = stream
         self.n, self.m = n, m
-        self.version = version
+
         self._rotations: dict[bytes, TenantRotation] = {}
 
     def enroll(
@@ -91,13 +87,13 @@ class People:
         template_id: str,
         dtype: wire.WireDtype = "float16",
     ) -> bytes:
-        rotation = self.tenant_rotation(epoch, tenant).of(template_id, self.version)
+        rotation = self.tenant_rotation(epoch, tenant).of(template_id)
         turned = template.turned_by(rotation.turned)
         return wire.encode(turned, contract_id=self.binding.contract_id, dtype=dtype)
 
     @property
     def binding(self) -> Binding:
-        return binding(self.n, self.m, self.version)
+        return binding(self.n, self.m)
 
     def put(
         self,
@@ -128,12 +124,11 @@ class People:
             self._rotations[key] = TenantRotation(key, self.n)
         return self._rotations[key]
 
-    def rotation(self, stored: SubjectTemplate) -> Rotation:
+    def rotation(self, stored: SubjectTemplate) -> SignedCosineRotation:
         """By the epoch, id and contract of a stored template."""
         record = stored.record
-        versions = binding(self.n, self.m).rotation_versions
         of_epoch = self.tenant_rotation(record.rotation_epoch)
-        return of_epoch.of(record.template_id, versions[record.contract_id])
+        return of_epoch.of(record.template_id)
 
     def distances(
         self, probes: NDArray[np.float64], metric: Metric = Metric.EUCLIDEAN
@@ -214,12 +209,11 @@ def test_a_new_epoch_serves_new_enrollments_and_keeps_the_old(store: TemplateSto
         store.rerotation.begin("nobody")
 
 
-@pytest.mark.parametrize("version", [HAAR_VERSION, ROTATION_VERSION])
 @pytest.mark.parametrize("dtype", ["float16", "float32"])
 def test_moved_templates_are_the_same_sets_in_the_new_rotation(
-    store: TemplateStore, clock: Clock, dtype: wire.WireDtype, version: str
+    store: TemplateStore, clock: Clock, dtype: wire.WireDtype
 ) -> None:
-    people = People(store, 7, version=version)
+    people = People(store, 7)
     for name in people.names:
         people.enroll(name, dtype=dtype)
     people.enroll("s003", tenant="other")
@@ -244,8 +238,6 @@ def test_moved_templates_are_the_same_sets_in_the_new_rotation(
         "templates.ciphertext",
         "templates.rotation_epoch",
     }
-    if version == HAAR_VERSION:
-        changed.add("templates.contract_id")
     old_rotation = people.tenant_rotation(1)
     for name in people.names:
         different = {key for key in before[name] if before[name][key] != after[name][key]}
@@ -258,7 +250,7 @@ def test_moved_templates_are_the_same_sets_in_the_new_rotation(
         # The new numbers are those of the new rotation only.
         subspace = SubspaceBatch.of([wire.decode(stored.wire).subspace])
         own = people.points[[people.names.index(name)]]
-        old = old_rotation.of(stored.record.template_id, version).turned(own)
+        old = old_rotation.of(stored.record.template_id).turned(own)
         assert pairwise_distances(old, subspace, metric="euclidean").min() > 0.1
     assert store.subjects.get("other", "s003") == theirs
 
@@ -375,9 +367,8 @@ def test_what_is_left_is_named_in_pages(store: TemplateStore) -> None:
         list(store.rerotation.subjects_of_old_epochs("nobody"))
 
 
-@pytest.mark.parametrize("version", [HAAR_VERSION, ROTATION_VERSION])
-def test_an_interrupted_move_goes_on_where_it_stopped(store: TemplateStore, version: str) -> None:
-    people = People(store, 8, version=version)
+def test_an_interrupted_move_goes_on_where_it_stopped(store: TemplateStore) -> None:
+    people = People(store, 8)
     for name in people.names:
         people.enroll(name)
     store.rerotation.begin("default")
@@ -391,42 +382,6 @@ def test_an_interrupted_move_goes_on_where_it_stopped(store: TemplateStore, vers
     assert people.own_distances().max() < 1e-3  # in both epochs
     assert store.rerotation.move("default", binding()) == 5
     assert people.own_distances().max() < 1e-3
-
-
-def test_templates_of_both_versions_are_served_in_one_epoch_and_moved(store: TemplateStore) -> None:
-    """A deployment that was calibrated anew, and enrolls, before its tenant is renewed."""
-    before, after = People(store, 6, version=HAAR_VERSION), People(store, 6)
-    for name in before.names:
-        before.enroll(name)
-    for name in after.names[:2]:
-        after.enroll(name)
-    old, new = before.binding.contract_id, after.binding.contract_id
-    served = after.binding.contract_ids
-    assert served == (new, old)
-    found = [row["templates.contract_id"] for _, row in sorted(rows(store).items())]
-    assert found == [new] * 2 + [old] * 4
-    assert {row["templates.rotation_epoch"] for row in rows(store).values()} == {1}
-    assert after.own_distances().max() < 1e-3
-    begun = store.attempts.begin("default", "s005", contract_ids=served)
-    assert begun.template is not None
-    assert begun.template.record.contract_id == old
-
-    store.rerotation.begin("default")
-    assert store.rerotation.move("default", after.binding) == 6
-    assert store.rerotation.retire("default") == 1
-    assert {row["templates.contract_id"] for row in rows(store).values()} == {new}
-    assert after.own_distances().max() < 1e-3
-    # What was read before the move is still decided on.
-    store.attempts.conclude(
-        "default",
-        "s005",
-        accepted=True,
-        template_id=begun.template_id,
-        contract_ids=served,
-        level="m",
-        nonce=None,
-        by=OPERATOR,
-    )
 
 
 def test_templates_of_another_contract_are_left_and_named(store: TemplateStore) -> None:
@@ -473,7 +428,7 @@ store.rerotation.move("default", binding(), batch=2, progress=die)
 def test_ten_kills_on_the_way_lose_nothing(
     store: TemplateStore, database_url: str, key_file: Path
 ) -> None:
-    people = People(store, 11, version=HAAR_VERSION)
+    people = People(store, 11)
     for name in people.names:
         people.enroll(name)
     store.rerotation.begin("default")
@@ -601,12 +556,11 @@ def test_an_enrollment_under_way_is_waited_for_before_a_key_goes(
     service.close()
 
 
-@pytest.mark.parametrize("version", [HAAR_VERSION, ROTATION_VERSION])
 def test_a_service_in_use_loses_nothing(
-    store: TemplateStore, database_url: str, key_file: Path, version: str
+    store: TemplateStore, database_url: str, key_file: Path
 ) -> None:
     service = TemplateStore(database_url, MasterKeyring.load(key_file))
-    people, users = People(store, 10, version=version), People(service, 10)
+    people, users = People(store, 10), People(service, 10)
     for name in people.names:
         people.enroll(name)
     errors: list[BaseException] = []

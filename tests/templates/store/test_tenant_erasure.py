@@ -254,7 +254,7 @@ def test_concurrent_enrollments_leave_nothing(
                             name,
                             accepted=False,
                             template_id=None,
-                            contract_ids=["of another one"],
+                            contract_id="of another one",
                             level="m",
                             nonce=None,
                             by=By(),

@@ -1,3 +1,4 @@
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -81,6 +82,21 @@ def test_each_side_is_lifted_and_the_other_compared_with_it() -> None:
         assert found[Mode.SUBSPACE, "euclidean", "both"][row] == pytest.approx(
             similarity(residual(second.foot, first.foot, rows)), abs=1e-4
         )
+
+
+def test_both_photos_are_projected_on_the_axes_of_a_generator() -> None:
+    known = material(people=60, pairs=30)
+    source = DecoyGenerator.fit(known.descriptors).reduced(N - 6)
+    known = dataclasses.replace(known, sources=(source,))
+    (found,) = score_unit(known, unit(modes=(Mode.POINT,), metrics=(Metric.EUCLIDEAN,)))[:1]
+    probes, enrolled = (
+        source.project(known.descriptors[photos]) for photos in (known.second, known.first)
+    )
+    with Keystream.seeded("evaluation", "first", Strategy.ADVERSARIAL, 4, 3) as stream:
+        lifted = lift(enrolled, strategy="adversarial", m=4, source=source, stream=stream)
+    for row in range(30):
+        distance = residual(probes[row], lifted[row].foot, lifted[row].basis)
+        assert found.similarities[row] == pytest.approx(similarity(distance), abs=1e-5)
 
 
 def test_a_device_gives_the_similarities_of_the_processor() -> None:

@@ -196,7 +196,7 @@ def test_a_separation_may_be_negative() -> None:
 def test_the_report_says_what_mlp_hash_is() -> None:
     report = markdown(sample_results(dims=(2,)))
     said = "Rows of mlp-hash are of a reconstruction from the published description"
-    assert f"{said} (docs/evaluation-columns.md)" in report
+    assert f"{said} (docs/evaluation.md)" in report
 
 
 def test_failures_to_acquire_are_listed_up_to_twenty() -> None:

@@ -6,7 +6,6 @@ import { meanEmbedding } from "./agreement.js";
 import { ContractError } from "./errors.js";
 import type { DecoyGenerator } from "./generator.js";
 import { lift, type Strategy } from "./lifting.js";
-import { Keystream } from "./randomness.js";
 import { encode } from "./wire.js";
 
 /** The answer of `GET /v1/contract`, as far as a client reads it. */
@@ -15,6 +14,7 @@ export interface PublicContract extends PackContract {
   readonly binding: PackContract["binding"] & {
     readonly strategy: Strategy;
     readonly m: number;
+    readonly axes: number;
     readonly decoy_source_id: string;
     readonly rotation_version: string;
   };
@@ -35,7 +35,7 @@ export async function requireContract(
   if ((await digest(binding)) !== contract.contract_id) {
     throw new ContractError("the contract_id is not the hash of the binding");
   }
-  if (generator.sourceId !== binding.decoy_source_id) {
+  if (generator.sourceId !== binding.decoy_source_id || generator.k !== binding.axes) {
     throw new ContractError("the decoy generator is not that of the contract");
   }
   const { embedder_sha256, preprocessing } = binding;
@@ -78,14 +78,8 @@ export function liftTemplate(
   const { binding, contract_id, photo_consistency, probe_consistency } = contract;
   const m = liftDimension(contract, options);
   const consistency = options.probe ? probe_consistency : photo_consistency;
-  const descriptor = meanEmbedding(embeddings, consistency);
-  const stream = Keystream.fresh();
-  try {
-    const subspace = lift(descriptor, { strategy: binding.strategy, m, generator, stream });
-    return encode(subspace, contract_id);
-  } finally {
-    stream.destroy();
-  }
+  const mean = meanEmbedding(embeddings, consistency);
+  return encode(lift(mean, { strategy: binding.strategy, m, generator }), contract_id);
 }
 
 /** SHA-256 of the canonical JSON: sorted keys, no spaces. */

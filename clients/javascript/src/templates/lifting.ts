@@ -1,62 +1,47 @@
-/** From descriptors to private templates: `templates/space/lifting.py`. */
+/** From embeddings to private templates: `templates/space/lifting.py`. */
 
 import { LiftingError } from "./errors.js";
 import type { DecoyGenerator } from "./generator.js";
-import type { Keystream } from "./randomness.js";
-import { rowsOf, templateThrough, type AffineSubspace } from "./subspace.js";
+import { Randomness } from "./randomness.js";
+import { dot, rowsOf, templateThrough, type AffineSubspace } from "./subspace.js";
 
 /** The strategies that a decoy generator serves. */
 export type Strategy = "random" | "adversarial" | "hybrid";
 
-const UNIT_TOLERANCE = 1e-3;
-// Two decoys, or a decoy and the descriptor, nearer than this would add a direction of noise.
+// Two decoys, or a decoy and the point, nearer than this would add a direction of noise.
 const SAME = 1e-3;
 const REDRAWS = 16;
 
 /**
- * Lift a descriptor to a private template.
+ * Project an embedding on the generator's axes, and lift it to a private template of k numbers.
  *
- * A person's photos are averaged first and lifted once: two lifts of one descriptor meet in it
+ * A person's photos are averaged first and lifted once: two lifts of one embedding meet in it
  * (docs/method.md §4.6).
  *
- * @param descriptor n values of norm 1.
- * @param m dimension of the subspace, 1 ≤ m < n; 2 or more for the hybrid strategy.
- * @param stream a fresh one for each template, destroyed afterwards.
+ * @param embedding n values of norm 1.
+ * @param m dimension of the subspace, 1 ≤ m < k; 2 or more for the hybrid strategy.
  */
 export function lift(
-  descriptor: ArrayLike<number>,
+  embedding: Float32Array,
   {
     strategy,
     m,
     generator,
-    stream,
-  }: { strategy: Strategy; m: number; generator: DecoyGenerator; stream: Keystream },
+    randomness = new Randomness(),
+  }: { strategy: Strategy; m: number; generator: DecoyGenerator; randomness?: Randomness },
 ): AffineSubspace {
-  const n = descriptor.length;
-  const k = decoysOf(strategy, m);
-  if (!Number.isInteger(m) || m < 1 || m >= n || (strategy !== "random" && k === 0)) {
-    throw new LiftingError(`m = ${m} is out of range for ${strategy} lifting of ${n} numbers`);
+  const { k } = generator;
+  const count = decoysOf(strategy, m);
+  if (!Number.isInteger(m) || m < 1 || m >= k || (strategy !== "random" && count === 0)) {
+    throw new LiftingError(`m = ${m} is out of range for ${strategy} lifting of ${k} numbers`);
   }
-  if (generator.n !== n) {
-    throw new LiftingError(`decoys of ${generator.n} numbers do not fit embeddings of ${n}`);
-  }
-  let point = Float64Array.from(descriptor);
-  const norm = Math.sqrt(dot(point, point));
-  if (!(Math.abs(norm - 1) <= UNIT_TOLERANCE)) {
-    throw new LiftingError("an embedding must have norm 1; L2-normalise it");
-  }
-  point = point.map((value) => value / norm);
-  if (k > 0 && generator.noise > 0) {
-    const deviation = Math.sqrt(generator.noise);
-    const noise = stream.normal(n);
-    point = point.map((value, i) => value + deviation * noise[i]);
-    const length = Math.sqrt(dot(point, point));
-    point = point.map((value) => value / length);
-  }
-  const directions = k > 0 ? decoys(point, k, generator, stream) : [];
+  const projected = Float64Array.from(generator.project(embedding));
+  const norm = Math.sqrt(dot(projected, projected));
+  const point = projected.map((value) => value / norm);
+  const directions = decoys(point, count, generator, randomness);
   for (const decoy of directions) decoy.forEach((value, i) => (decoy[i] = value - point[i]));
-  if (k < m) directions.push(...rowsOf(stream.uniform((m - k) * n, -1, 1), n));
-  return templateThrough(point, directions, stream);
+  directions.push(...rowsOf(randomness.uniform((m - count) * k, -1, 1), k));
+  return templateThrough(point, directions, randomness);
 }
 
 /** Number of decoys among `m` directions: all, half (rounded down) or none. */
@@ -73,15 +58,15 @@ function decoysOf(strategy: Strategy, m: number): number {
   }
 }
 
-/** Draw decoys, and draw again where two nearly coincide, or one with the descriptor. */
+/** Draw decoys, and draw again where two nearly coincide, or one with the point. */
 function decoys(
   point: Float64Array,
-  k: number,
+  count: number,
   generator: DecoyGenerator,
-  stream: Keystream,
+  randomness: Randomness,
 ): Float64Array[] {
   for (let draw = 0; draw <= REDRAWS; draw++) {
-    const drawn = generator.draw(k, stream);
+    const drawn = generator.draw(count, randomness);
     const members = [point, ...drawn];
     const repeats = members.some((one, i) =>
       members.some((other, j) => j < i && 2 - 2 * dot(one, other) < SAME ** 2),
@@ -90,9 +75,3 @@ function decoys(
   }
   throw new LiftingError("the decoy generator keeps drawing the same decoy twice");
 }
-
-const dot = (a: Float64Array, b: Float64Array): number => {
-  let sum = 0;
-  for (let i = 0; i < a.length; i++) sum += a[i] * b[i];
-  return sum;
-};

@@ -1,7 +1,7 @@
 /** The private template: an affine subspace in a form that shows nothing but the set. */
 
 import { LiftingError } from "./errors.js";
-import type { Keystream } from "./randomness.js";
+import type { Randomness } from "./randomness.js";
 
 /** One private template, foot + span(basis). Printing it shows no number of it. */
 export class AffineSubspace {
@@ -13,12 +13,12 @@ export class AffineSubspace {
     this.#basis = basis;
   }
 
-  /** Foot point, n values, orthogonal to the basis. */
+  /** Foot point, k values, orthogonal to the basis. */
   get foot(): Float32Array {
     return this.#foot;
   }
 
-  /** Orthonormal rows: m · n values, row by row. */
+  /** Orthonormal rows: m · k values, row by row. */
   get basis(): Float32Array {
     return this.#basis;
   }
@@ -27,7 +27,8 @@ export class AffineSubspace {
 // Directions closer than this to the span of the others, relative to their length, are noise.
 const LEAST_PIVOT = 1e-5;
 
-const dot = (a: Float64Array, b: Float64Array): number => {
+/** The scalar product. */
+export const dot = (a: Float64Array, b: Float64Array): number => {
   let sum = 0;
   for (let i = 0; i < a.length; i++) sum += a[i] * b[i];
   return sum;
@@ -77,26 +78,26 @@ export function orthonormalised(rows: readonly Float64Array[]): Float64Array[] {
  *
  * The basis is O · GS(Π G): G a Gaussian frame, Π the projection on the direction space, GS the
  * Gram–Schmidt process, O an orthogonal matrix by Haar's measure. So it depends on the set and on
- * the stream alone, not on the descriptor, nor on the decoys one by one (docs/method.md §2.2).
+ * the samples alone, not on the embedding, nor on the decoys one by one (docs/method.md §2.2).
  * All of it is float64; the result is rounded to float32.
  */
 export function templateThrough(
   point: Float64Array,
   directions: readonly Float64Array[],
-  stream: Keystream,
+  randomness: Randomness,
 ): AffineSubspace {
-  const [m, n] = [directions.length, point.length];
-  const frame = rowsOf(stream.normal(m * n), n);
+  const [m, k] = [directions.length, point.length];
+  const frame = rowsOf(randomness.normal(m * k), k);
   const span = orthonormalised(directions);
   const foot = Float64Array.from(point);
   for (let twice = 0; twice < 2; twice++) {
     for (const row of span) add(foot, -dot(foot, row), row);
   }
-  const turn = orthonormalised(rowsOf(stream.normal(m * m), m));
+  const turn = orthonormalised(rowsOf(randomness.normal(m * m), m));
   const projected = frame.map((row) => Float64Array.from(span, (other) => dot(row, other)));
   const basis = combined(combined(turn, orthonormalised(projected)), span);
-  const stored = new Float32Array(m * n);
-  basis.forEach((row, i) => stored.set(row, i * n));
+  const stored = new Float32Array(m * k);
+  basis.forEach((row, i) => stored.set(row, i * k));
   return new AffineSubspace(Float32Array.from(foot), stored);
 }
 

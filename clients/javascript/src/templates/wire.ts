@@ -4,12 +4,12 @@ import type { AffineSubspace } from "./subspace.js";
 
 /** The bytes of a template: safetensors with one canonical header, float16. */
 export function encode({ foot, basis }: AffineSubspace, contractId: string): Uint8Array {
-  const [n, m] = [foot.length, basis.length / foot.length];
-  const [split, end] = [2 * n, 2 * n * (m + 1)];
+  const [k, m] = [foot.length, basis.length / foot.length];
+  const [split, end] = [2 * k, 2 * k * (m + 1)];
   const header = JSON.stringify({
     __metadata__: { format: "veilface-template", version: "1", contract_id: contractId },
-    foot: { dtype: "F16", shape: [n], data_offsets: [0, split] },
-    basis: { dtype: "F16", shape: [m, n], data_offsets: [split, end] },
+    foot: { dtype: "F16", shape: [k], data_offsets: [0, split] },
+    basis: { dtype: "F16", shape: [m, k], data_offsets: [split, end] },
   });
   const text = new TextEncoder().encode(header.padEnd(8 * Math.ceil(header.length / 8), " "));
   const bytes = new Uint8Array(8 + text.length + end);

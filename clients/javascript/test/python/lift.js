@@ -4,11 +4,10 @@ import {
   DecoyGenerator,
   encode,
   InconsistentImages,
-  inverseNormal,
-  Keystream,
   lift,
   liftTemplate,
   meanEmbedding,
+  Randomness,
   requireContract,
   TemplateError,
 } from "../../dist/index.js";
@@ -17,33 +16,32 @@ import { bytes, input, output, text } from "./io.js";
 const floats = (encoded) => new Float32Array(bytes(encoded).buffer);
 
 const calls = {
-  quantiles: ({ probabilities }) => probabilities.map(inverseNormal),
-
-  draws({ key, count }) {
-    const stream = new Keystream(bytes(key));
-    return [stream.uniform(count), stream.normal(count), stream.uniform(count, -1, 1)].map(text);
-  },
+  draws: ({ count }) => [
+    text(new Randomness().uniform(count, -1, 1)),
+    text(new Randomness().normal(count)),
+  ],
 
   async read({ generator }) {
-    return (await DecoyGenerator.fromBytes(bytes(generator))).noise;
+    const { n, k, sourceId } = await DecoyGenerator.fromBytes(bytes(generator));
+    return { n, k, source_id: sourceId };
   },
 
-  async lift({ key, descriptor, generator, strategy, m, contract_id }) {
+  async project({ generator, embedding }) {
+    return text((await DecoyGenerator.fromBytes(bytes(generator))).project(floats(embedding)));
+  },
+
+  async decoys({ generator, count }) {
     const source = await DecoyGenerator.fromBytes(bytes(generator));
-    const stream = new Keystream(bytes(key));
-    const begun = performance.now();
-    const subspace = lift(floats(descriptor), { strategy, m, generator: source, stream });
-    const milliseconds = performance.now() - begun;
-    return {
-      foot: text(subspace.foot),
-      basis: text(subspace.basis),
-      wire: text(encode(subspace, contract_id)),
-      source_id: source.sourceId,
-      milliseconds,
-    };
+    return text(Float32Array.from(source.draw(count, new Randomness()).flatMap((row) => [...row])));
   },
 
-  /** Under keys of this process's own. */
+  async lift({ embedding, generator, strategy, m, contract_id }) {
+    const source = await DecoyGenerator.fromBytes(bytes(generator));
+    const { foot, basis } = lift(floats(embedding), { strategy, m, generator: source });
+    const wire = text(encode({ foot, basis }, contract_id));
+    return { foot: text(foot), basis: text(basis), wire };
+  },
+
   async template({ contract, generator, embeddings, probe, dim }) {
     const source = await DecoyGenerator.fromBytes(bytes(generator));
     await requireContract(contract, source);
