@@ -31,6 +31,7 @@ from templates.distances import Metric
 from templates.keys.randomness import KEY_BYTES, Keystream
 from templates.space.lifting import Strategy, lift, plain_strategy
 from templates.space.subspace import SubspaceBatch
+from verify.evaluation.groups import least_of_highest
 from verify.metrics import rate, threshold_at_fmr
 
 SHARES_OF_VARIANCE = (0.76, 0.83, 0.90)
@@ -368,7 +369,8 @@ def judge_groups(contract: Contract) -> Judgement | None:
     """Hold the FMR within the worst group of people, at the default level, against its limit.
 
     The highest over raw probes of every number of photos, in groups with trials enough to judge;
-    None where there is none: nobody was labelled, or all groups are small.
+    None where there is none: nobody was labelled, or all groups are small. A rate above the limit
+    shows nothing where the highest of so many groups may be as high by chance.
     """
     name = contract.default_level
     judged = [
@@ -383,14 +385,21 @@ def judge_groups(contract: Contract) -> Judgement | None:
         return None
     # Of equal rates the one with more trials is named: it is known best.
     worst, target, calibration = max(judged, key=lambda one: (one[0].fmr.value, one[0].fmr.trials))
+    limit, found = GROUP_LIMIT * target, worst.fmr
+    groups = len({(one.attribute, one.group) for one, _, _ in judged})
+    shortfall = None
+    if found.value > limit >= least_of_highest(found.errors, found.trials, groups=groups):
+        shortfall = f"the highest of {groups} groups may be above the limit by chance"
     return Judgement(
-        worst.fmr,
-        GROUP_LIMIT * target,
+        found,
+        limit,
         {
             "level": name,
             "attribute": worst.attribute,
             "group": worst.group,
             "probe_photos": calibration.probe_photos,
+            "groups": groups,
             "groups_from": calibration.calibrated_on.get("groups_from"),
         },
+        shortfall,
     )

@@ -69,7 +69,7 @@ def _groups_line(groups: Judgement | None) -> str:
         f"Groups:   {groups.status}. Worst is {basis['attribute']} {basis['group']}: "
         f"{shown_rate(groups.rate)} of its impostor probes of {photos} "
         f"match at {basis['level']}; limit {100 * groups.limit:.3g} %. "
-        f"Groups by {basis['groups_from']}; lifted probes are not in it."
+        f"Groups by {basis['groups_from']}; lifted probes are not in it.{_shortfall(groups)}"
     )
 
 

@@ -19,6 +19,15 @@ MIN_GENUINE = 100
 _LEVEL = 0.05
 
 
+def least_of_highest(errors: float, trials: int, *, groups: int) -> float:
+    """Lower bound of the highest of so many groups' rates: Wilson's at 1 − 0.05 / groups.
+
+    The highest of several rates is above by chance alone more often than one that was named
+    beforehand (Bonferroni). `evaluate` and the verdict of a calibration judge by this bound.
+    """
+    return wilson(errors, trials, confidence=1 - _LEVEL / groups)[0]
+
+
 @dataclass(frozen=True)
 class MeanRate:
     """An error rate over one or several runs on the same trials.
@@ -267,7 +276,7 @@ def _worst(judged: Sequence[tuple[str, MeanRate]], pooled: MeanRate) -> Worst | 
         return None
     # Of equal rates the one with more trials is named: it is known best.
     name, rate = max(judged, key=lambda entry: (entry[1].value or 0.0, entry[1].trials))
-    low, _ = wilson(rate.errors, rate.trials, confidence=1 - _LEVEL / len(judged))
+    low = least_of_highest(rate.errors, rate.trials, groups=len(judged))
     return Worst(group=name, rate=rate, apart=low > (pooled.value or 0.0))
 
 
