@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from attacks.outcomes import CONTROL, AttackOutcome, Knowledge, Leaked, Property, unproven
+from attacks.second_order import Moments, decoy_moment
 from attacks.system import System
 from attacks.unlinkability import Unlinkability, unlinkability
 from templates.contract.canonical import Json
-from templates.distances import Metric, pairwise_distances, similarity
 from templates.keys.randomness import KEY_BYTES, Keystream
 from templates.keys.rotation import SignedCosineRotation, TenantRotation, holder_rotation
 from templates.space.subspace import SubspaceBatch, Turn
@@ -26,10 +26,24 @@ Array64 = NDArray[np.float64]
 Score = Callable[[SubspaceBatch, SubspaceBatch], Array64]
 
 
-def nearest_similarities(left: SubspaceBatch, right: SubspaceBatch) -> Array64:
-    """Spherical subspace-to-subspace similarities, (T, U): what a service would match with."""
-    distances = pairwise_distances(left, right, metric=Metric.SPHERICAL)
-    return np.asarray(similarity(distances), dtype=np.float64)
+def span_overlaps(left: SubspaceBatch, right: SubspaceBatch, decoys: Moments) -> Array64:
+    """How much the linear spans of templates have in common, (T, U): more where they share a face.
+
+    The sum of squared cosines of the principal angles, in coordinates in which decoys are spread
+    evenly, less the average over templates. Nearest points tell nothing where two templates have
+    more dimensions than the axes are: they meet then, whosesoever they are.
+    """
+    white = decoys.whitening.astype(np.float64)
+
+    def projectors(batch: SubspaceBatch) -> Array64:
+        rows = []
+        for foot, basis in zip(batch.feet, batch.bases, strict=True):
+            span = np.concatenate([foot[None], basis]).astype(np.float64) @ white
+            axes = np.linalg.qr(span.T)[0]
+            rows.append((axes @ axes.T).ravel())
+        return np.asarray(np.stack(rows) - np.mean(rows, axis=0))
+
+    return np.asarray(projectors(left) @ projectors(right).T)
 
 
 def foot_lengths(left: SubspaceBatch, right: SubspaceBatch) -> Array64:
@@ -37,8 +51,7 @@ def foot_lengths(left: SubspaceBatch, right: SubspaceBatch) -> Array64:
     return -np.abs(left.foot_norms[:, None] - right.foot_norms)
 
 
-LENGTHS, NEAREST = "foot lengths", "nearest points"
-SCORES: Mapping[str, Score] = {NEAREST: nearest_similarities, LENGTHS: foot_lengths}
+LENGTHS, SPANS = "foot lengths", "overlap of spans"
 
 
 @dataclass(frozen=True)
@@ -75,7 +88,7 @@ _SETTINGS = (
         Leaked.HOLDER_KEYS,
         assumption="One rotated template of each of two tenants, and the rotation keys of both"
         + _SUCCESS,
-        score=NEAREST,
+        score=SPANS,
     ),
     _Setting(
         _ONE_SET,
@@ -178,11 +191,16 @@ def link(system: System, *, liftings: int, most_people: int = 400) -> list[Attac
     """
     enrolled = system.victims.enrolled[:most_people]
     fresh = system.victims.fresh[:most_people]
+    decoys = Moments.of(decoy_moment(system.source))
+    by_name: Mapping[str, Score] = {
+        LENGTHS: foot_lengths,
+        SPANS: lambda left, right: span_overlaps(left, right, decoys),
+    }
     scores: dict[str, list[Array64]] = {setting.name: [] for setting in _SETTINGS}
     for number in range(liftings):
         sides = _sides(system, enrolled, fresh, number)
         for setting in _SETTINGS:
-            scores[setting.name].append(SCORES[setting.score](*sides[setting.name]))
+            scores[setting.name].append(by_name[setting.score](*sides[setting.name]))
     rows = {
         setting.name: linkage_outcome(
             system,

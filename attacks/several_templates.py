@@ -27,8 +27,9 @@ TWO_SECRETS = "the same photos under two lift secrets"
 OVERLAP = "two of three photos the same"
 OVERLAPPING = ((0, 1, 2), (0, 1, 3))
 """Photos of two enrollments that overlap."""
-JUDGED_PEOPLE = 20
-"""Of fewer people a share says too little to judge by."""
+JUDGED_PEOPLE = 75
+"""Of fewer people a share says too little to judge by: of none of 74 the upper bound is 4 %, twice
+the limit where keys are kept."""
 _SHARED = 1e-3
 """A direction that all of T templates have is one in which Σ dist² rises by less than this · T:
 the rounding of the wire format makes it 10⁻⁶, and two directions of different decoys make it 0.2
@@ -48,7 +49,7 @@ def several_templates(
     photos
         Of every person (i, n) unit rows, embeddings. The last is the fresh photo; of the others, T
         are lifted, one template each. People with fewer are left out, and T that nobody reaches; T
-        that fewer than 20 people reach is reported, and not judged.
+        that fewer than 75 people reach is reported, and not judged.
 
     Returns
     -------

@@ -9,14 +9,15 @@ from attacks.linkage import (
     foot_lengths,
     holder_rotations_of,
     link,
-    nearest_similarities,
     rotations_of,
+    span_overlaps,
     turned,
     turned_back,
     turned_points,
 )
 from attacks.outcomes import CONTROL, POOLED, AttackOutcome, Leaked, Property, Scheme
 from attacks.population import Population
+from attacks.second_order import Moments, decoy_moment
 from attacks.stored.foot_point import foot_points
 from attacks.system import System
 from enroll import Enroller, Holder
@@ -45,7 +46,7 @@ def by_variant(outcomes: list[AttackOutcome]) -> dict[str, AttackOutcome]:
 def test_templates_link_when_the_keys_leak(system: System) -> None:
     rows = by_variant(link(system, liftings=3))
     assert len(rows) == 5
-    leaked = rows["keys leaked, nearest points"]
+    leaked = rows["keys leaked, overlap of spans"]
     assert leaked.measured.value > 0.5
     assert leaked.leaked is Leaked.HOLDER_KEYS
     assert leaked.breaks is Property.UNLINKABILITY
@@ -58,7 +59,7 @@ def test_secret_rotations_unlink(system: System, setting: str) -> None:
     row = rows[f"{setting}, foot lengths"]
     assert (row.judged, row.leaked) == (True, Leaked.MASTER_KEY)
     assert is_within_null(row)
-    assert not is_within_null(rows["keys leaked, nearest points"])
+    assert not is_within_null(rows["keys leaked, overlap of spans"])
 
 
 def test_each_template_of_a_tenant_has_a_rotation_of_its_own(system: System) -> None:
@@ -90,7 +91,7 @@ def test_a_holder_has_another_rotation_for_each_enrollment(system: System) -> No
 def test_different_people_do_not_link(system: System, strangers: np.ndarray) -> None:
     others = replace(system, victims=replace(system.victims, fresh=strangers))
     rows = by_variant(link(others, liftings=2))
-    row = rows["keys leaked, nearest points"]
+    row = rows["keys leaked, overlap of spans"]
     assert row.measured.value <= float(str(row.details["null_95_percent"]))
 
 
@@ -154,8 +155,12 @@ def test_only_lengths_survive_a_rotation(system: System) -> None:
         foot_lengths(system.templates, rotated),
         atol=1e-6,
     )
-    apart = nearest_similarities(system.templates, rotated)
-    assert np.diagonal(apart).mean() < 0.9
+    decoys = Moments.of(decoy_moment(system.source))
+    same, apart = (
+        np.diagonal(span_overlaps(system.templates, batch, decoys)).mean()
+        for batch in (system.templates, rotated)
+    )
+    assert apart < 0.2 * same
 
 
 @pytest.mark.long
@@ -181,6 +186,6 @@ def test_real_faces_link_without_rotations_and_not_with_them(
     faces = replace(system, scheme=scheme, source=DecoyPool(rows[120:]), victims=victims)
     faces = replace(faces, templates=faces.lift(rows[:60], "victims"))
     found = by_variant(link(faces, liftings=3))
-    assert found["keys leaked, nearest points"].measured.value > 0.8
+    assert found["keys leaked, overlap of spans"].measured.value > 0.8
     for setting in ("secret rotations", "one tenant", "holder's key kept"):
         assert is_within_null(found[f"{setting}, foot lengths"]), setting
