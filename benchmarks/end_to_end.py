@@ -208,7 +208,8 @@ class LiftingClient:
     def template(self, photos: Sequence[Path], m: int) -> str:
         """Base64 of the wire bytes: the photos' mean embedding, lifted once to dimension m."""
         mean = mean_embedding(self.pack, photos)
-        lifted = lift(mean[None], strategy=self.strategy, m=m, source=self.generator)
+        points = self.generator.project(mean[None])
+        lifted = lift(points, strategy=self.strategy, m=m, source=self.generator)
         return base64.b64encode(encode(lifted[0], contract_id=self.contract_id)).decode()
 
 
