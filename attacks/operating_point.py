@@ -23,9 +23,9 @@ from attacks.privacy import (
 from templates.contract.binding import MAX_M
 from templates.contract.canonical import Json
 from templates.contract.document import Contract
-from templates.contract.levels import Level, Rate
+from templates.contract.levels import GroupRates, Level, Rate
 from templates.contract.nobody import Nobody
-from templates.contract.verdict import Judgement
+from templates.contract.verdict import Judgement, upper_bound
 from templates.decoys import DecoyGenerator, DecoySource, client_source
 from templates.distances import Metric
 from templates.keys.randomness import KEY_BYTES, Keystream
@@ -42,6 +42,8 @@ RATIOS = (0.28, 0.41, 0.54)
 """Dimensions that are measured, as shares of the axes; theft between them is interpolated."""
 MOST_BYTES = 60_000
 """Of a stored template, in half precision."""
+_HEADER = 400
+"""Most bytes of a template beside its numbers."""
 STEP = 4
 """Between dimensions that may be chosen."""
 AIM = 0.04
@@ -56,6 +58,8 @@ PRICED_AT = 1e-3
 """FMR at which the price in accuracy is estimated."""
 ACCURACY_LIMIT = 0.02
 """Largest false rejection rate of the default level, with the advised photos."""
+LEAST_PROBES = 150
+"""Genuine probes below which even none rejected does not show that limit (the rule of three)."""
 GROUP_LIMIT = 2.0
 """Most that the FMR within a group of people may be, in multiples of the level's target."""
 LAXEST_JUDGED = 1e-3
@@ -142,6 +146,12 @@ def choose_and_judge(
         tried: tuple[Tried, ...] = ()
     else:
         choosing, judged = setup.halves()
+        if not len(choosing.victims):
+            choosing, judged = setup, setup
+            uncovered = uncovered or (
+                f"{len(setup.victims)} people are too few to choose by some of them and judge by "
+                f"{LEAST_VICTIMS} others"
+            )
         axes, m, chosen, tried = choose(
             choosing, strategy=strategy, axes=axes, m=m, progress=lambda one: progress(0.8 * one)
         )
@@ -172,7 +182,7 @@ def choose(
     tried : tuple of Tried
     """
     grid = axes_to_try(setup.source) if axes is None else (axes,)
-    grid = tuple(k for k in grid if m is None or m < k)
+    grid = tuple(k for k in grid if m is None or m < k) or (setup.source.k,)
     curves = []
     for number, k in enumerate(grid):
         dims = dims_to_try(k) if m is None else (m,)
@@ -208,7 +218,7 @@ def axes_to_try(source: DecoySource) -> tuple[int, ...]:
 
 def dims_to_try(axes: int) -> tuple[int, ...]:
     """Dimensions in rising order that theft is measured at."""
-    most = min(axes - 1, MOST_BYTES // (2 * axes) - 1, MAX_M)
+    most = min(axes - 1, (MOST_BYTES - _HEADER) // (2 * axes) - 1, MAX_M)
     return tuple(sorted({max(1, min(most, _rounded(ratio * axes))) for ratio in RATIOS}))
 
 
@@ -224,7 +234,7 @@ def judge_privacy(
     uncovered
         What an attacker of such templates has and none of these had, in a sentence; None: nothing.
     """
-    strongest = max(thefts, key=lambda theft: theft.found.value)
+    strongest = max(thefts, key=_strength)
     faces = max(theft.faces or 0 for theft in thefts)
     victims = min(theft.found.trials for theft in thefts if theft.faces is not None)
     shortfall = uncovered
@@ -250,13 +260,19 @@ def judge_privacy(
     )
 
 
+def _strength(theft: Theft) -> tuple[bool, float, float]:
+    """A share above the limit counts before a bound, and a bound before a share."""
+    found = theft.found
+    return found.value > PRIVACY_LIMIT, upper_bound(found.errors, found.trials), found.value
+
+
 def _predicted(
     setup: AttackSetup, strategy: Strategy, axes: int, dims: Sequence[int]
 ) -> Callable[[int], float]:
     """Measure theft at some dimensions, and lay a curve through it.
 
     The logit of the share that the strongest attacker opens is taken for a line in m. Each point
-    weighs as many trials as it has.
+    weighs by the inverse of its variance.
     """
     bed = setup.along(axes, quick=True)
     drawn = setup.simulated(bed)
@@ -271,8 +287,11 @@ def _line(bed: TestBed, strategy: Strategy, dims: Sequence[int]) -> tuple[float,
     logits = np.log(shares / (1 - shares))
     if len(dims) == 1:
         return float(logits[0]), 0.0
-    slope, start = np.polyfit(dims, logits, 1, w=np.sqrt(shares * (1 - shares)))
-    return float(start), min(float(slope), 0.0)
+    weights = shares * (1 - shares)
+    slope, start = np.polyfit(dims, logits, 1, w=np.sqrt(weights))
+    if slope > 0:  # theft does not rise with m: what rises is noise
+        return float(np.average(logits, weights=weights)), 0.0
+    return float(start), float(slope)
 
 
 def _rejected(setup: AttackSetup, strategy: Strategy, axes: int, m: int) -> Rate | None:
@@ -337,6 +356,8 @@ def judge_accuracy(contract: Contract, *, photos: int, not_acquired: int) -> Jud
     if level.target_fmr is None or level.target_fmr > LAXEST_JUDGED:
         shortfall = f"so few people resolve no level stricter than {name}"
     enrolled, rate = rejected_as_advised(level)
+    if shortfall is None and rate.value <= ACCURACY_LIMIT and rate.trials < LEAST_PROBES:
+        shortfall = f"{rate.trials} genuine probes are too few to show so low a rate"
     return Judgement(
         rate,
         ACCURACY_LIMIT,
@@ -383,12 +404,20 @@ def judge_groups(contract: Contract) -> Judgement | None:
     ]
     if not judged:
         return None
-    # Of equal rates the one with more trials is named: it is known best.
-    worst, target, calibration = max(judged, key=lambda one: (one[0].fmr.value, one[0].fmr.trials))
-    limit, found = GROUP_LIMIT * target, worst.fmr
+    # One that is shown to be above comes first; of equal rates the one with more trials.
     groups = len({(one.attribute, one.group) for one, _, _ in judged})
+
+    def shown_above(group: GroupRates, target: float) -> bool:
+        least = least_of_highest(group.fmr.errors, group.fmr.trials, groups=groups)
+        return least > GROUP_LIMIT * target
+
+    worst, target, calibration = max(
+        judged,
+        key=lambda one: (shown_above(one[0], one[1]), one[0].fmr.value, one[0].fmr.trials),
+    )
+    limit, found = GROUP_LIMIT * target, worst.fmr
     shortfall = None
-    if found.value > limit >= least_of_highest(found.errors, found.trials, groups=groups):
+    if found.value > limit and not shown_above(worst, target):
         shortfall = f"the highest of {groups} groups may be above the limit by chance"
     return Judgement(
         found,

@@ -311,7 +311,8 @@ class AttackSetup:
         """Prepare from photos (N, n) of named people: half of the people at most are attacked.
 
         Of those with two photos or more: one photo is fresh, up to ``photos`` others are enrolled.
-        Where nobody has two, a guess must match the very photo that is enrolled, which is harsher.
+        Where so few have two that they show little, people with one are attacked as well: a guess
+        must match the very photo that is enrolled, which is harsher.
         All photos of the others are the attacker's.
         """
         person = np.unique(np.asarray(identities), return_inverse=True)[1]
@@ -319,8 +320,10 @@ class AttackSetup:
         rng = np.random.default_rng([seed, 3])
         counts = np.bincount(person)
         several = rng.permutation(np.flatnonzero(counts > 1))
-        willing = several if len(several) else rng.permutation(len(counts))
-        most = min(MOST_ATTACKED, len(counts) // 2)
+        willing, most = several, min(MOST_ATTACKED, len(counts) // 2)
+        if len(several) < min(2 * LEAST_VICTIMS, most):
+            willing = np.concatenate([several, rng.permutation(np.flatnonzero(counts == 1))])
+            most = min(most, 2 * LEAST_VICTIMS) if len(several) else most
         others = ~np.isin(person, willing[:most])
         mates = several[most : most + MOST_ATTACKED]
         return cls.of(
@@ -396,7 +399,7 @@ class AttackSetup:
         Their moments are as far from the decoys' as those of the faces at hand are
         (:func:`as_far_as_faces`), and they are lifted with the deployment's own decoys. A fresh
         photo is drawn as near to what is enrolled as those of real people are. None where decoys
-        are a pool's, or nobody has two photos.
+        are a pool's, or nobody is attacked.
         """
         known = self.victims if len(self.victims) else self.mates
         if not isinstance(bed.source, DecoyGenerator) or not len(known):

@@ -34,6 +34,7 @@ from templates.space.embedding import normalised
 from templates.space.lifting import Strategy, lift
 from verify import labelled_folder
 from verify.metrics import rate
+from verify.raw_pairs import impostor_cosines
 
 ENROLLED = 3
 FRONTAL, TURNED = 10.0, 20.0
@@ -110,7 +111,9 @@ def main() -> None:
     names = [str(one) for one in decoys.person]
     source = DecoyGenerator.adapt(many, decoys.rows, names).reduced(args.axes)
     contract = calibrated(calibration, source, args.dim)
-    raw = np.sort((calibration.rows[:4000] @ calibration.rows[-4000:].T).ravel())
+    raw = np.sort(
+        impostor_cosines(calibration.rows, calibration.person, rng=np.random.default_rng(0))
+    )
 
     groups = [rows[people.person[rows] == person] for person in measured]
     pairs = [[enrolled_photos(g, yaw, turned=turned) for turned in (False, True)] for g in groups]

@@ -25,7 +25,7 @@ from templates.decoys import Attributes, DecoySource
 from templates.errors import ContractMismatch, InvalidTemplate
 from templates.keys.randomness import Keystream
 from templates.keys.rotation import HolderKey, TenantRotation, holder_rotation
-from templates.space.agreement import mean_embedding
+from templates.space.agreement import distinct_rows, mean_embedding
 from templates.space.embedding import unit_rows
 from templates.space.lifting import Strategy, lift, lift_stream
 from templates.space.subspace import AffineSubspace, SubspaceBatch
@@ -73,6 +73,8 @@ class Enrollment:
         Contract that the template belongs to.
     per_photo
         One result per photo; empty for a client's template.
+    photos
+        How many different photos were averaged: one that is given twice counts once.
     holder_salt
         Random; the holder's rotation is derived from it and the holder's key. None where the
         template needs no key.
@@ -82,6 +84,7 @@ class Enrollment:
     template_id: str
     contract_id: str
     per_photo: tuple[PhotoResult, ...]
+    photos: int = 0
     holder_salt: str | None = None
 
 
@@ -228,7 +231,9 @@ class Enroller:
                 attributes=named,
             )
         turned, salt = self._turned_by_holder(lifted[0], holder)
-        return self._finish(turned, per_photo=tuple(results), holder_salt=salt)
+        return self._finish(
+            turned, per_photo=tuple(results), photos=len(distinct_rows(rows)), holder_salt=salt
+        )
 
     def from_template(self, data: bytes, *, holder: Holder | None = None) -> Enrollment:
         """Enroll a template that a client lifted, in the wire format, un-rotated.
@@ -297,7 +302,7 @@ class Enroller:
         # template's rotation for whoever sees them stored; of a fresh basis only the set is known.
         with Keystream.fresh() as stream:
             spanned = AffineSubspace.through(subspace.foot, subspace.basis, stream=stream)
-        return self._finish(spanned, per_photo=(), holder_salt=holder_salt)
+        return self._finish(spanned, per_photo=(), photos=0, holder_salt=holder_salt)
 
     def _turned_by_holder(
         self, subspace: AffineSubspace, holder: Holder | None
@@ -314,6 +319,7 @@ class Enroller:
         subspace: AffineSubspace,
         *,
         per_photo: tuple[PhotoResult, ...],
+        photos: int,
         holder_salt: str | None,
     ) -> Enrollment:
         contract_id, template_id = self._contract.contract_id, secrets.token_hex(16)
@@ -324,5 +330,6 @@ class Enroller:
             template_id=template_id,
             contract_id=contract_id,
             per_photo=per_photo,
+            photos=photos,
             holder_salt=holder_salt,
         )

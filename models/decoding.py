@@ -161,7 +161,7 @@ def decode_image(data: bytes, *, limits: ImageLimits = DEFAULT_LIMITS) -> NDArra
         the bytes.
     """
     if len(data) == 0:
-        raise ImageError("unsupported_image", "The photo is empty.")
+        raise ImageError("unsupported_image", "The photo is empty: send the complete file.")
     if len(data) > limits.max_bytes:
         raise ImageError(
             "image_too_large",
@@ -281,7 +281,8 @@ def _check_header(image: Image.Image, data: bytes, limits: ImageLimits) -> str:
         raise animated(name)
     if name == "BMP" and image.info["compression"] in _BMP_RUNS:
         raise ImageError(
-            "unsupported_image", "The BMP file is compressed; save it without, or as JPEG."
+            "unsupported_image",
+            "The BMP file is compressed: save it without compression, or as JPEG.",
         )
     if name == "JPEG":
         pixels = image.width * image.height

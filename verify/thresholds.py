@@ -94,7 +94,7 @@ def resolved_targets(
         elif (bound := bound_when_set_anew(impostors, target, seed=seed)) > MOST_OVER * target:
             refused.append(
                 f"FMR {target:g} is not resolved by {impostors.people} people: a threshold set on "
-                f"others like them may let {bound:.2g} pass, and {MOST_OVER * target:g} is the most"
+                f"others like them may let {bound:.3g} pass, and {MOST_OVER * target:g} is the most"
             )
         else:
             kept.append(target)

@@ -117,7 +117,12 @@ def setup(
     labelled = None if people is None else _labelled(people)
     roles = assign_roles(labelled, faces, like or [])
     can, cannot = promises(roles, n=pack.info.n)
-    plan = {**_plan(roles, pack, settings), "can": can, "cannot": cannot}
+    plan = {
+        **_plan(roles, pack, settings),
+        "labelled": labelled is not None,
+        "can": can,
+        "cannot": cannot,
+    }
     resolves = bool(resolved_rates(roles.calibration))
     if not as_json:
         _tell_plan(plan)
@@ -254,7 +259,7 @@ def _tell_plan(plan: dict[str, Any]) -> None:
     say(f"Pack:       {pack['name']}, {pack['n']} numbers per embedding, detector {detector}")
     adapted = f", adapted to {plan['sample']:,} photos" if plan["sample"] else ""
     say(f"Decoys:     {plan['faces']:,} faces{adapted}")
-    alone = "" if plan["people_with_several_photos"] else ", each of --faces taken for a person"
+    alone = "" if plan["labelled"] else ", each of --faces taken for a person"
     say(f"Thresholds: {plan['people']:,} people, {plan['photos']:,} photos{alone}")
     if plan["left_out"]:
         say(f"Left out:   {plan['left_out']:,} photos of people who have another role")

@@ -103,7 +103,8 @@ class _InMemoryParser(MultiPartParser):
         if self._current_files > self._max_images:
             raise ApiError(
                 "too_many_images",
-                f"at most {self._max_images} photos in one request",
+                f"at most {self._max_images} {'photo' if self._max_images == 1 else 'photos'} "
+                "in one request",
                 {"limit": self._max_images},
             )
 
@@ -113,7 +114,8 @@ class _InMemoryParser(MultiPartParser):
             if self._image_bytes > self._max_image_bytes:
                 raise ApiError(
                     "image_too_large",
-                    f"a photo is larger than {self._max_image_bytes} bytes",
+                    f"photo {self._current_files} is larger than {self._max_image_bytes:,} bytes: "
+                    "send a smaller copy",
                     {"limit_bytes": self._max_image_bytes, "image": self._current_files - 1},
                 )
         super().on_part_data(data, start, end)
@@ -212,8 +214,9 @@ async def read_form(
         except (MultiPartException, UnicodeError, ValueError):
             raise ApiError(
                 "malformed_request",
-                "the body is not a well-formed multipart form: let your HTTP library write both "
-                "the form and its Content-Type, which names the boundary",
+                "the body is not a well-formed multipart form, or has a field that is too long or "
+                "too many fields: let your HTTP library write both the form and its Content-Type, "
+                "which names the boundary",
             ) from None
     files: list[tuple[str, bytes]] = []
     fields: dict[str, str] = {}

@@ -62,7 +62,10 @@ ERROR_CODES: dict[str, ErrorCode] = {
             "The template does not follow the format or exceeds its limits.",
         ),
         ErrorCode(
-            "invalid_embedding", 400, "The embedding is not a finite unit vector of n numbers."
+            "invalid_embedding",
+            400,
+            "The embedding is not a finite unit vector of n numbers, or has no part along the "
+            "contract's axes.",
         ),
         ErrorCode(
             "unauthorized",

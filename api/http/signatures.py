@@ -85,6 +85,6 @@ def nonce_in_time(nonce: str, timestamp: int, *, key_prefix: str, window_s: floa
 def _field(name: str, rule: str) -> ApiError:
     return ApiError(
         "validation_failed",
-        f"a probe that is not a photo is signed: {name} must be {rule}",
+        f"a probe that is not a photo must be signed: {name} must be {rule}",
         {"field": name},
     )

@@ -105,19 +105,22 @@ def require_made_with(source: DecoySource, pack: ModelPack) -> None:
         )
 
 
-LOOKALIKE = 0.5
-"""Raw cosine from which on two photos that nobody labelled are taken for one person."""
+LOOKALIKE = 0.75
+"""Raw cosine from which on two photos that nobody labelled are taken for copies. Lower, it would
+drop strangers who look alike, of whom there are many among children, and flatter the thresholds."""
+_TILE = 2_048
 
 
 def without_lookalikes(extraction: Extraction) -> Extraction:
     """Drop photos that resemble an earlier one, of faces of which each shows another person."""
     rows = extraction.descriptors
-    kept: list[int] = []
-    alike = np.zeros(len(rows), dtype=np.bool_)
-    for row in range(len(rows)):
-        if not alike[row]:
-            kept.append(row)
-            alike[row + 1 :] |= rows[row + 1 :] @ rows[row] >= LOOKALIKE
+    stays = np.ones(len(rows), dtype=np.bool_)
+    for start in range(0, len(rows), _TILE):
+        tile = rows[start : start + _TILE]
+        alike = tile @ rows[: start + len(tile)].T >= LOOKALIKE
+        for row in np.flatnonzero(alike.sum(axis=1) > 1):
+            stays[start + row] = not (alike[row] & stays)[: start + row].any()
+    kept = np.flatnonzero(stays).tolist()
     return Extraction(
         rows[kept],
         [extraction.paths[row] for row in kept],

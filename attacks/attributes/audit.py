@@ -36,6 +36,7 @@ from models.extraction import Extraction
 from templates.decoys import DecoyGenerator
 from verify.evaluation.attributes import resembling_rows
 from verify.fairface_labels import CLASSES, Label
+from verify.own_decoys import require_others
 
 PAPER_LIFTING = 10_000
 LIFTING_SHARE = 0.3
@@ -201,6 +202,9 @@ def run_attribute_audit(
     if generator is None:
         generator = DecoyGenerator.fit(parts.lifting.descriptors)
         generator = generator.reduced(plan.axes or generator.k)
+    else:
+        people = [str(number) for number in range(len(parts.attacked))]
+        require_others(generator, parts.attacked.descriptors, people)
     whole = prepare(parts, plan=plan.attackers, seed=plan.seed)
     ours = prepare(parts.along(generator), plan=plan.attackers, seed=plan.seed, generator=generator)
     setups = [ours if scheme.decoys == GENERATED else whole for scheme in plan.schemes]

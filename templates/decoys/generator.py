@@ -216,7 +216,10 @@ class DecoyGenerator:
         along = points @ self.axes.astype(np.float64)
         norms = np.linalg.norm(along, axis=1, keepdims=True)
         if not (norms > _SMALLEST_NORM).all():
-            raise InvalidEmbedding("an embedding has no part along the axes of faces")
+            raise InvalidEmbedding(
+                "the embedding has no part along the axes of faces: send what the contract's model "
+                "gives for a face"
+            )
         return np.asarray(along / norms, dtype=np.float32)
 
     def draw(

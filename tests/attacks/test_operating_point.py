@@ -16,7 +16,7 @@ from attacks.operating_point import (
     judge_groups,
     judge_privacy,
 )
-from attacks.privacy import AttackSetup, Theft
+from attacks.privacy import LEAST_VICTIMS, AttackSetup, Theft
 from templates.contract.levels import GroupRates, Level, Rate
 from templates.contract.verdict import Judgement
 from templates.space.lifting import Strategy
@@ -128,6 +128,9 @@ def test_who_knows_the_moments_exactly_may_be_the_strongest() -> None:
     assert (judgement.status, judgement.basis["attacker_faces"]) == ("FAIL", "unlimited")
 
 
+RATE_OF_GROUP = Rate(1, 1000, 0.0, 1.0)
+
+
 def groups_of(*errors: int, judged: bool = True, trials: int = 1000) -> tuple[GroupRates, ...]:
     rates = [Rate(count, trials, 0.0, 1.0) for count in errors]
     return tuple(
@@ -197,3 +200,44 @@ def test_accuracy_counts_probes_that_are_refused(enrolled: int) -> None:
         assert judgement.status == status
         assert judgement.basis["photos_not_acquired"] == 7
         assert judgement.basis["enrolled_photos"] == enrolled
+
+
+@pytest.mark.parametrize(("count", "photos"), [(30, 1), (60, 2), (200, 1)])
+def test_people_who_are_too_few_to_part_show_nothing(count: int, photos: int) -> None:
+    point = choose_and_judge(people(count, FACES, photos=photos), strategy=Strategy.ADVERSARIAL)
+    assert point.privacy.status == "NOT SHOWN"
+    assert "too few to choose by" in str(point.privacy.shortfall)
+
+
+def test_a_few_second_photos_do_not_leave_the_others_unattacked() -> None:
+    setup = people(500, FACES, photos=1)
+    rows_of = np.concatenate([setup.victims.enrolled, setup.faces])
+    names = ["twice", "twice", *map(str, range(len(rows_of) - 2))]
+    mixed = AttackSetup.of_people(rows_of, names, setup.source, photos=3, seed=0)
+    assert len(mixed.victims) == 2 * LEAST_VICTIMS
+
+
+def test_a_dimension_above_the_axes_that_are_tried_takes_all_axes() -> None:
+    setup = people(300, FACES).halves()[0]
+    axes, m, _, _ = choose(setup, strategy=Strategy.ADVERSARIAL, m=46)
+    assert (axes, m) == (setup.source.k, 46)
+
+
+def test_a_group_that_is_shown_to_be_above_is_not_hidden_by_a_small_one() -> None:
+    big = GroupRates("kind", "big", Rate(30_000, 10**6, 0.0, 1.0), RATE_OF_GROUP, True, True)
+    small = GroupRates("kind", "small", Rate(4, 100, 0.0, 1.0), RATE_OF_GROUP, True, True)
+    level = level_of(big, small)
+    judgement = judge_groups(make_contract(calibrations=(make_calibration(levels=(level,)),)))
+    assert judgement is not None
+    assert (judgement.status, judgement.basis["group"]) == ("FAIL", "big")
+
+
+def test_a_few_probes_do_not_show_that_hardly_any_is_rejected() -> None:
+    for errors, status in ((0, "NOT SHOWN"), (9, "FAIL")):
+        seen = Rate(errors, 140, 0.0, 1.0)
+        level = Level("fmr-1e-3", 1e-3, 2.0, seen, seen, fnmr_by_photos={3: seen})
+        contract = make_contract(
+            calibrations=(make_calibration(levels=(level,), probe_photos=3),),
+            default_level="fmr-1e-3",
+        )
+        assert judge_accuracy(contract, photos=1000, not_acquired=0).status == status

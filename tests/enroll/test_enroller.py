@@ -97,6 +97,7 @@ def test_a_photo_given_twice_is_as_if_it_were_given_once(
     twice = enroller.from_embeddings(PHOTOS[rows])
     assert largest_angle(stored_template(once), stored_template(twice)) < 1e-2
     assert [result.index for result in twice.per_photo] == list(range(len(rows)))
+    assert twice.photos == len(set(rows))
 
 
 def test_other_photos_another_deployment_and_another_contract_give_other_decoys(
@@ -297,6 +298,7 @@ def test_nothing_private_shows(enroller: Enroller) -> None:
         "template_id",
         "contract_id",
         "per_photo",
+        "photos",
         "holder_salt",
     }
 

@@ -25,7 +25,7 @@ from tests.once import made_once
 from verify import labelled_folder
 
 FACES = range(5000, 5100)
-PEOPLE = range(6000, 6025)
+PEOPLE = range(6000, 6030)
 
 
 def make_folders(root: Path) -> None:
@@ -63,12 +63,12 @@ def test_the_plan_is_shown_and_nothing_is_done(folders: Path) -> None:
     before = sorted(folders.iterdir())
     shown = setup("--dry-run")
     assert shown.status == 0, shown.stderr
-    assert "25 people, 50 photos" in shown.stdout
+    assert "30 people, 60 photos" in shown.stdout
     assert "100 faces" in shown.stdout
     assert "Can be promised:    thresholds for false match rates of 1 in 100." in shown.stdout
     assert "Cannot be promised: that templates are private" in shown.stdout
     plan = setup("--dry-run", "--json").json
-    assert (plan["people"], plan["photos"], plan["faces"], plan["sample"]) == (25, 50, 100, 0)
+    assert (plan["people"], plan["photos"], plan["faces"], plan["sample"]) == (30, 60, 100, 0)
     assert sorted(folders.iterdir()) == before
 
 
@@ -313,7 +313,7 @@ def test_a_stopped_run_goes_on_without_embedding_again(
     monkeypatch.setattr(command, "extract", seen)
     again = setup()
     assert "decoys.veil is there and kept" in again.stderr
-    assert [(one.attempts, one.cached) for one in embedded] == [(50, 50)]
+    assert [(one.attempts, one.cached) for one in embedded] == [(60, 60)]
     assert "50 embedded before" in again.stderr
     assert Path("veilface-data/decoys.veil").read_bytes() == decoys
 
@@ -342,7 +342,7 @@ def test_from_nothing_to_a_contract(folders: Path, monkeypatch: pytest.MonkeyPat
         yield shares.append
 
     # So many that a threshold set on them holds for others.
-    draw(folders / "people", range(6025, 6050), range(2))
+    draw(folders / "people", range(6030, 6050), range(2))
     shutil.copytree("people/person-6000", "people/Six, Thousand")
     with monkeypatch.context() as patch:
         patch.setattr(command, "_drop_caches", killed)

@@ -31,7 +31,7 @@ def test_so_few_people_show_nothing_of_any_dimension(asked: int | None) -> None:
     assert point.privacy.status == "NOT SHOWN"
     (said, accuracy, _) = verdict_lines(Verdict(point.privacy))
     assert said.startswith("Privacy:  NOT SHOWN. ")
-    assert "Not enough to pass: 15 people attacked with 30 faces show little" in said
+    assert "Not enough to pass: 15 people are too few to choose by" in said
     assert accuracy == "Accuracy: not measured: nobody has two photos."
 
 

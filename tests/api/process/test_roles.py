@@ -66,6 +66,7 @@ def test_a_sample_of_too_few_people_is_none() -> None:
         (((77, 4),), [1e-2]),
         (((78, 4),), [1e-2, 1e-3]),
         (((5, 2), (40, 1)), [1e-2]),
+        (((80, 2),), [1e-2]),  # 12,640 trials, and half as many again as 10,000 are asked for
         (((45, 1),), [1e-2]),  # nobody needs a second photo
         (((300, 1), (10, 2)), [1e-2, 1e-3]),  # pairs enough for 1e-4, but 98,880 trials
     ],
@@ -76,7 +77,7 @@ def test_rates_that_are_resolved(counts: tuple[tuple[int, int], ...], rates: lis
 
 def test_how_many_are_attacked_and_with_how_many_faces() -> None:
     assert attacked_and_others(albums((200, 5))) == (100, 500)
-    assert attacked_and_others(albums((1_000, 1), (150, 4))) == (150, 1_000)
+    assert attacked_and_others(albums((1_000, 1), (150, 4))) == (200, 950)
     assert attacked_and_others(albums((10, 1))) == (5, 5)
 
 
