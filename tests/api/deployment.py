@@ -88,8 +88,9 @@ def unit(rows: NDArray[np.floating]) -> NDArray[np.float32]:
 
 @functools.cache
 def make_source(n: int = N) -> DecoyGenerator:
+    """Decoys of all axes but four, so that embeddings are projected."""
     rng = np.random.default_rng(3)
-    return DecoyGenerator.fit(unit(rng.normal(size=(400, n)))).reduced(min(n, AXES))
+    return DecoyGenerator.fit(unit(rng.normal(size=(400, n)))).reduced(n - N + AXES)
 
 
 def make_contract(

@@ -174,9 +174,9 @@ GENDER = cell(
 SCHEME = f"adversarial, m = {M} of {AXES} axes, generated decoys"
 
 
-def report(dim: int = M, **changes: Any) -> dict[str, Any]:
+def report(dim: int = M, *, axes: int = AXES, **changes: Any) -> dict[str, Any]:
     verdict = {
-        "strategy": "adversarial", "decoys": "generator", "dim": dim, "axes": AXES,
+        "strategy": "adversarial", "decoys": "generator", "dim": dim, "axes": axes,
         "passed": False,
         "comparison": False,
         "cells": [
