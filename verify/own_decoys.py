@@ -55,7 +55,12 @@ def memory(generator: DecoyGenerator, descriptors: NDArray[np.floating]) -> Memo
     # The leading axes carry clusters, such as gender, which correlate in any part of the people.
     scores = scores[:, generator.k // 4 :]
     scores -= scores.mean(axis=0)
-    scores /= np.maximum(np.linalg.norm(scores, axis=0), 1e-12)
+    # Faces fewer than their numbers do not vary on some axes of their own fit but by rounding.
+    lengths = np.linalg.norm(scores, axis=0)
+    scores = scores[:, lengths > 1e-4 * lengths.max()]
+    if scores.shape[1] < 2:  # nothing to correlate
+        return Memory(correlation=1.0, least=0.0)
+    scores /= np.linalg.norm(scores, axis=0)
     squares = (scores.T @ scores) ** 2
     pairs = squares.shape[0] * (squares.shape[0] - 1)
     between = float(squares.sum() - np.trace(squares)) / pairs
