@@ -145,7 +145,7 @@ def test_axes_and_dimension_are_chosen_and_the_verdict_told_last(world, veilface
     assert privacy.startswith("Privacy:  NOT SHOWN. The strongest thief, with ")
     assert shown in privacy
     assert f"at m = {binding.m} of {binding.axes} axes, and at most " in privacy
-    assert "limits 5 and 10 %. Not enough to pass: 25 people attacked with 100 " in privacy
+    assert "limits 5 and 10 %. Not enough to pass: 25 people are too few to choose by " in privacy
     assert accuracy.startswith(f"Accuracy: {verdict.accuracy.status}. ")
     assert "limit 2 %." in accuracy
     assert groups.startswith("Groups:   not measured: ")
