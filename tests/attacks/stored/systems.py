@@ -26,9 +26,10 @@ def population() -> Population:
 @cache
 def system_of(decoys: str, strategy: str = "adversarial", m: int = M) -> System:
     source = owners_pool(population(), None) if decoys == "pool" else generator()
-    # Fewer comparisons than the audit's, in R⁶⁴, so that a system takes a second or two.
+    # Fewer comparisons than the audit's, in R⁶⁴, so that a system takes a second or two; as many
+    # as FMR 1e-3 is resolved by.
     options = CalibrationOptions(
-        probe_dims=(0, 3), lifted_probes=200, lifted_impostor_pairs=12_000, steps=10
+        probe_dims=(0, 3), lifted_probes=400, lifted_impostor_pairs=40_000, steps=10
     )
     return small_system(
         population(),
