@@ -59,10 +59,6 @@ class Subjects:
             self, enrolled=source.project(self.enrolled), fresh=source.project(self.fresh)
         )
 
-    def mismatched(self) -> "Subjects":
-        """Give each the next one's fresh photo: the control of an attack."""
-        return replace(self, fresh=np.roll(self.fresh, 1, axis=0))
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Population:

@@ -51,11 +51,6 @@ def compiled(function: _Function, **options: Any) -> _Function:
         return cast(_Function, njit(**options)(function))
 
 
-def compiled_sums(function: _Function) -> _Function:
-    """Compile as `compiled` does; sums are added in the order that is quickest."""
-    return compiled(function, fastmath={"reassoc", "contract"})
-
-
 def inlined(function: _Function) -> _Function:
     """Compile as a part of its callers: a call costs as much as a small solve."""
     return cast(_Function, njit(forceinline=True, **_OPTIONS)(function))
