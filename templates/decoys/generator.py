@@ -8,6 +8,7 @@ does not depend on the subject (docs/method.md "The decoys").
 
 import hashlib
 from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Self
 
@@ -192,6 +193,11 @@ class DecoyGenerator:
         mean = self.mean.astype(np.float64)
         return self.covariance + np.outer(mean, mean)
 
+    @cached_property
+    def _wide_axes(self) -> NDArray[np.float64]:
+        """The axes in the precision of a projection, made once: every decision projects."""
+        return self.axes.astype(np.float64)
+
     def project(self, descriptors: ArrayLike) -> NDArray[np.float32]:
         """Take embeddings to the coordinates that templates have.
 
@@ -213,7 +219,7 @@ class DecoyGenerator:
         points = unit_descriptors(descriptors)
         if points.shape[1] != self.n:
             raise InvalidEmbedding(f"an embedding has {self.n} numbers, not {points.shape[1]}")
-        along = points @ self.axes.astype(np.float64)
+        along = points @ self._wide_axes
         norms = np.linalg.norm(along, axis=1, keepdims=True)
         if not (norms > _SMALLEST_NORM).all():
             raise InvalidEmbedding(
