@@ -21,7 +21,7 @@ from attacks.learned.inverter import Inverter
 from attacks.linkage import link
 from attacks.outcomes import GENERATED, POOLED, AttackOutcome, Scheme
 from attacks.population import LEAST_FITTED, Population, draw_population, without_decoy_people
-from attacks.privacy import AttackSetup, Pairs, reduced
+from attacks.privacy import AttackSetup, Pairs
 from attacks.renewability import renew
 from attacks.several_templates import several_templates
 from attacks.stored import template_attacks
@@ -196,7 +196,7 @@ def _schemes(plan: AuditPlan, source: DecoySource, population: Population) -> li
         binding = plan.contract.binding
         strategy, dims, axes = binding.strategy, (binding.m,), binding.axes
     if isinstance(source, DecoyGenerator):
-        source = reduced(source, axes or source.axes_for(DEFAULT_SHARE))
+        source = source.reduced(axes or source.axes_for(DEFAULT_SHARE))
     kind = POOLED if isinstance(source, DecoyPool) else GENERATED
     decoys = kind if strategy.needs_decoys else None
     on = source.k if source.k < source.n else None

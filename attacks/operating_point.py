@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from attacks.privacy import (
     LEAST_FACES,
@@ -18,7 +17,6 @@ from attacks.privacy import (
     TestBed,
     Theft,
     all_thefts,
-    reduced,
 )
 from templates.contract.binding import MAX_M
 from templates.contract.canonical import Json
@@ -27,10 +25,9 @@ from templates.contract.levels import GroupRates, Level, Rate
 from templates.contract.nobody import Nobody
 from templates.contract.verdict import Judgement, upper_bound
 from templates.decoys import DecoyGenerator, DecoySource, client_source
-from templates.distances import Metric
+from templates.distances import Metric, pairwise_distances, similarity
 from templates.keys.randomness import KEY_BYTES, Keystream
 from templates.space.lifting import Strategy, lift, plain_strategy
-from templates.space.subspace import SubspaceBatch
 from verify.evaluation.groups import least_of_highest
 from verify.metrics import rate, threshold_at_fmr
 
@@ -302,23 +299,18 @@ def _rejected(setup: AttackSetup, strategy: Strategy, axes: int, m: int) -> Rate
     )
     if len(people) < 2 or np.allclose(people.enrolled, people.fresh, atol=1e-5):
         return None
-    source = reduced(setup.source, axes)
+    source = setup.source.reduced(axes)
     pairs = people.along(source)
     plain = plain_strategy(strategy)
     with Keystream.seeded("price", setup.seed, axes, m) as stream:
         templates = lift(pairs.enrolled, strategy=plain, m=m, source=source, stream=stream)
     nobody = Nobody(client_source(source), plain, m, bytes(KEY_BYTES))
     means, spreads = nobody.statistics(pairs.fresh, Metric.SPHERICAL)
-    scores = (_similarities(pairs.fresh, templates) - means[:, None]) / spreads[:, None]
+    close = similarity(pairwise_distances(pairs.fresh, templates, metric=Metric.SPHERICAL))
+    scores = (close - means[:, None]) / spreads[:, None]
     same = np.eye(len(pairs), dtype=np.bool_)
     threshold = threshold_at_fmr(scores[~same], PRICED_AT)
     return rate(int(np.count_nonzero(scores[same] < threshold)), len(pairs))
-
-
-def _similarities(probes: NDArray[np.float32], templates: SubspaceBatch) -> NDArray[np.float64]:
-    """Spherical similarities (P, T) of points to templates."""
-    inside = np.stack([np.linalg.norm(probes @ basis.T, axis=1) for basis in templates.bases], 1)
-    return np.asarray(probes @ templates.feet.T + templates.radii * inside, dtype=np.float64)
 
 
 def _between(dims: Sequence[int]) -> list[int]:

@@ -375,7 +375,7 @@ class AttackSetup:
         quick
             Only attackers with all faces.
         """
-        source = reduced(self.source, axes)
+        source = self.source.reduced(axes)
         decoys = Moments.of(decoy_moment(source))
         attackers = []
         for name, faces in self.counted:
@@ -434,15 +434,6 @@ def all_thefts(setup: AttackSetup, strategy: Strategy, *, axes: int, m: int) -> 
     drawn = setup.simulated(bed)
     thefts = bed.thefts(strategy, m)
     return thefts if drawn is None else (*thefts, *drawn.thefts(strategy, m)[1:])
-
-
-def reduced(source: DecoySource, axes: int) -> DecoySource:
-    """Take the leading axes of a generator; a pool has no fewer than all."""
-    if isinstance(source, DecoyGenerator):
-        return source.reduced(axes)
-    if axes != source.k:
-        raise AuditError(f"templates with decoys of a pool have all {source.k} numbers")
-    return source
 
 
 def face_counts(total: int) -> tuple[int, ...]:

@@ -19,7 +19,6 @@ from api.settings import Settings
 from attacks.audit import AuditPlan, run_audit
 from attacks.learned.extra import need
 from attacks.population import LEAST_FITTED
-from attacks.privacy import reduced
 from attacks.report import document
 from templates.contract.document import Binding, Contract
 from templates.decoys import DecoySource
@@ -177,7 +176,7 @@ def templates(
         None if fit_decoys else load_decoys(decoys or settings.resolved_decoys_file, sealer, pack)
     )
     if loaded is not None and source is not None:
-        own = reduced(source, loaded.binding.axes)
+        own = source.reduced(loaded.binding.axes)
         loaded.binding.require_source(source_id=own.source_id, made_with=own.made_with)
     if loaded is None and (dim is None or strategy is None or axes is None):
         served = _served(settings, sealer, source)
@@ -257,6 +256,6 @@ def _served(settings: Settings, sealer: Sealer, source: DecoySource | None) -> B
         message(f"note: not auditing as the contract in `data_dir` has it: {error}")
         return None
     fits = binding.axes <= source.k and (
-        binding.decoy_source_id == reduced(source, binding.axes).source_id
+        binding.decoy_source_id == source.reduced(binding.axes).source_id
     )
     return binding if fits else None

@@ -16,7 +16,6 @@ from api.process.opening import file_sealer, open_keyring
 from api.process.preparation import recorded_of
 from api.settings import Settings
 from attacks.impostor_presentations import verify_presentations
-from attacks.privacy import reduced
 from models.liveness import PassiveLiveness
 from models.pack import ModelPack
 from templates.contract.document import Contract
@@ -209,7 +208,7 @@ def _verified(
     if decoys is None and not file.is_file():
         return None, "it takes the contract's decoys (--decoys)"
     source = load_decoys(file, file_sealer(open_keyring(settings)), pack)
-    source = reduced(source, contract.binding.axes)
+    source = source.reduced(contract.binding.axes)
     verified = verify_presentations(scored, pack.info, contract, source, level=level, seed=seed)
     if not verified.enrolled:
         return None, (

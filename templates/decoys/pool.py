@@ -111,7 +111,9 @@ class DecoyPool:
             Fewer axes are asked for.
         """
         if k != self.n:
-            raise DecoyError(f"a pool has no axes: its templates have {self.n} numbers, not {k}")
+            raise DecoyError(
+                f"a pool has no axes: its templates have all {self.n} numbers, not {k}"
+            )
         return self
 
     def project(self, descriptors: ArrayLike) -> NDArray[np.float32]:

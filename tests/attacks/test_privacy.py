@@ -14,9 +14,9 @@ from attacks.privacy import (
     Theft,
     all_thefts,
     face_counts,
-    reduced,
 )
 from templates.decoys import DecoyGenerator
+from templates.errors import DecoyError
 from templates.space.lifting import Strategy
 from tests.verify.synthetic import make_pool, unit
 
@@ -150,5 +150,5 @@ def test_what_does_not_fit_is_refused() -> None:
         AttackSetup.of(
             Pairs(setup.victims.enrolled, setup.victims.fresh[:3]), setup.faces, setup.source
         )
-    with pytest.raises(AuditError, match="have all 64 numbers"):
-        reduced(make_pool(), 60)
+    with pytest.raises(DecoyError, match="have all 64 numbers"):
+        make_pool().reduced(60)
