@@ -393,7 +393,7 @@ class AttackSetup:
             self.seed,
         )
 
-    def simulated(self, bed: TestBed, *, people: int = DRAWN_PEOPLE) -> TestBed | None:
+    def simulated(self, bed: TestBed) -> TestBed | None:
         """Draw people whose second moments an attacker knows exactly: one with unlimited faces.
 
         Their moments are as far from the decoys' as those of the faces at hand are
@@ -414,11 +414,11 @@ class AttackSetup:
         rng = np.random.default_rng([self.seed, 2])
 
         def drawn() -> Array64:
-            return normalised(mean + rng.standard_normal((people, len(root))) @ root)
+            return normalised(mean + rng.standard_normal((DRAWN_PEOPLE, len(root))) @ root)
 
         enrolled, others = drawn(), drawn()
         others = normalised(others - np.sum(others * enrolled, axis=1, keepdims=True) * enrolled)
-        cosines = np.clip(rng.choice(genuine, people), -1, 1)[:, None]
+        cosines = np.clip(rng.choice(genuine, DRAWN_PEOPLE), -1, 1)[:, None]
         fresh = cosines * enrolled + np.sqrt(1 - cosines**2) * others
         exact = Moments.of(moment_on_sphere(mean, root.T @ root))
         return replace(

@@ -73,7 +73,7 @@ class Genuine:
 
 
 def resolved_targets(
-    impostors: Impostors, targets: Sequence[float] = TARGETS, *, seed: int = 0
+    impostors: Impostors, targets: Sequence[float] = TARGETS
 ) -> tuple[list[float], list[str]]:
     """Split targets into those the trials resolve and sentences about those they do not.
 
@@ -91,7 +91,7 @@ def resolved_targets(
                 f"{impostors.person_pairs} pairs of people: it needs "
                 f"{EXPECTED_ERRORS / target:.0f} trials and {3 / target:.0f} pairs"
             )
-        elif (bound := bound_when_set_anew(impostors, target, seed=seed)) > MOST_OVER * target:
+        elif (bound := bound_when_set_anew(impostors, target)) > MOST_OVER * target:
             refused.append(
                 f"FMR {target:g} is not resolved by {impostors.people} people: a threshold set on "
                 f"others like them may let {bound:.3g} pass, and {MOST_OVER * target:g} is the most"
@@ -101,7 +101,7 @@ def resolved_targets(
     return kept, refused
 
 
-def bound_when_set_anew(impostors: Impostors, target: float, *, seed: int = 0) -> float:
+def bound_when_set_anew(impostors: Impostors, target: float) -> float:
     """95 % bound of the FMR on these trials of a threshold that is set on people like these.
 
     Every resample draws people with replacement and sets the threshold on their trials; the FMR of
@@ -112,7 +112,7 @@ def bound_when_set_anew(impostors: Impostors, target: float, *, seed: int = 0) -
     highest = highest[np.isfinite(impostors.scores[highest])]
     highest = highest[np.argsort(-impostors.scores[highest], kind="stable")]
     first, second = impostors.people_of(highest).T
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     rates = np.empty(RESAMPLES)
     for number in range(RESAMPLES):
         drawn = rng.integers(impostors.people, size=impostors.people)

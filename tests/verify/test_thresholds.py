@@ -10,6 +10,7 @@ from verify.metrics import threshold_at_fmr
 from verify.thresholds import (
     Genuine,
     Impostors,
+    bound_when_set_anew,
     highest_scores,
     level_name,
     make_level,
@@ -56,6 +57,26 @@ def test_levels_are_refused_that_the_data_cannot_resolve() -> None:
     assert "FMR 0.001 is not resolved by 9999 impostor trials" in refused[0]
     few_pairs = impostors_of(scores, trials=10**6, person_pairs=2_999)
     assert resolved_targets(few_pairs, [1e-2, 1e-3])[0] == [1e-2]
+
+
+def test_a_threshold_that_one_person_decides_does_not_hold_when_set_anew() -> None:
+    """Of 50 people, one near everybody: a third of the resamples have another threshold."""
+    pairs = np.array([(i, j) for i in range(50) for j in range(50) if i != j])
+    scores = np.random.default_rng(0).normal(size=len(pairs)).astype(np.float32)
+
+    def bound(values: NDArray[np.float32]) -> float:
+        impostors = Impostors(
+            scores=values,
+            trials=len(pairs),
+            people=50,
+            person_pairs=len(pairs) // 2,
+            people_of=lambda flat: pairs[flat],
+            weighted_trials=lambda weights: float(weights.sum() ** 2 - weights @ weights),
+        )
+        return bound_when_set_anew(impostors, 0.02)
+
+    assert 0.02 < bound(scores) < 0.04
+    assert bound(np.where((pairs == 0).any(axis=1), scores + 9, scores)) > 0.04
 
 
 def test_a_level_counts_both_errors_and_by_photos() -> None:
