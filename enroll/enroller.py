@@ -10,6 +10,7 @@ and then the tenant's, so that clients never need the tenant's.
 import secrets
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -162,11 +163,13 @@ class Enroller:
         )
         if not 1 <= len(photos) <= MAX_PHOTOS:
             raise ValueError(f"an enrollment has 1 to {MAX_PHOTOS} photos, not {len(photos)}")
-        samples = embed_photos(pack, photos, policy=policy, quality=quality, limits=limits)
+        samples = embed_photos(
+            pack, photos, policy=policy, quality=quality, limits=limits, digested=True
+        )
         embeddings = np.stack([sample.embedding for sample in samples])
         return self._lifted(
             unit_rows(embeddings, n=info.n, most=MAX_PHOTOS),
-            photos,
+            [cast("bytes", sample.picture) for sample in samples],
             attributes=attributes,
             holder=holder,
             results=[PhotoResult(index, sample.quality) for index, sample in enumerate(samples)],

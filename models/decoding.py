@@ -5,6 +5,7 @@ limits are checked on the header before a pixel is decoded, and whatever a parse
 hostile bytes leaves as an `ImageError`.
 """
 
+import hashlib
 import io
 import threading
 import warnings
@@ -185,6 +186,19 @@ def decode_image(data: bytes, *, limits: ImageLimits = DEFAULT_LIMITS) -> NDArra
     # ...), so no narrower clause would hold. The cause is dropped: it may quote the bytes.
     except Exception:
         raise _damaged() from None
+
+
+def picture_digest(pixels: NDArray[np.uint8]) -> bytes:
+    """SHA-256 of a decoded picture: equal for files that show the same pixels upright.
+
+    Parameters
+    ----------
+    pixels
+        As `decode_image` gives them.
+    """
+    digest = hashlib.sha256(repr(pixels.shape).encode())
+    digest.update(pixels.data)
+    return digest.digest()
 
 
 def image_size(data: bytes) -> tuple[int, int] | None:

@@ -20,7 +20,7 @@ class FaceCrop:
         Aligned, RGB uint8, shape (s, s, 3). Never shown by ``repr``.
     face
         As it was detected; ``None`` for crops that came aligned.
-    liveness
+    liveness, picture
         As in `FaceSample`.
     """
 
@@ -28,6 +28,7 @@ class FaceCrop:
     quality: Quality
     face: Face | None = field(repr=False)
     liveness: float | None = None
+    picture: bytes | None = field(default=None, repr=False)
 
     @property
     def box(self) -> Box | None:
@@ -50,9 +51,12 @@ class FaceSample:
         x1, y1, x2, y2 in pixels of the upright photo; ``None`` for crops that came aligned.
     liveness
         How live the face looks (`PassiveLiveness.score`); ``None`` where it was not asked for.
+    picture
+        SHA-256 of the decoded photo; ``None`` where it was not asked for. Never shown by ``repr``.
     """
 
     embedding: NDArray[np.float32] = field(repr=False)
     quality: Quality
     box: Box | None
     liveness: float | None = None
+    picture: bytes | None = field(default=None, repr=False)

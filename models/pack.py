@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from models.alignment import TEMPLATE_NAME, align, template
 from models.boxes import Face, ranked
-from models.decoding import DEFAULT_LIMITS, ImageLimits, decode_image
+from models.decoding import DEFAULT_LIMITS, ImageLimits, decode_image, picture_digest
 from models.demo import DEMO_DIMENSION, is_demo_model, require_face
 from models.detection import DEFAULT_SIZE, Detector, find_faces
 from models.embedding import Embedder, Preprocessing
@@ -235,11 +235,12 @@ class ModelPack:
         quality: QualityLimits | None = DEFAULT_QUALITY,
         limits: ImageLimits = DEFAULT_LIMITS,
         liveness: bool = False,
+        digested: bool = False,
     ) -> FaceCrop:
         """Decode, find the face, align and check it: `embed_photo` without the embedding.
 
         Parameters and errors as there. The whole picture is dropped: with `liveness` the face is
-        scored on it before.
+        scored on it before, and with `digested` its digest is taken.
         """
         if liveness and self.liveness is None:
             raise PackError(
@@ -264,7 +265,7 @@ class ModelPack:
             self.require_quality(taken, quality)
         if liveness and self.liveness is not None and taken.box is not None:
             score = self.liveness.score(image, taken.box)
-        return replace(taken, liveness=score)
+        return replace(taken, liveness=score, picture=picture_digest(image) if digested else None)
 
     def require_quality(self, taken: FaceCrop, limits: QualityLimits = DEFAULT_QUALITY) -> None:
         """Refuse a face that fails a limit, by what this pack's detector recommends.
@@ -293,6 +294,7 @@ class ModelPack:
         quality: QualityLimits | None = DEFAULT_QUALITY,
         limits: ImageLimits = DEFAULT_LIMITS,
         liveness: bool = False,
+        digested: bool = False,
     ) -> FaceSample:
         """From the bytes of a photo to the embedding of its face.
 
@@ -310,6 +312,8 @@ class ModelPack:
             Limits; ``None`` checks nothing but that there is an upright face.
         liveness
             Also say how live the face looks; the pack needs a liveness graph.
+        digested
+            Also give the digest of the decoded photo.
 
         Raises
         ------
@@ -323,13 +327,19 @@ class ModelPack:
             If inference fails.
         """
         taken = self.crop_photo(
-            data, policy=policy, quality=quality, limits=limits, liveness=liveness
+            data,
+            policy=policy,
+            quality=quality,
+            limits=limits,
+            liveness=liveness,
+            digested=digested,
         )
         return FaceSample(
             embedding=self.embed(taken.crop[None])[0],
             quality=taken.quality,
             box=taken.box,
             liveness=taken.liveness,
+            picture=taken.picture,
         )
 
     def as_aligned(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -18,12 +18,13 @@ def embed_photos(
     quality: QualityLimits | None = DEFAULT_QUALITY,
     limits: ImageLimits = DEFAULT_LIMITS,
     liveness: bool = False,
+    digested: bool = False,
 ) -> list[FaceSample]:
     """Embed photo files in their order; all or none. A file given twice is embedded once.
 
     Parameters
     ----------
-    policy, quality, limits, liveness
+    policy, quality, limits, liveness, digested
         See ``ModelPack.embed_photo``.
 
     Raises
@@ -37,7 +38,12 @@ def embed_photos(
             continue
         try:
             samples[photo] = pack.embed_photo(
-                photo, policy=policy, quality=quality, limits=limits, liveness=liveness
+                photo,
+                policy=policy,
+                quality=quality,
+                limits=limits,
+                liveness=liveness,
+                digested=digested,
             )
         except ModelError as error:
             raise PhotoRejected(index, error, count=len(photos)) from error

@@ -94,12 +94,13 @@ def lift_stream(
     Parameters
     ----------
     secret : bytes
-        32 random bytes of the deployment. Who has them and these very photos has the decoys.
+        32 random bytes of the deployment. Who has them and these very pixels has the decoys.
     contract_id : str
         Of the contract that the template will carry.
     photos : sequence of bytes
-        What was sent, in any order, however often each: the files, or the bytes of the embeddings.
-        Not what a model made of the files, which another processor rounds in another way.
+        What was sent, in any order, however often each: the digests of the decoded photos, or the
+        bytes of the embeddings. Not the files: others of the same pixels give the same embedding.
+        Nor what a model made of them, which another processor rounds in another way.
     holder : (tenant, subject), optional
         Whose key turns the template; not the key, which may be replaced by another one.
     """

@@ -198,7 +198,9 @@ class FakePack:
     def embed_photo(self, photo: bytes, **_: object) -> object:
         if photo == b"\xff":
             raise NoFace("no face was found")
-        return type("Sample", (), {"embedding": PHOTOS[photo[0]], "quality": "good"})
+        # The second byte stands for what a file has beside its pixels.
+        facts = {"embedding": PHOTOS[photo[0]], "quality": "good", "picture": photo[:1]}
+        return type("Sample", (), facts)
 
 
 def test_photos_are_embedded_and_enrolled(contract: Contract, enroller: Enroller) -> None:
@@ -206,6 +208,15 @@ def test_photos_are_embedded_and_enrolled(contract: Contract, enroller: Enroller
     assert [(r.index, r.quality) for r in enrollment.per_photo] == [(0, "good"), (1, "good")]
     mean = projected(unit(PHOTOS[0] + PHOTOS[1]))[None]
     assert stored_template(enrollment).contains(mean, tol=2e-3).all()
+
+
+def test_files_of_the_same_pixels_give_the_same_set(contract: Contract, enroller: Enroller) -> None:
+    first, again, other = (
+        stored_template(enroller.from_photos(FakePack(contract), photos))  # type: ignore[arg-type]
+        for photos in ([b"\x00a", b"\x01a"], [b"\x00b", b"\x01a"], [b"\x00a", b"\x02a"])
+    )
+    assert largest_angle(first, again) < 1e-2
+    assert largest_angle(first, other) > 0.9
 
 
 def test_one_unusable_photo_refuses_the_set(contract: Contract, enroller: Enroller) -> None:

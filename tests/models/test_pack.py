@@ -53,6 +53,21 @@ def test_a_folder_with_graphs_that_are_not_needed(tmp_path):
     }
 
 
+def test_the_digest_is_of_the_upright_pixels_and_not_of_the_file(tmp_path):
+    pack = ModelPack.load(write_pack(tmp_path / "mine", emb=pooling_embedder()))
+    shown = crop()
+    turned = io.BytesIO()
+    exif = Image.Exif()
+    exif[0x0112] = 3  # upside down
+    Image.fromarray(np.ascontiguousarray(shown[::-1, ::-1])).save(turned, "PNG", exif=exif)
+    bitmap = io.BytesIO()
+    Image.fromarray(shown).save(bitmap, "BMP")
+    files = [png(shown), turned.getvalue(), bitmap.getvalue(), png(shown[::-1])]
+    digests = [pack.embed_photo(file, quality=None, digested=True).picture for file in files]
+    assert digests[0] == digests[1] == digests[2] != digests[3]
+    assert pack.embed_photo(files[0], quality=None).picture is None
+
+
 def test_a_nested_folder_of_the_same_name(tmp_path):
     write_pack(tmp_path / "antelopev2" / "antelopev2", emb=pooling_embedder())
     assert ModelPack.load(tmp_path / "antelopev2").info.name == "antelopev2"
