@@ -26,7 +26,7 @@ from api.http.audit_report import open_audit_report
 from api.http.context import RequestContext
 from api.http.cors import Cors
 from api.http.deps import refuse_unknown
-from api.http.errors import ApiError, StartError, api_error
+from api.http.errors import ApiError, StartError, api_error, wrong_values
 from api.http.openapi import allowed_methods
 from api.http.protocol import Protocol
 from api.http.reference import DescribedApi, describe, operation_id
@@ -328,12 +328,4 @@ async def _framework_error(request: Request, error: Exception) -> Response:
 
 async def _validation_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)  # noqa: S101 - registered for this type
-    # Only the names of fields and the validator's own words: the input is not repeated.
-    problems = [
-        {"field": ".".join(map(str, problem["loc"][1:])), "problem": problem["type"]}
-        for problem in error.errors()
-    ]
-    return await _known_error(
-        request,
-        ApiError("validation_failed", "a parameter has a wrong value", {"problems": problems}),
-    )
+    return await _known_error(request, wrong_values(error.errors()))

@@ -6,7 +6,7 @@ An error body has one shape, framework errors included::
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -213,6 +213,35 @@ _TABLE: tuple[tuple[type[Exception], str, str | None], ...] = (
     (UnknownTenant, "unauthorized", "the tenant of this API key no longer exists"),
     (StoreError, "store_unavailable", "the database does not respond"),
 )
+
+
+_BOUNDS = {
+    "ge": "must be at least {}",
+    "le": "must be at most {}",
+    "min_length": "must have a length of at least {}",
+    "max_length": "must have a length of at most {}",
+}
+
+
+def wrong_values(problems: Sequence[Mapping[str, Any]]) -> ApiError:
+    """Name the parameters that the framework refused: the first in words, all in details.
+
+    Only their names and bounds are told: the input is not repeated.
+
+    Parameters
+    ----------
+    problems
+        Of pydantic: each with ``loc``, ``type`` and perhaps the bounds in ``ctx``.
+    """
+    told = [
+        {"field": ".".join(map(str, problem["loc"][1:])), "problem": problem["type"]}
+        for problem in problems
+    ]
+    bounds = problems[0].get("ctx", {})
+    said = [words.format(bounds[name]) for name, words in _BOUNDS.items() if name in bounds]
+    wrong = f"has a wrong value ({told[0]['problem'].replace('_', ' ')})"
+    message = f"the parameter {told[0]['field']} {' and '.join(said) or wrong}"
+    return ApiError("validation_failed", message, {"problems": told})
 
 
 def plain_details(details: Mapping[str, Any]) -> dict[str, Any]:

@@ -49,6 +49,23 @@ def test_a_query_has_one_reading(client: Client, query: str) -> None:
 
 
 @pytest.mark.parametrize(
+    ("query", "said"),
+    [
+        ("limit=0", "limit must be at least 1"),
+        ("limit=1001", "limit must be at most 1000"),
+        ("limit=many", "limit has a wrong value"),
+    ],
+)
+def test_a_wrong_value_is_named_with_its_bound(client: Client, query: str, said: str) -> None:
+    answer = client.get(f"/v1/subjects?{query}")
+    details = assert_error(answer, 422, "validation_failed")
+    assert [problem["field"] for problem in details["problems"]] == ["limit"]
+    message = answer.json()["error"]["message"]
+    assert said in message
+    assert "many" not in message
+
+
+@pytest.mark.parametrize(
     ("method", "path"),
     [
         ("DELETE", "/v1/subjects/alice%2Flockout"),
