@@ -115,24 +115,6 @@ def between(rejected: float, accepted: float) -> float:
     return middle if middle > rejected else float(accepted)
 
 
-def fnmr_at_fmr(genuine: ArrayLike, impostor: ArrayLike, target: float) -> tuple[float, Rate]:
-    """Threshold at FMR ≤ target, and the FNMR there.
-
-    Raises
-    ------
-    ValueError
-        Where the impostor trials cannot resolve the target (``resolvable``).
-    """
-    trials = np.asarray(impostor).size
-    if not resolvable(target, trials):
-        raise ValueError(
-            f"{trials} impostor trials cannot resolve FMR {target:g}: with no error at all their "
-            f"95 % upper bound is {RULE_OF_THREE / max(trials, 1):.2g}; add trials"
-        )
-    threshold = threshold_at_fmr(impostor, target)
-    return threshold, false_non_match_rate(genuine, threshold)
-
-
 def resolvable(target: float, trials: int, *, expected_errors: float = RULE_OF_THREE) -> bool:
     """Whether ``trials`` can speak about a rate of ``target``: at least 3 errors expected.
 

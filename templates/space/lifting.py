@@ -166,29 +166,6 @@ def lift(
     return SubspaceBatch(feet, bases)
 
 
-def draw_directions(
-    descriptors: ArrayLike,
-    *,
-    strategy: Strategy | str,
-    m: int,
-    source: DecoySource | None = None,
-    stream: Keystream,
-    attributes: Sequence[Attributes] | None = None,
-) -> NDArray[np.float64]:
-    """Draw the directions that span the subspaces, before they are orthonormalised.
-
-    See :func:`lift` for the parameters and errors. Whoever holds the
-    directions knows the descriptor: they do not leave memory.
-
-    Returns
-    -------
-    ndarray of float64, shape (N, m, n)
-    """
-    points = unit_descriptors(descriptors)
-    strategy = _check(points, strategy, m, source, attributes)
-    return _directions(points, strategy, m, source, stream, attributes)
-
-
 def _check(
     points: NDArray[np.float64],
     strategy: Strategy | str,

@@ -67,14 +67,6 @@ def test_resolvable_is_the_rule_of_three() -> None:
     assert not metrics.resolvable(1e-3, 3000, expected_errors=10)
 
 
-def test_fnmr_at_fmr_refuses_what_the_trials_cannot_resolve() -> None:
-    with pytest.raises(ValueError, match="cannot resolve FMR"):
-        metrics.fnmr_at_fmr([0.9], np.zeros(2999), 1e-3)
-    threshold, fnmr = metrics.fnmr_at_fmr([0.2, 0.9], np.linspace(-1, 0.5, 3000), 1e-3)
-    assert 0.49 < threshold < 0.5
-    assert (fnmr.errors, fnmr.trials) == (1, 2)
-
-
 @given(scores, scores)
 def test_error_curve_counts(genuine: list[float], impostor: list[float]) -> None:
     curve = metrics.error_curve(genuine, impostor)
