@@ -221,8 +221,8 @@ def _labelled(people: Path) -> LabelledFolder:
         raise CommandError(
             f"{people} has {photos:,} photos and no folder for a person: nobody is labelled. "
             "Thresholds are set on people who are told apart, each in a subfolder with two photos "
-            "or more; 80 people resolve a false match rate of 1 in 1,000. Unlabelled photos serve "
-            "as --faces, and as --like"
+            "or more; 80 people with three resolve a false match rate of 1 in 1,000. Unlabelled "
+            "photos serve as --faces, and as --like"
         )
     return labelled_people(people)
 
