@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from templates.decoys import container
 from templates.decoys.files import read_bounded, write_private
+from templates.decoys.fitting import MIN_DESCRIPTORS
 from templates.decoys.generator import DecoyGenerator
 from templates.decoys.source import MAX_DIMENSION, Attributes, checked_made_with, take_made_with
 from templates.errors import DecoyError
@@ -98,7 +99,19 @@ class DecoyPool:
 
     @cached_property
     def fitted(self) -> DecoyGenerator:
-        """A generator fitted to the entries, always the same for the same pool."""
+        """A generator fitted to the entries, always the same for the same pool.
+
+        Raises
+        ------
+        DecoyError
+            The pool has fewer entries than a generator is fitted to.
+        """
+        if len(self) < MIN_DESCRIPTORS:
+            raise DecoyError(
+                f"the decoy pool has {len(self)} entries; calibrating needs {MIN_DESCRIPTORS}, "
+                "because strangers' scores and lifting clients take a generator that is fitted to "
+                "them: build the pool of more photos"
+            )
         ordered = self._descriptors[np.lexsort(self._descriptors.T)]
         return DecoyGenerator.fit(ordered).in_coordinates_of_embeddings()
 

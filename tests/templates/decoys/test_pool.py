@@ -54,6 +54,12 @@ def indices(pool_rows: NDArray[np.float32], drawn: NDArray[np.float32]) -> NDArr
     return np.array([number[row.tobytes()] for row in flat]).reshape(drawn.shape[:-1])
 
 
+def test_a_pool_that_is_too_small_to_calibrate_with_says_how_many_it_needs() -> None:
+    assert DecoyPool(unit_rows(100, 16)).fitted.n == 16
+    with pytest.raises(DecoyError, match="the decoy pool has 99 entries; calibrating needs 100"):
+        _ = DecoyPool(unit_rows(99, 16)).fitted
+
+
 def test_draws_are_entries_and_never_repeat_inside_a_row(pool: DecoyPool) -> None:
     drawn = pool.draw(200, 20, stream=Keystream.seeded("pool"))
     assert drawn.shape == (200, 20, 16)
