@@ -10,7 +10,7 @@ Example
 ::
 
     python -m benchmarks.operating_point --data ../shared/data
-    python -m benchmarks.operating_point --spared 600 --splits 1
+    python -m benchmarks.operating_point --spared 600 --splits 0
 """
 
 import argparse
@@ -188,7 +188,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
     parser.add_argument("--pack", choices=sorted(SETS), default="w600k_mbf")
     parser.add_argument("--spared", type=int, nargs="*", default=[100, 300, 600, 1200, 2400])
-    parser.add_argument("--splits", type=int, default=3)
+    parser.add_argument("--splits", type=int, nargs="*", default=[0, 1, 2], help="their numbers")
     parser.add_argument("--victims", type=int, default=400, help="to judge; as many to choose by")
     parser.add_argument("--no-alone", dest="alone", action="store_false")
     parser.add_argument("--embeddings", type=Path, help="of the crops, embedded before")
@@ -205,7 +205,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print(f"| {head} |\n|{'---|' * 12}")
     with single_threaded():
         for spared in given.spared:
-            for number in range(given.splits):
+            for number in given.splits:
                 rng = np.random.default_rng([spared, number])
                 sample, by, judged, others = split(people, spared, given.victims, rng)
                 names = [str(one) for one in sample.person]
@@ -215,7 +215,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
                     np.concatenate([judged.person, others.person]),
                 )
                 show(f"{spared:,}", number, *measured(source, by, judged, others, rest, rng))
-        for number in range(given.splits if given.alone else 0):
+        for number in given.splits if given.alone else ():
             rng = np.random.default_rng([7, number])
             order = rng.permutation(len(sets[0]))
             strangers = People(sets[0][order[:2_400]], np.arange(2_400))

@@ -88,10 +88,11 @@ def main() -> None:
     parser.add_argument("--axes", type=int, default=228)
     parser.add_argument("--dim", type=int, default=112)
     parser.add_argument("--spared", type=int, default=600)
+    parser.add_argument("--embeddings", type=Path, help="of the crops, embedded before")
     args = parser.parse_args()
     pack = ModelPack.load(args.data / "packs" / "w600k_mbf", threads=1)
     people, folder = (
-        lfw(args.data, "w600k_mbf", None),
+        lfw(args.data, "w600k_mbf", args.embeddings),
         labelled_folder(args.data / "lfw/aligned112"),
     )
     crops = len(folder.paths)
