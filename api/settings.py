@@ -254,13 +254,6 @@ class Settings(BaseSettings):
         description="Rejected verifications in a row at which the subject is locked until an "
         "operator resets it.",
     )
-    probe_window_s: float = Field(
-        60.0,
-        ge=1,
-        le=3600,
-        description="Seconds that the timestamp of a signed probe may differ from the service's "
-        "clock.",
-    )
     retention_days: int | None = Field(
         None,
         ge=1,

@@ -17,7 +17,6 @@ Example
 """
 
 import argparse
-import base64
 import http.client
 import json
 import multiprocessing
@@ -48,8 +47,6 @@ from benchmarks.end_to_end import (
 from benchmarks.request_overhead import bare_inference
 from models.decoding import decode_image
 from models.pack import ModelPack
-from templates.keys.api_token import probe_key
-from templates.keys.probe_signature import probe_mac
 
 LEVEL = "fmr-1e-3"
 BOUNDARY = "veilface-load"
@@ -57,45 +54,37 @@ BOUNDARY = "veilface-load"
 
 @dataclass(frozen=True)
 class Prepared:
-    """One probe, ready to be sent any number of times: only its signature is made anew."""
+    """One probe, ready to be sent any number of times."""
 
     subject: str
     kind: str
     body: bytes
-    signed: Any
-    key: bytes
 
-    def request(self) -> tuple[bytes, str]:
-        """Return body and content type of one sending."""
+    @property
+    def content_type(self) -> str:
+        """Content type of the body."""
         if self.kind == "photo":
-            return self.body, f"multipart/form-data; boundary={BOUNDARY}"
-        nonce, now = os.urandom(12).hex(), int(time.time())
-        mac = probe_mac(
-            self.key, self.subject, self.signed, level=LEVEL, nonce=nonce, timestamp=now
-        )
-        signature = json.dumps({"nonce": nonce, "timestamp": now, "hmac": mac, "level": LEVEL})
-        return self.body + b"," + signature[1:].encode(), "application/json"
+            return f"multipart/form-data; boundary={BOUNDARY}"
+        return "application/json"
 
 
 def prepared_probes(
-    kind: str, people: Sequence[Person], client: httpx.Client, pack: ModelPack, token: str, dim: int
+    kind: str, people: Sequence[Person], client: httpx.Client, pack: ModelPack, dim: int
 ) -> list[Prepared]:
     """Make the probes of one kind, of every person's photos that were not enrolled."""
     lifting = LiftingClient.connect(client, pack) if kind == "template" else None
     made = []
     for person in people:
         for photo in person.probes:
-            signed: Any = None
             if kind == "photo":
                 body = _form(photo.read_bytes())
-            elif lifting is not None:
-                text = lifting.template([photo], dim)
-                signed, body = base64.b64decode(text), json.dumps({"template": text})[:-1].encode()
             else:
-                sample = pack.embed_photo(photo.read_bytes())
-                signed = sample.embedding.astype(np.float64)
-                body = json.dumps({"embedding": signed.tolist()})[:-1].encode()
-            made.append(Prepared(person.name, kind, body, signed, probe_key(token)))
+                if lifting is not None:
+                    sent: dict[str, Any] = {"template": lifting.template([photo], dim)}
+                else:
+                    sent = {"embedding": pack.embed_photo(photo.read_bytes()).embedding.tolist()}
+                body = json.dumps({**sent, "level": LEVEL}).encode()
+            made.append(Prepared(person.name, kind, body))
     return made
 
 
@@ -137,8 +126,8 @@ def send_all(
             if seconds is not None and time.perf_counter() - started > seconds:
                 break
             probe = probes[turn % len(probes)]
-            body, kind = probe.request()
-            headers = {"Authorization": f"Bearer {token}", "Content-Type": kind}
+            body = probe.body
+            headers = {"Authorization": f"Bearer {token}", "Content-Type": probe.content_type}
             before = time.perf_counter()
             connection.request("POST", f"/v1/subjects/{probe.subject}/verify", body, headers)
             answer = connection.getresponse()
@@ -283,7 +272,7 @@ def main() -> None:
             return [server, *server.children(recursive=True)]
 
         for kind in args.kind.split(","):
-            probes = prepared_probes(kind, enrolled, client, pack, token, args.probe_dim)
+            probes = prepared_probes(kind, enrolled, client, pack, args.probe_dim)
             probes = accepted_probes(address, token, probes)
             runs = []
             for clients in map(int, args.clients.split(",")):
@@ -313,11 +302,10 @@ def accepted_probes(address: str, token: str, probes: Sequence[Prepared]) -> lis
     kept = []
     with httpx.Client(base_url=address, timeout=120) as client:
         for probe in probes:
-            body, kind = probe.request()
             answer = client.post(
                 f"/v1/subjects/{probe.subject}/verify",
-                content=body,
-                headers={"Authorization": f"Bearer {token}", "Content-Type": kind},
+                content=probe.body,
+                headers={"Authorization": f"Bearer {token}", "Content-Type": probe.content_type},
             )
             if answer.status_code == 200 and answer.json()["decision"] == "accept":
                 kept.append(probe)

@@ -73,7 +73,7 @@ class Load:
     def prepare(self, address: str, pack: ModelPack, probe_dim: int) -> None:
         """Make the probes, and leave out those that the service rejects."""
         for kind in ("photo", "template", "embedding"):
-            made = prepared_probes(kind, self._people, self._client, pack, self._token, probe_dim)
+            made = prepared_probes(kind, self._people, self._client, pack, probe_dim)
             self._probes[kind] = accepted_probes(address, self._token, made)
 
     def send(self, kind: str, minute: int, draw: random.Random, due: float) -> None:
@@ -114,9 +114,10 @@ class Load:
             photos = (*person.probes[:2], person.enroll[0])
             return verify_photos(self._client, person.name, photos, "fmr-1e-3")
         probe = draw.choice(self._probes[kind])
-        body, media = probe.request()
         return self._client.post(
-            f"/v1/subjects/{probe.subject}/verify", content=body, headers={"Content-Type": media}
+            f"/v1/subjects/{probe.subject}/verify",
+            content=probe.body,
+            headers={"Content-Type": probe.content_type},
         )
 
 

@@ -98,13 +98,11 @@ def ask(
     client: httpx.Client, token: str, subject: str, probe: Prepared, key: str | None = None
 ) -> float:
     """Seconds until the answer, which must be a rejection."""
-    own = Prepared(subject, probe.kind, probe.body, probe.signed, probe.key)
-    body, kind = own.request()
-    headers = {"Authorization": f"Bearer {token}", "Content-Type": kind}
+    headers = {"Authorization": f"Bearer {token}", "Content-Type": probe.content_type}
     if key is not None:
         headers["Veilface-Holder-Key"] = key
     started = time.perf_counter()
-    answer = client.post(f"/v1/subjects/{subject}/verify", content=body, headers=headers)
+    answer = client.post(f"/v1/subjects/{subject}/verify", content=probe.body, headers=headers)
     took = time.perf_counter() - started
     if answer.status_code != 200 or answer.json()["decision"] != "reject":
         raise SystemExit(f"not a rejection: {answer.text}")
@@ -165,7 +163,7 @@ def main() -> None:
         }
         report: dict[str, Any] = {"database": args.database, "lockout": "off", "kinds": {}}
         for kind in args.kind.split(","):
-            probe = prepared_probes(kind, [stranger], client, pack, asking, args.probe_dim)[0]
+            probe = prepared_probes(kind, [stranger], client, pack, args.probe_dim)[0]
             for subjects, key in cases.values():
                 for subject in subjects:
                     ask(client, asking, subject, probe, key)

@@ -23,7 +23,7 @@
     │   │   ├── AlteredTenant    its row is not as this program left it [11]
     │   │   └── RetiredRotation  no rotation key of this epoch any more [11]
     │   ├── LockedOut            too many failed attempts on the subject [12]
-    │   ├── Replayed             a signed probe or a token that was seen before [12]
+    │   ├── Replayed             a challenge or a token that was seen before [12]
     │   ├── BrokenAuditLog       an audit log whose head or key is missing or forged [13]
     │   ├── EnrollmentConflict   another template than the one that a write may replace [17]
     │   └── TemplateNotStored    the subject's holder keeps the template, and did not send it [15]

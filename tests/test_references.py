@@ -3,7 +3,7 @@
 - ``docs/method.md §4.7``: a numbered section of a page. Further ones follow by "and", "to" or a
   comma.
 - ``§4.7`` alone: a section of the page that it stands in.
-- ``docs/rest.md "Signed probes"``: a heading of a page.
+- ``docs/rest.md "Challenges"``: a heading of a page.
 - ``paper §4.3``: the paper that ``docs/method.md`` names.
 - ``RFC 9110 §15``, ``NIST SP 800-38D §8.3``, ``ISO/IEC 24745 §6``: other documents; not looked up.
 """

@@ -1,7 +1,6 @@
 """``veilface lift``: a client makes its own private template; no face leaves its machine."""
 
 import base64
-import os
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,13 +18,10 @@ from models.pack import ModelPack
 from models.selection import FacePolicy
 from templates.contract.canonical import parse_object
 from templates.decoys import DecoyGenerator
-from templates.keys.api_token import is_token
 from templates.keys.holder_key import encode_holder_key, read_holder_key
 from templates.keys.private_file import replace_private
-from templates.keys.probe_signature import signed_probe
 from templates.space.agreement import InconsistentImages
 
-TOKEN_VARIABLE = "VEILFACE_API_KEY"  # noqa: S105 - a name, not a secret
 MAX_CONTRACT_BYTES = 256 * 2**20
 MAX_PHOTO_BYTES = 64 * 2**20
 
@@ -60,12 +56,6 @@ def lift(
     probe: Annotated[
         bool, typer.Option("--probe", help="Make a probe for verify, not an enrollment.")
     ] = False,
-    subject: Annotated[
-        str | None,
-        typer.Option(
-            help="With `--probe --out -`: whom the probe is for; it is signed for one subject."
-        ),
-    ] = None,
     level: Annotated[
         str | None,
         typer.Option(
@@ -102,15 +92,13 @@ def lift(
     person are averaged before they are lifted. Never lift the same photo twice for enrollment: two
     templates of one embedding give it away.
 
-    A probe on stdout is signed for one request, with the API key in the variable
-    `VEILFACE_API_KEY`; send it within a minute.
-
     Example: `veilface lift me-1.jpg me-2.jpg --pack buffalo_l --generator generator.bin
     --contract contract.json --out me.veil`
     """
     if len(photos) > MAX_PHOTOS:
         raise UsageError(f"a template is made from 1 to {MAX_PHOTOS} photos, not {len(photos)}")
-    token = _signing_token(subject, level, asked=probe and str(out) == "-")
+    if level is not None and not (probe and str(out) == "-"):
+        raise UsageError("--level goes with --probe --out -")
     holder_key: dict[str, str] = {}
     if holder_key_file is not None:
         if str(out) != "-":
@@ -136,10 +124,8 @@ def lift(
         raise CommandError(error.sentence([photo.name for photo in photos])) from None
     notice = demo_notice(info.embedder_sha256, n=info.n)
     if str(out) == "-":
-        if token is None or subject is None:
-            emit({"template": base64.b64encode(data).decode("ascii"), **holder_key})
-        else:
-            emit({**signed_probe(token, subject, data, level=level), **holder_key})
+        asked = {} if level is None else {"level": level}
+        emit({"template": base64.b64encode(data).decode("ascii"), **asked, **holder_key})
         return
     replace_private(out, data)
     facts: dict[str, Any] = {
@@ -158,22 +144,6 @@ def lift(
             f"{out}: {facts['kind']} template of {counted(len(photos), 'photo')}, m = {m}, "
             f"{len(data)} bytes."
         )
-
-
-def _signing_token(subject: str | None, level: str | None, *, asked: bool) -> str | None:
-    """Return the API key that signs a probe on stdout; None where nothing is signed."""
-    if not asked:
-        if subject is not None or level is not None:
-            raise UsageError("--subject and --level go with --probe --out -")
-        return None
-    if subject is None:
-        raise UsageError("a probe on stdout is signed for one subject: name it with --subject")
-    token = os.environ.get(TOKEN_VARIABLE, "")
-    if not is_token(token):
-        raise UsageError(
-            f"a probe on stdout is signed: put the API key into the variable {TOKEN_VARIABLE}"
-        )
-    return token
 
 
 def embed_file(pack: ModelPack, photo: Path, *, policy: FacePolicy) -> np.ndarray[Any, Any]:

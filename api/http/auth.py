@@ -12,7 +12,7 @@ from api.http.tokens import USES, SubjectToken, opened_token, prefix_of
 from api.limits.admission import Gate
 from api.limits.rates import RateLimits
 from api.process.runtime import Runtime
-from templates.keys.api_token import is_token, probe_key
+from templates.keys.api_token import is_token
 from templates.store.api_keys import ApiKey
 
 _bearer = HTTPBearer(
@@ -35,17 +35,14 @@ class Caller:
         Its row's id.
     rights
         Of the key. With a token: what it is for, and ``embeddings`` where the key has it.
-    token
-        What the request came with.
     subject_token
-        What it is good for, where it is not the API key itself.
+        What the request's token is good for; None where it came with the API key itself.
     """
 
     prefix: str
     tenant: str
     key_id: str = field(repr=False)
     rights: frozenset[str]
-    token: str = field(repr=False, compare=False)
     lowest_level: str | None = None
     subject_token: SubjectToken | None = None
 
@@ -54,11 +51,6 @@ class Caller:
         """What it is counted by."""
         token = self.subject_token
         return self.prefix if token is None else f"{self.prefix}:{token.token_id}"
-
-    @property
-    def probe_key(self) -> bytes:
-        """The key that its probes are signed with."""
-        return probe_key(self.token)
 
     def require(self, *rights: str) -> None:
         """Refuse unless the key has all of these rights.
@@ -119,7 +111,6 @@ async def caller(
         tenant=api_key.tenant,
         key_id=api_key.id,
         rights=rights,
-        token=token,
         lowest_level=api_key.lowest_level,
         subject_token=subject_token,
     )

@@ -1,6 +1,6 @@
 """Challenges: sealed, self-contained ids, so that any worker knows one and nothing is stored of it.
 
-Its nonce is used up by the decision, in the decision's transaction, as that of a signed probe is.
+Its nonce is used up by the decision, in the decision's transaction.
 """
 
 import base64

@@ -70,13 +70,12 @@ ERROR_CODES: dict[str, ErrorCode] = {
         ErrorCode(
             "unauthorized",
             401,
-            "The API key or token is missing, unknown or revoked, or the `hmac` of a probe is "
-            "wrong.",
+            "The API key or token is missing, unknown or revoked.",
         ),
         ErrorCode(
             "replayed",
             401,
-            "The signed probe, the challenge or the token was used before, or has expired.",
+            "The challenge or the token was used before, or has expired.",
         ),
         ErrorCode(
             "forbidden",

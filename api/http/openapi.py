@@ -7,9 +7,7 @@ from typing import Any
 from api.http.errors import ERROR_CODES
 from api.http.schemas import (
     HELD_TEMPLATE,
-    HEX,
     HOLDER_KEY,
-    NONCE_EXAMPLE,
     REQUEST_ID,
     ErrorAnswer,
     TemplateRequest,
@@ -95,7 +93,6 @@ HOLDER_KEY_FIELD = _text(
     examples=[HOLDER_KEY],
 )
 FILE = {"type": "string", "format": "binary"}
-SIGNATURE_EXAMPLE = {"nonce": NONCE_EXAMPLE, "timestamp": 1767225600, "hmac": HEX}
 
 
 def _body(multipart: dict[str, Any] | None, json_body: dict[str, Any]) -> dict[str, Any]:
@@ -194,13 +191,9 @@ VERIFY_BODY = _body(
     {
         "schema": VerifyRequest.model_json_schema(),
         "examples": {
-            "embedding": {
-                "value": {"embedding": [0.6, -0.8], "level": "fmr-1e-3", **SIGNATURE_EXAMPLE}
-            },
-            "embeddings": {
-                "value": {"embeddings": [[0.6, -0.8], [0.8, -0.6]], **SIGNATURE_EXAMPLE}
-            },
-            "template": {"value": {"template": "kAAAAAAAAAB7Li4u", **SIGNATURE_EXAMPLE}},
+            "embedding": {"value": {"embedding": [0.6, -0.8], "level": "fmr-1e-3"}},
+            "embeddings": {"value": {"embeddings": [[0.6, -0.8], [0.8, -0.6]]}},
+            "template": {"value": {"template": "kAAAAAAAAAB7Li4u"}},
         },
     },
 )

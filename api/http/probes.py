@@ -24,8 +24,6 @@ from api.http.challenges import FIELD as CHALLENGE
 from api.http.challenges import MAX_ID, Challenge, opened_challenge
 from api.http.errors import ApiError
 from api.http.holder_keys import FIELD, holder_key_of
-from api.http.signatures import FIELDS as SIGNATURE_FIELDS
-from api.http.signatures import checked_signature, nonce_in_time
 from api.http.tokens import is_of_token
 from api.http.values import (
     embedding_of,
@@ -77,8 +75,9 @@ async def sent_probe(
     ApiError, VeilfaceError
         Whatever is wrong with it, or forbids it, that can be told without decoding anything.
     """
-    read = _photos if is_form(request) else _signed
-    return await read(request, runtime, caller, subject, holder_key_header)
+    if is_form(request):
+        return await _photos(request, runtime, caller, subject, holder_key_header)
+    return await _numbers(request, runtime, caller, holder_key_header)
 
 
 async def _photos(
@@ -152,7 +151,7 @@ async def _photos(
 
 
 def _nonce(caller: Caller, challenge: Challenge | None) -> Nonce | None:
-    """Return what a decision on photos uses up.
+    """Return what a decision uses up, if anything.
 
     Raises
     ------
@@ -189,16 +188,11 @@ def _check_count(count: int, settings: Settings, *, is_challenge: bool) -> None:
         )
 
 
-async def _signed(
-    request: Request,
-    runtime: Runtime,
-    caller: Caller,
-    subject: str,
-    holder_key_header: str | None,
+async def _numbers(
+    request: Request, runtime: Runtime, caller: Caller, holder_key_header: str | None
 ) -> Probe:
-    settings = runtime.settings
-    known = (*PROBES, "level", "held_template", FIELD, *SIGNATURE_FIELDS)
-    body = await sent_json(request, settings, known, photos="image")
+    known = (*PROBES, "level", "held_template", FIELD)
+    body = await sent_json(request, runtime.settings, known, photos="image")
     named = [kind for kind in PROBES if kind in body]
     if len(named) != 1:
         raise ApiError(
@@ -207,7 +201,6 @@ async def _signed(
         )
     # After the fields: a caller that only forgot how to send a photo needs no further right.
     caller.require("embeddings")
-    asked = text_field(body.get("level"), "level")
     held_template = held_template_of(body)
     kind, value = named[0], body[named[0]]
     sent: bytes | NDArray[np.float64]
@@ -215,13 +208,7 @@ async def _signed(
         sent = base64_field(value, "template", code="invalid_template")
     else:
         sent = embedding_of(value) if kind == "embedding" else embeddings_of(value)
-    signed = checked_signature(body, sent, key=caller.probe_key, subject_id=subject, level=asked)
-    if caller.subject_token is None:
-        nonce = nonce_in_time(*signed, key_prefix=caller.prefix, window_s=settings.probe_window_s)
-    else:
-        # It ends by this clock, and not by that of a browser, and is good once.
-        nonce = caller.subject_token.nonce
-    level = _level(runtime, caller, asked)
+    level = _level(runtime, caller, text_field(body.get("level"), "level"))
     runtime.liveness.require(photos=False, challenge=False)
     holder_key = holder_key_of(holder_key_header, body)
 
@@ -243,7 +230,7 @@ async def _signed(
         "template" if kind == "template" else "embedding",
         compare,
         held_template,
-        nonce,
+        _nonce(caller, None),
         holder_key,
     )
 

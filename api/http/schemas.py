@@ -12,7 +12,6 @@ from verify import MAX_PROBE_PHOTOS
 
 HEX = "9f86d081884c7d659a2feaa0c55ad015a3bf4f1b2b0b822cd15d6c15b0f00a08"
 REQUEST_ID = "4b1f0d5c8f1e4c54a52b3c9f7e2d6a10"
-NONCE_EXAMPLE = "kT3v0m9Qe2-cB7xYwZ1a"
 HOLDER_KEY = "AAECAwQFBgcICQoLDA0ODxAREhMUFRYXGBkaGxwdHh8"
 
 
@@ -85,7 +84,7 @@ class TemplateRequest(_Shape):
 
 
 class VerifyRequest(_Shape):
-    """A probe that is not a photo, signed: exactly one of embedding, embeddings and template."""
+    """A probe that is not a photo: exactly one of embedding, embeddings and template."""
 
     embedding: list[float] | None = Field(None, description="Unit-norm, of the contract's n.")
     embeddings: list[list[float]] | None = Field(
@@ -104,19 +103,6 @@ class VerifyRequest(_Shape):
         pattern=HOLDER_KEY_PATTERN,
         description="The holder's key, where the enrollment needs one.",
         examples=[HOLDER_KEY],
-    )
-    nonce: str = Field(
-        pattern="^[A-Za-z0-9_-]{16,64}$",
-        description="Drawn at random for this probe; a second use is refused.",
-        examples=[NONCE_EXAMPLE],
-    )
-    timestamp: int = Field(
-        ge=0, lt=2**53, description="Seconds since 1970, UTC.", examples=[1767225600]
-    )
-    hmac: str = Field(
-        pattern="^[0-9a-f]{64}$",
-        description="HMAC-SHA256 of the probe under the API key; docs/rest.md says of what.",
-        examples=[HEX],
     )
 
 

@@ -2,8 +2,7 @@
 
 A token is sealed under the master key and bound to the row of the API key that asked for it, so
 that any worker knows it and nothing is stored of it. Its nonce is used up with what it is for, in
-the same transaction. Sealed, and not only authenticated, because a probe is signed with it: what is
-in it must not let anybody guess it.
+the same transaction.
 """
 
 import base64
@@ -151,7 +150,7 @@ def _another(what: str, message: str) -> ApiError:
 
 
 def nonce_of(key_prefix: str, token_id: str, expires_at: datetime) -> Nonce:
-    """Nonce of a token. No probe's is like it: those have no colon."""
+    """Nonce of a token. No challenge's own is like it: those have no colon."""
     return Nonce(key_prefix, f"{_NONCE}{token_id}", expires_at)
 
 

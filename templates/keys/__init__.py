@@ -1,1 +1,1 @@
-"""Keys and secrets: sealing, key files, rotations, randomness, signatures of probes."""
+"""Keys and secrets: sealing, key files, rotations, randomness."""

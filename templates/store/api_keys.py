@@ -2,8 +2,7 @@
 
 A token is ``vf_<prefix>_<secret>``, 48 and 256 random bits in hexadecimal. The store keeps the
 prefix, to find the row, and the SHA-256 of the whole token: a secret of 256 random bits cannot be
-guessed from a fast hash. The key that signs probes is derived from the token, so that a client
-needs nothing else; the server keeps it sealed, because the hash must not double as a credential.
+guessed from a fast hash.
 """
 
 import contextlib
@@ -23,8 +22,7 @@ from sqlalchemy.engine import Connection
 
 from templates.contract.levels import LEVEL_NAME
 from templates.errors import StoreError, StoreUnavailable
-from templates.keys.api_token import TOKEN, probe_key
-from templates.keys.sealing import sealed_key_id
+from templates.keys.api_token import TOKEN
 from templates.store.audit_log import PROGRAM, TENANT_ERASE, By, Entry
 from templates.store.authenticity import LAST_KEY_LINE, columns_of, is_current, row_mac, warn
 from templates.store.context import StoreContext
@@ -32,7 +30,6 @@ from templates.store.schema import ApiKeyRow, AuditRow, TenantRow
 from templates.store.subject_rows import tenant_id_of
 from templates.store.tenants import Tenants
 
-PROBE_KEY_PURPOSE = "api-key-probe-key"
 MAX_LABEL = 128
 
 _NOBODYS_HASH = os.urandom(32)
@@ -285,19 +282,6 @@ class ApiKeys:
 
         return self._context.write(work)
 
-    def probe_key(self, prefix: str) -> bytes:
-        """Open the key that probes of this API key are signed with; see :func:`probe_key`."""
-        columns = ApiKeyRow.id, ApiKeyRow.wrapped_probe_key
-        query = sa.select(*columns).where(ApiKeyRow.prefix == prefix)
-        row = self._context.database.read(
-            lambda connection: connection.execute(query).one_or_none()
-        )
-        if row is None:
-            raise StoreError("there is no API key of this prefix")
-        return self._context.keyring.open(
-            row.wrapped_probe_key, purpose=PROBE_KEY_PURPOSE, bound_to=[row.id]
-        )
-
     def _row(self, prefix: str) -> Any:
         return self._context.read(
             lambda connection: connection.execute(_OF_PREFIX, {"prefix": prefix}).one_or_none()
@@ -308,9 +292,6 @@ class ApiKeys:
         key_id, prefix = uuid.uuid4().hex, os.urandom(6).hex()
         key = ApiKey(id=key_id, prefix=prefix, created_at=self._context.clock(), **vars(grant))
         token = f"vf_{prefix}_{os.urandom(32).hex()}"
-        wrapped = self._context.keyring.seal(
-            probe_key(token), purpose=PROBE_KEY_PURPOSE, bound_to=[key_id]
-        )
         entry = Entry("key-create", "created", by, key.tenant, detail=prefix)
         row: dict[str, Any] = {
             "id": key_id,
@@ -327,8 +308,7 @@ class ApiKeys:
         }
         row_key = self._context.audit_log.row_key()
         row["mac"] = row_mac(row_key, ApiKeyRow, {**row, "tenant": key.tenant})
-        wrapping = {"wrapped_probe_key": wrapped, "wrapping_key": sealed_key_id(wrapped)}
-        connection.execute(sa.insert(ApiKeyRow).values(**row, **wrapping))
+        connection.execute(sa.insert(ApiKeyRow).values(row))
         return NewApiKey(key=key, token=token)
 
     def _change(self, connection: Connection, row: Any, entry: Entry, **columns: object) -> None:

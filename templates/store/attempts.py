@@ -111,7 +111,7 @@ class Attempts:
             A template of another contract is as good as none: nothing of it is read or decrypted,
             so that it costs what a subject costs that does not exist.
         nonce
-            Of a signed probe; None for a photo.
+            Of a challenge or a token; None where there is neither.
         held_template
             The sealed template that the subject's holder sent, if any did. It counts where the
             store keeps none of the subject; whose it is turns out here.
@@ -161,7 +161,7 @@ class Attempts:
         level
             Security level of the decision, for the audit log.
         nonce
-            Of a signed probe; None for a photo.
+            Of a challenge or a token; None where there is neither.
         by
             Who asked.
 

@@ -54,7 +54,7 @@ class Erasures:
         own call removed.
 
         What stays is the receipt, and the lines of the audit log, which name the subject by its
-        pseudonym. The nonces of signed probes stay for their few minutes:
+        pseudonym. The nonces of challenges and tokens stay for their few minutes:
         they belong to an API key and name no subject. As the failed attempts go, an erasure ends a
         lock: whoever may erase and enroll a subject may also start its count anew.
         """

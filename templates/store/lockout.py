@@ -97,7 +97,7 @@ class LockedOut(StoreError):
 
 
 class Replayed(StoreError):
-    """A signed probe, an answer to a challenge, or a token, that was seen before.
+    """An answer to a challenge, or a token, that was seen before.
 
     Attributes
     ----------
@@ -109,10 +109,7 @@ class Replayed(StoreError):
 
     def __init__(
         self,
-        message: str = (
-            "this was seen before: sign each probe with a nonce of its own, and ask for another "
-            "challenge or token"
-        ),
+        message: str = "this was seen before: ask for another challenge or token",
         *,
         recorded: bool = False,
     ) -> None:
@@ -122,9 +119,9 @@ class Replayed(StoreError):
 
 @dataclass(frozen=True)
 class Nonce:
-    """The nonce of a signed probe, a challenge or a token; kept until its time alone refuses it.
+    """The nonce of a challenge or a token; kept until its time alone refuses it.
 
-    `key_prefix` is of the key that the probe is signed with, or that asked for the others.
+    `key_prefix` is of the key that asked for it.
     """
 
     key_prefix: str

@@ -82,7 +82,7 @@ class ErasedTenant:
     api_keys
         API keys, those that were revoked or had expired before included.
     failed_attempts, nonces
-        Records of lockout and of signed probes.
+        Records of lockout, and of challenges and tokens that were used.
     """
 
     subjects: int

@@ -19,12 +19,10 @@ from sqlalchemy.engine import Connection
 from sqlalchemy.orm import InstrumentedAttribute
 
 from templates.keys.sealing import MasterKeyring, sealed_key_id
-from templates.store.api_keys import PROBE_KEY_PURPOSE
 from templates.store.context import StoreContext
 from templates.store.deployment import CHECK_PURPOSE, SECRET_PURPOSE
 from templates.store.envelope import DATA_KEY_PURPOSE
 from templates.store.schema import (
-    ApiKeyRow,
     Base,
     MasterKeyCheckRow,
     RotationKeyRow,
@@ -65,14 +63,6 @@ WRAPPED_COLUMNS = (
         [RotationKeyRow.tenant_id, RotationKeyRow.epoch],
         ROTATION_PURPOSE,
         [RotationKeyRow.tenant_id, RotationKeyRow.epoch],
-    ),
-    WrappedColumn(
-        ApiKeyRow,
-        ApiKeyRow.wrapped_probe_key,
-        ApiKeyRow.wrapping_key,
-        [ApiKeyRow.id],
-        PROBE_KEY_PURPOSE,
-        [ApiKeyRow.id],
     ),
     WrappedColumn(
         SecretRow,

@@ -152,8 +152,6 @@ class ApiKeyRow(Base):
     token_hash: Mapped[bytes] = mapped_column(LargeBinary(32))
     rights: Mapped[str] = mapped_column(String(128))
     label: Mapped[str] = mapped_column(String(128))
-    wrapped_probe_key: Mapped[bytes] = mapped_column(LargeBinary)
-    wrapping_key: Mapped[str] = mapped_column(KEY_ID)
     created_at: Mapped[datetime] = mapped_column(UtcDateTime)
     expires_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
     revoked_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
@@ -231,7 +229,7 @@ class FailedAttemptsRow(Base):
 
 
 class UsedNonceRow(Base):
-    """A nonce of a signed probe, kept until its time stamp alone would refuse it."""
+    """A nonce of a challenge or a token, kept until its time alone would refuse it."""
 
     __tablename__ = "used_nonces"
 

@@ -45,8 +45,6 @@ class Bodies:
             "embeddings": [[0.1] * 8, [0.2] * 8],
             "template": "AAAA",
             "level": "fmr-1e-3",
-            "nonce": "x",
-            "timestamp": 1,
         }
 
     def make(self, rng: random.Random) -> bytes:

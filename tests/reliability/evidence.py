@@ -8,10 +8,12 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from datetime import timedelta
 from typing import Any, Protocol
 
 import sqlalchemy as sa
 
+from api.http.tokens import LONGEST_S
 from api.process.runtime import open_keyring, open_store
 from templates.contract import wire
 from templates.errors import VeilfaceError
@@ -25,6 +27,7 @@ from tests.reliability.operations import Operation
 from tests.reliability.register import call_of, explain
 
 DECIDED = ("accept", "reject")
+SURELY_KEPT = timedelta(seconds=LONGEST_S / 2)
 ENROLLED = {True: "replaced", False: "created"}
 
 
@@ -189,16 +192,22 @@ class _Examination:
             self._wrong("receipts: not one for each erasure of the audit log")
 
     def _nonces(self) -> None:
-        """Every decision of a signed probe has used up a nonce; nothing else has."""
-        decisions = sum(
-            1 for line in self.lines if line.action == "verify" and line.outcome in DECIDED
-        )
+        """Every decision has used up a token of its own, and nothing else has."""
+        decided = [
+            line for line in self.lines if line.action == "verify" and line.outcome in DECIDED
+        ]
+        digests = {line.nonce for line in decided} - {None}
         used = self._scalar(sa.select(sa.func.count()).select_from(UsedNonceRow))
-        if used != decisions:
-            self._wrong(f"nonces: {used} are used up by {decisions} decisions")
+        # Rows of tokens that have expired are removed at every start.
+        recent = sum(line.at > self.lines[-1].at - SURELY_KEPT for line in decided)
+        if len(digests) != len(decided) or not recent <= used <= len(decided):
+            self._wrong(
+                f"nonces: {len(decided)} decisions, of which {recent} are recent, have "
+                f"{len(digests)} digests and {used} rows"
+            )
 
     def _repeated_probes(self) -> None:
-        """A probe that was decided is refused when it is sent again, and only such a one."""
+        """A token that was decided on is refused when it is sent again, and only such a one."""
         for earlier, again in self.replays:
             decided = bool(self.by_request.get(earlier.request_id))
             if earlier.answered_well and not decided:

@@ -28,8 +28,6 @@ QUIET: dict[str, Any] = {
     "rate_limit_key": "off",
     "rate_limit_address": "off",
     "lockout_after": 0,
-    # Probes are sent again after restarts: their nonce must refuse them, not their time.
-    "probe_window_s": 3600,
     "queue_limit": 256,
 }
 """Settings at which nothing but the faults of a scenario refuses."""

@@ -13,8 +13,9 @@ import httpx
 import numpy as np
 from numpy.typing import NDArray
 
+from api.http.tokens import LONGEST_S, new_token
+from api.process.runtime import open_keyring, open_store
 from models.pack import ModelPack
-from templates.keys.probe_signature import signed_probe
 from tests.api.deployment import Deployment, bearer, images, photo
 from tests.patience import PATIENCE_S
 from tests.reliability.service import Service
@@ -41,8 +42,8 @@ class Operation:
         Moment after which it cannot take effect any more.
     outcome
         HTTP status, or :data:`NOT_SENT` or :data:`LOST`.
-    body
-        What was sent, of a verification; to send it again.
+    token
+        What it was sent with.
     """
 
     kind: Kind
@@ -56,7 +57,7 @@ class Operation:
     code: str | None = None
     retry_after: str | None = None
     answer: dict[str, Any] = field(default_factory=dict, repr=False)
-    body: dict[str, Any] = field(default_factory=dict, repr=False)
+    token: str = field(default="", repr=False)
 
     @property
     def answered_well(self) -> bool:
@@ -136,6 +137,26 @@ class Tokens:
         self.enroll = deployment.key("enroll")
         self.erase = deployment.key("erase")
         self.verify = deployment.key("verify", "embeddings")
+        self._keyring = open_keyring(deployment.settings)
+        store = open_store(deployment.settings, self._keyring)
+        try:
+            key = store.api_keys.verify(self.verify)
+        finally:
+            store.close()
+        assert key is not None
+        self._key = key
+
+    def once(self, subject: str) -> str:
+        """Make a token as ``POST /v1/tokens`` does, without a request: for one verification."""
+        return new_token(
+            self._keyring,
+            key_id=self._key.id,
+            key_prefix=self._key.prefix,
+            subject=subject,
+            action="verify",
+            level=None,
+            lifetime_s=LONGEST_S,
+        ).text
 
 
 class Clients:
@@ -180,29 +201,26 @@ class Clients:
         return self._send("contract", "", None, "GET", "/v1/contract", self.tokens.enroll)
 
     def verify(self, subject: str, person: int) -> Operation:
-        """Verify by a signed embedding."""
-        body = signed_probe(self.tokens.verify, subject, self._people.embeddings[person])
-        return self._verify(subject, person, body)
+        """Verify by an embedding, with a token of its own."""
+        return self._verify(subject, person, self.tokens.once(subject))
 
     def replay(self, earlier: Operation) -> Operation:
-        """Send the signed probe of an earlier verification again; not part of the history."""
+        """Send an earlier verification again, with its token; not part of the history."""
         assert earlier.person is not None
-        again = self._verify(earlier.subject, earlier.person, earlier.body, kept=False)
+        again = self._verify(earlier.subject, earlier.person, earlier.token, kept=False)
         self.replays.append((earlier, again))
         return again
 
-    def _verify(
-        self, subject: str, person: int, body: dict[str, Any], *, kept: bool = True
-    ) -> Operation:
+    def _verify(self, subject: str, person: int, token: str, *, kept: bool = True) -> Operation:
         return self._send(
             "verify",
             subject,
             person,
             "POST",
             f"/v1/subjects/{subject}/verify",
-            self.tokens.verify,
+            token,
             kept=kept,
-            json=body,
+            json={"embedding": self._people.embeddings[person].tolist()},
         )
 
     def _send(
@@ -220,7 +238,7 @@ class Clients:
         request_id = f"{next(self._numbers):06d}-{secrets.token_hex(8)}"
         client, headers = self._client(), {**bearer(token), "X-Request-ID": request_id}
         each = Operation(kind, subject, person, request_id, time.monotonic())
-        each.body = sent.get("json", {})
+        each.token = token
         if kept:
             # Before it is sent: an operation that is never heard of again counts too.
             self.history.append(each)

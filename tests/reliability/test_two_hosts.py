@@ -20,7 +20,6 @@ import psycopg
 import pytest
 
 from api.process.opening import open_keyring, open_store
-from templates.keys.probe_signature import signed_probe
 from tests.api.cli.conftest import run
 from tests.api.deployment import bearer, images
 from tests.patience import PATIENCE_S, wait_until
@@ -240,7 +239,7 @@ class ThroughProxy:
 
     def verify(self, subject: str, request_id: str | None = None) -> httpx.Response:
         token = self._tokens.verify
-        body = signed_probe(token, subject, self._people.embeddings[PEOPLE[subject]])
+        body = {"embedding": self._people.embeddings[PEOPLE[subject]].tolist()}
         return self.send("POST", f"/v1/subjects/{subject}/verify", token, request_id, json=body)
 
 

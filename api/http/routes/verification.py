@@ -2,7 +2,7 @@
 
 The order of a verification, which is what bounds an attacker::
 
-    body and signature read ─▶ locked out, or nonce used? template ─▶ probe, decision
+    body read ─▶ locked out, or nonce used? template ─▶ probe, decision
         ─▶ one transaction: nonce used up, lockout checked and counted, audit line ─▶ answer
 
 No decision leaves before that transaction has committed. So of requests that run at the same time

@@ -11,7 +11,6 @@ export { newHolderKey } from "./service/holder-keys.js";
 export { Enrollable, Probe } from "./service/lifts.js";
 export { PrivateClient, type Photo, type PrivateOptions } from "./service/private-client.js";
 export { DEFAULT_RETRIES, type Retries } from "./service/retries.js";
-export { signedProbe } from "./service/signature.js";
 export * from "./templates/agreement.js";
 export * from "./templates/contract.js";
 export * from "./templates/errors.js";

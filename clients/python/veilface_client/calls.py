@@ -17,7 +17,6 @@ from veilface_client import results
 from veilface_client.errors import UnexpectedAnswer
 from veilface_client.holder_keys import holder_key_field
 from veilface_client.results import parse
-from veilface_client.signature import signed_probe
 
 T = TypeVar("T")
 Face = Literal["dominant", "largest", "single"]
@@ -162,7 +161,6 @@ def verify_photos(
 
 
 def verify_template(
-    token: str,
     subject: str,
     template: bytes,
     *,
@@ -170,13 +168,17 @@ def verify_template(
     held_template: str | None,
     holder_key: bytes | None,
 ) -> Call[results.Decision]:
-    """Verify a lifted probe, signed anew for each sending."""
-    more = {**_fields(held_template=held_template), **holder_key_field(holder_key)}
+    """Verify a lifted probe."""
+    body = {
+        "template": base64.b64encode(template).decode("ascii"),
+        **_fields(level=level, held_template=held_template),
+        **holder_key_field(holder_key),
+    }
     return Call(
         "POST",
         subject_path(subject, "/verify"),
         lambda answer: parse(results.Decision, answer),
-        lambda: {"json": {**signed_probe(token, subject, template, level=level), **more}},
+        lambda: {"json": body},
         Resend.WHEN_NOT_DONE,
     )
 

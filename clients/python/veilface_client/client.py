@@ -11,7 +11,7 @@ import httpx
 
 from veilface_client import calls, flows, private_flows, results
 from veilface_client.calls import Action, Call, Face, Storage
-from veilface_client.connection import DEFAULT_TIMEOUT, options, signing_token
+from veilface_client.connection import DEFAULT_TIMEOUT, options
 from veilface_client.errors import UnexpectedAnswer
 from veilface_client.flows import Flow, Send, Wait, Work
 from veilface_client.held_templates import HeldTemplate
@@ -311,7 +311,6 @@ class PrivateClient(Session):
         verify: ssl.SSLContext | bool = True,
         transport: httpx.BaseTransport | None = None,
     ) -> None:
-        self._token = signing_token(token)
         self._lifter = Lifter(pack, dim=dim)
         super().__init__(
             url, token, timeout=timeout, retries=retries, verify=verify, transport=transport
@@ -379,7 +378,6 @@ class PrivateClient(Session):
             private_flows.verify(
                 subject,
                 photos,
-                self._token,
                 self._lifter,
                 self._retries,
                 level=level,

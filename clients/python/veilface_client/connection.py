@@ -6,8 +6,6 @@ from typing import Any
 
 import httpx
 
-from veilface_client.signature import signs
-
 DEFAULT_TIMEOUT = httpx.Timeout(60.0, connect=5.0, pool=5.0)
 """Ten large photos on a busy service take a while; a connection does not."""
 
@@ -44,16 +42,3 @@ def options(
         "limits": _LIMITS,
         "follow_redirects": False,
     }
-
-
-def signing_token(token: str) -> str:
-    """Return an API key, or a token for a browser, that can sign probes.
-
-    Raises
-    ------
-    ValueError
-        It is none of the service's. The text does not repeat it.
-    """
-    if not signs(token):
-        raise ValueError("only an API key of the service (vf_…) or a token (vft_…) can sign probes")
-    return token

@@ -6,7 +6,7 @@
     ├── ServiceError            the service answered with an error: .code, .status, .details …
     │   ├── InvalidRequest      the request itself: malformed, unknown field, too large
     │   ├── PhotoRefused        a better photo heals it: no face, several, too small, blurred …
-    │   ├── Unauthorized        the API key, or a probe's signature
+    │   ├── Unauthorized        the API key or token
     │   ├── Forbidden           a right that the API key lacks
     │   ├── NotFound
     │   │   └── NotEnrolled
@@ -97,7 +97,7 @@ class PhotoRefused(ServiceError):
 
 
 class Unauthorized(ServiceError):
-    """The API key is unknown or revoked, or a probe's signature is wrong or was used."""
+    """The API key or token is unknown, revoked or used."""
 
 
 class Forbidden(ServiceError):

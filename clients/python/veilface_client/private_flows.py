@@ -82,7 +82,6 @@ def enroll(
 def verify(
     subject: str,
     photos: Photo | Iterable[Photo] | Probe,
-    token: str,
     lifter: Lifter,
     retries: Retries,
     *,
@@ -95,18 +94,18 @@ def verify(
     calls.subject_path(subject)
     held = yield from read_held_template(held_template)
     if isinstance(photos, Probe):
-        return (yield from _verify(subject, photos, token, retries, level, held, holder_key))
+        return (yield from _verify(subject, photos, retries, level, held, holder_key))
     pictures: list[bytes] = yield Work(lambda: read_photos(photos))
     probe = yield from lift_probe(pictures, lifter, retries, face=face)
     try:
-        return (yield from _verify(subject, probe, token, retries, level, held, holder_key))
+        return (yield from _verify(subject, probe, retries, level, held, holder_key))
     except ContractMismatch:
         renewed = yield from inputs_of(lifter, retries, fresh=True)
         if renewed.contract_id == probe.contract_id:
             # It is the subject's stored template that is of another contract.
             raise
     probe = yield from _probe(pictures, lifter, renewed, face)
-    return (yield from _verify(subject, probe, token, retries, level, held, holder_key))
+    return (yield from _verify(subject, probe, retries, level, held, holder_key))
 
 
 def _probe(
@@ -144,14 +143,12 @@ def _enroll(
 def _verify(
     subject: str,
     lift: Probe,
-    token: str,
     retries: Retries,
     level: str | None,
     held_template: str | None,
     holder_key: bytes | None,
 ) -> Flow[results.Decision]:
     call = calls.verify_template(
-        token,
         subject,
         lift.template,
         level=level,

@@ -16,7 +16,6 @@ from api.http.errors import StartError
 from api.http.schemas import ChallengeAnswer, VerifyAnswer
 from api.process.runtime import Runtime
 from models.pack import ModelPack
-from templates.keys.probe_signature import signed_probe
 from tests.api.client import Client
 from tests.api.deployment import Deployment, bearer, deploy, images, photo
 from tests.api.shapes import assert_answer, assert_error
@@ -257,8 +256,7 @@ def test_a_policy_refuses_what_cannot_show_liveness(active: Service) -> None:
     assert "POST /v1/challenges" in answer.json()["error"]["message"]
     pack = ModelPack.load(deployment.settings.pack or "", threads=1)
     embedding = pack.embed_photo(frame(person=ANNA)).embedding.astype(np.float64)
-    for probe in (embedding, embedding[None]):
-        body = signed_probe(deployment.token, "anna", probe)
+    for body in ({"embedding": embedding.tolist()}, {"embeddings": [embedding.tolist()]}):
         answer = client.post("/v1/subjects/anna/verify", json=body)
         assert assert_error(answer, 403, "forbidden") == {"liveness": "active"}
         assert "embeddings and lifted probes cannot show" in answer.json()["error"]["message"]

@@ -19,7 +19,6 @@ from api.http.transfer import ExportKey, open_export
 from templates.contract import wire
 from templates.decoys import DecoySource, client_source
 from templates.errors import InvalidTemplate, SealError, StoreError
-from templates.keys.probe_signature import signed_probe
 from templates.keys.rotation import TenantRotation
 from templates.keys.sealing import MasterKeyring
 from templates.space.subspace import AffineSubspace
@@ -66,7 +65,7 @@ class Thief:
 
     @staticmethod
     def log_in(client: Client, subject: str, token: str, vector: NDArray[np.float64]) -> Any:
-        body = signed_probe(token, subject, vector)
+        body = {"embedding": vector.tolist()}
         return client.post(f"/v1/subjects/{subject}/verify", json=body, headers=bearer(token))
 
     def decisions(

@@ -17,7 +17,6 @@ import sqlalchemy as sa
 from api.http.schemas import AuditLogAnswer
 from api.process.opening import open_keyring, open_store
 from templates.errors import StoreError
-from templates.keys.probe_signature import signed_probe
 from templates.keys.sealing import MasterKeyring
 from templates.store import By, TemplateStore
 from templates.store.database import Database
@@ -121,13 +120,11 @@ class Attacked:
         """Answer to alice's own face."""
         return attempt(self.client, token, 1, subject)
 
-    def signed_probe(self, token: str) -> Callable[[], Any]:
-        """Sends alice's face, signed once, as often as it is called."""
-        face = self.client.app.state.runtime.pack.embed_photo(photo(1, 5)).embedding
-        body = signed_probe(token, "alice", face)
-        return lambda: self.client.post(
-            "/v1/subjects/alice/verify", json=body, headers=bearer(token), sign=False
-        )
+    def one_use(self) -> Callable[[], Any]:
+        """Send alice's face with one and the same token, as often as it is called."""
+        asked = {"subject_id": "alice", "action": "verify"}
+        token = self.client.post("/v1/tokens", json=asked).json()["token"]
+        return lambda: self.decides(token)
 
 
 @pytest.fixture
@@ -407,9 +404,9 @@ def test_the_locks_of_an_erased_subject_and_tenant_are_gone(attacked: Attacked) 
     "forget",
     ["DELETE FROM used_nonces", "UPDATE used_nonces SET expires_at = '2020-01-01 00:00:00'"],
 )
-def test_a_signed_probe_does_not_pass_twice(attacked: Attacked, forget: str) -> None:
+def test_a_token_does_not_pass_twice(attacked: Attacked, forget: str) -> None:
     enroll(attacked.client)
-    send = attacked.signed_probe(attacked.deployment.key("verify", "embeddings"))
+    send = attacked.one_use()
     assert send().json()["decision"] == "accept"
     attacked.attacker.run(forget)
     attacked.store.purge()
@@ -420,7 +417,7 @@ def test_a_signed_probe_does_not_pass_twice(attacked: Attacked, forget: str) -> 
 def test_a_nonce_that_served_twice_is_found(attacked: Attacked) -> None:
     """With the lines of the first decision set aside, and put back afterwards."""
     enroll(attacked.client)
-    send = attacked.signed_probe(attacked.deployment.key("verify", "embeddings"))
+    send = attacked.one_use()
     assert send().status_code == 200
     attacked.attacker.drop_triggers()
     line = attacked.attacker.rows("audit_log", "nonce IS NOT NULL")[0]

@@ -5,10 +5,8 @@ from collections.abc import Sequence
 from importlib.util import find_spec
 from typing import Any
 
-import numpy as np
 import pytest
 
-from templates.keys.probe_signature import sign_probe
 from tests.api.deployment import photo, picture
 from tests.clients.conftest import Running
 from tests.clients.javascript.conftest import Node
@@ -169,20 +167,6 @@ def test_no_service(node: Node, service: Running) -> None:
         retries={"sendings": 1},
     )
     assert (outcome["error"], outcome["sent"]) == ("ConnectionFailed", False)
-
-
-@pytest.mark.parametrize("level", [None, "fmr-1e-3"])
-def test_signatures_are_those_of_the_service(node: Node, level: str | None) -> None:
-    bearer = f"vf_{'0' * 12}_{'5e' * 32}"
-    template = np.arange(40, dtype=np.uint8).tobytes()
-    given = {"bearer": bearer, "subject": "anna", "template": base64.b64encode(template).decode()}
-    body = node("sign.js", {**given, "level": level})
-    again = sign_probe(
-        bearer, "anna", template, level=level, nonce=body["nonce"], timestamp=body["timestamp"]
-    )
-    assert body["hmac"] == again.hmac
-    assert base64.b64decode(body["template"]) == template
-    assert body.get("level") == level
 
 
 @pytest.mark.skipif(find_spec("api.http.routes.tokens") is None, reason="there are no tokens yet")

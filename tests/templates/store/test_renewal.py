@@ -13,7 +13,6 @@ import sqlalchemy as sa
 from templates.errors import SealError, StoreError
 from templates.keys.sealing import MasterKeyring, sealed_key_id
 from templates.store import By, Entry, Right, TemplateStore, verify_receipt
-from templates.store.api_keys import PROBE_KEY_PURPOSE
 from templates.store.audit_chain import Anchor, head_mac, line_hash
 from templates.store.audit_log import BrokenAuditLog
 from templates.store.authenticity import row_mac
@@ -288,8 +287,7 @@ def test_a_row_that_was_not_good_is_not_vouched_for(deployment: Deployment) -> N
     row_key = store.audit_log.row_key_of(loot.chain_key)
     query = sa.select(ApiKeyRow.__table__).where(ApiKeyRow.prefix == unknown.key.prefix)
     row = store.database.read(lambda connection: connection.execute(query).one())._asdict()
-    probe_key = loot.keyring.seal(bytes(32), purpose=PROBE_KEY_PURPOSE, bound_to=["0" * 32])
-    row |= {"prefix": "0123456789ab", "id": "0" * 32, "line": 0, "wrapped_probe_key": probe_key}
+    row |= {"prefix": "0123456789ab", "id": "0" * 32, "line": 0}
     row["mac"] = row_mac(row_key, ApiKeyRow, {**row, "tenant": "default"})
     widened = sa.update(ApiKeyRow).where(ApiKeyRow.prefix == altered.key.prefix)
     deployment.run(sa.insert(ApiKeyRow).values(row), widened.values(rights="admin"))

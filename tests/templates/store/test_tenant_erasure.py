@@ -382,7 +382,6 @@ def test_sqlite_files_keep_nothing_of_an_erased_tenant(
             .where(SubjectRow.tenant_id == tenant_id),
             sa.select(SubjectRow.wrapped_key).where(SubjectRow.tenant_id == tenant_id),
             sa.select(RotationKeyRow.wrapped_key).where(RotationKeyRow.tenant_id == tenant_id),
-            sa.select(ApiKeyRow.wrapped_probe_key).where(ApiKeyRow.tenant_id == tenant_id),
             sa.select(ApiKeyRow.token_hash).where(ApiKeyRow.tenant_id == tenant_id),
         ]
         blobs = [blob for query in queries for blob in connection.execute(query).scalars()]

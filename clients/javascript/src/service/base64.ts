@@ -13,8 +13,3 @@ export function base64(bytes: Uint8Array): string {
 export function base64url(bytes: Uint8Array): string {
   return base64(bytes).replaceAll("+", "-").replaceAll("/", "_").replace(/=+$/, "");
 }
-
-/** Random text of `count` bytes. */
-export function randomText(count: number): string {
-  return base64url(crypto.getRandomValues(new Uint8Array(count)));
-}

@@ -19,13 +19,13 @@ import type {
 import { ConnectionFailed, errorOf, UnexpectedAnswer } from "./errors.js";
 import { holderKeyField } from "./holder-keys.js";
 import { DEFAULT_RETRIES, waitFor, type Resend, type Retries } from "./retries.js";
-import { isToken } from "./signature.js";
 
 /** The most photos of one enrollment, and of one probe. */
 export const ENROLL_PHOTOS = 10;
 export const PROBE_PHOTOS = 5;
 
 const SUBJECT = /^(?!\.{1,2}$)[A-Za-z0-9._@:-]{1,128}$/;
+const TOKEN = /^vft_[A-Za-z0-9_-]{8,600}$/;
 const VISIBLE = /^[\x21-\x7e]+$/;
 const TEMPLATE_ID = /^[A-Za-z0-9_-]{1,64}$/;
 // Connections that were never made, as Node names them; a browser does not tell.
@@ -68,7 +68,7 @@ export interface Call<T> {
   readonly method: "GET" | "POST" | "PUT" | "DELETE";
   readonly path: string;
   readonly headers?: Readonly<Record<string, string>>;
-  readonly body?: () => FormData | object | Promise<object>;
+  readonly body?: () => FormData | object;
   /** Long answers tell of each piece that came, so that slow ones are not taken for lost. */
   readonly read: (response: Response, alive: () => void) => Promise<T>;
   readonly resend?: Resend;
@@ -112,12 +112,7 @@ export class Session {
 
   /** When an enrollment may be sent again: one that uses up a token or has a condition would meet itself. */
   protected resendOf(replace: Replace = true): Resend {
-    return replace === true && !isToken(this.#bearer) ? "when-lost" : "when-not-done";
-  }
-
-  /** The bearer, for signatures. */
-  protected get bearer(): string {
-    return this.#bearer;
+    return replace === true && !TOKEN.test(this.#bearer) ? "when-lost" : "when-not-done";
   }
 
   /** List one page of subjects. Right: `enroll`. */
@@ -257,7 +252,7 @@ export class Session {
       Authorization: `Bearer ${this.#bearer}`,
       Accept: "application/json, */*",
     };
-    const content = await call.body?.();
+    const content = call.body?.();
     if (content !== undefined && !(content instanceof FormData)) {
       headers["Content-Type"] = "application/json";
     }

@@ -6,7 +6,7 @@
  * ├── ServiceError            the service answered with an error: .code, .status, .details …
  * │   ├── InvalidRequest      the request itself: malformed, unknown field, too large
  * │   ├── PhotoRefused        a better photo heals it: no face, several, too small, blurred …
- * │   ├── Unauthorized        the API key or token, or a probe's signature
+ * │   ├── Unauthorized        the API key or token
  * │   ├── Forbidden           a right that the API key or the token lacks
  * │   ├── NotFound
  * │   │   └── NotEnrolled
@@ -69,7 +69,7 @@ export class InvalidRequest extends ServiceError {
 export class PhotoRefused extends ServiceError {
   override name = "PhotoRefused";
 }
-/** The API key or token is unknown, revoked or used, or a probe's signature is wrong. */
+/** The API key or token is unknown, revoked or used. */
 export class Unauthorized extends ServiceError {
   override name = "Unauthorized";
 }

@@ -28,7 +28,6 @@ import { ContractMismatch, UnexpectedAnswer } from "./errors.js";
 import { holderKeyField } from "./holder-keys.js";
 import { Enrollable, Probe } from "./lifts.js";
 import { LiftInputs, SharedInputs } from "./lift-inputs.js";
-import { canSign, signedProbe } from "./signature.js";
 
 const LOOKS = 3;
 
@@ -54,9 +53,6 @@ export class PrivateClient extends Session {
   #closed = false;
 
   constructor(url: string, bearer: string, options: PrivateOptions) {
-    if (!canSign(bearer)) {
-      throw new RangeError("only an API key (vf_…) or a token (vft_…) of the service signs probes");
-    }
     super(url, bearer, options);
     this.#options = options;
     this.#shared = new SharedInputs();
@@ -235,15 +231,13 @@ export class PrivateClient extends Session {
 
   async #verify(subject: string, lift: Probe, options: VerifyOptions): Promise<Decision> {
     const { level, heldTemplate, holderKey } = options;
-    const more = fields({ held_template: heldTemplate, ...holderKeyField(holderKey) });
+    const template = base64(lift.template);
+    const body = fields({ template, level, held_template: heldTemplate, ...holderKeyField(holderKey) });
     return this.#naming(lift, () =>
       this.send({
         method: "POST",
         path: subjectPath(subject, "/verify"),
-        body: async () => ({
-          ...(await signedProbe(this.bearer, subject, lift.template, { level })),
-          ...more,
-        }),
+        body: () => body,
         read: readDecision,
         resend: "when-not-done",
       }),

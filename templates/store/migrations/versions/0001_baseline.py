@@ -175,8 +175,6 @@ def upgrade() -> None:
         sa.Column("token_hash", sa.LargeBinary(length=32), nullable=False),
         sa.Column("rights", sa.String(length=128), nullable=False),
         sa.Column("label", sa.String(length=128), nullable=False),
-        sa.Column("wrapped_probe_key", sa.LargeBinary(), nullable=False),
-        sa.Column("wrapping_key", sa.String(length=16), nullable=False),
         sa.Column("created_at", sa.DateTime(timezone=True), nullable=False),
         sa.Column("expires_at", sa.DateTime(timezone=True), nullable=True),
         sa.Column("revoked_at", sa.DateTime(timezone=True), nullable=True),
