@@ -65,8 +65,7 @@ def _verdicts(report: Row) -> Iterable[str]:
     )
     yield (
         "The database alone holds ciphertext only: no attack begins there, and what stands in its "
-        "column uses the service. A template that its holder keeps is not in the database, "
-        "whatever key leaked; once stolen from the holder too, it is as one from the database."
+        "column uses the service."
     )
     for verdict in report["verdicts"]:
         cells: dict[tuple[str, str], dict[str, list[str]]] = {}

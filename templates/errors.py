@@ -12,7 +12,6 @@
     │   ├── ContractMismatch     a template, pack or decoy source of another contract
     │   └── Uncalibrated         no calibration for the requested mode, metric, dimension or level
     ├── SealError                a ciphertext that does not open, or a key that cannot be used
-    │   └── ForeignTemplate      a sealed template that was altered, or is another owner's [16]
     ├── StoreError
     │   ├── StoreUnavailable     the database does not answer
     │   │   ├── DatabaseFileRemoved  its file is not the one that was opened
@@ -25,8 +24,7 @@
     │   ├── LockedOut            too many failed attempts on the subject [12]
     │   ├── Replayed             a challenge or a token that was seen before [12]
     │   ├── BrokenAuditLog       an audit log whose head or key is missing or forged [13]
-    │   ├── EnrollmentConflict   another template than the one that a write may replace [17]
-    │   └── TemplateNotStored    the subject's holder keeps the template, and did not send it [15]
+    │   └── EnrollmentConflict   another template than the one that a write may replace [17]
     ├── InconsistentImages [3]   photos that do not show one and the same person
     ├── DatasetError [4]         a dataset that cannot be read
     ├── EvaluationError [5]      an evaluation that cannot be made as it was asked for
@@ -43,9 +41,7 @@ Each is defined here, or next to what raises it: [1] ``templates.store.identifie
 [5] ``verify.evaluation.plan``, [6] ``verify.evaluation.backends``, [7] ``attacks.errors``,
 [8] ``api.http.errors``, [9] ``api.process.preparation``, [10] ``api.cli.errors``,
 [11] ``templates.store.tenants``, [12] ``templates.store.lockout``,
-[13] ``templates.store.audit_log``,
-[15] ``templates.store.subject_rows``, [16] ``templates.store.envelope``,
-[17] ``templates.store.subjects``.
+[13] ``templates.store.audit_log``, [17] ``templates.store.subjects``.
 
 Messages name the cause and the remedy. They never hold a number of a descriptor, a template or
 an image, nor a key.

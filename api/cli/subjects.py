@@ -1,8 +1,5 @@
 """``veilface enroll`` and ``veilface verify``: on this machine, against the store itself."""
 
-import base64
-import binascii
-import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,11 +9,10 @@ import typer
 
 from api.cli.console import counted, demo_notice, emit, message, say
 from api.cli.errors import CommandError, UsageError
-from api.cli.files import read_bounded, read_photo
+from api.cli.files import read_photo
 from api.cli.options import LOCAL, AsJson, Tenant, takes_settings
 from api.http.audit import operator
 from api.http.errors import ApiError
-from api.limits.admission import MAX_JSON_BYTES
 from api.process.opening import weak_privacy
 from api.process.runtime import Runtime
 from api.settings import Settings
@@ -31,12 +27,11 @@ from templates.keys.holder_key import (
     wipe,
     write_holder_key,
 )
-from templates.keys.private_file import create_private
 from templates.space.agreement import InconsistentImages
 from templates.store.audit_log import Entry
-from templates.store.subject_rows import Source, Storage, TemplateNotStored
+from templates.store.subject_rows import Source
 from templates.store.subjects import Precondition
-from verify import MAX_PROBE_PHOTOS, OpenedTemplate, Verifier
+from verify import MAX_PROBE_PHOTOS
 
 Subject = Annotated[str, typer.Argument(help="Id of the person.")]
 Face = Annotated[
@@ -73,13 +68,6 @@ def enroll(
     ] = None,
     tenant: Tenant = None,
     face: Face = FacePolicy.SINGLE,
-    held_template: Annotated[
-        Path | None,
-        typer.Option(
-            help="Write the sealed template to this new file, and store none: every verification "
-            "of the person then needs the file."
-        ),
-    ] = None,
     holder_key_file: HolderKeyFile = None,
     new_holder_key_file: Annotated[
         Path | None,
@@ -101,17 +89,13 @@ def enroll(
     """Enroll a person from photos, or replace their enrollment.
 
     Needs: what `serve` needs (contract, decoys, pack); the service may run meanwhile. All photos
-    must show the same person. Only the private template is stored, or handed out to be kept by its
-    holder (`--held-template`): then the file is the only copy. With a holder's key it accepts
+    must show the same person. Only the private template is stored. With a holder's key it accepts
     nobody without that key, which is not stored: who loses the file enrolls again.
 
     Example: `veilface enroll alice alice-1.jpg alice-2.jpg alice-3.jpg --pack buffalo_l`
     """
     if len(photos) > MAX_PHOTOS:
         raise UsageError(f"an enrollment has 1 to {MAX_PHOTOS} photos, not {len(photos)}")
-    if held_template is not None and os.path.lexists(held_template):
-        # It may be the only copy of somebody's template.
-        raise UsageError(f"{held_template} is there already: name a new file")
     if no_replace and replace is not None:
         raise UsageError("give --no-replace or --replace, not both")
     may_replace_all = not no_replace and replace is None
@@ -146,12 +130,9 @@ def enroll(
             enrollment,
             source=Source.PHOTOS,
             photos=len(photos),
-            storage=Storage.SERVICE if held_template is None else Storage.HOLDER,
             precondition=None if may_replace_all else Precondition(replace),
             by=operator(),
         )
-        if held_template is not None and stored.held_template is not None:
-            _hand_out(stored.held_template, held_template, subject)
         if (weakness := weak_privacy(runtime.contract)) is not None:
             message(f"warning: weak privacy: {weakness}")
         binding = runtime.contract.binding
@@ -169,16 +150,13 @@ def enroll(
                 "replaced": not stored.created,
                 "holder_key": enrollment.holder_salt is not None,
                 "photos": len(photos),
-                "storage": str(Storage.SERVICE if held_template is None else Storage.HOLDER),
                 **notice,
             }
         )
     else:
         done = "Enrolled" if stored.created else "Replaced the enrollment of"
-        size, where = len(enrollment.wire), "stored"
-        if held_template is not None:
-            where = f"wrote to {held_template}, and stored none of,"
-        say(f"{done} {subject} from {counted(len(photos), 'photo')}; {where} {size} bytes.")
+        size = len(enrollment.wire)
+        say(f"{done} {subject} from {counted(len(photos), 'photo')}; stored {size} bytes.")
 
 
 @takes_settings(*LOCAL)
@@ -201,12 +179,6 @@ def verify(
     ] = None,
     tenant: Tenant = None,
     face: Face = FacePolicy.SINGLE,
-    held_template: Annotated[
-        Path | None,
-        typer.Option(
-            help="File that `enroll --held-template` wrote, of a person who keeps their template."
-        ),
-    ] = None,
     holder_key_file: HolderKeyFile = None,
     as_json: AsJson = False,
 ) -> None:
@@ -224,12 +196,14 @@ def verify(
         raise UsageError(f"a verification takes 1 to {MAX_PROBE_PHOTOS} photos, not {len(photos)}")
     holder_key = None if holder_key_file is None else read_holder_key(holder_key_file)
     data = [read_photo(photo, settings.max_image_bytes) for photo in photos]
-    sealed = None if held_template is None else _handed_in(held_template)
     runtime = Runtime.open(settings)
     try:
         pack = _required_pack(runtime)
         name = _tenant(runtime, tenant)
-        template, verifier = _opened(runtime, name, subject, sealed)
+        read = runtime.read(name, subject)
+        if read is None:
+            raise CommandError(f"nobody is enrolled as {subject!r} in tenant {name}")
+        template, verifier = read[0], read[1].verifier
         try:
             level = runtime.levels.in_force(level)
         except ApiError as error:
@@ -268,43 +242,6 @@ def verify(
             say(decision.advice)
     if not decision.accepted:
         raise typer.Exit(1)
-
-
-def _opened(
-    runtime: Runtime, tenant: str, subject: str, held_template: bytes | None
-) -> tuple[OpenedTemplate, Verifier]:
-    """Return the subject's template and its verifier; one of nobody where another was handed in."""
-    try:
-        read = runtime.read(tenant, subject, held_template=held_template)
-    except TemplateNotStored:
-        if held_template is None:
-            raise CommandError(
-                f"the holder of {subject!r} keeps the template: name its file with --held-template"
-            ) from None
-        return runtime.stand_ins.open(None), runtime.verifier(tenant, runtime.epoch(tenant))
-    if read is None:
-        raise CommandError(f"nobody is enrolled as {subject!r} in tenant {tenant}")
-    template, in_rotation = read
-    return template, in_rotation.verifier
-
-
-def _hand_out(sealed: bytes, path: Path, subject: str) -> None:
-    """Write a held template, in base64, to a new file of mode 0600."""
-    try:
-        create_private(path, base64.b64encode(sealed))
-    except OSError as error:
-        raise CommandError(
-            f"{subject!r} is enrolled, but its template could not be written and is lost "
-            f"({path}: {error.strerror}): enroll again"
-        ) from None
-
-
-def _handed_in(path: Path) -> bytes:
-    """Read what :func:`_hand_out` wrote."""
-    try:
-        return base64.b64decode(read_bounded(path, MAX_JSON_BYTES).strip(), validate=True)
-    except (binascii.Error, ValueError):
-        raise CommandError(f"{path} is not a held template: it is not base64") from None
 
 
 @contextmanager

@@ -26,8 +26,6 @@ from templates.contract.canonical import too_many_parts
 _FORM, _JSON = "multipart/form-data", "application/json"
 _MEDIA_TYPE = re.compile(r"[a-z0-9.+-]{1,63}/[a-z0-9.+-]{1,63}")
 MAX_FIELD_BYTES = 4096
-LONG_FIELDS = {"held_template": MAX_JSON_BYTES}
-"""Text fields that may be longer, and how long: what fits into a JSON body fits into a form."""
 MAX_FIELDS = 16
 MAX_JSON_PARTS = 24_576
 """Values in a JSON body, counted before it is parsed: six of the longest embeddings, where no
@@ -75,6 +73,7 @@ class _InMemoryParser(MultiPartParser):
             stream_limited(request, max_bytes),
             max_files=float("inf"),
             max_fields=MAX_FIELDS,
+            max_part_size=MAX_FIELD_BYTES,
         )
         self._max_images = max_images
         self._max_image_bytes = max_image_bytes
@@ -99,7 +98,6 @@ class _InMemoryParser(MultiPartParser):
     def on_headers_finished(self) -> None:
         super().on_headers_finished()
         self._image_bytes = 0
-        self.max_part_size = LONG_FIELDS.get(self._current_part.field_name, MAX_FIELD_BYTES)
         if self._current_files > self._max_images:
             raise ApiError(
                 "too_many_images",

@@ -25,7 +25,6 @@ from templates.errors import (
 from templates.space.agreement import InconsistentImages
 from templates.store.identifiers import InvalidIdentifier, UnknownTenant
 from templates.store.lockout import LockedOut, Replayed
-from templates.store.subject_rows import TemplateNotStored
 from templates.store.subjects import EnrollmentConflict
 from templates.store.tenants import RetiredRotation
 
@@ -93,12 +92,6 @@ ERROR_CODES: dict[str, ErrorCode] = {
             409,
             "The subject has another template than the one that `If-None-Match` or `If-Match` "
             "lets the request replace.",
-        ),
-        ErrorCode(
-            "template_not_stored",
-            409,
-            "The subject's holder keeps the template: it can be verified with it, and not exported "
-            "or shown.",
         ),
         ErrorCode("image_too_large", 413, "The photo is too large, in bytes or pixels."),
         ErrorCode("request_too_large", 413, "The request body is too large."),
@@ -205,7 +198,6 @@ _TABLE: tuple[tuple[type[Exception], str, str | None], ...] = (
     (Uncalibrated, "uncalibrated", None),
     (SealError, "store_unavailable", "the stored data cannot be opened with the master key"),
     (InvalidIdentifier, "validation_failed", None),
-    (TemplateNotStored, "template_not_stored", None),
     (Replayed, "replayed", None),
     (RetiredRotation, "store_unavailable", "the tenant's rotation is being renewed; send it again"),
     # The key was good a moment ago: its tenant was erased meanwhile.

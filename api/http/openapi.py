@@ -6,7 +6,6 @@ from typing import Any
 
 from api.http.errors import ERROR_CODES
 from api.http.schemas import (
-    HELD_TEMPLATE,
     HOLDER_KEY,
     REQUEST_ID,
     ErrorAnswer,
@@ -82,11 +81,6 @@ FACE = _text(
     "refused as `multiple_faces`.",
     enum=["dominant", "largest", "single"],
 )
-STORAGE = _text(
-    "Who keeps the sealed template: the service (`service`, the default), or whoever gets the "
-    "answer (`holder`).",
-    enum=["service", "holder"],
-)
 HOLDER_KEY_FIELD = _text(
     "The holder's key: 32 random bytes, base64url.",
     pattern=HOLDER_KEY_PATTERN,
@@ -113,7 +107,6 @@ ENROLLMENT_BODY = _body(
                 examples=['{"gender": "Female", "race": "Indian"}'],
             ),
             "face": FACE,
-            "storage": STORAGE,
             "holder_key": HOLDER_KEY_FIELD,
         },
     },
@@ -184,7 +177,6 @@ VERIFY_BODY = _body(
             "challenge_id": CHALLENGE_ID,
             "level": LEVEL,
             "face": FACE,
-            "held_template": _text(HELD_TEMPLATE),
             "holder_key": HOLDER_KEY_FIELD,
         },
     },

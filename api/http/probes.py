@@ -29,7 +29,6 @@ from api.http.values import (
     embedding_of,
     embeddings_of,
     face_policy,
-    held_template_of,
 )
 from api.process.metrics import step
 from api.process.runtime import Runtime
@@ -56,7 +55,6 @@ class Probe:
 
     kind: Literal["photo", "frames", "embedding", "template"]
     compare: Callable[[Verifier, OpenedTemplate], Decision]
-    held_template: bytes | None = field(repr=False)
     nonce: Nonce | None
     holder_key: bytearray | None = field(repr=False)
 
@@ -91,10 +89,9 @@ async def _photos(
     settings = runtime.settings
     form = await sent_form(request, settings, field="image", max_images=MAX_FRAMES)
     photos = form.images("image", "images")
-    reject_unknown(form.fields, ("level", "face", "held_template", CHALLENGE, FIELD))
+    reject_unknown(form.fields, ("level", "face", CHALLENGE, FIELD))
     challenge_id = text_field(form.fields.get(CHALLENGE), CHALLENGE, max_length=MAX_ID)
     _check_count(len(photos), settings, is_challenge=challenge_id is not None)
-    held_template = held_template_of(form.fields)
     level = _level(runtime, caller, text_field(form.fields.get("level"), "level"))
     policy = face_policy(form.fields.get("face"))
     holder_key = holder_key_of(holder_key_header, form.fields)
@@ -144,7 +141,6 @@ async def _photos(
     return Probe(
         "photo" if challenge is None else "frames",
         compare,
-        held_template,
         nonce,
         holder_key,
     )
@@ -191,7 +187,7 @@ def _check_count(count: int, settings: Settings, *, is_challenge: bool) -> None:
 async def _numbers(
     request: Request, runtime: Runtime, caller: Caller, holder_key_header: str | None
 ) -> Probe:
-    known = (*PROBES, "level", "held_template", FIELD)
+    known = (*PROBES, "level", FIELD)
     body = await sent_json(request, runtime.settings, known, photos="image")
     named = [kind for kind in PROBES if kind in body]
     if len(named) != 1:
@@ -201,7 +197,6 @@ async def _numbers(
         )
     # After the fields: a caller that only forgot how to send a photo needs no further right.
     caller.require("embeddings")
-    held_template = held_template_of(body)
     kind, value = named[0], body[named[0]]
     sent: bytes | NDArray[np.float64]
     if kind == "template":
@@ -229,7 +224,6 @@ async def _numbers(
     return Probe(
         "template" if kind == "template" else "embedding",
         compare,
-        held_template,
         _nonce(caller, None),
         holder_key,
     )

@@ -15,12 +15,6 @@ REQUEST_ID = "4b1f0d5c8f1e4c54a52b3c9f7e2d6a10"
 HOLDER_KEY = "AAECAwQFBgcICQoLDA0ODxAREhMUFRYXGBkaGxwdHh8"
 
 
-HELD_TEMPLATE = (
-    "`held_template` of the enrollment, where the subject's holder keeps the template; else it "
-    "changes nothing."
-)
-
-
 class _Shape(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
@@ -61,20 +55,12 @@ class EnrollmentAnswer(_Answer):
     replaced: bool = Field(description="An earlier enrollment was replaced.")
     holder_key: bool = Field(description="It accepts nobody without the holder's key.")
     images: list[Photo] = Field(description="One for each photo; empty for a template.")
-    held_template: str | None = Field(
-        None,
-        description="Only with `storage=holder`: base64 of the sealed template, which the service "
-        "does not keep.",
-    )
 
 
 class TemplateRequest(_Shape):
     """A private template that a client lifted."""
 
     template: str = Field(description="Base64 of the wire bytes.")
-    storage: Literal["service", "holder"] = Field(
-        "service", description="Who keeps the sealed template."
-    )
     holder_key: str | None = Field(
         None,
         pattern=HOLDER_KEY_PATTERN,
@@ -97,7 +83,6 @@ class VerifyRequest(_Shape):
     level: str | None = Field(
         None, description="Security level; default from the contract, or the lowest allowed."
     )
-    held_template: str | None = Field(None, description=HELD_TEMPLATE)
     holder_key: str | None = Field(
         None,
         pattern=HOLDER_KEY_PATTERN,
@@ -217,7 +202,6 @@ class Subject(_Shape):
     current: bool = Field(description="Served by the contract in force; otherwise enroll again.")
     enrolled_by: Literal["photos", "template"]
     photos: int = Field(description="Photos that were averaged; 0 for a template.")
-    storage: Literal["service", "holder"] = Field(description="Who keeps the sealed template.")
     holder_key: bool = Field(description="It accepts nobody without the holder's key.")
     created_at: str = Field(examples=["2026-01-31T12:00:00Z"])
     updated_at: str = Field(examples=["2026-01-31T12:00:00Z"])

@@ -1,6 +1,5 @@
 """Stand-ins of unknown subjects: what opening a real template costs, and what is told of them."""
 
-import contextlib
 import hashlib
 import hmac
 import secrets
@@ -61,12 +60,6 @@ class StandIns:
             self._sealed = self._seal()
             plain = open_envelope(self._sealed, self._owner, self._keyring)
         return StandIn(plain, lifted)
-
-    def open_in_vain(self, held_template: bytes) -> None:
-        """Try a held template that no enrollment waits for: the work that another one costs."""
-        foreign = Envelope(self._sealed.wrapped_key, held_template)
-        with contextlib.suppress(SealError):
-            open_envelope(foreign, self._owner, self._keyring)
 
     def _seal(self) -> Envelope:
         lifted = lift_stand_in(self._nobody, secrets.token_bytes(32))

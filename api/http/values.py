@@ -1,17 +1,14 @@
 """Fields of a request, checked and turned into the values of the packages below."""
 
-from collections.abc import Mapping
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from api.http.bodies import base64_field, text_field
 from api.http.errors import ApiError
 from models.selection import FacePolicy
 from templates.errors import InvalidEmbedding
-from templates.store.subject_rows import Storage
 from verify import MAX_PROBE_PHOTOS
 
 MAX_EMBEDDING = 4096
@@ -50,38 +47,6 @@ def face_policy(value: str | None) -> FacePolicy:
             "validation_failed", "face must be dominant, largest or single", {"field": "face"}
         )
     return FacePolicy(value)
-
-
-def storage_of(fields: Mapping[str, Any]) -> Storage:
-    """Return who is to keep a template: the service, unless the field ``storage`` says otherwise.
-
-    Raises
-    ------
-    ApiError
-        ``validation_failed``.
-    """
-    value = text_field(fields.get("storage"), "storage")
-    if value is None:
-        return Storage.SERVICE
-    if value not in list(Storage):
-        raise ApiError(
-            "validation_failed", "storage must be service or holder", {"field": "storage"}
-        )
-    return Storage(value)
-
-
-def held_template_of(fields: Mapping[str, Any]) -> bytes | None:
-    """Return the sealed template that a holder sent in the field ``held_template``, if any did.
-
-    Raises
-    ------
-    ApiError
-        ``validation_failed`` if it is no string, ``invalid_template`` if it is no base64. What it
-        holds is looked at with the subject only.
-    """
-    if "held_template" not in fields:
-        return None
-    return base64_field(fields["held_template"], "held_template", code="invalid_template")
 
 
 def embedding_of(value: Any) -> NDArray[np.float64]:

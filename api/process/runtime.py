@@ -45,7 +45,7 @@ from templates.store import TemplateStore
 from templates.store.audit_log import By
 from templates.store.lockout import Nonce
 from templates.store.secret import SecretName
-from templates.store.subject_rows import Source, Storage, SubjectTemplate
+from templates.store.subject_rows import Source, SubjectTemplate
 from templates.store.subjects import Precondition, StoredTemplate
 from templates.store.tenants import RetiredRotation
 from verify import Verifier
@@ -190,18 +190,10 @@ class Runtime:
         """Return the tenant's verifier for one epoch."""
         return self._of(tenant, epoch).verifier
 
-    def read(
-        self, tenant: str, subject: str, *, held_template: bytes | None = None
-    ) -> tuple[SubjectTemplate, InRotation] | None:
-        """Return a subject's template and what works with its rotation; None if there is none.
-
-        Raises
-        ------
-        TemplateNotStored
-            If its holder keeps the template, and `held_template` is not it.
-        """
+    def read(self, tenant: str, subject: str) -> tuple[SubjectTemplate, InRotation] | None:
+        """Return a subject's template and what works with its rotation; None if there is none."""
         for _ in range(READS):
-            template = self.store.subjects.get(tenant, subject, held_template=held_template)
+            template = self.store.subjects.get(tenant, subject)
             if template is None:
                 return None
             with contextlib.suppress(RetiredRotation):
@@ -281,7 +273,6 @@ class Runtime:
         *,
         source: Source,
         photos: int,
-        storage: Storage = Storage.SERVICE,
         precondition: Precondition | None = None,
         nonce: Nonce | None = None,
         action: Literal["enroll", "import"] = "enroll",
@@ -289,7 +280,7 @@ class Runtime:
     ) -> StoredTemplate:
         """Store an enrollment in place of an earlier one.
 
-        `storage`, `precondition`, `nonce` and `action` are those of ``Subjects.put``.
+        `precondition`, `nonce` and `action` are those of ``Subjects.put``.
         """
         binding = self.contract.binding
         return self.store.subjects.put(
@@ -305,7 +296,6 @@ class Runtime:
             template_id=enrollment.template_id,
             holder_salt=enrollment.holder_salt,
             rotation_epoch=epoch,
-            storage=storage,
             precondition=precondition,
             action=action,
             nonce=nonce,
@@ -323,8 +313,6 @@ class Runtime:
         ------
         ContractMismatch
             If the stored template belongs to another contract: its dimension may not even fit.
-        TemplateNotStored
-            If its holder keeps the template.
         """
         read = self.read(tenant, subject)
         if read is None:

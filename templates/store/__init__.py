@@ -16,10 +16,8 @@ from templates.store.retention import Retention
 from templates.store.standing import AttemptsStatus
 from templates.store.subject_rows import (
     Source,
-    Storage,
     SubjectRecord,
     SubjectTemplate,
-    TemplateNotStored,
 )
 from templates.store.subjects import StoredTemplate, SubjectPage
 from templates.store.tenant_erasure import TenantErasure
@@ -49,13 +47,11 @@ __all__ = [
     "Right",
     "RotationKey",
     "Source",
-    "Storage",
     "StoredTemplate",
     "SubjectPage",
     "SubjectRecord",
     "SubjectTemplate",
     "Superseded",
-    "TemplateNotStored",
     "TemplateStore",
     "Tenant",
     "TenantErasure",

@@ -38,10 +38,7 @@ _SUBJECT = sa.and_(
     SubjectRow.subject_id == sa.bindparam("subject_id"),
 )
 _TEMPLATE = TemplateRow.subject_pk == SubjectRow.id
-_OTHER, _NEAR = aliased(TemplateRow), aliased(TemplateRow)
-_PASSED = 16
-"""Templates that are passed over, as their holders keep them, before none is taken."""
-_BEYOND_ALL = "g"  # after every id in hexadecimal digits
+_OTHER = aliased(TemplateRow)
 
 COUNTS = tuple(
     getattr(FailedAttemptsRow, name).label(f"counted_{name}")
@@ -94,21 +91,10 @@ def _last_line(last: sa.Subquery) -> tuple[Any, Any]:
 
 
 def _first_stored(least: Any) -> Any:
-    """First ciphertext that is stored, by the ids of rows from `least` on; NULL if none is near."""
-    beyond = (
-        sa.select(_NEAR.subject_pk)
-        .where(_NEAR.subject_pk >= least)
-        .order_by(_NEAR.subject_pk)
-        .limit(1)
-        .offset(_PASSED)
-    )
+    """First ciphertext by the ids of rows from `least` on; NULL if there is none."""
     return (
         sa.select(_OTHER.ciphertext)
-        .where(
-            _OTHER.subject_pk >= least,
-            _OTHER.subject_pk < sa.func.coalesce(beyond.scalar_subquery(), _BEYOND_ALL),
-            _OTHER.ciphertext.is_not(None),
-        )
+        .where(_OTHER.subject_pk >= least)
         .order_by(_OTHER.subject_pk)
         .limit(1)
         .scalar_subquery()

@@ -7,9 +7,8 @@ is held against the audit log (``templates.store.standing``), and so is a nonce:
 from its table changes nothing.
 """
 
-import contextlib
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import timedelta
 from functools import partial
 from typing import Any, Protocol, TypeVar
@@ -28,7 +27,6 @@ from templates.store.schema import FailedAttemptsRow, UsedNonceRow
 from templates.store.standing import UNKNOWN_RETENTION, AttemptsStatus, Standing
 from templates.store.subject_rows import (
     SubjectTemplate,
-    TemplateNotStored,
     opened_template,
     subject_lock,
 )
@@ -48,15 +46,12 @@ class Attempt:
     template_id
         Id of the subject's template; None where there is none of the contract.
     template
-        That template; None also where its holder keeps it, and sent none, or another one.
-    untried
-        A held template that was sent for a subject who has none: nothing tried to open it yet.
+        That template.
     """
 
     rotation_epoch: int
     template_id: str | None
     template: SubjectTemplate | None
-    untried: bytes | None = field(default=None, repr=False)
 
 
 class Decided(Protocol):
@@ -96,7 +91,6 @@ class Attempts:
         *,
         contract_id: str,
         nonce: Nonce | None = None,
-        held_template: bytes | None = None,
     ) -> Attempt:
         """Read all that a decision needs, and refuse early what :meth:`conclude` would refuse.
 
@@ -112,9 +106,6 @@ class Attempts:
             so that it costs what a subject costs that does not exist.
         nonce
             Of a challenge or a token; None where there is neither.
-        held_template
-            The sealed template that the subject's holder sent, if any did. It counts where the
-            store keeps none of the subject; whose it is turns out here.
 
         Raises
         ------
@@ -124,7 +115,7 @@ class Attempts:
         """
         asked = partial(self._asked, tenant, subject_id, nonce, contract_id)
         row = self._context.read(lambda connection: self._before(connection, asked()))
-        return self._opened(row, held_template)
+        return self._opened(row)
 
     def conclude(
         self,
@@ -154,7 +145,7 @@ class Attempts:
         accepted
             The decision; who is not enrolled is never accepted.
         template_id
-            Id of the template that was decided on, or that its holder did not send; None for a
+            Id of the template that was decided on; None for a
             subject that was not enrolled.
         contract_id
             As of :meth:`begin`; None where any template counts.
@@ -192,7 +183,6 @@ class Attempts:
         *,
         contract_id: str,
         nonce: Nonce | None,
-        held_template: bytes | None = None,
         by: By,
     ) -> D:
         """:meth:`begin`, a decision and :meth:`conclude` while nobody replaces the template.
@@ -210,7 +200,7 @@ class Attempts:
 
         def work(connection: Connection) -> D | LockedOut | Replayed:
             asked = self._asked(tenant, subject_id, nonce, contract_id)
-            attempt = self._opened(self._before(connection, asked), held_template)
+            attempt = self._opened(self._before(connection, asked))
             decided = decide(attempt)
             refusal = self._record(
                 connection, asked, decided.accepted, attempt.template_id, nonce, decided.level, by
@@ -311,17 +301,12 @@ class Attempts:
         self._standing.refuse_locked(self._status(connection, row, asked))
         return row
 
-    def _opened(self, row: Any, held_template: bytes | None) -> Attempt:
-        template = None
-        if row.template_id is not None:
-            with contextlib.suppress(TemplateNotStored):
-                template = opened_template(row, self._context.keyring, held_template)
-        is_held = row.template_id is not None and row.ciphertext is None
+    def _opened(self, row: Any) -> Attempt:
+        enrolled = row.template_id is not None
         return Attempt(
             rotation_epoch=row.current_epoch,
             template_id=row.template_id,
-            template=template,
-            untried=None if is_held else held_template,
+            template=opened_template(row, self._context.keyring) if enrolled else None,
         )
 
     def _status(

@@ -5,9 +5,6 @@ template, so that a nonce cannot repeat under it. It is stored wrapped by the ma
 the tenant and to the random row id of the subject. The template's ciphertext is bound to tenant,
 row id, subject id, contract id, template id, rotation epoch and, where it needs a holder's key, the
 salt of the holder's rotation: a row that is moved or relabelled does not open.
-
-A held template is that ciphertext, given to the subject's holder and kept nowhere: the data key
-stays in the store, so that the template opens here only, for this subject and this enrollment.
 """
 
 import os
@@ -21,10 +18,6 @@ from templates.keys.sealing import NONCE_BYTES, TAG_BYTES, MasterKeyring, encode
 
 _VERSION = b"\x01"
 DATA_KEY_PURPOSE = "subject-data-key"
-
-
-class ForeignTemplate(SealError):
-    """A ciphertext that is not the template it is taken for: altered, or of another owner."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +49,7 @@ class Owner:
 
 @dataclass(frozen=True)
 class Envelope:
-    """A template as it is kept: the key by the store, the ciphertext by it or by the holder."""
+    """A template as it is kept."""
 
     wrapped_key: bytes = field(repr=False)
     ciphertext: bytes = field(repr=False)
@@ -81,10 +74,9 @@ def open_envelope(envelope: Envelope, owner: Owner, keyring: MasterKeyring) -> b
 
     Raises
     ------
-    ForeignTemplate
-        If the ciphertext was altered, or belongs to another owner or another enrollment.
     SealError
-        If the wrapped key was altered or belongs to another owner, or its master key is missing.
+        If the ciphertext or the wrapped key was altered, or belongs to another owner or another
+        enrollment, or its master key is missing.
     """
     data_key = keyring.open(
         envelope.wrapped_key,
@@ -93,14 +85,12 @@ def open_envelope(envelope: Envelope, owner: Owner, keyring: MasterKeyring) -> b
     )
     sealed = envelope.ciphertext
     if len(sealed) < 1 + NONCE_BYTES + TAG_BYTES or sealed[:1] != _VERSION:
-        raise ForeignTemplate(
-            "a sealed template is cut short, or of a version this program cannot read"
-        )
+        raise SealError("a sealed template is cut short, or of a version this program cannot read")
     try:
         return AESGCM(data_key).decrypt(
             sealed[1 : 1 + NONCE_BYTES], sealed[1 + NONCE_BYTES :], owner.bound_to
         )
     except InvalidTag:
-        raise ForeignTemplate(
+        raise SealError(
             "a sealed template does not open: it was altered, or belongs to another subject"
         ) from None

@@ -121,11 +121,8 @@ class Erasures:
                 contract_id = connection.execute(
                     sa.select(TemplateRow.contract_id).where(TemplateRow.subject_pk == subject_pk)
                 ).scalar_one()
-                # One that its holder keeps was not here; the rest of its row goes with the subject.
                 templates = connection.execute(
-                    sa.delete(TemplateRow).where(
-                        TemplateRow.subject_pk == subject_pk, TemplateRow.ciphertext.is_not(None)
-                    )
+                    sa.delete(TemplateRow).where(TemplateRow.subject_pk == subject_pk)
                 ).rowcount
                 subjects = connection.execute(
                     sa.delete(SubjectRow).where(SubjectRow.id == subject_pk)

@@ -47,8 +47,7 @@ class Erased:
     contract_id
         Contract of the template; None where there was none.
     template, data_key, metadata
-        1 or 0: they come and go together, but for a template that its holder keeps (0), which
-        opens no more without the data key.
+        1 or 0: they come and go together.
     failed_attempts
         Records that named the subject by its pseudonym.
     """

@@ -17,8 +17,8 @@ square, and by 8·10⁻⁵ at most over 400,000 pairs: as much as the first roun
 (``tests/templates/store/test_rerotation.py``). They add up like independent errors: after three
 moves the distance is 2.6·10⁻⁵ from that to the template before any rounding.
 
-A template that its holder keeps is not here to be turned: it stays in its epoch, whose key is kept
-until the subject is enrolled again or erased.
+A template of another contract is not turned: it stays in its epoch, whose key is kept until the
+subject is enrolled again or erased.
 """
 
 import time
@@ -192,7 +192,7 @@ class Rerotation:
             if left := _count(connection, older):
                 raise StoreError(
                     f"{left} templates of tenant {tenant!r} are still in an older rotation: "
-                    "move them first, and enroll again the subjects whose holders keep theirs"
+                    "move them first, and enroll again the subjects of another contract"
                 )
             dropped = connection.execute(
                 sa.delete(RotationKeyRow).where(
@@ -334,7 +334,6 @@ def _old_templates(
         .join(TemplateRow, TemplateRow.subject_pk == SubjectRow.id)
         .where(
             _is_old(tenant_id),
-            TemplateRow.ciphertext.is_not(None),
             TemplateRow.contract_id == contract_id,
             SubjectRow.id > after,
         )

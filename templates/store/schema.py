@@ -184,8 +184,7 @@ class SubjectRow(Base):
 class TemplateRow(Base):
     """The one template of a subject, encrypted under the subject's data key.
 
-    Where the subject's holder keeps the ciphertext, it is NULL here. `holder_salt` is NULL where
-    the template needs no holder's key.
+    `holder_salt` is NULL where the template needs no holder's key.
     """
 
     __tablename__ = "templates"
@@ -196,7 +195,7 @@ class TemplateRow(Base):
     template_id: Mapped[str] = mapped_column(String(64))
     contract_id: Mapped[str] = mapped_column(String(64), index=True)
     rotation_epoch: Mapped[int] = mapped_column(Integer)
-    ciphertext: Mapped[bytes | None] = mapped_column(LargeBinary)
+    ciphertext: Mapped[bytes] = mapped_column(LargeBinary)
     n: Mapped[int] = mapped_column(Integer)
     m: Mapped[int] = mapped_column(Integer)
     dtype: Mapped[str] = mapped_column(String(16))

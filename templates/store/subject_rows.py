@@ -8,9 +8,8 @@ from typing import Any
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
-from templates.errors import StoreError
 from templates.keys.sealing import MasterKeyring
-from templates.store.envelope import Envelope, ForeignTemplate, Owner, open_envelope
+from templates.store.envelope import Envelope, Owner, open_envelope
 from templates.store.identifiers import UnknownTenant
 from templates.store.schema import SubjectRow, TemplateRow, TenantRow
 
@@ -20,23 +19,6 @@ class Source(StrEnum):
 
     PHOTOS = "photos"
     TEMPLATE = "template"
-
-
-class Storage(StrEnum):
-    """Who keeps a subject's sealed template; its data key is always in the store."""
-
-    SERVICE = "service"
-    HOLDER = "holder"
-
-
-class TemplateNotStored(StoreError):
-    """The subject's holder keeps its template, and none was sent, or none that opens."""
-
-    def __init__(self) -> None:
-        super().__init__(
-            "the holder of this subject keeps its template, and the service has none: it can be "
-            "verified with that template, and not exported or shown"
-        )
 
 
 @dataclass(frozen=True)
@@ -55,7 +37,6 @@ class SubjectRecord:
     dtype: str
     source: Source
     photos: int
-    storage: Storage
     holder_salt: str | None
     created_at: datetime
     updated_at: datetime
@@ -89,9 +70,6 @@ RECORD_COLUMNS = (
     TemplateRow.dtype,
     TemplateRow.source,
     TemplateRow.photos,
-    sa.case(
-        (TemplateRow.ciphertext.is_(None), Storage.HOLDER.value), else_=Storage.SERVICE.value
-    ).label("storage"),
     TemplateRow.holder_salt,
     SubjectRow.created_at,
     SubjectRow.updated_at,
@@ -120,8 +98,7 @@ def of_tenant(columns: tuple[Any, ...], tenant: str) -> Any:
 def read_record(row: Any) -> SubjectRecord:
     """Read a row that has :data:`RECORD_COLUMNS`."""
     values = {name: row._mapping[name] for name in SubjectRecord.__dataclass_fields__}
-    values |= {"source": Source(row.source), "storage": Storage(row.storage)}
-    return SubjectRecord(**values)
+    return SubjectRecord(**{**values, "source": Source(row.source)})
 
 
 def owner_of(row: Any) -> Owner:
@@ -134,29 +111,15 @@ def envelope_of(row: Any) -> Envelope:
     return Envelope(row.wrapped_key, row.ciphertext)
 
 
-def opened_template(
-    row: Any, keyring: MasterKeyring, held_template: bytes | None = None
-) -> SubjectTemplate:
-    """Decrypt the template of a row, or the one that its holder sent; a stored one is preferred.
+def opened_template(row: Any, keyring: MasterKeyring) -> SubjectTemplate:
+    """Decrypt the template of a row.
 
     Raises
     ------
-    TemplateNotStored
-        If the holder keeps it, and sent none, or another one.
     SealError
         If the row was altered or moved, or its master key is missing.
     """
-    envelope = envelope_of(row)
-    if row.ciphertext is None:
-        if held_template is None:
-            raise TemplateNotStored
-        envelope = Envelope(row.wrapped_key, held_template)
-    try:
-        wire = open_envelope(envelope, owner_of(row), keyring)
-    except ForeignTemplate:
-        if row.ciphertext is None:
-            raise TemplateNotStored from None
-        raise
+    wire = open_envelope(envelope_of(row), owner_of(row), keyring)
     return SubjectTemplate(record=read_record(row), wire=wire)
 
 

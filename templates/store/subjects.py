@@ -28,7 +28,6 @@ from templates.store.subject_rows import (
     RECORD_COLUMNS,
     TEMPLATE_COLUMNS,
     Source,
-    Storage,
     SubjectRecord,
     SubjectTemplate,
     of_tenant,
@@ -75,14 +74,10 @@ class Precondition:
 
 @dataclass(frozen=True)
 class StoredTemplate:
-    """What :meth:`Subjects.put` did.
-
-    `held_template` is what the holder is to keep, where the store does not.
-    """
+    """What :meth:`Subjects.put` did."""
 
     template_id: str
     created: bool
-    held_template: bytes | None = field(default=None, repr=False)
 
 
 @dataclass(frozen=True)
@@ -134,7 +129,6 @@ class Subjects:
         template_id: str,
         holder_salt: str | None = None,
         rotation_epoch: int | None = None,
-        storage: Storage = Storage.SERVICE,
         precondition: Precondition | None = None,
         action: Literal["enroll", "import"] = "enroll",
         nonce: Nonce | None = None,
@@ -157,8 +151,6 @@ class Subjects:
         rotation_epoch
             Epoch of the tenant's key that the template is turned by; the current one by default.
             Another one is refused: its key is, or will be, dropped.
-        storage
-            Who keeps the sealed template. A holder's is returned, and all but it is stored.
         precondition
             What may be replaced; whatever there is by default.
         action
@@ -179,8 +171,7 @@ class Subjects:
         Notes
         -----
         A replacement gets a fresh data key, and the old key and ciphertext are removed with it:
-        an old backup of one of the two rows does not help to read the other, and a template that a
-        holder kept opens no more.
+        an old backup of one of the two rows does not help to read the other.
         """
         checked_subject_id(subject_id)
         checked_opaque_id(contract_id, what="contract id")
@@ -212,14 +203,13 @@ class Subjects:
                 tenant_id, subject_pk, subject_id, contract_id, template_id, epoch, holder_salt
             )
             envelope = close_envelope(wire, owner, context.keyring)
-            is_held = storage is Storage.HOLDER
             metadata = {
                 "n": n,
                 "m": m,
                 "dtype": dtype,
                 "source": Source(source).value,
                 "photos": photos,
-                "ciphertext": None if is_held else envelope.ciphertext,
+                "ciphertext": envelope.ciphertext,
             }
             _write_rows(connection, owner, envelope.wrapped_key, metadata, is_new=is_new, now=now)
             if is_new:
@@ -233,10 +223,9 @@ class Subjects:
                     .values(known=True)
                 )
             outcome = "created" if is_new else "replaced"
-            detail = storage.value if is_held else None
-            entry = Entry(action, outcome, by, tenant, pseudonym, detail=detail, nonce=nonce_digest)
+            entry = Entry(action, outcome, by, tenant, pseudonym, nonce=nonce_digest)
             context.audit_log.append(connection, entry)
-            return StoredTemplate(template_id, is_new, envelope.ciphertext if is_held else None)
+            return StoredTemplate(template_id, is_new)
 
         stored = context.write(work, lock=subject_lock(tenant, subject_id))
         if not stored.created:
@@ -262,20 +251,16 @@ class Subjects:
         subject = {"tenant": tenant, "subject_id": checked_subject_id(subject_id)}
         context.write(work, lock=subject_lock(tenant, subject_id))
 
-    def get(
-        self, tenant: str, subject_id: str, *, held_template: bytes | None = None
-    ) -> SubjectTemplate | None:
+    def get(self, tenant: str, subject_id: str) -> SubjectTemplate | None:
         """Return a subject with its decrypted template, or None.
 
         Raises
         ------
-        TemplateNotStored
-            If its holder keeps the template, and `held_template` is not it.
         SealError
             If the row was altered or moved, or its master key is missing.
         """
         row = self._row(TEMPLATE_COLUMNS, tenant, subject_id)
-        return None if row is None else opened_template(row, self._context.keyring, held_template)
+        return None if row is None else opened_template(row, self._context.keyring)
 
     def describe(self, tenant: str, subject_id: str) -> SubjectRecord | None:
         """Return a subject's metadata, or None; nothing is decrypted."""
@@ -287,8 +272,6 @@ class Subjects:
 
         Raises
         ------
-        TemplateNotStored
-            If its holder keeps the template.
         SealError
             If the row was altered or moved, or its master key is missing.
         """

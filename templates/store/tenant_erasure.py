@@ -311,8 +311,7 @@ def _remove(connection: Connection, records: _Records, rows: Sequence[Any]) -> C
         some = rows[start : start + BATCH]
         if records.table is SubjectRow:
             templates = sa.delete(TemplateRow).where(
-                TemplateRow.subject_pk.in_([row.id for row in some]),
-                TemplateRow.ciphertext.is_not(None),
+                TemplateRow.subject_pk.in_([row.id for row in some])
             )
             _count(counts, ["templates"], connection.execute(templates).rowcount)
         keys = [tuple(row._mapping[column.key] for column in records.key) for row in some]
@@ -338,5 +337,4 @@ def _count(counts: Counts, items: Sequence[str], count: int) -> None:
 
 def _template_of(tenant_id: str) -> sa.ColumnElement[bool]:
     subjects = sa.select(SubjectRow.id).where(SubjectRow.tenant_id == tenant_id)
-    # What holders keep is not here.
-    return sa.and_(TemplateRow.subject_pk.in_(subjects), TemplateRow.ciphertext.is_not(None))
+    return TemplateRow.subject_pk.in_(subjects)

@@ -4,7 +4,6 @@ import asyncio
 import inspect
 import io
 import socket
-import stat
 from pathlib import Path
 
 import httpx
@@ -17,7 +16,6 @@ from veilface_client import (
     AsyncClient,
     AsyncPrivateClient,
     Client,
-    Conflict,
     ConnectionFailed,
     EnrollmentConflict,
     Forbidden,
@@ -81,39 +79,6 @@ def test_a_person_from_enrollment_to_receipt(service: Running, token: str, tmp_p
     assert forged != receipt.raw
     (tmp_path / "receipt.json").write_bytes(forged)
     assert run("keys", "verify-receipt", *saved).status != 0
-
-
-def test_a_person_who_keeps_their_template(service: Running, token: str, tmp_path: Path) -> None:
-    photos, now, file = [photo(1, 0), photo(1, 1)], photo(1, 9), tmp_path / "hana.template"
-    with Client(service.url, token) as client:
-        enrolled = client.enroll("hana", photos, storage="holder")
-        held = enrolled.held_template
-        assert held is not None
-        assert "held_template" not in repr(enrolled)
-        enrolled.save_held_template(file)
-        assert stat.S_IMODE(file.stat().st_mode) == 0o600
-        with pytest.raises(FileExistsError):
-            enrolled.save_held_template(file)
-        assert client.describe("hana").storage == "holder"
-        for template in (held, file, str(file)):
-            assert client.verify("hana", now, held_template=template)
-        assert not client.verify("hana", now)
-        with pytest.raises(Conflict, match="the holder of this subject keeps its template"):
-            client.export("hana")
-        with pytest.raises(ValueError, match="storage='holder'"):
-            client.enroll("hana", photos, storage="service").save_held_template(tmp_path / "none")
-        assert client.verify("hana", now), "the service has a template again"
-        client.erase("hana")
-
-    async def asynchronously() -> list[bool]:
-        async with AsyncClient(service.url, token) as client:
-            enrolled = await client.enroll("hana", photos, storage="holder")
-            kept = (enrolled.held_template, file)
-            decisions = [await client.verify("hana", now, held_template=sent) for sent in kept]
-            await client.erase("hana")
-        return [decision.accepted for decision in decisions]
-
-    assert asyncio.run(asynchronously()) == [True, False], "the file has an earlier one"
 
 
 def test_an_enrollment_replaces_what_it_may(service: Running, token: str) -> None:

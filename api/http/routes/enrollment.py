@@ -1,6 +1,5 @@
 """Enrollment: photos, or a client's template."""
 
-import base64
 from typing import Any
 
 from fastapi import APIRouter, Request
@@ -29,7 +28,7 @@ from api.http.holder_keys import FIELD, HolderKeyHeaderDep, holder_key_of, wipin
 from api.http.openapi import BODY, ENROLLMENT_BODY, EVERY_CALL, PHOTO, error_responses
 from api.http.preconditions import PreconditionDep, etag
 from api.http.schemas import EnrollmentAnswer
-from api.http.values import face_policy, storage_of
+from api.http.values import face_policy
 from api.limits.admission import Gate
 from api.process.runtime import Runtime
 from enroll import Enrollment, Holder
@@ -37,7 +36,7 @@ from models.quality import Quality
 from templates.decoys import Attributes
 from templates.store.audit_log import By
 from templates.store.lockout import Nonce
-from templates.store.subject_rows import Source, Storage
+from templates.store.subject_rows import Source
 from templates.store.subjects import Precondition
 
 router = APIRouter(prefix="/v1/subjects", tags=["subjects"])
@@ -87,9 +86,6 @@ async def enroll(
     With `holder_key` the template accepts nobody without this key, which the service does not
     keep: a verification must send it too. Who loses it enrolls again.
 
-    With `storage=holder` the answer has the sealed template (`held_template`), and the service
-    keeps only what it is opened with: every verification must bring it.
-
     An earlier enrollment is replaced, unless a header says otherwise: `If-None-Match: *` never
     replaces, `If-Match: "template id"` replaces only that template. Otherwise the answer is
     `enrollment_conflict`, with the `template_id` that is enrolled, or null.
@@ -113,12 +109,11 @@ async def enroll(
                 holder_key_header,
                 precondition,
             )
-        body = await sent_json(request, settings, ("template", "storage", FIELD), photos="images")
+        body = await sent_json(request, settings, ("template", FIELD), photos="images")
         # After the fields: a caller that only forgot how to send a photo needs no further right.
         caller.require("embeddings")
         await gate.query(lambda: runtime.require_template_enrollment(caller.tenant))
         template = base64_field(body.get("template"), "template", code="invalid_template")
-        storage = storage_of(body)
         holder_key = holder_key_of(holder_key_header, body)
 
         def work() -> dict[str, Any]:
@@ -134,7 +129,6 @@ async def enroll(
                 epoch,
                 enrollment,
                 Source.TEMPLATE,
-                storage,
                 precondition,
                 nonce,
                 by(request),
@@ -155,8 +149,7 @@ async def _enroll_photos(
     runtime: Runtime = request.app.state.runtime
     gate: Gate = request.app.state.gate
     pack, photos = runtime.required_pack(), form.images("images")
-    reject_unknown(form.fields, ("attributes", "face", "storage", FIELD))
-    storage = storage_of(form.fields)
+    reject_unknown(form.fields, ("attributes", "face", FIELD))
     policy = face_policy(form.fields.get("face"))
     attributes = parse_attributes(form.fields.get("attributes"))
     holder_key = holder_key_of(holder_key_header, form.fields)
@@ -179,7 +172,6 @@ async def _enroll_photos(
             epoch,
             enrollment,
             Source.PHOTOS,
-            storage,
             precondition,
             nonce,
             by(request),
@@ -251,7 +243,6 @@ def _stored(
     epoch: int,
     enrollment: Enrollment,
     source: Source,
-    storage: Storage,
     precondition: Precondition | None,
     nonce: Nonce | None,
     who: By,
@@ -263,12 +254,11 @@ def _stored(
         enrollment,
         source=source,
         photos=enrollment.photos,
-        storage=storage,
         precondition=precondition,
         nonce=nonce,
         by=who,
     )
-    body: dict[str, Any] = {
+    return {
         "template_id": stored.template_id,
         "contract_id": enrollment.contract_id,
         "replaced": not stored.created,
@@ -278,9 +268,6 @@ def _stored(
             for result in enrollment.per_photo
         ],
     }
-    if stored.held_template is not None:
-        body["held_template"] = base64.b64encode(stored.held_template).decode("ascii")
-    return body
 
 
 def _written(request: Request, body: dict[str, Any]) -> Response:

@@ -25,9 +25,7 @@ EXCERPT_BYTES = 64
 @router.get(
     "/subjects/{subject_id}/stored",
     response_model=StoredAnswer,
-    responses=error_responses(
-        *EVERY_CALL, "forbidden", "not_enrolled", "validation_failed", "template_not_stored"
-    ),
+    responses=error_responses(*EVERY_CALL, "forbidden", "not_enrolled", "validation_failed"),
     summary="What is stored of a subject",
 )
 async def get_stored(
@@ -36,8 +34,7 @@ async def get_stored(
     """Right: `enroll`. Sizes, an excerpt of the ciphertext, and how far the foot point lies out.
 
     No byte and no direction of the template: the length of its foot point, to three digits, is
-    the one number that is read from it. A line in the audit log says who looked. Where the
-    subject's holder keeps the template, there is none to show: `template_not_stored`.
+    the one number that is read from it. A line in the audit log says who looked.
     """
 
     def work() -> tuple[StoredForm, float] | None:

@@ -124,7 +124,6 @@ def _described(record: SubjectRecord, binding: Binding) -> dict[str, Any]:
         "current": record.contract_id == binding.contract_id,
         "enrolled_by": str(record.source),
         "photos": record.photos,
-        "storage": str(record.storage),
         "holder_key": record.holder_salt is not None,
         "created_at": iso_time(record.created_at),
         "updated_at": iso_time(record.updated_at),

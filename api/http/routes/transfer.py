@@ -32,7 +32,6 @@ router = APIRouter(prefix="/v1/subjects", tags=["transfer"])
         "not_found",
         "validation_failed",
         "contract_mismatch",
-        "template_not_stored",
     ),
     summary="Export a subject, encrypted",
 )
@@ -41,8 +40,7 @@ async def export_subject(
 ) -> Response:
     """Right: `export`. The template is un-rotated inside the encryption; a holder's rotation stays.
 
-    Only keys with `enroll` or `admin` are told `not_enrolled`; others get `not_found`. Where the
-    subject's holder keeps the template, there is none to export: `template_not_stored`.
+    Only keys with `enroll` or `admin` are told `not_enrolled`; others get `not_found`.
     """
     async with gate.admitted(caller.prefix):
         exported = await gate.compute(

@@ -98,10 +98,6 @@ async def verify(
     only to keys with `scores`, of a rejection where a holder's key is needed only to those that
     have `enroll` or `admin` too: others are told the one that an unknown subject would have.
 
-    Where the subject's holder keeps the template, it comes with the probe as `held_template`. One
-    that is missing, altered, replaced or another subject's is a rejection; where the service
-    stores the template, it changes nothing.
-
     A token for this subject may stand in the place of the API key; the decision uses it up.
     """
     async with gate.admitted(caller.prefix):
@@ -163,7 +159,6 @@ def _decide_and_record(
                     subject,
                     contract_id=contract_id,
                     nonce=probe.nonce,
-                    held_template=probe.held_template,
                 )
                 opened = _opened(runtime, caller, subject, attempt)
             decision = _decided(probe, opened)
@@ -185,7 +180,6 @@ def _decide_and_record(
         compare,
         contract_id=contract_id,
         nonce=probe.nonce,
-        held_template=probe.held_template,
         by=who,
     )
 
@@ -221,13 +215,10 @@ def _opened(runtime: Runtime, caller: Caller, subject: str, attempt: Attempt) ->
     if "scores" in caller.rights and not caller.sees_enrollment:
         # The distance will be told. Lifted for every subject, enrolled or not: the time tells.
         lifted = runtime.stand_ins.lift(tenant, subject)
-    if attempt.untried is not None:
-        # Opened for every subject, as one whose holder keeps a template: the time tells.
-        runtime.stand_ins.open_in_vain(attempt.untried)
     stored: OpenedTemplate
     if template is not None:
         stored, epoch = template, template.record.rotation_epoch
-    elif caller.sees_enrollment and attempt.template_id is None:
+    elif caller.sees_enrollment:
         raise _why_not(runtime, tenant, subject)
     else:
         stored, epoch = runtime.stand_ins.open(lifted), attempt.rotation_epoch

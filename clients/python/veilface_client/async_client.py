@@ -10,11 +10,10 @@ from typing import Self, TypeVar
 import httpx
 
 from veilface_client import calls, flows, private_flows, results
-from veilface_client.calls import Action, Call, Face, Storage
+from veilface_client.calls import Action, Call, Face
 from veilface_client.connection import DEFAULT_TIMEOUT, options
 from veilface_client.errors import UnexpectedAnswer
 from veilface_client.flows import Flow, Send, Wait, Work
-from veilface_client.held_templates import HeldTemplate
 from veilface_client.lifting import Lifter
 from veilface_client.lifts import Enrollable, Probe
 from veilface_client.photos import Photo
@@ -173,7 +172,6 @@ class AsyncClient(AsyncSession):
         *,
         attributes: Mapping[str, str] | None = None,
         face: Face | None = None,
-        storage: Storage | None = None,
         holder_key: bytes | None = None,
         replace: bool | str = True,
     ) -> results.Enrollment:
@@ -185,7 +183,6 @@ class AsyncClient(AsyncSession):
                 self._retries,
                 attributes=attributes,
                 face=face,
-                storage=storage,
                 holder_key=holder_key,
                 replace=replace,
             )
@@ -203,7 +200,6 @@ class AsyncClient(AsyncSession):
         level: str | None = None,
         face: Face | None = None,
         challenge: results.Challenge | None = None,
-        held_template: HeldTemplate | None = None,
         holder_key: bytes | None = None,
     ) -> results.Decision:
         """Check whether photos of one person show the subject."""
@@ -215,7 +211,6 @@ class AsyncClient(AsyncSession):
                 level=level,
                 face=face,
                 challenge=challenge,
-                held_template=held_template,
                 holder_key=holder_key,
             )
         )
@@ -247,7 +242,6 @@ class AsyncPrivateClient(AsyncSession):
         photos: Photo | Iterable[Photo] | Enrollable,
         *,
         face: Face | None = None,
-        storage: Storage | None = None,
         holder_key: bytes | None = None,
         replace: bool | str = True,
     ) -> results.Enrollment:
@@ -259,7 +253,6 @@ class AsyncPrivateClient(AsyncSession):
                 self._lifter,
                 self._retries,
                 face=face,
-                storage=storage,
                 holder_key=holder_key,
                 replace=replace,
             )
@@ -286,7 +279,6 @@ class AsyncPrivateClient(AsyncSession):
         *,
         level: str | None = None,
         face: Face | None = None,
-        held_template: HeldTemplate | None = None,
         holder_key: bytes | None = None,
     ) -> results.Decision:
         """Lift photos of one person here (or take a probe of :meth:`lift`), and verify by it."""
@@ -298,7 +290,6 @@ class AsyncPrivateClient(AsyncSession):
                 self._retries,
                 level=level,
                 face=face,
-                held_template=held_template,
                 holder_key=holder_key,
             )
         )

@@ -20,7 +20,6 @@ from veilface_client.results import parse
 
 T = TypeVar("T")
 Face = Literal["dominant", "largest", "single"]
-Storage = Literal["service", "holder"]
 Action = Literal["verify", "enroll"]
 
 _SUBJECT = re.compile(r"[A-Za-z0-9._@:-]{1,128}")
@@ -84,7 +83,6 @@ def enroll_photos(
     *,
     attributes: Mapping[str, str] | None,
     face: Face | None,
-    storage: Storage | None,
     holder_key: bytes | None,
     replace: bool | str,
 ) -> Call[results.Enrollment]:
@@ -94,7 +92,7 @@ def enroll_photos(
         "files": [("images", _file(photo)) for photo in photos],
         "data": {
             **fields,
-            **_fields(face=face, storage=storage),
+            **_fields(face=face),
             **holder_key_field(holder_key),
         },
         "headers": precondition(replace),
@@ -112,14 +110,13 @@ def enroll_template(
     subject: str,
     template: bytes,
     *,
-    storage: Storage | None,
     holder_key: bytes | None,
     replace: bool | str,
 ) -> Call[results.Enrollment]:
     """Enroll by a private template."""
     body = {"template": base64.b64encode(template).decode("ascii")}
     content = {
-        "json": {**body, **_fields(storage=storage), **holder_key_field(holder_key)},
+        "json": {**body, **holder_key_field(holder_key)},
         "headers": precondition(replace),
     }
     return Call(
@@ -138,16 +135,13 @@ def verify_photos(
     level: str | None,
     face: Face | None,
     challenge_id: str | None,
-    held_template: str | None,
     holder_key: bytes | None,
 ) -> Call[results.Decision]:
     """Verify photos of one person, or the frames that answer a challenge."""
     content = {
         "files": [("image", _file(photo)) for photo in photos],
         "data": {
-            **_fields(
-                level=level, face=face, challenge_id=challenge_id, held_template=held_template
-            ),
+            **_fields(level=level, face=face, challenge_id=challenge_id),
             **holder_key_field(holder_key),
         },
     }
@@ -165,13 +159,12 @@ def verify_template(
     template: bytes,
     *,
     level: str | None,
-    held_template: str | None,
     holder_key: bytes | None,
 ) -> Call[results.Decision]:
     """Verify a lifted probe."""
     body = {
         "template": base64.b64encode(template).decode("ascii"),
-        **_fields(level=level, held_template=held_template),
+        **_fields(level=level),
         **holder_key_field(holder_key),
     }
     return Call(

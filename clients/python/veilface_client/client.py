@@ -10,11 +10,10 @@ from typing import Self, TypeVar
 import httpx
 
 from veilface_client import calls, flows, private_flows, results
-from veilface_client.calls import Action, Call, Face, Storage
+from veilface_client.calls import Action, Call, Face
 from veilface_client.connection import DEFAULT_TIMEOUT, options
 from veilface_client.errors import UnexpectedAnswer
 from veilface_client.flows import Flow, Send, Wait, Work
-from veilface_client.held_templates import HeldTemplate
 from veilface_client.lifting import Lifter
 from veilface_client.lifts import Enrollable, Probe
 from veilface_client.photos import Photo
@@ -198,7 +197,6 @@ class Client(Session):
         *,
         attributes: Mapping[str, str] | None = None,
         face: Face | None = None,
-        storage: Storage | None = None,
         holder_key: bytes | None = None,
         replace: bool | str = True,
     ) -> results.Enrollment:
@@ -214,9 +212,6 @@ class Client(Session):
             Of several faces, ``dominant`` (the service's default) takes the largest if it covers
             the middle and has twice the area of every other; ``largest`` takes the largest wherever
             it is; ``single`` refuses the photo.
-        storage
-            ``holder`` answers with the sealed template (``held_template``), which the service then
-            does not keep: save it, for every verification needs it.
         holder_key
             32 bytes (:func:`new_holder_key`) without which the enrollment accepts nobody, and which
             the service does not keep. Who loses it enrolls again.
@@ -232,7 +227,6 @@ class Client(Session):
                 self._retries,
                 attributes=attributes,
                 face=face,
-                storage=storage,
                 holder_key=holder_key,
                 replace=replace,
             )
@@ -253,7 +247,6 @@ class Client(Session):
         level: str | None = None,
         face: Face | None = None,
         challenge: results.Challenge | None = None,
-        held_template: HeldTemplate | None = None,
         holder_key: bytes | None = None,
     ) -> results.Decision:
         """Check whether 1 to 5 photos of one person show the subject. Right: ``verify``.
@@ -267,8 +260,6 @@ class Client(Session):
         challenge
             One of :meth:`challenge`: the photos are then the frames that answer it, in their
             order, as the camera gives them, not mirrored.
-        held_template
-            Of a subject whose holder keeps it: the bytes, or the path of the file.
         """
         return self._run(
             flows.verify(
@@ -278,7 +269,6 @@ class Client(Session):
                 level=level,
                 face=face,
                 challenge=challenge,
-                held_template=held_template,
                 holder_key=holder_key,
             )
         )
@@ -322,7 +312,6 @@ class PrivateClient(Session):
         photos: Photo | Iterable[Photo] | Enrollable,
         *,
         face: Face | None = None,
-        storage: Storage | None = None,
         holder_key: bytes | None = None,
         replace: bool | str = True,
     ) -> results.Enrollment:
@@ -338,7 +327,6 @@ class PrivateClient(Session):
                 self._lifter,
                 self._retries,
                 face=face,
-                storage=storage,
                 holder_key=holder_key,
                 replace=replace,
             )
@@ -366,13 +354,12 @@ class PrivateClient(Session):
         *,
         level: str | None = None,
         face: Face | None = None,
-        held_template: HeldTemplate | None = None,
         holder_key: bytes | None = None,
     ) -> results.Decision:
         """Lift photos of one person here (or take a probe of :meth:`lift`), and verify by it.
 
-        Rights: ``verify``, ``embeddings``. Each sending is signed anew. After an error repeat
-        with its ``lift``, never with the photos.
+        Rights: ``verify``, ``embeddings``. After an error repeat with its ``lift``, never with the
+        photos.
         """
         return self._run(
             private_flows.verify(
@@ -382,7 +369,6 @@ class PrivateClient(Session):
                 self._retries,
                 level=level,
                 face=face,
-                held_template=held_template,
                 holder_key=holder_key,
             )
         )

@@ -190,7 +190,6 @@ FAMILIES: dict[str, type[ServiceError]] = {
     "method_not_allowed": InvalidRequest,
     "contract_mismatch": ContractMismatch,
     "enrollment_conflict": EnrollmentConflict,
-    "template_not_stored": Conflict,
     "image_too_large": PhotoRefused,
     "request_too_large": InvalidRequest,
     "too_many_images": InvalidRequest,

@@ -17,9 +17,8 @@ from typing import Any, TypeVar
 import httpx
 
 from veilface_client import calls, results
-from veilface_client.calls import Call, Face, Storage
+from veilface_client.calls import Call, Face
 from veilface_client.errors import ConnectionFailed, VeilfaceError, error_of
-from veilface_client.held_templates import HeldTemplate, held_template_text
 from veilface_client.photos import Photo, read_photos
 from veilface_client.retries import Retries
 
@@ -93,7 +92,6 @@ def enroll(
     *,
     attributes: Mapping[str, str] | None,
     face: Face | None,
-    storage: Storage | None,
     holder_key: bytes | None,
     replace: bool | str,
 ) -> Flow[results.Enrollment]:
@@ -104,7 +102,6 @@ def enroll(
         pictures,
         attributes=attributes,
         face=face,
-        storage=storage,
         holder_key=holder_key,
         replace=replace,
     )
@@ -119,27 +116,16 @@ def verify(
     level: str | None,
     face: Face | None,
     challenge: results.Challenge | None,
-    held_template: HeldTemplate | None,
     holder_key: bytes | None,
 ) -> Flow[results.Decision]:
     """Verify photos of one person, or the frames that answer a challenge."""
     pictures: list[bytes] = yield Work(lambda: read_photos(photos))
-    held = yield from read_held_template(held_template)
     call = calls.verify_photos(
         subject,
         pictures,
         level=level,
         face=face,
         challenge_id=None if challenge is None else challenge.challenge_id,
-        held_template=held,
         holder_key=holder_key,
     )
     return (yield from send(call, retries))
-
-
-def read_held_template(held_template: HeldTemplate | None) -> Flow[str | None]:
-    """Return what is sent of a held template, if there is one."""
-    if held_template is None:
-        return None
-    text: str = yield Work(lambda: held_template_text(held_template))
-    return text

@@ -5,10 +5,9 @@ from functools import partial
 from typing import TypeVar
 
 from veilface_client import calls, results
-from veilface_client.calls import Call, Face, Storage
+from veilface_client.calls import Call, Face
 from veilface_client.errors import ContractMismatch, UnexpectedAnswer, VeilfaceError
-from veilface_client.flows import Flow, Work, read_held_template, send
-from veilface_client.held_templates import HeldTemplate
+from veilface_client.flows import Flow, Work, send
 from veilface_client.lifting import Lifter, LiftInputs
 from veilface_client.lifts import Enrollable, Probe
 from veilface_client.photos import Photo, read_photos
@@ -59,24 +58,23 @@ def enroll(
     retries: Retries,
     *,
     face: Face | None,
-    storage: Storage | None,
     holder_key: bytes | None,
     replace: bool | str,
 ) -> Flow[results.Enrollment]:
     """Enroll by photos that are lifted here, or by a template that was lifted before."""
     calls.subject_path(subject)
     if isinstance(photos, Enrollable):
-        return (yield from _enroll(subject, photos, retries, storage, holder_key, replace))
+        return (yield from _enroll(subject, photos, retries, holder_key, replace))
     pictures: list[bytes] = yield Work(lambda: read_photos(photos))
     lift = yield from lift_enrollment(pictures, lifter, retries, face=face)
     try:
-        return (yield from _enroll(subject, lift, retries, storage, holder_key, replace))
+        return (yield from _enroll(subject, lift, retries, holder_key, replace))
     except ContractMismatch:
         renewed = yield from inputs_of(lifter, retries, fresh=True)
         if renewed.contract_id == lift.contract_id:
             raise
     lift = yield from _enrollable(pictures, lifter, renewed, face)
-    return (yield from _enroll(subject, lift, retries, storage, holder_key, replace))
+    return (yield from _enroll(subject, lift, retries, holder_key, replace))
 
 
 def verify(
@@ -87,25 +85,23 @@ def verify(
     *,
     level: str | None,
     face: Face | None,
-    held_template: HeldTemplate | None,
     holder_key: bytes | None,
 ) -> Flow[results.Decision]:
     """Verify photos that are lifted here, or a probe that was lifted before."""
     calls.subject_path(subject)
-    held = yield from read_held_template(held_template)
     if isinstance(photos, Probe):
-        return (yield from _verify(subject, photos, retries, level, held, holder_key))
+        return (yield from _verify(subject, photos, retries, level, holder_key))
     pictures: list[bytes] = yield Work(lambda: read_photos(photos))
     probe = yield from lift_probe(pictures, lifter, retries, face=face)
     try:
-        return (yield from _verify(subject, probe, retries, level, held, holder_key))
+        return (yield from _verify(subject, probe, retries, level, holder_key))
     except ContractMismatch:
         renewed = yield from inputs_of(lifter, retries, fresh=True)
         if renewed.contract_id == probe.contract_id:
             # It is the subject's stored template that is of another contract.
             raise
     probe = yield from _probe(pictures, lifter, renewed, face)
-    return (yield from _verify(subject, probe, retries, level, held, holder_key))
+    return (yield from _verify(subject, probe, retries, level, holder_key))
 
 
 def _probe(
@@ -126,14 +122,12 @@ def _enroll(
     subject: str,
     lift: Enrollable,
     retries: Retries,
-    storage: Storage | None,
     holder_key: bytes | None,
     replace: bool | str,
 ) -> Flow[results.Enrollment]:
     call = calls.enroll_template(
         subject,
         lift.template,
-        storage=storage,
         holder_key=holder_key,
         replace=replace,
     )
@@ -145,14 +139,12 @@ def _verify(
     lift: Probe,
     retries: Retries,
     level: str | None,
-    held_template: str | None,
     holder_key: bytes | None,
 ) -> Flow[results.Decision]:
     call = calls.verify_template(
         subject,
         lift.template,
         level=level,
-        held_template=held_template,
         holder_key=holder_key,
     )
     return (yield from _send(call, lift, retries))

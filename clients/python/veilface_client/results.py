@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import httpx
-from pydantic import AwareDatetime, Base64Bytes, Field, StringConstraints, ValidationError
+from pydantic import AwareDatetime, Field, StringConstraints, ValidationError
 
 from veilface_client.errors import UnexpectedAnswer
-from veilface_client.held_templates import save_held_template
 from veilface_client.lifts import Value
 
 Hex = Annotated[str, StringConstraints(pattern=r"\A[0-9a-f]{64}\z")]
@@ -33,32 +32,13 @@ class PhotoUsed(Value):
 
 
 class Enrollment(Answer):
-    """The subject is enrolled; ``images`` is empty for a template.
-
-    ``held_template`` is there where it was enrolled with ``storage="holder"``: the one copy of its
-    sealed template, which every verification needs.
-    """
+    """The subject is enrolled; ``images`` is empty for a template."""
 
     template_id: str
     contract_id: str
     replaced: bool
     holder_key: bool = False
     images: tuple[PhotoUsed, ...]
-    held_template: Base64Bytes | None = Field(default=None, repr=False)
-
-    def save_held_template(self, path: str | os.PathLike[str]) -> None:
-        """Write the held template to a new file that only this user can read.
-
-        Raises
-        ------
-        ValueError
-            The service keeps the template.
-        FileExistsError
-            There is a file already: it may be the only copy of another template.
-        """
-        if self.held_template is None:
-            raise ValueError("the service keeps the template: enroll with storage='holder'")
-        save_held_template(self.held_template, path)
 
 
 class Decision(Answer):
@@ -140,7 +120,6 @@ class Subject(Value):
     current: bool
     enrolled_by: str
     photos: int
-    storage: str = "service"  # a service that does not say keeps all
     holder_key: bool = False
     created_at: AwareDatetime
     updated_at: AwareDatetime

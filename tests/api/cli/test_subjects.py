@@ -1,5 +1,4 @@
 import os
-import stat
 import subprocess
 import sys
 
@@ -129,34 +128,6 @@ def test_an_unknown_level_names_those_there_are(world, veilface):
     )
     assert ran.status == 3
     assert "fmr-1e-2" in ran.stderr
-
-
-def test_a_held_template_is_written_once_and_read_back(world, veilface, tmp_path):
-    pack, file = ("--pack", world.pack), tmp_path / "hal.template"
-    enroll = ("enroll", "hal", *world.photos(3, range(3)), *pack, "--held-template", file)
-    enrolled = veilface(*enroll, "--json")
-    assert (enrolled.status, enrolled.json["storage"]) == (0, "holder")
-    assert stat.S_IMODE(file.stat().st_mode) == 0o600
-    again = veilface(*enroll)
-    assert (again.status, "name a new file" in again.stderr) == (2, True)
-
-    # A renewal of the rotations cannot turn what is not there: it says so, and keeps the old key.
-    renewed = veilface("keys", "rotate-tenant", "--json").json
-    assert (renewed["moved"], renewed["enroll_again"]) == (0, ["hal"])
-    assert renewed["rotations_dropped"] == 0
-
-    verify = ("verify", "hal", *world.photos(3, range(3, 4)), *pack)
-    own = veilface(*verify, "--held-template", file)
-    assert (own.status, own.stdout[:6]) == (0, "accept")
-    without = veilface(*verify)
-    assert (without.status, without.stdout) == (3, "")
-    assert "--held-template" in without.stderr
-    file.write_bytes(b"no base64!")
-    broken = veilface(*verify, "--held-template", file)
-    assert (broken.status, "is not a held template" in broken.stderr) == (3, True)
-    file.write_bytes(b"AAAA")
-    other = veilface(*verify, "--held-template", file)
-    assert (other.status, other.stdout[:6]) == (1, "reject")
 
 
 def test_a_holders_key_in_a_file(world, veilface, tmp_path):

@@ -19,7 +19,6 @@ PRODUCT_CODES = {
     409: {
         "contract_mismatch",
         "enrollment_conflict",
-        "template_not_stored",
     },
     413: {"image_too_large", "request_too_large", "too_many_images"},
     422: {

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from templates.keys.sealing import MasterKeyring
-from templates.store import Source, Storage, StoredTemplate, TemplateStore
+from templates.store import Source, StoredTemplate, TemplateStore
 from templates.store.envelope import Envelope, close_envelope
 from tests.databases import (  # noqa: F401
     database_url,
@@ -108,7 +108,6 @@ def put(
     wire: bytes,
     *,
     tenant: str = "default",
-    storage: Storage = Storage.SERVICE,
     **changes: Any,
 ) -> StoredTemplate:
     """Store a template with ordinary metadata."""
@@ -123,6 +122,5 @@ def put(
         dtype="float16",
         source=Source.PHOTOS,
         photos=3,
-        storage=storage,
         **changes,
     )

@@ -13,8 +13,6 @@ export interface Enrollment extends Answer {
   readonly replaced: boolean;
   readonly holder_key: boolean;
   readonly images: readonly { index: number; status: string; quality: Record<string, number | null> }[];
-  /** With `storage: "holder"`: the one copy of the sealed template, base64. Not printed. */
-  readonly held_template?: string;
 }
 
 /**
@@ -75,7 +73,6 @@ export interface Subject {
   readonly current: boolean;
   readonly enrolled_by: string;
   readonly photos: number;
-  readonly storage: "service" | "holder";
   readonly holder_key: boolean;
   readonly created_at: string;
   readonly updated_at: string;

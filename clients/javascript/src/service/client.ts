@@ -48,8 +48,6 @@ export type Replace = boolean | string;
 /** Options of every enrollment. */
 export interface EnrollOptions {
   readonly face?: FacePolicy;
-  /** With `holder` the answer has the sealed template, which the service does not keep. */
-  readonly storage?: "service" | "holder";
   /** 32 bytes of `newHolderKey()`, without which the enrollment accepts nobody. */
   readonly holderKey?: Uint8Array;
   readonly replace?: Replace;
@@ -59,7 +57,6 @@ export interface EnrollOptions {
 export interface VerifyOptions {
   readonly level?: string;
   readonly face?: FacePolicy;
-  readonly heldTemplate?: string;
   readonly holderKey?: Uint8Array;
 }
 
@@ -309,11 +306,10 @@ export class Client extends Session {
     } = {},
   ): Promise<Enrollment> {
     requirePhotos(photos, ENROLL_PHOTOS);
-    const { attributes, face, storage, holderKey, replace } = options;
+    const { attributes, face, holderKey, replace } = options;
     const more = {
       attributes: attributes && JSON.stringify(attributes),
       face,
-      storage,
       ...holderKeyField(holderKey),
     };
     return this.send({
@@ -341,12 +337,11 @@ export class Client extends Session {
   ): Promise<Decision> {
     // How many frames answer a challenge, the challenge says.
     requirePhotos(photos, options.challenge?.max_frames ?? PROBE_PHOTOS);
-    const { level, face, heldTemplate, holderKey, challenge } = options;
+    const { level, face, holderKey, challenge } = options;
     const more = {
       level,
       face,
       challenge_id: challenge?.challenge_id,
-      held_template: heldTemplate,
       ...holderKeyField(holderKey),
     };
     return this.send({
@@ -440,9 +435,7 @@ function answer<T extends object>(
   };
 }
 
-export const readEnrollment = answer<Enrollment>({ template_id: "string", replaced: "boolean" }, [
-  "held_template",
-]);
+export const readEnrollment = answer<Enrollment>({ template_id: "string", replaced: "boolean" });
 
 /** A decision that is neither accept nor reject is none. */
 export async function readDecision(response: Response): Promise<Decision> {

@@ -151,7 +151,6 @@ export const FAMILIES: Readonly<Record<string, Family>> = {
   method_not_allowed: InvalidRequest,
   contract_mismatch: ContractMismatch,
   enrollment_conflict: EnrollmentConflict,
-  template_not_stored: Conflict,
   image_too_large: PhotoRefused,
   request_too_large: InvalidRequest,
   too_many_images: InvalidRequest,

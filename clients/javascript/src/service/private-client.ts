@@ -212,10 +212,10 @@ export class PrivateClient extends Session {
   }
 
   async #enroll(subject: string, lift: Enrollable, options: EnrollOptions): Promise<Enrollment> {
-    const { storage, holderKey, replace } = options;
+    const { holderKey, replace } = options;
     const headers = precondition(replace);
     const template = base64(lift.template);
-    const body = fields({ template, storage, ...holderKeyField(holderKey) });
+    const body = fields({ template, ...holderKeyField(holderKey) });
     const path = subjectPath(subject, "/enrollment");
     return this.#naming(lift, () =>
       this.send({
@@ -230,9 +230,9 @@ export class PrivateClient extends Session {
   }
 
   async #verify(subject: string, lift: Probe, options: VerifyOptions): Promise<Decision> {
-    const { level, heldTemplate, holderKey } = options;
+    const { level, holderKey } = options;
     const template = base64(lift.template);
-    const body = fields({ template, level, held_template: heldTemplate, ...holderKeyField(holderKey) });
+    const body = fields({ template, level, ...holderKeyField(holderKey) });
     return this.#naming(lift, () =>
       this.send({
         method: "POST",

@@ -283,7 +283,7 @@ def upgrade() -> None:
         sa.Column("template_id", sa.String(length=64), nullable=False),
         sa.Column("contract_id", sa.String(length=64), nullable=False),
         sa.Column("rotation_epoch", sa.Integer(), nullable=False),
-        sa.Column("ciphertext", sa.LargeBinary(), nullable=True),
+        sa.Column("ciphertext", sa.LargeBinary(), nullable=False),
         sa.Column("n", sa.Integer(), nullable=False),
         sa.Column("m", sa.Integer(), nullable=False),
         sa.Column("dtype", sa.String(length=16), nullable=False),
