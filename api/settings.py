@@ -322,8 +322,8 @@ class Settings(BaseSettings):
     audit_report_file: Path | None = Field(
         None,
         description="The `report.json` that `veilface audit templates` or `veilface audit "
-        "fairface` wrote: its figures are shown to whoever asks what is stored. Unset: the page "
-        "says that the deployment has not been audited.",
+        "fairface` wrote: its figures are the answer of `GET /v1/contract/audit`. Unset: that "
+        "answer says that the deployment has not been audited.",
     )
     demo: bool = Field(False, description="Say in every answer that the pack is the demo model.")
 

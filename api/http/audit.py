@@ -20,7 +20,6 @@ ACTIONS = {
     "erase_subject": "erase",
     "export_subject": "export",
     "get_audit_log": "audit-log",
-    "get_stored": "inspect",
     "create_token": "token",
     "import_subject": "import",
     "unlock_subject": "unlock",

@@ -400,33 +400,6 @@ class PhotoCheckAnswer(_Answer):
     quality: dict[str, float | None] = Field(description="What was measured, if usable.")
 
 
-class StoredAnswer(_Answer):
-    """What is stored of a subject; never a byte of the template."""
-
-    subject_id: str = Field(examples=["alice"])
-    template_id: str
-    contract_id: str = Field(examples=[HEX])
-    current: bool = Field(description="Served by the contract in force; otherwise enroll again.")
-    strategy: str | None = Field(description="How it was lifted; null: by another contract.")
-    decoys: int | None = Field(description="Decoys among its m directions.")
-    n: int = Field(description="Numbers in an embedding.")
-    m: int = Field(description="Dimension of the set that hides it.")
-    dtype: str
-    wire_bytes: int = Field(description="Bytes of the template before encryption.")
-    sealed_bytes: int = Field(description="Bytes in the database.")
-    sealed_excerpt: str = Field(
-        description="64 bytes at most from the middle of the ciphertext, hexadecimal."
-    )
-    foot_point_similarity: float = Field(
-        description="Length of the foot point: its cosine to the hidden embedding, 3 digits."
-    )
-    enrolled_by: Literal["photos", "template"]
-    photos: int = Field(description="Photos that were averaged; 0 for a template.")
-    created_at: str = Field(examples=["2026-01-31T12:00:00Z"])
-    updated_at: str = Field(examples=["2026-01-31T12:00:00Z"])
-    last_used_at: str | None = Field(description="Of the last accepted verification.")
-
-
 class AuditCell(_Shape):
     """The strongest attack on one property by one kind of attacker."""
 

@@ -79,7 +79,7 @@ export function facts(pairs) {
   );
 }
 
-export const row = ([first, ...rest]) =>
+const row = ([first, ...rest]) =>
   h("tr", {}, h("th", { scope: "row" }, first), rest.map((each) => h("td", {}, each)));
 
 // A table that scrolls by itself where it is too wide; the keyboard reaches it.

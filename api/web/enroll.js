@@ -168,7 +168,6 @@ function enrolled(id, answer, thumbs) {
       "p",
       { class: "row" },
       h("a", { href: `#/verify/${encodeURIComponent(id)}` }, "Verify this person"),
-      h("a", { href: `#/stored/${encodeURIComponent(id)}` }, "See what is stored"),
     ),
     h("p", { class: "fine" }, "Template ", h("code", {}, answer.template_id)),
   );

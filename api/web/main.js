@@ -2,11 +2,9 @@
 
 import { carriesFiles, h, takesFiles } from "./dom.js";
 import { enrollView } from "./enroll.js";
-import { logView } from "./log.js";
 import { peopleView } from "./people.js";
 import { serviceView } from "./panel.js";
-import { forgetKey, hasKey, learn, may, session, useKey } from "./service.js";
-import { storedView } from "./stored.js";
+import { forgetKey, hasKey, learn, session, useKey } from "./service.js";
 import { verifyView } from "./verify.js";
 import { problemBox } from "./words.js";
 
@@ -14,9 +12,7 @@ const VIEWS = {
   verify: ["Verify", verifyView],
   enroll: ["Enroll", enrollView],
   people: ["People", peopleView],
-  stored: ["Stored", storedView],
   service: ["Service", serviceView],
-  log: ["Log", logView],
 };
 
 const main = document.getElementById("main");
@@ -58,9 +54,9 @@ function signedIn(focus) {
     h(
       "ul",
       {},
-      Object.entries(VIEWS)
-        .filter(([name]) => name !== "log" || may("admin"))
-        .map(([name, [title]]) => h("li", {}, h("a", { href: `#/${name}`, "data-view": name }, title))),
+      Object.entries(VIEWS).map(([name, [title]]) =>
+        h("li", {}, h("a", { href: `#/${name}`, "data-view": name }, title)),
+      ),
     ),
   );
   who.replaceChildren(
@@ -124,7 +120,7 @@ function signInView(problem = null) {
     h(
       "p",
       { class: "lead" },
-      "Enroll people, verify them, and see what the service stores about them.",
+      "Enroll people, verify them, and erase them.",
     ),
     h(
       "form",

@@ -1,6 +1,6 @@
 import { download, facts, h, oneIn, percent, table, when } from "./dom.js";
 import { call, session } from "./service.js";
-import { judged } from "./verdict.js";
+import { judged, thiefCard } from "./verdict.js";
 import { problemBox } from "./words.js";
 
 const RIGHTS = {
@@ -60,6 +60,7 @@ export function serviceView() {
         ),
       ),
     ),
+    thiefCard(contract),
     h(
       "section",
       { class: "card" },

@@ -86,7 +86,6 @@ export function peopleView() {
       h(
         "p",
         { class: "row" },
-        h("a", { href: `#/stored/${path}`, "aria-label": `What is stored about ${id}` }, "What is stored"),
         h("a", { href: `#/verify/${path}`, "aria-label": `Verify ${id}` }, "Verify"),
         h("a", { href: `#/enroll/${path}`, "aria-label": `Enroll ${id} again` }, "Enroll again"),
         erase,

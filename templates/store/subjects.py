@@ -1,7 +1,7 @@
 """Subjects and their templates: put, get, describe, list."""
 
 import uuid
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, Literal
 
@@ -78,25 +78,6 @@ class StoredTemplate:
 
     template_id: str
     created: bool
-
-
-@dataclass(frozen=True)
-class StoredForm:
-    """A subject's template as it is stored.
-
-    Attributes
-    ----------
-    template
-        What the ciphertext opens to, and its metadata.
-    sealed
-        The ciphertext, byte for byte: version, nonce, AES-256-GCM, tag.
-    last_used_at
-        Time of the last accepted verification.
-    """
-
-    template: SubjectTemplate
-    sealed: bytes = field(repr=False)
-    last_used_at: datetime | None
 
 
 @dataclass(frozen=True)
@@ -266,20 +247,6 @@ class Subjects:
         """Return a subject's metadata, or None; nothing is decrypted."""
         row = self._row(RECORD_COLUMNS, tenant, subject_id)
         return None if row is None else read_record(row)
-
-    def stored_form(self, tenant: str, subject_id: str) -> StoredForm | None:
-        """Read a subject's template as it is stored, in one query; None if there is none.
-
-        Raises
-        ------
-        SealError
-            If the row was altered or moved, or its master key is missing.
-        """
-        row = self._row((*TEMPLATE_COLUMNS, SubjectRow.last_used_at), tenant, subject_id)
-        if row is None:
-            return None
-        template = opened_template(row, self._context.keyring)
-        return StoredForm(template, bytes(row.ciphertext), row.last_used_at)
 
     def _row(self, columns: tuple[Any, ...], tenant: str, subject_id: str) -> Any:
         subject = SubjectRow.subject_id == checked_subject_id(subject_id)

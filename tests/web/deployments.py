@@ -16,7 +16,7 @@ from models.pack import ModelPack
 from templates.contract.document import Contract
 from templates.distances.blas import single_threaded
 from tests.api.deployment import deploy, images
-from tests.api.http.test_stored import report
+from tests.api.http.test_contract_audit import report
 from tests.api.real_people import calibrated_on_lfw
 from tests.clients.conftest import Running, started
 from tests.marked_heads import frame, write_marked_pack

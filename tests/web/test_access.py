@@ -15,7 +15,7 @@ from tests.web.walk_obstacles import walk_challenge, walk_obstacles, walk_passke
 
 pytestmark = pytest.mark.long
 
-VIEWS = ("Verify", "Enroll", "People", "Stored", "Service", "Log")
+VIEWS = ("Verify", "Enroll", "People", "Service")
 
 
 def test_axe_finds_nothing_in_any_state_of_any_view(open_tab: OpenTab, demo: Served) -> None:

@@ -27,7 +27,7 @@ def enrolled(demo: Served) -> Iterator[None]:
             assert client.delete(f"/v1/subjects/{name}").is_success
 
 
-@pytest.mark.parametrize("view", ["Verify", "Enroll", "Stored", "Log"])
+@pytest.mark.parametrize("view", ["Verify", "Enroll"])
 def test_a_person_is_picked_from_those_whose_ids_begin_so(
     open_tab: OpenTab, demo: Served, view: str
 ) -> None:
@@ -157,32 +157,6 @@ def test_photos_are_dropped_on_the_form(open_tab: OpenTab, demo: Served) -> None
     tab.sign_in(demo.key("verify"))
     tab.open("Enroll")
     assert page.evaluate(DROP, ["form", url])[1] is False
-
-
-def test_operators_read_the_audit_log(open_tab: OpenTab, demo: Served) -> None:
-    tab = open_tab(demo)
-    page = tab.page
-    tab.open("Log")
-    rows = page.get_by_role("row")
-    expect(rows.nth(1)).to_be_visible()
-    newest = page.locator("tbody tr").first
-    expect(newest).to_contain_text("enroll")
-    page.get_by_label("Person's id").fill("found-ada")
-    page.get_by_role("button", name="Show", exact=True).click()
-    with demo.client() as client:
-        told = client.get("/v1/audit-log?subject_id=found-ada").json()["lines"]
-        expect(rows).to_have_count(1 + len(told))
-        all_of_them = client.get("/v1/audit-log?limit=1000").json()["lines"]
-    pseudonym = told[0]["subject"][:16]
-    expect(page.locator("tbody tr").filter(has_text=pseudonym)).to_have_count(len(told))
-    assert "found-ada" not in page.get_by_role("table").inner_text()
-    # All lines, page by page.
-    page.get_by_label("Person's id").fill("")
-    page.get_by_role("button", name="Show", exact=True).click()
-    expect(rows).to_have_count(1 + min(50, len(all_of_them)))
-    if len(all_of_them) > 50:
-        page.get_by_role("button", name="Show earlier").click()
-        expect(rows).to_have_count(1 + min(100, len(all_of_them)))
 
 
 def test_what_is_printed_is_what_was_found(open_tab: OpenTab, demo: Served) -> None:

@@ -1,7 +1,6 @@
 """What comes late: answers after the visitor went on, and a key that was changed meanwhile."""
 
 import contextlib
-from typing import Any
 
 import pytest
 from playwright.sync_api import Error, Page, expect
@@ -119,47 +118,6 @@ def test_a_late_refusal_of_another_key_does_not_sign_out(open_tab: OpenTab, demo
     tab.complaints[:] = [each for each in tab.complaints if "ERR_ABORTED" not in each]
 
 
-def log_page(subject: str, cursor: str | None) -> dict[str, Any]:
-    """One line of the audit log on a subject."""
-    line = {"at": "2026-01-31T12:00:00Z", "actor": "program", "action": "verify",
-            "subject": subject * 64, "outcome": "accept", "detail": None, "request_id": None,
-            "altered": False, "sequence": None}  # fmt: skip
-    return {"lines": [line], "next_cursor": cursor, "request_id": "0" * 32}
-
-
-def test_a_late_page_of_the_log_is_not_of_another_person(open_tab: OpenTab, demo: Served) -> None:
-    tab = open_tab(demo)
-    page = tab.page
-    pending = PendingRequests(page, "**/v1/audit-log?*")
-    tab.open("Log")
-    pending.wait().fulfill(json=log_page("a", "earlier"))
-    rows, shown = page.locator("tbody tr"), page.get_by_role("button", name="Show", exact=True)
-    expect(rows).to_have_count(1)
-    # Earlier lines of everybody come after those on one person were asked for.
-    pending.routes.clear()
-    page.get_by_role("button", name="Show earlier").click()
-    late = pending.wait()
-    pending.routes.clear()
-    page.get_by_label("Person's id").fill("found-nobody")
-    shown.click()
-    wanted = pending.wait()
-    wanted.fulfill(json=log_page("b", "further"))
-    expect(rows).to_contain_text("b" * 16)
-    late.fulfill(**refused(429, "rate_limited", "too many requests"))
-    expect(rows).to_have_count(1)
-    # What comes next is of the person and the place that are shown, whatever the field says.
-    pending.routes.clear()
-    page.get_by_label("Person's id").fill("found-else")
-    page.get_by_role("button", name="Show earlier").click()
-    asked = pending.wait()
-    assert asked.request.url.endswith("?limit=50&subject_id=found-nobody&cursor=further")
-    altered = dict.fromkeys(log_page("c", None)["lines"][0]) | {"altered": True, "sequence": 7}
-    asked.fulfill(json={**log_page("c", None), "lines": [altered]})
-    expect(rows).to_have_count(2)
-    expect(rows.last).to_contain_text("Line 7")
-    expect(page.get_by_role("alert")).to_have_count(0)
-
-
 ADDRESSES = """
 window.addresses = new Set();
 const [make, forget] = [URL.createObjectURL, URL.revokeObjectURL];
@@ -188,7 +146,7 @@ def test_a_photo_that_is_decoded_late_keeps_no_memory(open_tab: OpenTab, demo: S
     tab.sign_in(demo.token)
     page.get_by_role("button", name="Choose photo 1 of person-1", exact=True).click()
     tab.wait_for("window.decoding")
-    tab.open("Log")
+    tab.open("People")
     page.evaluate("decoded()")
     tab.wait_for("window.ended")
     assert page.evaluate("addresses.size") == 0
@@ -264,22 +222,3 @@ def test_a_browser_without_storage_and_a_view_that_is_none(open_tab: OpenTab, de
         expect(tab.page.get_by_role("heading", level=1, name="Verify")).to_be_visible()
     tab.page.get_by_role("button", name="Sign out").click()
     expect(tab.page.get_by_role("heading", level=1, name="Sign in")).to_be_visible()
-
-
-def test_what_a_client_lifted_is_told_as_the_contract_has_it(
-    open_tab: OpenTab, demo: Served
-) -> None:
-    with demo.client() as client:
-        stored = client.get("/v1/subjects/person-2/stored").json()
-    tab = open_tab(demo)
-    tab.page.route(
-        "**/stored", lambda route: route.fulfill(json={**stored, "enrolled_by": "template"})
-    )
-    tab.page.goto(f"{tab.url}#/stored/person-2")
-    tab.open("Stored")
-    tab.page.get_by_label("Person's id").fill("person-2")
-    tab.page.get_by_role("button", name="Show").click()
-    expect(tab.page.locator(".facts").first).to_contain_text("by the contract; lifted by a client")
-    expect(tab.page.locator("figcaption")).to_contain_text(
-        "By the contract, the set passes through"
-    )

@@ -1,6 +1,5 @@
 """Real faces before a fake camera: enroll, accept, reject, erase, and guidance on the way."""
 
-import math
 from pathlib import Path
 
 import pytest
@@ -171,87 +170,3 @@ def test_photos_that_the_service_refuses_are_named(
     expect(page.get_by_text("No more than 5 photos: these are the first.")).to_be_visible()
     with real.client() as client:
         assert client.delete("/v1/subjects/two-people").is_success
-
-
-def test_what_is_stored_is_shown_with_its_true_numbers(
-    open_tab: OpenTab, real: Served, people: dict[str, list[Path]]
-) -> None:
-    with real.client() as client:
-        files = [("images", (photo.name, photo.read_bytes())) for photo in people[OTHER][:2]]
-        assert client.put("/v1/subjects/palocci/enrollment", files=files).is_success
-        stored = client.get("/v1/subjects/palocci/stored").json()
-    tab = open_tab(real)
-    tab.open("Stored")
-    tab.page.get_by_label("Person's id").fill("palocci")
-    tab.page.get_by_role("button", name="Show").click()
-    similarity = stored["foot_point_similarity"]
-    words = (
-        f"resembles the face with similarity {similarity:.3f}; every unit vector in the "
-        "16-dimensional set at that angle"
-    )
-    expect(tab.page.locator("figcaption")).to_contain_text(words)
-    drawing = tab.page.locator("figure svg").nth(0)
-    assert words in (drawing.get_attribute("aria-label") or "")
-    # The drawing is to scale: foot point and face lie where their numbers say.
-    sphere, foot, face = (
-        {name: float(drawing.locator(f".{kind}").get_attribute(name) or "nan") for name in names}
-        for kind, names in (
-            ("sphere", ("cx", "cy", "r")),
-            ("foot", ("cx", "cy")),
-            ("face", ("cx", "cy")),
-        )
-    )
-    assert (foot["cx"] - sphere["cx"]) / sphere["r"] == pytest.approx(similarity, abs=1e-6)
-    right, up = face["cx"] - sphere["cx"], sphere["cy"] - face["cy"]
-    assert (right**2 + up**2) ** 0.5 == pytest.approx(sphere["r"])
-    assert right / sphere["r"] == pytest.approx(similarity, abs=1e-6)
-    # A decoy is a candidate like the face: no place on the line is its own, and from the front all
-    # of them are as far from the foot point as the face.
-    expect(drawing.locator(".decoy")).to_have_count(0)
-    front = tab.page.locator("figure svg").nth(1)
-    assert "the decoys, as far from the foot point as the face" in (
-        front.get_attribute("aria-label") or ""
-    )
-    rim = sphere["r"] * (1 - similarity**2) ** 0.5
-    places = front.locator("circle").evaluate_all(
-        "all => all.map(each => [each.getAttribute('class'), each.cx.baseVal.value,"
-        " each.cy.baseVal.value, each.r.baseVal.value])"
-    )
-    (middle,) = [place for kind, *place in places if kind == "foot"]
-    assert [r for kind, _, _, r in places if kind == "rim"] == [pytest.approx(rim, abs=1e-3)]
-    candidates = [place for kind, *place in places if kind in ("decoy", "face")]
-    assert len(candidates) == 1 + stored["decoys"]
-    for x, y, r in candidates:
-        assert math.dist((x, y), middle[:2]) == pytest.approx(rim, abs=1e-3)
-        assert r == candidates[0][2]
-    expect(tab.page.locator(".hex")).to_have_text(
-        " ".join(stored["sealed_excerpt"][i : i + 8] for i in range(0, 128, 8))
-    )
-    audit = tab.page.locator("[data-audit=contract]")
-    expect(audit).to_contain_text("20 % of stolen and decrypted templates gave a match")
-    expect(audit).to_contain_text("failed: a limit is exceeded")
-    rows = audit.get_by_role("row")
-    expect(rows).to_have_count(1 + 6)
-    # What is compared stands beside the limit: not the value; and D_sys is no share.
-    linkability = [
-        "unlinkability",
-        "holder keys",
-        "algorithm",
-        "0.25 [0.2, 0.3]",
-        "0.1",
-        "0.15 [0.1, 0.2]",
-        "0.1",
-    ]
-    assert rows.nth(5).get_by_role("cell").all_inner_texts() == [*linkability, "fail"]
-    gender = [
-        "confidentiality",
-        "holder keys",
-        "algorithm",
-        "63 % [58 %, 68 %]",
-        "51 %",
-        "12 % [7 %, 17 %]",
-        "10 %",
-    ]
-    assert rows.nth(6).get_by_role("cell").all_inner_texts() == [*gender, "fail"]
-    expect(audit).to_contain_text("if it was calibrated again since")
-    assert_accessible(tab, "stored-audited")

@@ -109,21 +109,9 @@ def _demo_states(tab: BrowserTab, demo: Served) -> Iterator[str]:
     yield "people-erase"
     page.keyboard.press("Escape")
 
-    tab.open("Stored")
-    yield "stored"
-    page.get_by_label("Person's id").fill(SUBJECT)
-    button("button", name="Show").click()
-    expect(page.get_by_role("figure")).to_be_visible()
-    expect(page.get_by_text("This deployment has not been audited.")).to_be_visible()
-    yield "stored-shown"
-
     tab.open("Service")
     expect(page.get_by_text("✓ up")).to_have_count(2)
     yield "service"
-
-    tab.open("Log")
-    expect(page.get_by_role("row").nth(1)).to_be_visible()
-    yield "log"
 
     tab.open("People")
     button("button", name=f"Erase {SUBJECT}").click()
@@ -135,7 +123,7 @@ def _demo_states(tab: BrowserTab, demo: Served) -> Iterator[str]:
 def walk_real(
     tab: BrowserTab, real: Served, camera: FakeCamera, own: list[Path], other: list[Path]
 ) -> Iterator[str]:
-    """Visit what only a real pack shows: boxes around faces, guidance, an audited template.
+    """Visit what only a real pack shows: boxes around faces, and guidance.
 
     `tab` is not signed in. Whom the walk enrolls is erased at its end, however that comes.
     """
@@ -180,11 +168,6 @@ def _real_states(
     page.get_by_role("button", name="Verify", exact=True).click()
     expect(page.locator(".verdict.accept")).to_be_visible()
     yield "real-accepted"
-    tab.open("Stored")
-    page.get_by_label("Person's id").fill(SUBJECT)
-    page.get_by_role("button", name="Show").click()
-    expect(page.get_by_role("figure")).to_be_visible()
-    yield "real-stored"
     tab.open("Service")
     expect(page.get_by_text("✓ up")).to_have_count(2)
     yield "real-service"

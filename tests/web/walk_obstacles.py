@@ -80,16 +80,6 @@ def walk_obstacles(tab: BrowserTab, demo: Served) -> Iterator[str]:
     page.get_by_label("Find people whose id begins with").fill(NOBODY)
     expect(page.get_by_text("Nobody’s id begins so.")).to_be_visible()
     yield "people-not-found"
-    tab.open("Stored")
-    page.get_by_label("Person's id").fill(NOBODY)
-    button("button", name="Show").click()
-    expect(alert).to_contain_text("not_enrolled")
-    yield "stored-not-enrolled"
-    tab.open("Log")
-    page.get_by_label("Person's id").fill("nobody-else")  # the lines above are about nobody-here
-    button("button", name="Show", exact=True).click()
-    expect(page.get_by_text("No line about nobody-else.")).to_be_visible()
-    yield "log-empty"
     with answered(tab, "**/v1/subjects?*", 401, "unauthorized", "send a valid API key"):
         button("link", name="People").click()
         expect(button("heading", level=1, name="Sign in")).to_be_visible()

@@ -1,155 +1,18 @@
-"""What is stored of a subject, and what an audit found: true numbers, and no byte of a template."""
+"""What an audit found of templates like those of the contract."""
 
 import json
-import sqlite3
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from api.http.app import create_app
 from api.http.audit_report import open_audit_report
 from api.http.errors import StartError
-from api.http.schemas import AuditAnswer, StoredAnswer
-from api.process.runtime import open_keyring, open_store
-from models.pack import ModelPack
-from templates.contract import wire
-from templates.errors import StoreUnavailable
+from api.http.schemas import AuditAnswer
 from tests.api.client import Client
-from tests.api.deployment import AXES, Deployment, M, bearer, deploy, images, photo
-from tests.api.shapes import assert_answer, assert_error
-
-
-def test_the_numbers_are_those_of_the_database(client: Client, deployment: Deployment) -> None:
-    assert client.put("/v1/subjects/a/enrollment", files=images(photo(1), photo(1, 1))).is_success
-    body = assert_answer(client.get("/v1/subjects/a/stored"), 200, StoredAnswer)
-    with sqlite3.connect(deployment.settings.data_dir / "veilface.db") as database:
-        (sealed,) = database.execute("SELECT ciphertext FROM templates").fetchone()
-    store = open_store(deployment.settings, open_keyring(deployment.settings))
-    try:
-        found = store.subjects.get("default", "a")
-    finally:
-        store.close()
-    assert found is not None
-    assert (body["n"], body["m"], body["decoys"]) == (AXES, M, M)
-    assert (body["wire_bytes"], body["sealed_bytes"]) == (len(found.wire), len(sealed))
-    assert body["dtype"] == "float16"
-    assert body["current"] is True
-    assert body["enrolled_by"] == "photos"
-    assert body["photos"] == 2
-    assert body["last_used_at"] is None
-    excerpt = bytes.fromhex(body["sealed_excerpt"])
-    assert len(excerpt) == 64
-    assert excerpt in sealed
-    # The length of the foot point is its cosine to the hidden descriptor, whatever the rotation.
-    subspace = wire.decode(found.wire).subspace
-    assert body["foot_point_similarity"] == round(float(np.linalg.norm(subspace.foot)), 3)
-    assert deployment.settings.pack is not None
-    pack = ModelPack.load(deployment.settings.pack, threads=1)
-    mean = sum(pack.embed_photo(photo(1, shot)).embedding for shot in (0, 1))
-    turned = _turned(deployment, found.template_id, mean / np.linalg.norm(mean))
-    cosine = float(subspace.foot @ turned) / float(np.linalg.norm(subspace.foot))
-    assert body["foot_point_similarity"] == pytest.approx(cosine, abs=2e-3)
-
-
-def _turned(deployment: Deployment, template_id: str, descriptor: Any) -> Any:
-    from templates.keys.rotation import TenantRotation
-
-    store = open_store(deployment.settings, open_keyring(deployment.settings))
-    try:
-        key = store.tenants.rotation_key("default").key
-    finally:
-        store.close()
-    points = deployment.source.project(descriptor[None])
-    return TenantRotation(key, AXES).of(template_id).turned(points)[0]
-
-
-def test_no_byte_of_the_template_is_told(client: Client, deployment: Deployment) -> None:
-    assert client.put("/v1/subjects/secret/enrollment", files=images(photo(3))).is_success
-    store = open_store(deployment.settings, open_keyring(deployment.settings))
-    try:
-        found = store.subjects.get("default", "secret")
-    finally:
-        store.close()
-    assert found is not None
-    body = client.get("/v1/subjects/secret/stored").json()
-    excerpt = bytes.fromhex(body["sealed_excerpt"])
-    pieces = {found.wire[start : start + 4] for start in range(len(found.wire) - 3)}
-    told = [excerpt[start : start + 4] for start in range(len(excerpt) - 3)]
-    # 61 pieces of four random bytes among a thousand: that one meets by chance is 1 in 60,000.
-    assert not pieces & set(told)
-    # Besides the excerpt there are texts, counts and one rounded number.
-    numbers = [value for value in body.values() if isinstance(value, float)]
-    assert numbers == [body["foot_point_similarity"]]
-    assert not any(isinstance(value, list | dict) for value in body.values())
-
-
-def test_use_and_replacement_are_seen(client: Client) -> None:
-    client.put("/v1/subjects/used/enrollment", files=images(photo(4)))
-    before = client.get("/v1/subjects/used/stored").json()
-    accepted = client.post("/v1/subjects/used/verify", files=images(photo(4, 1), name="image"))
-    assert accepted.json()["decision"] == "accept"
-    assert client.get("/v1/subjects/used/stored").json()["last_used_at"] is not None
-    client.put("/v1/subjects/used/enrollment", files=images(photo(4)))
-    after = client.get("/v1/subjects/used/stored").json()
-    assert after["template_id"] != before["template_id"]
-    assert after["sealed_excerpt"] != before["sealed_excerpt"]
-
-
-def test_who_may_ask(client: Client, deployment: Deployment) -> None:
-    client.put("/v1/subjects/mine/enrollment", files=images(photo(5)))
-    path = "/v1/subjects/mine/stored"
-    blind = client.get(path, headers=bearer(deployment.key("verify", "erase", "admin")))
-    assert_error(blind, 403, "forbidden")
-    other = client.get(path, headers=bearer(deployment.key("enroll", tenant="other")))
-    assert_error(other, 404, "not_enrolled")
-    assert_error(client.get("/v1/subjects/nobody/stored"), 404, "not_enrolled")
-    assert_error(client.get("/v1/subjects/a%20b/stored"), 422, "validation_failed")
-
-
-def test_whoever_looks_is_written_down(client: Client, deployment: Deployment) -> None:
-    store = client.app.state.runtime.store
-    verifier = bearer(deployment.key("verify"))
-    client.put("/v1/subjects/seen/enrollment", files=images(photo(6)))
-    before = list(store.audit_log.lines())[-1].sequence
-    path = "/v1/subjects/seen/stored"
-    answers = [
-        client.get(path),
-        client.get(path, headers=verifier),
-        client.get("/v1/subjects/unseen/stored"),
-    ]
-    lines = list(store.audit_log.lines(after=before))
-    assert [(line.action, line.outcome, line.tenant) for line in lines] == [
-        ("inspect", "inspected", "default"),
-        ("inspect", "forbidden", "default"),
-        ("inspect", "not_enrolled", "default"),
-    ]
-    assert lines[0].actor == f"key:{deployment.token[3:15]}"
-    # A right that is missing is refused before the subject is looked at.
-    assert [line.pseudonym for line in lines] == [
-        store.signer.pseudonym("default", "seen"),
-        None,
-        store.signer.pseudonym("default", "unseen"),
-    ]
-    assert [line.request_id for line in lines] == [
-        answer.headers["x-request-id"] for answer in answers
-    ]
-    assert store.audit_log.verify().intact
-
-
-def test_what_cannot_be_written_down_is_not_shown(
-    client: Client, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    client.put("/v1/subjects/seen/enrollment", files=images(photo(6)))
-
-    def full(*_: object) -> None:
-        raise StoreUnavailable("the SQLite database does not answer: database or disk is full")
-
-    monkeypatch.setattr(client.app.state.runtime.store.audit_log, "record", full)
-    answer = client.get("/v1/subjects/seen/stored")
-    assert_error(answer, 503, "store_unavailable")
-    assert "foot_point_similarity" not in answer.text
+from tests.api.deployment import AXES, M, bearer, deploy
+from tests.api.shapes import assert_answer
 
 
 def cell(**changes: Any) -> dict[str, Any]:
