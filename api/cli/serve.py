@@ -136,8 +136,6 @@ def _opened_once(settings: Settings, *, check: bool) -> tuple[Contract, bool]:
         binding = runtime.contract.binding
         if not check:
             _show_first_key(runtime.store, settings)
-        if check and (warning := runtime.superseded_calibrations()) is not None:
-            message(f"warning: {warning}")
         return runtime.contract, bool(demo_notice(binding.embedder_sha256, n=binding.n))
     finally:
         runtime.close()

@@ -225,15 +225,12 @@ async def _open(
         contract_id=runtime.contract.contract_id,
         pack=None if runtime.pack is None else runtime.pack.info.name,
     )
-    if (warning := await anyio.to_thread.run_sync(runtime.superseded_calibrations)) is not None:
-        log(warning, severity=logging.WARNING, contract_id=runtime.contract.contract_id)
     if (weakness := require_privacy(runtime.contract, settings)) is not None:
         log(
             "weak privacy is accepted: " + weakness,
             severity=logging.WARNING,
             contract_id=runtime.contract.contract_id,
         )
-    await anyio.to_thread.run_sync(runtime.note_calibrations)
     if runtime.contract.takes_lifted_probes:
         # No request is answered before this is done, so none waits for the compiler. Points are
         # compared without it, and it takes 130 MB.

@@ -65,11 +65,6 @@ __all__ = [
 READS = 3
 """Looks at a template whose rotation key may be dropped between the looks at the two."""
 
-SUPERSEDED_CALIBRATIONS = (
-    "the calibrations of the contract file are older ones: others of the same contract were served "
-    "since; put the newer contract file back, or calibrate again"
-)
-
 TENANTS_KEPT = 64
 """Tenants and epochs whose rotations a process keeps."""
 
@@ -160,23 +155,6 @@ class Runtime:
 
     def _stand_in_key(self) -> bytes:
         return self.store.secrets.get(SecretName.STAND_INS).value
-
-    def superseded_calibrations(self) -> str | None:
-        """Return what to tell the operator of a contract file that is older than one served."""
-        if not self.store.known_calibrations.are_superseded(*self._calibrations):
-            return None
-        return SUPERSEDED_CALIBRATIONS
-
-    def note_calibrations(self) -> None:
-        """Remember the contract's calibrations as served."""
-        self.store.known_calibrations.note(*self._calibrations)
-
-    @property
-    def _calibrations(self) -> tuple[str, list[str]]:
-        contract = self.contract
-        return contract.contract_id, [
-            calibration.calibration_id for calibration in contract.calibrations
-        ]
 
     def epoch(self, tenant: str) -> int:
         """Return the epoch that the tenant's new templates are in."""

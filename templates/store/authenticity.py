@@ -26,7 +26,6 @@ from templates.store.schema import (
     AuditRow,
     Base,
     FailedAttemptsRow,
-    KnownCalibrationsRow,
     TenantRow,
 )
 
@@ -56,7 +55,6 @@ AUTHENTICATED: dict[type[Base], tuple[str, ...]] = {
         "disabled_at",
         "line",
     ),
-    KnownCalibrationsRow: ("contract_id", "position", "calibration_ids", "created_at"),
 }
 """The columns that a MAC covers, in its order.
 `tenant` of a key is the name of its tenant: so the tenant's own row decides nothing about a request

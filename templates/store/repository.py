@@ -13,7 +13,6 @@ from templates.store.context import StoreContext
 from templates.store.database import Database
 from templates.store.erasure import Erasures
 from templates.store.identifiers import Clock, utc_now
-from templates.store.known_calibrations import KnownCalibrations
 from templates.store.lockout import LockoutPolicy
 from templates.store.nonces import Nonces
 from templates.store.record_check import RecordProblem, check_records
@@ -69,7 +68,6 @@ class TemplateStore:
         self.attempts = Attempts(context, self.nonces, lockout)
         self.erasures = Erasures(context)
         self.retention = RetentionJob(context, self.erasures)
-        self.known_calibrations = KnownCalibrations(context)
         self.rerotation = Rerotation(context, self.tenants)
         self.tenant_erasures = TenantErasures(context, self.tenants, self.api_keys)
         self.wrapped_keys = WrappedKeys(context)

@@ -252,18 +252,6 @@ class ReceiptRow(Base):
     created_at: Mapped[datetime] = mapped_column(UtcDateTime)
 
 
-class KnownCalibrationsRow(Base):
-    """Calibrations of a contract that were served, in the order in which they came first."""
-
-    __tablename__ = "known_calibrations"
-
-    contract_id: Mapped[str] = mapped_column(String(64), primary_key=True)
-    position: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=False)
-    calibration_ids: Mapped[str] = mapped_column(Text)
-    created_at: Mapped[datetime] = mapped_column(UtcDateTime)
-    mac: Mapped[bytes | None] = mapped_column(MAC)
-
-
 class AuditRow(Base):
     """One line of the audit log, chained to the one before by its hash."""
 

@@ -403,43 +403,6 @@ def test_a_template_of_an_older_contract_is_refused(fresh: Deployment) -> None:
         assert put.status_code == 200
 
 
-def test_an_older_contract_of_the_same_id_is_told_of_and_served(
-    fresh: Deployment, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = fresh.settings.resolved_contract_file
-    older = path.read_bytes()
-
-    def check() -> tuple[int, bool]:
-        settings = fresh.settings
-        ran = run("serve", "--check", "--data-dir", settings.data_dir, "--pack", settings.pack)
-        return ran.status, "calibrations of the contract file are older" in ran.stderr
-
-    with Client(create_app(fresh.settings)):
-        pass
-    assert check() == (0, False)
-    level = fresh.contract.calibrations[0].levels[0]
-    p2s, s2s = fresh.contract.calibrations
-    stricter = replace(level, threshold=level.threshold + 0.05)
-    newer = replace(
-        fresh.contract,
-        calibrations=(
-            replace(p2s, levels=(stricter, *p2s.levels[1:]), calibration_id=""),
-            s2s,
-        ),
-    )
-    assert newer.contract_id == fresh.contract.contract_id
-    newer.save(path, file_sealer(open_keyring(fresh.settings)))
-    assert check() == (0, False)
-    with Client(create_app(fresh.settings)):
-        pass
-    path.write_bytes(older)
-    assert check() == (0, True)
-    capsys.readouterr()
-    with Client(create_app(fresh.settings), headers=bearer(fresh.token)) as client:
-        assert client.get("/v1/contract").status_code == 200
-    assert "the calibrations of the contract file are older ones" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize("measured", [True, False])
 def test_weak_privacy_is_served_only_knowingly(fresh: Deployment, measured: bool) -> None:
     settings = fresh.settings

@@ -109,15 +109,6 @@ def upgrade() -> None:
         ),
     )
     op.create_table(
-        "known_calibrations",
-        sa.Column("contract_id", sa.String(length=64), nullable=False),
-        sa.Column("position", sa.Integer(), autoincrement=False, nullable=False),
-        sa.Column("calibration_ids", sa.Text(), nullable=False),
-        sa.Column("created_at", sa.DateTime(timezone=True), nullable=False),
-        sa.Column("mac", sa.LargeBinary(length=32), nullable=True),
-        sa.PrimaryKeyConstraint("contract_id", "position", name=op.f("pk_known_calibrations")),
-    )
-    op.create_table(
         "master_key_check",
         sa.Column("id", sa.Integer(), autoincrement=False, nullable=False),
         sa.Column("wrapped_value", sa.LargeBinary(), nullable=False),
