@@ -426,8 +426,5 @@ except LiftUnavailable as error:
     assert "call no package of yours enroll, models or templates" in done.stdout
 
 
-def test_only_a_key_of_the_service_signs(pack: Path) -> None:
-    with pytest.raises(ValueError, match="API key") as refused:
-        PrivateClient("http://service.test", "some-other-token", pack=pack)
-    assert "some-other-token" not in str(refused.value)
+def test_a_probe_prints_its_size_alone() -> None:
     assert repr(Probe(template=b"12345", contract_id="c")) == "<Probe of 5 bytes>"

@@ -165,6 +165,7 @@ def test_a_token_outlives_a_restart_and_its_key_does_not(service: Service) -> No
     kept, revoked = (issue(client, headers=bearer(key))["token"] for _ in range(2))
     with Client(create_app(deployment.settings)) as restarted:
         assert verify(restarted, kept).json()["decision"] == "accept"
+        assert_error(verify(client, kept), 401, "replayed")
         store = open_store(deployment.settings, open_keyring(deployment.settings))
         try:
             assert store.api_keys.revoke(key[3:15])
