@@ -140,7 +140,7 @@ class RotationKeyRow(Base):
 
 
 class ApiKeyRow(Base):
-    """An API key: the hash of its token, and the sealed key that its probes are signed with."""
+    """An API key, as the hash of its token."""
 
     __tablename__ = "api_keys"
 

@@ -110,7 +110,7 @@ def test_private_templates(node: Node, service: Running) -> None:
     assert described["value"]["enrolled_by"] == "template"
     assert "template" not in probe["shown"]
     assert found["value"]["accepted"] is True
-    assert levelled["value"]["level"] == "fmr-1e-2", "signed anew, else it would be replayed"
+    assert levelled["value"]["level"] == "fmr-1e-2"
     assert keyless["value"]["accepted"] is False
     assert wrong["value"]["accepted"] is False
     assert two["error"] == "InconsistentImages"
