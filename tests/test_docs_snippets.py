@@ -179,7 +179,6 @@ DRAWINGS = {
     ("docs/distances.md", "__init__ ──▶ tiles"),
     ("docs/distances.md", "probes, templates ──stack──▶"),
     ("docs/login.md", "application ──/authorize──▶"),
-    ("docs/rest.md", "veilface-probe-1"),
 }
 PACKAGES = ("templates", "models", "enroll", "verify", "attacks", "api")
 
