@@ -80,6 +80,7 @@ def walk_obstacles(tab: BrowserTab, demo: Served) -> Iterator[str]:
     page.get_by_label("Find people whose id begins with").fill(NOBODY)
     expect(page.get_by_text("Nobody’s id begins so.")).to_be_visible()
     yield "people-not-found"
+    tab.open("Service")
     with answered(tab, "**/v1/subjects?*", 401, "unauthorized", "send a valid API key"):
         button("link", name="People").click()
         expect(button("heading", level=1, name="Sign in")).to_be_visible()
