@@ -153,4 +153,4 @@ lock: | $(UV)
 	$(UV) pip compile --quiet --upgrade --universal --generate-hashes --python-version 3.11 pyproject.toml --extra all --group build --group dev -o requirements.lock
 
 clean:
-	rm -rf .venv .bootstrap dist clients/javascript/dist clients/javascript/node_modules api/web/client .schemathesis templates/distances/kernels/__pycache__ .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf .venv .bootstrap dist clients/javascript/dist clients/javascript/node_modules api/web/client .schemathesis templates/distances/__pycache__ .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -101,13 +101,12 @@ def best_of_restarts(a: SubspaceBatch, b: SubspaceBatch, seed: int) -> NDArray[n
     """Best similarity of probe i and template i over random restarts, (P,)."""
     out = np.empty(len(a))
     rng = np.random.default_rng(seed)
-    left, right = exact.Rows.cleaned(a), exact.Rows.cleaned(b)
     for start in range(0, len(a), _CHUNK):
         part = slice(start, start + _CHUNK)
-        dots, problem = exact.problem_of(exact.Rows.of(left, part), exact.Rows.of(right, part))
+        dots, *fields = exact.problem_of(exact.Rows.of(a, part), exact.Rows.of(b, part))
         starts = rng.normal(size=(len(dots), _RESTARTS, b.m))
         starts /= np.linalg.norm(starts, axis=2, keepdims=True)
-        gains, _ = exact.maximise(problem, starts, _STEPS)
+        _, gains = exact.maximise(exact.Problem(*fields), starts, _STEPS)
         out[part] = dots + gains
     return out
 

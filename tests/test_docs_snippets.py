@@ -176,7 +176,7 @@ DRAWINGS = {
     ("docs/architecture.md", "                models"),
     ("docs/architecture.md", "bytes ─▶ protocol"),
     ("docs/architecture.md", "set ─▶ reader"),
-    ("docs/distances.md", "__init__ ──▶ tiles"),
+    ("docs/distances.md", "__init__ ──▶ exact"),
     ("docs/distances.md", "probes, templates ──stack──▶"),
     ("docs/login.md", "application ──/authorize──▶"),
 }

@@ -22,7 +22,6 @@ from starlette.routing import BaseRoute
 
 from api.http.answers import error_answer
 from api.http.audit import note_refusal
-from api.http.audit_report import open_audit_report
 from api.http.context import RequestContext
 from api.http.cors import Cors
 from api.http.deps import refuse_unknown
@@ -67,7 +66,6 @@ from api.settings import NO_PROXIES, Settings
 from models.errors import ModelError
 from templates.contract.document import Contract
 from templates.contract.nobody import Nobody
-from templates.distances import warm_up
 from templates.distances.blas import single_threaded
 from templates.errors import VeilfaceError
 
@@ -201,7 +199,6 @@ async def _open(
     # Requests compute beside each other, as many as there are slots. Threads of the matrix library
     # would only wait for each other, and burn processor time while they do.
     running.enter_context(single_threaded())
-    app.state.audit_report = open_audit_report(settings)
     rate_limits = RateLimits.open(settings)
     running.push_async_callback(rate_limits.close)
     stop_told = threading.Event()
@@ -231,10 +228,6 @@ async def _open(
             severity=logging.WARNING,
             contract_id=runtime.contract.contract_id,
         )
-    if runtime.contract.takes_lifted_probes:
-        # No request is answered before this is done, so none waits for the compiler. Points are
-        # compared without it, and it takes 130 MB.
-        await anyio.to_thread.run_sync(warm_up)
     # What was made so far stays: looking through it for garbage would stop requests for 0.1 s.
     gc.collect()
     gc.freeze()

@@ -1,6 +1,6 @@
 """The server process, and the supervisor of its workers where there are several.
 
-Workers are forks of the supervisor. What it has loaded, the contract, the kernels and all modules,
+Workers are forks of the supervisor. What it has loaded, the contract and all modules,
 is in memory once, and a worker in place of one that died starts at once.
 """
 
@@ -23,8 +23,6 @@ from api.process.allocator import give_back
 from api.process.logging import configure, log
 from api.settings import Settings
 from templates.contract.document import Contract
-from templates.distances import warm_up
-from templates.distances.blas import single_threaded
 
 
 def run_server(
@@ -54,9 +52,6 @@ def run_server(
         if not server.started:
             sys.exit(STARTUP_FAILURE)
         return
-    if contract.takes_lifted_probes:
-        with single_threaded():
-            warm_up()
     configure(settings.log_level)
     # What workers share stays shared while nobody writes to it: the collector would.
     gc.collect()

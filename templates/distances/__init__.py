@@ -1,10 +1,10 @@
 """Distances of probes to templates: the one entrance to both metrics and both modes.
 
-A probe is a raw descriptor (point to subspace) or itself lifted (subspace to subspace). Probes
-and templates may have different subspace dimensions. Float32 runs on compiled kernels (``tiles``)
-or, under ``on_device``, on ``torch``; float64 on the plain NumPy of ``exact``, which is their
-specification. The kernels' compiler and torch take long to load, so the two are imported where they
-are first used.
+A probe is a raw embedding (point to subspace) or itself lifted (subspace to subspace). Probes and
+templates may have different subspace dimensions. Three files compute the parts of a matrix:
+``exact`` in NumPy and float64, which is the specification and all that a service needs;
+``compiled`` in float32 (extra ``evaluate``), where there are more than some thousand pairs; and
+``torch`` in float32, under ``on_device``. The last two are imported where they are first used.
 """
 
 from collections.abc import Iterator
@@ -23,7 +23,9 @@ from templates.distances.metric import (
     Labels,
     Metric,
     Neighbours,
+    Probes,
     Progress,
+    Tile,
     similarity,
 )
 from templates.errors import InvalidEmbedding, InvalidTemplate, TemplateError
@@ -34,6 +36,7 @@ __all__ = [
     "Labels",
     "Metric",
     "Neighbours",
+    "Probes",
     "count_within",
     "nearest",
     "on_device",
@@ -44,7 +47,9 @@ __all__ = [
     "warm_up",
 ]
 
-Probes = NDArray[np.float32] | NDArray[np.float64] | SubspaceBatch
+# Pairs that NumPy computes sooner than compiled loops are loaded: what a service compares.
+_FEW = 1 << 12
+_NOTHING = np.iinfo(np.int64).max
 _DEVICE: ContextVar[str | None] = ContextVar("device", default=None)
 
 
@@ -127,18 +132,11 @@ def pairwise_distances(
     ----------
     Paper eq. 1 to 9; docs/method.md §3.
     """
-    options = _options(metric, steps, threads)
     probes = _checked(probes, templates, dtype)
-    distances: Floats
-    device = _DEVICE.get()
-    if np.dtype(dtype) == np.float64:
-        distances = exact.pairwise(probes, templates, **options)
-    elif device is not None:
-        torch, *sides = _placed(probes, templates, device)
-        distances = torch.pairwise(*sides, **options).cpu().numpy()
-    else:
-        distances = _tiles().pairwise(probes, templates, threads=threads, **options)
-    return distances
+    out = np.empty((len(probes), len(templates)), dtype=dtype)
+    for rows, columns, distances in _tiles(probes, templates, metric, steps, dtype, threads):
+        out[rows, columns] = distances
+    return out
 
 
 def nearest(
@@ -179,19 +177,28 @@ def nearest(
     InvalidEmbedding, InvalidTemplate, TemplateError
         As of `pairwise_distances`.
     """
-    options = _options(metric, steps, threads)
     if k < 1:
         raise TemplateError(f"{k} neighbours cannot be found; k is at least 1")
-    options |= {"of_templates": of_templates, "labels": _labels(labels, probes, templates)}
+    labels = _labels(labels, probes, templates)
     probes = _checked(probes, templates, np.float32)
-    device = _DEVICE.get()
-    if device is not None:
-        torch, *sides = _placed(probes, templates, device)
-        neighbours = torch.nearest(*sides, k, **options)
-        _report_all(progress, probes, templates)
-        return Neighbours(*(part.cpu().numpy() for part in neighbours))
-    options |= {"threads": threads, "progress": progress}
-    return Neighbours(*_tiles().nearest(probes, templates, k, **options))
+    # Of a distance, which is not negative, the bits ascend with it; behind them stands the index.
+    best = np.full((len(templates if of_templates else probes), k), _NOTHING)
+    for rows, columns, distances in _tiles(probes, templates, metric, steps, np.float32, threads):
+        keys = np.ascontiguousarray(distances, dtype=np.float32).view(np.int32).astype(np.int64)
+        keys <<= 32
+        if labels is not None:
+            keys[labels[0][rows, None] == labels[1][columns]] = _NOTHING
+        done = keys.size
+        if of_templates:
+            rows, columns, keys = columns, rows, keys.T
+        keys = np.concatenate([best[rows], keys | np.arange(columns.start, columns.stop)], axis=1)
+        best[rows] = np.partition(keys, k - 1, axis=1)[:, :k]
+        if progress is not None:
+            progress(done)
+    best.sort(axis=1)
+    nothing = best == _NOTHING
+    nearby = (best >> 32).astype(np.int32).view(np.float32)
+    return Neighbours(np.where(nothing, -1, best & 0xFFFFFFFF), np.where(nothing, np.inf, nearby))
 
 
 def count_within(
@@ -227,23 +234,26 @@ def count_within(
     InvalidEmbedding, InvalidTemplate, TemplateError
         As of `pairwise_distances`; a threshold that is not a number.
     """
-    options = _options(metric, steps, threads)
     limits = np.atleast_1d(np.asarray(thresholds, dtype=np.float64))
     if limits.ndim != 1 or not limits.size or np.isnan(limits).any():
         raise TemplateError("thresholds are a row of numbers")
-    options["labels"] = _labels(labels, probes, templates)
-    order = np.argsort(limits)
-    counts = np.empty(len(limits), dtype=np.int64)
+    labels = _labels(labels, probes, templates)
     probes = _checked(probes, templates, np.float32)
-    device = _DEVICE.get()
-    if device is not None:
-        torch, *sides = _placed(probes, templates, device)
-        counts[order] = torch.counts_within(*sides, limits[order], **options).cpu().numpy()
-        _report_all(progress, probes, templates)
-    else:
-        options |= {"threads": threads, "progress": progress}
-        counts[order] = _tiles().counts_within(probes, templates, limits[order], **options)
-    return counts
+    order = np.argsort(limits)
+    ascending = limits[order]
+    counts = np.zeros(len(limits), dtype=np.int64)
+    for rows, columns, distances in _tiles(probes, templates, metric, steps, np.float32, threads):
+        within = distances <= ascending[-1]
+        if labels is not None:
+            within &= labels[0][rows, None] != labels[1][columns]
+        # In float64, so that a threshold between two float32 numbers separates them.
+        first = np.searchsorted(ascending, distances[within].astype(np.float64))
+        counts += np.bincount(first, minlength=len(counts))
+        if progress is not None:
+            progress(distances.size)
+    out = np.empty_like(counts)
+    out[order] = np.cumsum(counts)
+    return out
 
 
 def paired_distances(
@@ -255,7 +265,9 @@ def paired_distances(
     dtype: DTypeLike = np.float32,
     as_stored: bool = False,
 ) -> Floats:
-    """Distances of probe i to template i; parameters and errors as in `pairwise_distances`.
+    """Distances of probe i to template i, computed in float64 whatever ``dtype`` is.
+
+    Parameters and errors are those of `pairwise_distances`.
 
     Parameters
     ----------
@@ -267,39 +279,73 @@ def paired_distances(
     -------
     ndarray of ``dtype``, shape (P,)
     """
-    options = _options(metric, steps)
+    metric = _metric(metric, steps)
     probes = _checked(probes, templates, dtype)
     if len(probes) != len(templates):
         raise TemplateError(f"{len(probes)} probes do not pair with {len(templates)} templates")
-    if isinstance(probes, SubspaceBatch) and np.dtype(dtype) == np.float32:
-        distances: Floats
-        device = _DEVICE.get()
-        if device is not None:
-            torch, *sides = _placed(probes, templates, device)
-            distances = torch.paired(*sides, **options).cpu().numpy()
-        else:
-            distances = _tiles().paired(probes, templates, **options)
-        return distances
     every = np.arange(len(probes))
-    return exact.pairs(probes, templates, every, every, as_stored=as_stored, **options).astype(
-        dtype
-    )
+    return exact.pairs(
+        probes, templates, every, every, metric=metric, steps=steps, as_stored=as_stored
+    ).astype(dtype)
 
 
 def warm_up() -> None:
-    """Compile the kernels, or load them from their cache, so that no request has to wait."""
-    _tiles().warm_up()
+    """Compile the loops of the extra ``evaluate``, or load them from their cache.
+
+    Raises
+    ------
+    TemplateError
+        numba is not installed; the message names the remedy.
+    """
+    compiled = _compiled()
+    if compiled is None:
+        raise TemplateError(
+            'numba is not installed, and fast distances need it: pip install "veilface[evaluate]"'
+        )
+    axes = np.eye(3, dtype=np.float32)
+    batch = SubspaceBatch(0.5 * axes[:1], axes[None, 1:2])
+    for metric in Metric:
+        for probes in (axes, batch):
+            list(compiled.tiles(probes, batch, metric=metric, steps=2, threads=1))
 
 
-def _report_all(progress: Progress | None, probes: Probes, templates: SubspaceBatch) -> None:
-    if progress is not None:
-        progress(len(probes) * len(templates))
+def _tiles(
+    probes: Probes,
+    templates: SubspaceBatch,
+    metric: Metric | str,
+    steps: int,
+    dtype: DTypeLike,
+    threads: int | None,
+) -> Iterator[Tile]:
+    """Choose who computes, and yield rows, columns and distances of all parts of the matrix."""
+    metric = _metric(metric, steps)
+    if threads is not None and threads < 1:
+        raise TemplateError(f"there is no work for {threads} threads; at least 1 is needed")
+    device = None if np.dtype(dtype) == np.float64 else _DEVICE.get()
+    if device is not None:
+        of_device: Iterator[Tile] = _torch().tiles(
+            probes, templates, metric=metric, steps=steps, device=device
+        )
+        return of_device
+    compiled = None
+    if np.dtype(dtype) == np.float32 and len(probes) * len(templates) > _FEW:
+        compiled = _compiled()
+    if compiled is None:
+        parts = exact.tiles(probes, templates, metric=metric, steps=steps)
+        return ((rows, columns, part.astype(dtype)) for rows, columns, part in parts)
+    of_loops: Iterator[Tile] = compiled.tiles(
+        probes, templates, metric=metric, steps=steps, threads=threads
+    )
+    return of_loops
 
 
-def _tiles() -> ModuleType:
-    from templates.distances import tiles
-
-    return tiles
+def _compiled() -> ModuleType | None:
+    """Load the compiled loops; without the extra there are none, and NumPy gives the same."""
+    try:
+        from templates.distances import compiled
+    except ImportError:
+        return None
+    return compiled
 
 
 def _torch() -> ModuleType:
@@ -312,19 +358,10 @@ def _torch() -> ModuleType:
     return torch
 
 
-def _placed(probes: Probes, templates: SubspaceBatch, device: str) -> tuple[Any, Any, Any]:
-    """Load what computes on a device, and copy both sides there."""
-    torch = _torch()
-    there = torch.usable(device)
-    return torch, torch.placed(probes, there), torch.placed(templates, there)
-
-
-def _options(metric: Metric | str, steps: int, threads: int | None = None) -> dict[str, Any]:
-    if threads is not None and threads < 1:
-        raise TemplateError(f"there is no work for {threads} threads; at least 1 is needed")
+def _metric(metric: Metric | str, steps: int) -> Metric:
     if steps < 1:
         raise TemplateError(f"the iteration needs at least one step, not {steps}")
-    return {"metric": Metric(metric), "steps": steps}
+    return Metric(metric)
 
 
 def _checked(probes: Any, templates: SubspaceBatch, dtype: DTypeLike) -> Probes:

@@ -9,17 +9,17 @@ length count. A subspace with foot point p meets the unit sphere in a sphere aro
 s = √(1 − ‖p‖²).
 """
 
+from collections.abc import Iterator
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from templates.distances.metric import LONGEST, Indices, Metric, parts
-from templates.errors import InvalidTemplate, LiftingError
-from templates.space.subspace import SubspaceBatch, span_basis
+from templates.distances.metric import LONGEST, Indices, Metric, Probes, Tile, parts
+from templates.space.subspace import SubspaceBatch
 
-_CHUNK_BYTES = 32 << 20
-_POINTS = 256
+_CHUNK_BYTES = 4 << 20
+_SIDE = 256
 
 # A direction shared by two subspaces to within this angle is one direction: float32 storage
 # turns equal directions by 10⁻⁷. Squared, because eigenvalues of the Gram matrix are compared.
@@ -29,6 +29,8 @@ _PASSES = 2
 # A pair is finished when a step moves v by less than this; what is left of the similarity is of
 # the order of its square.
 _STILL = 1e-10
+# Squared distances below this are made from differences: a square loses half of the digits.
+_NEAR2 = 0.25
 _TINY = np.finfo(np.float64).tiny
 
 Doubles = NDArray[np.float64]
@@ -45,38 +47,29 @@ class Rows(NamedTuple):
         """Take some subspaces of a batch as they are stored."""
         return cls(batch.feet[index].astype(np.float64), batch.bases[index].astype(np.float64))
 
-    @classmethod
-    def cleaned(cls, batch: SubspaceBatch) -> Self:
-        """Free a batch of the rounding of its float32 storage.
 
-        Raises
-        ------
-        InvalidTemplate
-            The basis is nowhere near orthonormal.
-        """
-        try:
-            bases = span_basis(batch.bases.astype(np.float64))
-        except LiftingError:
-            raise InvalidTemplate("a template's basis is linearly dependent") from None
-        feet = batch.feet.astype(np.float64)
-        return cls(feet - _inside(feet[:, None], bases)[:, 0], bases)
-
-
-def pairwise(probes: Any, templates: SubspaceBatch, *, metric: Metric, steps: int) -> Doubles:
-    """Distances of every probe, a point or a subspace, to every template, shape (P, T)."""
-    out = np.empty((len(probes), len(templates)))
-    right = Rows.cleaned(templates)
-    if isinstance(probes, SubspaceBatch):
-        left = Rows.cleaned(probes)
-        i, j = (side.ravel() for side in np.indices(out.shape))
-        out[i, j] = pairs(left, right, i, j, metric=metric, steps=steps)
-        return out
-    for rows in parts(len(probes), _POINTS):
-        points = probes[None, rows].astype(np.float64)
-        for columns in _chunks(len(templates), 3 * points.size + right.bases[0].size):
-            some = Rows.of(right, columns)
-            out[rows, columns] = _POINT_DISTANCES[metric](points, some).T
-    return out
+def tiles(
+    probes: Probes, templates: SubspaceBatch, *, metric: Metric, steps: int
+) -> Iterator[Tile]:
+    """Yield rows, columns and distances (R, C) of all parts of the matrix of every pair."""
+    for columns in parts(len(templates), _SIDE):
+        some = Rows.of(templates, columns)
+        for rows in parts(len(probes), _SIDE):
+            group = probes[rows]
+            if isinstance(group, SubspaceBatch):
+                shape = len(group), len(some.feet)
+                i, j = (side.ravel() for side in np.indices(shape))
+                yield (
+                    rows,
+                    columns,
+                    pairs(group, some, i, j, metric=metric, steps=steps).reshape(shape),
+                )
+                continue
+            out = np.empty((len(group), len(some.feet)))
+            points = group[None].astype(np.float64)
+            for part in _chunks(len(some.feet), 3 * points.size + some.bases[0].size):
+                out[:, part] = _POINT_DISTANCES[metric](points, Rows.of(some, part)).T
+            yield rows, columns, out
 
 
 def pairs(
@@ -96,18 +89,19 @@ def pairs(
     out = np.empty(len(i))
     lifted = not isinstance(probes, np.ndarray)
     rows = templates.bases.shape[1] + (probes.bases.shape[1] if lifted else 0)
-    for part in _chunks(len(i), 2 * rows * templates.feet.shape[1]):
+    chunks = _chunks(len(i), 2 * rows * templates.feet.shape[1])
+    if lifted and metric is Metric.SPHERICAL:
+        return _spherical_subspaces(probes, templates, i, j, steps, chunks)
+    for part in chunks:
         right = Rows.of(templates, j[part])
-        if not lifted:
-            points = probes[i[part], None].astype(np.float64)
-            if metric is Metric.EUCLIDEAN:
-                out[part] = _euclidean_points(points, right)[:, 0]
-            else:
-                out[part] = _spherical_points(points, right, as_stored=as_stored)[:, 0]
-        elif metric is Metric.EUCLIDEAN:
+        if lifted:
             out[part] = _euclidean_subspaces(Rows.of(probes, i[part]), right)
+            continue
+        points = probes[i[part], None].astype(np.float64)
+        if metric is Metric.EUCLIDEAN:
+            out[part] = _euclidean_points(points, right)[:, 0]
         else:
-            out[part] = _spherical_subspaces(Rows.of(probes, i[part]), right, steps)
+            out[part] = _spherical_points(points, right, as_stored=as_stored)[:, 0]
     return out
 
 
@@ -187,22 +181,31 @@ def _euclidean_subspaces(left: Rows, right: Rows) -> Doubles:
     return np.asarray(np.linalg.norm(gaps[:, :, 0], axis=1))
 
 
-def _spherical_subspaces(left: Rows, right: Rows, steps: int) -> Doubles:
-    """Difference of the closest points that the iteration finds."""
-    _, problem = problem_of(left, right)
-    _, v = maximise(problem, _starts(problem), steps)
-    u = problem.g + _times(problem.b, v)
-    x, y = _point_of_sphere(left, u), _point_of_sphere(right, v)
-    return np.asarray(np.linalg.norm(x - y, axis=1))
+def _spherical_subspaces(
+    probes: Any, templates: Any, i: Indices, j: Indices, steps: int, chunks: list[slice]
+) -> Doubles:
+    """Distances from the similarity, and of near pairs from the closest points themselves."""
+    if probes.bases.shape[1] < templates.bases.shape[1]:  # the smaller one is iterated over
+        probes, templates, i, j = templates, probes, j, i
+    made = [problem_of(Rows.of(probes, i[part]), Rows.of(templates, j[part])) for part in chunks]
+    if not made:
+        return np.empty(0)
+    dots, *fields = (np.concatenate(part) for part in zip(*made, strict=True))
+    problems = Problem(*fields)
+    v, gains = maximise(problems, starts_of(problems.gram), steps)
+    squared = 2 - 2 * (dots + gains)
+    near = np.flatnonzero(squared < _NEAR2)
+    for part in parts(len(near), max(1, chunks[0].stop)):
+        some = near[part]
+        right = Rows.of(templates, j[some])
+        scales, radii = spheres(right.feet)
+        inside = _times(right.bases.transpose(0, 2, 1), v[some])
+        ends = right.feet * scales[:, None] + radii[:, None] * inside
+        squared[some] = _spherical_points(ends[:, None], Rows.of(probes, i[some]))[:, 0] ** 2
+    return np.sqrt(squared)
 
 
-def _point_of_sphere(side: Rows, coefficients: Doubles) -> Doubles:
-    scales, radii = spheres(side.feet)
-    inside = _times(side.bases.transpose(0, 2, 1), _directions(coefficients))
-    return np.asarray(side.feet * scales[:, None] + radii[:, None] * normalised(inside))
-
-
-# --- the sphere, and the spherical iteration ----------------------------------------------------
+# --- the sphere, and two subspaces on it ----------------------------------------------------
 
 
 def spheres(feet: NDArray[np.floating[Any]]) -> tuple[Doubles, Doubles]:
@@ -229,110 +232,96 @@ def _directions(coefficients: Doubles) -> Doubles:
 
 
 class Problem(NamedTuple):
-    """Maximise g·u + h·v + uᵀBv over unit u and v, for K pairs."""
+    """Maximise g·u + h·v + uᵀBv over unit u and v, for K pairs.
 
-    g: Doubles
-    """s D q, shape (K, m_D)."""
+    The best u of a v is known, so with G = BᵀB and c = Bᵀg it is to maximise F(v) = h·v + λ,
+    λ² = ‖g‖² + 2 c·v + vᵀGv.
+    """
+
+    gram: Doubles
+    """G, shape (K, m, m)."""
+    c: Doubles
     h: Doubles
-    """t E p, shape (K, m_E)."""
-    b: Doubles
-    """s t D Eᵀ, shape (K, m_D, m_E)."""
-    transposed: Doubles
-    """Bᵀ, contiguous: small products with a transposed view are four times slower."""
-
-    def take(self, index: slice | Indices) -> Self:
-        """Return some of the pairs."""
-        return type(self)(*(part[index] for part in self))
+    """t E p, shape (K, m)."""
+    g2: Doubles
+    """‖g‖² of g = s D q, shape (K, 1)."""
 
 
-def problem_of(left: Rows, right: Rows) -> tuple[Doubles, Problem]:
-    """Products p·q of K pairs, (K,), and the problems of the rest of the similarity."""
+def problem_of(left: Rows, right: Rows) -> tuple[Doubles, ...]:
+    """Products p·q of K pairs, (K,), and their problems: the similarity is p·q + max F."""
     (scale, s), (their_scale, t) = spheres(left.feet), spheres(right.feet)
     p, q = left.feet * scale[:, None], right.feet * their_scale[:, None]
     b = (s * t)[:, None, None] * (left.bases @ right.bases.transpose(0, 2, 1))
-    return np.einsum("ki,ki->k", p, q), Problem(
-        s[:, None] * _times(left.bases, q),
-        t[:, None] * _times(right.bases, p),
-        b,
-        np.ascontiguousarray(b.transpose(0, 2, 1)),
-    )
+    g, columns = s[:, None] * _times(left.bases, q), b.transpose(0, 2, 1)
+    g2 = np.einsum("ki,ki->k", g, g)[:, None]
+    h = t[:, None] * _times(right.bases, p)
+    return np.einsum("ki,ki->k", p, q), columns @ b, _times(columns, g), h, g2
 
 
-def _starts(problem: Problem) -> Doubles:
-    """Starts of v, shape (K, 2, m_E): the leading right singular vector of B with both signs.
+def starts_of(gram: Doubles) -> Doubles:
+    """Starts of v, shape (K, 2, m): the leading eigenvector of G with both signs.
 
     The objective has one or two local maxima, on either side of that vector, and its two signs
     lead to both: of 45,000 pairs of lifted faces, random subspaces and wolves one (in R⁸) ended
-    more than 10⁻⁴ below random restarts. The vector is a column of a power of BᵀB, as good as the
+    more than 10⁻⁴ below random restarts. The vector is a column of a power of G, as good as the
     exact one, and cheaper.
     """
-    power = problem.transposed @ problem.b
+    power = gram
     for _ in range(5):
-        power /= np.maximum(np.einsum("kii->k", power), _TINY)[:, None, None]
+        power = power / np.maximum(np.einsum("kii->k", power), _TINY)[:, None, None]
         power = power @ power
     largest = np.argmax(np.einsum("kii->ki", power), axis=1)
-    leading = normalised(power[np.arange(len(power)), :, largest])
+    leading = _directions(power[np.arange(len(power)), :, largest])
     return np.stack([leading, -leading], axis=1)
 
 
 def maximise(problem: Problem, starts: Doubles, steps: int) -> tuple[Doubles, Doubles]:
-    """Best value over all starts, shape (K,), and its v, shape (K, m_E).
+    """Best v over all starts (K, S, m), shape (K, m), and F(v), (K,).
 
-    One step is u ← normalise(g + B v), v ← normalise(h + Bᵀu), which never lowers the value. It
-    converges linearly, slowly where two singular values are close; an Anderson extrapolation of
-    depth one through the last two steps mends that. Where the extrapolated point is worse than
-    the last one, the plain step is taken instead, so the value rises in every step.
+    One step is v ← normalise(h + (c + G v)/λ), which never lowers F. It converges linearly, slowly
+    where two eigenvalues are close; an Anderson extrapolation of depth one through the last two
+    steps mends that. Where the extrapolated point is worse than the last one, the plain step comes
+    next instead.
     """
-    count = len(starts)
-    values, best_v = np.empty(starts.shape[:2]), starts.copy()
-    active = np.arange(count)
     v = starts
-    value, stepped = _step(problem, v)
-    moved = stepped - v
-    trial = stepped
-    for taken in range(1, steps):
-        next_value, next_stepped = _step(problem, trial)
-        worse = (next_value < value).any(axis=1)
-        if taken > 1 and worse.any():
-            again = np.flatnonzero(worse)
-            keep = (next_value[again] >= value[again])[:, :, None]
-            trial[again] = np.where(keep, trial[again], stepped[again])
-            next_value[again], next_stepped[again] = _step(problem.take(again), trial[again])
-        next_moved = next_stepped - trial
-        turn = next_moved - moved
-        slope = np.einsum("ksi,ksi->ks", next_moved, turn)
+    best, values = v.copy(), np.full(v.shape[:2], -np.inf)
+    active, moved, stepped = np.arange(len(v)), np.zeros_like(v), v
+    trial, value = v, values
+    for taken in range(steps):
+        following, new = _step(problem, trial)
+        worse = new < value
+        motion = following - trial
+        turn = motion - moved
+        slope = np.einsum("ksi,ksi->ks", motion, turn)
         slope /= np.maximum(np.einsum("ksi,ksi->ks", turn, turn), _TINY)
-        np.clip(slope, -LONGEST, LONGEST, out=slope)
-        v, value, moved = trial, next_value, next_moved
-        trial = normalised(next_stepped - slope[:, :, None] * (next_stepped - stepped))
-        stepped = next_stepped
-        if taken % 4 == 0:
-            done = (np.einsum("ksi,ksi->ks", moved, moved) < _STILL**2).all(axis=1)
-            if done.any():
-                values[active[done]], best_v[active[done]] = value[done], v[done]
-                left = np.flatnonzero(~done)
-                active, problem = active[left], problem.take(left)
-                v, value, moved, trial, stepped = (
-                    part[left] for part in (v, value, moved, trial, stepped)
-                )
-                if not left.size:
-                    break
-    values[active], best_v[active] = value, v
-    winner = np.argmax(values, axis=1)
-    every = np.arange(count)
-    return values[every, winner], best_v[every, winner]
+        slope = np.clip(slope, -LONGEST, LONGEST)[:, :, None] * (taken > 0)
+        again = worse[:, :, None]
+        v = np.where(again, v, trial)
+        trial = np.where(again, stepped, normalised(following - slope * (following - stepped)))
+        moved, stepped = np.where(again, moved, motion), np.where(again, stepped, following)
+        value = np.where(worse, value, new)
+        done = (~worse & (np.einsum("ksi,ksi->ks", motion, motion) < _STILL**2)).all(axis=1)
+        if taken == steps - 1 or (taken % 4 == 3 and done.any()):
+            done |= taken == steps - 1
+            values[active[done]], best[active[done]] = value[done], v[done]
+            left = ~done
+            problem = Problem(*(part[left] for part in problem))
+            active, moved, stepped, v, trial, value = (
+                part[left] for part in (active, moved, stepped, v, trial, value)
+            )
+            if not active.size:
+                break
+    every, winner = np.arange(len(best)), np.argmax(values, axis=1)
+    return best[every, winner], values[every, winner]
 
 
 def _step(problem: Problem, v: Doubles) -> tuple[Doubles, Doubles]:
-    """Value at v with the best u, shape (K, S), and the next v, shape (K, S, m_E)."""
-    u = v @ problem.transposed
-    u += problem.g[:, None, :]
-    norms = np.sqrt(np.einsum("ksi,ksi->ks", u, u))
-    u /= np.maximum(norms, _TINY)[:, :, None]
-    norms += np.einsum("ksi,ki->ks", v, problem.h)
-    following = u @ problem.b
-    following += problem.h[:, None, :]
-    return norms, normalised(following)
+    """Following v of a v, shape (K, S, m), and the value at v, shape (K, S)."""
+    turned = v @ problem.gram
+    inside = turned + 2 * problem.c[:, None]
+    lengths = np.sqrt(np.maximum(problem.g2 + np.einsum("ksi,ksi->ks", v, inside), _TINY))
+    following = problem.h[:, None] + (turned + problem.c[:, None]) / lengths[:, :, None]
+    return normalised(following), np.asarray(lengths + np.einsum("ksi,ki->ks", v, problem.h))
 
 
 def _times(matrices: Doubles, rows: Doubles) -> Doubles:

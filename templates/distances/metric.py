@@ -7,6 +7,8 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from templates.space.subspace import SubspaceBatch
+
 DEFAULT_STEPS = 50
 """Steps of the spherical subspace-to-subspace iteration; part of a calibration."""
 
@@ -20,9 +22,14 @@ similarity is of the order of its square."""
 LONGEST = 1e3
 """Extrapolations of the iteration that are longer than this are rounding noise."""
 
+Array32 = NDArray[np.float32]
 Floats = NDArray[np.floating[Any]]
 _Number = TypeVar("_Number", float, NDArray[np.floating[Any]])
 Indices = NDArray[np.int64]
+
+Probes = Array32 | NDArray[np.float64] | SubspaceBatch
+Tile = tuple[slice, slice, Floats]
+"""Probes and templates of a part of the matrix, and their distances (R, C)."""
 
 Labels = tuple[Indices, Indices]
 """One label for each probe and each template; pairs with equal labels do not count."""

@@ -1,137 +1,99 @@
-"""Distances on a device, in plain torch: float32, a tile at a time.
+"""Distances on a device of torch (extra ``torch``): float32, a tile at a time.
 
 What float32 gets wrong is computed by ``exact``, on the processor. Only those who ask for a device
-import this file: torch is an optional extra of the project.
+import this file.
 """
 
 import math
-from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from templates.distances import exact
-from templates.distances.metric import ACCURACY, LONGEST, NEAR, STILL, Labels, Metric, parts
+from templates.distances.metric import (
+    ACCURACY,
+    LONGEST,
+    NEAR,
+    STILL,
+    Metric,
+    Probes,
+    Tile,
+    parts,
+)
 from templates.errors import TemplateError
 from templates.space.subspace import SubspaceBatch
 
-TILE_BYTES = defaultdict(lambda: 128 << 20, cpu=8 << 20)
-"""Size of the products that are made at a time; the whole computation holds a few times that."""
-
+_TILE_BYTES = {"cpu": 8 << 20, "cuda": 128 << 20}
+"""Size of the products that are made at a time; the computation holds a few times that."""
 _EPS, _TINY = torch.finfo(torch.float32).eps, torch.finfo(torch.float32).tiny
-# No pair: behind every distance, and behind the index of every template.
-_NOTHING = torch.iinfo(torch.int64).max
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class SubspaceTensors:
-    """N templates of one dimension on one device: feet (N, n), bases (N, m, n), both float32."""
+class Rows(NamedTuple):
+    """Points or subspaces on a device, float32: rows (m + 1, N, n), all feet or points first."""
 
-    feet: Tensor
-    bases: Tensor
-
-    @classmethod
-    def of(cls, batch: SubspaceBatch, device: torch.device | str) -> Self:
-        """Copy a batch to a device."""
-        return cls(*(torch.tensor(part, device=device) for part in (batch.feet, batch.bases)))
-
-    def __len__(self) -> int:
-        return self.feet.shape[0]
-
-    def __getitem__(self, index: slice | Tensor) -> Self:
-        return type(self)(self.feet[index], self.bases[index])
-
-    @property
-    def n(self) -> int:
-        """Descriptor dimension."""
-        return self.bases.shape[2]
-
-    @property
-    def m(self) -> int:
-        """Subspace dimension."""
-        return self.bases.shape[1]
-
-    @property
-    def device(self) -> torch.device:
-        """Where the tensors are."""
-        return self.feet.device
+    rows: Tensor
+    squares: Tensor
+    """Squared lengths of points or feet, (N,)."""
 
 
-Side = Tensor | SubspaceTensors
+def usable(device: str) -> torch.device:
+    """Name a device; a TemplateError says why torch cannot use it."""
+    try:
+        torch.zeros(1, device=device).cpu()
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        raise TemplateError(
+            f"torch cannot use the device {device}: {str(error).splitlines()[0]}"
+        ) from None
+    return torch.device(device)
 
 
-def pairwise(probes: Side, templates: SubspaceTensors, *, metric: Metric, steps: int) -> Tensor:
-    """Distances of every probe, points (P, n) or subspaces, to every template, (P, T)."""
-    out = torch.empty(len(probes), len(templates), device=templates.device)
-    with ieee_products(templates.device):
-        for rows, columns, distances in _tiles(probes, templates, metric, steps):
-            out[rows, columns] = distances
-    return out
+def tiles(
+    probes: Probes, templates: SubspaceBatch, *, metric: Metric, steps: int, device: str
+) -> Iterator[Tile]:
+    """Yield rows, columns and distances (R, C) float32 of all parts of the matrix."""
+    there = usable(device)
+    budget = _TILE_BYTES.get(there.type, 128 << 20) // 4
+    deep = probes.m + 1 if isinstance(probes, SubspaceBatch) else 1
+    wide = templates.m + 1
+    pairs = max(1, budget // (deep * wide))
+    # The stacked rows count too: few probes and many templates must not make a long tile.
+    height = max(1, min(len(probes), math.isqrt(pairs), budget // (deep * templates.n)))
+    width = max(1, min(len(templates), pairs // height, budget // (wide * templates.n)))
+    for columns in parts(len(templates), width):
+        right = stacked(templates[columns], metric, there)
+        for rows in parts(len(probes), height):
+            left = stacked(probes[rows], metric, there)
+            with ieee_products(there):
+                out = distances(left, right, metric=metric, steps=steps).cpu().numpy()
+            i, j = np.nonzero(~((out >= NEAR) & (out < np.inf)))
+            if i.size:
+                sides = probes[rows], templates[columns]
+                out[i, j] = exact.pairs(*sides, i, j, metric=metric, steps=steps)
+            yield rows, columns, out
 
 
-def paired(
-    probes: SubspaceTensors, templates: SubspaceTensors, *, metric: Metric, steps: int
-) -> Tensor:
-    """Distances of subspace i to subspace i, (P,)."""
-    out = torch.empty(len(templates), device=templates.device)
-    numbers = (probes.m + templates.m + 2) * probes.n + (probes.m + 1) * (templates.m + 1)
-    step = max(1, TILE_BYTES[templates.device.type] // 4 // numbers)
-    with ieee_products(templates.device):
-        for part in parts(len(templates), step):
-            out[part] = _distances(probes[part], templates[part], metric, steps, paired=True)
-    return out
-
-
-def nearest(
-    probes: Side,
-    templates: SubspaceTensors,
-    k: int,
-    *,
-    of_templates: bool = False,
-    labels: Labels | None = None,
-    **options: Any,
-) -> tuple[Tensor, Tensor]:
-    """Indices and distances of the k nearest, as ``templates.distances.nearest`` finds them."""
-    there = templates.device
-    best = torch.full((len(templates if of_templates else probes), k), _NOTHING, device=there)
-    with ieee_products(there):
-        for rows, columns, distances in _tiles(probes, templates, **options):
-            # A distance is not negative, so its bits ascend with it.
-            keys = distances.abs().contiguous().view(torch.int32).long() << 32
-            _drop(keys, labels, rows, columns, _NOTHING)
-            if of_templates:
-                rows, columns, keys = columns, rows, keys.T
-            keys = keys | torch.arange(columns.start, columns.stop, device=there)
-            keys = torch.cat([best[rows], keys], dim=1)
-            best[rows] = torch.topk(keys, k, dim=1, largest=False).values
-    nothing = best == _NOTHING
-    distances = (best >> 32).int().view(torch.float32).masked_fill(nothing, torch.inf)
-    return (best & 0xFFFFFFFF).masked_fill_(nothing, -1), distances
-
-
-def counts_within(
-    probes: Side,
-    templates: SubspaceTensors,
-    thresholds: NDArray[np.float64],
-    *,
-    labels: Labels | None = None,
-    **options: Any,
-) -> Tensor:
-    """Numbers of pairs up to each threshold, int64; thresholds ascend."""
-    bounds = torch.tensor(thresholds, dtype=torch.float64, device=templates.device)
-    counts = torch.zeros(len(bounds) + 1, dtype=torch.int64, device=templates.device)
-    with ieee_products(templates.device):
-        for rows, columns, distances in _tiles(probes, templates, **options):
-            places = torch.searchsorted(bounds, distances.double().contiguous())
-            _drop(places, labels, rows, columns, len(bounds))
-            counts += torch.bincount(places.flatten(), minlength=len(counts))
-    return counts[:-1].cumsum(0)
+def stacked(side: Probes, metric: Metric, device: torch.device) -> Rows:
+    """Copy points or subspaces to a device, those of the sphere scaled to it."""
+    spherical = metric is Metric.SPHERICAL
+    if isinstance(side, SubspaceBatch):
+        rows = torch.tensor(side.bases, device=device).transpose(0, 1)
+        feet = torch.tensor(side.feet, device=device)
+        if spherical:
+            scales, radii = (
+                torch.tensor(part, dtype=torch.float32, device=device)[:, None]
+                for part in exact.spheres(side.feet)
+            )
+            feet, rows = feet * scales, rows * radii
+        rows = torch.cat([feet[None], rows])
+    else:
+        points = exact.normalised(side.astype(np.float64)) if spherical else side
+        rows = torch.tensor(points, dtype=torch.float32, device=device)[None]
+    lengths: Tensor = torch.linalg.vector_norm(rows[0], dim=1, dtype=torch.float64)
+    return Rows(rows.contiguous(), lengths.square().float())
 
 
 @contextmanager
@@ -141,8 +103,8 @@ def ieee_products(device: torch.device) -> Iterator[None]:
     torch has an older and a newer setting for this and refuses to read the older one where only
     the newer has been changed. Setting the older one sets both.
     """
-    parts = torch.backends.cuda, torch.backends.mkldnn
-    backends: list[Any] = [part.matmul for part in parts if hasattr(part, "matmul")]
+    kinds = torch.backends.cuda, torch.backends.mkldnn
+    backends: list[Any] = [kind.matmul for kind in kinds if hasattr(kind, "matmul")]
     newer = [getattr(backend, "fp32_precision", None) for backend in backends]
     try:
         older = torch.get_float32_matmul_precision()
@@ -160,111 +122,24 @@ def ieee_products(device: torch.device) -> Iterator[None]:
                 backend.fp32_precision = precision
 
 
-def stacked(side: Side) -> Tensor:
-    """Points, or rows [p; D] with all feet first, then all first directions, ((m + 1) · N, n)."""
-    if isinstance(side, Tensor):
-        return side
-    return torch.cat([side.feet[None], side.bases.transpose(0, 1)]).flatten(0, 1)
+def distances(left: Rows, right: Rows, *, metric: Metric, steps: int) -> Tensor:
+    """Distances (P, T) of stacked rows, without a guarantee for those that float32 gets wrong.
 
-
-def usable(device: str) -> torch.device:
-    """Name a device; a TemplateError says why torch cannot use it."""
-    try:
-        torch.zeros(1, device=device).cpu()
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
-        raise TemplateError(
-            f"torch cannot use the device {device}: {str(error).splitlines()[0]}"
-        ) from None
-    return torch.device(device)
-
-
-def placed(side: NDArray[Any] | SubspaceBatch, device: torch.device) -> Side:
-    """Copy points or subspaces to a device."""
-    if isinstance(side, SubspaceBatch):
-        return SubspaceTensors.of(side, device)
-    return torch.tensor(side, dtype=torch.float32, device=device)
-
-
-def _drop(table: Tensor, labels: Labels | None, rows: slice, columns: slice, value: int) -> None:
-    """Overwrite the pairs of a tile that have equal labels."""
-    if labels is not None:
-        left, right = (torch.as_tensor(side, device=table.device) for side in labels)
-        table.masked_fill_(left[rows, None] == right[columns], value)
-
-
-# --- one tile ------------------------------------------------------------------------------------
-
-
-def _tiles(
-    probes: Side, templates: SubspaceTensors, metric: Metric, steps: int
-) -> Iterator[tuple[slice, slice, Tensor]]:
-    """Yield rows, columns and their distances, the columns of one row of tiles in order."""
-    rows, columns, budget = len(probes), len(templates), TILE_BYTES[templates.device.type] // 4
-    deep, wide = 1 if isinstance(probes, Tensor) else probes.m + 1, templates.m + 1
-    pairs = max(1, budget // (deep * wide))
-    # The stacked rows count too: few probes and many templates must not make a long tile.
-    height = max(1, min(rows, math.isqrt(pairs), budget // (deep * templates.n)))
-    width = max(1, min(columns, pairs // height, budget // (wide * templates.n)))
-    for row in parts(rows, height):
-        for column in parts(columns, width):
-            yield row, column, _distances(probes[row], templates[column], metric, steps)
-
-
-def _distances(
-    probes: Side, templates: SubspaceTensors, metric: Metric, steps: int, *, paired: bool = False
-) -> Tensor:
-    """Distances of one tile, shape (P, T), or of probe i to template i, shape (P,)."""
-    spherical = metric is Metric.SPHERICAL
-    left, right = (_on_sphere(side) if spherical else side for side in (probes, templates))
-    # Products of every pair: (pairs, m_D + 1, m_E + 1), m_D = 0 for points.
-    rows, columns = stacked(left), stacked(right)
-    if paired:
-        rows, columns = (part.view(-1, len(probes), templates.n) for part in (rows, columns))
-        block = rows.transpose(0, 1) @ columns.permute(1, 2, 0)
-    else:
-        gram = (rows @ columns.T).view(-1, len(probes), templates.m + 1, len(templates))
-        block = gram.permute(1, 3, 0, 2).flatten(0, 1).contiguous()
-    if spherical:
-        gains = block[:, 0, 1:].norm(dim=1) if isinstance(left, Tensor) else _gains(block, steps)
+    What is nearer than 0.1, NaN or infinite has to be computed by ``exact``.
+    """
+    deep, count, n = left.rows.shape
+    wide, others = right.rows.shape[:2]
+    gram = (left.rows.view(-1, n) @ right.rows.view(-1, n).T).view(deep, count, wide, others)
+    block = gram.permute(1, 3, 0, 2).flatten(0, 1).contiguous()  # (pairs, m_D + 1, m_E + 1)
+    if metric is Metric.SPHERICAL:
+        gains = block[:, 0, 1:].norm(dim=1) if deep == 1 else _gains(block, steps)
         squared = 2 - 2 * (block[:, 0, 0] + gains)
+        if deep == 1:  # a zero probe has no direction: similarity 0 with everything
+            squared = torch.where((left.squares > 0).repeat_interleave(others), squared, 2.0)
     else:
-        squares = _squares(left) if paired else _squares(left)[:, None]
-        gaps = (squares + _squares(right)).flatten() - 2 * block[:, 0, 0]
-        lifted = not isinstance(left, Tensor)
-        squared = _schur(block, gaps) if lifted else gaps - block[:, 0, 1:].square().sum(dim=1)
-    distances = squared.clamp(min=0).sqrt()
-    if not paired:
-        distances = distances.view(len(probes), len(templates))
-    near = torch.nonzero(~((distances >= NEAR) & (distances < torch.inf)), as_tuple=True)
-    if len(near[0]):
-        i, j = (index.cpu().numpy() for index in (near[0], near[-1]))
-        sides = _on_processor(probes), _on_processor(templates)
-        corrected = exact.pairs(*sides, i, j, metric=metric, steps=steps)
-        distances[near] = torch.tensor(corrected, dtype=torch.float32, device=distances.device)
-    return distances
-
-
-def _on_processor(side: Side) -> Any:
-    if isinstance(side, Tensor):
-        return side.cpu().numpy()
-    return SubspaceBatch(*(part.cpu().numpy() for part in (side.feet, side.bases)))
-
-
-def _squares(side: Side) -> Tensor:
-    """Squared lengths of points or feet, summed in float64."""
-    rows = side if isinstance(side, Tensor) else side.feet
-    norms: Tensor = torch.linalg.vector_norm(rows, dim=1, dtype=torch.float64)
-    return norms.square().float()
-
-
-def _on_sphere(side: Side) -> Any:
-    """Directions of points; feet and bases times their factors (``exact.spheres``)."""
-    if isinstance(side, Tensor):
-        return _normalised(side.double(), torch.finfo(torch.float64).tiny).float()
-    norms = torch.linalg.vector_norm(side.feet, dim=1, dtype=torch.float64)[:, None]
-    radii = (1 - norms.square()).clamp(min=0).sqrt()
-    feet = side.feet / norms.clamp(min=1).float()
-    return SubspaceTensors(feet, side.bases * radii[:, :, None].float())
+        gaps = (left.squares[:, None] + right.squares).flatten() - 2 * block[:, 0, 0]
+        squared = gaps - block[:, 0, 1:].square().sum(dim=1) if deep == 1 else _schur(block, gaps)
+    return squared.clamp(min=0).sqrt().view(count, others)
 
 
 def _schur(block: Tensor, gaps: Tensor) -> Tensor:
@@ -286,64 +161,40 @@ def _schur(block: Tensor, gaps: Tensor) -> Tensor:
     return squared.masked_fill(~sound, torch.nan)
 
 
-class _Problem(NamedTuple):
-    """Maximise g·u + h·v + uᵀBv over unit u and v, for K pairs."""
-
-    g: Tensor
-    h: Tensor
-    b: Tensor
-
-    def take(self, index: Tensor) -> Self:
-        return type(self)(*(part[index] for part in self))
-
-
 def _gains(block: Tensor, steps: int) -> Tensor:
-    """What the directions add to p·q: ``exact.maximise`` from its two starts."""
-    problem = _Problem(block[:, 1:, 0], block[:, 0, 1:], block[:, 1:, 1:].contiguous())
-    power = problem.b.mT @ problem.b
+    """Maximise g·u + h·v + uᵀBv from two starts, as ``exact.maximise``, all pairs in step."""
+    g, h, b = block[:, None, 1:, 0], block[:, None, 0, 1:], block[:, 1:, 1:].contiguous()
+    power = b.mT @ b
     for _ in range(5):
         power = power / power.diagonal(dim1=1, dim2=2).sum(1).clamp(min=_TINY)[:, None, None]
         power = power @ power
     largest = power.diagonal(dim1=1, dim2=2).argmax(dim=1)
     leading = _normalised(power[torch.arange(len(power), device=power.device), :, largest])
     v = torch.stack([leading, -leading], dim=1)
-    values = v.new_zeros(v.shape[:2])
-    active = torch.arange(len(v), device=v.device)
-    value, stepped = _step(problem, v)
-    moved, trial = stepped - v, stepped
-    for taken in range(1, steps):
-        next_value, next_stepped = _step(problem, trial)
-        if taken > 1:
-            again = torch.nonzero((next_value < value).any(dim=1))[:, 0]
-            keep = (next_value[again] >= value[again])[:, :, None]
-            trial[again] = torch.where(keep, trial[again], stepped[again])
-            next_value[again], next_stepped[again] = _step(problem.take(again), trial[again])
-        next_moved = next_stepped - trial
-        turn = next_moved - moved
-        slope = (next_moved * turn).sum(2) / turn.square().sum(2).clamp(min=_TINY)
-        slope = slope.clamp(-LONGEST, LONGEST)[:, :, None]
-        value, moved = next_value, next_moved
-        trial = _normalised(next_stepped - slope * (next_stepped - stepped))
-        stepped = next_stepped
-        if taken % 4 == 0:
-            done = (moved.square().sum(2) < STILL**2).all(dim=1)
-            values[active[done]] = value[done]
-            active, problem = active[~done], problem.take(~done)
-            value, moved, trial, stepped = (p[~done] for p in (value, moved, trial, stepped))
-            if not len(active):
-                break
-    values[active] = value
-    return values.amax(dim=1)
+    value = torch.full_like(v[..., :1], -4)
+    moved = stepped = torch.zeros_like(v)
+    for taken in range(steps):
+        u = v @ b.mT + g
+        following = _normalised(_normalised(u) @ b + h)
+        new = u.norm(dim=2, keepdim=True) + (v * h).sum(dim=2, keepdim=True)
+        # Where the extrapolated point is worse than the last one, the plain step comes next.
+        worse = new < value - 1e-6
+        motion = following - v
+        turn = motion - moved
+        slope = (motion * turn).sum(2, keepdim=True)
+        slope = slope / turn.square().sum(2, keepdim=True).clamp(min=_TINY)
+        slope = slope.clamp(-LONGEST, LONGEST) if taken else torch.zeros_like(slope)
+        value = torch.where(worse, value, new)
+        trial = following - slope * (following - stepped)
+        v = _normalised(torch.where(worse, stepped, trial))
+        moved, stepped = torch.where(worse, moved, motion), torch.where(worse, stepped, following)
+        resting = ~worse[..., 0] & (motion.square().sum(2) < STILL**2)
+        if taken % 8 == 7 and bool(resting.all()):
+            break
+    return value.amax(dim=(1, 2))
 
 
-def _step(problem: _Problem, v: Tensor) -> tuple[Tensor, Tensor]:
-    """Value at v with the best u, shape (K, S), and the next v, shape (K, S, m_E)."""
-    u = v @ problem.b.mT + problem.g[:, None]
-    following = _normalised(u) @ problem.b + problem.h[:, None]
-    return u.norm(dim=2) + (v @ problem.h[:, :, None])[:, :, 0], _normalised(following)
-
-
-def _normalised(rows: Tensor, tiny: float = _TINY) -> Tensor:
+def _normalised(rows: Tensor) -> Tensor:
     """Unit rows along the last axis; a zero row stays zero."""
-    norms: Tensor = torch.linalg.vector_norm(rows, dim=-1, keepdim=True)
-    return rows / norms.clamp(min=tiny)
+    units: Tensor = rows / rows.norm(dim=-1, keepdim=True).clamp(min=_TINY)
+    return units

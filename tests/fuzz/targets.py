@@ -130,7 +130,7 @@ def probe(folder: Path) -> Target:
         demand(np.isfinite(decision.distance), "a finite distance")
         demand(np.isfinite(decision.score), "a finite score")
 
-    read(wire.encode(subspace(K, 2), contract_id=contract.contract_id))  # compiles the kernels
+    read(wire.encode(subspace(K, 2), contract_id=contract.contract_id))
     refusals = (InvalidTemplate, ContractMismatch, Uncalibrated)
     return Target(read, refusals, templates.make, 64)
 

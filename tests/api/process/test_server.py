@@ -89,35 +89,6 @@ def http(server: Server) -> Iterator[httpx.Client]:
 
 
 @pytest.mark.long
-def test_the_kernels_are_compiled_before_the_server_is_ready(tmp_path: Path) -> None:
-    """A first start, with nothing in the compiler's cache."""
-    kernels = tmp_path / "kernels"
-    deployment = deploy(tmp_path, workers=1, port=free_port())
-    server = Server(deployment, tmp_path, NUMBA_CACHE_DIR=str(kernels))
-    try:
-        server.wait()
-        ready = sorted(path.name for path in kernels.rglob("*.nb[ci]"))
-        with httpx.Client(
-            base_url=server.url, headers=bearer(deployment.token), timeout=PATIENCE_S
-        ) as client:
-            assert client.put("/v1/subjects/a/enrollment", files=images(photo(1))).is_success
-            answer = client.post("/v1/subjects/a/verify", files=images(photo(1, 2), name="image"))
-            assert answer.is_success
-    finally:
-        server.stop()
-    named = {name.split("-")[0].split(".")[1] for name in ready}
-    assert {
-        "compute",
-        "solve",
-        "euclidean_subspaces",
-        "spherical_subspaces",
-        "keep_nearest",
-        "count_within",
-    } <= named
-    assert sorted(path.name for path in kernels.rglob("*.nb[ci]")) == ready
-
-
-@pytest.mark.long
 @pytest.mark.parametrize("seconds", [0.0, 0.5])
 def test_a_start_that_is_stopped_leaves_nothing(tmp_path: Path, seconds: float) -> None:
     deployment = deploy(tmp_path, workers=2, port=free_port(), compute_slots=1)

@@ -178,13 +178,13 @@ def test_threads_search_on_the_device_of_their_caller(monkeypatch: pytest.Monkey
     from templates.distances import torch
 
     searched = []
-    nearest = torch.nearest
+    tiles = torch.tiles
 
-    def spy(probes: Any, templates: Any, k: int, **options: Any) -> Any:
+    def spy(probes: Any, templates: Any, **options: Any) -> Any:
         searched.append(len(probes) * len(templates))
-        return nearest(probes, templates, k, **options)
+        return tiles(probes, templates, **options)
 
-    monkeypatch.setattr(torch, "nearest", spy)
+    monkeypatch.setattr(torch, "tiles", spy)
     plan = AttributePlan(feature_ks=(10,), threads=2)
     setup = prepared(SMALL, plan=plan, seed=1)
     here = run_scheme(setup, OURS)

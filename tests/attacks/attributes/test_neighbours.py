@@ -14,7 +14,7 @@ from attacks.attributes.neighbours import (
 )
 from attacks.errors import AuditError
 from templates.decoys import DecoyPool
-from templates.distances import Metric, Neighbours, pairwise_distances, tiles
+from templates.distances import Metric, Neighbours, compiled, pairwise_distances
 from templates.keys.randomness import Keystream
 from templates.space.lifting import lift
 from tests.attacks.attributes.people import faces
@@ -31,11 +31,11 @@ TEMPLATES = lift(
 
 
 @pytest.mark.parametrize("metric", METRICS)
-@pytest.mark.parametrize("side", [1024, 200, 64])
+@pytest.mark.parametrize("size", [1 << 19, 1 << 11])
 def test_finds_what_sorting_all_distances_finds(
-    metric: Metric, side: int, monkeypatch: pytest.MonkeyPatch
+    metric: Metric, size: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(tiles, "_TILE_SIDE", side)
+    monkeypatch.setattr(compiled, "_TASK_PAIRS", size)
     found = nearest_neighbours(TEMPLATES, GALLERY, k=12)[metric]
     exact = pairwise_distances(GALLERY, TEMPLATES, metric=metric, dtype=np.float64).T
     np.testing.assert_allclose(found.distances, np.sort(exact, axis=1)[:, :12], atol=2e-5)
@@ -74,7 +74,7 @@ def test_two_searches_find_what_one_does() -> None:
 
 
 def test_memory_does_not_grow_with_the_gallery(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tiles, "_BLOCK_BYTES", 1 << 20)
+    monkeypatch.setattr(compiled, "_TASK_PAIRS", 1 << 15)
 
     def peak(rows: int) -> int:
         gallery = np.resize(GALLERY, (rows, 64))

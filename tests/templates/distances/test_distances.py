@@ -1,3 +1,5 @@
+"""Distances agree with independent computations, whichever of the three files computes them."""
+
 import functools
 import itertools
 import tracemalloc
@@ -13,48 +15,26 @@ from hypothesis import strategies as st
 from templates.distances import (
     DEFAULT_STEPS,
     Metric,
-    exact,
     paired_distances,
     pairwise_distances,
     similarity,
-    tiles,
 )
 from templates.errors import InvalidEmbedding, InvalidTemplate, TemplateError
 from templates.keys.randomness import Keystream
 from templates.space.lifting import lift
 from templates.space.subspace import AffineSubspace, SubspaceBatch
-
-N = 24
-METRICS = [str(metric) for metric in Metric]
-DTYPES = ["float32", "float64"]
-
-
-def units(stream: Keystream, count: int, n: int = N) -> np.ndarray:
-    rows = stream.normal((count, n))
-    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
-
-
-def through(members: np.ndarray, seed: int = 0) -> AffineSubspace:
-    """The set that holds all members."""
-    return AffineSubspace.through(
-        members[0], members[1:] - members[0], stream=Keystream.seeded("through", seed)
-    )
-
-
-def randoms(count: int, m: int, seed: int, n: int = N) -> SubspaceBatch:
-    stream = Keystream.seeded("randoms", seed)
-    return lift(units(stream, count, n), strategy="random", m=m, stream=stream)
-
-
-def faces(count: int, m: int, seed: int, n: int = 128) -> SubspaceBatch:
-    """Adversarial lifts among descriptors that are spread like faces: a mean, a steep spectrum."""
-    stream = Keystream.seeded("faces", seed)
-    scales = 1 / np.sqrt(1 + np.arange(n) / 8)
-    rows = stream.normal((count * (m + 1), n)) * scales + 0.3 * (np.arange(n) == 0)
-    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
-    members = rows.reshape(count, m + 1, n)
-    return SubspaceBatch.through(members[:, 0], members[:, 1:] - members[:, :1], stream=stream)
-
+from tests.templates.distances.batches import (
+    BACKENDS,
+    METRICS,
+    N,
+    backend,
+    faces,
+    matrix,
+    pairs,
+    randoms,
+    through,
+    units,
+)
 
 # --- independent computations, in float64 ------------------------------------------------------
 
@@ -101,47 +81,6 @@ BRUTE: dict[str, Callable[[AffineSubspace, AffineSubspace], float]] = {
 }
 
 
-def pairs() -> dict[str, tuple[AffineSubspace, AffineSubspace]]:
-    """Pairs of subspaces in every relation that matters."""
-    stream = Keystream.seeded("pairs")
-    x = units(stream, 14)
-    axes = scipy.linalg.qr(stream.normal((N, N)))[0]
-
-    def of(foot: np.ndarray, basis: np.ndarray) -> AffineSubspace:
-        return AffineSubspace(foot, basis)
-
-    tilt = np.cos(1e-3) * axes[0] + np.sin(1e-3) * axes[1]
-    crossing = 0.5 * axes[9] + 0.3 * (np.cos(0.01) * axes[1] - np.sin(0.01) * axes[0])
-    crossed = np.cos(0.01) * axes[0] + np.sin(0.01) * axes[1]
-    plane = np.stack([axes[0], axes[1], axes[2]])
-    slight = np.cos(2e-5) * axes[0] + np.sin(2e-5) * axes[1]
-    return {
-        "random": (through(x[:4]), through(x[4:8])),
-        "unequal dimensions": (through(x[:3]), through(x[4:10])),
-        "lines": (through(x[:2]), through(x[2:4])),
-        "shared decoy": (through(x[:4]), through(x[3:7])),
-        "two shared decoys": (through(x[:5]), through(x[3:8])),
-        "contained": (through(x[:6]), through(x[1:4])),
-        "identical": (through(x[:4]), through(x[:4], seed=1)),
-        "orthogonal": (of(0.4 * axes[8], axes[:3]), of(0.5 * axes[9], axes[3:6])),
-        "parallel": (of(0.4 * axes[8], axes[:3]), of(0.5 * axes[9], axes[:3])),
-        "parallel, other basis": tuple(
-            AffineSubspace.through(foot, plane, stream=Keystream.seeded("plane", seed))
-            for seed, foot in enumerate((0.4 * axes[8], 0.5 * axes[9]))
-        ),
-        # The closest points are 30 away from the foot points: float32 products do not do.
-        "crossing far away": (of(0.4 * axes[8], axes[:1]), of(crossing, crossed[None])),
-        "one shared direction": (of(0.4 * axes[8], axes[:3]), of(0.5 * axes[9], axes[2:5])),
-        "nearly parallel": (of(0.4 * axes[8], axes[:1]), of(0.5 * axes[9], tilt[None])),
-        "very nearly parallel": (
-            of(0.4 * axes[8], axes[[0, 4]]),
-            of(0.5 * axes[9], np.stack([slight, axes[5]])),
-        ),
-        "central": (of(np.zeros(N), axes[:3]), through(x[:4])),
-        "close": (of(0.4 * axes[8], axes[:2]), of(0.4 * axes[8] + 0.02 * axes[9], axes[2:4])),
-    }
-
-
 MEETING = {"shared decoy", "two shared decoys", "contained", "identical"}
 
 
@@ -150,18 +89,15 @@ def brute_force(name: str, metric: str) -> float:
     return BRUTE[metric](*pairs()[name])
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("name", BACKENDS)
 @pytest.mark.parametrize("metric", METRICS)
-@pytest.mark.parametrize("name", pairs())
-def test_subspace_pairs_agree_with_brute_force(name: str, metric: str, dtype: str):
-    a, b = pairs()[name]
-    expected = brute_force(name, metric)
+@pytest.mark.parametrize("relation", pairs())
+def test_subspace_pairs_agree_with_brute_force(relation: str, metric: str, name: str):
+    a, b = pairs()[relation]
+    expected = brute_force(relation, metric)
     for one, two in ((a, b), (b, a)):
-        seen = pairwise_distances(
-            SubspaceBatch.of([one]), SubspaceBatch.of([two]), metric=metric, dtype=dtype
-        )
-        assert seen.dtype == dtype
-        if name in MEETING:
+        seen = matrix(name, SubspaceBatch.of([one]), SubspaceBatch.of([two]), metric=metric)
+        if relation in MEETING:
             assert 0 <= seen[0, 0] < (1e-6 if metric == "euclidean" else 1e-5)
         else:
             assert seen[0, 0] == pytest.approx(expected, rel=1e-4 if expected > 0.1 else 1e-3)
@@ -173,19 +109,17 @@ def brute_table(metric: str) -> np.ndarray:
     return np.array([[BRUTE[metric](x, y) for y in b] for x in a])
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("name", BACKENDS)
 @pytest.mark.parametrize("metric", METRICS)
-def test_random_subspaces_agree_with_brute_force(metric: str, dtype: str):
-    a, b = faces(3, 3, seed=1, n=16), faces(4, 2, seed=2, n=16)
-    seen = pairwise_distances(a, b, metric=metric, dtype=dtype)
-    expected = brute_table(metric)
-    rtol = 1e-4 if dtype == "float32" else 1e-6
-    np.testing.assert_allclose(seen, expected, rtol=rtol)
+def test_random_subspaces_agree_with_brute_force(metric: str, name: str):
+    seen = matrix(name, faces(3, 3, seed=1, n=16), faces(4, 2, seed=2, n=16), metric=metric)
+    rtol = 1e-6 if name == "exact" else 1e-4
+    np.testing.assert_allclose(seen, brute_table(metric), rtol=rtol)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("name", BACKENDS)
 @pytest.mark.parametrize("metric", METRICS)
-def test_points_agree_with_brute_force(metric: str, dtype: str):
+def test_points_agree_with_brute_force(metric: str, name: str):
     stream = Keystream.seeded("points")
     points = units(stream, 30)
     templates = lift(units(stream, 12), strategy="random", m=5, stream=stream)
@@ -196,30 +130,77 @@ def test_points_agree_with_brute_force(metric: str, dtype: str):
     for step in (0.01, 0.09):
         moved = member + step * units(stream, 1)[0]
         near.append(moved / np.linalg.norm(moved))
-    points = np.vstack([points, *near])
-    seen = pairwise_distances(points.astype(dtype), templates, metric=metric, dtype=dtype)
-    expected = np.array(
-        [[brute_point(x, t, metric) for t in templates] for x in points.astype(dtype)]
-    )
-    assert seen.dtype == dtype
+    points = np.vstack([points, *near]).astype(np.float32).astype(np.float64)
+    seen = matrix(name, points, templates, metric=metric)
+    expected = np.array([[brute_point(x, t, metric) for t in templates] for x in points])
     assert expected.min() < 0.02
-    rtol, atol = (2e-5, 2e-6) if dtype == "float32" else (1e-7, 1e-7)
+    rtol, atol = (1e-6, 5e-7) if name == "exact" else (2e-5, 2e-6)
     np.testing.assert_allclose(seen, expected, rtol=rtol, atol=atol)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("name", BACKENDS)
 @pytest.mark.parametrize("metric", METRICS)
-def test_a_member_is_at_distance_zero(metric: str, dtype: str):
+def test_a_member_is_at_distance_zero(metric: str, name: str):
     stream = Keystream.seeded("members")
     members = units(stream, 9)
     template = SubspaceBatch.of([through(members)])
-    distances = pairwise_distances(members.astype(dtype), template, metric=metric, dtype=dtype)
-    assert (distances >= 0).all()
-    assert distances.max() < 1e-6
+    seen = matrix(name, members, template, metric=metric)
+    assert (seen >= 0).all()
+    assert seen.max() < 1e-6
     probes = lift(members, strategy="random", m=4, stream=stream)
-    distances = pairwise_distances(probes, template, metric=metric, dtype=dtype)
-    assert (distances >= 0).all()
-    assert distances.max() < (1e-6 if metric == "euclidean" else 2e-4)
+    seen = matrix(name, probes, template, metric=metric)
+    assert (seen >= 0).all()
+    assert seen.max() < (1e-6 if metric == "euclidean" else 2e-4)
+
+
+# --- the two in float32 against float64 --------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["compiled", "torch"])
+@pytest.mark.parametrize("metric", METRICS)
+@pytest.mark.parametrize(
+    ("m", "k", "n"),
+    [(1, 1, 64), (1, 9, 64), (2, 2, 64), (3, 4, 200), (7, 5, 64), (2, 16, 128), (20, 33, 512)],
+)
+def test_float32_agrees_with_the_specification(m: int, k: int, n: int, metric: str, name: str):
+    a, b = faces(21, m, seed=1, n=n), faces(37, k, seed=2, n=n)
+    points = units(Keystream.seeded("points"), 21, n).astype(np.float32)
+    expected = matrix("exact", points, b, metric=metric)
+    np.testing.assert_allclose(matrix(name, points, b, metric=metric), expected, rtol=3e-6)
+    # Some pairs meet, and no product in float32 can say so.
+    b = SubspaceBatch(np.concatenate([b.feet, b.feet[:2]]), np.concatenate([b.bases, b.bases[:2]]))
+    for one, two in ((a, b), (b[:30], b)):
+        seen = similarity(matrix(name, one, two, metric=metric).astype(np.float64))
+        expected = similarity(matrix("exact", one, two, metric=metric, steps=400))
+        assert (seen - expected).max() < 2e-5
+        # The search for the maximum on the sphere may end in the lower of two.
+        missing = expected - seen
+        assert np.quantile(missing, 0.98) < 3e-6
+        assert missing.max() < (3e-6 if metric == "euclidean" else 1e-2)
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+@pytest.mark.parametrize("scale", [1.5, 40.0, 1e25])
+@pytest.mark.parametrize("metric", METRICS)
+def test_sets_outside_the_sphere_and_squares_that_overflow(metric: str, scale: float, name: str):
+    axes = np.eye(64)
+    outside = SubspaceBatch((scale * axes[5])[None], axes[None, :3])
+    templates = faces(6, 4, seed=4, n=64)
+    points = np.vstack([units(Keystream.seeded(2), 4, 64), np.zeros((1, 64))])
+    for probes, others in ((outside, templates), (templates, outside), (points, outside)):
+        np.testing.assert_allclose(
+            matrix(name, probes, others, metric=metric),
+            matrix("exact", probes, others, metric=metric),
+            rtol=3e-6,
+        )
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+@pytest.mark.parametrize("size", [1e-25, 1e-12, 1e12, 1e25])
+def test_the_length_of_a_point_does_not_count_on_the_sphere(size: float, name: str) -> None:
+    templates, points = randoms(20, 2, seed=1), units(Keystream.seeded(1), 3)
+    seen = matrix(name, size * points, templates, metric="spherical")
+    np.testing.assert_allclose(seen, matrix(name, points, templates, metric="spherical"), rtol=1e-5)
 
 
 @pytest.mark.parametrize("metric", METRICS)
@@ -259,15 +240,14 @@ def restarted_similarities(restarts: int) -> np.ndarray:
     return out
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_default_steps_reach_the_best_of_many_restarts(dtype: str):
+@pytest.mark.parametrize("name", BACKENDS)
+def test_default_steps_reach_the_best_of_many_restarts(name: str):
     a, b = hard_pairs()
     best = restarted_similarities(64)
-    seen = pairwise_distances(a, b, metric="spherical", dtype=dtype)
-    missing = best - similarity(seen)
-    assert np.abs(missing).max() < (2e-6 if dtype == "float32" else 1e-6)
+    missing = best - similarity(matrix(name, a, b, metric="spherical").astype(np.float64))
+    assert np.abs(missing).max() < (1e-6 if name == "exact" else 2e-6)
     # docs/method.md §3.5: many pairs unfinished after 10 plain steps; the data must be that hard.
-    few = best - similarity(pairwise_distances(a, b, metric="spherical", steps=3, dtype=dtype))
+    few = best - similarity(matrix(name, a, b, metric="spherical", steps=3))
     assert (few > 1e-4).mean() > 0.3
 
 
@@ -335,7 +315,7 @@ def test_distances_obey_the_order_of_the_sets(m: int, k: int, seed: int, metric:
 
 
 @pytest.mark.parametrize("metric", METRICS)
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_paired_is_the_diagonal_of_pairwise(metric: str, dtype: str):
     a, b = faces(15, 4, seed=9), faces(15, 7, seed=10)
     options = {"metric": metric, "dtype": dtype}
@@ -347,44 +327,35 @@ def test_paired_is_the_diagonal_of_pairwise(metric: str, dtype: str):
         np.testing.assert_allclose(paired, expected, atol=2e-6)
 
 
-@pytest.mark.parametrize(
-    ("metric", "dtype"),
-    [
-        ("euclidean", "float32"),
-        ("euclidean", "float64"),
-        ("spherical", "float32"),
-        pytest.param("spherical", "float64", marks=pytest.mark.long),
-    ],
-)
+@pytest.mark.parametrize("name", BACKENDS)
+@pytest.mark.parametrize("metric", METRICS)
 def test_tiles_bound_the_memory_and_do_not_show(
-    metric: str, dtype: str, monkeypatch: pytest.MonkeyPatch
+    metric: str, name: str, monkeypatch: pytest.MonkeyPatch
 ):
     a, b = randoms(150, 6, seed=11), randoms(150, 7, seed=12)
     points = units(Keystream.seeded(2), 900).astype(np.float32)
-
-    def everything() -> list[np.ndarray]:
-        options = {"metric": metric, "dtype": dtype, "threads": 1}
-        found = [pairwise_distances(probes, b, **options) for probes in (points, a)]
-        return [*found, paired_distances(a, b, metric=metric, dtype=dtype)]
-
-    whole = everything()
-    for module, name, size in (
-        (exact, "_CHUNK_BYTES", 1 << 16),
-        (tiles, "_TILE_SIDE", 64),
-        (tiles, "_BLOCK_BYTES", 1 << 16),
-        (tiles, "_PAIRED_BYTES", 1 << 16),
-    ):
-        monkeypatch.setattr(module, name, size)
-    tracemalloc.start()
-    tiled = everything()
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
+    module, options = backend(name)
+    whole = [matrix(name, probes, b, metric=metric) for probes in (points, a)]
+    for size, value in {
+        "_CHUNK_BYTES": 1 << 16,
+        "_SIDE": 32,
+        "_TASK_PAIRS": 1 << 12,
+        "_TEMPLATE_ROWS": 128,
+        "_TILE_BYTES": {"cpu": 1 << 16},
+    }.items():
+        if hasattr(module, size):
+            monkeypatch.setattr(module, size, value)
+    tiled = [matrix(name, probes, b, metric=metric) for probes in (points, a)]
     for one, two in zip(whole, tiled, strict=True):
         np.testing.assert_allclose(two, one, atol=5e-6)
-    results = sum(distances.nbytes for distances in tiled)
+    tracemalloc.start()
+    for _ in module.tiles(a, b, metric=Metric(metric), steps=50, **options):
+        pass
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
     # The cross-Gram matrix of the subspaces alone would be 5 MB.
     assert 4 * 150 * 7 * 150 * 8 > 5e6
-    assert peak < 2 * results + (1 << 21)
+    assert peak < 3 << 20
 
 
 # --- odd and hostile input ---------------------------------------------------------------------
@@ -401,35 +372,6 @@ def test_zero_probe_is_as_far_as_the_method_says():
         paired_distances(np.repeat(zero, 4, axis=0), templates, metric="spherical"),
     ):
         np.testing.assert_allclose(distances, np.sqrt(2), rtol=1e-6)
-
-
-def test_spherical_distance_sees_only_the_direction_of_a_point():
-    templates = faces(6, 5, seed=14)
-    points = units(Keystream.seeded(3), 8, 128)
-    points[0] = templates.feet[0] + templates.radii[0] * templates.bases[0, 0]
-    once = pairwise_distances(points, templates, metric="spherical", dtype=np.float64)
-    twice = pairwise_distances(3 * points, templates, metric="spherical", dtype=np.float64)
-    np.testing.assert_allclose(twice, once, atol=1e-9)
-
-
-@pytest.mark.parametrize("scale", [1.0, 1.5, 40.0])
-def test_a_set_outside_the_sphere_gains_nothing(scale: float):
-    axes = np.eye(N)
-    outside = SubspaceBatch((scale * axes[5])[None], axes[None, :3])
-    templates = randoms(20, 4, seed=15)
-    points = units(Keystream.seeded(4), 20)
-    foot = axes[5][None].astype(np.float32)
-    expected = pairwise_distances(foot, templates, metric="spherical")
-    for distances in (
-        pairwise_distances(outside, templates, metric="spherical"),
-        pairwise_distances(templates, outside, metric="spherical").T,
-    ):
-        np.testing.assert_allclose(distances, expected, atol=1e-5)
-    np.testing.assert_allclose(
-        pairwise_distances(points, outside, metric="spherical")[:, 0],
-        np.linalg.norm(points - axes[5], axis=1),
-        rtol=1e-5,
-    )
 
 
 @pytest.mark.parametrize("metric", METRICS)

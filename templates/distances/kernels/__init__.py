@@ -1,1 +1,0 @@
-"""Compiled kernels for tiles of the cross-Gram matrix; ``templates.distances.tiles`` feeds them."""

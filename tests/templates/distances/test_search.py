@@ -1,0 +1,323 @@
+"""What is kept of a matrix that nobody holds: the nearest, and counts; and who computes it."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from templates import distances
+from templates.distances import (
+    Metric,
+    count_within,
+    exact,
+    nearest,
+    on_device,
+    paired_distances,
+    pairwise_distances,
+    warm_up,
+)
+from templates.errors import InvalidEmbedding, TemplateError
+from templates.keys.randomness import Keystream
+from templates.space.lifting import lift
+from tests.patience import PATIENCE_S
+from tests.templates.distances.batches import (
+    BACKENDS,
+    METRICS,
+    backend,
+    faces,
+    matrix,
+    randoms,
+    sorted_matrix,
+    units,
+)
+
+
+@pytest.fixture(params=BACKENDS)
+def name(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Each of the three computes what these small problems need, in many small parts."""
+    module, _ = backend(request.param)
+    for size, value in {
+        "_SIDE": 16,
+        "_TASK_PAIRS": 256,
+        "_TEMPLATE_ROWS": 64,
+        "_TILE_BYTES": {"cpu": 1 << 15},
+    }.items():
+        if hasattr(module, size):
+            monkeypatch.setattr(module, size, value)
+    monkeypatch.setattr(distances, "_FEW", 0 if request.param == "compiled" else 1 << 40)
+    with on_device("cpu" if request.param == "torch" else None):
+        yield request.param
+
+
+SETS = {seed: randoms(60, 3, seed) for seed in (1, 2)}
+
+
+@settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_nearest_is_what_sorting_the_matrix_finds(name: str, data: st.DataObject) -> None:
+    draw = data.draw
+    probes, count, k = draw(st.integers(1, 60)), draw(st.integers(1, 60)), draw(st.integers(1, 70))
+    metric, labels = draw(st.sampled_from(METRICS)), draw(st.integers(0, 4))
+    of_templates = draw(st.booleans())
+    # Half of the rows twice, so that there are ties.
+    order = np.arange(60) % 30
+    points = units(Keystream.seeded(3), 60)[order[:probes]].astype(np.float32)
+    left = SETS[1][order[:probes]] if draw(st.booleans()) else points
+    right = SETS[2][order[:count]]
+    table = pairwise_distances(left, right, metric=metric)
+    tags = None
+    if labels:
+        tags = np.arange(probes) % labels, np.arange(count) % 3
+        table = np.where(tags[0][:, None] == tags[1], np.inf, table)
+    expected = sorted_matrix(table.T if of_templates else table, k)
+    done: list[int] = []
+    found = nearest(
+        left,
+        right,
+        k=k,
+        metric=metric,
+        of_templates=of_templates,
+        labels=tags,
+        progress=done.append,
+    )
+    assert sum(done) == probes * count
+    np.testing.assert_allclose(found.distances, expected.distances, rtol=0, atol=5e-6)
+    assert ((found.indices < 0) == (expected.indices < 0)).all()
+    if name != "torch":  # whose products of equal rows may differ in the last bit
+        np.testing.assert_array_equal(found.indices, expected.indices)
+
+
+@pytest.mark.parametrize("metric", METRICS)
+def test_counts_are_those_of_the_matrix(name: str, metric: str) -> None:
+    templates = faces(70, 4, seed=2, n=64)
+    points = units(Keystream.seeded(4), 50, 64).astype(np.float32)
+    for probes in (points, faces(50, 3, seed=3, n=64)):
+        table = pairwise_distances(probes, templates, metric=metric)
+        people = np.arange(50) // 2, np.arange(70) // 3
+        thresholds = np.concatenate([np.quantile(table, [0.5, 0.01]), [-1.0, 0.0, 9.0, np.inf]])
+        seen = count_within(probes, templates, thresholds, metric=metric)
+        np.testing.assert_array_equal(seen, [(table <= t).sum() for t in thresholds])
+        others = people[0][:, None] != people[1]
+        seen = count_within(probes, templates, thresholds, metric=metric, labels=people)
+        np.testing.assert_array_equal(seen, [(table <= t)[others].sum() for t in thresholds])
+        one = table[5, 5].astype(np.float64)
+        between = count_within(probes, templates, one - 1e-12, metric=metric)
+        assert between == count_within(probes, templates, one, metric=metric) - 1
+
+
+def test_nothing_in_nothing_out(name: str) -> None:
+    templates = randoms(4, 2, seed=1)
+    none = np.empty((0, 24), dtype=np.float32)
+    for metric in METRICS:
+        assert pairwise_distances(none, templates, metric=metric).shape == (0, 4)
+        assert pairwise_distances(templates, templates[:0], metric=metric).shape == (4, 0)
+        assert paired_distances(templates[:0], templates[:0], metric=metric).shape == (0,)
+        found = nearest(none, templates, k=2, metric=metric)
+        assert found.indices.shape == found.distances.shape == (0, 2)
+        found = nearest(none, templates, k=2, metric=metric, of_templates=True)
+        assert (found.indices == -1).all()
+        assert count_within(none, templates, [1.0], metric=metric) == 0
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda t: nearest(t, t, k=0, metric="euclidean"), "at least 1"),
+        (lambda t: count_within(t, t, [[1.0]], metric="euclidean"), "a row of numbers"),
+        (lambda t: count_within(t, t, [np.nan], metric="euclidean"), "a row of numbers"),
+        (lambda t: count_within(t, t, [], metric="euclidean"), "a row of numbers"),
+        (lambda t: nearest(t, t, k=1, metric="euclidean", threads=0), "at least 1 is needed"),
+        (
+            lambda t: count_within(
+                t, t, [1.0], metric="euclidean", labels=(np.arange(3), np.arange(4))
+            ),
+            "do not fit 4 probes and 4 templates",
+        ),
+        (
+            lambda t: nearest(
+                t, t, k=1, metric="euclidean", labels=(np.arange(4) + 0.5, np.arange(4))
+            ),
+            "labels are whole numbers",
+        ),
+        (lambda t: pairwise_distances(t, t, metric="euclidean", steps=0), "one step"),
+    ],
+)
+def test_wrong_parameters_are_refused(call, message: str) -> None:
+    with pytest.raises(TemplateError, match=message):
+        call(randoms(4, 2, seed=1))
+
+
+def test_what_is_infinite_in_float32_is_refused() -> None:
+    templates, far = randoms(4, 2, seed=1), 1e39 * units(Keystream.seeded(1), 3)
+    with pytest.raises(InvalidEmbedding, match="not finite"):
+        pairwise_distances(far, templates, metric="spherical")
+
+
+@pytest.mark.parametrize("metric", METRICS)
+def test_threads_and_neighbours_do_not_change_a_distance(metric: str) -> None:
+    a, b = faces(70, 5, seed=1, n=64), faces(90, 3, seed=2, n=64)
+    for probes in (a, units(Keystream.seeded(5), 70, 64)):
+        alone = matrix("compiled", probes, b, metric=metric, threads=1)
+        for threads in (2, 5):
+            other = matrix("compiled", probes, b, metric=metric, threads=threads)
+            np.testing.assert_allclose(other, alone, rtol=0, atol=2e-6)
+        one = matrix("compiled", probes[7:8], b[31:32], metric=metric)
+        assert one[0, 0] == pytest.approx(alone[7, 31], abs=2e-6)
+
+
+def test_a_failure_of_the_caller_ends_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    from templates.distances import compiled
+
+    monkeypatch.setattr(compiled, "_TASK_PAIRS", 16)
+    monkeypatch.setattr(distances, "_FEW", 0)
+    templates = faces(200, 3, seed=1, n=64)
+
+    def progress(count: int) -> None:
+        raise InterruptedError
+
+    with pytest.raises(InterruptedError):
+        nearest(templates, templates, k=1, metric="euclidean", threads=2, progress=progress)
+
+
+# --- who computes ------------------------------------------------------------------------------
+
+
+def test_few_pairs_and_float64_are_left_to_numpy(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without the extra everything is; a service never loads what it does not need."""
+    used: list[str] = []
+    for module in ("exact", "compiled"):
+        made, _ = backend(module)
+        monkeypatch.setattr(made, "tiles", lambda *_, of=module, **__: iter(used.append(of) or ()))
+    points, templates = np.zeros((64, 24), np.float32), randoms(65, 2, seed=1)
+    pairwise_distances(points, templates[:64], metric="spherical")
+    pairwise_distances(points, templates, metric="spherical")
+    pairwise_distances(points, templates, metric="spherical", dtype=np.float64)
+    monkeypatch.setitem(sys.modules, "templates.distances.compiled", None)
+    monkeypatch.delattr(distances, "compiled")
+    pairwise_distances(points, templates, metric="spherical")
+    assert used == ["exact", "compiled", "exact", "exact"]
+    with pytest.raises(TemplateError, match=r"veilface\[evaluate\]"):
+        warm_up()
+
+
+@pytest.mark.parametrize("metric", METRICS)
+def test_a_device_holds_for_its_block_alone_and_not_for_float64(
+    metric: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    torch, _ = backend("torch")
+    used: list[str] = []
+    make = torch.tiles
+
+    def spy(*sides, **options):
+        used.append(options["device"])
+        return make(*sides, **options)
+
+    monkeypatch.setattr(torch, "tiles", spy)
+    templates = faces(4, 3, seed=14)
+    with on_device("cpu"):
+        there = pairwise_distances(templates, templates, metric=metric)
+        pairwise_distances(templates, templates, metric=metric, dtype=np.float64)
+        paired_distances(templates, templates, metric=metric)
+        with on_device(None):
+            here = pairwise_distances(templates, templates, metric=metric)
+    assert used == ["cpu"]
+    np.testing.assert_allclose(there, here, atol=2e-5)
+
+
+def test_a_device_that_is_not_there_is_refused() -> None:
+    backend("torch")
+    rows = np.eye(24)[:4]
+    templates = lift(rows, strategy="random", m=2)
+    with pytest.raises(TemplateError, match="cannot use the device nowhere"), on_device("nowhere"):
+        pairwise_distances(rows, templates, metric="euclidean")
+
+
+@pytest.mark.parametrize("setting", ["older", "newer"])
+def test_products_on_a_device_are_float32_and_the_setting_is_restored(setting: str) -> None:
+    made, _ = backend("torch")
+    import torch
+
+    matmul = torch.backends.cuda.matmul
+    if setting == "newer" and not hasattr(matmul, "fp32_precision"):
+        pytest.skip("this torch has only the older setting")
+    try:
+        if setting == "older":
+            torch.set_float32_matmul_precision("high")
+        else:
+            matmul.fp32_precision = "tf32"
+        with torch.autocast("cpu", dtype=torch.bfloat16), made.ieee_products(torch.device("cpu")):
+            assert torch.get_float32_matmul_precision() == "highest"
+            assert not torch.is_autocast_enabled("cpu")
+        if setting == "older":
+            assert torch.get_float32_matmul_precision() == "high"
+        else:
+            assert matmul.fp32_precision == "tf32"
+    finally:
+        torch.set_float32_matmul_precision("highest")
+
+
+_NOTHING_COMPILED = """
+import numpy as np
+from numba.core import event
+from templates import distances
+from templates.distances import compiled, warm_up
+from templates.space.lifting import lift
+
+warm_up()
+names = []
+
+class Listener(event.Listener):
+    def on_start(self, event):
+        names.append(event.data["dispatcher"].__name__)
+
+    def on_end(self, event):
+        pass
+
+event.register("numba:compile", Listener())
+distances._FEW = 0
+rows = np.linalg.qr(np.random.default_rng(0).normal(size=(64, 64)))[0]
+for m, k in ((1, 1), (2, 9), (16, 16), (20, 7)):
+    a, b = (lift(rows, strategy="random", m=dim) for dim in (m, k))
+    for metric in ("euclidean", "spherical"):
+        for probes in (a, a[::2], rows, rows.astype(np.float32), rows.astype(np.float32)[::2]):
+            distances.pairwise_distances(probes, b, metric=metric)
+print(names)
+"""
+
+
+def test_nothing_is_compiled_after_the_warm_up() -> None:
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", _NOTHING_COMPILED],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        cwd=Path(__file__).resolve().parents[3],
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == "[]"
+
+
+def test_the_specification_needs_numpy_alone() -> None:
+    assert Metric.SPHERICAL in exact._POINT_DISTANCES
+    script = (
+        "import sys, numpy as np\n"
+        "from templates.distances import pairwise_distances\n"
+        "from templates.space.subspace import SubspaceBatch\n"
+        "axes = np.eye(6)\n"
+        "batch = SubspaceBatch(0.5 * axes[:1], axes[None, 1:3])\n"
+        "for probes in (axes, batch):\n"
+        "    pairwise_distances(probes, batch, metric='spherical')\n"
+        "print(sorted({'numba', 'torch', 'llvmlite'} & set(sys.modules)))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        cwd=Path(__file__).resolve().parents[3],
+    )
+    assert done.stdout.strip() == "[]", done.stderr
